@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
+OPAQUE = 0.005
+"""Mean transparency of an image up to which its backdrop decides nothing."""
+
 
 class Encoder(nn.Module, ABC):
     """Images to features. Frozen; deterministic; normalises its input itself."""
@@ -48,6 +51,19 @@ class Encoder(nn.Module, ABC):
     @abstractmethod
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features of sRGB images in [0, 1], aligned to the whole image: cell (i, j) covers its h-th and w-th part."""
+
+    def cutout(self, image: Annotated[Tensor, "B 3 H W"], opacity: Annotated[Tensor, "B H W"]) -> Annotated[Tensor, "B C h w"]:
+        """Features of what images show that are transparent in places; colours are premultiplied by the opacity in [0, 1].
+
+        This mean over a white and a black backdrop serves any encoder: neither alone decides what a single thing is. Override
+        it where an encoder can leave the backdrop out. Cells that show nothing may hold anything finite.
+        """
+        behind = 1 - opacity[:, None]
+        features: Tensor = self((image + behind).clamp(0, 1))
+        # Where next to nothing shows through, both backdrops give one picture, and encoders take most of the time.
+        if float(behind.mean((1, 2, 3)).amax()) > OPAQUE:
+            features = (features + self(image.clamp(0, 1))) / 2
+        return features
 
 
 class ContentField(nn.Module, ABC):

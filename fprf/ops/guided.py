@@ -108,10 +108,12 @@ def apply(
         weight.append(torch.stack([1 - (at - low), at - low], 1))
     flat = (index[0][:, :, None] * columns + index[1][:, None, :]).flatten(1)
     share = (weight[0][:, :, None] * weight[1][:, None, :]).flatten(1)
-    corners = coefs.reshape(rows * columns, channels, 4)[flat].float()
     colour = torch.cat([rgb.float(), torch.ones_like(rgb[:, :1], dtype=torch.float32)], 1)
-    with full_precision(coefs):
-        return torch.einsum("rkcl,rk,rl->rc", corners, share, colour)
+    # Sixteen rows of channels a pixel, four of each corner, summed without R x 16 x C numbers on the way.
+    table = coefs.float().movedim(3, 2).reshape(-1, channels)
+    row = (4 * flat[:, :, None] + torch.arange(4, device=flat.device)).flatten(1)
+    part = (share[:, :, None] * colour[:, None]).flatten(1)
+    return F.embedding_bag(row, table, mode="sum", per_sample_weights=part)
 
 
 class Packed(NamedTuple):

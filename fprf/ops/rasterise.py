@@ -20,7 +20,7 @@ from ..errors import FprfError
 from .backend import compiled
 from .rasterise_reference import Pinhole, rasterise_reference, view_colours
 
-__all__ = ["Lifted", "Pinhole", "Rasterised", "lift", "rasterise"]
+__all__ = ["Pinhole", "Rasterised", "lift", "rasterise"]
 
 _Array = np.ndarray[Any, Any]
 _SKIPPED = ("faint", "behind", "outside", "invalid")
@@ -38,14 +38,6 @@ class Rasterised(NamedTuple):
     """Composited on zeros; C = 0 where none were given."""
     counts: Mapping[str, int]
     """Gaussians left out: faint, behind, outside, invalid; then entries (Gaussians times tiles) and saturated ones, skipped."""
-
-
-class Lifted(NamedTuple):
-    """Features of the pixels of a view, carried to N Gaussians; add up over views, then divide: features / weights."""
-
-    features: Annotated[Tensor, "N C"]
-    """Sum over pixels of weight times feature."""
-    weights: Annotated[Tensor, "N"]
 
 
 class _View(NamedTuple):
@@ -117,15 +109,15 @@ def lift(
     pixels: Annotated[Tensor, "H W C"],
     *,
     antialiased: bool = False,
-) -> Lifted:
+) -> Annotated[Tensor, "N C"]:
     """Carry the features of pixels back to the Gaussians that show there, by their weights in the image: the transpose of
-    rendering features. No gradients. Raises FprfError where shapes do not fit.
+    rendering features. A channel of ones gives the sum of the weights. No gradients. Raises FprfError where shapes do not fit.
     """
     harmonics = means.new_zeros(len(means), 1, 3)
     _check(means, quaternions, log_scales, logits, harmonics, None)
     if pixels.shape[:2] != (camera.height, camera.width):
         raise FprfError(f"pixels {tuple(pixels.shape)}: a camera of {camera.height} x {camera.width} has other ones")
-    pixels = torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1).detach()
+    pixels = pixels.detach()
     shape = (means.detach(), quaternions.detach(), log_scales.detach(), logits.detach())
     if _fits(*shape, pixels):
         lifted = _lifted(_view(*shape, harmonics, camera, antialiased), pixels)
@@ -134,7 +126,7 @@ def lift(
             values = means.new_zeros(len(means), pixels.shape[-1], requires_grad=True)
             image, _ = rasterise_reference(*shape, values, camera, pixels.new_zeros(pixels.shape[-1]), antialiased=antialiased)
             (lifted,) = torch.autograd.grad((image[..., :-1] * pixels).sum(), values)
-    return Lifted(lifted[:, :-1], lifted[:, -1])
+    return lifted
 
 
 class _Rasterise(torch.autograd.Function):

@@ -93,8 +93,8 @@ class Cell:
             camera = cover(cameras.select(torch.tensor([view])).scaled(_COARSER), 0, near)[0]
             runs = torch.from_numpy(in_view(camera, centre, radius)[1]).nonzero()[:, 0]
             mean, quaternion, log_scale = (x[runs].flatten(0, 1) for x in (means, quaternions, log_scales))
-            nothing = torch.zeros(camera.height, camera.width, 1)
-            weights = lift(mean, quaternion, log_scale, logits[runs].flatten(), camera, nothing, antialiased=True).weights
+            ones = torch.ones(camera.height, camera.width, 1)
+            weights = lift(mean, quaternion, log_scale, logits[runs].flatten(), camera, ones, antialiased=True)
             shown[runs] |= weights.view(-1, _RUN) > _WEIGHT
         visible[order[shown]] = True
         return visible

@@ -45,10 +45,6 @@ _CHANNELS = 31
 """Principal components of the semantics that are kept; with the weight they are carried back in four vectors of eight."""
 _SOLID = 0.5
 """Pixels and cells less opaque than this say nothing about the scene."""
-_BACKDROPS = (1.0, 0.0)
-"""Greys behind a capture where it is encoded; features are the mean, so that none of them decides what a single thing is."""
-_OPAQUE = 0.005
-"""Mean transparency of a view up to which its backdrop decides nothing."""
 _TRUST = 4.0
 """Pixels count by this power of their opacity: a soft edge would carry the backdrop's semantics."""
 _SAMPLES = 65_536
@@ -317,11 +313,7 @@ def find_semantics(
         camera = camera_of(cameras, view, near)
         drawn = draw(gaussians.select(seen_by(gaussians, camera)), camera, antialiased=antialiased)
         pictures.append((drawn.image, drawn.opacity))
-        behind = (1 - drawn.opacity)[..., None]
-        # Where nothing shows through, all backdrops give one picture, and encoders take most of the time.
-        backdrops = _BACKDROPS if float(behind.mean()) > _OPAQUE else _BACKDROPS[:1]
-        filled = torch.stack([drawn.image + behind * grey for grey in backdrops]).clamp(0, 1)
-        maps = encoder(filled.permute(0, 3, 1, 2)).float().mean(0)
+        maps = encoder.cutout(drawn.image.permute(2, 0, 1)[None], drawn.opacity[None])[0].float()
         cover = torch.nn.functional.interpolate(drawn.opacity[None, None], maps.shape[1:], mode="area")[0, 0]
         cells.append(maps)
         solid.append(maps[:, cover > _SOLID].T)
@@ -342,7 +334,7 @@ def find_semantics(
         camera = camera_of(small, 0, near)
         index = seen_by(gaussians, camera)
         shape = (gaussians.means[index], gaussians.quaternions[index], gaussians.log_scales[index], gaussians.logits[index])
-        lifted = lift(*shape, camera, torch.cat([fine * trust, trust], 2), antialiased=antialiased).features
+        lifted = lift(*shape, camera, torch.cat([fine * trust, trust], 2), antialiased=antialiased)
         sums.index_add_(0, index, lifted[:, :dim])
         weights.index_add_(0, index, lifted[:, dim])
         # Colours are those of single pixels of the whole picture: averages would have less contrast.
@@ -412,7 +404,7 @@ def _group(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:
 def cache_name(data: bytes, encoder: str, config: LookConfig) -> str:
     """A name for what is found out about a file: by its content, the encoder, and how it is looked at."""
     digest = hashlib.sha256(data)
-    digest.update(f"7 {encoder} {config.up} {config.inside} {config.views} {config.size} {config.regions}".encode())
+    digest.update(f"8 {encoder} {config.up} {config.inside} {config.views} {config.size} {config.regions}".encode())
     return f"{digest.hexdigest()[:32]}.safetensors"
 
 

@@ -127,8 +127,8 @@ def seen_means(gaussians: Gaussians, cameras: Cameras, *, antialiased: bool) -> 
     for view in torch.linspace(0, len(cameras) - 1, min(_MEAN_VIEWS, len(cameras))).round().long().tolist():
         camera = cover(cameras, view, near)[0]
         direction = torch.nn.functional.normalize(gaussians.means - cameras.pose[view, :, 3].float(), dim=1)
-        pixels = torch.zeros(camera.height, camera.width, 1)
-        weight = _UNSEEN + lift(*shape, camera, pixels, antialiased=antialiased).weights[:, None]
+        pixels = torch.ones(camera.height, camera.width, 1)
+        weight = _UNSEEN + lift(*shape, camera, pixels, antialiased=antialiased)
         functions += weight * harmonic_functions(direction, bands)
         opacities += weight * project_reference(*shape, camera, antialiased=antialiased).opacity[:, None]
         weights += weight

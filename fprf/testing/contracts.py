@@ -79,6 +79,11 @@ def check_encoder(config: EncoderConfig) -> None:
         require(not features.requires_grad, f"{name}: features must not carry gradients to the weights")
         same(encoder(image), features, 0.0, f"{name}: must be deterministic")
         same(encoder(image[1:]), features[1:], 1e-3, f"{name}: an image's features must not depend on its batch")
+        opaque = torch.ones(2, height, width)
+        same(encoder.cutout(image, opaque), features, 1e-3, f"{name}: what is opaque must have the features of the image")
+        for opacity in ((torch.arange(width) < width // 2).float() * opaque, 0 * opaque):
+            shown = encoder.cutout(image * opacity[:, None], opacity)
+            tensor(shown, tuple(features.shape), f"{name} of a picture that is transparent in places")
     for height, width in ((1, 1), (2, 90), (90, 2)):
         features = encoder(cases.uniform(1, 3, height, width, seed=19))
         tensor(features, (1, encoder.channels, None, None), f"{name} of {height} x {width} pixels")

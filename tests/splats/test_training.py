@@ -239,7 +239,7 @@ def test_nothing_floats_before_a_sky_that_is_masked(config: GaussiansConfig, sce
         found = learnt(replace(config, masks=masks), masked).gaussians()
         sky, seen = torch.from_numpy(above[..., :1] / 255).float(), torch.zeros(len(found), 1)
         for view in scene.train.tolist():
-            seen += lift(*list(vars(found).values())[:4], camera_of(scene.cameras, view), sky, antialiased=True).features
+            seen += lift(*list(vars(found).values())[:4], camera_of(scene.cameras, view), sky, antialiased=True)
         distance = (found.means - centre).norm(dim=1)
         return float(seen[distance < 0.4 * distance.max()].sum())
 

@@ -58,14 +58,22 @@ class ConcatEncoder(FrozenEncoder):
         kind = "concat:" if cells == "finest" else f"concat:{cells}:"
         super().__init__(kind + "+".join(names), sum(part.channels for part in parts))
         self._cells = cells
-        self.parts = nn.ModuleList(parts)
+        self.parts, self._encoders = nn.ModuleList(parts), tuple(parts)
         self._factors = [weight / unit for weight, unit in zip(weights, units, strict=True)]
         freeze(self)
 
     @torch.no_grad()
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features on the cells of the finest part, or of the first; coarser ones are interpolated, finer ones averaged."""
-        maps = [part(image) * factor for part, factor in zip(self.parts, self._factors, strict=True)]
+        return self._side_by_side([part(image) for part in self._encoders])
+
+    @torch.no_grad()
+    def cutout(self, image: Annotated[Tensor, "B 3 H W"], opacity: Annotated[Tensor, "B H W"]) -> Annotated[Tensor, "B C h w"]:
+        """Each part leaves the backdrop out as it can."""
+        return self._side_by_side([part.cutout(image, opacity) for part in self._encoders])
+
+    def _side_by_side(self, maps: Sequence[Annotated[Tensor, "B C h w"]]) -> Annotated[Tensor, "B C h w"]:
+        maps = [each * factor for each, factor in zip(maps, self._factors, strict=True)]
         if self._cells == "first":
             size = maps[0].shape[2:]
             maps = [F.interpolate(F.adaptive_avg_pool2d(each, _least(each, size)), size, mode="bilinear") for each in maps]

@@ -25,6 +25,10 @@ HELD, BLOCKS = 11, 12
 """Blocks in the file and of the network."""
 EPS = 1e-6
 """Of layer norms, as in training."""
+COVER = 0.02
+"""Mean opacity of a patch from which on it is encoded."""
+GREY = 0.5
+"""Backdrop of patches that show something in part: the mean colour of what is shown hides its outline, and matches worse."""
 WEIGHTS = Path(__file__).parent / "weights" / "dinov2-small.safetensors"
 
 
@@ -60,16 +64,28 @@ class Dinov2(nn.Module):
         self.pos_embed = nn.Parameter(torch.empty(WIDTH, GRID, GRID))
         self.blocks = nn.ModuleList(Block() for _ in range(blocks))
 
-    def forward(self, image: Annotated[Tensor, "B 3 14h 14w"], keys: bool) -> Annotated[Tensor, "B 384 h w"]:
-        """Patch tokens after the last block without a norm, or that block's keys. Colours are normalised."""
+    def forward(
+        self, image: Annotated[Tensor, "B 3 14h 14w"], keys: bool, shown: Annotated[Tensor, "h w"] | None = None
+    ) -> Annotated[Tensor, "B 384 h w"]:
+        """Patch tokens after the last block without a norm, or that block's keys. Colours are normalised.
+
+        Only patches that are `shown` (bool, at least one) attend to each other; the others take the features of the nearest.
+        """
         patches = self.patch_embed(image)
         shape = patches.shape[-2:]
         positions = F.interpolate(self.pos_embed[None], shape, mode="bicubic", align_corners=False)
         tokens = (patches + positions).flatten(2).transpose(1, 2)
+        if shown is not None:
+            tokens = tokens[:, shown.flatten()]
         x = torch.cat([self.cls_token.expand(len(image), 1, -1), tokens], 1)
         for index, block in enumerate(self.blocks, start=1):
             x = block(x, keys and index == len(self.blocks))
-        return x[:, 1:].transpose(1, 2).reshape(len(image), WIDTH, *shape)
+        x = x[:, 1:]
+        if shown is not None:
+            # So that no filter over cells mixes in what is not there.
+            cells = torch.ones_like(shown).nonzero().float()
+            x = x[:, torch.cdist(cells, cells[shown.flatten()]).argmin(1)]
+        return x.transpose(1, 2).reshape(len(image), WIDTH, *shape)
 
 
 class Dinov2Encoder(FrozenEncoder):
@@ -85,11 +101,27 @@ class Dinov2Encoder(FrozenEncoder):
     @torch.no_grad()
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features; cells cover the whole image evenly, at least one along each axis."""
+        return self._features(image)
+
+    @torch.no_grad()
+    def cutout(self, image: Annotated[Tensor, "B 3 H W"], opacity: Annotated[Tensor, "B H W"]) -> Annotated[Tensor, "B C h w"]:
+        """Features of the patches that show something, encoded without the others: cheaper, and no backdrop has a say."""
+        cover = F.adaptive_avg_pool2d(opacity[:, None], patch_grid(image.shape[-2:], self._stride))[:, 0]
+        filled = image + (1 - opacity[:, None]) * GREY
+        # One by one: as many tokens as each image shows.
+        return torch.cat(
+            [
+                self._features(each, shown if bool(shown.any() & ~shown.all()) else None)
+                for each, shown in zip(torch.split(filled, 1), cover > COVER, strict=True)
+            ]
+        )
+
+    def _features(self, image: Tensor, shown: Annotated[Tensor, "h w"] | None = None) -> Annotated[Tensor, "B C h w"]:
         size = [PATCH * n for n in patch_grid(image.shape[-2:], self._stride)]
         if size != list(image.shape[-2:]):
             image = F.interpolate(image, size, mode="bicubic", align_corners=False, antialias=True)
         mean, std = (image.new_tensor(each).view(1, 3, 1, 1) for each in (IMAGENET_MEAN, IMAGENET_STD))
-        features: Tensor = self.network((image - mean) / std, self._keys)
+        features: Tensor = self.network((image - mean) / std, self._keys, shown)
         return features
 
 

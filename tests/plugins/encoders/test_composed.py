@@ -12,6 +12,7 @@ from fprf.plugins.encoders.config import (
     SEMANTICS,
     AveragedConfig,
     ConcatConfig,
+    Dinov2Config,
     RandomConfig,
 )
 from fprf.plugins.encoders.frozen import street
@@ -81,3 +82,19 @@ def test_known_units_are_those_measured() -> None:
     parts = [part.build() for part in (SEMANTICS.first, SEMANTICS.second)]
     assert [UNITS[part.identity] for part in parts] == [pytest.approx(unit_of(part, street()), rel=0.01) for part in parts]
     assert len(UNITS) == len(parts)
+
+
+def test_cut_out_pictures_are_seen_on_white_and_black() -> None:
+    image, opacity = torch.rand(2, 3, 16, 24), torch.rand(2, 16, 24)
+    encoder, drawn = RandomConfig(stride=4).build(), image * opacity[:, None]
+    on_white = drawn + 1 - opacity[:, None]
+    torch.testing.assert_close(encoder.cutout(drawn, opacity), (encoder(on_white) + encoder(drawn)) / 2)
+
+
+def test_each_part_cuts_out_as_it_can() -> None:
+    image, opacity = torch.rand(1, 3, 70, 98), torch.zeros(1, 70, 98)
+    opacity[:, 20:50, 30:60] = 1
+    parts = [Dinov2Config(layer=1, stride=14).build(), RandomConfig(stride=7).build()]
+    found = ConcatEncoder(parts, (3.0, 0.5), (2.0, 4.0), cells="first").cutout(image * opacity, opacity)
+    tokens, random = (part.cutout(image * opacity, opacity) for part in parts)
+    torch.testing.assert_close(found, torch.cat([tokens * 1.5, F.avg_pool2d(random, 2) * 0.125], dim=1))

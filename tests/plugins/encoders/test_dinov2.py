@@ -4,11 +4,12 @@ from pathlib import Path
 
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from fprf.errors import ConfigError, WeightsError
 from fprf.plugins.encoders.config import Dinov2Config
-from fprf.plugins.encoders.dinov2 import WEIGHTS, dequantised
+from fprf.plugins.encoders.dinov2 import WEIGHTS, dequantised, load_dinov2
 from fprf.plugins.typed_json import from_json
 from fprf.plugins.weights import IMAGENET_MEAN, IMAGENET_STD, read_weights, write_weights
 from fprf.splats.config import GaussianSemanticsConfig
@@ -90,6 +91,46 @@ def _renamed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 @pytest.mark.parametrize(("size", "cells"), [((96, 128), (16, 22)), ((40, 10), (22, 6)), ((3, 300), (1, 22))])
 def test_without_a_stride_the_longer_side_has_22_cells(size: tuple[int, int], cells: tuple[int, int]) -> None:
     assert Dinov2Config(layer=1).build()(torch.rand(1, 3, *size)).shape[2:] == cells
+
+
+@pytest.mark.parametrize("kind", ["tokens", "keys"])
+def test_patches_that_show_nothing_are_as_if_masked_in_attention(kind: str) -> None:
+    """The oracle attends from all patches to those shown, in float64."""
+    network = load_dinov2(layer=3, kind=kind, stride=14).network.double()
+    image = picture(70, 98).double()
+    shown = torch.rand(5, 7, generator=torch.Generator().manual_seed(0)) < 0.4
+    attention = F.scaled_dot_product_attention
+    visible = torch.cat([torch.ones(1, dtype=torch.bool), shown.flatten()])
+    with pytest.MonkeyPatch.context() as patch, torch.no_grad():
+        patch.setattr(F, "scaled_dot_product_attention", lambda q, k, v: attention(q, k, v, attn_mask=visible[None]))
+        masked = network(image, kind == "keys")
+        patch.undo()
+        found, plain = network(image, kind == "keys", shown), network(image, kind == "keys")
+    torch.testing.assert_close(found[:, :, shown], masked[:, :, shown])
+    assert (plain - masked)[:, :, shown].abs().max() > 0.01
+    for row, column in (~shown).nonzero().tolist():
+        away = (shown.nonzero() - torch.tensor([row, column])).double().norm(dim=1)
+        nearest = shown.nonzero()[away == away.min()]
+        assert any(torch.equal(found[..., row, column], found[..., y, x]) for y, x in nearest.tolist())
+
+
+def test_what_is_cut_out_is_encoded_alone() -> None:
+    """Each image of a batch as many patches as it shows; nothing shown, and all of it, are as images on grey."""
+    encoder = Dinov2Config(layer=2, stride=14).build()
+    opacity = torch.zeros(4, 70, 98)
+    opacity[0, 14:42, 28:70] = 1
+    opacity[1, :, :14] = 0.5
+    opacity[2] = 1
+    image = picture(70, 98) * opacity[:, None]
+    found = encoder.cutout(image, opacity)
+    on_grey = image + 0.5 * (1 - opacity[:, None])
+    torch.testing.assert_close(found[2:], encoder(on_grey[2:]))
+    for index, (rows, columns) in enumerate([(slice(1, 3), slice(2, 5)), (slice(0, 5), slice(0, 1))]):
+        shown = torch.zeros(5, 7, dtype=torch.bool)
+        shown[rows, columns] = True
+        normal = (on_grey[index, None] - torch.tensor(IMAGENET_MEAN).view(3, 1, 1)) / torch.tensor(IMAGENET_STD).view(3, 1, 1)
+        with torch.no_grad():
+            torch.testing.assert_close(found[index, None], encoder.network(normal, False, shown))
 
 
 @pytest.mark.parametrize(("layer", "same"), [(-4, 9), (-2, 11)])
