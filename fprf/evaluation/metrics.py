@@ -311,14 +311,14 @@ def region_contrasts(pictures: Labelled) -> dict[int, Contrast]:
         # Forward differences; the last row and column repeat themselves and are left out.
         steps = (light[:-1, 1:] - light[:-1, :-1]).abs() + (light[1:, :-1] - light[:-1, :-1]).abs()
         inside, kinds, light = inside[:-1, :-1], near[0, 0, :-1, :-1].long(), light[:-1, :-1]
-        for kind in kinds[inside].unique().tolist():
+        for kind in sorted(set(kinds[inside].tolist())):
             here = inside & (kinds == kind)
             found.setdefault(kind, []).append((light[here], steps[here] / 2))
     contrasts = {}
     for kind, parts in sorted(found.items()):
-        light, steps = (torch.cat(each).double().cpu().numpy() for each in zip(*parts, strict=True))
-        black, white = np.quantile(light, (0.01, 0.99)).tolist()
-        contrasts[kind] = Contrast(len(light), float(steps.mean()), black, white)
+        values, differences = (torch.cat(each).double().cpu().numpy() for each in zip(*parts, strict=True))
+        black, white = np.quantile(values, (0.01, 0.99)).tolist()
+        contrasts[kind] = Contrast(len(values), float(differences.mean()), black, white)
     return contrasts
 
 

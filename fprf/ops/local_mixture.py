@@ -35,8 +35,8 @@ def explained(
     *,
     radius: float,
     noise: Annotated[Tensor, "C"],
-    own: float = 0.5,
-    steps: int = 2,
+    own: float = 0.3,
+    steps: int = 4,
 ) -> Annotated[Tensor, "H W K"]:
     """Memberships after `steps`, float32; rows sum to what they did.
 

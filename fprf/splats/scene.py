@@ -57,7 +57,7 @@ _SAMPLES = 65_536
 """Pixels of all views together that statistics are taken of, about."""
 _COARSER = 2
 """Features, which are smooth, are filtered and carried back at the views' resolution divided by this."""
-_MEETING = 0.12
+_MEETING = 0.25
 """Half the width of the windows in which regions compete for pixels, as a share of the root of a view's area."""
 _GRAIN, _ROUGH = 0.03, 0.05
 """Deviations of colours in [0, 1], and of the logarithm of depth, that tell nothing apart."""
@@ -451,11 +451,12 @@ def _sharpened(
     `coarse` holds colours times opacity, opacity, and depth times opacity.
     """
     share = membership(fine.flatten(0, 1), style.semantic_mean, *region_units(style.keys, style.semantic_mean))
-    share, opacity = share.unflatten(0, fine.shape[:2]), coarse[..., 3]
+    share, opacity = share.view(*fine.shape[:2], -1), coarse[..., 3]
     depth = (coarse[..., 4] / opacity.clamp_min(_SOLID)).clamp_min(1e-30).log()
     guide, noise = torch.cat([_colours(coarse), depth[..., None]], 2), torch.tensor([*3 * (_GRAIN,), _ROUGH])
     after = explained(share, guide, opacity > _SOLID, radius=_MEETING * math.sqrt(opacity.numel()), noise=noise)
-    return fine + (after - share) @ style.keys
+    moved: Tensor = fine + (after - share) @ style.keys
+    return moved
 
 
 def _colours(coarse: Annotated[Tensor, "H W 4+"]) -> Annotated[Tensor, "H W 3"]:
