@@ -18,7 +18,7 @@ from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import DataError
 from fprf.evaluation.consistency import consistency
-from fprf.evaluation.metrics import matched_regions, ssim, structure, style_distances
+from fprf.evaluation.metrics import contrast_kept, matched_regions, region_contrasts, ssim, structure, style_distances
 from fprf.evaluation.restyle import STYLIZERS
 from fprf.evaluation.single_image import histogram_matching, reinhard
 from fprf.interfaces import Encoder
@@ -68,8 +68,8 @@ def colour_baselines(
 
 
 def judge_exhibit(exhibit: Exhibit, judges: Mapping[str, Encoder], *, full: bool = False) -> dict[str, Row]:
-    """By method: `structure` and `ssim` (means over the views), and `style_distance`, also by judge and, with `full`, of whole
-    covariances.
+    """By method: `structure` and `ssim` (means over the views), `contrast_kept`, and `style_distance`, also by judge and, with
+    `full`, of whole covariances.
 
     Raises DataError where the lists of views differ in length.
     """
@@ -82,11 +82,13 @@ def judge_exhibit(exhibit: Exhibit, judges: Mapping[str, Encoder], *, full: bool
     kinds = {"style_distance": False, "full_distance": True} if full else {"style_distance": False}
     distances = {name: style_distances(judges, plain, styled, style, full=exact) for name, exact in kinds.items()}
     rows: dict[str, Row] = {}
+    contrasts = region_contrasts(plain), region_contrasts(style)
     for name, views in exhibit.styled.items():
         pairs = list(zip(exhibit.plain, views, strict=True))
         row: Row = {
             "structure": math.fsum(structure(a, b) for a, b in pairs) / len(pairs),
             "ssim": math.fsum(_luminance_ssim(a, b) for a, b in pairs) / len(pairs),
+            **contrast_kept(contrasts[0], region_contrasts(styled[name]), contrasts[1]),
         }
         for kind, found in distances.items():
             row[kind] = found[name].pop("mean")

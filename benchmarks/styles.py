@@ -2,8 +2,10 @@
 
     python -m benchmarks styles [RUN ...] [--shared DIR] [--sheets DIR] [--output JSON] [any field]
 
-structure, ssim: kept of the unstylised picture, 1 = all of it. style_distance: to the references, region by region, 1 = no
-change, in the eyes of VGG-19, which no shipped part of the product uses. consistency: warp error between neighbouring views.
+structure, ssim: kept of the unstylised picture, 1 = all of it. gradient_kept, range_kept: contrast inside of regions (mean
+gradient; from the 1 % to the 99 % quantile of luma), where the references have as much. style_distance: to the references,
+region by region, 1 = no change, in the eyes of VGG-19, which no shipped part of the product uses. consistency: warp error
+between neighbouring views.
 Sheets show other people's photographs: they are written only where asked for.
 """
 
@@ -173,7 +175,16 @@ def _spread(names: Sequence[str], count: int) -> list[str]:
 
 
 LAYERS = ("relu1_1", "relu2_1", "relu3_1")
-COLUMNS = ("structure", "ssim", "style_distance", "full_distance", "consistency_rmse", "consistency_relative")
+COLUMNS = (
+    "structure",
+    "ssim",
+    "gradient_kept",
+    "range_kept",
+    "style_distance",
+    "full_distance",
+    "consistency_rmse",
+    "consistency_relative",
+)
 SHEET_ROWS = 12
 
 

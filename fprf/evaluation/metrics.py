@@ -30,6 +30,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from kornia.metrics import ssim as _ssim_map
@@ -48,6 +49,8 @@ PSNR_CAP = 99.0
 """PSNR of identical images, in dB: means over views stay finite. Reached at a mean squared error of 1.3e-10."""
 
 _WINDOW = 11
+_INSIDE = 2
+"""Pixels around one that must be of its region for it to lie inside."""
 
 
 def _pair(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
@@ -278,6 +281,63 @@ def region_statistics(encoder: Encoder, pictures: Labelled) -> dict[int, RegionS
     if not kinds:
         raise DataError("style distance: no cell lies wholly in one region; use larger pictures or regions")
     return {kind: _described(cells[label == kind]) for kind in kinds}
+
+
+class Contrast(NamedTuple):
+    """Contrast of luma inside of a region, away from its borders."""
+
+    pixels: int
+    gradient: float
+    """Mean absolute difference between neighbouring pixels, along rows and columns."""
+    black: float
+    """1 % quantile."""
+    white: float
+    """99 % quantile."""
+
+    @property
+    def range(self) -> float:
+        """From black to white."""
+        return self.white - self.black
+
+
+def region_contrasts(pictures: Labelled) -> dict[int, Contrast]:
+    """Contrast of every region over all pictures together, of pixels no nearer than two to another region."""
+    found: dict[int, list[tuple[Tensor, Tensor]]] = {}
+    for image, regions in pictures:
+        near = F.interpolate(regions[None, None].double(), image.shape[:2], mode="nearest-exact")
+        padded, side = F.pad(near, (_INSIDE,) * 4, mode="replicate"), 2 * _INSIDE + 1
+        inside = (F.max_pool2d(padded, side, 1) == -F.max_pool2d(-padded, side, 1))[0, 0]
+        light = luma(image.flatten(0, 1)).view(image.shape[:2])
+        # Forward differences; the last row and column repeat themselves and are left out.
+        steps = (light[:-1, 1:] - light[:-1, :-1]).abs() + (light[1:, :-1] - light[:-1, :-1]).abs()
+        inside, kinds, light = inside[:-1, :-1], near[0, 0, :-1, :-1].long(), light[:-1, :-1]
+        for kind in sorted(set(kinds[inside].tolist())):
+            here = inside & (kinds == kind)
+            found.setdefault(kind, []).append((light[here], steps[here] / 2))
+    contrasts = {}
+    for kind, parts in sorted(found.items()):
+        values, differences = (torch.cat(each).double().cpu().numpy() for each in zip(*parts, strict=True))
+        black, white = np.quantile(values, (0.01, 0.99)).tolist()
+        contrasts[kind] = Contrast(len(values), float(differences.mean()), black, white)
+    return contrasts
+
+
+def contrast_kept(
+    plain: Mapping[int, Contrast], styled: Mapping[int, Contrast], style: Mapping[int, Contrast]
+) -> dict[str, float | None]:
+    """Shares of the plain picture's mean gradient (`gradient_kept`) and range of luma (`range_kept`) that are left.
+
+    Means over the regions whose range is no less in the style than in the plain picture, by their pixels; None where there is
+    no such region.
+    """
+    kept = [(each, styled[k]) for k, each in plain.items() if k in style and style[k].range >= each.range > 0 < each.gradient]
+    pixels = sum(each.pixels for each, _ in kept)
+    if not pixels:
+        return {"gradient_kept": None, "range_kept": None}
+    return {
+        "gradient_kept": math.fsum(a.pixels * b.gradient / a.gradient for a, b in kept) / pixels,
+        "range_kept": math.fsum(a.pixels * b.range / a.range for a, b in kept) / pixels,
+    }
 
 
 def gaussian_distance(a: RegionStatistics, b: RegionStatistics, *, full: bool = False) -> float:

@@ -13,12 +13,15 @@ from torch import Tensor
 from fprf.errors import DataError, NumericsError
 from fprf.evaluation.metrics import (
     PSNR_CAP,
+    Contrast,
     RegionStatistics,
+    contrast_kept,
     delta_e_2000,
     gaussian_distance,
     image_metrics,
     matched_regions,
     psnr,
+    region_contrasts,
     relative_distance,
     srgb_to_lab,
     ssim,
@@ -244,3 +247,28 @@ def test_bands_of_another_light_find_their_like() -> None:
     assert there[0].equal(torch.tensor([sky, wall, grass]).repeat_interleave(4)[:, None].expand(12, 6))
     assert here[0][:, 0].tolist() == [sky] * 4 + [wall] * 2 + [grass] * 6
     assert here[1][:, 0].tolist() == [sky] * 2 + [wall] * 6 + [grass] * 4
+
+
+def test_contrast_follows_an_affine_change_of_light_and_not_the_borders() -> None:
+    image = 0.2 + 0.3 * noise(40, 60)[..., :1].expand(-1, -1, 3)
+    image[:, 30:] += 0.4  # an edge that lies on the regions' border
+    regions = torch.zeros(40, 60)
+    regions[:, 30:] = 1
+    before, after = region_contrasts([(image, regions)]), region_contrasts([(0.5 * image + 0.1, regions)])
+    assert before[0].gradient == pytest.approx(0.3 / 3, rel=0.1)  # mean distance of two uniform numbers
+    assert (before[0].black, before[0].white) == pytest.approx((0.203, 0.497), abs=0.005)
+    for kind in (0, 1):
+        assert before[kind].pixels == after[kind].pixels == 39 * (28 if kind == 0 else 27)
+        assert after[kind].gradient == pytest.approx(0.5 * before[kind].gradient, rel=1e-4)
+        assert after[kind].black == pytest.approx(0.5 * before[kind].black + 0.1, abs=1e-5)
+        assert after[kind].range == pytest.approx(0.5 * before[kind].range, rel=1e-4)
+
+
+def test_contrast_counts_where_the_style_has_as_much() -> None:
+    plain = {0: Contrast(30, 0.1, 0.2, 0.6), 1: Contrast(10, 0.2, 0.0, 0.5), 2: Contrast(99, 0.1, 0.0, 1.0)}
+    styled = {0: Contrast(30, 0.05, 0.2, 0.4), 1: Contrast(10, 0.2, 0.1, 0.6), 2: Contrast(99, 0.0, 0.0, 0.1)}
+    style = {0: Contrast(5, 0.0, 0.1, 0.6), 1: Contrast(5, 0.0, 0.0, 0.5), 2: Contrast(5, 0.0, 0.5, 0.6)}
+    kept = contrast_kept(plain, styled, style)
+    assert kept["gradient_kept"] == pytest.approx((30 * 0.5 + 10 * 1.0) / 40)
+    assert kept["range_kept"] == pytest.approx((30 * 0.5 + 10 * 1.0) / 40)
+    assert contrast_kept(plain, styled, {})["range_kept"] is None

@@ -1,0 +1,109 @@
+"""Which of the regions that meet around a pixel explains what it looks like: mixtures of Gaussians in windows.
+
+Features of encoders are smooth, so the memberships in regions that follow from them are blurred where regions meet. In every
+window each region k has a share pi_k and a Gaussian of what its pixels look like (colour, depth), N(m_k, S_k), all weighted by
+membership. A pixel's membership is then the posterior
+
+    q_k(p)  ~  (own s_k(p) + (1 - own) pi_k(p)) N(x(p); m_k, S_k + noise^2)
+
+with s the memberships at the beginning; a few such steps are taken, each with the moments of the last (EM). Regions that no
+pixel of a window belongs to cannot appear there.
+
+Letters: x guide [H W C], s shares [H W K]; windows are squares of 2 radius pixels, cut at the border. Moments are taken at
+cells half a radius apart; the logarithm of N, quadratic in x, is interpolated between them by its coefficients.
+"""
+
+import math
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+_CELLS = 2.0
+"""Cells for each radius."""
+_PRESENT = 1e-3
+"""Mean share in the image below which a region is left as it is."""
+_MASS = 1e-6
+"""Pixels of a region in a window below which its moments are those of nothing: 0 with the variance of the noise."""
+
+
+def explained(
+    share: Annotated[Tensor, "H W K"],
+    guide: Annotated[Tensor, "H W C"],
+    solid: Annotated[Tensor, "H W"],
+    *,
+    radius: float,
+    noise: Annotated[Tensor, "C"],
+    own: float = 0.3,
+    steps: int = 4,
+) -> Annotated[Tensor, "H W K"]:
+    """Memberships after `steps`, float32; rows sum to what they did.
+
+    `radius` in pixels, `noise` a deviation > 0 of each channel, `own` in [0, 1]. Pixels that are not `solid` (bool) count for
+    nothing and stay.
+    """
+    if not bool(solid.any()):
+        return share
+    present = (share.mean((0, 1)) > _PRESENT).nonzero()[:, 0]
+    before, radius = share[..., present].permute(2, 0, 1).float().contiguous(), max(1.0, radius)
+    # Squares of what lies far from 0 would round.
+    centred = torch.where(solid[..., None], guide - guide[solid].mean(0), 0.0)
+    monomials = _monomials(centred.float()).permute(2, 0, 1).contiguous()
+    masked, size, after = monomials * solid, (share.shape[0], share.shape[1]), before
+    for _ in range(steps):
+        prior, logarithm = _local_gaussians(after, masked, radius, noise)
+        # Bilinear interpolation as two small matrices, which takes less time than F.interpolate.
+        rows, columns = (_interpolation(n, m).to(prior) for n, m in zip(prior.shape[1:], size, strict=True))
+        prior = rows @ prior @ columns.T
+        likelihood = torch.empty_like(prior)
+        for k, coefficients in enumerate(logarithm):  # one region at a time: it stays in the cache
+            likelihood[k] = ((rows @ coefficients @ columns.T) * monomials).sum(0)
+        odds = (own * before + (1 - own) * prior).clamp_min(1e-9).log() + likelihood
+        after = torch.where(solid, torch.softmax(odds, 0) * before.sum(0), before)
+    return share.float().index_copy(2, present, after.permute(1, 2, 0))
+
+
+def _local_gaussians(
+    share: Annotated[Tensor, "K H W"], monomials: Annotated[Tensor, "M H W"], radius: float, noise: Annotated[Tensor, "C"]
+) -> tuple[Annotated[Tensor, "K h w"], Annotated[Tensor, "K M h w"]]:
+    """Share of each region in the windows, and the coefficients of the logarithm of its density, up to a constant."""
+    channels, (rows, columns) = len(noise), monomials.shape[1:]
+    i, j = torch.triu_indices(channels, channels)
+    windows = [_windows(n, radius).to(share) for n in (rows, columns)]
+    sums = torch.stack([windows[0] @ (part * monomials) @ windows[1].T for part in share])
+    sums = sums.double().permute(0, 2, 3, 1)
+    mass = sums[..., :1]
+    moments = sums[..., 1:] / mass.clamp_min(_MASS)
+    mean, square = moments[..., :channels], moments[..., channels:]
+    covariance = square.new_empty(*square.shape[:3], channels, channels)
+    covariance[..., i, j] = covariance[..., j, i] = square - mean[..., i] * mean[..., j]
+    # Rounding may leave a variance slightly below 0.
+    covariance.diagonal(dim1=-2, dim2=-1).clamp_min_(0).add_(noise.double().square())
+    root = torch.linalg.cholesky(covariance)
+    inverse = torch.cholesky_inverse(root)
+    slope = (inverse @ mean[..., None])[..., 0]
+    constant = -0.5 * (slope * mean).sum(-1) - root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    curvature = inverse[..., i, j] * torch.where(i == j, -0.5, -1.0).double()
+    logarithm = torch.cat([constant[..., None], slope, curvature], -1).permute(0, 3, 1, 2)
+    prior = (mass / mass.sum(0).clamp_min(_MASS))[..., 0]
+    return prior.float(), logarithm.float()
+
+
+def _monomials(x: Annotated[Tensor, "H W C"]) -> Annotated[Tensor, "H W M"]:
+    """1, every channel, and every product of two."""
+    i, j = torch.triu_indices(x.shape[-1], x.shape[-1])
+    return torch.cat([torch.ones_like(x[..., :1]), x, x[..., i] * x[..., j]], -1)
+
+
+def _interpolation(cells: int, pixels: int) -> Annotated[Tensor, "pixels cells"]:
+    """Bilinear weight of each cell at each pixel."""
+    at = ((torch.arange(pixels) + 0.5) * cells / pixels - 0.5).clamp(0, cells - 1)
+    return (1 - (at[:, None] - torch.arange(cells)).abs()).clamp_min(0)
+
+
+def _windows(pixels: int, radius: float) -> Annotated[Tensor, "cells pixels"]:
+    """Part of each pixel that lies in the window around each cell's centre."""
+    cells = math.ceil(_CELLS * pixels / radius)
+    centre = (torch.arange(cells).double() + 0.5)[:, None] * pixels / cells
+    edge = torch.arange(pixels + 1).double()
+    return (torch.minimum(centre + radius, edge[1:]) - torch.maximum(centre - radius, edge[:-1])).clamp_min(0)
