@@ -21,7 +21,7 @@ from fprf.datamanagers.basis import Basis, fit_basis
 from fprf.datamanagers.config import GuidedConfig
 from fprf.errors import FprfError
 from fprf.interfaces import Encoder
-from fprf.plugins.encoders.config import Dinov2Config, EncoderConfig
+from fprf.plugins.encoders.config import SEMANTICS, EncoderConfig
 from fprf.plugins.stylizers.config import RegionToneConfig
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
 from fprf.style.light import SURE, UNSURE, certainty, light_of
@@ -41,7 +41,7 @@ _FEWEST = 50
 class BenchmarkConfig:
     """What to measure, and on what."""
 
-    encoder: EncoderConfig = Dinov2Config()
+    encoder: EncoderConfig = SEMANTICS
     """The semantic encoder."""
     triplets: Path = SHARED / "data/pst"
     """Folder with content, style and segmentation."""
