@@ -1,4 +1,4 @@
-"""What `fprf doctor` finds in a parsed scene that its training would not say: each finding with what is decided.
+"""Findings of `fprf doctor` in a parsed scene that training would not say, each with what is decided.
 
 At most LOOKED views, evenly through the scene, have their files opened and their pixels looked at.
 """
@@ -69,7 +69,7 @@ def _coordinates(scene: Scene) -> Iterator[Finding]:
 
 
 def _points(data: Path, scene: Scene) -> Finding:
-    """How many of the reconstruction's points there are, and whether training views see them."""
+    """Number of the reconstruction's points, and of those that training views see."""
     count = 0 if scene.points is None else len(scene.points)
     if not count:
         found = "none; bounds come from the cameras, first Gaussians from matches between views"
@@ -196,7 +196,7 @@ def _pixels(scene: Scene, views: Sequence[int]) -> tuple[dict[int, Image], list[
 
 
 def _exposure(scene: Scene, images: Mapping[int, Image]) -> Iterator[Finding]:
-    """How far the exposures of the training views that were looked at are apart."""
+    """Spread of the exposures of the training views that were looked at."""
     train = torch.tensor([view for view in scene.train.tolist() if view in images], dtype=torch.int64)
     if len(train) < 2:
         return

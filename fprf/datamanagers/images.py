@@ -80,7 +80,7 @@ _TURNS = {
     7: PIL.Image.Transpose.TRANSVERSE,
     8: PIL.Image.Transpose.ROTATE_90,
 }
-"""What turns an image upright, by its EXIF orientation."""
+"""Transpose that turns an image upright, by its EXIF orientation."""
 _STRIP = 128
 """Rows that are copied at once."""
 _WARNINGS = threading.Lock()
@@ -188,7 +188,7 @@ def load_mask(path: Path, size: tuple[int, int] | None = None, *, upright: bool 
 
 
 def useless_masks(scene: "Scene") -> str:
-    """What is said of masks that leave no pixel of any view, or every pixel of all; empty of others and without masks.
+    """Describe masks that leave no pixel of any view, or every pixel of all; empty for others and without masks.
 
     Reads masks only until one, or two of them, tell that they are of use.
     """
@@ -395,7 +395,7 @@ def _decoding(kind: str, name: object, room: int = 0) -> Iterator[None]:
 
 @contextmanager
 def silent() -> Iterator[None]:
-    """No warnings, which Pillow gives of EXIF blocks. Filters are of the process, so one thread at a time changes them."""
+    """Suppress Pillow's warnings of EXIF blocks. Filters are of the process, so one thread at a time changes them."""
     with _WARNINGS, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield

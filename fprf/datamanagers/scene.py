@@ -48,9 +48,9 @@ class Scene:
     alpha: bool = False
     """Images carry transparency."""
     notes: tuple[str, ...] = ()
-    """What was decided while the capture was read, a line each, for the user."""
+    """Decisions taken while the capture was read, a line each, for the user."""
     origin: Origin = (0.0, 0.0, 0.0)
-    """What was taken off the capture's coordinates, along its own axes: cameras and points are relative to it."""
+    """Subtracted from the capture's coordinates, along its own axes: cameras and points are relative to it."""
 
 
 def in_local_frame(scene: Scene) -> Scene:
