@@ -85,4 +85,4 @@ if [ "$long" != 0 ]; then
     step train-long 7200 "${fprf[@]}" train "$method" "${data[@]}" "${again[@]}" --device "$device" --output "$work/long" "$@"
     step eval-long 60 "${fprf[@]}" eval "$work/long" --no-images --device "$device"
 fi
-"$python" "$here/gpu_rows.py" "$work" --output "$output"
+"$python" -m benchmarks.gpu_rows "$work" --output "$output"

@@ -1,6 +1,6 @@
 """What `gpu.sh` measured, as one JSON: its steps, rows with their goals, and the profile that explains them.
 
-    python benchmarks/gpu_rows.py WORK --output FILE
+    python -m benchmarks.gpu_rows WORK --output FILE
 
 WORK holds steps.jsonl, a log of each step and, as far as the steps came, run/metrics.json, speed.json, roofline.json,
 profile.json and long/metrics.json. Rows of what is missing are left out. The exit status is 1 where a step failed.

@@ -33,7 +33,6 @@ from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import (
     BundledContentConfig,
     BundledSemanticConfig,
-    DeepLabConfig,
     EncoderConfig,
     RandomConfig,
     Vgg19Config,
@@ -228,9 +227,8 @@ def judges(shared: Path) -> dict[str, Encoder]:
 
 
 def observer(shared: Path, otherwise: EncoderConfig) -> Encoder:
-    """Who finds the regions of runs: DeepLab where its weights are."""
-    weights = shared / "weights/deeplabv3_mobilenetv2_pascal.safetensors"
-    return DeepLabConfig(weights=weights).build() if weights.is_file() else otherwise.build()
+    """Who finds the regions of runs."""
+    return otherwise.build()
 
 
 def say(line: str) -> None:

@@ -1,6 +1,6 @@
 """Parts of frozen encoders: padding that any size survives, tensors that no optimiser sees, pictures to measure them on."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from importlib.resources import files
@@ -15,34 +15,6 @@ from torch import Tensor, nn
 from ...errors import WeightsError
 from ...interfaces import Encoder
 from ..weights import tensors_hash
-
-
-class FrozenTensors(nn.Module):
-    """Tensors by the names that they have in their file; they move with the module that holds them."""
-
-    def __init__(self, tensors: Mapping[str, Tensor]) -> None:
-        super().__init__()
-        for name, value in tensors.items():
-            self.register_buffer(_undotted(name), value)
-
-    def get(self, name: str) -> Tensor | None:
-        """The tensor of that name, if there is one."""
-        return self._buffers.get(_undotted(name))
-
-    def __getitem__(self, name: str) -> Tensor:
-        """Raises KeyError with the name where there is none."""
-        value = self.get(name)
-        if value is None:
-            raise KeyError(name)
-        return value
-
-    def __contains__(self, name: str) -> bool:
-        return _undotted(name) in self._buffers
-
-
-def _undotted(name: str) -> str:
-    """Modules keep the dot for themselves."""
-    return name.replace(".", "/")
 
 
 def finest(maps: Sequence[Annotated[Tensor, "B C h w"]]) -> list[Tensor]:
