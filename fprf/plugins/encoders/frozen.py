@@ -117,5 +117,6 @@ def fitting(source: str, what: str, flag: str) -> Iterator[None]:
 def street() -> Annotated[Tensor, "5 3 128 160"]:
     """Sky, plants, walls and a road, from day to night, in [0, 1]: five views of the town of benchmarks/town, seed 0."""
     stored = np.frombuffer((files(__package__) / "weights/street.webp").read_bytes(), np.uint8)
-    strip = cv2.cvtColor(cv2.imdecode(stored, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)  # lossless, one view below the other
+    strip = cv2.imdecode(stored, cv2.IMREAD_COLOR_RGB)  # lossless, one view below the other
+    assert strip is not None
     return torch.from_numpy(strip).reshape(5, 128, 160, 3).permute(0, 3, 1, 2).float() / 255
