@@ -46,7 +46,7 @@ def packages(tmp_path: Path) -> Iterator[Packages]:
 
 def test_a_packaged_verb_is_listed_without_being_imported(packages: Packages, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["--help"]) == 0
-    assert "count of acme-count 0.2".split() in [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["count", "of", "acme-count", "0.2"] in [line.split() for line in capsys.readouterr().out.splitlines()]
     assert ("count", "acme-count 0.2") in {(row.name, row.package) for row in rows()}
     assert "acme_count" not in sys.modules
 

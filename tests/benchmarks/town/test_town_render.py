@@ -10,6 +10,7 @@ from benchmarks.town.layout import build_town
 from benchmarks.town.palettes import PALETTES, palette
 from benchmarks.town.render import cast, colours, directions, geometry, render, shade, walk
 from benchmarks.town.surface import hashed, noise2, noise3
+from fprf.plugins.encoders.frozen import street
 
 TOWN = build_town(0)
 VIEWS = walk(seed=0, views=40, width=48, height=36)
@@ -70,3 +71,9 @@ def test_noise_is_continuous_and_in_range(state, seed):
         assert np.abs(value - near).max() < 2e-3
     i, j = np.round(p[:, :2]).astype(np.int64).T
     np.testing.assert_array_equal(noise2(i.astype(float), j.astype(float), seed), hashed(seed, i, j))
+
+
+def test_the_pictures_that_encoders_are_measured_on_are_the_towns():
+    town, views = build_town(0), walk(seed=0, views=len(PALETTES), width=160, height=128)
+    pictures = [render(town, view, look).rgb for view, look in zip(views, PALETTES.values(), strict=True)]
+    assert np.array_equal((street() * 255).round().byte().permute(0, 2, 3, 1).numpy(), np.stack(pictures))
