@@ -1,36 +1,40 @@
 """Pareto: time against error for every knob, plain and restyled, and which settings no other one beats."""
 
-import math
-from collections.abc import Callable, Sequence
+import copy
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple
 
-import cv2
-import numpy as np
 import torch
 from rich.table import Table
-from torch import Tensor
+from torch import Tensor, nn
 
-from fprf.checks import at_least, positive
+from fprf.checks import at_least
+from fprf.config import RenderConfig
 from fprf.datamanagers.images import load_image
 from fprf.errors import FprfError, UsageError
+from fprf.evaluation.metrics import psnr
+from fprf.fields.planes import Planes
+from fprf.interfaces import SemanticField
 from fprf.io.figures import number
-from fprf.io.images import Picture, write_image
-from fprf.io.maps import palette
-from fprf.plugins.stylizers.config import RegionOtConfig
+from fprf.plugins.stylizers.config import RegionOtConfig, StylizerConfig
 from fprf.rendering.cameras import Cameras
 from fprf.style.look import Restyle
-from fprf.style.restyle import restyle
-from fprf.training.loading import Trained, load_run
+from fprf.style.restyle import Styled, restyle
+from fprf.training.loading import Trained
+from fprf.training.model import Facts, Model
 from fprf.training.prepare import scene_of
+from fprf.training.quality import PRESETS, QualityConfig, at_quality
 from fprf.training.run import view_names
+from fprf.training.views import render_view
 
-from .common import BenchConfig, bench_run
-from .knobs import BUDGETS, Point, Scenes, as_rendered, front, measure, plain_settings, styled_settings, trained_points
-from .report import Outcome, Watch, document, table
-from .subject import Subject, count, exact, find, settings, size_of, small_view, view_rays, watch_of
+from .common import BenchConfig, Progress, bench_run
+from .report import Outcome, Spread, Watch, document, spread, table
+from .speed import plain_planes, replaced
+from .subject import Subject, count, difference, exact, find, plainly, settings, size_of, small_view, view_rays, watch_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,164 +43,260 @@ class ParetoConfig(BenchConfig):
 
     views: int = 1
     """Held-out views that times and errors are taken on."""
-    also: tuple[Path, ...] = ()
-    """Other runs of the same scene: each is a point by its method's name."""
-    train_minutes: float | None = None
-    """Also train the method with each training knob changed for so many minutes, and judge that; none = don't."""
-    plot: Path | None = None
-    """PNG of the curves; none = beside --output, with its name."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least("views", self.views, 1)
-        if self.train_minutes is not None:
-            positive("train_minutes", self.train_minutes)
 
 
-WIDTH, HEIGHT = 900, 620
-LEFT, RIGHT, TOP, BOTTOM = 90, 30, 50, 60
-INK, FAINT, PAPER = (40, 40, 44), (222, 222, 226), (255, 255, 255)
-FONT = cv2.FONT_HERSHEY_SIMPLEX
-LEAST = 1e-9
-"""Errors are shown from here on: an exact setting has none, and a logarithm."""
+BUDGETS = {"0": 0.0, "1/4096": 1 / 4096, "1/1024": 1 / 1024, "1/512": 1 / 512, "1/256": 1 / 256, "1/64": 1 / 64, "1/16": 1 / 16}
+SAMPLES = (0.25, 0.5, 0.75, 1.5, 2.0, 4.0)
+CHUNKS = (1024, 4096, 32768)
+SIZES = (0.25, 0.5, 0.75)
+Draw = Callable[[Cameras, int], Annotated[Tensor, "H W 3"]]
+"""Renders one view at its camera's size."""
 
 
-class Panel(NamedTuple):
-    """One picture."""
+class Setting(NamedTuple):
+    """One value of one knob."""
 
-    title: str
-    points: Sequence[Point]
-    front: Sequence[Point]
-    value: Callable[[Point], float | None]
-    label: str
-    """Of the upright axis."""
-    log: bool
-    """Whether that axis is logarithmic."""
+    knob: str
+    value: str
+    draw: Draw
 
-
-def draw(panels: Sequence[Panel]) -> Picture:
-    """All panels, two beside each other."""
-    drawn = [_panel(panel) for panel in panels] or [np.full((HEIGHT, WIDTH, 3), 255, np.uint8)]
-    if len(drawn) > 1 and len(drawn) % 2:
-        drawn.append(np.full_like(drawn[0], 255))
-    rows = [np.concatenate(drawn[i : i + 2], 1) for i in range(0, len(drawn), 2)]
-    return np.concatenate(rows, 0)
+    @property
+    def name(self) -> str:
+        """Knob and value."""
+        return f"{self.knob} {self.value}"
 
 
-def ticks(low: float, high: float, *, log: bool, most: int = 7) -> list[float]:
-    """Round values within [low, high]: powers of ten times 1, 2, 5, or multiples of such; at least the two ends' nearest."""
-    if log:
-        exponents = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-        for steps in ((1, 2, 5), (1, 3), (1,)):
-            found = [s * 10.0**e for e in exponents for s in steps if low <= s * 10.0**e <= high]
-            if len(found) <= most:
-                break
-        return found[:: -(-len(found) // most)] if found else [low, high]
-    step = 10.0 ** math.floor(math.log10(max(high - low, 1e-12)))
-    width = next(step * m for m in (0.2, 0.5, 1, 2, 5, 10) if (high - low) / (step * m) <= most)
-    return [width * k for k in range(math.ceil(low / width), math.floor(high / width) + 1)]
+def plain_settings(trained: Trained, styled: Styled) -> Iterator[Setting]:
+    """Everything but the style; and the style at strength 0, which must cost nothing and change nothing."""
+    yield from _settings(trained, None)
+    nothing = replace(styled.restyle, strength=0.0)
+    yield Setting("style", "at strength 0", _drawer(trained.model, trained.known.facts, trained.config.render, nothing))
 
 
-class _Axis(NamedTuple):
-    low: float
-    high: float
-    first: int
-    """Pixel of the low end."""
-    last: int
-    log: bool
-
-    def at(self, value: float) -> int:
-        low, high, here = (math.log10(v) for v in (self.low, self.high, value)) if self.log else (self.low, self.high, value)
-        return round(self.first + (here - low) / (high - low) * (self.last - self.first))
+def styled_settings(trained: Trained, styled: Styled, stylizer: StylizerConfig) -> Iterator[Setting]:
+    """The same in a style, and how many semantic channels it looks at."""
+    yield from _settings(trained, styled.restyle)
+    dim = styled.scene.keys.shape[1]
+    for channels in sorted({max(1, dim // 8), max(1, dim // 4), max(1, dim // 2)} - {dim}):
+        yield Setting("semantic channels", f"{channels} of {dim}", _fewer_channels(trained, styled, stylizer, channels))
 
 
-def _axis(values: Sequence[float], first: int, last: int, *, log: bool) -> _Axis:
-    low, high = min(values), max(values)
-    if log:
-        return _Axis(low / 1.3, high * 1.3, first, last, log)
-    edge = 0.08 * (high - low) or 0.5
-    return _Axis(low - edge, high + edge, first, last, log)
+def _settings(trained: Trained, look: Restyle | None) -> Iterator[Setting]:
+    render = trained.config.render
+    model, facts = trained.model, trained.known.facts
+    yield Setting("run", "as trained", _drawer(model, facts, render, look))
+    for preset in PRESETS:
+        chosen = at_quality(trained, QualityConfig(quality=preset))
+        yield Setting("quality", preset, _drawer(chosen.model, facts, chosen.config.render, look))
+    for name, budget in BUDGETS.items():
+        yield Setting("budget", name, _drawer(model, facts, replace(render, budget=budget), look))
+    for share in SAMPLES:
+        chosen = at_quality(trained, QualityConfig(samples=share))
+        yield Setting("samples", f"x {share:g}", _drawer(chosen.model, facts, chosen.config.render, look))
+    for chunk in CHUNKS:
+        yield Setting("chunk", str(chunk), _drawer(model, facts, replace(render, chunk=chunk), look))
+    for size in SIZES:
+        yield Setting("resolution", f"x {size:g}", _drawer(model, facts, replace(render, resolution=size), look))
+    yield Setting("kernels", "none, plain torch", _plain_drawer(model, facts, render, look, nullcontext))
+    yield Setting("kernels", "none, grid_sample", _plain_drawer(model, facts, render, look, lambda: plain_planes(model)))
+    stored = half_planes(model)
+    yield Setting("precision", "planes stored in float16", _drawer(stored, facts, render, look))
+    yield Setting("precision", "plain, bfloat16", _plain_drawer(model, facts, render, look, lambda: half_networks(model)))
 
 
-def _panel(panel: Panel) -> Picture:
-    image = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
-    shown = [(p, 1e3 * p.seconds.median, _shown(panel, value)) for p in panel.points if (value := panel.value(p)) is not None]
-    across = _axis([t for _, t, _ in shown], LEFT, WIDTH - RIGHT, log=True)
-    up = _axis([v for _, _, v in shown], HEIGHT - BOTTOM, TOP, log=panel.log)
-    _frame(image, panel, across, up)
-    knobs = list(dict.fromkeys(p.knob for p in panel.points))
-    colours = {k: tuple(int(255 * c) for c in rgb) for k, rgb in zip(knobs, palette(len(knobs)).tolist(), strict=True)}
-    line = [(across.at(1e3 * p.seconds.median), up.at(_shown(panel, panel.value(p) or 0.0))) for p in panel.front]
-    cv2.polylines(image, [np.array(line, np.int32)], False, INK, 1, cv2.LINE_AA)
-    taken: list[tuple[int, int, int, int]] = []
-    for point, milliseconds, value in sorted(shown, key=lambda s: s[0] not in panel.front):
-        x, y = across.at(milliseconds), up.at(value)
-        best = point in panel.front
-        cv2.circle(image, (x, y), 6 if best else 4, colours[point.knob], -1 if best else 2, cv2.LINE_AA)
-        _label(image, point.name, x, y, taken, INK if best else (130, 130, 134))
-    return image
+def _drawer(model: Model, facts: Facts, render: RenderConfig, look: Restyle | None) -> Draw:
+    return lambda cameras, view: render_view(model, facts, cameras, view, render, look).rgb
 
 
-def _shown(panel: Panel, value: float) -> float:
-    return max(value, LEAST) if panel.log else value
+def _plain_drawer(
+    model: Model,
+    facts: Facts,
+    render: RenderConfig,
+    look: Restyle | None,
+    around: Callable[[], AbstractContextManager[None]],
+) -> Draw:
+    def draw(cameras: Cameras, view: int) -> Tensor:
+        width, height = (int(v) for v in cameras.size[view])
+        with around():
+            return plainly(model, facts, view_rays(model, cameras, view), render, look).view(height, width, 3).cpu()
+
+    return draw
 
 
-def _frame(image: Picture, panel: Panel, across: _Axis, up: _Axis) -> None:
-    for value in ticks(across.low, across.high, log=True):
-        x = across.at(value)
-        cv2.line(image, (x, TOP), (x, HEIGHT - BOTTOM), FAINT, 1)
-        _text(image, f"{value:g}", (x, HEIGHT - BOTTOM + 20), centred=True)
-    for value in ticks(up.low, up.high, log=panel.log):
-        y = up.at(value)
-        cv2.line(image, (LEFT, y), (WIDTH - RIGHT, y), FAINT, 1)
-        text = f"{value:.0e}" if panel.log else f"{value:g}"
-        _text(image, text, (LEFT - 8 - _width(text), y + 4))
-    cv2.rectangle(image, (LEFT, TOP), (WIDTH - RIGHT, HEIGHT - BOTTOM), INK, 1)
-    _text(image, panel.title, (LEFT, 30), size=0.6)
-    _text(image, "milliseconds a view", ((LEFT + WIDTH - RIGHT) // 2, HEIGHT - 14), centred=True)
-    _text(image, panel.label, (8, TOP - 12))
+@contextmanager
+def half_networks(model: Model) -> Iterator[None]:
+    """Content, semantics and decoder in bfloat16; planes, density and compositing stay in float32. For `plainly` alone: kernels
+    have one precision.
+    """
+    device = model.device.type
+
+    def around(method: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any) -> Any:
+            with torch.autocast(device, dtype=torch.bfloat16):
+                return method(*args).float()
+
+        return call
+
+    with ExitStack() as stack:
+        stack.enter_context(replaced(model.field, "content", around))
+        stack.enter_context(replaced(model.decoder, "forward", around))
+        stack.enter_context(replaced(model.decoder, "restyled", around))
+        if model.semantic is not None:
+            stack.enter_context(replaced(model.semantic, "forward", around))
+        yield
 
 
-def _label(
-    image: Picture, text: str, x: int, y: int, taken: list[tuple[int, int, int, int]], colour: tuple[int, int, int]
-) -> None:
-    """The name beside its point, where no other name is; left out where there is no room."""
-    width = _width(text)
-    for left, base in ((x + 9, y - 5), (x + 9, y + 14), (x - 9 - width, y - 5), (x - 9 - width, y + 14)):
-        box = (left, base - 10, left + width, base + 3)
-        inside = box[0] >= LEFT and box[2] <= WIDTH - RIGHT and box[1] >= TOP and box[3] <= HEIGHT - BOTTOM
-        if inside and not any(_meet(box, other) for other in taken):
-            taken.append(box)
-            _text(image, text, (left, base), colour=colour)
-            return
+def half_planes(model: Model) -> Model:
+    """A copy whose planes are stored in half precision; kernels for the CPU read float32, so there they are only rounded."""
+    made = copy.deepcopy(model).requires_grad_(False)
+    for module in made.modules():
+        if isinstance(module, Planes):
+            half = module.table.half()
+            module.table = nn.Parameter(half if half.device.type == "cuda" else half.float(), requires_grad=False)
+    return made
 
 
-def _meet(a: tuple[int, int, int, int], b: tuple[int, int, int, int]) -> bool:
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+class _Leading(SemanticField):
+    """The first channels of a semantic field: principal components, most variance first."""
+
+    def __init__(self, field: SemanticField, channels: int) -> None:
+        super().__init__()
+        self.field, self.channels = field, channels
+
+    def forward(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N D"]:
+        """Fewer channels of the same features."""
+        features: Tensor = self.field(points)
+        return features[:, : self.channels]
+
+    def penalties(self) -> dict[str, Tensor]:
+        """None: it is not trained."""
+        return {}
 
 
-def _width(text: str, size: float = 0.42) -> int:
-    return int(cv2.getTextSize(text, FONT, size, 1)[0][0])
+def _fewer_channels(trained: Trained, styled: Styled, stylizer: StylizerConfig, channels: int) -> Draw:
+    parts = trained.model.parts
+    assert parts.semantic is not None
+    scene = styled.scene._replace(keys=styled.scene.keys[:, :channels], semantic_mean=styled.scene.semantic_mean[:channels])
+    origin = None if styled.dictionary.origin is None else styled.dictionary.origin[:channels]
+    dictionary = styled.dictionary._replace(keys=styled.dictionary.keys[:, :channels], origin=origin)
+    device = trained.model.device
+    built = stylizer.build(dictionary=dictionary, scene=scene).to(device)
+    model = Model(parts._replace(semantic=_Leading(parts.semantic, channels))).eval()
+    look = replace(styled.restyle, stylizer=built)
+    return _drawer(model, trained.known.facts, trained.config.render, look)
 
 
-def _text(
-    image: Picture,
-    text: str,
-    at: tuple[int, int],
-    *,
-    size: float = 0.42,
-    centred: bool = False,
-    colour: tuple[int, int, int] = INK,
-) -> None:
-    left = at[0] - _width(text, size) // 2 if centred else at[0]
-    cv2.putText(image, text, (left, at[1]), FONT, size, colour, 1, cv2.LINE_AA)
+@dataclass(frozen=True, kw_only=True)
+class Point:
+    """One setting of one knob, everything else as the run has it."""
+
+    knob: str
+    value: str
+    seconds: Spread
+    """Of a view."""
+    rays_per_second: float
+    largest: float | None
+    """Largest colour error against the exact result; None where there is none to compare with."""
+    rms: float | None
+    """Root-mean-square colour error against it."""
+    psnr: float | None = None
+    """Against the photographs, in dB."""
+
+    @property
+    def name(self) -> str:
+        """Knob and value."""
+        return f"{self.knob} {self.value}"
+
+    def json(self) -> dict[str, object]:
+        """What is known of it."""
+        known: dict[str, object] = {
+            "knob": self.knob,
+            "value": self.value,
+            "milliseconds": 1e3 * self.seconds.median,
+            "low": 1e3 * self.seconds.low,
+            "high": 1e3 * self.seconds.high,
+            "rays_per_second": self.rays_per_second,
+            "largest_error": self.largest,
+            "rms_error": self.rms,
+            "psnr": self.psnr,
+        }
+        return {
+            key: float(f"{value:.5g}") if isinstance(value, float) else value
+            for key, value in known.items()
+            if value is not None
+        }
 
 
-Progress = Callable[[int, int, str], None]
+def front(points: Sequence[Point], error: Callable[[Point], float | None]) -> list[Point]:
+    """The points that no other one equals or beats in both time and error, fastest first. Points without error are left out."""
+    chosen: list[Point] = []
+    best = float("inf")
+    known = [(point.seconds.median, away, i) for i, point in enumerate(points) if (away := error(point)) is not None]
+    for _, away, i in sorted(known):
+        if away < best:
+            best = away
+            chosen.append(points[i])
+    return chosen
+
+
+class Scenes(NamedTuple):
+    """The views that all settings are judged by."""
+
+    cameras: Sequence[Cameras]
+    """Each holds one view."""
+    photographs: Sequence[Annotated[Tensor, "H W 3"]] | None
+    """What they really look like, if that is known and means something."""
+    exact: Sequence[Annotated[Tensor, "H W 3"]] | None
+    """What the model says when nothing is skipped, if all settings are of one model."""
+
+
+def measure(
+    settings: Sequence[Setting],
+    scenes: Scenes,
+    watch: Watch,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Point]:
+    """One point a setting; times are taken in turn."""
+    calls = {setting.name: partial(_images, setting, scenes.cameras) for setting in settings}
+    taken = watch.in_turn(calls, progress)
+    pixels = sum(int(camera.size.prod()) for camera in scenes.cameras)
+    points = []
+    for setting in settings:
+        images = calls[setting.name]()
+        away = None if scenes.exact is None else difference(_flat(images), _flat(scenes.exact))
+        seconds = spread(taken[setting.name])
+        points.append(
+            Point(
+                knob=setting.knob,
+                value=setting.value,
+                seconds=seconds.map(lambda s: s / len(scenes.cameras)),
+                rays_per_second=pixels / seconds.median,
+                largest=None if away is None else away.largest,
+                rms=None if away is None else away.rms,
+                psnr=None if scenes.photographs is None else _mean_psnr(images, scenes.photographs),
+            )
+        )
+    return points
+
+
+def _images(setting: Setting, cameras: Sequence[Cameras]) -> list[Tensor]:
+    return [setting.draw(camera, 0) for camera in cameras]
+
+
+def _flat(images: Sequence[Tensor]) -> Tensor:
+    return torch.cat([image.flatten() for image in images])
+
+
+def _mean_psnr(images: Sequence[Tensor], photographs: Sequence[Tensor]) -> float:
+    return sum(psnr(image, truth) for image, truth in zip(images, photographs, strict=True)) / len(images)
 
 
 def pareto(config: ParetoConfig, root: Path, folder: Path, progress: Progress) -> Outcome:
-    """Points, fronts, and a picture of them."""
+    """Points and fronts."""
     subject = find(root, config, folder)
     trained = subject.trained
     known, watch = trained.known, watch_of(config, trained)
@@ -212,11 +312,6 @@ def pareto(config: ParetoConfig, root: Path, folder: Path, progress: Progress) -
     ):
         scenes = Scenes(cameras, photographs, [_exact(trained, camera, look) for camera in cameras])
         curves[name] = measure(list(chosen), scenes, watch, partial(_told, progress, name))
-    by_photographs = Scenes(cameras, truth, None)
-    for other in config.also:
-        curves["plain"] += _other_run(load_run(other, config.device), [known.names[v] for v in views], by_photographs, watch)
-    if config.train_minutes is not None:
-        curves["trained"] = trained_points(config.train_minutes, subject, by_photographs, watch, folder, progress)
     rays = view_rays(trained.model, cameras[0], 0)
     counters = {name: count(trained.model.parts, rays, budget) for name, budget in BUDGETS.items()}
     return _outcome(config, subject, curves, missing, cameras[0], counters)
@@ -249,15 +344,6 @@ def _photographs(subject: Subject, views: Sequence[int], cameras: Sequence[Camer
     return images, ""
 
 
-def _other_run(other: Trained, names: Sequence[str], scenes: Scenes, watch: Watch) -> list[Point]:
-    """Another run on the same views: there is nothing exact to compare it with but the photographs."""
-    absent = [name for name in names if name not in other.known.names]
-    if absent:
-        raise UsageError(f"--also {other.run.root}: has no view {absent[0]}; name runs of the same scene")
-    points = measure([as_rendered("method", other.method, other)], scenes, watch)
-    return [replace(point, train_seconds=other.seconds) for point in points]
-
-
 def _loss(point: Point) -> float | None:
     return None if point.psnr is None else -point.psnr
 
@@ -270,15 +356,11 @@ def _outcome(
     camera: Cameras,
     counters: dict[str, dict[str, float]],
 ) -> Outcome:
-    panels, fronts, tables = [], {}, []
+    fronts, tables = {}, []
     for name, points in curves.items():
         by_error, by_truth = front(points, lambda p: p.rms), front(points, _loss)
         fronts[name] = {"rms_error": [p.name for p in by_error], "psnr": [p.name for p in by_truth]}
         tables.append(_table(name, points, by_error, by_truth))
-        if by_error:
-            panels.append(Panel(f"{name}: error against exact", points, by_error, lambda p: p.rms, "rms error", log=True))
-        if by_truth:
-            panels.append(Panel(f"{name}: against photographs", points, by_truth, lambda p: p.psnr, "PSNR, dB", log=False))
     trained = subject.trained
     about = settings(config, trained, missing) | {"view": size_of(camera), "views": config.views}
     extra = {
@@ -287,9 +369,6 @@ def _outcome(
         "counters_by_budget": counters,
     }
     made = document("pareto", [], device=trained.model.device, settings=about, extra=extra)
-    plot = config.plot or (config.output.with_suffix(".png") if config.output is not None else None)
-    if plot is not None:
-        write_image(plot, draw(panels))
     return Outcome(made, tables)
 
 
