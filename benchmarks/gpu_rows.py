@@ -16,9 +16,10 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from fprf.evaluation.report import Row, document, rows_table, table
 from fprf.io.atomic import write_json
 from fprf.ops import triplane_numba, triplane_triton
+
+from .report import Row, document, rows_table, table
 
 FRAME = 1008 * 756
 STYLES = ("stylised, region-tone", "stylised, region-ot", "stylised, local-adain")

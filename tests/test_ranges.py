@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
+from benchmarks.restyle import RestyleConfig
 from fprf.config import LossConfig, OptimizerConfig, RenderConfig, SemanticConfig, StatisticsConfig, TrainConfig
 from fprf.errors import ConfigError
-from fprf.evaluation.config import RestyleConfig
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.fields.layouts import AdaptiveConfig, GridConfig, StreetConfig
 from fprf.plugins.decoders.config import ResidualDecoderConfig

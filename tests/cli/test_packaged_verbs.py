@@ -70,10 +70,10 @@ def test_a_broken_verb_harms_only_its_callers(packages: Packages, capsys: pytest
     packages.install("acme-bad", {CommandConfig.group: {"bad": "acme_bad5:C"}}, code={"acme_bad5": "1 / 0"})
     for k in (1, 2):
         packages.install(f"acme-twice-{k}", {CommandConfig.group: {"twice": "acme_count:CountConfig"}})
-    packages.install("acme-train", {CommandConfig.group: {"completion": "acme_bad5:C"}})
+    packages.install("acme-train", {CommandConfig.group: {"plugins": "acme_bad5:C"}})
     assert cli.main(["--help"]) == 0
     assert "of acme-twice-1 1 and acme-twice-2 1" in capsys.readouterr().out
     assert cli.main(["bad"]) == 2
     assert "'bad' (acme_bad5:C from acme-bad 1) failed to import: ZeroDivisionError" in capsys.readouterr().err
     assert cli.main(["twice"]) == 2 and "several packages provide 'twice'" in capsys.readouterr().err
-    assert cli.main(["completion", "--help"]) == 0, "ours wins"
+    assert cli.main(["plugins", "--help"]) == 0, "ours wins"

@@ -16,6 +16,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from benchmarks.town.layout import build_town
+from benchmarks.town.palettes import PALETTES
+from benchmarks.town.render import geometry, render, walk
+from benchmarks.town.surface import CLASSES
 from fprf.errors import UsageError, WeightsError
 from fprf.interfaces import Encoder
 from fprf.ops.precision import double
@@ -25,10 +29,6 @@ from fprf.plugins.encoders.mobilenet import CLASSIFIER, DEEPLAB, TENSORFLOW_EPS,
 from fprf.plugins.weights import read_weights, write_weights
 from fprf.pretraining.loop import generator_of, train
 from fprf.pretraining.photos import find_photos, load_photo, split
-from fprf.town.layout import build_town
-from fprf.town.palettes import PALETTES
-from fprf.town.render import geometry, render, walk
-from fprf.town.surface import CLASSES
 from fprf.training.prepare import device_of
 
 from .config import SemanticDistilConfig

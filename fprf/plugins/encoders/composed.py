@@ -1,6 +1,6 @@
 """Several encoders side by side: what they see together, each counting by its weight whatever its units and channels.
 
-A part's unit is the root mean square length of its centred features on four views of the embedded town, so that an
+A part's unit is the root mean square length of its centred features on five views of a rendered town (`street`), so that an
 image's features depend on the image alone. On photographs the units of nine encoders were 0.7 to 1.3 of that (measured;
 0.4 to 1.5 with noise of a photograph's spectrum in the town's place).
 

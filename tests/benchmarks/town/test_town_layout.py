@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from town_views import project, world
 
-from fprf.town.layout import ROAD_HALF, build_town
-from fprf.town.render import geometry, is_test, walk
-from fprf.town.surface import CLASSES
+from benchmarks.town.layout import ROAD_HALF, build_town
+from benchmarks.town.render import geometry, is_test, walk
+from benchmarks.town.surface import CLASSES
 
 
 def test_towns_are_functions_of_their_seed():

@@ -21,10 +21,10 @@ from rich.markup import escape
 from rich.table import Table
 from torch import Tensor
 
-from .. import __version__
-from ..io.images import Picture, resized, to_uint8
-from ..io.report import number
-from ..training.prepare import device_of
+from fprf import __version__
+from fprf.io.figures import number
+from fprf.io.images import Picture, resized, to_uint8
+from fprf.training.prepare import device_of
 
 Clock = Literal["wall", "processor"]
 

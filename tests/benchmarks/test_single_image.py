@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from kornia.color import rgb_to_lab
 from torch import Tensor
 
+from benchmarks.single_image import encoded, flat_scene, histogram_matching, reinhard, render_flat
 from benchmarks.styles import flat_reference, painted
 from fprf.datamanagers.config import GuidedConfig
-from fprf.evaluation.single_image import encoded, flat_scene, histogram_matching, reinhard, render_flat
 from fprf.interfaces import Decoder, Encoder
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import BundledContentConfig

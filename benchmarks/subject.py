@@ -12,25 +12,26 @@ from typing import Annotated, NamedTuple, TypeVar
 import torch
 from torch import Tensor, nn
 
-from ..config import RenderConfig, TrainConfig
-from ..errors import FprfError, UsageError, WeightsError
-from ..io.images import write_image
-from ..ops import backend
-from ..rendering.cameras import Cameras, PixelRays
-from ..rendering.renderer import Parts, march, render_rays
-from ..style.look import Restyle
-from ..town.layout import build_town
-from ..town.palettes import palette
-from ..town.render import render, walk
-from ..training.loading import Trained, load_run
-from ..training.model import Facts, Model, background_of, build_model
-from ..training.prepare import Prepared, prepare
-from ..training.run import view_names
-from ..training.trainer import Loop, optimizer_of
-from ..training.views import view_rays as world_rays
-from ..types import Batch, Rays, Want
-from .config import BenchConfig
+from fprf.config import RenderConfig, TrainConfig
+from fprf.errors import FprfError, UsageError, WeightsError
+from fprf.io.images import write_image
+from fprf.ops import backend
+from fprf.rendering.cameras import Cameras, PixelRays
+from fprf.rendering.renderer import Parts, march, render_rays
+from fprf.style.look import Restyle
+from fprf.training.loading import Trained, load_run
+from fprf.training.model import Facts, Model, background_of, build_model
+from fprf.training.prepare import Prepared, prepare
+from fprf.training.run import view_names
+from fprf.training.trainer import Loop, optimizer_of
+from fprf.training.views import view_rays as world_rays
+from fprf.types import Batch, Rays, Want
+
+from .common import BenchConfig
 from .report import Watch
+from .town.layout import build_town
+from .town.palettes import palette
+from .town.render import render, walk
 
 LOOKS = {"autumn": (3, 9), "winter": (5, 14), "night": (2, 4)}
 """Palette of each default reference, with the seed of the town that it shows and the view of it."""

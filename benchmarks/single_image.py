@@ -10,20 +10,20 @@ import torch
 from kornia.color import lab_to_rgb, rgb_to_lab
 from torch import Tensor
 
-from ..datamanagers.basis import Basis
-from ..datamanagers.config import GuidedConfig
-from ..errors import DataError
-from ..interfaces import Decoder, Encoder
-from ..ops.guided import upsample
-from ..plugins.stylizers.config import StylizerConfig
-from ..splats.restyle import region_maps
-from ..style.colours import colour_maps, own_colours
-from ..style.config import StyleConfig
-from ..style.dictionary import StyleDictionary
-from ..style.light import light_of
-from ..style.look import Restyle
-from ..style.scene import SceneStyle, scene_style
-from ..types import Want
+from fprf.datamanagers.basis import Basis
+from fprf.datamanagers.config import GuidedConfig
+from fprf.errors import DataError
+from fprf.interfaces import Decoder, Encoder
+from fprf.ops.guided import upsample
+from fprf.plugins.stylizers.config import StylizerConfig
+from fprf.splats.restyle import region_maps
+from fprf.style.colours import colour_maps, own_colours
+from fprf.style.config import StyleConfig
+from fprf.style.dictionary import StyleDictionary
+from fprf.style.light import light_of
+from fprf.style.look import Restyle
+from fprf.style.scene import SceneStyle, scene_style
+from fprf.types import Want
 
 _CELL = 8
 """Pixels between guided-filter coefficients."""

@@ -2,7 +2,6 @@
 
 import json
 import math
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,14 +9,15 @@ import pytest
 import torch
 from town_views import project
 
-from fprf.datamanagers.parsers.config import TownConfig
+from benchmarks.__main__ import main
+from benchmarks.town import write
+from benchmarks.town.layout import build_town
+from benchmarks.town.palettes import palette
+from benchmarks.town.render import FIELD_OF_VIEW, render, walk
+from benchmarks.town.surface import SKY
+from benchmarks.town.write import TownSettings, cached_town, is_town, read_truth, write_town
+from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import DataError
-from fprf.town import write
-from fprf.town.layout import build_town
-from fprf.town.palettes import palette
-from fprf.town.render import FIELD_OF_VIEW, render, walk
-from fprf.town.surface import SKY
-from fprf.town.write import TownSettings, is_town, read_truth, write_town
 
 SMALL = {"seed": 2, "palette": "autumn", "views": 9, "width": 24, "height": 18}
 TINY = {**SMALL, "views": 2}
@@ -103,25 +103,21 @@ def test_somebody_elses_folder_is_left_alone(tmp_path):
     assert not is_town(tmp_path)
 
 
-def test_parser_renders_once_into_the_cache(cache, monkeypatch):
-    config = TownConfig(**TINY)
-    scene = config.build().parse(Path("town"), 1)
+def test_the_cached_town_is_rendered_once(cache, monkeypatch):
+    folder = cached_town(**TINY)
+    assert folder == cache / f"town-{TownSettings(**TINY).key}" / "town"
+    scene = parse_scene(folder, 1, None)
     assert scene.name == "town" and len(scene.cameras) == 2
     assert (scene.train.tolist(), scene.test.tolist()) == ([1], [0])
     assert scene.points is not None
     assert scene.cameras.size.tolist() == [[24, 18]] * 2
     poses = np.stack([view.pose for view in walk(seed=2, views=2, width=24, height=18)])
     torch.testing.assert_close(scene.cameras.pose, torch.from_numpy(poses), atol=1e-12, rtol=0)
-    assert [p.name for p in cache.iterdir()] == [f"town-{TownSettings(**TINY).key}"]
     monkeypatch.setattr(write, "_fill", lambda *_: pytest.fail("rendered again"))
-    half = config.build().parse(Path("nowhere"), 2)
-    assert half.cameras.size.tolist() == [[12, 9]] * 2
-    assert half.paths == scene.paths
+    assert cached_town(**TINY) == folder
 
 
-def test_parser_reads_town_folders_and_refuses_others(cache, folder, tmp_path):
-    scene = TownConfig().build().parse(folder, 1)
-    assert len(scene.cameras) == 9 and not cache.exists()
-    (tmp_path / "photos").mkdir()
-    with pytest.raises(DataError, match=r"no town\.json"):
-        TownConfig().build().parse(tmp_path / "photos", 1)
+def test_the_command_writes_a_folder(tmp_path):
+    words = ["town", str(tmp_path / "night"), "--palette", "night", "--views", "2", "--width", "24", "--height", "18"]
+    assert main(words) == 0
+    assert is_town(tmp_path / "night") and json.loads((tmp_path / "night/palette.json").read_text())["name"] == "night"

@@ -13,11 +13,8 @@ from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import World, stage_of
 from torch import Tensor
 
-from fprf.cli import main as cli
-from fprf.datamanagers.images import load_image
-from fprf.errors import DataError, UsageError
-from fprf.evaluation.metrics import psnr
-from fprf.evaluation.restyle import (
+from benchmarks.__main__ import main
+from benchmarks.restyle import (
     BOUND,
     FLAT,
     GLOBAL,
@@ -31,8 +28,10 @@ from fprf.evaluation.restyle import (
     one_by_one,
     verdict,
 )
-from fprf.evaluation.single_image import encoded
-from fprf.evaluation.town_truth import (
+from benchmarks.single_image import encoded
+from benchmarks.town.surface import SKY
+from benchmarks.town.write import read_truth
+from benchmarks.town_truth import (
     PARTS,
     Reference,
     Row,
@@ -45,12 +44,13 @@ from fprf.evaluation.town_truth import (
     true_class_maps,
     true_views,
 )
+from fprf.datamanagers.images import load_image
+from fprf.errors import DataError, UsageError
+from fprf.evaluation.metrics import psnr
 from fprf.ops import backend
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionToneConfig
 from fprf.style.dictionary import Reference as Samples
 from fprf.style.dictionary import build_dictionary
-from fprf.town.surface import SKY
-from fprf.town.write import read_truth
 from fprf.training.loading import load_run
 
 
@@ -181,7 +181,7 @@ METHODS = {*UNMATCHED, FLAT, *STYLIZERS, "nearest-code"}
 def test_every_method_is_in_the_table(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page, sheet = tmp_path / "docs/page.md", tmp_path / "docs/sheets/all.png"
     files = ["--output", str(tmp_path / "a.json"), "--page", str(page), "--sheet", str(sheet)]
-    assert cli.main(["bench", "restyle", str(world.run), *SMALL, *files]) == 0
+    assert main(["restyle", str(world.run), *SMALL, *files]) == 0
     document = json.loads((tmp_path / "a.json").read_text())
     assert set(document["means"]) == {"one", "three"}
     found = document["palettes"]["night"]["three"]

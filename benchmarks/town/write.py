@@ -8,6 +8,7 @@ points.npz                `xyz` [P 3] float32 surface points, `rgb` [P 3] uint8,
 palette.json, town.json   colours and light; the settings, written last
 """
 
+import argparse
 import hashlib
 import json
 import os
@@ -19,9 +20,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DataError
+from fprf.errors import DataError
+
 from .layout import build_town
-from .palettes import Palette
+from .palettes import PALETTES, Palette
 from .palettes import palette as palette_of
 from .render import Picture, View, directions, is_test, render, walk
 from .surface import CLASSES
@@ -171,6 +173,37 @@ def write_town(folder: Path, *, seed: int, palette: str, views: int, width: int,
             _place(fresh, folder, settings)
     except OSError as error:
         raise DataError(f"{folder}: can't be written ({error}); free some space or name another folder") from error
+
+
+def cached_town(
+    *, seed: int = 0, palette: str = "day", views: int = 40, width: int = 160, height: int = 120, extra: float = 0.0
+) -> Path:
+    """The folder of a town in the user's cache ($XDG_CACHE_HOME/fprf or ~/.cache/fprf), rendered where it is not there yet."""
+    settings = TownSettings(seed=seed, palette=palette, views=views, width=width, height=height, extra=float(extra))
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fprf"
+    folder = cache / f"town-{settings.key}" / "town"
+    write_town(folder, seed=seed, palette=palette, views=views, width=width, height=height, extra=extra)
+    return folder
+
+
+def scene_folder(data: Path) -> Path:
+    """`data` itself; `town`, where there is no such folder, is the cached town."""
+    return cached_town() if data == Path("town") and not data.exists() else data
+
+
+def main(argv: list[str]) -> int:
+    """`python -m benchmarks town FOLDER`: a town as a scene folder, with the truth beside its images."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks town", description="Render a town into a folder.")
+    parser.add_argument("folder", type=Path, help="empty or new")
+    parser.add_argument("--seed", type=int, default=0, help="decides where houses, trees and cars stand")
+    parser.add_argument("--palette", default="day", choices=sorted(PALETTES), help="light and colours")
+    parser.add_argument("--views", type=int, default=40, help="number of images")
+    parser.add_argument("--width", type=int, default=160, help="pixels across an image")
+    parser.add_argument("--height", type=int, default=120, help="pixels down an image")
+    parser.add_argument("--extra", type=float, default=0.0, help="metres by which the street is longer than the usual 49")
+    options = vars(parser.parse_args(argv))
+    write_town(options.pop("folder"), **options)
+    return 0
 
 
 def _place(fresh: Path, folder: Path, settings: TownSettings) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 from tiny_world import World
 
-from fprf.cli import main as cli
+from benchmarks.__main__ import main
 
 SMALL = ["--repeats", "2", "--rays", "64", "--device", "cpu", "--points", "500", "--clusters", "4"]
 
@@ -12,7 +12,7 @@ SMALL = ["--repeats", "2", "--rays", "64", "--device", "cpu", "--points", "500",
 def test_speed(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "speed.json"
     references = ["--references", *map(str, world.references)]
-    assert cli.main(["bench", "speed", str(world.run), *references, *SMALL, "--output", str(output)]) == 0
+    assert main(["speed", str(world.run), *references, *SMALL, "--output", str(output)]) == 0
     document = json.loads(output.read_text())
     assert document["benchmark"] == "speed" and document["settings"]["without"] == ""
     assert document["machine"]["device"] == "cpu" and document["machine"]["cores"] >= 1
@@ -37,3 +37,18 @@ def test_speed(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert all(name in rows for name in document["falls_short"])
     text = capsys.readouterr().out
     assert "faster" in text and all(name in text for name in compared), "nothing is cut off"
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("speed nowhere", "nowhere: no config.json"),
+        ("restyle RUN --device cpu --seeds 0 1 2", "is the town of the run itself"),
+        ("restyle RUN --device cpu --palettes noon", "noon"),
+        ("restyle --frames 7", "--frames"),
+    ],
+)
+def test_a_mistake_is_one_line(line: str, told: str, world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(line.replace("RUN", str(world.run)).split()) == 2
+    lines = [each for each in capsys.readouterr().err.splitlines() if not each.startswith("{")]
+    assert len(lines) == 1 and lines[0].startswith("error: ") and told in lines[0]

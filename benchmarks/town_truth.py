@@ -23,22 +23,23 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..config import RunConfig
-from ..datamanagers.config import GuidedConfig
-from ..errors import DataError, UsageError
-from ..interfaces import Scene, SceneView
-from ..rendering.cameras import Cameras
-from ..style.dictionary import StyleDictionary
-from ..style.references import Encoders
-from ..style.statistics import monge
-from ..town.layout import Town, build_town
-from ..town.palettes import palette
-from ..town.render import View, geometry, render, walk
-from ..town.surface import CAR, CLASSES, DOOR, FACADE, FOLIAGE, LAMP, LAWN, ROAD, ROOF, SIDEWALK, SKY, TRUNK, WINDOW
-from ..town.write import TownSettings, is_town
-from ..training.run import Known
-from .metrics import mean_scores
+from fprf.config import RunConfig
+from fprf.datamanagers.config import GuidedConfig
+from fprf.errors import DataError, UsageError
+from fprf.evaluation.metrics import mean_scores
+from fprf.interfaces import Scene, SceneView
+from fprf.rendering.cameras import Cameras
+from fprf.style.dictionary import StyleDictionary
+from fprf.style.references import Encoders
+from fprf.style.statistics import monge
+from fprf.training.run import Known
+
 from .single_image import encoded
+from .town.layout import Town, build_town
+from .town.palettes import palette
+from .town.render import View, geometry, render, walk
+from .town.surface import CAR, CLASSES, DOOR, FACADE, FOLIAGE, LAMP, LAWN, ROAD, ROOF, SIDEWALK, SKY, TRUNK, WINDOW
+from .town.write import TownSettings, is_town
 
 _STEP = 0.12
 """Metres between frames of the path: 7 frames on, near things have moved by a quarter of a small picture."""
@@ -57,7 +58,7 @@ class Truth(NamedTuple):
     depth: Annotated[Tensor, "H W"]
     """Metres along the unit ray, inf = sky."""
     labels: Annotated[Tensor, "H W"]
-    """int64, see `fprf.town.surface`."""
+    """int64, see `benchmarks.town.surface`."""
 
 
 class Stage(NamedTuple):
@@ -110,7 +111,7 @@ def town_settings(config: RunConfig) -> TownSettings:
     if folder is None:
         raise UsageError(
             f"the run was trained on {config.data}, whose looks in other light nobody knows; "
-            "train the embedded town, for example with `fprf train fprf-lite --data town`"
+            "train a town: `python -m benchmarks town FOLDER`, `fprf train fprf-lite --data FOLDER`"
         )
     record = folder / "town.json"
     try:

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from town_views import project, world
 
-from fprf.town.layout import build_town
-from fprf.town.palettes import PALETTES, palette
-from fprf.town.render import cast, colours, directions, geometry, render, shade, walk
-from fprf.town.surface import hashed, noise2, noise3
+from benchmarks.town.layout import build_town
+from benchmarks.town.palettes import PALETTES, palette
+from benchmarks.town.render import cast, colours, directions, geometry, render, shade, walk
+from benchmarks.town.surface import hashed, noise2, noise3
 
 TOWN = build_town(0)
 VIEWS = walk(seed=0, views=40, width=48, height=36)

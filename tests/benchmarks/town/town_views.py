@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fprf.town.render import directions
+from benchmarks.town.render import directions
 
 
 def world(view, depth):

@@ -1,11 +1,11 @@
-"""`fprf bench speed`: ours against the naive path, on the same model in the same run, with the error beside each time.
+"""Ours against the naive path, on the same model in the same run, with the error beside each time.
 
 The naive path: plain torch for the planes, every sample through every network, every term at every step.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,20 +14,23 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..config import RenderConfig, TrainConfig
-from ..fields.planes import Planes
-from ..interfaces import Stylizer
-from ..ops import backend, triplane
-from ..plugins import slots
-from ..plugins.stylizers.config import LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
-from ..rendering.cameras import Cameras
-from ..style.look import Restyle
-from ..style.restyle import restyle
-from ..training.loading import Trained
-from ..training.model import Facts, Model
-from ..training.prepare import Prepared
-from ..training.views import cache_view, render_view
-from .config import SpeedConfig
+from fprf.checks import at_least
+from fprf.config import RenderConfig, TrainConfig
+from fprf.fields.planes import Planes
+from fprf.interfaces import Stylizer
+from fprf.ops import backend, triplane
+from fprf.plugins import slots
+from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
+from fprf.rendering.cameras import Cameras
+from fprf.style.config import StyleConfig
+from fprf.style.look import Restyle
+from fprf.style.restyle import restyle
+from fprf.training.loading import Trained
+from fprf.training.model import Facts, Model
+from fprf.training.prepare import Prepared
+from fprf.training.views import cache_view, render_view
+
+from .common import BenchConfig, bench_run
 from .report import Outcome, Row, document, ratio, rows_table, spread
 from .subject import (
     Subject,
@@ -49,6 +52,21 @@ from .subject import (
     view_rays,
     watch_of,
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpeedConfig(BenchConfig):
+    """Ours against the naive path, in one run."""
+
+    points: int = 65536
+    """Points of the tri-plane lookup."""
+    clusters: int = StyleConfig.clusters
+    """Local styles per reference."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least("points", self.points, 1)
+        at_least("clusters", self.clusters, 1)
 
 
 def grid_sample_lookup(
@@ -343,3 +361,8 @@ def _restyling(config: SpeedConfig, subject: Subject) -> list[Row]:
         taken = spread(seconds[name])
         rows.append(Row(name=label, figure=taken.median, low=taken.low, high=taken.high, unit="s", goal=goal))
     return rows
+
+
+def main(argv: list[str]) -> int:
+    """`python -m benchmarks speed [RUN]`."""
+    return bench_run("python -m benchmarks speed", SpeedConfig(), argv, speed)

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from fprf.town.layout import build_town
-from fprf.town.render import cast, directions, shadowed, walk
-from fprf.town.shapes import Cylinder, Ellipsoid, Material, Polyhedron
+from benchmarks.town.layout import build_town
+from benchmarks.town.render import cast, directions, shadowed, walk
+from benchmarks.town.shapes import Cylinder, Ellipsoid, Material, Polyhedron
 
 TOWN = build_town(0)
 

@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..io.images import srgb_to_linear
+from fprf.io.images import srgb_to_linear
+
 from .layout import END, Town
 from .paint import foliage_normals, paint
 from .palettes import Palette
@@ -333,7 +334,7 @@ class Picture(NamedTuple):
     depth: NDArray[np.float32]
     """Metres along the unit ray through the pixel's centre; inf = sky."""
     labels: NDArray[np.uint8]
-    """Class at the pixel's centre, see `fprf.town.surface`."""
+    """Class at the pixel's centre, see `benchmarks.town.surface`."""
 
 
 def geometry(town: Town, view: View) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:

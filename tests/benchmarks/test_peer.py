@@ -1,4 +1,4 @@
-"""`fprf bench peer` on frames that another system might have written."""
+"""`python -m benchmarks peer` on frames that another system might have written."""
 
 import json
 import shutil
@@ -10,17 +10,17 @@ import pytest
 import torch
 from tiny_world import World
 
-from fprf.cli import main as cli
+from benchmarks.__main__ import main
+from benchmarks.peer import read_cameras, read_depths, read_pictures
+from benchmarks.town.write import read_truth, write_town
 from fprf.errors import DataError
-from fprf.evaluation.peer import read_cameras, read_depths, read_pictures
 from fprf.rendering.cameras import pixel_grid, project, rays_through
-from fprf.town.write import read_truth, write_town
 
 
 def peer(world: World, frames: Path, output: Path, *more: str) -> dict[str, Any]:
     cameras = str(world.town / "transforms.json")
-    args = ["bench", "peer", str(frames), "--cameras", cameras, "--device", "cpu", "--output", str(output), *more]
-    assert cli.main(args) == 0
+    args = ["peer", str(frames), "--cameras", cameras, "--device", "cpu", "--output", str(output), *more]
+    assert main(args) == 0
     document: dict[str, Any] = json.loads(output.read_text())
     return document
 
@@ -56,7 +56,7 @@ def test_unlike_sizes_are_one_line(world: World, tmp_path: Path, capsys: pytest.
     for path in (world.town / "images").iterdir():
         shutil.copy(world.references[0], tmp_path / path.name)
     cameras = ["--cameras", str(world.town / "transforms.json"), "--device", "cpu"]
-    assert cli.main(["bench", "peer", str(world.town / "images"), *cameras, "--plain", str(tmp_path)]) == 2
+    assert main(["peer", str(world.town / "images"), *cameras, "--plain", str(tmp_path)]) == 2
     assert "the stylised frame 32x24; both must agree" in capsys.readouterr().err
 
 

@@ -1,19 +1,28 @@
-"""`fprf bench restyle`: every method restyles a town by references of other towns, judged by the town in that light."""
+"""Every method restyles a town by references of other towns, judged by the town in that light."""
 
 import math
+import os
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
-from ..errors import UsageError
-from ..interfaces import Scene, SceneView
-from ..io.images import Picture, to_uint8, write_image
-from ..plugins import registry
-from ..plugins.stylizers.config import (
+from fprf.checks import at_least, between, positive
+from fprf.cli.parsing import as_flag, parse
+from fprf.cli.progress import Display
+from fprf.cli.train import train_scene
+from fprf.errors import ConfigError, UsageError
+from fprf.evaluation.consistency import published, steadiness
+from fprf.interfaces import Scene, SceneView
+from fprf.io.images import Picture, to_uint8, write_image
+from fprf.methods import fprf_lite
+from fprf.plugins import registry
+from fprf.plugins.stylizers.config import (
     AdainConfig,
     LocalAdainConfig,
     RegionAdainConfig,
@@ -21,18 +30,20 @@ from ..plugins.stylizers.config import (
     RegionToneConfig,
     StylizerConfig,
 )
-from ..style.config import StyleConfig, labels
-from ..style.dictionary import StyleDictionary, build_dictionary
-from ..style.files import StyleFile
-from ..style.references import Encoders, encode_photograph
-from ..style.restyle import dress
-from ..training.loading import open_run
-from ..types import Want
-from .config import RestyleConfig
-from .consistency import published, steadiness
-from .report import Column, contact_sheet, markdown, words
+from fprf.style.config import StyleConfig, labels
+from fprf.style.dictionary import StyleDictionary, build_dictionary
+from fprf.style.files import StyleFile
+from fprf.style.references import Encoders, encode_photograph
+from fprf.style.restyle import dress
+from fprf.training.loading import open_run
+from fprf.types import Want
+
+from .common import ReportConfig, console, write_report
+from .report import Column, contact_sheet, markdown, printed, provenance, words
 from .single_image import encoded, flat_look, flat_scene, histogram_matching, reinhard, render_flat
+from .town.write import cached_town
 from .town_truth import (
+    CUT,
     Matched,
     Reference,
     Row,
@@ -67,6 +78,52 @@ STYLIZERS: Mapping[str, StylizerConfig] = {
 }
 _SHARP = 0.01
 """Relative temperature at which a point takes one code alone."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RestyleConfig(ReportConfig):
+    """Restyling judged by the truth: a town in the light of other towns, against itself in that very light."""
+
+    run: Path | None = None
+    """Run folder, trained on a town (`python -m benchmarks town FOLDER`); none = fprf-lite is trained on one first."""
+    minutes: float = 2.0
+    """Training time, where no run is given."""
+    palettes: tuple[str, ...] = ("autumn", "winter", "sunset", "night")
+    """Lights that are asked for."""
+    seeds: tuple[int, ...] = (7, 11, 13)
+    """Three other towns, which the references show."""
+    views: int = 4
+    """Held-out views that are judged."""
+    frames: int = 8
+    """Frames of the path on which consistency is measured; at least 8, so that there is a pair 7 apart."""
+    longest: int = 120
+    """Longer side in pixels of views and frames."""
+    stylizer: StylizerConfig = RegionToneConfig()
+    """The method that is to be recommended."""
+    clusters: int = StyleConfig.clusters
+    """Style codes per reference, for all methods."""
+    blend: float = StyleConfig.blend
+    """Share of the overall style in each local one, for all methods, in [0, 1]."""
+    missing: tuple[str, ...] = tuple(CUT)
+    """Kinds of things that a reference is without, one after the other."""
+    sheet: Path | None = None
+    """Picture of all methods side by side, .png or .jpg; none = none."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto."""
+
+    def __post_init__(self) -> None:
+        positive("minutes", self.minutes)
+        at_least("views", self.views, 1)
+        at_least("frames", self.frames, 8)
+        at_least("longest", self.longest, 16)
+        at_least("clusters", self.clusters, 1)
+        between("blend", self.blend, 0.0, 1.0)
+        at_least("palettes", len(self.palettes), 1)
+        at_least("seeds", len(self.seeds), 3)
+        for kind in self.missing:
+            if kind not in CUT:
+                raise ConfigError(f"missing: {kind!r} is no kind of thing of the town; allowed are {', '.join(CUT)}")
+
 
 Image = Annotated[Tensor, "H W 3"]
 T = TypeVar("T")
@@ -415,7 +472,7 @@ COLUMNS: tuple[Column, ...] = (
 LACKING: tuple[Column, ...] = (("inside", "PSNR inside, dB", ".2f"), ("elsewhere", "elsewhere, dB", ".2f"))
 _ABOUT = """# Restyling with a true answer
 
-Nobody knows what a photographed scene would look like at night. Of the embedded town we know: a palette changes colours and
+Nobody knows what a photographed scene would look like at night. Of a rendered town we know: a palette changes colours and
 light and nothing else. A scene is trained on one town in one palette; references are pictures of *other* towns in another
 palette; the truth is the scene's own town rendered in that palette from the same, held-out cameras.
 
@@ -444,9 +501,9 @@ the street and its sky.
 """
 _USE = """## Use it for another system
 
-`fprf bench restyle RUN --output restyle.json --page restyle.md --sheet restyle.jpg` makes all of this again. The town in any
-palette comes from the parser (`--datamanager.parser town --datamanager.parser.palette night` when a scene is trained) or from
-`fprf.town.write.write_town`. Another system's frames of the same cameras are scored by `fprf bench peer`
+`python -m benchmarks restyle RUN --output restyle.json --page restyle.md --sheet restyle.jpg` makes all of this again. The
+town in any palette is a scene folder that `python -m benchmarks town FOLDER --palette night` writes. Another system's frames
+of the same cameras are scored by `python -m benchmarks peer`
 ([protocol.md](protocol.md)).
 """
 
@@ -502,3 +559,27 @@ def _by_class(document: Mapping[str, Any]) -> str:
     methods, kinds = list(tables[0]), list(tables[0][next(iter(tables[0]))])
     rows = {method: {kind: sum(t[method][kind] for t in tables) / len(tables) for kind in kinds} for method in methods}
     return markdown(rows, [(kind, kind, ".1f") for kind in kinds], first="method")
+
+
+def main(argv: list[str]) -> int:
+    """`python -m benchmarks restyle [RUN]`."""
+    about = (RestyleConfig.__doc__ or "").strip()
+    config = parse(RestyleConfig(), as_flag(argv, "--run"), prog="python -m benchmarks restyle [RUN]", description=about)
+    with tempfile.TemporaryDirectory(prefix="fprf-restyle-") as made:
+        root = config.run
+        if root is None:
+            run = Path(made) / "run"
+            town = replace(fprf_lite(), data=cached_town(), output=run, minutes=config.minutes, device=config.device)
+            root = train_scene(town, "fprf-lite")
+        with Display() as display:
+            document, found = restyle(config, root, Path(made), display.count)
+    document["provenance"] = provenance(config.device)
+    for name, rows in document["means"].items():
+        console().print(printed(f"mean over {len(config.palettes)} palettes, references: {name}", rows, COLUMNS))
+    picture = None
+    if config.sheet is not None:
+        write_image(config.sheet, restyle_sheet(found))
+        if config.page is not None:
+            picture = Path(os.path.relpath(config.sheet, config.page.parent)).as_posix()
+    write_report(config, document, lambda: restyle_page(document, picture=picture))
+    return 0

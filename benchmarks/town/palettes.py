@@ -5,7 +5,7 @@ Colours are sRGB in [0, 1] as (r, g, b); intensities of light are linear.
 
 from dataclasses import dataclass, replace
 
-from ..errors import DataError
+from fprf.errors import DataError
 
 Colour = tuple[float, float, float]
 

@@ -10,10 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import World
 
-from fprf.evaluation.config import SpeedConfig
-from fprf.evaluation.report import Row, Watch, ratio
-from fprf.evaluation.speed import grid_sample_lookup, plain_planes
-from fprf.evaluation.subject import (
+from benchmarks.report import Row, Watch, ratio
+from benchmarks.speed import SpeedConfig, grid_sample_lookup, plain_planes
+from benchmarks.subject import (
     attempt,
     batch_rays,
     colour_gradient,

@@ -1,28 +1,56 @@
-"""`fprf bench peer`: frames of any system, read from files and scored by the code that scores ours."""
+"""Frames of any system, read from files and scored by the code that scores ours."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor
 
-from ..datamanagers.images import IMAGE_SUFFIXES, load_image
-from ..datamanagers.parsers.files import Record, as_record, read_bytes, read_json, read_npy, read_npz
-from ..datamanagers.parsers.views import rigid_pose
-from ..errors import DataError
-from ..plugins.encoders.config import BundledContentConfig, BundledSemanticConfig
-from ..rendering.cameras import Cameras, grid_rays
-from ..training.loading import load_run
-from ..training.views import render_view
-from .config import PeerConfig
-from .consistency import published, steadiness
-from .metrics import matched_regions, mean_scores, structure, style_distances
-from .report import words
+from fprf.cli.parsing import parse
+from fprf.cli.progress import Display
+from fprf.datamanagers.images import IMAGE_SUFFIXES, load_image
+from fprf.datamanagers.parsers.files import Record, as_record, read_bytes, read_json, read_npy, read_npz
+from fprf.datamanagers.parsers.views import rigid_pose
+from fprf.errors import DataError
+from fprf.evaluation.consistency import published, steadiness
+from fprf.evaluation.metrics import matched_regions, mean_scores, structure, style_distances
+from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig
+from fprf.rendering.cameras import Cameras, grid_rays
+from fprf.training.loading import load_run
+from fprf.training.views import render_view
+
+from .common import ReportConfig, write_report
+from .report import provenance, words
 
 Frames = Mapping[str, Annotated[Tensor, "H W 3"]]
 """Pictures by the stems of their files, in the order of these."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeerConfig(ReportConfig):
+    """Stylised frames of any system, scored by the same code; see docs/evidence/protocol.md."""
+
+    frames: Path = Path()
+    """Folder of the stylised frames, in the order of their names: a path for consistency."""
+    cameras: Path = Path("transforms.json")
+    """Their cameras: a transforms.json whose file_path have the frames' stems. Pinholes."""
+    plain: Path | None = None
+    """Folder of the same frames before they were stylised, by the same names: what consistency is relative to."""
+    depth: Path | None = None
+    """Folder of NAME.npz (array `depth`) or NAME.npy: [H W], in the unit of the poses; 0 or infinite = nothing there."""
+    depth_along: Literal["ray", "axis"] = "ray"
+    """Kind of depth: distances along each pixel's ray, or along the camera's axis."""
+    run: Path | None = None
+    """A run of ours on the same scene: renders the plain frames and depths that are not given."""
+    truth: Path | None = None
+    """Folder of the true frames, where they are known, by the same names."""
+    references: tuple[Path, ...] = ()
+    """Photographs that gave the style."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto: where a run is rendered."""
 
 
 def read_pictures(folder: Path, names: Sequence[str] | None = None) -> Frames:
@@ -225,3 +253,16 @@ def peer_page(document: Mapping[str, Any]) -> str:
     if document["missing"]:
         lines += ["", *(f"- {part}: not known without {flag}" for part, flag in document["missing"].items())]
     return "\n".join(lines) + "\n"
+
+
+def main(argv: list[str]) -> int:
+    """`python -m benchmarks peer FRAMES --cameras FILE`."""
+    about = (PeerConfig.__doc__ or "").strip()
+    config = parse(PeerConfig(), argv, prog="python -m benchmarks peer", description=about, positional=("frames",))
+    with Display() as display:
+        document = peer(config, display.count)
+    document["provenance"] = provenance(config.device)
+    page = peer_page(document)
+    print(page)
+    write_report(config, document, lambda: page)
+    return 0
