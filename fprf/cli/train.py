@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import UsageError
 from .blocks import train_blocks
-from .parsing import LIST_FLAGS, load_method, methods, parse
+from .parsing import load_method, methods, parse
 from .progress import EventLog
 from .view import check_viewer
 
@@ -99,8 +99,6 @@ def run(args: list[str]) -> int:
     if "--plan" in rest:
         raise UsageError("--plan: is gone; training says first how many blocks there are, and blocks.json where they lie")
     flags, others = [arg for arg in rest if arg != CHANGED], CHANGED in rest
-    if LIST_FLAGS in flags:
-        print(f"{VIEW}\n{CHANGED}")
     about = (
         f"Train a scene with {method}.\n"
         f"{VIEW} [[HOST:]PORT] shows training live in the browser, at http://127.0.0.1:8080 if nothing is said;\n"
