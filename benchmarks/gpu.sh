@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Measure a machine with a GPU in about ten minutes: the tests of devices, a scene trained for a given time, restyled frames
-# a second, a new style to its first frame, Triton's tri-planes against plain torch. Writes one JSON with rows and goals.
+# a second, a new style to its first frame. Writes one JSON with rows and goals.
 #
 #   benchmarks/gpu.sh --scene DIR [--images images_4] [--minutes 3] [--method fprf] [--long STEPS] [--output FILE]
 #                     [-- FLAGS OF fprf train]
@@ -59,7 +59,7 @@ else
     data=(--data "$scene" --datamanager.parser llff --datamanager.parser.images "$images")
     time=(--minutes "$minutes") again=(--steps "$long")
     size=(--rays 762048 --repeats 5) points=(--points 262144)
-    tests+=(-k "not pretended" "$root/tests/test_gpu.py" "$root/tests/ops/test_triplane_triton.py")
+    tests+=(-k "not pretended" "$root/tests/test_gpu.py")
 fi
 
 # step NAME SECONDS COMMAND...: run it, note its exit status, print the end of its log where it failed.

@@ -17,7 +17,7 @@ import torch
 from rich.console import Console
 
 from fprf.io.atomic import write_json
-from fprf.ops import triplane_numba, triplane_triton
+from fprf.ops import triplane
 
 from .report import Row, document, rows_table, table
 
@@ -81,7 +81,7 @@ def rows(work: Path, form: str) -> Iterator[Row]:
 def kernels(device: torch.device) -> str:
     """Which form of the tri-planes runs."""
     points, table = torch.zeros(1, 3, device=device), torch.zeros(12, 8, device=device)
-    return "triton" if triplane_triton.usable(points, table) else "numba" if triplane_numba.usable(points, table) else "plain"
+    return "numba" if triplane.usable(points, table) else "plain"
 
 
 def read(path: Path) -> Any:

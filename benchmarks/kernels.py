@@ -20,7 +20,7 @@ from torch import Tensor
 from fprf.config import RenderConfig
 from fprf.datamanagers.features import FeatureStore
 from fprf.fields import planes
-from fprf.ops import backend, dense, march, mixture, triplane, triplane_numba
+from fprf.ops import backend, dense, march, mixture, triplane
 from fprf.rendering import renderer, space
 from fprf.rendering.cameras import Cameras
 from fprf.style import matching
@@ -52,7 +52,7 @@ def plain_lookups(store: FeatureStore, *given: Tensor) -> None:
 packed: dict[int, FeatureStore] = {}
 no_march = SimpleNamespace(usable=never)
 SWITCHES: dict[str, Patches] = {
-    "tri-planes": [(triplane_numba, "usable", never)],
+    "tri-planes": [(triplane, "usable", never)],
     "tri-planes: total variation": [(triplane, "variation", triplane.variation_reference)],
     "networks": [(dense, "network", dense.network_reference)],
     "marching": [(march, "usable", never)],

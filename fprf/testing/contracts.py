@@ -12,12 +12,12 @@ from pathlib import Path
 import torch
 from torch import nn
 
+from ..blocks.config import LayoutConfig
 from ..blocks.routing import shares
 from ..datamanagers.config import DataManagerConfig
 from ..datamanagers.parsers.config import DataParserConfig
 from ..errors import DataError
 from ..fields.config import ContentFieldConfig, SemanticFieldConfig
-from ..fields.layouts import LayoutConfig
 from ..interfaces import (
     BlockLayout,
     ContentField,
@@ -31,6 +31,8 @@ from ..interfaces import (
     SemanticField,
     Stylizer,
 )
+from ..ops.harmonics import HARMONIC
+from ..plugins.captures import CaptureFormat
 from ..plugins.config import Need, PluginConfig
 from ..plugins.decoders.config import DecoderConfig
 from ..plugins.encoders.config import EncoderConfig, RandomConfig
@@ -241,26 +243,24 @@ def check_semantic_field(config: SemanticFieldConfig) -> None:
 
 
 def check_layout(config: LayoutConfig) -> None:
-    """Boxes with room in them and orthonormal axes, from any site, and weights of them that sum to 1 everywhere."""
+    """Cells with room in them and one border, from any site, and weights of them that sum to 1 everywhere."""
     check_config(config)
     layout, name = config.build(), type(config).__name__
     require(isinstance(layout, BlockLayout), f"{name}: build() gives {type(layout).__name__}, not a BlockLayout")
     for site in (cases.site(40, 200), cases.site(3, 0), cases.site(1, 0)):
-        boxes = layout.cut(site)
-        count = len(boxes.low)
-        require(count > 0, f"{name}: at least one block is needed")
-        shapes = (tuple(boxes.low.shape), tuple(boxes.high.shape), tuple(boxes.turn.shape))
-        require(shapes == ((count, 3), (count, 3), (count, 3, 3)), f"{name}: expected [Z 3], [Z 3] and [Z 3 3], found {shapes}")
-        require(bool((boxes.low < boxes.high).all()), f"{name}: a box's lowest corner must lie below its highest")
-        apart = (boxes.turn @ boxes.turn.mT - torch.eye(3, dtype=boxes.turn.dtype)).abs().amax()
-        require(float(apart) < 1e-6, f"{name}: the axes of a box must be orthonormal")
-        require(boxes.margin > 0 or count == 1, f"{name}: blocks need a margin above 0 to blend in")
-        points = 4 * cases.points(64)
-        weight = shares(points, boxes)
+        cells, again = layout.cut(site), layout.cut(site)
+        require(len(cells) > 0, f"{name}: at least one block is needed")
+        for cell, other in zip(cells, again, strict=True):
+            shapes = {tuple(each.shape) for each in (cell.low, cell.high, cell.border)}
+            require(shapes == {(3,)}, f"{name}: low, high and border must be [3], found {shapes}")
+            require(bool((cell.low < cell.high).all()), f"{name}: a cell's lowest corner must lie below its highest")
+            require(torch.equal(cell.border, cells[0].border), f"{name}: all cells must have the same border")
+            same = torch.equal(cell.low, other.low) and torch.equal(cell.high, other.high)
+            require(same, f"{name}: must be deterministic")
+        require(bool((cells[0].border > 0).all()) or len(cells) == 1, f"{name}: blocks need a border above 0 to blend in")
+        weight = shares(4 * cases.points(64), cells)
         whole = bool((weight >= 0).all()) and close(weight.sum(1), torch.ones(64), 1e-4)
         require(whole, f"{name}: weights must be at least 0 and sum to 1")
-        again = layout.cut(site)
-        require(torch.equal(again.low, boxes.low) and torch.equal(again.high, boxes.high), f"{name}: must be deterministic")
 
 
 def check_parser(config: DataParserConfig, data: Path) -> None:
@@ -410,3 +410,45 @@ def _sample(sampler: Sampler, rays: Rays, seed: int | None) -> Sampled:
     step = None if seed is None else 10
     sampled: Sampled = sampler(rays, space=cases.space(), step=step, generator=generator)
     return sampled
+
+
+def check_capture_format(form: CaptureFormat) -> None:
+    """What it writes it reads again, as many Gaussians of the same places and colours; recolouring changes nothing else.
+
+    Damaged files end in DataError.
+    """
+    import numpy as np
+
+    from ..splats.gaussians import Gaussians
+
+    check_config(form)
+    name, path = type(form).__name__, Path("capture")
+    made = Gaussians(
+        cases.normal(50, 3, seed=30),
+        torch.nn.functional.normalize(cases.normal(50, 4, seed=31), dim=1),
+        cases.normal(50, 3, seed=32) - 3,
+        cases.normal(50, seed=33),
+        0.3 * cases.normal(50, 4 if form.view_dependent else 1, 3, seed=34),
+    )
+    data = form.pack(made, form.view_dependent, (0.0, 0.0, 0.0))
+    require(form.recognises(data[:64], len(data)), f"{name}.recognises: must be True of a file that it wrote")
+    read = form.read(path, data)
+    found, apart = read.gaussians, torch.cdist(made.means, read.gaussians.means)
+    require(len(found) == len(made), f"{name}: {len(found)} Gaussians come back of {len(made)}")
+    require(read.antialiased == form.view_dependent, f"{name}: whether opacities are compensated must come back")
+    order = apart.argmin(1)
+    same(found.means[order], made.means, 0.02, f"{name}: positions must come back")
+    same(found.colours[order], made.colours, 0.05, f"{name}: colours must come back")
+    require(read.data == data, f"{name}: Capture.data must be the file")
+    changed = np.arange(len(found)) % 2 == 0
+    new = torch.where(torch.from_numpy(changed)[:, None, None], 0.5 * found.harmonics, found.harmonics)
+    again = form.read(path, read.recolour(new.numpy(), changed)).gaussians
+    for part in ("means", "quaternions", "log_scales", "logits"):
+        same(getattr(again, part), getattr(found, part), 0.0, f"{name}.recolour: {part} must stay as they are")
+    same(again.colours, 0.5 + HARMONIC * new[:, 0], 0.05, f"{name}.recolour: the new colours must be there")
+    for wrong in (b"", data[: len(data) // 2]):
+        try:
+            shorter = len(form.read(path, wrong).gaussians)
+        except DataError:
+            continue
+        require(0 < shorter < len(made), f"{name}: a file that is cut off must raise DataError, or hold fewer Gaussians")
