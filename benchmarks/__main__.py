@@ -4,10 +4,13 @@ import importlib
 import importlib.util
 import shlex
 import sys
+import tempfile
 from typing import NamedTuple
 
 from fprf.errors import FprfError, UsageError
 from fprf.process import keep_memory
+
+from .town.write import cached_town
 
 
 class Benchmark(NamedTuple):
@@ -15,14 +18,17 @@ class Benchmark(NamedTuple):
 
     about: str
     quick: str
-    """Flags that `--quick` stands for: the whole way, in about a minute, with figures that mean nothing."""
+    """Flags that `--quick` stands for: the whole way, in about a minute, with figures that mean nothing.
+
+    {town} is the folder of a small town, {folder} one that is thrown away.
+    """
     needs: str = "nothing but fprf"
     """Data, extras and time; said before it starts."""
     packages: tuple[str, ...] = ()
     """Modules that must be there."""
 
 
-_RUN = "--data small-town --steps 20 --repeats 1 --rays 256 --device cpu"
+_RUN = "--data {town} --steps 20 --repeats 1 --rays 256 --device cpu"
 _TRAINED = "a run of fields; without one it trains fprf-lite on the town first"
 BENCHMARKS = {
     "exports": Benchmark("exported files drawn again, against the scene's own renders", "--steps 30 --views 1", _TRAINED),
@@ -31,7 +37,7 @@ BENCHMARKS = {
         "every reader under libFuzzer", "--minutes 0.2 --only png", "the package atheris; Linux", ("atheris",)
     ),
     "gaussians": Benchmark("the rasteriser of 3D Gaussians: time and error", "--count 500 --times 2"),
-    "kernels": Benchmark("what each compiled kernel brings end to end", "--data small-town --steps 20 --repeats 1", _TRAINED),
+    "kernels": Benchmark("what each compiled kernel brings end to end", "--data {town} --steps 20 --repeats 1", _TRAINED),
     "kills": Benchmark("training that is killed a hundred times", "--kills 3 --steps 25", "ten minutes; Linux"),
     "large_scene": Benchmark(
         "a district of towns in cells: seconds, memory, fidelity, workers of Ray",
@@ -46,12 +52,14 @@ BENCHMARKS = {
     ),
     "paper": Benchmark(
         "the paper's ablations on the town, or on another scene by photographs",
-        "--data small-town --steps 5 --views 1 --palettes night --device cpu",
+        "--data {town} --steps 5 --views 1 --palettes night --device cpu",
         "a scene of --data; VGG-19's weights in the cache where photographs restyle it",
     ),
     "pareto": Benchmark("time against error, knob by knob", _RUN, _TRAINED),
     "peer": Benchmark(
-        "frames of any system, scored by the code that scores ours", "", "a folder of frames and their cameras; --quick makes them"
+        "frames of any system, scored by the code that scores ours",
+        "{town}/images --cameras {town}/transforms.json --plain {town}/images --depth {town}/depth --truth {town}/images",
+        "a folder of frames and their cameras",
     ),
     "profiling": Benchmark("where the time of a training step and of a view goes", f"{_RUN} --operators 3", _TRAINED),
     "restyle": Benchmark(
@@ -60,7 +68,9 @@ BENCHMARKS = {
         "a run of a town; without one it trains fprf-lite on one first",
     ),
     "scenes": Benchmark(
-        "methods on captures for the same time, judged on the same views", "--steps 20 --side 80", "captures; without any the garden"
+        "methods on captures for the same time, judged on the same views",
+        "--steps 20 --side 80",
+        "captures; without any, the garden",
     ),
     "semantic_matching": Benchmark(
         "which encoder finds like with like, and what its scores say",
@@ -79,7 +89,9 @@ BENCHMARKS = {
         "--triplets 0 --steps 20 --views 2 --longest 64",
         "triplets, photographs and VGG-19's weights in --shared; without them a run of the town",
     ),
-    "town": Benchmark("write a town as a scene folder", "", "the folder to write; --quick writes none that stays"),
+    "town": Benchmark(
+        "write a town as a scene folder", "{folder}/town --views 2 --width 24 --height 18", "a folder to write into"
+    ),
     "viewer_speed": Benchmark(
         "response times and memory of the viewer", "--parts start --steps 20", "the extra viewer, playwright and a Chromium"
     ),
@@ -104,11 +116,13 @@ def main(args: list[str]) -> int:
             absent = [package for package in chosen.packages if importlib.util.find_spec(package) is None]
             if absent:
                 raise UsageError(f"{name}: {', '.join(absent)} not installed; pip install {' '.join(absent)}")
-        if "--quick" in flags:
-            flags.remove("--quick")
-            flags = [*shlex.split(chosen.quick), *flags]
         keep_memory()  # as the command line does: else large gradients are mapped anew in every step
-        return importlib.import_module(f".{name}", __package__).main(flags) or 0
+        with tempfile.TemporaryDirectory(prefix="fprf-quick-") as folder:
+            if "--quick" in flags:
+                flags.remove("--quick")
+                town = cached_town(views=8, width=48, height=36)
+                flags = [*shlex.split(chosen.quick.format(town=town, folder=folder)), *flags]
+            return importlib.import_module(f".{name}", __package__).main(flags) or 0
     except FprfError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -67,7 +67,7 @@ class Cost(NamedTuple):
 
 
 def cost_of(*args: str | Path) -> Cost:
-    """Run `fprf ARGS` in a process of its own without showing its output. Raises FprfError with its last lines where it fails."""
+    """Run `fprf ARGS` in a process of its own without showing its output. Raises FprfError with its last lines."""
     words, start = [str(each) for each in args], time.perf_counter()
     with tempfile.TemporaryFile() as said:
         process = subprocess.Popen([sys.executable, "-m", "fprf", *words], stdout=subprocess.DEVNULL, stderr=said)

@@ -25,7 +25,11 @@ from .common import arguments, report
 WIDTH, HEIGHT, BANDS, CHANNELS = 500, 375, 4, 32
 
 
-def cloud(count: int) -> list[Tensor]:
+Cloud = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+"""Means, quaternions, log scales, logits, harmonics."""
+
+
+def cloud(count: int) -> Cloud:
     draw = torch.Generator().manual_seed(0)
 
     def normal(*shape: int) -> Tensor:
@@ -37,7 +41,7 @@ def cloud(count: int) -> list[Tensor]:
     pixel = depth / (0.8 * WIDTH)
     # Standard deviations of about a pixel where there are 50 000; fewer are larger, so that they cover the image as well.
     scales = (math.sqrt(50_000 / count) * pixel).log()[:, None] + 0.5 * normal(count, 3)
-    return [means, normal(count, 4), scales, 2 * normal(count), 0.4 * normal(count, BANDS, 3)]
+    return means, normal(count, 4), scales, 2 * normal(count), 0.4 * normal(count, BANDS, 3)
 
 
 def camera() -> Pinhole:
@@ -56,11 +60,11 @@ def least(call: Callable[[], object], times: int) -> dict[str, float]:
     return {"seconds": min(wall), "processor_seconds": min(processor)}
 
 
-def learn(given: list[Tensor], pull: Tensor) -> list[Tensor]:
-    learnt = [x.detach().clone().requires_grad_() for x in given]
-    found = rasterise(*learnt, camera())
-    (found.image * pull.to(found.image)).sum().backward()
-    return [x.grad for x in learnt if x.grad is not None]
+def learn(given: Cloud, pull: Tensor) -> tuple[Tensor, ...]:
+    """Gradients of the image's product with `pull`."""
+    a, b, c, d, e = (x.detach().clone().requires_grad_() for x in given)
+    found = rasterise(a, b, c, d, e, camera())
+    return torch.autograd.grad((found.image * pull.to(found.image)).sum(), (a, b, c, d, e))
 
 
 def measure(count: int, times: int) -> dict[str, Any]:
@@ -77,7 +81,8 @@ def measure(count: int, times: int) -> dict[str, Any]:
         "render_and_gradients": least(lambda: learn(given, pull), times),
         f"lift_{CHANNELS}_channels": least(lambda: lift(*given[:4], camera(), pixels), times),
     }
-    exact = [x.double() for x in given]
+    a, b, c, d, e = (x.double() for x in given)
+    exact = a, b, c, d, e
     with backend.plain():
         rows["render_plain"] = least(render, 1)
         true = rasterise(*exact, camera())

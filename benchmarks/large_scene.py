@@ -73,7 +73,8 @@ def train(work: Path, run: Path, towns: int, steps: int) -> list[str]:
     """Words of the training: `--steps` covers the whole, then one cell."""
     cells, coarse = CELLS * towns, COARSE_STEPS * towns * steps // 400 + 1
     words = f"""train fprf-splats --data {work}/towns{towns} --output {run} --downscale 1 --cells {cells}
-        --steps {coarse + steps} --overview {coarse / (coarse + steps)} --initial {POINTS * cells} --cap {GAUSSIANS * cells} --background"""
+        --steps {coarse + steps} --overview {coarse / (coarse + steps)} --initial {POINTS * cells} --cap {GAUSSIANS * cells}
+        --background"""
     return [*words.split(), *map(str, SKY)]
 
 

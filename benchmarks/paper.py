@@ -25,6 +25,7 @@ from fprf.config import TrainConfig
 from fprf.datamanagers.images import load_image
 from fprf.evaluation.metrics import image_metrics, matched_regions, mean_metrics, structure
 from fprf.interfaces import Decoder
+from fprf.io.atomic import write_json
 from fprf.io.images import shrink, to_uint8, write_image
 from fprf.plugins.decoders.config import DecoderConfig, MlpDecoderConfig
 from fprf.plugins.encoders.config import Vgg19Config
@@ -41,12 +42,11 @@ from fprf.training.style_pass import measure_style
 from fprf.training.trainer import Report, train
 from fprf.training.views import cache_view, render_view
 
-from .common import Progress, ReportConfig, origin, write_report
-from .report import Column, markdown, words
+from .common import Progress, console, origin
+from .report import Column, printed
 from .restyle import PLAIN, dictionary_of, in_scene
 from .styles import Exhibit, judge_exhibit
-from .town.write import scene_folder
-from .town_truth import (
+from .town.truth import (
     Row,
     code_classes,
     match_rates,
@@ -60,10 +60,11 @@ from .town_truth import (
     true_views,
     winners,
 )
+from .town.write import scene_folder
 
 
 @dataclass(frozen=True, kw_only=True)
-class PaperConfig(ReportConfig):
+class PaperConfig:
     """A table of the paper, from short trainings of one scene: the method as it is, and with one thing changed."""
 
     table: Literal["ablation", "guided-filter", "clusters"] = "ablation"
@@ -90,6 +91,8 @@ class PaperConfig(ReportConfig):
     """Style codes per reference, of all others."""
     blend: float = StyleConfig.blend
     """Share of the overall style in each local one, in [0, 1]."""
+    output: Path | None = None
+    """JSON file for the figures; none = only the table."""
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
 
@@ -311,29 +314,10 @@ COLUMNS: tuple[Column, ...] = (
     ("style_seconds", "style s", ".2f"),
     ("view_seconds", "view s", ".3f"),
 )
-_ABOUT = {
-    "ablation": "What the content loss and the pre-trained decoder are good for: the scene as it is, and restyled.",
-    "guided-filter": "Feature targets with the guided filter, and merely interpolated between cells.",
-    "clusters": "Local styles per reference, one training.",
-}
-
-
-def page_of(document: Mapping[str, Any]) -> str:
-    """Markdown. Columns that no row has are left out."""
-    settings, rows = document["settings"], document["rows"]
-    columns = [each for each in COLUMNS if any(row.get(each[0]) is not None for row in rows.values())]
-    seeds = ", ".join(map(str, settings["trainings"]))
-    by = ", ".join(settings["references"]) or f"towns in the palettes {', '.join(settings['palettes'])}"
-    return (
-        f"# {document['table'].capitalize()}\n\n{_ABOUT[document['table']]} Restyled by {by}. *Structure*: of the unstylised "
-        "render, 1 = all of it. *Style distance*: 0 = the references' own, 1 = no change.\n\n"
-        f"{settings['data']} at 1/{settings['downscale']}, {settings['method']}, {settings['steps']} steps, seeds {seeds}, "
-        f"{settings['views']} held-out views. {words(document)}.\n\n{markdown(rows, columns)}\n"
-    )
 
 
 def main(argv: list[str]) -> int:
-    """`python -m benchmarks paper --table NAME [flags]`: the table's page is printed, and written where asked for."""
+    """`python -m benchmarks paper --table NAME [flags]`."""
     config = parse(PaperConfig(), argv, prog="python -m benchmarks paper", description=__doc__ or "")
     method, name = load_field_method(config.method)
     base = replace(method, data=scene_folder(config.data), downscale=config.downscale, device=config.device)
@@ -360,7 +344,8 @@ def main(argv: list[str]) -> int:
         "rows": mean_rows(tables),
         **origin(config.device),
     }
-    page = page_of(document)
-    print(page)
-    write_report(config, document, lambda: page)
+    columns = [each for each in COLUMNS if any(row.get(each[0]) is not None for row in document["rows"].values())]
+    console().print(printed(f"{config.table}, {name} on {config.data.name}, {config.steps} steps", document["rows"], columns))
+    if config.output is not None:
+        write_json(config.output, document)
     return 0

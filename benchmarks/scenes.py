@@ -54,7 +54,8 @@ def main(argv: list[str]) -> None:
         row: dict[str, Any] = {"training_views": views, "held_out_views": len(scene.test), "size": size, "limit": limit}
         with tempfile.TemporaryDirectory() as scratch:
             if count or any(asked.disturb):
-                source = rewritten(source, Path(scratch) / source.name, views, *asked.disturb, asked.seed)
+                degrees, share = asked.disturb
+                source = rewritten(source, Path(scratch) / source.name, views, degrees, share, asked.seed)
             for number, side in enumerate(asked.sides):
                 row[side] = judged(side, source, Path(scratch) / str(number), downscale, limit, fit_poses=asked.fit_poses)
         row["load_average"] = os.getloadavg()[0]
@@ -91,15 +92,16 @@ def rewritten(source: Path, folder: Path, views: int, degrees: float, share: flo
     for name, view in zip(names, kept.tolist(), strict=True):
         (folder / name).symlink_to(scene.paths[view].resolve())
     place = {view: number for number, view in enumerate(kept.tolist())}
-    split = {name: [place[view] for view in part.tolist()] for name, part in (("train", train), ("test", scene.test))}
-    write_json(folder / "transforms.json", transforms(replace(scene.cameras, pose=pose).select(kept), names, **split))
+    learnt, held = ([place[view] for view in part.tolist()] for part in (train, scene.test))
+    cameras = replace(scene.cameras, pose=pose).select(kept)
+    write_json(folder / "transforms.json", transforms(cameras, names, train=learnt, test=held))
     if scene.points is not None:
-        parts = {"xyz": scene.points.numpy()}
-        if scene.seen is not None:
+        if scene.seen is None:
+            np.savez(folder / "points.npz", xyz=scene.points.numpy())
+        else:
             seen = scene.seen.numpy()
             often = np.bincount(seen[np.isin(seen[:, 0], train), 1], minlength=len(scene.points)) >= 2
             seen = seen[np.isin(seen[:, 0], kept) & often[seen[:, 1]]]
             numbers = np.stack([np.searchsorted(kept, seen[:, 0]), (np.cumsum(often) - 1)[seen[:, 1]]], 1)
-            parts = {"xyz": scene.points.numpy()[often], "seen": numbers}
-        np.savez(folder / "points.npz", **parts)
+            np.savez(folder / "points.npz", xyz=scene.points.numpy()[often], seen=numbers)
     return folder

@@ -53,14 +53,8 @@ from .restyle import PLAIN, STYLIZERS, transfers
 from .semantic_matching import COLOURS, Triplet, read_triplets, triplet_names
 from .single_image import encoded, flat_look, flat_scene, render_flat
 from .town.render import walk
+from .town.truth import Place, Row, mean_rows, photograph
 from .town.write import is_town, read_truth
-from .town_truth import Place, Row, mean_rows, photograph
-
-RECOMMENDED = "region-tone"
-GOALS: Mapping[str, float] = {"adain": 0.30, "local-adain": 0.15}
-"""By what share the recommended stylizer shall come nearer to the style than these."""
-_SLACK = 0.02
-"""How much structure it may lose against them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,23 +175,6 @@ def false_edges(plain: Annotated[Tensor, "H W 3"], styled: Annotated[Tensor, "H 
     return cuts / pairs if pairs else None
 
 
-def verdict(rows: Mapping[str, Row]) -> dict[str, dict[str, float | bool | None]]:
-    """Against each method of GOALS: by what share the recommended one is nearer to the style, the structure that it loses, and
-    whether both goals are met (None where a distance is not known).
-    """
-    found: dict[str, dict[str, float | bool | None]] = {}
-    for method, goal in GOALS.items():
-        ours, theirs = (rows[name]["style_distance"] for name in (RECOMMENDED, method))
-        kept, theirs_kept = (rows[name]["structure"] for name in (RECOMMENDED, method))
-        if ours is None or theirs is None or theirs <= 0 or kept is None or theirs_kept is None:
-            found[method] = {"nearer_share": None, "goal_share": goal, "structure_lost": None, "met": None}
-            continue
-        nearer, lost = 1 - ours / theirs, theirs_kept - kept
-        met = nearer >= goal and lost <= _SLACK
-        found[method] = {"nearer_share": nearer, "goal_share": goal, "structure_lost": lost, "met": met}
-    return found
-
-
 def judges_of(shared: Path) -> dict[str, Encoder]:
     """VGG-19 where its weights are; untrained convolutions, which see colours and grain, elsewhere."""
     weights = shared / "weights/vgg19_imagenet.safetensors"
@@ -295,7 +272,7 @@ def triplets(config: StylesConfig, judges: Mapping[str, Encoder]) -> dict[str, o
     result: dict[str, object] = {"content": content.identity, "semantic": semantic.identity}
     for source, cases in found.items():
         means = show(f"triplets, {source}", list(cases.values()))
-        result[source] = {"means": means, "verdict": verdict(means), "triplets": cases}
+        result[source] = {"means": means, "triplets": cases}
     return result
 
 
@@ -383,7 +360,7 @@ def run_figures(root: Path, config: StylesConfig, judges: Mapping[str, Encoder])
     if config.sheets is not None:
         write_sheet(config.sheets / f"run-{root.name}.jpg", shown)
     means = show(root.name, list(cases.values()))
-    return {"scene": known.name, "means": means, "verdict": verdict(means), "styles": cases}
+    return {"scene": known.name, "means": means, "styles": cases}
 
 
 COLUMNS: tuple[Column, ...] = tuple(
@@ -422,8 +399,6 @@ def main(argv: list[str]) -> int:
             config = replace(config, runs=(train_run(Path(made) / "town", "fprf-lite", Path("town"), steps=config.steps),))
         document = {
             "benchmark": "styles",
-            "recommended": RECOMMENDED,
-            "goals": dict(GOALS),
             "judges": list(judges),
             "longest": config.longest,
             "triplets": painted_figures,

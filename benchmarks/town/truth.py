@@ -34,12 +34,12 @@ from fprf.style.references import Encoders
 from fprf.style.statistics import monge
 from fprf.training.run import Known
 
-from .single_image import encoded
-from .town.layout import Town, build_town
-from .town.palettes import palette
-from .town.render import View, geometry, render, walk
-from .town.surface import CAR, CLASSES, DOOR, FACADE, FOLIAGE, LAMP, LAWN, ROAD, ROOF, SIDEWALK, SKY, TRUNK, WINDOW
-from .town.write import TownSettings, is_town
+from ..single_image import encoded
+from .layout import Town, build_town
+from .palettes import palette
+from .render import View, geometry, render, walk
+from .surface import CAR, CLASSES, DOOR, FACADE, FOLIAGE, LAMP, LAWN, ROAD, ROOF, SIDEWALK, SKY, TRUNK, WINDOW
+from .write import TownSettings, is_town
 
 _STEP = 0.12
 """Metres between frames of the path: 7 frames on, near things have moved by a quarter of a small picture."""
