@@ -16,7 +16,6 @@ from ..plugins import registry
 from ..plugins.stylizers.config import (
     AdainConfig,
     LocalAdainConfig,
-    RegionAdainConfig,
     RegionOtConfig,
     RegionToneConfig,
     StylizerConfig,
@@ -61,7 +60,6 @@ GLOBAL = ("reinhard", "histogram", "adain")
 STYLIZERS: Mapping[str, StylizerConfig] = {
     "adain": AdainConfig(),
     "local-adain": LocalAdainConfig(),
-    "region-adain": RegionAdainConfig(),
     "region-ot": RegionOtConfig(),
     "region-tone": RegionToneConfig(),
 }
