@@ -43,8 +43,7 @@ export PYTHONPATH="$root${PYTHONPATH:+:$PYTHONPATH}"
 tests=(-q -c "$root/pyproject.toml" -o addopts= -o filterwarnings=default -W "ignore::pytest.PytestConfigWarning")
 if [ "$dry" = 1 ]; then
     method=fprf-lite device=cpu limit=3600
-    data=(--data town --datamanager.parser town --datamanager.parser.views 6 --datamanager.parser.width 48
-        --datamanager.parser.height 36)
+    data=(--data garden --downscale 8)
     time=(--steps 20) again=(--steps 40)
     size=(--rays 500 --repeats 2) points=(--points 2000)
     tests+=(-k "pretended and views" "$root/tests/test_gpu.py")
@@ -79,11 +78,11 @@ fprf=("$python" -m fprf)
 step tests 150 "$python" -m pytest "${tests[@]}"
 step train "$whole" "${fprf[@]}" train "$method" "${data[@]}" "${time[@]}" --device "$device" --output "$work/run" "$@"
 step eval 40 "${fprf[@]}" eval "$work/run" --no-images --device "$device"
-step speed 130 "${fprf[@]}" bench speed "$work/run" "${size[@]}" "${points[@]}" --device "$device" --output "$work/speed.json"
+step speed 130 "$python" -m benchmarks speed "$work/run" "${size[@]}" "${points[@]}" --device "$device" --output "$work/speed.json"
 step profile 40 "$python" -m benchmarks profiling "$work/run" "${size[@]}" --device "$device" --operators 15 --output "$work/profile.json"
 step roofline 40 "$python" -m benchmarks roofline "$work/run" "${size[@]}" "${points[@]}" --device "$device" --output "$work/roofline.json"
 if [ "$long" != 0 ]; then
     step train-long 7200 "${fprf[@]}" train "$method" "${data[@]}" "${again[@]}" --device "$device" --output "$work/long" "$@"
     step eval-long 60 "${fprf[@]}" eval "$work/long" --no-images --device "$device"
 fi
-"$python" "$here/gpu_rows.py" "$work" --output "$output"
+"$python" -m benchmarks.gpu_rows "$work" --output "$output"

@@ -19,10 +19,6 @@ from torch import Tensor
 
 from fprf.config import RenderConfig
 from fprf.datamanagers.features import FeatureStore
-from fprf.evaluation.config import SpeedConfig
-from fprf.evaluation.report import Watch
-from fprf.evaluation.speed import STYLES
-from fprf.evaluation.subject import Subject, find, fresh_model, loop_of, stepper, test_view
 from fprf.fields import planes
 from fprf.ops import backend, dense, march, mixture, triplane
 from fprf.rendering import renderer, space
@@ -33,6 +29,9 @@ from fprf.style.restyle import restyle
 from fprf.training.views import render_view
 
 from .common import RESULTS, arguments, report
+from .report import Watch
+from .speed import STYLES, SpeedConfig
+from .subject import Subject, find, fresh_model, loop_of, stepper, test_view
 
 Patches = Sequence[tuple[object, str, object]]
 

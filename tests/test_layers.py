@@ -9,7 +9,7 @@ import fprf
 ROOT = Path(fprf.__file__).parent
 ORDER = (
     *("version", "errors", "types", "memory", "checks", "process", "io", "interfaces", "configs"),
-    *("ops", "town", "rendering", "datamanagers", "style", "fields", "plugins", "blocks", "testing"),
+    *("ops", "rendering", "datamanagers", "style", "fields", "plugins", "blocks", "testing"),
     *("training", "splats", "pretraining", "reconstruction", "evaluation", "export"),
     *("viewer", "api", "cli", "__main__"),
 )

@@ -265,7 +265,7 @@ def _trouble(folder: Path) -> Iterator[Finding]:
         return
     if notes:
         more = f" and {len(notes) - 1} more" if len(notes) > 1 else ""
-        yield Finding("events", notes[-1] + more, f"fprf report {shlex.quote(str(folder))}", True)
+        yield Finding("events", notes[-1] + more, f"read {shlex.quote(str(folder / 'events.jsonl'))}", True)
 
 
 def _packages() -> Iterator[Finding]:

@@ -89,7 +89,7 @@ def scene_of(config: GaussiansConfig, saved: Facts | None = None) -> Scene:
     Raises UsageError where it names none, DataError where that cannot be read.
     """
     if config.data is None:
-        raise UsageError("no scene is named: give --data FOLDER, or --data town for the embedded one")
+        raise UsageError("no scene is named: give --data FOLDER, or --data garden for the embedded one")
     scene = parse_scene(config.data, config.downscale or 1, config.parser)
     return scene if saved is None else at_origin(scene, saved.origin)
 

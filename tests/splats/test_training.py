@@ -15,6 +15,7 @@ from stand_in_viewers import GREEDY, viewer
 from torch import Tensor
 
 import fprf
+from benchmarks.town.write import write_town
 from fprf.cli import train as cli_train
 from fprf.cli.main import main
 from fprf.datamanagers.images import load_image, load_images
@@ -35,7 +36,6 @@ from fprf.splats.learner import Learner
 from fprf.splats.photographs import camera_of
 from fprf.splats.training import prepare, reach_of
 from fprf.splats.views import draw
-from fprf.town.write import write_town
 from fprf.training import checkpoint
 from fprf.training.camera_optimizers import Tones, moved_cameras
 from fprf.training.loading import open_run
