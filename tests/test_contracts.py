@@ -253,12 +253,6 @@ class Bright(Decoder):
     def forward(self, content: Tensor) -> Tensor:
         return content[:, :3]
 
-    def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
-        return self(styled)
-
-    def frozen_colour(self, content: Tensor) -> None:
-        return None
-
 
 class Averaging(Stylizer):
     @property
