@@ -13,11 +13,13 @@ from fprf.cli import main as cli
 from fprf.cli.parsing import parse
 from fprf.errors import FprfError, UsageError
 
+from .__main__ import main as benchmark
 from .common import RESULTS, ROOT, SHARED
+from .town.write import cached_town
 
 PAGES = ROOT / "docs/evidence"
 LIGHTS = ("--palettes", "autumn", "winter", "sunset", "night")
-TOWN = ("--data", "town", "--steps", "800", *LIGHTS)
+TOWN = ("--steps", "800", *LIGHTS)
 SCENES: Mapping[str, tuple[str, str]] = {"reconstruction": ("fox", "2"), "reconstruction-flower": ("llff_flower", "2")}
 STYLES = ("clusters", "multi-reference", "statistics", "large-scale", "time")
 TRAININGS = ("ablation", "guided-filter")
@@ -46,13 +48,13 @@ class EvidencePages:
 
 
 def command(name: str, config: EvidencePages) -> list[str]:
-    """The command line that makes a page, without `fprf`."""
+    """Name and flags of the benchmark that makes a page."""
     device, run = ["--device", config.device], str(config.runs / "town")
     if name == "restyle":
         files = ["--output", str(RESULTS / "restyle_town.json"), "--page", str(PAGES / "restyle.md")]
-        return ["bench", "restyle", run, *files, "--sheet", str(PAGES / "restyle.jpg"), *device]
+        return ["restyle", run, *files, "--sheet", str(PAGES / "restyle.jpg"), *device]
     files = ["--output", str(PAGES / f"paper-{name}.json"), "--page", str(PAGES / f"paper-{name}.md")]
-    table = ["bench", "paper", "--table", "reconstruction" if name in SCENES else name]
+    table = ["paper", "--table", "reconstruction" if name in SCENES else name]
     if name in SCENES:
         scene, smaller = SCENES[name]
         return [*table, "--data", str(config.scenes / scene), "--downscale", smaller, "--steps", "2000", *files, *device]
@@ -68,7 +70,7 @@ def main(argv: list[str]) -> int:
     wanted = config.only or NAMES
     run = config.runs / "town"
     if {"restyle", *STYLES} & set(wanted) and not (run / "style.safetensors").is_file():
-        train = ["train", "fprf-lite", "--data", "town", "--steps", str(config.steps), "--output", str(run)]
+        train = ["train", "fprf-lite", "--data", str(cached_town()), "--steps", str(config.steps), "--output", str(run)]
         if code := cli.main([*train, "--device", config.device]):
             return code
     worst = 0
@@ -76,6 +78,6 @@ def main(argv: list[str]) -> int:
         if name in SCENES and not (config.scenes / SCENES[name][0]).is_dir():
             print(f"{name}: skipped, no {config.scenes / SCENES[name][0]}", file=sys.stderr)
             continue
-        print("fprf " + " ".join(command(name, config)), file=sys.stderr)
-        worst = max(worst, cli.main(command(name, config)))
+        print("python -m benchmarks " + " ".join(command(name, config)), file=sys.stderr)
+        worst = max(worst, benchmark(command(name, config)))
     return worst

@@ -22,15 +22,16 @@ from pathlib import Path
 from typing import Any
 
 from .common import RESULTS, report
+from .town.write import cached_town
 
 SURROUNDINGS = "surroundings"
 
 
 def flags(options: argparse.Namespace, output: Path) -> list[str]:
     """`fprf train` of a town street, about 17 m of it in a block."""
-    words = f"""train fprf-lite --data town --output {output} --steps {options.steps} --device cpu --checkpoint-minutes 1
-        --datamanager.parser town --datamanager.parser.views {options.views} --datamanager.parser.width 96
-        --datamanager.parser.height 72 --datamanager.parser.extra {max(0, 17 * options.blocks - 26)} --datamanager.rays 2048
+    town = cached_town(views=options.views, width=96, height=72, extra=max(0, 17 * options.blocks - 26))
+    words = f"""train fprf-lite --data {town} --output {output} --steps {options.steps} --device cpu --checkpoint-minutes 1
+        --datamanager.rays 2048
         --blocks street --blocks.segments {options.blocks} --sampler.resolutions 64 --content.field.resolutions 16 32 64 128
         --semantic.field.resolutions 16 64"""
     return words.split()

@@ -16,7 +16,6 @@ from torch import Tensor
 from fprf.checks import at_least
 from fprf.cli.parsing import parse
 from fprf.errors import FprfError
-from fprf.evaluation.restyle import STYLIZERS
 from fprf.io.atomic import write_text
 from fprf.io.images import write_image
 from fprf.plugins.encoders.config import BundledSemanticConfig, EncoderConfig
@@ -25,6 +24,7 @@ from fprf.training.loading import Trained, load_run
 from . import style_runs
 from .common import ROOT, SHARED
 from .pictures import sheet
+from .restyle import STYLIZERS
 from .style_runs import PLAIN, Row, mean_rows
 from .styles import judges, observer, say
 

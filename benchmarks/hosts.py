@@ -3,8 +3,8 @@
     sudo python -m benchmarks hosts [--blocks 4] [--steps 200] [--output FILE]
 
 Linux, root, `ip` and the extra `cluster`. The hosts are two network namespaces of this machine with a cable between them; they
-share the file system, as `fprf cluster` asks for. Ray's head runs on the first, a worker on each. As soon as both train a block
-the second host is cut off and all its processes are killed.
+share the file system, as docs/large-scenes.md asks for. Ray's head runs on the first, a worker on each. As soon as both
+train a block the second host is cut off and all its processes are killed.
 """
 
 import json

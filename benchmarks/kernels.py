@@ -19,12 +19,8 @@ from torch import Tensor
 
 from fprf.config import RenderConfig
 from fprf.datamanagers.features import FeatureStore
-from fprf.evaluation.config import SpeedConfig
-from fprf.evaluation.report import Watch
-from fprf.evaluation.speed import STYLES
-from fprf.evaluation.subject import Subject, find, fresh_model, loop_of, stepper, test_view
 from fprf.fields import planes
-from fprf.ops import backend, dense, march, mixture, triplane, triplane_numba
+from fprf.ops import backend, dense, march, mixture, triplane
 from fprf.rendering import renderer, space
 from fprf.rendering.cameras import Cameras
 from fprf.style import matching
@@ -33,6 +29,9 @@ from fprf.style.restyle import restyle
 from fprf.training.views import render_view
 
 from .common import RESULTS, arguments, report
+from .report import Watch
+from .speed import STYLES, SpeedConfig
+from .subject import Subject, find, fresh_model, loop_of, stepper, test_view
 
 Patches = Sequence[tuple[object, str, object]]
 
@@ -53,7 +52,7 @@ def plain_lookups(store: FeatureStore, *given: Tensor) -> None:
 packed: dict[int, FeatureStore] = {}
 no_march = SimpleNamespace(usable=never)
 SWITCHES: dict[str, Patches] = {
-    "tri-planes": [(triplane_numba, "usable", never)],
+    "tri-planes": [(triplane, "usable", never)],
     "tri-planes: total variation": [(triplane, "variation", triplane.variation_reference)],
     "networks": [(dense, "network", dense.network_reference)],
     "marching": [(march, "usable", never)],

@@ -31,12 +31,12 @@ from fprf.datamanagers.config import RayBatchesConfig
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.methods import fprf_lite
 from fprf.plugins.samplers.config import ProposalConfig
-from fprf.town.write import write_town
 from fprf.training import block_plan, prepare, style_pass, trainer
 from fprf.training.checkpoint import load
 from fprf.training.checkpoint import steps as saved
 
 from .common import arguments, report
+from .town.write import write_town
 
 KILLED = -9
 PARTS = (block_plan, prepare, style_pass, trainer)

@@ -14,9 +14,6 @@ from torch import Tensor, nn
 from fprf.config import RenderConfig, TrainConfig
 from fprf.errors import ConfigError
 from fprf.evaluation.metrics import psnr
-from fprf.evaluation.report import Spread, Watch, spread
-from fprf.evaluation.speed import plain_planes, replaced
-from fprf.evaluation.subject import Subject, difference, plainly, view_rays
 from fprf.fields.planes import Planes
 from fprf.interfaces import SemanticField
 from fprf.plugins import slots
@@ -30,6 +27,10 @@ from fprf.training.quality import PRESETS, QualityConfig, at_quality
 from fprf.training.run import Run
 from fprf.training.trainer import Report, train
 from fprf.training.views import render_view
+
+from .report import Spread, Watch, spread
+from .speed import plain_planes, replaced
+from .subject import Subject, difference, plainly, view_rays
 
 BUDGETS = {"0": 0.0, "1/4096": 1 / 4096, "1/1024": 1 / 1024, "1/512": 1 / 512, "1/256": 1 / 256, "1/64": 1 / 64, "1/16": 1 / 16}
 SAMPLES = (0.25, 0.5, 0.75, 1.5, 2.0, 4.0)

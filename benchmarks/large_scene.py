@@ -26,7 +26,7 @@ from fprf.cli.train import train_scene
 from fprf.config import TrainConfig
 from fprf.datamanagers.config import RayBatchesConfig
 from fprf.datamanagers.images import load_image
-from fprf.datamanagers.parsers.config import TownConfig, parse_scene
+from fprf.datamanagers.parsers.config import parse_scene
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.fields.layouts import SingleConfig, StreetConfig
 from fprf.io.images import to_uint8, write_image
@@ -35,7 +35,6 @@ from fprf.plugins.samplers.config import ProposalConfig
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.restyle import apply_style
-from fprf.town.write import write_town
 from fprf.training import trainer
 from fprf.training.block_plan import lay_out, plan_scene
 from fprf.training.blocks import load_boxes
@@ -44,6 +43,7 @@ from fprf.training.views import render_view
 
 from .blocks import costs, jumps, ratios
 from .common import RESULTS, arguments, report
+from .town.write import cached_town, write_town
 
 METRES = 17.0
 """Of street in a block."""
@@ -53,19 +53,18 @@ PALETTES = ("sunset", "autumn", "winter")
 def configs(options: argparse.Namespace) -> tuple[TrainConfig, TrainConfig]:
     """Blocks, and the single field with as many parameters as all of them and their surroundings."""
     lite, n = fprf_lite(), options.blocks
-    town = TownConfig(
-        views=options.views, width=options.size[0], height=options.size[1], extra=max(0.0, round(METRES * n - 26.0))
-    )
+    width, height = options.size
+    town = cached_town(views=options.views, width=width, height=height, extra=max(0.0, round(METRES * n - 26.0)))
     nodes = tuple(options.nodes)
     blocks = replace(
         lite,
-        data=Path("town"),
+        data=town,
         output=options.scratch / "blocks",
         steps=10**6,
         minutes=options.minutes,
         device="cpu",
         checkpoint_minutes=60.0,
-        datamanager=RayBatchesConfig(rays=options.rays, semantic_share=0.25, parser=town),
+        datamanager=RayBatchesConfig(rays=options.rays, semantic_share=0.25),
         sampler=replace(lite.sampler, resolutions=(nodes[-1] // 2,)),
         content=replace(lite.content, field=PlanesConfig(resolutions=nodes, channels=16, hidden=64, layers=1)),
         semantic=replace(lite.semantic, field=replace(lite.semantic.field, resolutions=(nodes[0], nodes[-2]))),

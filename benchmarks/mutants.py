@@ -224,7 +224,6 @@ def _with(node: ast.AST, **changes: object) -> ast.AST:
 MODULES: dict[str, tuple[str, ...]] = {
     "fprf/ops/march.py": ("ops/test_march.py",),
     "fprf/ops/triplane.py": ("ops/test_triplane.py",),
-    "fprf/ops/triplane_numba.py": ("ops/test_triplane.py",),
     "fprf/ops/dense.py": ("ops/test_dense.py",),
     "fprf/ops/guided.py": ("ops/test_guided.py",),
     "fprf/ops/mixture.py": ("ops/test_mixture.py",),
@@ -249,7 +248,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "fprf/rendering/splines.py": ("rendering/test_splines.py",),
 }
 """Each numerics module and its tests."""
-COMPILED = ("_kernels.py", "lanes.py", "simd.py", "triplane_numba.py")
+COMPILED = ("_kernels.py", "lanes.py", "simd.py")
 THIRD_PARTY = (
     "torch",
     "torch.distributed.tensor",

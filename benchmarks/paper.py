@@ -11,15 +11,12 @@ from typing import Annotated, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from fprf.cli.bench import write_report
 from fprf.cli.parsing import load_field_method, parse
 from fprf.cli.progress import Display
 from fprf.config import TrainConfig
 from fprf.datamanagers.images import load_image
 from fprf.errors import UsageError
 from fprf.evaluation.metrics import image_metrics, mean_metrics
-from fprf.evaluation.report import Column, markdown, provenance, words
-from fprf.evaluation.town_truth import Row, mean_rows, town_folder
 from fprf.interfaces import Decoder
 from fprf.plugins.decoders.config import DecoderConfig, MlpDecoderConfig, ResidualDecoderConfig
 from fprf.plugins.decoders.decoders import ColourHead
@@ -32,8 +29,11 @@ from fprf.training.style_pass import measure_style
 from fprf.training.trainer import Report, train
 from fprf.training.views import render_view
 
-from .common import origin
+from .common import origin, write_report
 from .paper_styles import Bench, PaperConfig, restyled, set_up, style_rows, styled_by_photographs
+from .report import Column, markdown, provenance, words
+from .town.write import scene_folder
+from .town_truth import Row, mean_rows, town_folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +126,7 @@ class Short(NamedTuple):
 
 def paper(config: PaperConfig, method: TrainConfig, name: str, progress: Progress) -> dict[str, Any]:
     """The document of one table; `method` is the config that `config.method` stands for, `name` that of its method."""
-    base = replace(method, data=config.data, downscale=config.downscale, device=config.device)
+    base = replace(method, data=scene_folder(config.data), downscale=config.downscale, device=config.device)
     base = replace(base, steps=config.steps, minutes=None, output=None)
     steps = config.steps
     if config.run is not None and config.table not in TRAINED:
@@ -160,7 +160,7 @@ def short_training(config: TrainConfig, folder: Path, progress: Progress) -> Sho
     prepared = prepare(config)
     run = Run(folder)
     run.root.mkdir(parents=True)
-    run.save_known(prepared.scene, config.data, prepared.facts)
+    run.save_known(prepared.scene, scene_folder(config.data), prepared.facts)
     last: list[Report] = []
 
     def report(event: Report) -> None:

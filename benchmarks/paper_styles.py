@@ -16,26 +16,8 @@ from torch import Tensor
 from fprf.checks import at_least, between
 from fprf.datamanagers.images import load_image
 from fprf.errors import DataError
-from fprf.evaluation.config import ReportConfig
 from fprf.evaluation.consistency import steadiness
 from fprf.evaluation.metrics import matched_regions, structure
-from fprf.evaluation.restyle import Shown, dictionary_of, in_scene, nothing, one_by_one
-from fprf.evaluation.single_image import encoded
-from fprf.evaluation.town_truth import (
-    Reference,
-    Row,
-    Stage,
-    code_classes,
-    match_rates,
-    mean_rows,
-    photograph,
-    places,
-    score,
-    set_stage,
-    town_settings,
-    true_views,
-    winners,
-)
 from fprf.interfaces import SceneView
 from fprf.io.images import shrink, to_uint8, write_image
 from fprf.plugins.encoders.config import Vgg19Config
@@ -51,7 +33,25 @@ from fprf.style.statistics import covariance, group_moments, moments
 from fprf.training.loading import Trained
 from fprf.training.views import cache_view
 
+from .common import ReportConfig
+from .restyle import Shown, dictionary_of, in_scene, nothing, one_by_one
+from .single_image import encoded
 from .style_runs import PLAIN, Exhibit, judge_exhibit
+from .town_truth import (
+    Reference,
+    Row,
+    Stage,
+    code_classes,
+    match_rates,
+    mean_rows,
+    photograph,
+    places,
+    score,
+    set_stage,
+    town_settings,
+    true_views,
+    winners,
+)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,15 +14,11 @@ from rich.table import Table
 from torch import Tensor
 
 from fprf.checks import at_least, positive
-from fprf.cli.bench import bench_run
 from fprf.datamanagers.images import load_image
 from fprf.errors import FprfError, UsageError
-from fprf.evaluation.config import BenchConfig
-from fprf.evaluation.report import Outcome, Watch, document, table
-from fprf.evaluation.subject import Subject, count, exact, find, settings, size_of, small_view, view_rays, watch_of
+from fprf.io.figures import number
 from fprf.io.images import Picture, write_image
 from fprf.io.maps import palette
-from fprf.io.report import number
 from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.rendering.cameras import Cameras
 from fprf.style.look import Restyle
@@ -31,7 +27,10 @@ from fprf.training.loading import Trained, load_run
 from fprf.training.prepare import scene_of
 from fprf.training.run import view_names
 
+from .common import BenchConfig, bench_run
 from .knobs import BUDGETS, Point, Scenes, as_rendered, front, measure, plain_settings, styled_settings, trained_points
+from .report import Outcome, Watch, document, table
+from .subject import Subject, count, exact, find, settings, size_of, small_view, view_rays, watch_of
 
 
 @dataclass(frozen=True, kw_only=True)

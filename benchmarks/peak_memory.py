@@ -15,13 +15,11 @@ from typing import Any
 
 from torch import nn
 
-from fprf.cli.bench import bench_run
 from fprf.errors import FprfError
-from fprf.evaluation.config import BenchConfig
-from fprf.evaluation.report import Outcome, Row, document, rows_table
-from fprf.evaluation.subject import attempt, find, fresh_model, settings
 
-from .common import ROOT
+from .common import ROOT, BenchConfig, bench_run
+from .report import Outcome, Row, document, rows_table
+from .subject import attempt, find, fresh_model, settings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +56,7 @@ def _do(part: str, asked: dict[str, Any]) -> float | None:
     """Most device memory in MiB, where the device has its own."""
     import torch
 
-    from fprf.evaluation.subject import find, fresh_model, loop_of, test_view
+    from .subject import find, fresh_model, loop_of, test_view
 
     if part == "import":
         return None

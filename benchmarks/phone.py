@@ -24,10 +24,10 @@ from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import UsageError
 from fprf.io.atomic import write_json
 from fprf.io.images import to_uint8, write_image
-from fprf.town.write import write_town
 
 from .common import ROOT, report
 from .pictures import sheet, town_reference
+from .town.write import write_town
 
 sys.path.insert(0, str(ROOT / "tests" / "reconstruction"))  # the tests' own measure of poses
 

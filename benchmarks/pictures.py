@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from fprf.io.images import Picture, to_uint8
-from fprf.town.layout import build_town
-from fprf.town.palettes import palette
-from fprf.town.render import render, walk
+
+from .town.layout import build_town
+from .town.palettes import palette
+from .town.render import render, walk
 
 BAR = 18
 GAP = 4

@@ -2,7 +2,7 @@
 
     python -m benchmarks poses [SCENE] [--method NAME] [--steps 3000] [--degrees 0.5] [--share 0.005] [--output FILE] -- [field]
 
-Without a scene, the embedded town. Its training views are turned by so many degrees about random axes and shifted by a share of
+Without a scene, the town. Its training views are turned by so many degrees about random axes and shifted by a share of
 the cameras' extent in random directions; then it is trained with its true poses, with the wrong ones, and with the wrong ones
 refined, for the same steps. A folder whose poses are not exact (`--as-given`) is trained as it is, with and without refining.
 
@@ -30,6 +30,7 @@ from fprf.training.camera_optimizers import rotated
 from fprf.training.loading import open_run
 
 from .common import add_entry, arguments, split_flags
+from .town.write import scene_folder
 
 
 def perturbed(source: Path, folder: Path, degrees: float, share: float, seed: int) -> Path:
@@ -121,7 +122,7 @@ def main(argv: list[str]) -> None:
     own, flags_behind = split_flags(argv)
     options = parser.parse_args(own)
     method, _ = load_method(options.method)
-    flags = ["--data", str(options.scene), "--steps", str(options.steps), *flags_behind]
+    flags = ["--data", str(scene_folder(options.scene)), "--steps", str(options.steps), *flags_behind]
     base = parse(method, flags, prog="poses", description="")
     base = replace(base, downscale=base.downscale or 1)
     source = base.read_scene().paths[0].parents[1]

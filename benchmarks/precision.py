@@ -17,8 +17,6 @@ from torch import Tensor
 
 from fprf.config import TrainConfig
 from fprf.datamanagers.parsers.config import parse_scene
-from fprf.evaluation.report import machine
-from fprf.evaluation.subject import batch_rays
 from fprf.ops.backend import plain
 from fprf.rendering.renderer import render_rays
 from fprf.training import checkpoint
@@ -28,6 +26,8 @@ from fprf.training.run import Run
 from fprf.types import Want
 
 from .common import RESULTS, arguments, report
+from .report import machine
+from .subject import batch_rays
 
 
 class Rounded(torch.autograd.Function):

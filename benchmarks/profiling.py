@@ -22,17 +22,17 @@ from torch.autograd.profiler import profile as recording
 from torch.profiler import record_function
 
 from fprf.checks import at_least
-from fprf.cli.bench import bench_run
-from fprf.evaluation.config import BenchConfig
-from fprf.evaluation.report import Outcome, Spread, Watch, document, table
-from fprf.evaluation.speed import replaced
-from fprf.evaluation.subject import attempt, find, fresh_model, loop_of, settings, stepper, test_view, view_rays, watch_of
 from fprf.interfaces import Stylizer
 from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.rendering.renderer import render_rays
 from fprf.style.restyle import restyle
 from fprf.training.model import Model, background_of
 from fprf.types import Rays, Want
+
+from .common import BenchConfig, bench_run
+from .report import Outcome, Spread, Watch, document, table
+from .speed import replaced
+from .subject import attempt, find, fresh_model, loop_of, settings, stepper, test_view, view_rays, watch_of
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,15 +12,13 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from fprf.cli.bench import bench_run
-from fprf.evaluation.config import SpeedConfig
-from fprf.evaluation.report import Outcome, Row, Watch, document, rows_table, spread
-from fprf.evaluation.speed import draw_points, largest_planes
-from fprf.evaluation.subject import find, settings, watch_of
 from fprf.ops import triplane
 from fprf.training.loading import Trained
 
-from .common import origin
+from .common import bench_run, origin
+from .report import Outcome, Row, Watch, document, rows_table, spread
+from .speed import SpeedConfig, draw_points, largest_planes
+from .subject import find, settings, watch_of
 
 COPIED = 1 << 28
 """Bytes of the copy: more than caches hold."""
@@ -101,7 +99,7 @@ def _size(tensor: Tensor) -> int:
 
 
 def main(argv: list[str]) -> int:
-    """`python -m benchmarks roofline [RUN]`, with the flags of `fprf bench speed`."""
+    """`python -m benchmarks roofline [RUN]`, with the flags of `python -m benchmarks speed`."""
     return bench_run("python -m benchmarks roofline", SpeedConfig(), argv, roofline)
 
 

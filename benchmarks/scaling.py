@@ -8,17 +8,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fprf.checks import at_least
-from fprf.cli.bench import bench_run
-from fprf.evaluation.config import BenchConfig
-from fprf.evaluation.report import Outcome, Spread, document, spread, table
-from fprf.evaluation.speed import draw_points, forward_backward, largest_planes
-from fprf.evaluation.subject import Subject, attempt, find, settings, test_view, watch_of
-from fprf.io.report import number
+from fprf.io.figures import number
 from fprf.ops import triplane
 from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.style.restyle import restyle
 from fprf.training.prepare import Prepared
 from fprf.training.views import render_view
+
+from .common import BenchConfig, bench_run
+from .report import Outcome, Spread, document, spread, table
+from .speed import draw_points, forward_backward, largest_planes
+from .subject import Subject, attempt, find, settings, test_view, watch_of
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,11 +25,11 @@ from fprf.errors import DataError, FprfError
 from fprf.evaluation.metrics import MIXED, whole_cells
 from fprf.interfaces import Encoder
 from fprf.plugins.encoders.config import SEMANTICS, EncoderConfig
-from fprf.town.layout import build_town
-from fprf.town.palettes import PALETTES, palette
-from fprf.town.render import colours, geometry, walk
 
 from .common import RESULTS, SHARED, report
+from .town.layout import build_town
+from .town.palettes import PALETTES, palette
+from .town.render import colours, geometry, walk
 
 COLOURS = ("black", "white", "blue", "green", "red", "yellow", "magenta", "cyan", "grey")
 """Names by region id."""

@@ -61,7 +61,7 @@ def main(argv: list[str]) -> None:
 
 
 def report(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    from fprf.evaluation.report import provenance
+    from .report import provenance
 
     return {"threads": 1, "seconds": "of the processor, kernels compiled", "captures": rows, **provenance("cpu")}
 

@@ -10,14 +10,10 @@ import torch
 from torch import Tensor
 
 from fprf.checks import at_least
-from fprf.cli.bench import bench_run
 from fprf.config import RenderConfig
 from fprf.datamanagers.bounds import find_space
 from fprf.datamanagers.scene import Scene
 from fprf.errors import FprfError
-from fprf.evaluation.config import BenchConfig
-from fprf.evaluation.report import Outcome, machine, table
-from fprf.evaluation.subject import attempt, exact, find, settings, test_view, view_rays
 from fprf.io.atomic import write_text
 from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.rendering.cameras import Cameras
@@ -30,8 +26,11 @@ from fprf.training.loading import Trained
 from fprf.training.model import Facts, Model, background_of
 from fprf.types import Rays, Want
 
+from .common import BenchConfig, bench_run
 from .readers import fuzz, targets
+from .report import Outcome, machine, table
 from .stress_operators import Check, clusters, guided, markdown, matching, sampling, statistics, stylizers, weights
+from .subject import attempt, exact, find, settings, test_view, view_rays
 
 
 @dataclass(frozen=True, kw_only=True)

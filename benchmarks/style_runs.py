@@ -15,12 +15,9 @@ import torch
 from torch import Tensor
 
 from fprf.datamanagers.images import load_image
-from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import DataError
 from fprf.evaluation.consistency import consistency
 from fprf.evaluation.metrics import contrast_kept, matched_regions, region_contrasts, ssim, structure, style_distances
-from fprf.evaluation.restyle import STYLIZERS
-from fprf.evaluation.single_image import histogram_matching, reinhard
 from fprf.interfaces import Encoder
 from fprf.io.images import shrink, to_uint8, write_image
 from fprf.style.config import StyleConfig
@@ -28,11 +25,13 @@ from fprf.style.controls import luma
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
 from fprf.style.restyle import apply_style
-from fprf.town.write import read_truth
 from fprf.training.loading import Trained, load_run
 from fprf.training.views import cache_view
 
 from .pictures import SETS, town_reference
+from .restyle import STYLIZERS
+from .single_image import histogram_matching, reinhard
+from .town.write import is_town, read_truth
 
 PLAIN = "unstylised"
 RECOMMENDED = "region-tone"
@@ -245,10 +244,8 @@ def suited(pairings: Path, styles: Path, longest: int) -> Callable[[Trained, Pat
 
 def town_folder(trained: Trained) -> Path | None:
     """Where the truth of a run's town lies; None where it is another scene."""
-    if trained.known.name != "town":
-        return None
-    scene = parse_scene(trained.config.data, trained.config.downscale, trained.config.datamanager.parser)
-    return scene.paths[0].parents[1]
+    folder = trained.config.data
+    return folder if folder is not None and is_town(folder) else None
 
 
 def _middle(count: int, views: int) -> list[int]:

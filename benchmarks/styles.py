@@ -27,15 +27,12 @@ from fprf.datamanagers.basis import Basis, fit_basis
 from fprf.datamanagers.config import GuidedConfig
 from fprf.datamanagers.images import load_image
 from fprf.errors import FprfError
-from fprf.evaluation.restyle import STYLIZERS
-from fprf.evaluation.single_image import encoded, flat_look, flat_scene, render_flat
 from fprf.interfaces import Decoder, Encoder
 from fprf.io.images import shrink, write_image
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import (
     BundledContentConfig,
     BundledSemanticConfig,
-    DeepLabConfig,
     EncoderConfig,
     RandomConfig,
     Vgg19Config,
@@ -46,7 +43,9 @@ from fprf.style.dictionary import Reference, build_dictionary
 from . import style_runs
 from .common import RESULTS, SHARED, report
 from .pictures import sheet
+from .restyle import STYLIZERS
 from .semantic_matching import COLOURS, Triplet, read_triplets, triplet_names
+from .single_image import encoded, flat_look, flat_scene, render_flat
 from .style_runs import GOALS, PLAIN, RECOMMENDED, Exhibit, Row, colour_baselines, judge_exhibit, mean_rows, verdict
 
 DIM, REGIONS, CLUSTERS = 32, 16, 20
@@ -228,9 +227,8 @@ def judges(shared: Path) -> dict[str, Encoder]:
 
 
 def observer(shared: Path, otherwise: EncoderConfig) -> Encoder:
-    """Who finds the regions of runs: DeepLab where its weights are."""
-    weights = shared / "weights/deeplabv3_mobilenetv2_pascal.safetensors"
-    return DeepLabConfig(weights=weights).build() if weights.is_file() else otherwise.build()
+    """Who finds the regions of runs."""
+    return otherwise.build()
 
 
 def say(line: str) -> None:

@@ -31,6 +31,7 @@ import torch
 from safetensors.torch import load_file
 
 from .common import RESULTS, ROOT, arguments, report
+from .town.write import cached_town
 
 sys.path.insert(0, str(ROOT / "tests" / "viewer"))
 
@@ -120,7 +121,7 @@ def training(run: Path, references: list[Path], steps: int) -> dict[str, object]
 
 def trained(root: Path, view: list[str], steps: int, *, look: bool) -> dict[str, float]:
     """Seconds of the training part alone (events.jsonl), and processor seconds of all that the command did."""
-    command = [sys.executable, "-m", "fprf", "train", "fprf-lite", "--data", "town", "--steps", str(steps)]
+    command = [sys.executable, "-m", "fprf", "train", "fprf-lite", "--data", str(cached_town()), "--steps", str(steps)]
     with subprocess.Popen(
         [*command, "--device", "cpu", "--output", str(root), *view], stderr=subprocess.PIPE, text=True
     ) as process:

@@ -183,7 +183,7 @@ class RunConfig:
     """Fields of files written before that mean nothing any more."""
 
     data: Path | None = None
-    """Scene folder, which must be named; `town` is the embedded one."""
+    """Scene folder, which must be named; `garden` is the embedded one."""
     output: Path | None = None
     """Run folder; by default runs/SCENE-METHOD. A folder with a run in it is resumed."""
     downscale: int | None = None

@@ -6,19 +6,16 @@ from typing import Any
 
 import pytest
 
+from benchmarks.restyle import RestyleConfig
 from fprf.config import LossConfig, OptimizerConfig, RenderConfig, SemanticConfig, StatisticsConfig, TrainConfig
 from fprf.errors import ConfigError
-from fprf.evaluation.config import RestyleConfig
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.fields.layouts import AdaptiveConfig, GridConfig, StreetConfig
 from fprf.plugins.decoders.config import ResidualDecoderConfig
 from fprf.plugins.encoders.config import (
-    AveragedConfig,
     ConcatConfig,
-    DeepLabConfig,
     DinoConfig,
     Dinov2Config,
-    MobileNetV2Config,
     RandomConfig,
     Vgg16Config,
     Vgg19Config,
@@ -66,11 +63,8 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
     RandomConfig: {"channels": [0], "stride": [0], "seed": [-1]},
     Vgg16Config: {"layer": ["relu3_4", "fc7"]},
     Vgg19Config: {"layer": ["relu0_1", "relu2_3", "relu2_1 "]},
-    MobileNetV2Config: {"layer": ["features.19", "13", "features.013"]},
-    DeepLabConfig: {"layer": ["backbone.18", "logits2"]},
     DinoConfig: {"layer": [0], "stride": [0]},
     Dinov2Config: {"layer": [0], "stride": [0]},
-    AveragedConfig: {"scales": [(), (0.0,), (nan,)]},
     ConcatConfig: {"weights": [(0.0,), (1.0, -1.0), (inf,)]},
     LocalAdainConfig: {"temperature": [0.0, nan, inf]},
     RegionAdainConfig: {"temperature": [-1.0], "gain": [0.99]},

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.town.write import write_town
+from benchmarks.town_truth import Stage, set_stage, town_settings
 from fprf.cli.train import train_scene
 from fprf.config import StatisticsConfig, TrainConfig
 from fprf.datamanagers.config import RayBatchesConfig
-from fprf.evaluation.town_truth import Stage, set_stage, town_settings
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.interfaces import DataManager
 from fprf.io.images import write_image
@@ -20,7 +21,6 @@ from fprf.methods import fprf_lite
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.plugins.samplers.config import ProposalConfig
 from fprf.rendering.cameras import PixelRays
-from fprf.town.write import write_town
 from fprf.training.loading import Trained, load_run
 from fprf.training.model import Model, build_model
 from fprf.training.prepare import Prepared, prepare

@@ -1,5 +1,6 @@
 """`fprf eval RUN`: measure a run on views it has not seen."""
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from ..config import RunConfig
     from ..datamanagers.images import Image
     from ..datamanagers.scene import Scene
-    from ..training.run import Known
+    from ..training.run import History, Known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +37,8 @@ class EvalConfig(QualityConfig):
     metrics.json then says how far they were moved."""
     images: bool = True
     """Write the renders to RUN/renders/SPLIT."""
+    tensorboard: Path | None = None
+    """A folder for how training went, as event files of TensorBoard (extra tensorboard): `tensorboard --logdir` shows them."""
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
 
@@ -44,7 +47,12 @@ def run(args: list[str]) -> int:
     """Render the split, write metrics.json, print a table."""
     description = "Measure a run: PSNR, SSIM, speed, memory, consistency over views."
     config = parse(EvalConfig(), args, prog="fprf eval", description=description, positional=("run",))
-    _print(verbs_of(config.run).evaluate(config))
+    metrics = verbs_of(config.run).evaluate(config)
+    if config.tensorboard is not None:
+        from ..training.run import read_history
+
+        write_scalars(config.tensorboard, read_history(config.run))
+    _print(metrics)
     return 0
 
 
@@ -92,6 +100,31 @@ def store(
         names = [known.names[v] for v in views]
         write_frames(config.run / "renders" / config.split, names, images)
     return metrics
+
+
+def write_scalars(folder: Path, histories: "Sequence[History]") -> int:
+    """One run of TensorBoard for the training and each block, replaced if it is there; how many values were written.
+
+    Times are those of training, so that a resumed run has no gap. Raises UsageError without the package `tensorboard`.
+    """
+    try:
+        from torch.utils.tensorboard.writer import SummaryWriter
+    except ImportError as fault:
+        raise UsageError("--tensorboard: the package tensorboard is not installed; pip install 'fprf[tensorboard]'") from fault
+    written = 0
+    for history in histories:
+        place = folder / (history.name or "training")
+        shutil.rmtree(place, ignore_errors=True)
+        writer = SummaryWriter(str(place))
+        try:
+            for name, values in history.values.items():
+                for step, seconds, value in zip(history.step, history.seconds, values, strict=True):
+                    if value is not None:
+                        writer.add_scalar(name, value, step, walltime=seconds)
+                        written += 1
+        finally:
+            writer.close()
+    return written
 
 
 def _print(metrics: dict[str, object]) -> None:

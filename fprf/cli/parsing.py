@@ -191,8 +191,6 @@ _SCALARS = {bool: "True or False", int: "a whole number", float: "a number", str
 
 
 C = TypeVar("C")
-LIST_FLAGS = "--list-flags"
-"""Asks any verb for its flags, one a line: for shells that complete them."""
 DESCRIBE = "--describe"
 """Asks any verb for all of its flags with their meanings, as JSON."""
 _COLUMNS = 100
@@ -205,9 +203,6 @@ def parse(default: C, args: Sequence[str], *, prog: str, description: str, posit
     `none` empties whatever may be None. Fields named in `positional` are given without a flag, in that order, and must
     be given. `--help` prints all of it and exits. Raises UsageError, PluginError or ConfigError with one line.
     """
-    if LIST_FLAGS in args:
-        print("\n".join(sorted({*flags_of(default), *(f"--{_dashed(slot.path)}" for slot in slots(default))})))
-        raise SystemExit(0)
     if DESCRIBE in args:
         print(describe(default, prog=prog, description=description, positional=positional))
         raise SystemExit(0)

@@ -14,6 +14,7 @@ from ..errors import PluginError
 from ..fields.config import ContentFieldConfig, SemanticFieldConfig
 from ..fields.layouts import LayoutConfig
 from ..plugins import registry
+from ..plugins.captures import CaptureFormat
 from ..plugins.config import PluginConfig
 from ..plugins.decoders.config import DecoderConfig
 from ..plugins.encoders.config import EncoderConfig
@@ -36,6 +37,7 @@ KINDS: dict[str, tuple[type[PluginConfig], ...]] = {
     "fprf.dataparsers": (DataParserConfig,),
     "fprf.executors": (ExecutorConfig,),
     "fprf.losses": (LossTermConfig,),
+    "fprf.captures": (CaptureFormat,),
     "fprf.commands": (CommandConfig,),
 }
 """The groups of configs, and what a plug-in of each must derive from."""

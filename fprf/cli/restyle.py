@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from ..checks import at_least
 from ..errors import CheckpointError, UsageError
+from ..plugins.captures import endings, format_name
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from ..splats.config import LookConfig
 from ..style.config import StyleConfig
@@ -26,9 +27,9 @@ if TYPE_CHECKING:
 _KEPT = 24
 """Captures of which the cache keeps what was found out."""
 
-_DESCRIPTION = """Restyle a finished capture of 3D Gaussians with photographs; its own photographs and cameras are not needed.
+_DESCRIPTION = f"""Restyle a finished capture of 3D Gaussians with photographs; its own photographs and cameras are not needed.
 
-Reads and writes .ply, .compressed.ply, .splat, .spz, .sog and SOG folders (meta.json); the output's ending says which. In the
+Reads and writes {", ".join(endings())} and SOG folders (meta.json); the output's ending says which. In the
 format that was read everything but colours is kept bit for bit. REGION is a region's number (--explain lists them), its name
 in a style file, VIEW:X,Y (a pixel of a view) or VIEW:MASK.png; in --pin also a place: box:X,Y,Z:X,Y,Z:BORDER,
 path:X,Y,Z:X,Y,Z:WIDTH,BORDER or everywhere. REFERENCE is a file or its number, from 0 in the order given."""
@@ -117,12 +118,11 @@ def run(args: list[str]) -> int:
 
 def _check(config: RestyleConfig) -> None:
     """Raise UsageError for what cannot be written, before anything takes time."""
-    from ..splats.files import ENDINGS
-
     if config.output is None and not (config.sheet or config.page or config.explain):
         raise UsageError("fprf restyle: name what to write, with --output, --sheet, --page or --explain")
-    if config.output is not None and not config.output.name.lower().endswith(ENDINGS):
-        raise UsageError(f"--output {config.output}: no file of Gaussians by its name; known endings are {', '.join(ENDINGS)}")
+    if config.output is not None and format_name(config.output) is None:
+        known = ", ".join(endings())
+        raise UsageError(f"--output {config.output}: no file of Gaussians by its name; known endings are {known}")
     if config.page is not None and config.page.suffix.lower() != ".html":
         raise UsageError(f"--page {config.page}: the page is an .html file; give such a name")
     if not config.references and not config.explain:

@@ -82,7 +82,8 @@ class SplatVerbs(Verbs):
 
     def export(self, config: "ExportConfig", file: "StyleFile") -> None:
         from ..export.config import Plan, look_file, make_looks, styles_of
-        from ..splats.files import ENDINGS, write_gaussians, write_ply_parts
+        from ..plugins.captures import format_name
+        from ..splats.files import write_gaussians, write_ply_parts
         from ..splats.training import open_gaussians
         from ..training.checkpoint import digest
         from ..training.quality import QualityConfig
@@ -98,7 +99,7 @@ class SplatVerbs(Verbs):
         if config.fit:
             raise UsageError("--fit: the run is of Gaussians already; leave it out")
         output = config.output or config.run / "exports"
-        kinds, gaussians = tuple(dict.fromkeys(config.kinds or _KINDS[:2])), output.name.lower().endswith(ENDINGS)
+        kinds, gaussians = tuple(dict.fromkeys(config.kinds or _KINDS[:2])), format_name(output) is not None
         table = output.suffix.lower() == ".json" and not gaussians
         single = (gaussians or table) and not output.is_dir()
         if single and config.kinds and table != ("cameras" in kinds):

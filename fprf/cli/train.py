@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import UsageError
 from .blocks import train_blocks
-from .parsing import LIST_FLAGS, load_method, methods, parse
+from .parsing import load_method, methods, parse
 from .progress import EventLog
 from .view import check_viewer
 
@@ -98,8 +98,6 @@ def run(args: list[str]) -> int:
         config = replace(config, output=source.parent)
     rest, place = take_view(args[1:])
     flags, others = [arg for arg in rest if arg not in (PLAN, CHANGED)], CHANGED in rest
-    if LIST_FLAGS in flags:
-        print(f"{PLAN}\n{VIEW}\n{CHANGED}")
     about = (
         f"Train a scene with {method}. {PLAN} alone shows its blocks and what they will cost, and runs nothing;\n"
         f"{VIEW} [[HOST:]PORT] shows training live in the browser, at http://127.0.0.1:8080 if nothing is said;\n"

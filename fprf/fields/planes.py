@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ..interfaces import ContentField, SemanticField
-from ..ops import dense, march, triplane, triplane_numba
+from ..ops import dense, march, triplane
 from ..types import FieldSample
 from .config import PlanesConfig, SemanticPlanesConfig
 
@@ -179,4 +179,4 @@ class ProposalField(nn.Module):
 
     def kernels_apply(self, *tensors: Tensor) -> bool:
         """Return whether `ops.march.propose` may read the planes: without gradients, on the CPU, channels in whole vectors."""
-        return march.usable(*tensors) and triplane_numba.usable(tensors[0], self.planes.table)
+        return march.usable(*tensors) and triplane.usable(tensors[0], self.planes.table)

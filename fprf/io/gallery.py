@@ -14,9 +14,9 @@ from urllib.parse import quote
 
 from ..errors import DataError
 from .atomic import write_text
+from .figures import Metrics, figures, number
 from .images import Picture, data_uri, shrink, to_uint8
 from .maps import palette
-from .report import Metrics, figures, number
 
 _VIEW_SIDE, _MAP_SIDE, _SMALL_SIDE, _TINY_SIDE = 1024, 512, 224, 80
 """Longest sides in pixels of embedded views, of maps and references, of the overview, and of thumbnails."""

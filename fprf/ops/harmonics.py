@@ -13,6 +13,7 @@ import functools
 import math
 from typing import Annotated, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -89,5 +90,6 @@ def recoloured(
 
     out = torch.empty_like(harmonics, memory_format=torch.contiguous_format)
     parts = (harmonics, change, weight, directions.values, directions.fit)
-    kernels.recolour(*(array(part.float()) for part in parts), len(directions.values), out.view(-1).numpy())
+    flat = [array(part.float()) for part in parts]
+    kernels.recolour(*flat, len(directions.values), np.float32(MAX_COLOUR), out.view(-1).numpy())
     return out

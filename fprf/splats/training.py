@@ -19,6 +19,7 @@ from ..datamanagers.parsers.config import parse_scene
 from ..datamanagers.scene import Scene, at_origin, find_sightings, sparser
 from ..errors import CheckpointError, NumericsError, UsageError
 from ..interfaces import Encoder
+from ..ops.rasterise_training import LOG_SCALES, MEANS, TrainableGaussians
 from ..rendering.cameras import Cameras
 from ..style.references import Encoders
 from ..training import checkpoint
@@ -88,7 +89,7 @@ def scene_of(config: GaussiansConfig, saved: Facts | None = None) -> Scene:
     Raises UsageError where it names none, DataError where that cannot be read.
     """
     if config.data is None:
-        raise UsageError("no scene is named: give --data FOLDER, or --data town for the embedded one")
+        raise UsageError("no scene is named: give --data FOLDER, or --data garden for the embedded one")
     scene = parse_scene(config.data, config.downscale or 1, config.parser)
     return scene if saved is None else at_origin(scene, saved.origin)
 
@@ -149,9 +150,9 @@ class _Sphere(NamedTuple):
         apart: Tensor = (means - self.centre).norm(dim=1)
         return apart < 0.5 * self.radius
 
-    def widest(self, means: Annotated[Floats, "B 3 L"]) -> Annotated[Floats, "B 1 L"]:
+    def widest(self, means: Annotated[Floats, "N 3"]) -> Annotated[Floats, "N"]:
         """Logarithms of the greatest standard deviations."""
-        square = np.square(means - self.centre.numpy()[:, None]).sum(1, keepdims=True)
+        square = np.square(means - self.centre.numpy()).sum(1)
         return np.where(square < (0.5 * self.radius) ** 2, np.float32(np.inf), np.float32(math.log(_WIDE * self.radius)))
 
 
@@ -171,17 +172,16 @@ def limit_widths(scene: Scene, near: float, *, cells: bool, sphere: _Sphere | No
         some = centres[apart <= 1.001 * (apart.amin() + 2 * radius)]
         return torch.cdist(points, some, compute_mode="donot_use_mm_for_euclid_dist").amin(1)
 
-    def narrow(rows: Annotated[Floats, "B R L"], step: int) -> None:
+    def narrow(gaussians: TrainableGaussians, step: int) -> None:
         if sphere is not None and step % 10 == 0:
-            np.minimum(rows[:, 3:6], sphere.widest(rows[:, :3]), out=rows[:, 3:6])
+            gaussians.limit_scales(sphere.widest(gaussians.read(MEANS)))
         if step % every:
             return
-        block, lane = np.nonzero(rows[:, 3:6].max(1) > math.log(share * near))
-        if not len(block):
-            return
-        points = torch.from_numpy(rows[block, :3, lane])
-        widest = torch.cat([share * nearest(part) for part in torch.split(points, _TOGETHER)]).clamp_min(1e-12).log()
-        rows[block, 3:6, lane] = np.minimum(rows[block, 3:6, lane], widest[:, None].numpy())
+        wide = np.flatnonzero(gaussians.read(LOG_SCALES).max(1) > math.log(share * near))
+        if len(wide):
+            points = torch.from_numpy(gaussians.read(MEANS, wide))
+            widest = torch.cat([share * nearest(part) for part in torch.split(points, _TOGETHER)]).clamp_min(1e-12).log()
+            gaussians.limit_scales(widest.numpy(), wide)
 
     return narrow
 

@@ -31,6 +31,8 @@ from ..interfaces import (
     SemanticField,
     Stylizer,
 )
+from ..ops.harmonics import HARMONIC
+from ..plugins.captures import CaptureFormat
 from ..plugins.config import Need, PluginConfig
 from ..plugins.decoders.config import DecoderConfig
 from ..plugins.encoders.config import EncoderConfig, RandomConfig
@@ -410,3 +412,45 @@ def _sample(sampler: Sampler, rays: Rays, seed: int | None) -> Sampled:
     step = None if seed is None else 10
     sampled: Sampled = sampler(rays, space=cases.space(), step=step, generator=generator)
     return sampled
+
+
+def check_capture_format(form: CaptureFormat) -> None:
+    """What it writes it reads again, as many Gaussians of the same places and colours; recolouring changes nothing else.
+
+    Damaged files end in DataError.
+    """
+    import numpy as np
+
+    from ..splats.gaussians import Gaussians
+
+    check_config(form)
+    name, path = type(form).__name__, Path("capture")
+    made = Gaussians(
+        cases.normal(50, 3, seed=30),
+        torch.nn.functional.normalize(cases.normal(50, 4, seed=31), dim=1),
+        cases.normal(50, 3, seed=32) - 3,
+        cases.normal(50, seed=33),
+        0.3 * cases.normal(50, 4 if form.view_dependent else 1, 3, seed=34),
+    )
+    data = form.pack(made, form.view_dependent, (0.0, 0.0, 0.0))
+    require(form.recognises(data[:64], len(data)), f"{name}.recognises: must be True of a file that it wrote")
+    read = form.read(path, data)
+    found, apart = read.gaussians, torch.cdist(made.means, read.gaussians.means)
+    require(len(found) == len(made), f"{name}: {len(found)} Gaussians come back of {len(made)}")
+    require(read.antialiased == form.view_dependent, f"{name}: whether opacities are compensated must come back")
+    order = apart.argmin(1)
+    same(found.means[order], made.means, 0.02, f"{name}: positions must come back")
+    same(found.colours[order], made.colours, 0.05, f"{name}: colours must come back")
+    require(read.data == data, f"{name}: Capture.data must be the file")
+    changed = np.arange(len(found)) % 2 == 0
+    new = torch.where(torch.from_numpy(changed)[:, None, None], 0.5 * found.harmonics, found.harmonics)
+    again = form.read(path, read.recolour(new.numpy(), changed)).gaussians
+    for part in ("means", "quaternions", "log_scales", "logits"):
+        same(getattr(again, part), getattr(found, part), 0.0, f"{name}.recolour: {part} must stay as they are")
+    same(again.colours, 0.5 + HARMONIC * new[:, 0], 0.05, f"{name}.recolour: the new colours must be there")
+    for wrong in (b"", data[: len(data) // 2]):
+        try:
+            shorter = len(form.read(path, wrong).gaussians)
+        except DataError:
+            continue
+        require(0 < shorter < len(made), f"{name}: a file that is cut off must raise DataError, or hold fewer Gaussians")

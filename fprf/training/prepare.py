@@ -76,7 +76,7 @@ def scene_of(config: TrainConfig, saved: Facts | None = None) -> Scene:
     Raises UsageError where it names none, DataError where that cannot be read.
     """
     if config.data is None:
-        raise UsageError("no scene is named: give --data FOLDER, or --data town for the embedded one")
+        raise UsageError("no scene is named: give --data FOLDER, or --data garden for the embedded one")
     size = with_downscale(config).downscale
     scene = parse_scene(config.data, size or 1, config.datamanager.parser)
     return scene if saved is None else at_origin(scene, saved.origin)
@@ -333,7 +333,7 @@ def decoder_needs(config: TrainConfig) -> list[Need]:
 def scene_needs(config: TrainConfig) -> list[Need]:
     """A scene folder that some parser reads."""
     if config.data is None:
-        return [Need("no scene is named", "give --data FOLDER, or --data town for the embedded scene")]
+        return [Need("no scene is named", "give --data FOLDER, or --data garden for the embedded scene")]
     if config.datamanager.parser is not None:
         return []
     try:

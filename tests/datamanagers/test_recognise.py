@@ -57,6 +57,15 @@ def test_formats_are_told_by_their_files(tmp_path: Path) -> None:
     assert recognise(tmp_path) == TransformsConfig()
 
 
+def test_the_embedded_garden_is_read_by_name_where_no_such_folder_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    scene = parse_scene(Path("garden"), 4, None)
+    assert scene.name == "garden" and len(scene.paths) == 25 and len(scene.test) == 4 and scene.points is not None
+    Path("garden").mkdir()
+    with pytest.raises(DataError, match="but nothing"):
+        parse_scene(Path("garden"), 4, None)
+
+
 PARSER = """
 from dataclasses import dataclass
 from fprf.datamanagers.parsers.config import DataParserConfig, Recognised

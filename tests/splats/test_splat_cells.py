@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.town.write import write_town
 from fprf.cli.main import main
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import Scene, find_sightings
@@ -20,7 +21,6 @@ from fprf.splats.cells import Cell, cut
 from fprf.splats.config import GaussiansConfig
 from fprf.splats.files import read_capture
 from fprf.splats.learner import MOVES
-from fprf.town.write import write_town
 from fprf.training.camera_optimizers import Tones
 from fprf.training.checkpoint import load_latest
 from fprf.training.loading import open_run

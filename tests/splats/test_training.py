@@ -15,6 +15,7 @@ from stand_in_viewers import GREEDY, viewer
 from torch import Tensor
 
 import fprf
+from benchmarks.town.write import write_town
 from fprf.cli import train as cli_train
 from fprf.cli.main import main
 from fprf.datamanagers.images import load_image, load_images
@@ -24,7 +25,7 @@ from fprf.errors import CheckpointError
 from fprf.evaluation.metrics import psnr
 from fprf.io.images import write_image
 from fprf.ops.rasterise import lift
-from fprf.ops.rasterise_training import learn
+from fprf.ops.rasterise_training import LOG_SCALES, TrainableGaussians
 from fprf.plugins.encoders.config import SEMANTICS, RandomConfig
 from fprf.rendering.cameras import Cameras, project
 from fprf.splats import initial, photographs, training
@@ -35,7 +36,6 @@ from fprf.splats.learner import Learner
 from fprf.splats.photographs import camera_of
 from fprf.splats.training import prepare, reach_of
 from fprf.splats.views import draw
-from fprf.town.write import write_town
 from fprf.training import checkpoint
 from fprf.training.camera_optimizers import Tones, moved_cameras
 from fprf.training.loading import open_run
@@ -150,13 +150,9 @@ def test_a_gaussian_learns_alike_however_late_it_is_seen(config: GaussiansConfig
     def learnt(order: list[int]) -> Tensor:
         learner = Learner(config, levels, 1.0, 32)
         learner.start_from(start)
-        moments = learner.first, learner.second, learner.weight
-        rates = np.full(learner.rows, 0.01, np.float32)
+        rates = np.full(learner.model.rows, 0.01, np.float32)
         for view in order:
-            learn(
-                learner.blocks, moments, 32, learner.bands, learner.splats, levels[0][view],
-                background=config.background, ssim=0.2, rates=rates,
-            )  # fmt: skip
+            learner.model.learn(levels[0][view], background=config.background, ssim=0.2, rates=rates)
         return torch.cat([part[16:].flatten() for part in vars(learner.gaussians()).values()])
 
     alone = learnt([1] * 3)
@@ -195,9 +191,7 @@ def test_tones_are_told_from_the_scene(config: GaussiansConfig, scene: Scene) ->
     wanted = torch.linspace(-0.3, 0.3, len(scene.paths))[:, None] * torch.tensor([1.0, 0.5, -0.5])
     for level in learner.levels:
         for view, target in level.items():
-            planes = target.planes[: len(target.planes) // 3 * 3]
-            area = -(-target.width // 16) * 16 * -(-target.height // 16) * 16
-            planes[: 3 * area].reshape(3, area)[:] *= wanted[view].exp().numpy()[:, None]
+            target.planes[: 3 * target.area].reshape(3, target.area)[:] *= wanted[view].exp().numpy()[:, None]
     stepped(learner, STEPS)
     train = scene.train
     assert learner.tones is not None
@@ -453,10 +447,12 @@ def test_the_nearest_of_many_cameras_is_found(scene: Scene, spread: float) -> No
     centre = 10 * torch.randn(400, 3, generator=draws, dtype=torch.float64)
     cameras = replace(cameras, pose=torch.cat([cameras.pose[:, :, :3], centre[:, :, None]], 2))
     means = 10 * torch.randn(60, 3, 1, generator=draws) + spread * torch.randn(60, 3, 16, generator=draws)
-    rows = np.concatenate([means.numpy(), np.full((60, 8, 16), 20, np.float32)], 1)
-    training.limit_widths(replace(scene, cameras=cameras, train=torch.arange(0, 400, 2)), 1e-3, cells=True)(rows, 0)
-    widest = rows[:, 3:4]
-    apart = (means[:, None].double() - centre[::2, :, None]).norm(dim=2).amin(1, keepdim=True)
+    means = means.transpose(1, 2).reshape(-1, 3)
+    gaussians = TrainableGaussians(len(means), bands=1)
+    gaussians.start(torch.cat([means, torch.full((len(means), 11), 20.0)], 1).numpy())
+    training.limit_widths(replace(scene, cameras=cameras, train=torch.arange(0, 400, 2)), 1e-3, cells=True)(gaussians, 0)
+    widest = gaussians.read(LOG_SCALES)
+    apart = (means[:, None].double() - centre[::2]).norm(dim=2).amin(1, keepdim=True)
     # Roundings of coordinates to float32, and of the logarithm.
     allowed = (4 * means.abs().max() + 16 * apart) * torch.finfo(torch.float32).eps
     assert ((torch.from_numpy(widest).double().exp() / 0.25 - apart).abs() <= allowed).all()

@@ -9,10 +9,10 @@ from typing import Any
 import torch
 from tiny_world import tiny
 
+from benchmarks.town.write import write_town
 from fprf.cli.train import train_scene
 from fprf.config import StatisticsConfig, TrainConfig
 from fprf.fields.layouts import LayoutConfig, StreetConfig
-from fprf.town.write import write_town
 from fprf.training import tensorfiles
 from fprf.training.blocks import folder_of
 

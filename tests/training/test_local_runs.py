@@ -140,7 +140,7 @@ def test_gaussians_are_as_good_and_lie_where_the_capture_is(world: World, splats
 def test_cells_and_blocks_are_in_the_local_frame(world: World, utm: Path, tmp_path: Path) -> None:
     town = world.folder / "wide"
     if not town.exists():
-        from fprf.town.write import write_town
+        from benchmarks.town.write import write_town
 
         write_town(town, seed=0, palette="day", views=10, width=96, height=72)
     scores = []

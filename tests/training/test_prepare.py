@@ -90,7 +90,7 @@ def test_a_config_gets_the_size_of_its_scene(world: World) -> None:
     assert config == world.config and with_downscale(config) is config
     half = scene_of(replace(config, downscale=2))
     assert half.cameras.size[0].tolist() == [16, 12]
-    with pytest.raises(UsageError, match="--data FOLDER, or --data town"):
+    with pytest.raises(UsageError, match="--data FOLDER, or --data garden"):
         scene_of(replace(config, data=None))
 
 

@@ -11,6 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.town.write import write_town
 from fprf.blocks.plan import boxes_to
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import Scene
@@ -22,7 +23,6 @@ from fprf.rendering.space import Space
 from fprf.splats import cell_training
 from fprf.splats.cell_training import OVERVIEW, read_cells, write_cells
 from fprf.splats.config import GaussiansConfig
-from fprf.town.write import write_town
 from fprf.training import blocks, checkpoint, tensorfiles
 from fprf.training.block_plan import trained_tasks
 from fprf.training.blocks import load_boxes, load_finished, read_done

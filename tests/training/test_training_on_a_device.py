@@ -1,10 +1,6 @@
 """Training on the pretended device gives what the CPU gives, and the host neither waits nor copies in a step."""
 
-import importlib.util
-import os
 import shutil
-import subprocess
-import sys
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -254,53 +250,3 @@ def test_a_block_is_trained_on_a_device(block_world: BlockWorld, tmp_path: Path,
     assert found.keys() == expected.keys()
     for key, value in expected.items():
         assert (found[key] - value).double().norm() <= 1e-5 * value.double().norm(), key
-
-
-TRITON = """
-import sys
-from collections import Counter
-from pathlib import Path
-import pytest
-from pretend_cuda import pretend_cuda
-from test_training_on_a_device import Steps, trained
-from fprf.ops import triplane_triton
-from fprf.training.run import Run
-
-taken, steps = Counter(), Steps(pytest.MonkeyPatch())
-
-def counting(name, function):
-    def call(points, table, *args, **kwargs):
-        taken[name] += len(points) > 5  # not the few that a new model is asked
-        return function(points, table, *args, **kwargs)
-    return call
-
-for name in ("forward", "backward"):
-    setattr(triplane_triton, name, counting(name, getattr(triplane_triton, name)))
-run = Run(Path(sys.argv[1]))
-with pretend_cuda(triton=True) as steps.seen:
-    trained(run.load_config()[0], run.root)
-print(taken["forward"], taken["backward"], sum(steps.waits))
-"""
-
-
-@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="triton is not installed")
-def test_kernels_of_the_device_are_taken(world: World, tmp_path: Path) -> None:
-    """Tri-planes by Triton, also where proposals are trusted and learn nothing in a step.
-
-    Triton is told to interpret its kernels before it is imported, so in a process of its own.
-    """
-    sampler = replace(world.config.sampler, anneal_steps=0, warm_up=1, update_every=2)
-    batches = replace(world.config.datamanager, rays=16)
-    config = replace(world.config, steps=2, device="cuda:0", datamanager=batches, sampler=sampler)
-    run = Run(tmp_path / "triton")
-    run.root.mkdir()
-    run.save_config(config, "fprf-lite")
-    here = Path(__file__).resolve().parent
-    environment = {**os.environ, "TRITON_INTERPRET": "1", "PYTHONPATH": f"{here}{os.pathsep}{here.parent}"}
-    command = [sys.executable, "-c", TRITON, str(run.root)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    # Of each step: proposals, content and semantics look up their planes; the proposals learn in the first one.
-    assert done.stdout.split() == ["6", "5", "0"]
-    # One parameter in some thousands has a gradient that is rounding alone.
-    agrees(run, config, tmp_path, within=0.05, train=on_device)

@@ -107,37 +107,17 @@ class ColmapConfig(DataParserConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TownConfig(DataParserConfig):
-    """The embedded scene: a small procedural town, rendered when it is asked for."""
-
-    seed: int = 0
-    """Decides where houses, trees and cars stand."""
-    palette: str = "day"
-    """Light and colours."""
-    views: int = 40
-    """Number of images."""
-    width: int = 160
-    """Pixels across an image."""
-    height: int = 120
-    """Pixels down an image."""
-    extra: float = 0.0
-    """Metres by which the street is longer than the usual 49: a scene for many blocks."""
-
-    def __post_init__(self) -> None:
-        at_least("parser.extra", self.extra, 0.0)
-        at_least("parser.seed", self.seed, 0)
-        at_least("parser.views", self.views, 2)
-        at_least("parser.width", self.width, 8)
-        at_least("parser.height", self.height, 8)
+class GardenConfig(DataParserConfig):
+    """The embedded scene: 25 photographs of a garden in Seattle, with their poses. Reads no folder."""
 
     def recognises(self, data: Path) -> Recognised | None:
-        """By the path `town`, where there is no such folder."""
-        return Recognised(1.0, "the embedded scene") if data == Path("town") and not data.exists() else None
+        """By the path `garden`, where there is no such folder."""
+        return Recognised(1.0, "the embedded scene") if data == Path("garden") and not data.exists() else None
 
     def build(self) -> DataParser:
-        from .town import TownParser
+        from .transforms import GardenParser
 
-        return TownParser(self)
+        return GardenParser()
 
 
 def is_record(name: str) -> bool:
@@ -263,7 +243,7 @@ class OdmConfig(DataParserConfig):
 
 
 def recognise(data: Path) -> DataParserConfig:
-    """The parser with the highest confidence, with its defaults; `town`, where no such folder exists, is the embedded scene.
+    """The parser with the highest confidence, with its defaults; `garden`, where no such folder exists, is the embedded scene.
 
     A parser that raises is skipped, with a warning on standard error. Raises DataError where no parser recognises the folder,
     or where several have the same confidence.
@@ -290,7 +270,7 @@ def recognise(data: Path) -> DataParserConfig:
     for config, _ in surest.values():
         return config
     if not data.exists():
-        raise DataError(f"{data}: no such folder; give a scene folder, or `town` for the embedded scene")
+        raise DataError(f"{data}: no such folder; give a scene folder, or `garden` for the embedded one")
     if not data.is_dir():
         raise DataError(f"{data}: a file; give the scene folder that it lies in, and name it with the parser's own field")
     names = sorted(path.name + "/" * path.is_dir() for path in data.iterdir())
