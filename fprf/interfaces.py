@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias, TypeVar
 import torch
 from torch import Tensor, nn
 
-from .types import Batch, Boxes, FieldSample, Origin, Rays, Rendered, Sampled, Site, View, Want
+from .types import Batch, Cell, FieldSample, Origin, Rays, Rendered, Sampled, Site, View, Want
 
 if TYPE_CHECKING:
     from .datamanagers.basis import Basis
@@ -306,8 +306,8 @@ class BlockLayout(ABC):
     """Division of a scene into blocks: geometry only, no parameters."""
 
     @abstractmethod
-    def cut(self, site: Site) -> Boxes:
-        """At least one cell; one alone means that the scene is not cut."""
+    def cut(self, site: Site) -> list[Cell]:
+        """At least one cell in the frame of the site, all with one border; one alone means that the scene is not cut."""
 
 
 class DataParser(ABC):

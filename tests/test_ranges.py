@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from benchmarks.restyle import RestyleConfig
+from fprf.blocks.config import AdaptiveConfig, GridConfig
 from fprf.config import LossConfig, OptimizerConfig, RenderConfig, SemanticConfig, StatisticsConfig, TrainConfig
 from fprf.errors import ConfigError
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
-from fprf.fields.layouts import AdaptiveConfig, GridConfig, StreetConfig
 from fprf.plugins.encoders.config import (
     ConcatConfig,
     DinoConfig,
@@ -45,7 +45,6 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
     SemanticPlanesConfig: PLANES,
     GridConfig: {"cells": [(0, 1)], "size": [0.0], "margin": [0.0, 0.6]},
     AdaptiveConfig: {"rays": [0], "smallest": [-1.0], "margin": [0.0]},
-    StreetConfig: {"segments": [0], "length": [0.0], "margin": [1.0]},
     UniformConfig: {"samples": [0, -3]},
     ProposalConfig: {
         "final": [0],
