@@ -40,8 +40,7 @@ from fprf.types import Want
 from .common import ReportConfig, console, write_report
 from .report import Column, contact_sheet, markdown, printed, provenance, words
 from .single_image import encoded, flat_look, flat_scene, histogram_matching, reinhard, render_flat
-from .town.write import cached_town
-from .town_truth import (
+from .town.truth import (
     CUT,
     Matched,
     Reference,
@@ -62,6 +61,7 @@ from .town_truth import (
     winners,
     without,
 )
+from .town.write import cached_town
 
 PLAIN = "no change"
 FLAT = "2d"

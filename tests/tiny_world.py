@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.town.truth import Stage, set_stage, town_settings
 from benchmarks.town.write import write_town
-from benchmarks.town_truth import Stage, set_stage, town_settings
 from fprf.cli.train import train_scene
 from fprf.config import StatisticsConfig, TrainConfig
 from fprf.datamanagers.config import RayBatchesConfig
