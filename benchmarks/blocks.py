@@ -6,21 +6,21 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from fprf.blocks.plan import boxes_to
-from fprf.io.atomic import write_json
+from fprf.blocks.partition import write_cells
 from fprf.rendering.renderer import render_rays
 from fprf.style.look import Restyle
-from fprf.training.blocks import SURROUNDINGS, folder_of, load_boxes
+from fprf.training.blocks import SURROUNDINGS, folder_of, load_blocks
 from fprf.training.loading import Trained, load_run
 from fprf.training.views import render_view
-from fprf.types import Boxes, Want
+from fprf.types import Cell, Want
 
 _PART = """
 import json, sys
@@ -36,24 +36,21 @@ Row = dict[str, float | int | str]
 
 def row_of(source: Path, target: Path, count: int) -> None:
     """A run folder of `count` blocks in a row, from one whose blocks are a row along axis 0."""
-    boxes = load_boxes(source)
-    order = boxes.low[:, 0].argsort().tolist()
-    total = float(boxes.high[:, 0].amax() - boxes.low[:, 0].amin())
+    cells = load_blocks(source)
+    order = sorted(range(len(cells)), key=lambda block: float(cells[block].low[0]))
+    total = float(max(cell.high[0] for cell in cells) - min(cell.low[0] for cell in cells))
     shutil.rmtree(target, ignore_errors=True)
     for name in ("config.json", "scene.json", "basis.safetensors", "style.safetensors"):
         target.mkdir(parents=True, exist_ok=True)
         shutil.copy(source / name, target / name)
     _copy(source, SURROUNDINGS, target, SURROUNDINGS)
-    lows, highs, turns = [], [], []
+    row = []
     for number in range(count):
         block, lap = order[number % len(order)], number // len(order)
-        shift = torch.tensor([lap * total, 0.0, 0.0], dtype=torch.float64) @ boxes.turn[block].T
-        lows.append(boxes.low[block] + shift)
-        highs.append(boxes.high[block] + shift)
-        turns.append(boxes.turn[block])
+        shift = torch.tensor([lap * total, 0.0, 0.0], dtype=torch.float64)
+        row.append(replace(cells[block], low=cells[block].low + shift, high=cells[block].high + shift))
         _copy(source, block, target, number)
-    row = Boxes(torch.stack(lows), torch.stack(highs), torch.stack(turns), boxes.margin)
-    write_json(target / "blocks.json", {"format": 1, "boxes": boxes_to(row), "rays": [], "views": []})
+    write_cells(target / "blocks.json", row)
 
 
 def _copy(source: Path, block: int, target: Path, number: int) -> None:
@@ -99,9 +96,9 @@ def apart(root: Path, limit: float | None, views: list[int]) -> Row:
 def middle_views(root: Path, count: int, blocks: int) -> list[int]:
     """Views whose cameras stand in the first `blocks` blocks of the row, spread evenly."""
     trained = load_run(root, "cpu")
-    boxes, space = load_boxes(root), trained.model.space
-    order = boxes.low[:, 0].argsort().tolist()[:blocks]
-    low, high = boxes.low[order, 0].amin(), boxes.high[order, 0].amax()
+    space = trained.model.space
+    cells = sorted(load_blocks(root), key=lambda cell: float(cell.low[0]))[:blocks]
+    low, high = cells[0].low[0], max(cell.high[0] for cell in cells)
     position = trained.known.cameras.pose[:, :, 3] - torch.tensor(space.centre, dtype=torch.float64)
     x = (position @ torch.tensor(space.rotation, dtype=torch.float64).T * space.scale)[:, 0]
     inside = ((x >= low) & (x <= high)).nonzero()[:, 0].tolist()
@@ -116,7 +113,7 @@ def costs(source: Path, scratch: Path, counts: tuple[int, ...], views: int, cach
     for count in counts:
         row_of(source, scratch / f"row{count}", count)
         timed.append({"blocks": count} | apart(scratch / f"row{count}", None, chosen))
-    total = len(load_boxes(source).low)
+    total = len(load_blocks(source))
     for count in (2, total):
         row_of(source, scratch / f"row{count}", count)
         limit = (cache_blocks + 1) * size
@@ -140,30 +137,27 @@ class Border(NamedTuple):
     """[3] of the face, in the space."""
 
 
-def borders(boxes: Boxes) -> list[Border]:
+def borders(cells: Sequence[Cell]) -> list[Border]:
     """High faces along axes 0 and 1 of each block behind which another one begins."""
     found = []
-    for block in range(len(boxes.low)):
+    for block, cell in enumerate(cells):
         for axis in (0, 1):
-            middle = (boxes.low[block] + boxes.high[block]) / 2
-            middle[axis] = boxes.high[block, axis]
+            middle = (cell.low + cell.high) / 2
+            middle[axis] = cell.high[axis]
             beyond = middle.clone()
             beyond[axis] += 1e-6
-            world = beyond @ boxes.turn[block]
-            for other in range(len(boxes.low)):
-                at = boxes.turn[other] @ world
-                if other != block and bool(((at >= boxes.low[other] - 1e-9) & (at <= boxes.high[other] + 1e-9)).all()):
-                    found.append(Border(block, axis, middle @ boxes.turn[block]))
-                    break
+            if any(other is not cell and bool(other.holds(beyond[None])) for other in cells):
+                found.append(Border(block, axis, middle))
     return found
 
 
-def _pairs(trained: Trained, boxes: Boxes, border: Border, shift: float, count: int) -> tuple[Tensor, Tensor, Tensor]:
+def _pairs(trained: Trained, cells: Sequence[Cell], border: Border, shift: float, count: int) -> tuple[Tensor, Tensor, Tensor]:
     """Origins on either side and directions, in the space: heights of cameras, level to a little up and down."""
     draw = torch.Generator().manual_seed(17 * border.block + border.axis)
-    turn, unit = boxes.turn[border.block], 1 / trained.model.space.scale
-    normal, along, up = turn[border.axis], turn[1 - border.axis], turn[2]
-    half = (boxes.high - boxes.low)[border.block, 1 - border.axis] / 2
+    axes, unit = torch.eye(3, dtype=torch.float64), 1 / trained.model.space.scale
+    normal, along, up = axes[border.axis], axes[1 - border.axis], axes[2]
+    cell = cells[border.block]
+    half = (cell.high - cell.low)[1 - border.axis] / 2
     space = trained.model.space
     pose = trained.known.cameras.pose[:, :, 3] - torch.tensor(space.centre, dtype=torch.float64)
     heights = (pose @ torch.tensor(space.rotation, dtype=torch.float64).T * space.scale)[:, 2]
@@ -189,14 +183,14 @@ def _seen(trained: Trained, origin: Tensor, direction: Tensor, restyle: Restyle 
     return out.rgb, out.depth / space.scale
 
 
-def jumps(trained: Trained, boxes: Boxes, restyle: Restyle, *, count: int, say: Callable[[str], None]) -> list[Row]:
+def jumps(trained: Trained, cells: Sequence[Cell], restyle: Restyle, *, count: int, say: Callable[[str], None]) -> list[Row]:
     """One row a border: mean differences of colour, depth and stylised colour of the pairs, there and inside its block."""
     rows: list[Row] = []
-    for border in borders(boxes):
+    for border in borders(cells):
         row: Row = {"block": border.block, "axis": border.axis, "pairs": count}
-        extent = float((boxes.high - boxes.low)[border.block, border.axis])
+        extent = float((cells[border.block].high - cells[border.block].low)[border.axis])
         for place, shift in (("border", 0.0), ("inside", -extent / 2)):
-            first, second, direction = _pairs(trained, boxes, border, shift, count)
+            first, second, direction = _pairs(trained, cells, border, shift, count)
             for look, restyle_or_none in (("", None), ("styled_", restyle)):
                 a, b = (_seen(trained, origin, direction, restyle_or_none) for origin in (first, second))
                 row[f"{look}colour_{place}"] = float((a[0] - b[0]).abs().mean())

@@ -15,11 +15,11 @@ from typing import Any
 
 import torch
 
+from fprf.blocks.config import SingleConfig
 from fprf.cli.parsing import load_method, parse
 from fprf.cli.train import train_scene
-from fprf.fields.layouts import SingleConfig
 from fprf.training.block_plan import lay_out, plan_scene
-from fprf.training.blocks import load_boxes
+from fprf.training.blocks import load_blocks
 from fprf.training.loading import load_run
 
 from .common import add_entry, arguments, split_flags
@@ -44,7 +44,7 @@ def main(argv: list[str]) -> None:
     name = options.name or options.scene.name
     scratch = options.scratch.resolve() / name
     scene, plan = plan_scene(blocks)
-    wide = 1.0 if options.same_planes else (len(plan.boxes.low) + 1) ** 0.5
+    wide = 1.0 if options.same_planes else (len(plan.cells) + 1) ** 0.5
     sides = {
         "blocks": replace(blocks, output=scratch / "blocks", steps=10**6),
         "single": replace(widened(blocks, wide), output=scratch / "single", steps=10**6, blocks=SingleConfig()),
@@ -70,7 +70,7 @@ def main(argv: list[str]) -> None:
             **trained_seconds(root),
         }
         if side == "blocks":
-            result[side]["blocks"] = len(load_boxes(root).low)
+            result[side]["blocks"] = len(load_blocks(root))
         print(name, side, json.dumps(result[side]), flush=True)
     if {"blocks", "single"} <= result.keys():
         result["blocks_minus_single_db"] = result["blocks"]["psnr"] - result["single"]["psnr"]

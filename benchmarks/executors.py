@@ -32,7 +32,7 @@ def flags(options: argparse.Namespace, output: Path) -> list[str]:
     town = cached_town(views=options.views, width=96, height=72, extra=max(0, 17 * options.blocks - 26))
     words = f"""train fprf-lite --data {town} --output {output} --steps {options.steps} --device cpu --checkpoint-minutes 1
         --datamanager.rays 2048
-        --blocks street --blocks.segments {options.blocks} --sampler.resolutions 64 --content.field.resolutions 16 32 64 128
+        --blocks grid --blocks.cells {options.blocks} 1 --sampler.resolutions 64 --content.field.resolutions 16 32 64 128
         --semantic.field.resolutions 16 64"""
     return words.split()
 

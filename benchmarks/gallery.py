@@ -39,9 +39,8 @@ ABOUT = {
     "histogram": "histogram matching of each view alone",
     "adain": "one mean and deviation for the whole scene",
     "local-adain": "the paper: every point mixes the local styles that its semantics resemble",
-    "region-adain": "scene regions match local styles, channel by channel",
     "region-ot": "scene regions match local styles, all channels at once",
-    "region-tone": "half of region-adain's features, then each region's colours carried over; the default",
+    "region-tone": "half of the features' change, channel by channel, then each region's colours carried over; the default",
 }
 
 

@@ -20,6 +20,7 @@ from typing import Any
 
 import torch
 
+from fprf.blocks.config import GridConfig, SingleConfig
 from fprf.cli import blocks as blocks_verb
 from fprf.cli import train as train_verb
 from fprf.cli.train import train_scene
@@ -28,7 +29,6 @@ from fprf.datamanagers.config import RayBatchesConfig
 from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
-from fprf.fields.layouts import SingleConfig, StreetConfig
 from fprf.io.images import to_uint8, write_image
 from fprf.methods import fprf_lite
 from fprf.plugins.samplers.config import ProposalConfig
@@ -37,7 +37,7 @@ from fprf.style.files import StyleFile
 from fprf.style.restyle import apply_style
 from fprf.training import trainer
 from fprf.training.block_plan import lay_out, plan_scene
-from fprf.training.blocks import load_boxes
+from fprf.training.blocks import load_blocks
 from fprf.training.loading import Trained, load_run
 from fprf.training.views import render_view
 
@@ -68,7 +68,7 @@ def configs(options: argparse.Namespace) -> tuple[TrainConfig, TrainConfig]:
         sampler=replace(lite.sampler, resolutions=(nodes[-1] // 2,)),
         content=replace(lite.content, field=PlanesConfig(resolutions=nodes, channels=16, hidden=64, layers=1)),
         semantic=replace(lite.semantic, field=replace(lite.semantic.field, resolutions=(nodes[0], nodes[-2]))),
-        blocks=StreetConfig(segments=n),
+        blocks=GridConfig(cells=(n, 1)),
     )
     # Parameters go with the square of the nodes; the surroundings are one block more.
     single = replace(widened(blocks, (n + 1) ** 0.5), output=options.scratch / "single", blocks=SingleConfig())
@@ -187,11 +187,11 @@ def main(argv: list[str]) -> None:
     blocks, single = configs(options)
     scene, plan = plan_scene(blocks)
     lay_out(blocks, scene, plan)
-    say(f"{len(scene.paths)} images, features extracted, {len(plan.boxes.low)} blocks")
+    say(f"{len(scene.paths)} images, features extracted, {len(plan.cells)} blocks")
     result: dict[str, Any] = {
         "images": len(scene.paths),
         "size": list(options.size),
-        "blocks": len(plan.boxes.low),
+        "blocks": len(plan.cells),
         "minutes_each_side": options.minutes,
         "clock": options.clock,
         "threads": torch.get_num_threads(),
@@ -212,7 +212,7 @@ def main(argv: list[str]) -> None:
     root = options.scratch / "blocks"
     run = load_run(root, "cpu")
     style = StyleFile(StyleConfig(references=references(options.scratch)))
-    rows = jumps(run, load_boxes(root), apply_style(run, style).restyle, count=options.pairs, say=lambda text: None)
+    rows = jumps(run, load_blocks(root), apply_style(run, style).restyle, count=options.pairs, say=lambda text: None)
     result["seams"] = {"borders": len(rows), **ratios(rows), "rows": rows}
     say(f"seams: { {k: v for k, v in result['seams'].items() if k != 'rows'} }")
     result["costs"] = costs(root, options.scratch, tuple(options.rows), options.frames, cache_blocks=4)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from fprf.cli.parsing import load_field_method, parse
 from fprf.cli.progress import Display
@@ -18,8 +18,8 @@ from fprf.datamanagers.images import load_image
 from fprf.errors import UsageError
 from fprf.evaluation.metrics import image_metrics, mean_metrics
 from fprf.interfaces import Decoder
-from fprf.plugins.decoders.config import DecoderConfig, MlpDecoderConfig, ResidualDecoderConfig
-from fprf.plugins.decoders.decoders import ColourHead
+from fprf.ops import dense
+from fprf.plugins.decoders.config import DecoderConfig, MlpDecoderConfig
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionToneConfig
 from fprf.style.references import Encoders
 from fprf.training.loading import Trained, encoders_of, load_run
@@ -49,28 +49,23 @@ class SceneDecoderConfig(DecoderConfig):
 
 
 class SceneDecoder(Decoder):
-    """rgb = sigmoid(head(content)), every weight the scene's own."""
+    """rgb = sigmoid(W2 relu(W1 f + b1) + b2), every weight the scene's own.
+
+    Weights are kept times the root of their fan-in: Adam moves each by the learning rate, whatever its size.
+    """
 
     def __init__(self, channels: int, hidden: int, generator: torch.Generator) -> None:
         super().__init__()
-        self.head = ColourHead(channels, hidden, generator)
+        bound = 6**0.5
+        self.first = nn.Parameter(torch.empty(hidden, channels).uniform_(-bound, bound, generator=generator))
+        self.first_bias = nn.Parameter(torch.zeros(hidden))
+        self.second = nn.Parameter(torch.zeros(3, hidden))
+        self.second_bias = nn.Parameter(torch.zeros(3))
 
     def forward(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"]:
         """sRGB in [0, 1]; grey before it is trained."""
-        return torch.sigmoid(self.head(content))
-
-    def restyled(
-        self,
-        content: Annotated[Tensor, "N C"],
-        styled: Annotated[Tensor, "N C"],
-        strength: float | Annotated[Tensor, "N 1"],
-    ) -> Annotated[Tensor, "N 3"]:
-        """The decoded style."""
-        colour: Tensor = self(styled)
-        return colour
-
-    def frozen_colour(self, content: Annotated[Tensor, "N C"]) -> None:
-        """None: there is nothing besides."""
+        maps = [weight / weight.shape[1] ** 0.5 for weight in (self.first, self.second)]
+        return torch.sigmoid(dense.network(content, maps, [self.first_bias, self.second_bias]))
 
 
 Progress = Callable[[int, int, str], None]
@@ -83,10 +78,6 @@ def _same(config: TrainConfig) -> TrainConfig:
 
 def _scene_decoder(config: TrainConfig) -> TrainConfig:
     return replace(config, content=replace(config.content, decoder=SceneDecoderConfig()))
-
-
-def _residual(config: TrainConfig) -> TrainConfig:
-    return replace(config, content=replace(config.content, decoder=ResidualDecoderConfig()))
 
 
 def _no_content_loss(config: TrainConfig) -> TrainConfig:
@@ -102,7 +93,6 @@ def _no_guide(config: TrainConfig) -> TrainConfig:
 TRAINED: Mapping[str, Mapping[str, Change]] = {
     "reconstruction": {
         "frozen decoder": _same,
-        "frozen and residual": _residual,
         "decoder trained with the scene": _scene_decoder,
     },
     "ablation": {

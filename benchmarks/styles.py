@@ -37,7 +37,7 @@ from fprf.plugins.encoders.config import (
     RandomConfig,
     Vgg19Config,
 )
-from fprf.plugins.stylizers.config import IdentityConfig
+from fprf.plugins.stylizers.config import AdainConfig
 from fprf.style.dictionary import Reference, build_dictionary
 
 from . import style_runs
@@ -113,7 +113,7 @@ def restyled(triplet: Triplet, tools: Tools, source: str) -> dict[str, Tensor]:
         [flat_reference("style", there, where_there, triplet.style.reshape(-1, 3))],
         clusters=len(COLOURS) if source == "painted" else CLUSTERS,
     )
-    configs = {"decoded": IdentityConfig(), **STYLIZERS} if source == SOURCES[0] else STYLIZERS
+    configs = {"decoded": AdainConfig(features=0.0), **STYLIZERS} if source == SOURCES[0] else STYLIZERS
     return {
         name: render_flat(flat, flat_look(flat, dictionary, config, tools.decoder), tools.decoder)
         for name, config in configs.items()

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
+from .blocks.config import LayoutConfig, SingleConfig
 from .checks import at_least, between, positive
 from .datamanagers.config import DataManagerConfig, RayBatchesConfig
 from .errors import ConfigError, UsageError
 from .fields.config import ContentFieldConfig, PlanesConfig, SemanticFieldConfig, SemanticPlanesConfig
-from .fields.layouts import LayoutConfig, SingleConfig
 from .plugins.decoders.config import DecoderConfig, MlpDecoderConfig
 from .plugins.encoders.config import SEMANTICS, EncoderConfig, Vgg19Config
 from .plugins.executors.config import ExecutorConfig, SerialConfig

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from fprf import testing
+from fprf.blocks.config import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig
 from fprf.datamanagers.config import RayBatchesConfig
 from fprf.fields.config import ContentFieldConfig, PlanesConfig, SemanticFieldConfig, SemanticPlanesConfig
-from fprf.fields.layouts import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig, StreetConfig
 from fprf.interfaces import (
     BlockLayout,
     ContentField,
@@ -33,7 +33,7 @@ from fprf.plugins.losses.config import LossTermConfig
 from fprf.plugins.samplers.config import ProposalConfig, SamplerConfig, UniformConfig
 from fprf.plugins.stylizers.config import StylizerConfig
 from fprf.rendering.renderer import Parts
-from fprf.types import Batch, Boxes, FieldSample, Rendered, Sampled, Site, Want
+from fprf.types import Batch, Cell, FieldSample, Rendered, Sampled, Site, Want
 
 BUILT_IN: list[tuple[Callable[[Any], None], Any]] = [
     (testing.check_encoder, RandomConfig(channels=5, stride=3)),
@@ -44,7 +44,6 @@ BUILT_IN: list[tuple[Callable[[Any], None], Any]] = [
     (testing.check_layout, SingleConfig()),
     (testing.check_layout, GridConfig()),
     (testing.check_layout, AdaptiveConfig()),
-    (testing.check_layout, StreetConfig()),
     (testing.check_executor, SerialConfig()),
     (testing.check_data_manager, RayBatchesConfig(rays=64, semantic_share=0.5)),
     *(
@@ -254,12 +253,6 @@ class Bright(Decoder):
     def forward(self, content: Tensor) -> Tensor:
         return content[:, :3]
 
-    def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
-        return self(styled)
-
-    def frozen_colour(self, content: Tensor) -> None:
-        return None
-
 
 class Averaging(Stylizer):
     @property
@@ -274,9 +267,9 @@ class Averaging(Stylizer):
 
 
 class Halves(BlockLayout):
-    def cut(self, site: Site) -> Boxes:
-        low = torch.tensor([[-1.0, -1.0, -1.0], [0.0, -1.0, -1.0]])
-        return Boxes(low, low + 1, 2 * torch.eye(3).expand(2, 3, 3), 0.1)
+    def cut(self, site: Site) -> list[Cell]:
+        corners = torch.tensor([[0.0] * 3, [1.0] * 3], dtype=torch.float64)
+        return [Cell(low=low, high=low + 1, border=0.1 * (low + 1)) for low in corners]
 
 
 class Silent(Executor):
@@ -375,7 +368,7 @@ OTHERS: list[tuple[Callable[[Any], None], Any, str]] = [
     (testing.check_config, Typed(), "must not be called 'type'"),
     (testing.check_sampler, giving(SamplerConfig, Backwards()), "must be sorted"),
     (testing.check_stylizer, giving(StylizerConfig, Averaging()), "must not depend on the others"),
-    (testing.check_layout, giving(LayoutConfig, Halves()), "orthonormal"),
+    (testing.check_layout, giving(LayoutConfig, Halves()), "same border"),
     (partial(testing.check_decoder, encoder="any", channels=6), giving(DecoderConfig, Bright()), r"in \[0, 1\]"),
     (testing.check_executor, giving(ExecutorConfig, Silent()), "must reach the caller"),
 ]

@@ -14,7 +14,7 @@ ORDER = (
     *("viewer", "api", "cli", "__main__"),
 )
 """Layers from the lowest to the highest. Imports within functions, such as those of `build`, may lead anywhere."""
-MECHANISM = ("config.py", "methods.py", "layouts.py")
+MECHANISM = ("config.py", "methods.py")
 """Files of any package that belong to the configs, as do the modules of `plugins` itself: none of them imports torch."""
 
 
@@ -23,7 +23,7 @@ def layer(parts: tuple[str, ...]) -> str:
     if parts in ((), ("__init__",)):
         return "version"
     plugins = parts[0] == "plugins" and len(parts) <= 2 and parts[-1] != "weights"
-    return "configs" if plugins or (f"{parts[-1]}.py" in MECHANISM and parts[0] not in ("blocks", "export")) else parts[0]
+    return "configs" if plugins or (f"{parts[-1]}.py" in MECHANISM and parts[0] != "export") else parts[0]
 
 
 def imported(file: Path) -> Iterator[tuple[str, ...]]:

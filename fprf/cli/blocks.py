@@ -1,4 +1,4 @@
-"""`fprf train` on a scene of several blocks: plan it, train each one as a task, measure the style of the whole."""
+"""`fprf train` on a scene of several blocks: train each one as a task, measure the style of the whole."""
 
 import time
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from .progress import Display, EventLog
 
 if TYPE_CHECKING:
-    from ..blocks.plan import Plan
+    from ..blocks.visibility import Plan
     from ..config import TrainConfig
     from ..datamanagers.scene import Scene
     from ..training.blocks import BlockTask
@@ -43,7 +43,7 @@ def train_blocks(
 
     laid = lay_out(config, scene, plan, display.count, folder.saved_facts())
     write_down(folder, config, method, laid)
-    count = len(plan.boxes.low)
+    count = len(plan.cells)
     display.say(f"{scene.name}: {len(scene.train)} + {len(scene.test)} views, {count} blocks and their surroundings")
     executor = config.executor.on(device_of(config.device).type).build()
     around, each = block_minutes(config, count, time.perf_counter() - start)
@@ -96,29 +96,3 @@ def run_block(task: "BlockTask", view: "LiveViewer | None" = None) -> None:
 
         if not train_block(task, report, begun):
             display.say(f"{name} is finished already")
-
-
-def show_plan(config: "TrainConfig", method: str, output: Path) -> None:
-    """Print the blocks with what each will cost, and write a top view beside."""
-    from rich.console import Console
-    from rich.table import Table
-
-    from ..blocks.plan import top_view
-    from ..io.atomic import write_json
-    from ..io.images import write_image
-    from ..training.block_plan import estimates, plan_scene
-
-    scene, plan = plan_scene(config)
-    rows = estimates(config, scene, plan)
-    table = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0))
-    for column in ("block", "images", "rays", "size", "memory", "disk", "time"):
-        table.add_column(column, justify="left" if column == "block" else "right")
-    for row in rows:
-        table.add_row(*row.cells())
-    console = Console(highlight=False, width=100)
-    console.print(f"{method} on {scene.name}: {len(scene.train)} training images, space unit {1 / plan.space.scale:.3g}")
-    console.print(table)
-    picture = output / "plan.png"
-    write_image(picture, top_view(scene, plan))
-    write_json(output / "plan.json", {"method": method, "scene": scene.name, "blocks": [row.json() for row in rows]})
-    console.print(f"seen from above: {picture}")

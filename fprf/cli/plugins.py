@@ -8,11 +8,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from ..blocks.config import LayoutConfig
 from ..datamanagers.config import DataManagerConfig
 from ..datamanagers.parsers.config import DataParserConfig
 from ..errors import PluginError
 from ..fields.config import ContentFieldConfig, SemanticFieldConfig
-from ..fields.layouts import LayoutConfig
 from ..plugins import registry
 from ..plugins.captures import CaptureFormat
 from ..plugins.config import PluginConfig

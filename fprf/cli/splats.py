@@ -34,9 +34,6 @@ class SplatVerbs(Verbs):
     def __init__(self, config: "GaussiansConfig") -> None:
         self.config = config
 
-    def plan(self, method: str) -> None:
-        raise UsageError(f"--plan: {method} trains a scene in one piece; leave --plan out")
-
     def train(self, method: str, *, quiet: bool = False, view: "LiveViewer | None" = None, others: bool = False) -> Path:
         if view is not None and self.config.cells > 1:
             raise UsageError("--view: cells are not shown while they train; leave --view or --cells out")

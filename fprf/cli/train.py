@@ -75,7 +75,6 @@ def finish_view(view: "LiveViewer | None", display: "Display") -> None:
 
 DEFAULT_METHOD = "fprf-splats"
 """Where none is named: the best quality for the time on every capture that was measured (docs/photographs.md)."""
-PLAN = "--plan"
 CHANGED = "--changed-images"
 _TIMED_VIEWS = 2
 """Views after which the time of all features is estimated."""
@@ -97,16 +96,16 @@ def run(args: list[str]) -> int:
     if source.suffix == ".json" and config.output is None:
         config = replace(config, output=source.parent)
     rest, place = take_view(args[1:])
-    flags, others = [arg for arg in rest if arg not in (PLAN, CHANGED)], CHANGED in rest
+    if "--plan" in rest:
+        raise UsageError("--plan: is gone; training says first how many blocks there are, and blocks.json where they lie")
+    flags, others = [arg for arg in rest if arg != CHANGED], CHANGED in rest
     about = (
-        f"Train a scene with {method}. {PLAN} alone shows its blocks and what they will cost, and runs nothing;\n"
+        f"Train a scene with {method}.\n"
         f"{VIEW} [[HOST:]PORT] shows training live in the browser, at http://127.0.0.1:8080 if nothing is said;\n"
         f"{CHANGED} goes on with a run although its images are no longer those that it was begun with."
     )
     config = parse(config, flags, prog=f"fprf train {args[0]}", description=about)
-    if PLAN in rest:
-        config.verbs().plan(method)
-    elif place is None:
+    if place is None:
         config.verbs().train(method, others=others)
     else:
         with open_view(place) as view:
@@ -168,7 +167,7 @@ def train_scene(
 
         if config.blocks.cuts:
             scene, plan = plan_scene(config, folder.saved_facts())
-            if plan.cut:
+            if len(plan.cells) > 1:
                 look(scene)
                 save_image_hashes(output, marks)
                 train_blocks(config, method, folder, scene, plan, display, start, view)

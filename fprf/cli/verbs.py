@@ -25,10 +25,6 @@ class Verbs(ABC):
     """
 
     @abstractmethod
-    def plan(self, method: str) -> None:
-        """Show what training would cost, and run nothing."""
-
-    @abstractmethod
     def train(self, method: str, *, quiet: bool = False, view: "LiveViewer | None" = None, others: bool = False) -> Path:
         """Train to the end and return the run folder; go on with a run that is there.
 
@@ -75,12 +71,6 @@ class FieldVerbs(Verbs):
 
     def __init__(self, config: "TrainConfig") -> None:
         self.config = config
-
-    def plan(self, method: str) -> None:
-        from .blocks import show_plan
-        from .train import default_output
-
-        show_plan(self.config, method, self.config.output or default_output(self.config, method))
 
     def train(self, method: str, *, quiet: bool = False, view: "LiveViewer | None" = None, others: bool = False) -> Path:
         from .train import train_scene

@@ -24,6 +24,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..blocks import partition
+from ..blocks.partition import bisect_sightings
 from ..config import RESUMABLE
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError
@@ -35,7 +37,8 @@ from ..training.camera_optimizers import Tones
 from ..training.model import Facts
 from ..training.run import Run, begin, held
 from ..training.trainer import Report
-from .cells import Cell, cut
+from ..types import Cell
+from .cells import crop, scene_in_windows, shown_in_windows
 from .config import GaussiansConfig
 from .gaussians import Gaussians
 from .learner import MOVES, Learner
@@ -58,8 +61,6 @@ from .training import (
 _FORMAT, _VIEWS, _WRITTEN = 6, "views.json", "train again to write it"
 OVERVIEW = "overview"
 """Folder of the whole scene in a run."""
-_WINDOWS = tuple[tuple[int, int, int, int, int], ...]
-"""Type of a cell's windows in the file: view, left, top, width, height of each."""
 _MOMENTS = "first", "second", "weight"
 _PIXELS, _SMALLEST = 16_000_000, 4
 """Pixels of all photographs that the whole scene is trained on, at most; how far they are reduced before some are left out."""
@@ -103,26 +104,9 @@ def write_cells(root: Path, scene: Scene, data: Path, count: int) -> list[Cell]:
 
     Cells of another cut, which could be taken for these, are removed.
     """
-    cells = cut(scene, count)
-    file = root / "cells.json"
-    document = {
-        "format": _FORMAT,
-        "frame": cells[0].frame.tolist(),
-        "cells": [
-            {
-                "low": [_bound(x) for x in cell.low.tolist()],
-                "high": [_bound(x) for x in cell.high.tolist()],
-                "border": cell.border.tolist(),
-                "windows": [[view, *window] for view, window in cell.windows.items()],
-            }
-            for cell in cells
-        ],
-    }
-    if file.is_file():
-        with open_json(file, "remove it and train again") as before:
-            if before != document:
-                shutil.rmtree(root / "cells", ignore_errors=True)
-    write_json(file, document)
+    cells = bisect_sightings(scene, count)
+    if partition.write_cells(root / "cells.json", cells):
+        shutil.rmtree(root / "cells", ignore_errors=True)
     (root / _VIEWS).unlink(missing_ok=True)
     if all(path is None or path.is_relative_to(data) for path in (*scene.paths, *scene.masks, *scene.sky_masks)):
         files = {"paths": scene.paths, "masks": scene.masks, "sky_masks": scene.sky_masks}
@@ -162,27 +146,7 @@ def _read_views(root: Path, config: GaussiansConfig, data: Path) -> Scene:
 
 def read_cells(root: Path) -> list[Cell]:
     """The cells of a run. Raises CheckpointError where the file cannot be read."""
-    with open_json(root / "cells.json", _WRITTEN) as document:
-        frame = torch.tensor(document["frame"], dtype=torch.float64).reshape(3, 3)
-        return [
-            Cell(
-                frame=frame,
-                low=_bounds(each["low"], -math.inf),
-                high=_bounds(each["high"], math.inf),
-                border=_bounds(each["border"], 0.0),
-                windows={v: (x, y, w, h) for v, x, y, w, h in from_json(each["windows"], _WINDOWS, path="windows")},
-            )
-            for each in document["cells"]
-        ]
-
-
-def _bound(value: float) -> float | None:
-    """JSON knows no infinity."""
-    return value if abs(value) < math.inf else None
-
-
-def _bounds(values: list[float | None], infinite: float) -> Tensor:
-    return torch.tensor([infinite if value is None else value for value in values], dtype=torch.float64).reshape(3)
+    return partition.read_cells(root / "cells.json")
 
 
 def train_overview(
@@ -259,12 +223,11 @@ def _prepared(config: GaussiansConfig, scene: Scene, facts: Facts, cell: Cell, s
     scene = replace(scene, cameras=refined(scene.cameras, start))
     images, masks = load_photographs(config, scene, list(cell.windows))
     skies = load_skies(config, scene, images)
-    images = {view: cell.cut(view, image) for view, image in images.items()}
-    masks, skies = ({view: cell.cut(view, mask) for view, mask in each.items()} for each in (masks, skies))
+    images, masks, skies = crop(cell, images), crop(cell, masks), crop(cell, skies)
     near, whole = float(start.model["near"]), gaussians_of(start)
-    shown = cell.shown(scene, whole, near)
+    shown = shown_in_windows(scene, cell, whole, near)
     gaussians = whole.select(shown)
-    own = cell.scene(scene)
+    own = scene_in_windows(scene, cell)
     # Only what lies inside and in the border becomes more: its share of all that may be added.
     around = int(cell.around(gaussians.means).sum())
     cap = len(gaussians) + round(max(config.cap - len(whole), 0) * around / len(whole))

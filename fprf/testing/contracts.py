@@ -12,12 +12,12 @@ from pathlib import Path
 import torch
 from torch import nn
 
+from ..blocks.config import LayoutConfig
 from ..blocks.routing import shares
 from ..datamanagers.config import DataManagerConfig
 from ..datamanagers.parsers.config import DataParserConfig
 from ..errors import DataError
 from ..fields.config import ContentFieldConfig, SemanticFieldConfig
-from ..fields.layouts import LayoutConfig
 from ..interfaces import (
     BlockLayout,
     ContentField,
@@ -97,7 +97,7 @@ def check_encoder(config: EncoderConfig) -> None:
 
 
 def check_decoder(config: DecoderConfig, *, encoder: str, channels: int) -> None:
-    """Colours in [0, 1], point by point; at strength 0, or without a change, those of the scene as it is.
+    """Colours in [0, 1], point by point.
 
     `encoder` is the identity of an encoder that it has weights for.
     """
@@ -110,27 +110,13 @@ def check_decoder(config: DecoderConfig, *, encoder: str, channels: int) -> None
     tensor(colour, (18, 3), name)
     require(bool(((colour >= 0) & (colour <= 1)).all()), f"{name}: colours must lie in [0, 1], for any features")
     pointwise(lambda points: decoder(points), content, name)
-    styled = content.flip(0)
-    for strength in (0.0, 0.3, 1.0, cases.uniform(18, 1, seed=15)):
-        restyled = decoder.restyled(content, styled, strength)
-        tensor(restyled, (18, 3), f"{name}.restyled")
-        require(bool(((restyled >= 0) & (restyled <= 1)).all()), f"{name}.restyled: colours must lie in [0, 1]")
-        same(decoder.restyled(content, content, strength), colour, 1e-5, f"{name}.restyled: no change, no other colour")
-    same(decoder.restyled(content, content, 0.0), colour, 0.0, f"{name}.restyled: must be forward at strength 0")
-    pointwise(lambda points: decoder.restyled(points, points + 1, 0.6), content, f"{name}.restyled")
     own = [parameter for parameter in decoder.parameters() if parameter.requires_grad]
-    alone = decoder.frozen_colour(content)
-    require(
-        (alone is None) == (not own), f"{name}.frozen_colour: colours where it has parameters to train, None where it is frozen"
-    )
-    if alone is not None:
-        tensor(alone, (18, 3), f"{name}.frozen_colour")
-        moved = torch.autograd.grad(alone.sum() + colour.sum(), own, allow_unused=True)
+    if own:
+        moved = torch.autograd.grad(colour.sum(), own, allow_unused=True)
         require(all(each is not None for each in moved), f"{name}: no gradient reaches a parameter that wants one")
     decoder.double()
-    content, styled = content.double(), styled.double()
+    content = content.double()
     follows(lambda: decoder(content), content, name)
-    follows(lambda: decoder.restyled(content, styled, 0.6), content, f"{name}.restyled")
 
 
 def check_stylizer(config: StylizerConfig) -> None:
@@ -243,26 +229,24 @@ def check_semantic_field(config: SemanticFieldConfig) -> None:
 
 
 def check_layout(config: LayoutConfig) -> None:
-    """Boxes with room in them and orthonormal axes, from any site, and weights of them that sum to 1 everywhere."""
+    """Cells with room in them and one border, from any site, and weights of them that sum to 1 everywhere."""
     check_config(config)
     layout, name = config.build(), type(config).__name__
     require(isinstance(layout, BlockLayout), f"{name}: build() gives {type(layout).__name__}, not a BlockLayout")
     for site in (cases.site(40, 200), cases.site(3, 0), cases.site(1, 0)):
-        boxes = layout.cut(site)
-        count = len(boxes.low)
-        require(count > 0, f"{name}: at least one block is needed")
-        shapes = (tuple(boxes.low.shape), tuple(boxes.high.shape), tuple(boxes.turn.shape))
-        require(shapes == ((count, 3), (count, 3), (count, 3, 3)), f"{name}: expected [Z 3], [Z 3] and [Z 3 3], found {shapes}")
-        require(bool((boxes.low < boxes.high).all()), f"{name}: a box's lowest corner must lie below its highest")
-        apart = (boxes.turn @ boxes.turn.mT - torch.eye(3, dtype=boxes.turn.dtype)).abs().amax()
-        require(float(apart) < 1e-6, f"{name}: the axes of a box must be orthonormal")
-        require(boxes.margin > 0 or count == 1, f"{name}: blocks need a margin above 0 to blend in")
-        points = 4 * cases.points(64)
-        weight = shares(points, boxes)
+        cells, again = layout.cut(site), layout.cut(site)
+        require(len(cells) > 0, f"{name}: at least one block is needed")
+        for cell, other in zip(cells, again, strict=True):
+            shapes = {tuple(each.shape) for each in (cell.low, cell.high, cell.border)}
+            require(shapes == {(3,)}, f"{name}: low, high and border must be [3], found {shapes}")
+            require(bool((cell.low < cell.high).all()), f"{name}: a cell's lowest corner must lie below its highest")
+            require(torch.equal(cell.border, cells[0].border), f"{name}: all cells must have the same border")
+            same = torch.equal(cell.low, other.low) and torch.equal(cell.high, other.high)
+            require(same, f"{name}: must be deterministic")
+        require(bool((cells[0].border > 0).all()) or len(cells) == 1, f"{name}: blocks need a border above 0 to blend in")
+        weight = shares(4 * cases.points(64), cells)
         whole = bool((weight >= 0).all()) and close(weight.sum(1), torch.ones(64), 1e-4)
         require(whole, f"{name}: weights must be at least 0 and sum to 1")
-        again = layout.cut(site)
-        require(torch.equal(again.low, boxes.low) and torch.equal(again.high, boxes.high), f"{name}: must be deterministic")
 
 
 def check_parser(config: DataParserConfig, data: Path) -> None:

@@ -6,31 +6,26 @@ semantic basis, one unit of each loss and one cache serve all blocks.
 
 import os
 import shutil
-import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..blocks.plan import Plan, boxes_to, make_plan
+from ..blocks.partition import write_cells
+from ..blocks.visibility import Plan, make_plan
 from ..config import TrainConfig
 from ..datamanagers.basis import Basis
-from ..datamanagers.batches import HELD
 from ..datamanagers.features import extract
 from ..datamanagers.images import load_image
 from ..datamanagers.scene import Scene
-from ..interfaces import DataManager
-from ..io.atomic import write_json
-from ..types import Batch
 from . import tensorfiles
-from .blocks import RAYS, SURROUNDINGS, Built, asked_of, folder_of, inset, surroundings
+from .blocks import RAYS, SURROUNDINGS, asked_of, folder_of
 from .model import Facts, build_decoder
-from .prepare import Prepared, behind, build_encoders, cache_folder, device_of, exposure_of, facts_of, scene_of
+from .prepare import behind, build_encoders, cache_folder, exposure_of, facts_of, scene_of
 from .run import Run, task_of
-from .trainer import Loop, optimizer_of
 
 
 class Laid(NamedTuple):
@@ -86,24 +81,16 @@ def write_down(run: Run, config: TrainConfig, method: str, laid: Laid) -> None:
     run.save_known(scene, config.data, laid.facts)
     if laid.basis is not None:
         run.save_tensors("basis", laid.basis.tensors())
-    count = len(plan.boxes.low)
+    count = len(plan.cells)
     rays = {block: _rays_of(plan, block) for block in (SURROUNDINGS, *range(count))}
     if trained_tasks(run.root):
-        asked = {block: asked_of(config, laid.facts, scene, plan.boxes, block, own)["task"] for block, own in rays.items()}
+        asked = {block: asked_of(config, laid.facts, scene, plan.cells, block, own)["task"] for block, own in rays.items()}
         renumber(run.root, {block: task for block, task in asked.items() if block != SURROUNDINGS})
     for block, own in rays.items():
         folder = folder_of(run.root, block)
         folder.mkdir(parents=True, exist_ok=True)
         tensorfiles.save(folder / RAYS, own)
-    write_json(
-        run.root / "blocks.json",
-        {
-            "format": 1,
-            "boxes": boxes_to(plan.boxes),
-            "rays": plan.rays.tolist(),
-            "views": [len(plan.views_of(b)) for b in range(count)],
-        },
-    )
+    write_cells(run.root / "blocks.json", plan.cells)
 
 
 def _rays_of(plan: Plan, block: int) -> dict[str, Tensor]:
@@ -155,163 +142,3 @@ def renumber(root: Path, asked: Mapping[int, str]) -> None:
 
 def _aside(root: Path, task: str) -> Path:
     return root / "blocks" / f"{_MOVING}{task}"
-
-
-_MIB = 1 << 20
-_STATE = 4
-"""Numbers that training keeps of a parameter: value, gradient, two moments."""
-_WORKING = 600
-"""Bytes of intermediate results per sample of a batch; measured, within a factor of two."""
-_STEPS = 3
-"""Steps that are timed, after one that is not."""
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """One line of the plan."""
-
-    name: str
-    views: int
-    rays: int
-    extent: tuple[float, float, float]
-    """Size in world units, margins left out."""
-    memory_mib: float
-    disk_mib: float
-    seconds: float
-
-    def cells(self) -> tuple[str, ...]:
-        """For a table."""
-        size = " x ".join(f"{side:.3g}" for side in self.extent)
-        return (
-            self.name,
-            f"{self.views:,}",
-            f"{self.rays:,}",
-            size,
-            f"{self.memory_mib:,.0f} MiB",
-            f"{self.disk_mib:,.0f} MiB",
-            _clock(self.seconds),
-        )
-
-    def json(self) -> dict[str, Any]:
-        """For plan.json."""
-        return {
-            "name": self.name,
-            "images": self.views,
-            "rays": self.rays,
-            "extent": list(self.extent),
-            "memory_mib": round(self.memory_mib, 1),
-            "disk_mib": round(self.disk_mib, 1),
-            "seconds": round(self.seconds, 1),
-        }
-
-
-def estimates(config: TrainConfig, scene: Scene, plan: Plan) -> list[Estimate]:
-    """A line for the surroundings and each block, and their sum; one block alone has no surroundings."""
-    content = config.content.encoder.build()
-    semantic = config.semantic.encoder.build() if config.semantic.encoder is not None else None
-    dim = min(config.semantic.dim, semantic.channels) if semantic is not None else 0
-    facts = Facts(
-        space=plan.space,
-        channels=content.channels,
-        dim=dim,
-        content_encoder=content.identity,
-        semantic_encoder=semantic.identity if semantic is not None else "",
-        content_scale=1.0,
-        semantic_scale=1.0,
-        background=None,
-    )
-    around = surroundings(config, facts, plan.boxes)
-    block = inset(config, facts, plan.boxes, 0, around) if plan.cut else around
-    parameters = sum(p.numel() for p in around.member.parameters())
-    batch = config.datamanager.batch_rays()
-    area = scene.cameras.size.prod(-1)
-    everything = int(area[scene.train].sum())
-    span = plan.boxes.high.amax(0) - plan.boxes.low.amin(0)
-
-    def row(name: str, views: Tensor, rays: int, span: Annotated[Tensor, "3"], members: int, step_seconds: float) -> Estimate:
-        pixels = 3 * int(area[views].sum())
-        images = pixels if pixels <= HELD else 0  # else they lie in a mapped file
-        held = members * parameters * 4
-        working = _WORKING * batch * 64
-        along, across, up = (span / plan.space.scale).tolist()
-        return Estimate(
-            name,
-            len(views),
-            rays,
-            (along, across, up),
-            (held * _STATE + images + working) / _MIB,
-            (parameters * 4 + 2 * 3 * held + pixels - images) / _MIB,
-            config.steps * step_seconds,
-        )
-
-    step_seconds = seconds_per_step(config, facts, scene, around, batch)
-    rows = [row("surroundings" if plan.cut else "whole", plan.views, everything, span, 1, step_seconds)]
-    if plan.cut:
-        step_seconds = seconds_per_step(config, facts, scene, block, batch)
-        spans = plan.boxes.high - plan.boxes.low
-        for z, rays in enumerate(plan.rays.tolist()):
-            rows.append(row(f"{z:02d}", plan.views_of(z), rays, spans[z], 2, step_seconds))
-    if config.minutes is not None:
-        limit = 60 * config.minutes / sum(r.seconds for r in rows)
-        rows = [replace(r, seconds=r.seconds * min(1.0, limit)) for r in rows]
-    if plan.cut:
-        features = _feature_mib(scene, facts)
-        rows.append(
-            Estimate(
-                "together",
-                len(plan.views),
-                sum(r.rays for r in rows),
-                rows[0].extent,
-                max(r.memory_mib for r in rows),
-                sum(r.disk_mib for r in rows) + features,
-                sum(r.seconds for r in rows),
-            )
-        )
-    return rows
-
-
-class _MadeUp(DataManager):
-    """Batches of random pixels with grey targets: they cost what real ones do."""
-
-    def __init__(self, scene: Scene, facts: Facts, rays: int) -> None:
-        self.content_store = self.semantic_store = None
-        self.scene, self.facts, self.rays = scene, facts, rays
-
-    def batch(self, step: int) -> Batch:
-        generator = torch.Generator().manual_seed(step)
-        view = self.scene.train[torch.randint(len(self.scene.train), (self.rays,), generator=generator)]
-        at = torch.rand(self.rays, 2, dtype=torch.float64, generator=generator) * self.scene.cameras.size[view]
-        grey = torch.full((self.rays, 3), 0.5)
-        content = torch.zeros(self.rays, self.facts.channels)
-        semantic = torch.zeros(self.rays // 4, self.facts.dim) if self.facts.dim else None
-        return Batch(view, at.floor() + 0.5, grey, content, semantic)
-
-    def image(self, view: int) -> torch.Tensor:
-        width, height = self.scene.cameras.size[view].tolist()
-        return torch.full((height, width, 3), 0.5)
-
-
-def seconds_per_step(config: TrainConfig, facts: Facts, scene: Scene, built: Built, rays: int) -> float:
-    """Time of a training step of a model here and now."""
-    device = device_of(config.device)
-    model = built.model.to(device)
-    prepared = Prepared(scene, _MadeUp(scene, facts, rays), facts, None)
-    loop = Loop(config, prepared, model, optimizer_of(config, model), device)
-    loop.step(0, 0.0)(0.0, 0.0)
-    start = time.perf_counter()
-    for step in range(1, 1 + _STEPS):
-        result = loop.step(step, 0.0)
-    result(0.0, 0.0)  # waits for the device
-    return (time.perf_counter() - start) / _STEPS
-
-
-def _feature_mib(scene: Scene, facts: Facts) -> float:
-    """Coefficients of all training views: four half-precision numbers a channel for every 8 x 8 pixels."""
-    pixels = int(scene.cameras.size[scene.train].prod(-1).sum())
-    return pixels / 64 * 4 * 2 * (facts.channels + facts.dim) / _MIB
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

@@ -17,7 +17,7 @@ import copy
 import hashlib
 import json
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -26,8 +26,9 @@ import torch
 from torch import Tensor, nn
 
 from ..blocks.fields import BlockedField, BlockedSampler, BlockedSemantic, Held, Member, Members, inherit
-from ..blocks.plan import boxes_from, pixel_mask
+from ..blocks.partition import read_cells
 from ..blocks.routing import Everywhere, Inset, Router, chart_of, surroundings_of
+from ..blocks.visibility import pixel_mask
 from ..config import RESUMABLE, TrainConfig
 from ..datamanagers.basis import Basis
 from ..datamanagers.scene import Scene
@@ -38,7 +39,7 @@ from ..io.strict_json import open_json
 from ..plugins.codec import from_json, to_json
 from ..rendering.plugin_checks import check_parts
 from ..rendering.renderer import Parts
-from ..types import Boxes
+from ..types import Cell
 from . import tensorfiles
 from .camera_optimizers import Poses, Tones
 from .checkpoint import misfit, reached
@@ -112,23 +113,28 @@ def assemble(
     )
 
 
-def surroundings(config: TrainConfig, facts: Facts, boxes: Boxes) -> Built:
+def surroundings(config: TrainConfig, facts: Facts, cells: Sequence[Cell]) -> Built:
     """The coarse scene that everything starts from. Raises PluginError where a part breaks its contract at once."""
     decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
-    member = Member(surroundings_of(boxes), *build_fields(config, facts))
+    member = Member(surroundings_of(cells), *build_fields(config, facts))
     model = assemble(config, facts, Held([member]), Everywhere(), decoder, tones_of(facts), poses_of(config, facts))
     check_parts(config, model.parts, facts.channels, facts.dim)
     return Built(model, member)
 
 
 def inset(
-    config: TrainConfig, facts: Facts, boxes: Boxes, block: int, around: Built, views: Annotated[Tensor, "M"] | None = None
+    config: TrainConfig,
+    facts: Facts,
+    cells: Sequence[Cell],
+    block: int,
+    around: Built,
+    views: Annotated[Tensor, "M"] | None = None,
 ) -> Built:
     """A block inside of a copy of its surroundings; decoder and tones are theirs, as they learnt them.
 
     Poses start as theirs too, and are refined further from the `views` that the block learns from.
     """
-    chart = chart_of(boxes, block)
+    chart = chart_of(cells[block])
     member = Member(chart, *build_fields(config, facts))
     inherit(member, around.member)
     decoder = copy.deepcopy(around.model.decoder).requires_grad_(False)
@@ -190,16 +196,13 @@ def restore_all(built: Built, tensors: dict[str, Tensor]) -> None:
         restore(part, kind, tensors)
 
 
-def load_boxes(root: Path) -> Boxes:
+def load_blocks(root: Path) -> list[Cell]:
     """Read the boxes of a run's blocks. Raises CheckpointError."""
-    with open_json(root / "blocks.json", "train the scene again") as document:
-        if document["format"] != 1:
-            raise ValueError(f"format {document['format']!r}, this fprf reads 1")
-        return boxes_from(document["boxes"])
+    return read_cells(root / "blocks.json")
 
 
 def asked_of(
-    config: TrainConfig, facts: Facts, scene: Scene, boxes: Boxes, block: int, rays: dict[str, Tensor]
+    config: TrainConfig, facts: Facts, scene: Scene, cells: Sequence[Cell], block: int, rays: dict[str, Tensor]
 ) -> dict[str, Any]:
     """Settings and data of a block's training; while they stay the same, the block stays valid. `rays` is its rays.safetensors.
 
@@ -211,10 +214,10 @@ def asked_of(
     knobs = {name: value for name, value in tree.items() if name not in FREE}
     views = rays["views"].tolist()
     # What the surroundings span follows from all blocks together, not from how they are cut.
-    chart = surroundings_of(boxes) if block == SURROUNDINGS else chart_of(boxes, block)
+    chart = surroundings_of(cells) if block == SURROUNDINGS else chart_of(cells[block])
     parts = {
         "config": knobs,
-        "bounds": [t.tolist() for t in (chart.low, chart.high, chart.turn)],
+        "bounds": [chart.low.tolist(), chart.high.tolist(), torch.eye(3).tolist()],
         "space": [facts.space.centre, facts.space.rotation, facts.space.scale, facts.space.near, facts.space.far],
         "views": views,
         "cameras": [scene.cameras.pose[views].tolist(), scene.cameras.focal[views].tolist()],
@@ -260,18 +263,18 @@ def _train_held(task: BlockTask, report: Callable[[Report], None], begun: Callab
     root = Path(task.root)
     run, folder = Run(root), folder_of(root, task.block)
     config = run.load_config()[0].fields_only(root)
-    facts, boxes, rays = run.load_known().facts, load_boxes(root), tensorfiles.read(folder / RAYS)
+    facts, cells, rays = run.load_known().facts, load_blocks(root), tensorfiles.read(folder / RAYS)
     scene, views = scene_of(replace(config, data=Path(task.data)), facts), rays["views"]
     if len(views) and int(views.max()) >= len(scene.paths):
         raise ConfigError(f"{folder}: its views are not those of {scene.name}; train with the scene that the run was cut from")
-    asked = asked_of(config, facts, scene, boxes, task.block, rays)
+    asked = asked_of(config, facts, scene, cells, task.block, rays)
     done = read_done(folder)
     if done is not None and done.asked == asked:
         return False
     config = replace(config, minutes=task.minutes)  # its part alone is not what was asked: it changes from call to call
     begin(folder, {"task": asked["task"]})
     own = replace(scene, train=views)
-    built = built_block(root, config, facts, boxes, task.block, views)
+    built = built_block(root, config, facts, cells, task.block, views)
     block_run = Run(folder)
     prepared, lead = Prepared(own, _manager(run, config, facts, own, rays), facts, None), 0
     if task.block != SURROUNDINGS:
@@ -306,13 +309,13 @@ def _manager(run: Run, config: TrainConfig, facts: Facts, scene: Scene, rays: di
     )
 
 
-def built_block(root: Path, config: TrainConfig, facts: Facts, boxes: Boxes, block: int, views: Tensor) -> Built:
+def built_block(root: Path, config: TrainConfig, facts: Facts, cells: Sequence[Cell], block: int, views: Tensor) -> Built:
     """The model of a block, inside of its finished surroundings."""
-    around = surroundings(config, facts, boxes)
+    around = surroundings(config, facts, cells)
     if block == SURROUNDINGS:
         return around
     finished = load_finished(folder_of(root, SURROUNDINGS)).tensors
     own = {name: tensor.clone() for name, tensor in finished.items()}  # training writes to them, the file stays
     restore_all(around, own)
     around.member.requires_grad_(True)
-    return inset(config, facts, boxes, block, around, views)
+    return inset(config, facts, cells, block, around, views)

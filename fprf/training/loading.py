@@ -2,6 +2,7 @@
 
 import copy
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Generic, NamedTuple, TypeVar
@@ -23,9 +24,9 @@ from ..style.dictionary import StyleDictionary
 from ..style.look import Restyle
 from ..style.references import Encoders
 from ..style.scene import SceneStyle, from_tensors
-from ..types import Boxes, Origin, View
+from ..types import Cell, Origin, View
 from . import checkpoint
-from .blocks import SURROUNDINGS, assemble, folder_of, load_boxes, load_finished, read_done, restore, restore_all, surroundings
+from .blocks import SURROUNDINGS, assemble, folder_of, load_blocks, load_finished, read_done, restore, restore_all, surroundings
 from .model import Model, build_model
 from .prepare import device_of
 from .quality import QualityConfig, at_quality
@@ -39,13 +40,13 @@ class Shelf(Members):
     def __init__(
         self,
         root: Path,
-        boxes: Boxes,
+        cells: Sequence[Cell],
         around: Member,
         *,
         device: torch.device,
         limit: int | None,
     ) -> None:
-        self._root, self._boxes, self._device = root, boxes, device
+        self._root, self._cells, self._device = root, cells, device
         self.held = (around,)
         self._here: OrderedDict[int, Member] = OrderedDict()
         self._verified: set[int] = set()
@@ -59,7 +60,7 @@ class Shelf(Members):
 
     def member(self, number: int) -> Member:
         """A block by its number; the surroundings come after the last one. Raises CheckpointError for a missing block."""
-        if number == len(self._boxes.low):
+        if number == len(self._cells):
             return self.held[0]
         if number in self._here:
             self._here.move_to_end(number)
@@ -71,7 +72,7 @@ class Shelf(Members):
 
     def _fetch(self, number: int) -> Member:
         member = copy.deepcopy(self.held[0])
-        member.chart = chart_of(self._boxes, number)
+        member.chart = chart_of(self._cells[number])
         finished = load_finished(folder_of(self._root, number), verify=number not in self._verified)
         restore(member, "member", finished.tensors)
         self._verified.add(number)
@@ -253,15 +254,15 @@ def _load_blocks(
     run: Run, config: TrainConfig, method: str, known: Known, device: torch.device, max_memory: float | None
 ) -> Trained:
     """The surroundings in memory, the blocks on a shelf."""
-    boxes, facts = load_boxes(run.root), known.facts
-    around = surroundings(config, facts, boxes)
+    cells, facts = load_blocks(run.root), known.facts
+    around = surroundings(config, facts, cells)
     finished = load_finished(folder_of(run.root, SURROUNDINGS))
     restore_all(around, finished.tensors)
     limit = None if max_memory is None else int(max_memory * _MIB)
-    shelf = Shelf(run.root, boxes, around.member.to(device), device=device, limit=limit)
-    model = assemble(config, facts, shelf, Blend(boxes), around.model.decoder, around.model.tones, around.model.poses)
+    shelf = Shelf(run.root, cells, around.member.to(device), device=device, limit=limit)
+    model = assemble(config, facts, shelf, Blend(cells), around.model.decoder, around.model.tones, around.model.poses)
     model.requires_grad_(False)
-    blocks = [read_done(folder_of(run.root, block)) for block in range(len(boxes.low))]
+    blocks = [read_done(folder_of(run.root, block)) for block in range(len(cells))]
     done = [each for each in blocks if each is not None]
     if len(done) < len(blocks):
         again = f"fprf train {run.root / 'config.json'}"

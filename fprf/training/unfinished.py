@@ -13,7 +13,7 @@ from ..errors import CheckpointError
 from ..interfaces import Scene
 from ..style.references import Encoders
 from . import tensorfiles
-from .blocks import RAYS, built_block, folder_of, load_boxes
+from .blocks import RAYS, built_block, folder_of, load_blocks
 from .loading import Trained, encoders_of
 from .model import build_model
 from .prepare import device_of
@@ -54,7 +54,7 @@ class UnfinishedFields(UnfinishedRun):
             model = build_model(config, self.known.facts)
         else:
             views = tensorfiles.read(folder_of(root, block) / RAYS)["views"]
-            model = built_block(root, config, self.known.facts, load_boxes(root), block, views).model
+            model = built_block(root, config, self.known.facts, load_blocks(root), block, views).model
         model.requires_grad_(False)
         self.trained = Trained(self.run, config, method, self.known, model.to(device_of(device)).eval(), 0, 0.0)
 

@@ -1,4 +1,4 @@
-"""`fprf train` with blocks on the command line: plan, train, judge, restyle."""
+"""`fprf train` with blocks on the command line: train, judge, restyle."""
 
 import json
 from pathlib import Path
@@ -10,19 +10,7 @@ from fprf.cli.blocks import SHARE, block_minutes
 from fprf.cli.main import main
 from fprf.config import TrainConfig
 
-BLOCKS = ["--blocks", "street", "--blocks.segments", "2", "--steps", "4"]
-
-
-def test_the_plan_runs_nothing(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["train", "fprf-lite", *flags(world, tmp_path / "run"), *BLOCKS, "--plan"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert "fprf-lite on town: 8 training images" in lines[0]
-    assert lines[1].split() == ["block", "images", "rays", "size", "memory", "disk", "time"]
-    assert [line.split()[0] for line in lines[2:6]] == ["surroundings", "00", "01", "together"]
-    assert sorted(p.name for p in (tmp_path / "run").iterdir()) == ["plan.json", "plan.png"]
-    document = json.loads((tmp_path / "run/plan.json").read_text())
-    assert [row["name"] for row in document["blocks"]] == ["surroundings", "00", "01", "together"]
-    assert all(row["images"] and row["rays"] and row["memory_mib"] > 0 for row in document["blocks"])
+BLOCKS = ["--blocks", "grid", "--blocks.cells", "2", "1", "--steps", "4"]
 
 
 def test_from_training_to_styles(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

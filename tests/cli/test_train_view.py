@@ -62,7 +62,7 @@ def test_blocks_are_shown_one_after_the_other_and_trained_the_same(
     monkeypatch.setattr(train, "open_view", lambda place: LiveViewer(place, viewer(GREEDY, str(tmp_path / "log"))))
     monkeypatch.setattr(trainer, "REPORT_SECONDS", 0.0)
     monkeypatch.setattr(live, "_COPY_SHARE", 1e6)  # so short a training gives no time for more than one copy
-    blocks = ["--blocks", "street", "--blocks.segments", "2", "--steps", "6"]
+    blocks = ["--blocks", "grid", "--blocks.cells", "2", "1", "--steps", "6"]
     for name, view in (("plain", []), ("shown", ["--view"])):
         assert cli.main(["train", "fprf-lite", *flags(world, tmp_path / name), *blocks, *view]) == 0
     for file in ("blocks/surroundings/block.safetensors", "blocks/00/block.safetensors", "style.safetensors"):

@@ -1,4 +1,4 @@
-"""Scenes in cells: the cut covers space once, cells can be lost and trained again, and their union is the scene."""
+"""Scenes in cells: cells can be lost and trained again, and their union is the scene."""
 
 import json
 import shutil
@@ -10,14 +10,14 @@ import pytest
 import torch
 
 from benchmarks.town.write import write_town
+from fprf.blocks.partition import bisect_sightings
 from fprf.cli.main import main
 from fprf.datamanagers.parsers.config import parse_scene
-from fprf.datamanagers.scene import Scene, find_sightings
+from fprf.datamanagers.scene import Scene
 from fprf.io.images import write_image
 from fprf.plugins.codec import load_config, save_config
 from fprf.splats import cell_training
 from fprf.splats.cell_training import CellTask, read_cells, train_cell
-from fprf.splats.cells import Cell, cut
 from fprf.splats.config import GaussiansConfig
 from fprf.splats.files import read_capture
 from fprf.splats.learner import MOVES
@@ -25,6 +25,7 @@ from fprf.training.camera_optimizers import Tones
 from fprf.training.checkpoint import load_latest
 from fprf.training.loading import open_run
 from fprf.training.run import Run
+from fprf.types import Cell
 
 COUNT = 3
 
@@ -49,42 +50,7 @@ def scene(town: Path) -> Scene:
 
 @pytest.fixture(scope="module")
 def cells(scene: Scene) -> list[Cell]:
-    return cut(scene, COUNT)
-
-
-def test_cells_cover_space_once_and_have_equally_many_sightings(scene: Scene, cells: list[Cell]) -> None:
-    draw = torch.Generator().manual_seed(0)
-    points = 1e3 * torch.randn(1000, 3, generator=draw, dtype=torch.float64) ** 3
-    assert torch.stack([cell.holds(points) for cell in cells]).sum(0).eq(1).all()
-    sightings = find_sightings(scene)
-    assert sightings is not None
-    shares = torch.stack([cell.holds(sightings.point).double().mean() for cell in cells])
-    assert (shares - 1 / COUNT).abs().max() < 0.02
-
-
-def test_windows_show_their_points_through_their_cameras(scene: Scene, cells: list[Cell]) -> None:
-    sightings = find_sightings(scene)
-    assert sightings is not None
-    for cell in cells:
-        assert not {*cell.windows} - {*scene.train.tolist()}
-        own = cell.scene(scene)
-        found = find_sightings(replace(own, seen=None))
-        assert found is not None and {*found.view.tolist()} == {*cell.windows}
-        mine = cell.holds(sightings.point)
-        inside = torch.zeros_like(mine)
-        for view, (left, top, width, height) in cell.windows.items():
-            x, y = sightings.pixel.unbind(1)
-            inside |= (sightings.view == view) & (x >= left) & (x < left + width) & (y >= top) & (y < top + height)
-        assert inside[mine].double().mean() > 0.9  # outliers and views with few points are left out
-
-
-def test_windows_of_a_photograph_reach_its_edges(scene: Scene, cells: list[Cell]) -> None:
-    for view in {view for cell in cells for view in cell.windows}:
-        width, height = scene.cameras.size[view].tolist()
-        windows = [cell.windows[view] for cell in cells if view in cell.windows]
-        assert min(left for left, _, _, _ in windows) == min(top for _, top, _, _ in windows) == 0
-        assert max(left + wide for left, _, wide, _ in windows) == width
-        assert max(top + tall for _, top, _, tall in windows) == height
+    return bisect_sightings(scene, COUNT)
 
 
 def test_a_run_of_before_with_its_rounds_is_read(tmp_path: Path) -> None:

@@ -10,14 +10,14 @@ import torch
 from tiny_world import tiny
 
 from benchmarks.town.write import write_town
+from fprf.blocks.config import GridConfig, LayoutConfig
 from fprf.cli.train import train_scene
 from fprf.config import StatisticsConfig, TrainConfig
-from fprf.fields.layouts import LayoutConfig, StreetConfig
 from fprf.training import tensorfiles
 from fprf.training.blocks import folder_of
 
 STEPS = 6
-BLOCKS = StreetConfig(segments=3)
+BLOCKS = GridConfig(cells=(3, 1))
 
 
 @dataclass(frozen=True)

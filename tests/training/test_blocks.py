@@ -19,13 +19,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import events, same
 
+from fprf.blocks.config import AdaptiveConfig
 from fprf.blocks.fields import Member
-from fprf.blocks.plan import pixel_mask
 from fprf.cli.train import train_scene
 from fprf.errors import CheckpointError, DataError
-from fprf.fields.layouts import AdaptiveConfig, SingleConfig, StreetConfig
 from fprf.training import tensorfiles, trainer
-from fprf.training.block_plan import estimates, plan_scene, renumber
+from fprf.training.block_plan import plan_scene, renumber
 from fprf.training.blocks import (
     RAYS,
     SURROUNDINGS,
@@ -33,7 +32,7 @@ from fprf.training.blocks import (
     Built,
     asked_of,
     folder_of,
-    load_boxes,
+    load_blocks,
     load_finished,
     read_done,
     restore,
@@ -48,7 +47,7 @@ from fprf.training.trainer import Report
 
 def around_of(world: BlockWorld) -> Built:
     """The surroundings at their start."""
-    return surroundings(world.config, Run(world.root).load_known().facts, load_boxes(world.root))
+    return surroundings(world.config, Run(world.root).load_known().facts, load_blocks(world.root))
 
 
 def test_finished_blocks_come_back_and_what_does_not_fit_is_refused(block_world: BlockWorld, tmp_path: Path) -> None:
@@ -76,32 +75,19 @@ def asked(world: BlockWorld, block: int, **change: Any) -> str:
     config = replace(world.config, **change)
     scene, plan = plan_scene(config)
     rays = tensorfiles.read(folder_of(world.root, block) / RAYS)
-    digest: str = asked_of(config, Run(world.root).load_known().facts, scene, plan.boxes, block, rays)["task"]
+    digest: str = asked_of(config, Run(world.root).load_known().facts, scene, plan.cells, block, rays)["task"]
     return digest
 
 
 def test_each_block_knows_its_views_and_tiles(block_world: BlockWorld) -> None:
     scene, plan = plan_scene(block_world.config)
-    document = json.loads((block_world.root / "blocks.json").read_text())
-    assert document["rays"] == plan.rays.tolist() and len(document["rays"]) == 3
+    assert len(load_blocks(block_world.root)) == 3
     for block in range(3):
         rays = tensorfiles.read(folder_of(block_world.root, block) / RAYS)
         assert torch.equal(rays["views"], plan.views_of(block))
         assert torch.equal(rays["seen"].bool(), plan.seen[torch.isin(plan.views, rays["views"]), block])
-        assert sum(int(pixel_mask(seen.bool(), (32, 24)).sum()) for seen in rays["seen"]) == document["rays"][block]
     around = tensorfiles.read(folder_of(block_world.root, SURROUNDINGS) / RAYS)
     assert torch.equal(around["views"], scene.train) and bool(around["seen"].bool().all())
-
-
-def test_the_cut_comes_back_from_its_file(block_world: BlockWorld, tmp_path: Path) -> None:
-    _, plan = plan_scene(block_world.config)
-    found = load_boxes(block_world.root)
-    assert all(torch.equal(mine, theirs) for mine, theirs in zip(found[:3], plan.boxes[:3], strict=True))
-    assert found.margin == plan.boxes.margin
-    for text in ("", '{"format": 2, "boxes": {}}', '{"format": 1, "boxes": {"low": [1], "high": [1], "turn": [1]}}'):
-        (tmp_path / "blocks.json").write_text(text)
-        with pytest.raises(CheckpointError):
-            load_boxes(tmp_path)
 
 
 def test_what_makes_it_another_task_and_what_does_not(block_world: BlockWorld) -> None:
@@ -114,18 +100,6 @@ def test_what_makes_it_another_task_and_what_does_not(block_world: BlockWorld) -
         {"loss": replace(base.loss, rgb=2.0)},
     ]
     assert len({was, *(asked(block_world, 1, **other) for other in others)}) == 5
-
-
-def test_a_plan_has_a_line_for_each_block_but_one_block_has_no_surroundings(block_world: BlockWorld) -> None:
-    scene, plan = plan_scene(block_world.config)
-    around, *blocks, whole = estimates(replace(block_world.config, minutes=1e-3), scene, plan)
-    assert [row.name for row in (around, *blocks, whole)] == ["surroundings", "00", "01", "02", "together"]
-    assert [row.rays for row in blocks] == plan.rays.tolist() and around.rays == 10 * 32 * 24
-    assert whole.seconds == pytest.approx(0.06) and whole.memory_mib == max(row.memory_mib for row in blocks)
-    for layout in (SingleConfig(), StreetConfig(segments=1)):
-        config = replace(small(block_world.config.data, block_world.root), blocks=layout)
-        (row,) = estimates(config, *plan_scene(config))
-        assert (row.name, row.views, row.rays) == ("whole", 10, 10 * 32 * 24)
 
 
 tasks = st.lists(st.sampled_from("abcdefgh"), unique=True, max_size=6)
@@ -188,7 +162,7 @@ def test_the_least_recently_used_goes_first(block_world: BlockWorld) -> None:
     room, around = 2, around_of(block_world).member
     restore(around, "member", load_finished(folder_of(block_world.root, SURROUNDINGS)).tensors)
     limit = (room + 1) * size_of(block_world)
-    shelf = Shelf(block_world.root, load_boxes(block_world.root), around, device=torch.device("cpu"), limit=limit)
+    shelf = Shelf(block_world.root, load_blocks(block_world.root), around, device=torch.device("cpu"), limit=limit)
     kept: dict[int, Member] = {}
     for block in (0, 1, 0, 2, 1, 0, 0, 2, 1, 2):
         old, found = kept.pop(block, None), shelf.member(block)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.town.write import write_town
-from fprf.blocks.plan import boxes_to
+from fprf.blocks.partition import write_cells as write_partition
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import Scene
 from fprf.errors import CheckpointError, FprfError
@@ -25,11 +25,11 @@ from fprf.splats.cell_training import OVERVIEW, read_cells, write_cells
 from fprf.splats.config import GaussiansConfig
 from fprf.training import blocks, checkpoint, tensorfiles
 from fprf.training.block_plan import trained_tasks
-from fprf.training.blocks import load_boxes, load_finished, read_done
+from fprf.training.blocks import load_blocks, load_finished, read_done
 from fprf.training.model import Facts
 from fprf.training.prepare import outcome
 from fprf.training.run import Run, begin, check_images, image_hashes, read_history, save_image_hashes, task_of
-from fprf.types import Boxes
+from fprf.types import Cell
 
 LARGE = "1" + "0" * 400
 JUNK = ("null", "true", "-1", "0.5", "1e300", "1e999", "NaN", "9" * 30, LARGE, "9" * 5000, '"x"', r'"\ud800"', "[]", "{}")
@@ -66,7 +66,7 @@ class Example:
         yield lambda: check_images(root, self.scene, image_hashes(self.scene))
         yield lambda: read_history(root)
         yield lambda: outcome(root, fprf_lite(), self.scene)
-        yield lambda: load_boxes(root)
+        yield lambda: load_blocks(root)
         yield lambda: load_finished(self.parts[0])
         yield lambda: trained_tasks(root)
         yield lambda: read_cells(root)
@@ -90,8 +90,8 @@ def example(tmp_path_factory: pytest.TempPathFactory) -> Example:
     save_config(root / "config.json", fprf_lite(), "fprf-lite")
     run.save_known(scene, town, facts)
     save_image_hashes(root, image_hashes(scene))
-    corner = torch.ones(1, 3, dtype=torch.float64)
-    write_json(root / "blocks.json", {"format": 1, "boxes": boxes_to(Boxes(-corner, corner, torch.eye(3)[None], 0.5))})
+    corner = torch.ones(3, dtype=torch.float64)
+    write_partition(root / "blocks.json", [Cell(low=-corner, high=corner, border=corner / 2)])
     write_cells(root, scene, town, 2)
     made = Example(root, scene, {})
     for part, task in zip(made.parts, ({"task": "a"}, "b", "c"), strict=True):
@@ -189,7 +189,7 @@ def test_a_line_of_events_with_a_number_too_large_is_passed_over(example: Exampl
 
 @pytest.mark.parametrize("name", ["scene.json", "blocks.json", "cells.json"])
 def test_a_number_too_large_is_refused(example: Example, name: str) -> None:
-    readers = {"scene.json": Run(example.root).load_known, "blocks.json": load_boxes, "cells.json": read_cells}
+    readers = {"scene.json": Run(example.root).load_known, "blocks.json": load_blocks, "cells.json": read_cells}
     file, read = example.root / name, readers[name]
     whole = json.loads(file.read_text())
     for container, key in places(whole):

@@ -35,7 +35,7 @@ class SingleConfig(LayoutConfig):
     cuts: ClassVar[bool] = False
 
     def build(self) -> BlockLayout:
-        from ..blocks.layouts import SingleLayout
+        from .partition import SingleLayout
 
         return SingleLayout()
 
@@ -56,10 +56,11 @@ class GridConfig(LayoutConfig):
             at_least("blocks.cells", count, 1)
         if self.size is not None:
             positive("blocks.size", self.size)
-        _check_margin(self.margin)
+        positive("blocks.margin", self.margin)
+        between("blocks.margin", self.margin, 0.0, 0.5)
 
     def build(self) -> BlockLayout:
-        from ..blocks.layouts import GridLayout
+        from .partition import GridLayout
 
         return GridLayout(self)
 
@@ -79,37 +80,10 @@ class AdaptiveConfig(LayoutConfig):
         at_least("blocks.rays", self.rays, 1)
         if self.smallest is not None:
             positive("blocks.smallest", self.smallest)
-        _check_margin(self.margin)
+        positive("blocks.margin", self.margin)
+        between("blocks.margin", self.margin, 0.0, 0.5)
 
     def build(self) -> BlockLayout:
-        from ..blocks.layouts import AdaptiveLayout
+        from .partition import AdaptiveLayout
 
         return AdaptiveLayout(self)
-
-
-@dataclass(frozen=True, kw_only=True)
-class StreetConfig(LayoutConfig):
-    """Segments along the path of the cameras, each turned along its own stretch and as wide as what is seen there."""
-
-    segments: int = 4
-    """Segments of the path, of about equal length."""
-    length: float | None = None
-    """Length of a segment instead, world units; the path is halved until none is longer."""
-    margin: float = 0.1
-    """Overlap of a block with its neighbours, as a share of the shortest segment; in (0, 0.5]."""
-
-    def __post_init__(self) -> None:
-        at_least("blocks.segments", self.segments, 1)
-        if self.length is not None:
-            positive("blocks.length", self.length)
-        _check_margin(self.margin)
-
-    def build(self) -> BlockLayout:
-        from ..blocks.layouts import StreetLayout
-
-        return StreetLayout(self)
-
-
-def _check_margin(margin: float) -> None:
-    positive("blocks.margin", margin)
-    between("blocks.margin", margin, 0.0, 0.5)
