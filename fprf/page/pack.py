@@ -162,8 +162,8 @@ def fit_maps(
 ) -> tuple[NDArray[np.uint8], Annotated[NDArray[np.float32], "M 9"]]:
     """At most 256 matrices A, and for each row the one by which before A comes nearest to after, in least squares.
 
-    The error of a row is <G, A A^T> - 2 <H, A> + const with G = before^T before and H = before^T after: a product of 18 numbers,
-    whatever K is.
+    The error of a row is <G, A A^T> - 2 <H, A> + const with G = before^T before and H = before^T after: a product of 18
+    numbers, whatever K is.
     """
     grams = torch.einsum("nki,nkj->nij", before, before).flatten(1)
     crosses = torch.einsum("nki,nkj->nij", before, after).flatten(1)
@@ -187,7 +187,9 @@ def fit_maps(
 
 
 @torch.inference_mode()
-def importance(gaussians: Gaussians, cameras: Cameras, *, antialiased: bool, near: float, most: int = 32) -> Annotated[Tensor, "N"]:
+def importance(
+    gaussians: Gaussians, cameras: Cameras, *, antialiased: bool, near: float, most: int = 32
+) -> Annotated[Tensor, "N"]:
     """Weight of each Gaussian in the pixels of at most so many views: those of the least weight show least."""
     shape = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)
     weight = torch.zeros(len(gaussians))

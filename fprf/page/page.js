@@ -80,7 +80,7 @@ class Stage {
     this.styles.push({ ...style, card });
     at("looks").insertBefore(card, at("add"));
     at("from").append(make("option", { value: style.name, textContent: style.name }));
-    if (this.from === null) this.set({ from: style.name, to: style.name });
+    this.set(this.from === null ? { from: style.name, to: style.name } : {});
   }
 
   // From the captured colours to a style, without a jump.

@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from html import escape
 from importlib.resources import files
 from itertools import groupby
@@ -23,9 +23,9 @@ from torch import Tensor
 
 from ..errors import DataError
 from ..io.atomic import write_text
+from ..io.figures import Metrics, figures, number
 from ..io.images import Picture, data_uri, shrink, to_uint8
 from ..io.maps import palette
-from ..io.report import Metrics, figures, number
 from ..rendering.cameras import Cameras
 from ..rendering.paths import upwards
 from ..splats.photographs import camera_of
@@ -33,7 +33,7 @@ from ..splats.scene import SplatScene
 from .pack import colour_header, colour_section, header, importance, pack, sections
 
 CAPTURED = "Captured"
-_STILL, _VIEW, _MAP, _REFERENCE, _THUMB = 960, 640, 360, 360, 140
+_STILL, _VIEW, _MAP, _REFERENCE, _THUMB = 800, 512, 320, 320, 160
 """Longest sides in pixels: of pictures on the stage and below it, of match maps, references and cards."""
 _CAMERAS = 48
 """Captured cameras that one can go to, at most."""
@@ -67,7 +67,7 @@ class Style(NamedTuple):
     metrics: Metrics = MappingProxyType({})
 
 
-class View(NamedTuple):
+class PageView(NamedTuple):
     """A view of the scene as captured."""
 
     name: str
@@ -85,7 +85,7 @@ class Page:
     lead: str = ""
     facts: Mapping[str, str | int | float]
     """A few, by their labels ("Photographs": 34)."""
-    views: Sequence[View]
+    views: Sequence[PageView]
     """At least one."""
     styles: Sequence[Style]
     references: Sequence[Reference] = ()
@@ -93,7 +93,7 @@ class Page:
     """The Gaussians as captured; None = the stage shows pictures."""
     start: int = 0
     """Camera of the scene that the stage begins at."""
-    metrics: Metrics = MappingProxyType({})
+    metrics: Metrics = field(default_factory=dict)
     film: Path | None = None
     """H.264 or WebP; embedded where it is small, else linked beside the page."""
     credits: Sequence[str] = ()
@@ -123,7 +123,9 @@ def write_page(path: Path, page: Page, *, megabytes: float | None = None) -> int
             return int(head["count"])
         share = (room - len(fixed.encode())) / max(1, size - len(fixed.encode()))
         if share <= 0.02:
-            raise DataError(f"{path}: {len(fixed.encode()) / 2**20:.1f} MiB without any Gaussian; allow more than {megabytes} MiB")
+            raise DataError(
+                f"{path}: {len(fixed.encode()) / 2**20:.1f} MiB without any Gaussian; allow more than {megabytes} MiB"
+            )
         if weight is None:
             scene = page.scene
             weight = importance(scene.gaussians, scene.views, antialiased=scene.antialiased, near=scene.near)
@@ -238,11 +240,11 @@ def _text(page: Page, film: str, head: Mapping[str, Any] | None, parts: Mapping[
         ],
         "stills": dict(zip(names, stills, strict=True)),
     }
+    height, width = page.views[0].original.shape[:2]
     known = {reference.name: reference for reference in page.references}
     blocks = "\n".join(_style(style, page.views, known) for style in page.styles)
     maps = "".join(_figure(view.depth, view.name, _MAP) for view in page.views if view.depth is not None)
     below = [
-        ("", _facts(page.facts)),
         ("Film", film),
         ("Views", _views(page.views) if any(view.photograph is not None for view in page.views) else ""),
         ("Styles", blocks),
@@ -256,16 +258,17 @@ def _text(page: Page, film: str, head: Mapping[str, Any] | None, parts: Mapping[
         lead=f'<p class="lead">{escape(page.lead)}</p>' if page.lead else "",
         css=(here / "page.css").read_text("utf-8"),
         hash=f"'sha256-{base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()}'",
-        nav="\n".join(f'<a href="#{name.lower()}">{name}</a>' for name, _ in present if name),
-        stage=Template((here / "stage.html").read_text("utf-8")).substitute(still=f'src="{stills[0][0]}"'),
-        body="\n".join(
-            f'<section id="{name.lower()}"><h2>{name}</h2>\n{part}\n</section>' if name else part for name, part in present
+        nav="\n".join(f'<a href="#{name.lower()}">{name}</a>' for name, _ in present),
+        stage=Template((here / "stage.html").read_text("utf-8")).substitute(
+            still=f'src="{stills[0][0]}"', ratio=f"{width / height:.4f}", facts=_facts(page.facts)
         ),
+        body="\n".join(f'<section id="{name.lower()}"><h2>{name}</h2>\n{part}\n</section>' for name, part in present),
         credits="\n".join(f"<p>{escape(line)}</p>" for line in page.credits),
         # "<" cannot end the script then, whatever a name holds.
         data=json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),
         sections="\n".join(
-            f'<script type="text/plain" id="data-{name}">{base64.b64encode(part).decode()}</script>' for name, part in parts.items()
+            f'<script type="text/plain" id="data-{name}">{base64.b64encode(part).decode()}</script>'
+            for name, part in parts.items()
         ),
         script=code,
     )
@@ -274,7 +277,9 @@ def _text(page: Page, film: str, head: Mapping[str, Any] | None, parts: Mapping[
 def _img(picture: Picture, side: int, alt: str) -> str:
     small = shrink(picture, side)
     height, width = small.shape[:2]
-    return f'<img src="{data_uri(small)}" alt="{escape(alt)}" width="{width}" height="{height}" decoding="async" loading="lazy">'
+    return (
+        f'<img src="{data_uri(small)}" alt="{escape(alt)}" width="{width}" height="{height}" decoding="async" loading="lazy">'
+    )
 
 
 def _figure(picture: Picture, name: str, side: int) -> str:
@@ -286,7 +291,7 @@ def _facts(facts: Mapping[str, str | int | float]) -> str:
     return f'<dl class="facts">{rows}</dl>' if rows else ""
 
 
-def _views(views: Sequence[View]) -> str:
+def _views(views: Sequence[PageView]) -> str:
     """Photographs beside what the scene shows from their places."""
     rows = "".join(
         f'<figure><div class="pair">{_img(view.photograph, _VIEW, f"Photograph {view.name}")}'
@@ -294,10 +299,12 @@ def _views(views: Sequence[View]) -> str:
         for view in views
         if view.photograph is not None
     )
-    return f'<p class="lead">Photographs that training did not see, and beside them the scene.</p><div class="grid">{rows}</div>'
+    return (
+        f'<p class="lead">Photographs that training did not see, and beside them the scene.</p><div class="grid">{rows}</div>'
+    )
 
 
-def _style(style: Style, views: Sequence[View], known: Mapping[str, Reference]) -> str:
+def _style(style: Style, views: Sequence[PageView], known: Mapping[str, Reference]) -> str:
     """References of a style, with the colours of its match maps and with shares where there are any; its figures; the maps."""
     rows = []
     colours = to_uint8(palette(len(style.references))[None])[0] if style.references else []
@@ -307,7 +314,8 @@ def _style(style: Style, views: Sequence[View], known: Mapping[str, Reference]) 
         image = _img(known[name].image, _REFERENCE, f"Reference {name}")
         rows.append(f"<figure>{image}<figcaption>{chip}<span>{escape(name)}</span>{share}</figcaption></figure>")
     measured = "".join(
-        f"<div><dt>{escape(row.label)}</dt><dd>{escape(row.value)} {escape(row.unit)}</dd></div>" for row in figures(style.metrics)
+        f"<div><dt>{escape(row.label)}</dt><dd>{escape(row.value)} {escape(row.unit)}</dd></div>"
+        for row in figures(style.metrics)
     )
     maps = "".join(_figure(each, view.name, _MAP) for view, each in zip(views, style.matches, strict=False))
     return f"""<article class="style"><h3>{escape(style.name)}</h3>
@@ -332,7 +340,9 @@ def _film(video: Path, page: Path, most: float) -> str:
     if animated or b"avc1" not in data:
         link = f'<a href="{escape(beside)}">{escape(video.name)}</a>'
         return f'<p class="lead">This film lies beside the page, for a player: {link}</p>'
-    return f'<video class="flight" src="{source}" controls loop muted playsinline preload="metadata" aria-label="Flight"></video>'
+    return (
+        f'<video class="flight" src="{source}" controls loop muted playsinline preload="metadata" aria-label="Flight"></video>'
+    )
 
 
 def _figures(metrics: Metrics) -> str:
