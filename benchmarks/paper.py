@@ -139,19 +139,6 @@ class SceneDecoder(Decoder):
         hidden = torch.relu(content @ first.T + self.first_bias)
         return torch.sigmoid(hidden @ second.T + self.second_bias)
 
-    def restyled(
-        self,
-        content: Annotated[Tensor, "N C"],
-        styled: Annotated[Tensor, "N C"],
-        strength: float | Annotated[Tensor, "N 1"],
-    ) -> Annotated[Tensor, "N 3"]:
-        """The decoded style."""
-        colour: Tensor = self(styled)
-        return colour
-
-    def frozen_colour(self, content: Annotated[Tensor, "N C"]) -> None:
-        """None: there is nothing besides."""
-
 
 def _scene_decoder(config: TrainConfig) -> TrainConfig:
     return replace(config, content=replace(config.content, decoder=SceneDecoderConfig()))

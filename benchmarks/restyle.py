@@ -25,7 +25,6 @@ from fprf.plugins import registry
 from fprf.plugins.stylizers.config import (
     AdainConfig,
     LocalAdainConfig,
-    RegionAdainConfig,
     RegionOtConfig,
     RegionToneConfig,
     StylizerConfig,
@@ -72,7 +71,6 @@ GLOBAL = ("reinhard", "histogram", "adain")
 STYLIZERS: Mapping[str, StylizerConfig] = {
     "adain": AdainConfig(),
     "local-adain": LocalAdainConfig(),
-    "region-adain": RegionAdainConfig(),
     "region-ot": RegionOtConfig(),
     "region-tone": RegionToneConfig(),
 }

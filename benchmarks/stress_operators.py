@@ -12,7 +12,7 @@ from torch import Tensor
 from fprf.errors import FprfError
 from fprf.ops import march
 from fprf.ops.guided import upsample
-from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionAdainConfig, RegionOtConfig, StylizerConfig
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from fprf.rendering.stepfun import resample, transmittance_weights
 from fprf.style.clusters import kmeans
 from fprf.style.dictionary import whole_style
@@ -287,7 +287,7 @@ def stylizers() -> list[Check]:
     """A scene in its own style comes back; no statistics make a number that is not finite."""
     kinds: dict[str, StylizerConfig] = {
         "adain": AdainConfig(),
-        "region-adain": RegionAdainConfig(),
+        "region-tone": RegionToneConfig(),
         "region-ot": RegionOtConfig(),
     }
     rows = []

@@ -127,33 +127,14 @@ class Sampler(nn.Module, ABC):
 
 
 class Decoder(nn.Module, ABC):
-    """Content features to colour, point by point (paper, D_VGG).
+    """Content features to colour, point by point (paper, D_VGG): those of the scene as it is, and those of a style.
 
     What is scene-agnostic comes frozen. Parameters that want gradients are the scene's own and are trained with it.
     """
 
     @abstractmethod
     def forward(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"]:
-        """The scene as it is: sRGB in [0, 1]."""
-
-    @abstractmethod
-    def restyled(
-        self,
-        content: Annotated[Tensor, "N C"],
-        styled: Annotated[Tensor, "N C"],
-        strength: float | Annotated[Tensor, "N 1"],
-    ) -> Annotated[Tensor, "N 3"]:
-        """The scene in a new style, sRGB in [0, 1]. `styled` is blended already by `strength`, one for all or one a point.
-
-        Where `styled` is `content`, this is `forward(content)`: bit for bit at strength 0, else within rounding.
-        """
-
-    @abstractmethod
-    def frozen_colour(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"] | None:
-        """`forward` without the scene's own parameters; None where there are none.
-
-        Training asks for these colours as well: they are what a new style starts from.
-        """
+        """sRGB in [0, 1], for any features."""
 
 
 class Stylizer(nn.Module, ABC):

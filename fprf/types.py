@@ -137,8 +137,6 @@ class Rendered(NamedTuple):
     sampled: Sampled | None = None
     counts: Mapping[str, int] = {}
     """Numbers of rays, samples, and kept samples."""
-    frozen_rgb: Annotated[Tensor, "R 3"] | None = None
-    """In training: the colour without the decoder's parameters that are the scene's own, if it has any."""
 
 
 class View(NamedTuple):

@@ -253,12 +253,6 @@ class Bright(Decoder):
     def forward(self, content: Tensor) -> Tensor:
         return content[:, :3]
 
-    def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
-        return self(styled)
-
-    def frozen_colour(self, content: Tensor) -> None:
-        return None
-
 
 class Averaging(Stylizer):
     @property
@@ -296,10 +290,10 @@ BREACHES: list[tuple[Callable[..., None], Any, dict[str, str]]] = [
         {
             "seed": "drawn from the seed alone",
             "batch": "must not depend on the others",
-            "rows": "points must not depend on others",
-            "negative": "at least 0",
+            "rows": "content: a point must not depend on the others",
+            "negative": r"expected numbers in \[0, inf\]",
             "infinite": "not finite",
-            "channels": "expected shape",
+            "channels": r"expected float32 \[",
             "idle": "no gradient reaches spare",
             "dtype": r"density: expected torch\.float64 on cpu .* found torch\.float32",
             "device": "density: makes a tensor that is not on the device",
@@ -313,7 +307,7 @@ BREACHES: list[tuple[Callable[..., None], Any, dict[str, str]]] = [
         testing.check_semantic_field,
         SemanticConfig,
         {
-            "channels": "expected shape",
+            "channels": r"expected float32 \[",
             "batch": "must not depend on the others",
             "frozen": "no gradient goes through its answer",
             "dtype": r"expected torch\.float64",
@@ -327,10 +321,10 @@ BREACHES: list[tuple[Callable[..., None], Any, dict[str, str]]] = [
             "item": "reads numbers of the device",
             "bool": "reads numbers of the device",
             "mask": "reads numbers of the device",
-            "log": "of rays that meet nothing: holds values that are not finite",
+            "log": "of rays that meet nothing: expected finite numbers",
             "root": "gradient for rays that meet nothing is not finite",
             "detached": "no gradient goes through",
-            "rays": "expected shape",
+            "rays": r"expected float32 \[",
             "random": "a function of its inputs",
             "device": "not on the device of its inputs",
         },
@@ -347,9 +341,9 @@ BREACHES: list[tuple[Callable[..., None], Any, dict[str, str]]] = [
             "outside": "must be centres",
             "colour": "the colour of the pixel",
             "none": "must bring what stores hold",
-            "channels": "semantic: expected shape",
-            "range": r"must lie in \[0, 1\]",
-            "turned": "image: expected shape",
+            "channels": r"semantic: expected float32 \[",
+            "range": r"expected numbers in \[0, 1\]",
+            "turned": r"image: expected float32 \[",
             "count": "the rays of a batch, 64",
         },
     ),
@@ -360,7 +354,7 @@ BREACHES: list[tuple[Callable[..., None], Any, dict[str, str]]] = [
             "unstable": "must be deterministic",
             "batch": "must not depend on its batch",
             "square": "do not keep the aspect",
-            "miscounted": "expected shape",
+            "miscounted": r"expected float32 \[",
             "divides": "not finite",
             "named": "identity must be the same",
             "training": "evaluation mode",

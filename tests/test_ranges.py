@@ -11,7 +11,6 @@ from fprf.blocks.config import AdaptiveConfig, GridConfig
 from fprf.config import LossConfig, OptimizerConfig, RenderConfig, SemanticConfig, StatisticsConfig, TrainConfig
 from fprf.errors import ConfigError
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
-from fprf.plugins.decoders.config import ResidualDecoderConfig
 from fprf.plugins.encoders.config import (
     ConcatConfig,
     DinoConfig,
@@ -22,7 +21,7 @@ from fprf.plugins.encoders.config import (
 )
 from fprf.plugins.executors.config import RayConfig
 from fprf.plugins.samplers.config import ProposalConfig, UniformConfig
-from fprf.plugins.stylizers.config import LocalAdainConfig, RegionAdainConfig, RegionOtConfig, RegionToneConfig
+from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig, RegionToneConfig
 from fprf.pretraining.config import PretrainDecoderConfig
 from fprf.style.config import NO_MASK, StyleConfig
 from fprf.training.quality import QualityConfig
@@ -58,7 +57,6 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
         "samples": [(1, 8), ()],
         "resolutions": [(1, 8)],
     },
-    ResidualDecoderConfig: {"hidden": [0], "fade": [0.0, -1.0]},
     RandomConfig: {"channels": [0], "stride": [0], "seed": [-1]},
     Vgg16Config: {"layer": ["relu3_4", "fc7"]},
     Vgg19Config: {"layer": ["relu0_1", "relu2_3", "relu2_1 "]},
@@ -66,7 +64,6 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
     Dinov2Config: {"layer": [0], "stride": [0]},
     ConcatConfig: {"weights": [(0.0,), (1.0, -1.0), (inf,)]},
     LocalAdainConfig: {"temperature": [0.0, nan, inf]},
-    RegionAdainConfig: {"temperature": [-1.0], "gain": [0.99]},
     RegionOtConfig: {"temperature": [-1.0], "gain": [0.99]},
     RegionToneConfig: {"temperature": [-1.0], "gain": [0.99]},
     RayConfig: {"workers": [0], "processors": [0.0], "retries": [-1], "gpus": [-1.0]},

@@ -37,8 +37,8 @@ from ..interfaces import DataManager, Decoder
 from ..io.atomic import write_json
 from ..io.strict_json import open_json
 from ..plugins.codec import from_json, to_json
-from ..rendering.plugin_checks import check_parts
 from ..rendering.renderer import Parts
+from ..testing.outputs import check_parts
 from ..types import Cell
 from . import tensorfiles
 from .camera_optimizers import Poses, Tones

@@ -13,9 +13,9 @@ from ..config import TrainConfig
 from ..errors import WeightsError
 from ..interfaces import ContentField, Decoder, Sampler, SemanticField
 from ..plugins.decoders.config import pretrain_line
-from ..rendering.plugin_checks import check_parts
 from ..rendering.renderer import Parts
 from ..rendering.space import Space
+from ..testing.outputs import check_parts
 from ..types import Origin
 from .camera_optimizers import Poses, Tones
 

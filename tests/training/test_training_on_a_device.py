@@ -17,7 +17,6 @@ from fprf.config import TrainConfig
 from fprf.errors import NumericsError
 from fprf.interfaces import DataManager
 from fprf.methods import fprf
-from fprf.plugins.decoders.config import ResidualDecoderConfig
 from fprf.plugins.samplers.config import UniformConfig
 from fprf.training import checkpoint, trainer
 from fprf.training.blocks import BlockTask, train_block
@@ -99,8 +98,8 @@ def agrees(
 def variant(name: str, config: TrainConfig) -> TrainConfig:
     config, content = replace(config, steps=STEPS), config.content
     match name:
-        case "marked, poses, tones, residual":
-            return replace(config, poses=0.02, tones=True, content=replace(content, decoder=ResidualDecoderConfig()))
+        case "marked, poses, tones":
+            return replace(config, poses=0.02, tones=True)
         case "uniform, no semantics":
             semantic = replace(config.semantic, encoder=None)
             return replace(config, sampler=UniformConfig(samples=12), semantic=semantic)
@@ -121,7 +120,7 @@ def variant(name: str, config: TrainConfig) -> TrainConfig:
     return config
 
 
-@pytest.mark.parametrize("name", ["lite", "marked, poses, tones, residual", "uniform, no semantics", "paper"])
+@pytest.mark.parametrize("name", ["lite", "marked, poses, tones", "uniform, no semantics", "paper"])
 def test_training_is_that_of_the_cpu_without_waits_or_copies(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
