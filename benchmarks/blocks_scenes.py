@@ -17,10 +17,11 @@ import torch
 
 from fprf.blocks.config import SingleConfig
 from fprf.cli.parsing import load_method, parse
-from fprf.cli.train import train_scene
-from fprf.training.block_plan import lay_out, plan_scene
+from fprf.training.block_plan import cut
 from fprf.training.blocks import load_blocks
+from fprf.training.driver import train
 from fprf.training.loading import load_run
+from fprf.training.prepare import read_scene
 
 from .common import add_entry, arguments, split_flags
 from .large_scene import parameters, psnr, trained_seconds, use_processor_time, widened
@@ -43,13 +44,14 @@ def main(argv: list[str]) -> None:
     blocks = parse(method, flags, prog="blocks_scenes", description="")
     name = options.name or options.scene.name
     scratch = options.scratch.resolve() / name
-    scene, plan = plan_scene(blocks)
-    wide = 1.0 if options.same_planes else (len(plan.cells) + 1) ** 0.5
+    scene = read_scene(blocks)
+    laid = cut(blocks, scene)
+    assert laid is not None  # the layout has several cells
+    wide = 1.0 if options.same_planes else (len(laid.plan.cells) + 1) ** 0.5
     sides = {
         "blocks": replace(blocks, output=scratch / "blocks", steps=10**6),
         "single": replace(widened(blocks, wide), output=scratch / "single", steps=10**6, blocks=SingleConfig()),
     }
-    lay_out(blocks, scene, plan)
     use_processor_time()
     result: dict[str, Any] = {
         "images": len(scene.paths),
@@ -61,7 +63,7 @@ def main(argv: list[str]) -> None:
     for side in options.sides:
         root = sides[side].output
         assert root is not None
-        train_scene(sides[side], "fprf-lite", quiet=True)
+        train(sides[side], "fprf-lite", quiet=True)
         values = psnr(load_run(root, "cpu"), scratch / f"{side}-views")
         result[side] = {
             "psnr": statistics.mean(values),

@@ -27,7 +27,8 @@ from fprf.datamanagers.images import load_images
 from fprf.rendering.cameras import pixel_grid, rays_through
 from fprf.splats.cell_training import read_cells
 from fprf.splats.config import GaussiansConfig
-from fprf.splats.training import load_tones, open_gaussians, scene_of
+from fprf.splats.loading import open_gaussians
+from fprf.training.prepare import read_scene
 from fprf.training.quality import QualityConfig
 from fprf.training.run import Run
 
@@ -52,16 +53,12 @@ def borders(run: Path, data: Path) -> dict[str, float]:
     """Mean absolute error of held-out views at borders of cells over that elsewhere, and the share of the pixels there."""
     config = Run(run).load_config()[0]
     assert isinstance(config, GaussiansConfig)
-    scene, cells = scene_of(replace(config, data=data)), read_cells(run)
-    opened = open_gaussians(run, config, QualityConfig())
-    tones, cameras = load_tones(opened.run), opened.known.cameras
+    scene, cells = read_scene(replace(config, data=data)), read_cells(run)
+    opened = open_gaussians(Run(run), config, "cpu", QualityConfig())
+    cameras = opened.known.cameras
     sums, counts = np.zeros(2), np.zeros(2)
     for view in opened.known.split("test"):
-        tone = (1.0, 1.0, 1.0)
-        if tones is not None:
-            red, green, blue = tones(torch.tensor([view]))[0].tolist()
-            tone = (red, green, blue)
-        shown = replace(opened.scene, tone=tone).render(cameras, view)
+        shown = opened.scene.as_taken(view).render(cameras, view)
         origin, direction = rays_through(cameras, torch.full((shown.depth.numel(),), view), pixel_grid(cameras, view))
         points = origin + direction * shown.depth.reshape(-1, 1)
         owner = torch.stack([cell.holds(points) for cell in cells]).int().argmax(0).view(shown.depth.shape).numpy()
@@ -98,7 +95,7 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--output", type=Path)
     args = parser.parse_args(argv)
     for data in (each.resolve() for each in args.scenes):
-        size = scene_of(GaussiansConfig(data=data)).cameras.size
+        size = read_scene(GaussiansConfig(data=data)).cameras.size
         downscale = math.ceil(int(size.max()) / args.side)
         flags = ["--downscale", str(downscale), "--initial", str(args.cap), "--cap", str(args.cap)]
         row: dict[str, Any] = {"downscale": downscale, "cap": args.cap, "cells": args.cells}

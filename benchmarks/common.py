@@ -15,9 +15,9 @@ from rich.console import Console
 
 from fprf.checks import at_least
 from fprf.cli.parsing import as_flag, load_field_method, parse
-from fprf.cli.progress import Display
-from fprf.cli.train import train_scene
 from fprf.io.atomic import write_json, write_text
+from fprf.progress import Display
+from fprf.training.driver import train
 
 from .report import Outcome, provenance
 from .town.write import scene_folder
@@ -127,7 +127,7 @@ def bench_run(prog: str, default: C, args: list[str], measure: Callable[[C, Path
             method, name = load_field_method(config.method)
             data = scene_folder(config.data or method.data or Path("town"))
             training = replace(method, data=data, output=folder / "run", steps=config.steps, minutes=None, device=config.device)
-            root = train_scene(training, name)
+            root = train(training, name)
         with Display() as display:
             outcome = measure(config, root, folder, display.count)
         for table in outcome.tables:

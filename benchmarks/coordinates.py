@@ -19,7 +19,7 @@ import trimesh
 from numpy.typing import NDArray
 
 import fprf
-from fprf.cli.eval import EvalConfig
+from fprf.cli.eval import EvalConfig, evaluate
 from fprf.cli.main import main as run_verb
 from fprf.cli.parsing import load_method, parse
 from fprf.datamanagers.parsers.config import parse_scene
@@ -29,6 +29,7 @@ from fprf.io.atomic import write_json
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.scene import SplatScene
+from fprf.training.driver import train
 from fprf.training.loading import open_run
 from fprf.types import Origin
 
@@ -120,9 +121,8 @@ def main(argv: list[str]) -> None:
         run = scratch / f"{name} {options.method}"
         method, _ = load_method(options.method)
         config = parse(method, ["--data", str(data), "--steps", str(options.steps), *flags], prog="coordinates", description="")
-        verbs = replace(config, output=run).verbs()
-        verbs.train(options.method, quiet=True)
-        judged = verbs.evaluate(EvalConfig(run=run, images=False, device="cpu"))
+        train(replace(config, output=run), options.method, quiet=True)
+        judged = evaluate(EvalConfig(run=run, images=False, device="cpu"))
         figures[name] = {"psnr": judged["psnr"], "seconds": judged["train_seconds"]}
         print(name, json.dumps(figures[name]), flush=True)
         figures[name]["share_of_extent"] = exported(run, scratch / f"{name} files", factor, shift)

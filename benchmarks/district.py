@@ -65,7 +65,8 @@ def begin(data: Path, run: Path, towns: int) -> dict[str, Any]:
     from fprf.datamanagers.images import load_images
     from fprf.splats.cell_training import train_overview, write_cells
     from fprf.splats.config import GaussiansConfig
-    from fprf.splats.training import facts_of, lit, scene_of
+    from fprf.splats.training import lit_facts
+    from fprf.training.prepare import read_scene
     from fprf.training.run import Run
 
     from .blocks import peak_mib
@@ -78,9 +79,9 @@ def begin(data: Path, run: Path, towns: int) -> dict[str, Any]:
         initial=POINTS * cells, cap=GAUSSIANS * cells, background=SKY, checkpoint_minutes=0.02,
     )  # fmt: skip
     start = time.process_time()
-    scene, folder = scene_of(config), Run(run)
+    scene, folder = read_scene(config), Run(run)
     run.mkdir(parents=True, exist_ok=True)
-    facts = lit(facts_of(config, scene), config, scene, lambda view: load_images(scene, config.background, [view])[0])
+    facts = lit_facts(config, scene, lambda view: load_images(scene, config.background, [view])[0])
     folder.save_config(config, "fprf-splats")
     folder.save_known(scene, data, facts)
     lit_after = time.process_time() - start
@@ -148,8 +149,8 @@ def killed(data: Path, run: Path, cell: int) -> str:
 def write_for_flight(run: Path) -> dict[str, Any]:
     """Write levels of detail of the whole scene."""
     from fprf.splats.cell_training import OVERVIEW
+    from fprf.splats.gaussians import from_tensors
     from fprf.splats.levels import write_levels
-    from fprf.splats.training import gaussians_of
     from fprf.training import checkpoint
 
     from .blocks import peak_mib
@@ -157,7 +158,7 @@ def write_for_flight(run: Path) -> dict[str, Any]:
     saved, _ = checkpoint.load_latest(run / OVERVIEW / "checkpoints", verify=False)
     assert saved is not None
     start = time.process_time()
-    write_levels(run / "levels", gaussians_of(saved), "flight")
+    write_levels(run / "levels", from_tensors(saved.model), "flight")
     count = len(saved.model["means"])
     return {
         "gaussians": count,
@@ -171,9 +172,9 @@ def flight(run: Path, frames: int, pixels: float, everything: bool) -> dict[str,
     import torch
 
     from fprf.splats.cell_training import OVERVIEW
+    from fprf.splats.gaussians import from_tensors
     from fprf.splats.levels import open_levels
     from fprf.splats.photographs import cover
-    from fprf.splats.training import gaussians_of
     from fprf.splats.views import draw
     from fprf.training import checkpoint
     from fprf.training.run import Run
@@ -195,7 +196,7 @@ def flight(run: Path, frames: int, pixels: float, everything: bool) -> dict[str,
             processor.append(time.process_time() - start[1])
             counts.append(len(shown))
         if everything:
-            full = draw(gaussians_of(saved), camera, antialiased=True, background=SKY).image.clamp(0, 1)
+            full = draw(from_tensors(saved.model), camera, antialiased=True, background=SKY).image.clamp(0, 1)
             errors.append(float((full - image).square().mean()))
     if everything:
         return {"rms_error_255": 255 * float(np.mean(errors)) ** 0.5, "worst_rms_error_255": 255 * max(errors) ** 0.5}

@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from fprf.splats.training import gaussians_of, open_gaussians, state_of
+from fprf.splats.gaussians import from_tensors, tensors_of
+from fprf.splats.loading import open_gaussians
 from fprf.training import checkpoint
 from fprf.training.quality import QualityConfig
 from fprf.training.run import Run
@@ -40,10 +41,10 @@ def tile(source: Path, run: Path, copies: int) -> int:
     run.mkdir()
     for name in ("config.json", "scene.json"):
         shutil.copy(source / name, run / name)
-    gaussians = gaussians_of(saved)
+    gaussians = from_tensors(saved.model)
     low, high = gaussians.means[:, 0].sort().values[[len(gaussians) // 50, -(len(gaussians) // 50) - 1]]
     shift = torch.arange(copies).repeat_interleave(len(gaussians)) * (high - low)
-    state = {name: torch.cat([part] * copies) for name, part in state_of(gaussians, 0.0).items() if name != "near"}
+    state = {name: torch.cat([part] * copies) for name, part in tensors_of(gaussians, 0.0).items() if name != "near"}
     state["means"][:, 0] += shift
     near = saved.model["near"]
     tones = {name: part for name, part in saved.optimizer.items() if name.startswith("tones.")}
@@ -53,7 +54,7 @@ def tile(source: Path, run: Path, copies: int) -> int:
 
 def _open(run: Path) -> Any:
     torch.set_num_threads(1)
-    return open_gaussians(run, Run(run).load_config()[0], QualityConfig(quality="standard")).scene  # type: ignore[arg-type]
+    return open_gaussians(Run(run), Run(run).load_config()[0], "cpu", QualityConfig(quality="standard")).scene
 
 
 def find_regions(run: Path) -> dict[str, float]:

@@ -22,13 +22,13 @@ from typing import Any
 import numpy as np
 
 from fprf.cli.parsing import load_method, parse
-from fprf.cli.train import train_scene
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.parsers.files import read_json
 from fprf.datamanagers.scene import Scene
 from fprf.evaluation.evaluate import judge
 from fprf.io.atomic import write_json
 from fprf.io.video import write_frames
+from fprf.training.driver import train
 from fprf.training.loading import load_run
 
 from .common import arguments, origin, read_report, split_flags
@@ -67,12 +67,12 @@ def measured(data: Path, run: Path, steps: int, side: int, flags: list[str], ren
     fixed += ["--semantic.encoder", "none", "--statistics.rays", "1024", "--device", "cpu"]
     config = parse(method, [*fixed, *flags], prog="first_use", description="")
     start = time.process_time()
-    train_scene(config, "fprf-lite", quiet=True)
+    train(config, "fprf-lite", quiet=True)
     seconds = time.process_time() - start
     trained = load_run(run, "cpu")
     scene = parse_scene(data, config.downscale, None)
     views = trained.known.split("test")
-    metrics, pictures = judge(trained, scene, views, lambda done, total, what: None)
+    metrics, pictures = judge(trained, trained.known, scene, views, lambda done, total, what: None)
     if renders is not None:
         renders.mkdir(parents=True, exist_ok=True)
         write_frames(renders, [trained.known.names[view] for view in views], pictures)

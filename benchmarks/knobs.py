@@ -21,11 +21,12 @@ from fprf.plugins.stylizers.config import StylizerConfig
 from fprf.rendering.cameras import Cameras
 from fprf.style.look import Restyle
 from fprf.style.restyle import Styled
+from fprf.training.driver import Report, learn, schedule_of
+from fprf.training.learner import FieldLearner
 from fprf.training.loading import Trained
 from fprf.training.model import Facts, Model
 from fprf.training.quality import PRESETS, QualityConfig, at_quality
 from fprf.training.run import Run
-from fprf.training.trainer import Report, train
 from fprf.training.views import render_view
 
 from .report import Spread, Watch, spread
@@ -332,7 +333,9 @@ def trained_points(
         run = Run(folder / f"variant-{i}")
         run.root.mkdir(parents=True)
         last: list[Report] = []
-        model = train(variant, prepared, run, last.append).requires_grad_(False).eval()
+        learner = FieldLearner(variant, prepared, subject.trained.device)
+        learn(learner, run, schedule_of(variant, len(prepared.scene.train)), last.append)
+        model = learner.model.requires_grad_(False).eval()
         trained = replace(subject.trained, config=variant, model=model)
         (point,) = measure([as_rendered("trained", f"{name} ({last[-1].step} steps)", trained)], scenes, watch)
         found.append(replace(point, train_seconds=last[-1].seconds))

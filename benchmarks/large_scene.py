@@ -21,9 +21,6 @@ from typing import Any
 import torch
 
 from fprf.blocks.config import GridConfig, SingleConfig
-from fprf.cli import blocks as blocks_verb
-from fprf.cli import train as train_verb
-from fprf.cli.train import train_scene
 from fprf.config import TrainConfig
 from fprf.datamanagers.config import RayBatchesConfig
 from fprf.datamanagers.images import load_image
@@ -35,10 +32,12 @@ from fprf.plugins.samplers.config import ProposalConfig
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.restyle import apply_style
-from fprf.training import trainer
-from fprf.training.block_plan import lay_out, plan_scene
+from fprf.training import driver
+from fprf.training.block_plan import cut
 from fprf.training.blocks import load_blocks
+from fprf.training.driver import train
 from fprf.training.loading import Trained, load_run
+from fprf.training.prepare import read_scene
 from fprf.training.views import render_view
 
 from .blocks import costs, jumps, ratios
@@ -129,9 +128,7 @@ def parameters(config: TrainConfig, root: Path) -> int:
 
 def use_processor_time() -> None:
     """Time limits of training count what this process has used, whatever else the machine does."""
-    clock = SimpleNamespace(perf_counter=time.process_time)
-    for module in (trainer, train_verb, blocks_verb):
-        vars(module)["time"] = clock
+    vars(driver)["time"] = SimpleNamespace(perf_counter=time.process_time, time=time.time)
 
 
 def trained_seconds(root: Path) -> dict[str, Any]:
@@ -185,20 +182,21 @@ def main(argv: list[str]) -> None:
     if options.clock == "processor":
         use_processor_time()
     blocks, single = configs(options)
-    scene, plan = plan_scene(blocks)
-    lay_out(blocks, scene, plan)
-    say(f"{len(scene.paths)} images, features extracted, {len(plan.cells)} blocks")
+    scene = read_scene(blocks)
+    laid = cut(blocks, scene)
+    assert laid is not None  # the layout has several cells
+    say(f"{len(scene.paths)} images, features extracted, {len(laid.plan.cells)} blocks")
     result: dict[str, Any] = {
         "images": len(scene.paths),
         "size": list(options.size),
-        "blocks": len(plan.cells),
+        "blocks": len(laid.plan.cells),
         "minutes_each_side": options.minutes,
         "clock": options.clock,
         "threads": torch.get_num_threads(),
     }
     for name, config in (("blocks", blocks), ("single", single)):
         assert config.output is not None
-        train_scene(config, "fprf-lite", quiet=True)
+        train(config, "fprf-lite", quiet=True)
         run = load_run(config.output, "cpu")
         values = psnr(run, options.scratch / f"{name}-views")
         result[name] = {

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor, nn
 
 from fprf.cli.parsing import load_field_method, parse
-from fprf.cli.progress import Display
 from fprf.config import TrainConfig
 from fprf.datamanagers.images import load_image
 from fprf.errors import UsageError
@@ -21,12 +20,14 @@ from fprf.interfaces import Decoder
 from fprf.ops import dense
 from fprf.plugins.decoders.config import DecoderConfig, MlpDecoderConfig
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionToneConfig
+from fprf.progress import Display
 from fprf.style.references import Encoders
+from fprf.training.driver import Report, learn, schedule_of
+from fprf.training.learner import FieldLearner
 from fprf.training.loading import Trained, encoders_of, load_run
-from fprf.training.prepare import prepare, scene_of
+from fprf.training.prepare import device_of, prepare, read_scene
 from fprf.training.run import Run
 from fprf.training.style_pass import measure_style
-from fprf.training.trainer import Report, train
 from fprf.training.views import render_view
 
 from .common import origin, write_report
@@ -147,7 +148,7 @@ def paper(config: PaperConfig, method: TrainConfig, name: str, progress: Progres
 
 def short_training(config: TrainConfig, folder: Path, progress: Progress) -> Short:
     """Prepare, train and measure the scene's style, without a run folder that others could read."""
-    prepared = prepare(config)
+    prepared = prepare(config, read_scene(config))
     run = Run(folder)
     run.root.mkdir(parents=True)
     run.save_known(prepared.scene, scene_folder(config.data), prepared.facts)
@@ -158,7 +159,9 @@ def short_training(config: TrainConfig, folder: Path, progress: Progress) -> Sho
         progress(event.step, config.steps, "training")
 
     start = time.perf_counter()
-    model = train(config, prepared, run, report).requires_grad_(False).eval()
+    learner = FieldLearner(config, prepared, device_of(config.device))
+    learn(learner, run, schedule_of(config, len(prepared.scene.train)), report)
+    model = learner.model.requires_grad_(False).eval()
     spent = time.perf_counter() - start
     scene = measure_style(config, model, prepared.scene.cameras, prepared.scene.train)
     trained = Trained(run, config, "", run.load_known(), model, config.steps, spent)
@@ -198,7 +201,7 @@ def _finished(root: Path, device: str) -> Short:
 
 def _held_out(trained: Trained, views: int) -> Row:
     known, config = trained.known, trained.config
-    scene = scene_of(config)
+    scene = read_scene(config)
     chosen = (known.test or known.train)[:views]
     found = []
     for view in chosen:

@@ -24,7 +24,7 @@ from fprf.rendering.cameras import Cameras
 from fprf.style.look import Restyle
 from fprf.style.restyle import restyle
 from fprf.training.loading import Trained, load_run
-from fprf.training.prepare import scene_of
+from fprf.training.prepare import read_scene
 from fprf.training.run import view_names
 
 from .common import BenchConfig, bench_run
@@ -236,7 +236,7 @@ def _photographs(subject: Subject, views: Sequence[int], cameras: Sequence[Camer
     """What the views really look like, at the size that they are rendered at; or why that is not known."""
     config, known = subject.trained.config, subject.trained.known
     try:
-        scene = scene_of(replace(config, data=subject.data))
+        scene = read_scene(replace(config, data=subject.data))
         if tuple(view_names(scene.paths)) != known.names:
             raise UsageError(f"{subject.data}: its images are not those of the run; name the folder with --data")
         images = []

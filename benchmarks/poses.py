@@ -21,13 +21,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fprf.cli.eval import EvalConfig
+from fprf.cli.eval import EvalConfig, evaluate
 from fprf.cli.parsing import load_method, parse
 from fprf.config import RunConfig, TrainConfig
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.rendering.cameras import Cameras
 from fprf.training.camera_optimizers import rotated
+from fprf.training.driver import train
 from fprf.training.loading import open_run
+from fprf.training.prepare import read_scene
 
 from .common import add_entry, arguments, split_flags
 from .town.write import scene_folder
@@ -87,11 +89,10 @@ def errors(found: Cameras, true: Cameras, views: Tensor) -> dict[str, float]:
 def run_one(config: RunConfig, method: str, true: Cameras | None) -> dict[str, Any]:
     """Train and judge, by the verbs that users call."""
     assert config.output is not None
-    verbs = config.verbs()
-    verbs.train(method, quiet=True)
+    train(config, method, quiet=True)
     asked = EvalConfig(run=config.output, images=False, device="cpu")
-    given = verbs.evaluate(asked)
-    after: dict[str, Any] = verbs.evaluate(replace(asked, fit_poses=True))
+    given = evaluate(asked)
+    after: dict[str, Any] = evaluate(replace(asked, fit_poses=True))
     result = {
         "psnr": given["psnr"],
         "psnr_poses_fitted": after["psnr"],
@@ -125,7 +126,7 @@ def main(argv: list[str]) -> None:
     flags = ["--data", str(scene_folder(options.scene)), "--steps", str(options.steps), *flags_behind]
     base = parse(method, flags, prog="poses", description="")
     base = replace(base, downscale=base.downscale or 1)
-    source = base.read_scene().paths[0].parents[1]
+    source = read_scene(base).paths[0].parents[1]
     scratch = options.scratch.resolve() / source.name
     true = None if options.as_given else parse_scene(source, base.downscale, None).cameras
     data = (

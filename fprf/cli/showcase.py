@@ -6,7 +6,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from .progress import Display
+from ..progress import Display
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
