@@ -15,8 +15,9 @@ import hashlib
 import json
 import math
 import shutil
+import time
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,36 +28,29 @@ from torch import Tensor
 from ..blocks import partition
 from ..blocks.partition import bisect_sightings
 from ..config import RESUMABLE
+from ..datamanagers.images import load_images
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError
+from ..interfaces import Partition, State
 from ..io.atomic import write_json
 from ..io.strict_json import open_json
+from ..ops.rasterise_training import compile_beside
 from ..plugins.codec import from_json, to_json
+from ..progress import Display
 from ..training import checkpoint
 from ..training.camera_optimizers import Tones
+from ..training.driver import Report, Schedule, learn, reporter
 from ..training.model import Facts
-from ..training.run import Run, begin, held
-from ..training.trainer import Report
+from ..training.prepare import read_scene
+from ..training.run import Run, begin, held, known_of
 from ..types import Cell
 from .cells import crop, scene_in_windows, shown_in_windows
 from .config import GaussiansConfig
-from .gaussians import Gaussians
-from .learner import MOVES, Learner
-from .photographs import make_levels
-from .training import (
-    Prepared,
-    gaussians_of,
-    limit_widths,
-    load_photographs,
-    load_skies,
-    other_views,
-    prepare,
-    reach_of,
-    refined,
-    scene_of,
-    state_of,
-    train,
-)
+from .gaussians import Gaussians, from_tensors, tensors_of
+from .learner import MOVES, GaussianLearner, Part
+from .loading import refined
+from .photographs import load_photographs, load_skies, make_levels
+from .training import build, limit_widths, lit_facts, reach_of
 
 _FORMAT, _VIEWS, _WRITTEN = 6, "views.json", "train again to write it"
 OVERVIEW = "overview"
@@ -88,6 +82,50 @@ class CellTask:
 def folder_of(root: Path, cell: int) -> Path:
     """Folder of a cell in a run."""
     return root / "cells" / f"{cell:02d}"
+
+
+class Cells(Partition):
+    """A scene whose parts of space are trained apart: the whole coarsely, then the cells, largest windows first."""
+
+    def __init__(self, config: GaussiansConfig, scene: Scene, saved: Facts | None) -> None:
+        self.config, self.scene = config, scene
+        self.compiling = compile_beside((config.degree + 1) ** 2)
+        self._facts = saved or lit_facts(config, scene, lambda view: load_images(scene, config.background, [view])[0])
+
+    @property
+    def facts(self) -> Facts:
+        return self._facts
+
+    def train(self, run: Run, display: Display, *, spent: float) -> None:
+        """Train the whole scene, then all cells, and write their union."""
+        config, scene, begun = self.config, self.scene, time.perf_counter()
+        assert config.data is not None  # the scene was read from there
+        for process in self.compiling:
+            process.wait()
+        cells = write_cells(run.root, scene, config.data, config.cells)
+        pixels = [sum(width * height for _, _, width, height in cell.windows.values()) for cell in cells]
+        whole = int(scene.cameras.size[scene.train].prod(1).sum())
+        display.say(f"{len(cells)} cells, whose windows are {sum(pixels) / whole:.2f} times the photographs")
+        report = reporter(display, run, "whole scene")
+        if not train_overview(run.root, config, scene, report, spent=spent + time.perf_counter() - begun):
+            display.say("the whole scene is trained already")
+        root, data = str(run.root.resolve()), str(config.data.resolve() if config.data.exists() else config.data)
+        order = sorted(range(len(cells)), key=lambda cell: -pixels[cell])
+        minutes = None
+        if config.minutes is not None:
+            passed = (spent + time.perf_counter() - begun) / 60
+            minutes = max(config.minutes - passed, 0.05 * config.minutes) / len(cells)
+        tasks = [CellTask(root=root, data=data, cell=cell, minutes=minutes, quiet=display.quiet) for cell in order]
+        config.executor.on("cpu").build().map(run_cell, tasks)
+        display.say(f"{unite(run.root, cells)} Gaussians")
+
+
+def run_cell(task: CellTask) -> None:
+    """Train one cell, here or on a worker, and show how it goes."""
+    name = f"cell {task.cell:02d}"
+    with Display(quiet=task.quiet) as display:
+        if not train_cell(task, reporter(display, Run(folder_of(Path(task.root), task.cell)), name)):
+            display.say(f"{name} is finished already")
 
 
 def _load_overview(root: Path) -> checkpoint.Saved:
@@ -124,7 +162,7 @@ def _read_views(root: Path, config: GaussiansConfig, data: Path) -> Scene:
     """
     file, known = root / _VIEWS, Run(root).load_known()
     if not file.is_file():
-        return scene_of(replace(config, data=data), known.facts)
+        return read_scene(replace(config, data=data), known.facts)
     with open_json(file, _WRITTEN) as document:
         paths = from_json(document["paths"], tuple[str, ...], path="paths")
         masks = from_json(document["masks"], tuple[str | None, ...], path="masks")
@@ -182,11 +220,11 @@ def train_overview(
         minutes=None if config.minutes is None else config.overview * config.minutes,
     )
     facts = Run(root).load_known().facts
-    small = scene_of(own, facts)
+    small = read_scene(own, facts)
     small = replace(small, train=small.train[:: -(-pixels // (factor**2 * _PIXELS))])
     own = replace(own, steps=max(own.steps, _VISITS * len(small.train)))
     facts = replace(facts, held=other_views(small, small.train.tolist()) if facts.exposure or facts.centres else ())
-    train(own, prepare(own, small, saved=facts), Run(folder), report, spent=spent)
+    learn(build(own, small, facts), Run(folder), schedule_of(own), report, spent=spent)
     write_json(folder / "done.json", {"format": _FORMAT, "task": task})
     return True
 
@@ -213,18 +251,28 @@ def train_cell(task: CellTask, report: Callable[[Report], None]) -> bool:
         steps = max(1, round((1 - config.overview) * config.steps))
         own = replace(config, rate=_RATE * config.rate, steps=steps, minutes=task.minutes)
         facts = Run(root).load_known().facts
-        train(own, _prepared(own, scene, facts, cell, start), Run(folder), report, spent=0.0)
+        learn(_learner(own, scene, facts, cell, start), Run(folder), schedule_of(own), report)
         write_json(folder / "done.json", asked)
     return True
 
 
-def _prepared(config: GaussiansConfig, scene: Scene, facts: Facts, cell: Cell, start: checkpoint.Saved) -> Prepared:
+def schedule_of(config: GaussiansConfig) -> Schedule:
+    """All steps and minutes of a part: passes limit whole scenes alone."""
+    return Schedule(config.steps, config.minutes, config.checkpoint_minutes)
+
+
+def other_views(scene: Scene, views: Iterable[int]) -> tuple[int, ...]:
+    """Numbers of the views that are not among some."""
+    return tuple(sorted(set(range(len(scene.paths))) - set(views)))
+
+
+def _learner(config: GaussiansConfig, scene: Scene, facts: Facts, cell: Cell, start: checkpoint.Saved) -> GaussianLearner:
     """A cell's windows, and the Gaussians of the whole scene that they show."""
     scene = replace(scene, cameras=refined(scene.cameras, start))
     images, masks = load_photographs(config, scene, list(cell.windows))
     skies = load_skies(config, scene, images)
     images, masks, skies = crop(cell, images), crop(cell, masks), crop(cell, skies)
-    near, whole = float(start.model["near"]), gaussians_of(start)
+    near, whole = float(start.model["near"]), from_tensors(start.model)
     shown = shown_in_windows(scene, cell, whole, near)
     gaussians = whole.select(shown)
     own = scene_in_windows(scene, cell)
@@ -235,13 +283,25 @@ def _prepared(config: GaussiansConfig, scene: Scene, facts: Facts, cell: Cell, s
     tones = tones and tones.going_on(other_views(scene, cell.windows))
     levels = make_levels(own, images, masks, near, skies)
     narrow = limit_widths(scene, near, cells=True)  # of all cameras: what lies before those of other cells is part of the union
-    learner = Learner(replace(config, cap=cap), levels, reach_of(own), cap, cell.around, narrow, tones=tones)
+    learner = GaussianLearner(
+        replace(config, cap=cap),
+        levels,
+        reach_of(own),
+        cap,
+        cell.around,
+        narrow,
+        near=near,
+        tones=tones,
+        part=Part(start.step, config.overview, 1.0),
+        known=known_of(own, config.data, facts),
+        origin="the whole scene",
+    )
     # As if the number had grown from the beginning of the schedule.
     passed = min(config.overview / config.grow, 0.99)
     begun = max(1, round((len(gaussians) / cap**passed) ** (1 / (1 - passed))))
     moments = {name: start.optimizer[name][shown] for name in _MOMENTS}
-    learner.restore(gaussians, {**moments, "begun": torch.tensor(begun)})
-    return Prepared(own, learner, near, "the whole scene", start.step, (config.overview, 1.0))
+    learner.load(State(vars(gaussians), {**moments, "begun": torch.tensor(begun)}))
+    return learner
 
 
 def _tones_of(facts: Facts, start: checkpoint.Saved) -> Tones | None:
@@ -296,13 +356,13 @@ def unite(root: Path, cells: Sequence[Cell]) -> int:
         saved, _ = checkpoint.load_latest(folder / "checkpoints")
         if saved is None or _read_done(folder) is None:
             raise CheckpointError(f"{folder}: this cell is not finished; go on with `fprf train {root / 'config.json'}`")
-        gaussians = gaussians_of(saved)
+        gaussians = from_tensors(saved.model)
         parts.append(tuple(vars(gaussians.select(cell.holds(gaussians.means))).values()))
         lights.append({name: each.clone() for name, each in saved.optimizer.items() if name.startswith("tones.")})
         step, seconds = max(step, start.step + saved.step), seconds + saved.seconds
     gaussians = Gaussians(*(torch.cat(column) for column in zip(*parts, strict=True)))
     tones = _mean_tones(_tones_of(Run(root).load_known().facts, start), lights, cells)
-    state = state_of(gaussians, float(start.model["near"]))
+    state = tensors_of(gaussians, float(start.model["near"]))
     moves = {name: each for name, each in start.optimizer.items() if name == MOVES}
     checkpoint.write(Run(root).checkpoints, state, tones | moves, step=step, seconds=seconds)
     return len(gaussians)

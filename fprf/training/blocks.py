@@ -17,8 +17,8 @@ import copy
 import hashlib
 import json
 import zlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -28,12 +28,10 @@ from torch import Tensor, nn
 from ..blocks.fields import BlockedField, BlockedSampler, BlockedSemantic, Held, Member, Members, inherit
 from ..blocks.partition import read_cells
 from ..blocks.routing import Everywhere, Inset, Router, chart_of, surroundings_of
-from ..blocks.visibility import pixel_mask
-from ..config import RESUMABLE, TrainConfig
-from ..datamanagers.basis import Basis
+from ..config import FREE_IN_BLOCKS, TrainConfig
 from ..datamanagers.scene import Scene
-from ..errors import CheckpointError, ConfigError
-from ..interfaces import DataManager, Decoder
+from ..errors import CheckpointError
+from ..interfaces import Decoder
 from ..io.atomic import write_json
 from ..io.strict_json import open_json
 from ..plugins.codec import from_json, to_json
@@ -42,14 +40,9 @@ from ..testing.outputs import check_parts
 from ..types import Cell
 from . import tensorfiles
 from .camera_optimizers import Poses, Tones
-from .checkpoint import misfit, reached
+from .checkpoint import misfit
 from .model import Facts, Model, build_decoder, build_fields, poses_of, tones_of
-from .prepare import Prepared, build_encoders, cache_folder, scene_of
-from .run import Run, begin, held
-from .trainer import Report, train
 
-FREE = (*RESUMABLE, "blocks", "executor", "statistics", "render")
-"""Fields of a config that do not decide what a block of given bounds and rays learns."""
 RAYS = "rays.safetensors"
 """In a block's folder: the views and tiles that it learns from."""
 SURROUNDINGS = -1
@@ -211,7 +204,7 @@ def asked_of(
     """
     tree = to_json(config)
     assert isinstance(tree, dict)
-    knobs = {name: value for name, value in tree.items() if name not in FREE}
+    knobs = {name: value for name, value in tree.items() if name not in FREE_IN_BLOCKS}
     views = rays["views"].tolist()
     # What the surroundings span follows from all blocks together, not from how they are cut.
     chart = surroundings_of(cells) if block == SURROUNDINGS else chart_of(cells[block])
@@ -227,86 +220,6 @@ def asked_of(
     for view in views:
         digest.update(zlib.crc32(scene.paths[view].read_bytes()).to_bytes(4, "little"))
     return {"task": digest.hexdigest()[:32], "steps": config.steps, "minutes": config.minutes}
-
-
-WARM_UP = 20
-"""Most steps of warm-up of a block: what it inherits is no random start, only Adam's averages are new."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class BlockTask:
-    """Message to a worker; the rest lies in the run folder. Small, so that it can be sent to other machines."""
-
-    root: str
-    """Run folder."""
-    data: str
-    """Scene folder."""
-    block: int
-    """Number of the block, or SURROUNDINGS."""
-    minutes: float | None
-    """Its part of the time limit."""
-    quiet: bool = False
-    """Show nothing."""
-
-
-def train_block(task: BlockTask, report: Callable[[Report], None], begun: Callable[[Model], None] = lambda model: None) -> bool:
-    """Train a block to its end, from its newest checkpoint; False where it was finished already. `begun` is given its model.
-
-    A folder that was trained as something else (other bounds, rays, images or knobs) is started anew. Raises ConfigError
-    where the images are not those of the run, DataError where another process trains the block at this moment.
-    """
-    with held(folder_of(Path(task.root), task.block)):
-        return _train_held(task, report, begun)
-
-
-def _train_held(task: BlockTask, report: Callable[[Report], None], begun: Callable[[Model], None]) -> bool:
-    root = Path(task.root)
-    run, folder = Run(root), folder_of(root, task.block)
-    config = run.load_config()[0].fields_only(root)
-    facts, cells, rays = run.load_known().facts, load_blocks(root), tensorfiles.read(folder / RAYS)
-    scene, views = scene_of(replace(config, data=Path(task.data)), facts), rays["views"]
-    if len(views) and int(views.max()) >= len(scene.paths):
-        raise ConfigError(f"{folder}: its views are not those of {scene.name}; train with the scene that the run was cut from")
-    asked = asked_of(config, facts, scene, cells, task.block, rays)
-    done = read_done(folder)
-    if done is not None and done.asked == asked:
-        return False
-    config = replace(config, minutes=task.minutes)  # its part alone is not what was asked: it changes from call to call
-    begin(folder, {"task": asked["task"]})
-    own = replace(scene, train=views)
-    built = built_block(root, config, facts, cells, task.block, views)
-    block_run = Run(folder)
-    prepared, lead = Prepared(own, _manager(run, config, facts, own, rays), facts, None), 0
-    if task.block != SURROUNDINGS:
-        lead = load_finished(folder_of(root, SURROUNDINGS), verify=False).step
-        config = replace(config, optimizer=replace(config.optimizer, warm_up=min(config.optimizer.warm_up, WARM_UP)))
-    begun(built.model)
-    train(config, prepared, block_run, report, model=built.model, lead=lead)
-    step, seconds = reached(block_run.checkpoints)
-    save_finished(folder, built, asked=asked, step=step, seconds=seconds)
-    return True
-
-
-def _manager(run: Run, config: TrainConfig, facts: Facts, scene: Scene, rays: dict[str, Tensor]) -> DataManager:
-    """The block's own batches: its views, its pixels, the whole scene's basis; features are in the cache."""
-    slots = {view: slot for slot, view in enumerate(rays["views"].tolist())}
-
-    def seen(view: int) -> Tensor:
-        width, height = scene.cameras.size[view].tolist()
-        return pixel_mask(rays["seen"][slots[view]].bool(), (width, height))
-
-    content, semantic = build_encoders(config)
-    return config.datamanager.build(
-        scene=scene,
-        content=content,
-        semantic=semantic if facts.dim else None,
-        dim=config.semantic.dim,
-        cache=cache_folder() / "features",
-        seed=config.seed,
-        basis=Basis.from_tensors(run.load_tensors("basis")) if facts.dim else None,
-        seen=seen,
-        background=facts.background,
-    )
 
 
 def built_block(root: Path, config: TrainConfig, facts: Facts, cells: Sequence[Cell], block: int, views: Tensor) -> Built:

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from tiny_world import World, flags
 
-from fprf.cli.blocks import SHARE, block_minutes
 from fprf.cli.main import main
 from fprf.config import TrainConfig
+from fprf.training.block_plan import SHARE, block_minutes
 
 BLOCKS = ["--blocks", "grid", "--blocks.cells", "2", "1", "--steps", "4"]
 

@@ -21,14 +21,13 @@ from tiny_world import events, same
 
 from fprf.blocks.config import AdaptiveConfig
 from fprf.blocks.fields import Member
-from fprf.cli.train import train_scene
+from fprf.blocks.visibility import make_plan
 from fprf.errors import CheckpointError, DataError
-from fprf.training import tensorfiles, trainer
-from fprf.training.block_plan import plan_scene, renumber
+from fprf.training import driver, tensorfiles
+from fprf.training.block_plan import BlockTask, renumber, train_block
 from fprf.training.blocks import (
     RAYS,
     SURROUNDINGS,
-    BlockTask,
     Built,
     asked_of,
     folder_of,
@@ -38,11 +37,11 @@ from fprf.training.blocks import (
     restore,
     save_finished,
     surroundings,
-    train_block,
 )
+from fprf.training.driver import Report, train
 from fprf.training.loading import Shelf, load_run
+from fprf.training.prepare import read_scene
 from fprf.training.run import Run
-from fprf.training.trainer import Report
 
 
 def around_of(world: BlockWorld) -> Built:
@@ -73,14 +72,16 @@ def test_finished_blocks_come_back_and_what_does_not_fit_is_refused(block_world:
 def asked(world: BlockWorld, block: int, **change: Any) -> str:
     """Digest of a block's task in a config with other fields."""
     config = replace(world.config, **change)
-    scene, plan = plan_scene(config)
+    scene = read_scene(config)
+    plan = make_plan(scene, config.blocks)
     rays = tensorfiles.read(folder_of(world.root, block) / RAYS)
     digest: str = asked_of(config, Run(world.root).load_known().facts, scene, plan.cells, block, rays)["task"]
     return digest
 
 
 def test_each_block_knows_its_views_and_tiles(block_world: BlockWorld) -> None:
-    scene, plan = plan_scene(block_world.config)
+    scene = read_scene(block_world.config)
+    plan = make_plan(scene, block_world.config.blocks)
     assert len(load_blocks(block_world.root)) == 3
     for block in range(3):
         rays = tensorfiles.read(folder_of(block_world.root, block) / RAYS)
@@ -204,7 +205,7 @@ def test_an_interrupted_block_goes_on_to_the_same_bits(
 ) -> None:
     root = copy_of(block_world, tmp_path)
     folder = unfinish(root, block)
-    monkeypatch.setattr(trainer, "REPORT_SECONDS", -1.0)
+    monkeypatch.setattr(driver, "REPORT_SECONDS", -1.0)
     seen: list[int] = []
 
     def interrupt(event: Report) -> None:
@@ -259,7 +260,7 @@ def test_another_task_in_the_folder_starts_anew(block_world: BlockWorld, tmp_pat
 
 def test_more_steps_go_on_from_where_it_stopped(block_world: BlockWorld, tmp_path: Path) -> None:
     root = copy_of(block_world, tmp_path)
-    train_scene(replace(small(block_world.config.data, root), steps=8), "fprf-lite", quiet=True)
+    train(replace(small(block_world.config.data, root), steps=8), "fprf-lite", quiet=True)
     for name in NAMES:
         assert done_of(root, name)["step"] == 8
         steps = [
@@ -274,10 +275,10 @@ def test_another_cut_trains_only_the_blocks_that_it_concerns(block_world: BlockW
     town = block_world.config.data
     coarse, fine = AdaptiveConfig(rays=3700, smallest=2.0), AdaptiveConfig(rays=3300, smallest=2.0)
     config = replace(small(town, tmp_path / "run"), blocks=coarse)
-    train_scene(config, "fprf-lite", quiet=True)
+    train(config, "fprf-lite", quiet=True)
     root = tmp_path / "run"
     first = {folder.name: done_of(root, folder.name) for folder in (root / "blocks").iterdir()}
-    train_scene(replace(config, blocks=fine), "fprf-lite", quiet=True)
+    train(replace(config, blocks=fine), "fprf-lite", quiet=True)
     second = {folder.name: done_of(root, folder.name) for folder in (root / "blocks").iterdir()}
     assert (len(first), len(second)) == (4, 5)
     # The surroundings, and the two blocks that were not split, which have other numbers now.
@@ -307,7 +308,7 @@ def test_a_killed_block_is_resumed_to_the_same_bits(block_world: BlockWorld, tmp
     steps, root = 60, tmp_path / "run"
     calm = tmp_path / "calm"
     config = replace(small(block_world.config.data, calm), steps=steps)
-    train_scene(config, "fprf-lite", quiet=True)
+    train(config, "fprf-lite", quiet=True)
     root.mkdir()
     Run(root).save_config(replace(config, output=None, checkpoint_minutes=1e-9), "fprf-lite")
     command = [sys.executable, "-m", "fprf", "train", str(root / "config.json")]

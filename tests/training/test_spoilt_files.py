@@ -26,8 +26,8 @@ from fprf.splats.config import GaussiansConfig
 from fprf.training import blocks, checkpoint, tensorfiles
 from fprf.training.block_plan import trained_tasks
 from fprf.training.blocks import load_blocks, load_finished, read_done
+from fprf.training.learner import outcome
 from fprf.training.model import Facts
-from fprf.training.prepare import outcome
 from fprf.training.run import Run, begin, check_images, image_hashes, read_history, save_image_hashes, task_of
 from fprf.types import Cell
 
@@ -65,7 +65,7 @@ class Example:
         yield Run(root).load_known
         yield lambda: check_images(root, self.scene, image_hashes(self.scene))
         yield lambda: read_history(root)
-        yield lambda: outcome(root, fprf_lite(), self.scene)
+        yield lambda: outcome(Run(root), fprf_lite(), self.scene)
         yield lambda: load_blocks(root)
         yield lambda: load_finished(self.parts[0])
         yield lambda: trained_tasks(root)
