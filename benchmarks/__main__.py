@@ -28,7 +28,7 @@ class Benchmark(NamedTuple):
     """Modules that must be there."""
 
 
-_RUN = "--data {town} --steps 20 --repeats 1 --rays 256 --device cpu"
+_RUN = "--data {town} --steps 5 --repeats 1 --rays 256 --device cpu"
 _TRAINED = "a run of fields; without one it trains fprf-lite on the town first"
 BENCHMARKS = {
     "exports": Benchmark("exported files drawn again, against the scene's own renders", "--steps 30 --views 1", _TRAINED),
@@ -37,7 +37,7 @@ BENCHMARKS = {
         "every reader under libFuzzer", "--minutes 0.2 --only png", "the package atheris; Linux", ("atheris",)
     ),
     "gaussians": Benchmark("the rasteriser of 3D Gaussians: time and error", "--count 500 --times 2"),
-    "kernels": Benchmark("what each compiled kernel brings end to end", "--data {town} --steps 20 --repeats 1", _TRAINED),
+    "kernels": Benchmark("what each compiled kernel brings end to end", "--data {town} --steps 5 --repeats 1", _TRAINED),
     "kills": Benchmark("training that is killed a hundred times", "--kills 3 --steps 25", "ten minutes; Linux"),
     "large_scene": Benchmark(
         "a district of towns in cells: seconds, memory, fidelity, workers of Ray",
