@@ -298,9 +298,11 @@ def _lifted(view: _View, pixels: Tensor) -> Tensor:
     from . import rasterise_gradient_kernels as kernels
 
     channels = pixels.shape[-1]
-    out = np.empty((view.total, -(-channels // 8) * 8), np.float32)
-    for first in range(0, out.shape[1], 8):
-        slope = _planes(view, pixels[..., first : first + 8], 8)
-        sums = kernels.lift(view.entries, view.splats, view.width, view.height, slope.reshape(-1))
-        kernels.lift_values(sums, view.entries.first_slot, view.total, out.reshape(-1), out.shape[1], first, 8)
+    # Sixteen channels fill the sums of an entry, and cost little more than eight: Gaussians are found, and entries read, once.
+    parts = [(first, 16 if channels - first > 8 else 8) for first in range(0, channels, 16)]
+    out = np.empty((view.total, sum(parts[-1]) if parts else 0), np.float32)
+    for first, size in parts:
+        slope = _planes(view, pixels[..., first : first + size], size)
+        sums = kernels.lift(size, view.entries, view.splats, view.width, view.height, slope.reshape(-1))
+        kernels.lift_values(sums, view.entries.first_slot, view.total, out.reshape(-1), out.shape[1], first, size, skipped=0)
     return torch.from_numpy(out)[:, :channels]
