@@ -17,8 +17,9 @@ from torch import Tensor
 from fprf.blocks.partition import write_cells
 from fprf.rendering.renderer import render_rays
 from fprf.style.look import Restyle
-from fprf.training.blocks import SURROUNDINGS, folder_of, load_blocks
+from fprf.training.blocks import folder_of, load_blocks
 from fprf.training.loading import Trained, load_run
+from fprf.training.tasks import WHOLE
 from fprf.training.views import render_view
 from fprf.types import Cell, Want
 
@@ -43,7 +44,7 @@ def row_of(source: Path, target: Path, count: int) -> None:
     for name in ("config.json", "scene.json", "basis.safetensors", "style.safetensors"):
         target.mkdir(parents=True, exist_ok=True)
         shutil.copy(source / name, target / name)
-    _copy(source, SURROUNDINGS, target, SURROUNDINGS)
+    _copy(source, WHOLE, target, WHOLE)
     row = []
     for number in range(count):
         block, lap = order[number % len(order)], number // len(order)

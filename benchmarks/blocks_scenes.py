@@ -17,7 +17,7 @@ import torch
 
 from fprf.blocks.config import SingleConfig
 from fprf.cli.parsing import load_method, parse
-from fprf.training.block_plan import cut
+from fprf.training.block_training import cut
 from fprf.training.blocks import load_blocks
 from fprf.training.driver import train
 from fprf.training.loading import load_run

@@ -25,7 +25,7 @@ import torch
 
 from fprf.datamanagers.images import load_images
 from fprf.rendering.cameras import pixel_grid, rays_through
-from fprf.splats.cell_training import read_cells
+from fprf.splats.cells import load_cells
 from fprf.splats.config import GaussiansConfig
 from fprf.splats.loading import open_gaussians
 from fprf.training.prepare import read_scene
@@ -53,7 +53,7 @@ def borders(run: Path, data: Path) -> dict[str, float]:
     """Mean absolute error of held-out views at borders of cells over that elsewhere, and the share of the pixels there."""
     config = Run(run).load_config()[0]
     assert isinstance(config, GaussiansConfig)
-    scene, cells = read_scene(replace(config, data=data)), read_cells(run)
+    scene, cells = read_scene(replace(config, data=data)), load_cells(run)
     opened = open_gaussians(Run(run), config, "cpu", QualityConfig())
     cameras = opened.known.cameras
     sums, counts = np.zeros(2), np.zeros(2)

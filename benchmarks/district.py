@@ -63,11 +63,12 @@ def begin(data: Path, run: Path, towns: int) -> dict[str, Any]:
     import torch
 
     from fprf.datamanagers.images import load_images
-    from fprf.splats.cell_training import train_overview, write_cells
+    from fprf.splats.cells import Cells, open_cell
     from fprf.splats.config import GaussiansConfig
     from fprf.splats.training import lit_facts
     from fprf.training.prepare import read_scene
     from fprf.training.run import Run
+    from fprf.training.tasks import WHOLE, Task, train_part
 
     from .blocks import peak_mib
 
@@ -85,9 +86,10 @@ def begin(data: Path, run: Path, towns: int) -> dict[str, Any]:
     folder.save_config(config, "fprf-splats")
     folder.save_known(scene, data, facts)
     lit_after = time.process_time() - start
-    found = write_cells(run, scene, data, cells)
+    found = Cells(config, scene, facts).write(folder)
     cut_after = time.process_time() - start
-    train_overview(run, config, scene, lambda event: None, spent=0.0)
+    whole = Task(root=str(run), data=str(data), part=WHOLE, minutes=None, quiet=True)
+    train_part(open_cell(whole), lambda event: None)
     return {
         "images": len(scene.paths),
         "tones": bool(facts.exposure),
@@ -105,15 +107,17 @@ def one_cell(data: Path, run: Path, cell: int) -> dict[str, Any]:
     import torch
 
     from fprf.splats import training
-    from fprf.splats.cell_training import CellTask, folder_of, train_cell
+    from fprf.splats.cells import folder_of, open_cell
     from fprf.training import checkpoint
+    from fprf.training.tasks import Task, train_part
 
     from .blocks import peak_mib
 
     torch.set_num_threads(1)
     vars(training)["time"] = SimpleNamespace(perf_counter=time.process_time)
     start = time.process_time()
-    train_cell(CellTask(root=str(run), data=str(data), cell=cell, minutes=None, quiet=True), lambda event: None)
+    task = Task(root=str(run), data=str(data), part=cell, minutes=None, quiet=True)
+    train_part(open_cell(task), lambda event: None)
     seconds = time.process_time() - start
     saved, _ = checkpoint.load_latest(folder_of(run, cell) / "checkpoints")
     assert saved is not None
@@ -131,7 +135,7 @@ def one_cell(data: Path, run: Path, cell: int) -> dict[str, Any]:
 
 def killed(data: Path, run: Path, cell: int) -> str:
     """Train a cell that is killed once it has a checkpoint; the digest of what it is in the end."""
-    from fprf.splats.cell_training import folder_of
+    from fprf.splats.cells import folder_of
 
     shutil.rmtree(folder_of(run, cell))
     process = multiprocessing.get_context("spawn").Process(target=one_cell, args=(data, run, cell))
@@ -148,15 +152,13 @@ def killed(data: Path, run: Path, cell: int) -> str:
 
 def write_for_flight(run: Path) -> dict[str, Any]:
     """Write levels of detail of the whole scene."""
-    from fprf.splats.cell_training import OVERVIEW
+    from fprf.splats.cells import load_overview
     from fprf.splats.gaussians import from_tensors
     from fprf.splats.levels import write_levels
-    from fprf.training import checkpoint
 
     from .blocks import peak_mib
 
-    saved, _ = checkpoint.load_latest(run / OVERVIEW / "checkpoints", verify=False)
-    assert saved is not None
+    saved = load_overview(run)
     start = time.process_time()
     write_levels(run / "levels", from_tensors(saved.model), "flight")
     count = len(saved.model["means"])
@@ -171,19 +173,18 @@ def flight(run: Path, frames: int, pixels: float, everything: bool) -> dict[str,
     """Draw views all over the scene; with `everything` all Gaussians as well, for the error."""
     import torch
 
-    from fprf.splats.cell_training import OVERVIEW
+    from fprf.splats.cells import load_overview
     from fprf.splats.gaussians import from_tensors
     from fprf.splats.levels import open_levels
     from fprf.splats.photographs import cover
     from fprf.splats.views import draw
-    from fprf.training import checkpoint
     from fprf.training.run import Run
 
     from .blocks import peak_mib
 
-    saved, _ = checkpoint.load_latest(run / OVERVIEW / "checkpoints", verify=False)
+    saved = load_overview(run)
     levels = open_levels(run / "levels", "flight")
-    assert saved is not None and levels is not None
+    assert levels is not None
     cameras, near = Run(run).load_known().cameras, float(saved.model["near"])
     before, wall, processor, counts, errors = peak_mib(), [], [], [], []
     for turn, view in enumerate(np.linspace(0, len(cameras) - 1, frames).round().astype(int).tolist()):

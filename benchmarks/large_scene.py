@@ -32,8 +32,8 @@ from fprf.plugins.samplers.config import ProposalConfig
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.restyle import apply_style
-from fprf.training import driver
-from fprf.training.block_plan import cut
+from fprf.training import driver, tasks
+from fprf.training.block_training import cut
 from fprf.training.blocks import load_blocks
 from fprf.training.driver import train
 from fprf.training.loading import Trained, load_run
@@ -128,7 +128,8 @@ def parameters(config: TrainConfig, root: Path) -> int:
 
 def use_processor_time() -> None:
     """Time limits of training count what this process has used, whatever else the machine does."""
-    vars(driver)["time"] = SimpleNamespace(perf_counter=time.process_time, time=time.time)
+    for module in (driver, tasks):
+        vars(module)["time"] = SimpleNamespace(perf_counter=time.process_time, time=time.time)
 
 
 def trained_seconds(root: Path) -> dict[str, Any]:
