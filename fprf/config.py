@@ -363,7 +363,7 @@ class TrainConfig(RunConfig):
         from .training.prepare import prepare
 
         if self.blocks.cuts:
-            from .training.block_plan import cut
+            from .training.block_training import cut
 
             blocks = cut(self, scene, saved, progress)
             if blocks is not None:

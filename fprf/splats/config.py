@@ -137,7 +137,7 @@ class GaussiansConfig(RunConfig):
     ) -> "Learner | Partition":
         """Read the photographs and find the first points; cells where there are to be some."""
         if self.cells > 1:
-            from .cell_training import Cells
+            from .cells import Cells
 
             return Cells(self, scene, saved)
         from .training import build

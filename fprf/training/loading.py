@@ -1,8 +1,6 @@
 """A trained run, ready to render; blocks of a large scene are fetched as they are met."""
 
-import copy
 import json
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,8 +9,6 @@ from typing import Annotated, Generic, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from ..blocks.fields import Member, Members
-from ..blocks.routing import Blend, chart_of
 from ..config import IncompleteConfig, RunConfig, TrainConfig, fields_only
 from ..datamanagers.basis import Basis
 from ..datamanagers.scene import Scene as ParsedScene
@@ -27,9 +23,9 @@ from ..style.dictionary import StyleDictionary
 from ..style.look import Restyle
 from ..style.references import Encoders
 from ..style.scene import SceneStyle, from_tensors
-from ..types import Cell, Origin, View
+from ..types import Origin, View
 from . import checkpoint
-from .blocks import SURROUNDINGS, assemble, folder_of, load_blocks, load_finished, read_done, restore, restore_all, surroundings
+from .blocks import load_blocked
 from .model import Model, build_model
 from .prepare import device_of, reach_of
 from .quality import QualityConfig, at_quality
@@ -37,57 +33,10 @@ from .run import Known, Run
 from .style_pass import measure_style
 from .views import CachedView, cache_view, fit_pose, paint_pixels, render_view
 
-
-class Shelf(Members):
-    """Blocks of a run, the last used first; the surroundings always at hand."""
-
-    def __init__(
-        self,
-        root: Path,
-        cells: Sequence[Cell],
-        around: Member,
-        *,
-        device: torch.device,
-        limit: int | None,
-    ) -> None:
-        self._root, self._cells, self._device = root, cells, device
-        self.held = (around,)
-        self._here: OrderedDict[int, Member] = OrderedDict()
-        self._verified: set[int] = set()
-        size = sum(t.numel() * t.element_size() for t in around.state_dict().values())
-        self._room = None if limit is None else max(1, limit // size - 1)
-
-    @property
-    def here(self) -> tuple[int, ...]:
-        """Blocks in memory, the least recently used first."""
-        return tuple(self._here)
-
-    def member(self, number: int) -> Member:
-        """A block by its number; the surroundings come after the last one. Raises CheckpointError for a missing block."""
-        if number == len(self._cells):
-            return self.held[0]
-        if number in self._here:
-            self._here.move_to_end(number)
-            return self._here[number]
-        while self._room is not None and len(self._here) >= self._room:
-            self._here.popitem(last=False)
-        self._here[number] = member = self._fetch(number)
-        return member
-
-    def _fetch(self, number: int) -> Member:
-        member = copy.deepcopy(self.held[0])
-        member.chart = chart_of(self._cells[number])
-        finished = load_finished(folder_of(self._root, number), verify=number not in self._verified)
-        restore(member, "member", finished.tensors)
-        self._verified.add(number)
-        return member.requires_grad_(False).to(self._device).eval()
-
-
 SCENES = "fprf.scenes"
 """Entry points by the `kind` of configs: functions `(run, config, device, quality) -> LoadedRun` that open their runs."""
 _FEW_RAYS = 2**14
 """Rays that the style of a run in training is measured with: 0.2 s instead of seconds, and it changes soon."""
-_MIB = 1 << 20
 S = TypeVar("S", bound=Scene, covariant=True)
 
 
@@ -273,7 +222,8 @@ def load_run(root: Path, device: str = "auto", max_memory: float | None = None) 
         package = json.loads(config.packages)["method"]
         raise PluginError(f"{root}: {config.reason}; to open a scene of its kind install {package}")
     if known.facts.space.kind == "open":
-        return _load_blocks(run, config, method, known, device_of(device), max_memory)
+        blended, step, seconds = load_blocked(root, config, known.facts, device_of(device), max_memory)
+        return Trained(run, config, method, _where_refined(known, blended), blended, step, seconds)
     saved, damaged = checkpoint.load_latest(run.checkpoints)
     if saved is None:
         raise CheckpointError(f"{root}: no checkpoint yet; go on with `fprf train {root / 'config.json'} --output {root}`")
@@ -300,29 +250,6 @@ def _in_local_frame(known: Known) -> Known:
 
 def _sum(a: Origin, b: Origin) -> Origin:
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
-def _load_blocks(
-    run: Run, config: TrainConfig, method: str, known: Known, device: torch.device, max_memory: float | None
-) -> Trained:
-    """The surroundings in memory, the blocks on a shelf."""
-    cells, facts = load_blocks(run.root), known.facts
-    around = surroundings(config, facts, cells)
-    finished = load_finished(folder_of(run.root, SURROUNDINGS))
-    restore_all(around, finished.tensors)
-    limit = None if max_memory is None else int(max_memory * _MIB)
-    shelf = Shelf(run.root, cells, around.member.to(device), device=device, limit=limit)
-    model = assemble(config, facts, shelf, Blend(cells), around.model.decoder, around.model.tones, around.model.poses)
-    model.requires_grad_(False)
-    blocks = [read_done(folder_of(run.root, block)) for block in range(len(cells))]
-    done = [each for each in blocks if each is not None]
-    if len(done) < len(blocks):
-        again = f"fprf train {run.root / 'config.json'}"
-        raise CheckpointError(
-            f"{run.root}: {len(blocks) - len(done)} of {len(blocks)} blocks are not finished; go on with `{again}`"
-        )
-    steps, seconds = [each.step for each in done], finished.seconds + sum(each.seconds for each in done)
-    return Trained(run, config, method, _where_refined(known, model), model.to(device).eval(), min(steps), seconds)
 
 
 def _where_refined(known: Known, model: Model) -> Known:

@@ -17,7 +17,6 @@ import errno
 import hashlib
 import json
 import os
-import shutil
 import socket
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -200,29 +199,6 @@ def view_names(paths: Sequence[Path]) -> list[str]:
         if len(set(names)) == len(names):
             return names
     return [f"{i:05d}-{p.stem}" for i, p in enumerate(paths)]
-
-
-_TASK = "task.json"
-
-
-def task_of(folder: Path) -> Any:
-    """Task that a block or cell was begun as; None where its task.json is absent or damaged, which is as good as not begun."""
-    try:
-        with open_json(folder / _TASK, "") as task:
-            return task
-    except CheckpointError:
-        return None
-
-
-def begin(folder: Path, task: object) -> None:
-    """Begin a block or cell as `task`, a JSON value, or resume it: what was trained there as another one is removed."""
-    (folder / "done.json").unlink(missing_ok=True)
-    if task_of(folder) == task:
-        return
-    shutil.rmtree(folder / "checkpoints", ignore_errors=True)
-    for name in (_TASK, "block.safetensors", "events.jsonl"):
-        (folder / name).unlink(missing_ok=True)
-    write_json(folder / _TASK, task)
 
 
 try:

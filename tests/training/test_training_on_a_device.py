@@ -11,6 +11,7 @@ import pytest
 import torch
 from block_world import BlockWorld, tensors_of, unfinish
 from pretend_cuda import CUDA, pretend_cuda
+from task_world import world_of_blocks
 from tiny_world import Altered, Change, World, events, parameters, prepared_for, spoilt, stopping, taught
 
 from fprf.config import TrainConfig
@@ -19,7 +20,6 @@ from fprf.interfaces import DataManager
 from fprf.methods import fprf
 from fprf.plugins.samplers.config import UniformConfig
 from fprf.training import checkpoint, driver, learner
-from fprf.training.block_plan import BlockTask, train_block
 from fprf.training.driver import Report
 from fprf.training.model import build_model
 from fprf.training.prepare import device_of
@@ -242,8 +242,7 @@ def test_a_block_is_trained_on_a_device(block_world: BlockWorld, tmp_path: Path,
     Run(root).save_config(replace(config, device="cuda:0"), method)
     unfinish(root, 1)
     with pretend_cuda() as steps.seen:
-        task = BlockTask(root=str(root), data=str(block_world.config.data), block=1, minutes=None, quiet=True)
-        assert train_block(task, lambda event: None)
+        assert world_of_blocks(block_world.config, root).train(root, 1)
     assert set(steps.waits) == {0} and set(steps.uploads[2:]) == {0}
     found, expected = tensors_of(root, "01"), tensors_of(block_world.root, "01")
     assert found.keys() == expected.keys()
