@@ -40,6 +40,7 @@ from .simd import (
     aligned,
     load,
     lowest_bit,
+    on_threads,
     splat,
     square_root,
     stack,
@@ -51,7 +52,6 @@ from .simd import (
     transposed,
     where_greater,
 )
-from .threads import on_threads
 
 SUMS = LANES
 GEOMETRY = 6

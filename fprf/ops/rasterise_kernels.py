@@ -36,6 +36,7 @@ from .simd import (
     lowest_bit,
     maximum,
     minimum,
+    on_threads,
     splat,
     square_root,
     stack,
@@ -46,7 +47,6 @@ from .simd import (
     transposed,
     where_greater,
 )
-from .threads import on_threads
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 _Ints = np.ndarray[Any, np.dtype[np.int32]]
