@@ -54,7 +54,7 @@ no_march = SimpleNamespace(usable=never)
 SWITCHES: dict[str, Patches] = {
     "tri-planes": [(triplane, "usable", never)],
     "tri-planes: total variation": [(triplane, "variation", triplane.variation_reference)],
-    "networks": [(dense, "network", dense.network_reference)],
+    "networks": [(dense, "usable", never)],
     "marching": [(march, "usable", never)],
     "marching: proposals": [(planes, "march", no_march)],
     "marching: weights and sums": [(renderer, "compiled", no_march), (space, "march", no_march)],
