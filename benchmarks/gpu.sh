@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Measure a machine with a GPU in about ten minutes: the tests of devices, a scene trained for a given time, restyled frames
-# a second, a new style to its first frame, Triton's tri-planes against plain torch. Writes one JSON with rows and goals.
+# a second, a new style to its first frame. Writes one JSON with rows and goals.
 #
 #   benchmarks/gpu.sh --scene DIR [--images images_4] [--minutes 3] [--method fprf] [--long STEPS] [--output FILE]
 #                     [-- FLAGS OF fprf train]
@@ -43,8 +43,7 @@ export PYTHONPATH="$root${PYTHONPATH:+:$PYTHONPATH}"
 tests=(-q -c "$root/pyproject.toml" -o addopts= -o filterwarnings=default -W "ignore::pytest.PytestConfigWarning")
 if [ "$dry" = 1 ]; then
     method=fprf-lite device=cpu limit=3600
-    data=(--data town --datamanager.parser town --datamanager.parser.views 6 --datamanager.parser.width 48
-        --datamanager.parser.height 36)
+    data=(--data garden --downscale 8)
     time=(--steps 20) again=(--steps 40)
     size=(--rays 500 --repeats 2) points=(--points 2000)
     tests+=(-k "pretended and views" "$root/tests/test_gpu.py")
@@ -60,7 +59,7 @@ else
     data=(--data "$scene" --datamanager.parser llff --datamanager.parser.images "$images")
     time=(--minutes "$minutes") again=(--steps "$long")
     size=(--rays 762048 --repeats 5) points=(--points 262144)
-    tests+=(-k "not pretended" "$root/tests/test_gpu.py" "$root/tests/ops/test_triplane_triton.py")
+    tests+=(-k "not pretended" "$root/tests/test_gpu.py")
 fi
 
 # step NAME SECONDS COMMAND...: run it, note its exit status, print the end of its log where it failed.
@@ -79,11 +78,10 @@ fprf=("$python" -m fprf)
 step tests 150 "$python" -m pytest "${tests[@]}"
 step train "$whole" "${fprf[@]}" train "$method" "${data[@]}" "${time[@]}" --device "$device" --output "$work/run" "$@"
 step eval 40 "${fprf[@]}" eval "$work/run" --no-images --device "$device"
-step speed 130 "${fprf[@]}" bench speed "$work/run" "${size[@]}" "${points[@]}" --device "$device" --output "$work/speed.json"
+step speed 130 "$python" -m benchmarks speed "$work/run" "${size[@]}" "${points[@]}" --device "$device" --output "$work/speed.json"
 step profile 40 "$python" -m benchmarks profiling "$work/run" "${size[@]}" --device "$device" --operators 15 --output "$work/profile.json"
-step roofline 40 "$python" -m benchmarks roofline "$work/run" "${size[@]}" "${points[@]}" --device "$device" --output "$work/roofline.json"
 if [ "$long" != 0 ]; then
     step train-long 7200 "${fprf[@]}" train "$method" "${data[@]}" "${again[@]}" --device "$device" --output "$work/long" "$@"
     step eval-long 60 "${fprf[@]}" eval "$work/long" --no-images --device "$device"
 fi
-"$python" "$here/gpu_rows.py" "$work" --output "$output"
+"$python" -m benchmarks.gpu_rows "$work" --output "$output"

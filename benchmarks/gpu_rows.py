@@ -1,8 +1,8 @@
 """What `gpu.sh` measured, as one JSON: its steps, rows with their goals, and the profile that explains them.
 
-    python benchmarks/gpu_rows.py WORK --output FILE
+    python -m benchmarks.gpu_rows WORK --output FILE
 
-WORK holds steps.jsonl, a log of each step and, as far as the steps came, run/metrics.json, speed.json, roofline.json,
+WORK holds steps.jsonl, a log of each step and, as far as the steps came, run/metrics.json, speed.json,
 profile.json and long/metrics.json. Rows of what is missing are left out. The exit status is 1 where a step failed.
 """
 
@@ -16,9 +16,10 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from fprf.evaluation.report import Row, document, rows_table, table
 from fprf.io.atomic import write_json
-from fprf.ops import triplane_numba, triplane_triton
+from fprf.ops import triplane
+
+from .report import Row, document, rows_table, table
 
 FRAME = 1008 * 756
 STYLES = ("stylised, region-tone", "stylised, region-ot", "stylised, local-adain")
@@ -73,14 +74,12 @@ def rows(work: Path, form: str) -> Iterator[Row]:
         if name.startswith("tri-plane forward + backward"):
             kept = ("figure", "unit", "low", "high", "peer", "error", "error_kind", "peer_error", "note")
             yield Row(name=f"{form} {name}", **{key: row[key] for key in kept})
-    for row in (read(work / "roofline.json") or {}).get("rows", []):
-        yield Row(name=row["name"], figure=row["figure"], unit="%", goal=50.0, more_is_better=True, note=row["note"])
 
 
 def kernels(device: torch.device) -> str:
     """Which form of the tri-planes runs."""
     points, table = torch.zeros(1, 3, device=device), torch.zeros(12, 8, device=device)
-    return "triton" if triplane_triton.usable(points, table) else "numba" if triplane_numba.usable(points, table) else "plain"
+    return "numba" if triplane.usable(points, table) else "plain"
 
 
 def read(path: Path) -> Any:

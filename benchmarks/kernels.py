@@ -1,6 +1,6 @@
 """What each compiled kernel of `fprf.ops` brings, end to end: steps and views with one at a time switched to plain torch.
 
-    OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m benchmarks kernels RUN [--data DIR] [--repeats 7] [--output FILE.json]
+    OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m benchmarks kernels [RUN] [--data DIR] [--repeats 7] [--output FILE.json]
 
 Every form does the same work on the same model in one process, in turn, by the processor's clock. The fastest of all rounds
 counts, which other programs on the machine disturb least.
@@ -19,12 +19,8 @@ from torch import Tensor
 
 from fprf.config import RenderConfig
 from fprf.datamanagers.features import FeatureStore
-from fprf.evaluation.config import SpeedConfig
-from fprf.evaluation.report import Watch
-from fprf.evaluation.speed import STYLES
-from fprf.evaluation.subject import Subject, find, fresh_model, loop_of, stepper, test_view
 from fprf.fields import planes
-from fprf.ops import backend, dense, march, mixture, triplane, triplane_numba
+from fprf.ops import backend, dense, march, mixture, triplane
 from fprf.rendering import renderer, space
 from fprf.rendering.cameras import Cameras
 from fprf.style import matching
@@ -32,7 +28,10 @@ from fprf.style.look import Restyle
 from fprf.style.restyle import restyle
 from fprf.training.views import render_view
 
-from .common import RESULTS, arguments, report
+from .common import arguments, report, train_run
+from .report import Watch
+from .speed import STYLES, SpeedConfig
+from .subject import Subject, find, fresh_model, loop_of, stepper, test_view
 
 Patches = Sequence[tuple[object, str, object]]
 
@@ -53,7 +52,7 @@ def plain_lookups(store: FeatureStore, *given: Tensor) -> None:
 packed: dict[int, FeatureStore] = {}
 no_march = SimpleNamespace(usable=never)
 SWITCHES: dict[str, Patches] = {
-    "tri-planes": [(triplane_numba, "usable", never)],
+    "tri-planes": [(triplane, "usable", never)],
     "tri-planes: total variation": [(triplane, "variation", triplane.variation_reference)],
     "networks": [(dense, "network", dense.network_reference)],
     "marching": [(march, "usable", never)],
@@ -118,16 +117,18 @@ def drawn(subject: Subject, camera: Cameras, render: RenderConfig, look: Restyle
 def main(argv: list[str]) -> None:
     """Measure and write."""
     parser = arguments("kernels", __doc__)
-    parser.add_argument("run", type=Path)
+    parser.add_argument("run", type=Path, nargs="?", help="run of fields; by default fprf-lite is trained on the town first")
     parser.add_argument("--data", type=Path)
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--output", type=Path, default=RESULTS / "kernels.json")
+    parser.add_argument("--steps", type=int, default=300, help="of the run that is trained")
+    parser.add_argument("--output", type=Path)
     args = parser.parse_args(argv)
-    config = SpeedConfig(run=args.run, data=args.data, repeats=args.repeats, clock="processor", device="cpu")
     names = ["", *SWITCHES, "all"]
     rows: dict[str, dict[str, object]] = {name: {} for name in names}
     with tempfile.TemporaryDirectory() as folder:
-        subject = find(args.run, config, Path(folder))
+        run = args.run or train_run(Path(folder) / "run", "fprf-lite", args.data, steps=args.steps)
+        config = SpeedConfig(run=run, data=args.data, repeats=args.repeats, clock="processor", device="cpu")
+        subject = find(run, config, Path(folder))
         watch = Watch(args.repeats, torch.device("cpu"), "processor")
         for task, call in tasks(subject, config).items():
             seconds = watch.in_turn({name: switched(name, call) for name in names})

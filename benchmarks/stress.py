@@ -10,15 +10,10 @@ import torch
 from torch import Tensor
 
 from fprf.checks import at_least
-from fprf.cli.bench import bench_run
 from fprf.config import RenderConfig
 from fprf.datamanagers.bounds import find_space
 from fprf.datamanagers.scene import Scene
 from fprf.errors import FprfError
-from fprf.evaluation.config import BenchConfig
-from fprf.evaluation.report import Outcome, machine, table
-from fprf.evaluation.subject import attempt, exact, find, settings, test_view, view_rays
-from fprf.io.atomic import write_text
 from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.renderer import render_rays
@@ -30,8 +25,11 @@ from fprf.training.loading import Trained
 from fprf.training.model import Facts, Model, background_of
 from fprf.types import Rays, Want
 
+from .common import BenchConfig, bench_run
 from .readers import fuzz, targets
-from .stress_operators import Check, clusters, guided, markdown, matching, sampling, statistics, stylizers, weights
+from .report import Outcome, machine, table
+from .stress_operators import Check, clusters, guided, matching, sampling, statistics, stylizers, weights
+from .subject import attempt, exact, find, settings, test_view, view_rays
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,8 +42,6 @@ class StressConfig(BenchConfig):
     """Mutated files for each reader."""
     flips: int = 200
     """Flipped bits in a file of tensors."""
-    markdown: Path | None = None
-    """The rows as a Markdown table; none = don't."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -87,8 +83,6 @@ def stress(config: StressConfig, root: Path, folder: Path, progress: Progress) -
         "rows": [check.json() for check in checks],
         "falls_short": [f"{check.stage}: {check.input}" for check in broken],
     }
-    if config.markdown is not None:
-        write_text(config.markdown, markdown(checks))
     title = f"{len(checks)} checks, {len(broken)} broken"
     shown = table(title, ("", "input", "reference", "bound", "measured", ""), (_cells(check) for check in checks))
     return Outcome(document, [shown])

@@ -1,7 +1,7 @@
 """A trained run as a Python object: look, restyle, render.
 
     import fprf
-    scene = fprf.load("runs/town-fprf-lite")
+    scene = fprf.load("runs/garden-fprf-lite")
     autumn = scene.stylize(["autumn.jpg"])
     shot = autumn.render(scene.camera("0015"))
     shot.save("autumn.png")

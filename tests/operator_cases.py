@@ -159,8 +159,6 @@ CASES = [
          lambda x, s, g, b, c: mixture.scaled_reference(x, s, g, b, centre=c), slopes=(0, 1, 2, 3)),
     Case("triplane.lookup", _planes, lambda p, t, w: triplane.lookup(p, t, (8, 16)), slopes=(1,)),
     Case("triplane.lookup_reference", _planes, lambda p, t, w: triplane.lookup_reference(p, t, (8, 16)), slopes=(1,)),
-    Case("triplane.point_slopes_reference", lambda n: (*_planes(n)[:2], _draw(n, 32)),
-         lambda p, t, g: triplane.point_slopes_reference(p, t, (8, 16), g), tolerance=1e-4, slack=1e-3),
     Case("triplane.variation", lambda n: (_draw(triplane.rows((n,)), 8),), lambda t: triplane.variation(t, (_side(t),)),
          slopes=(0,), sizes=(2, 3, 37, 128)),
     Case("matching.match_keys", lambda n: (_draw(n, 6), _unit(n) + 0.1, _draw(5, 6), _unit(5) + 0.1),

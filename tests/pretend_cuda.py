@@ -10,10 +10,10 @@ counted. Real values flow, so whole training runs, renders and restyles can be d
 CPU. Works with a CPU-only torch.
 
 Name the device with its index ("cuda:0"): a CPU-only torch has no guard that could find the index of "cuda" alone; `auto`
-names it. What it cannot show: memory (`mem_get_info` answers `memory`), streams, compiled kernels (Triton's are interpreted
-with `triton=True`), CUDA's own draws (generators are the CPU's), autocast (wrappers have no autocast key), and other threads:
-operators there are neither counted nor pretended. Numbers that reach a kernel as arguments (`x + 1.0`, `torch.full`) are no
-copies, on a card neither.
+names it. What it cannot show: memory (`mem_get_info` answers `memory`), streams, CUDA's own draws
+(generators are the CPU's), autocast (wrappers have no autocast key), and other threads: operators there are
+neither counted nor pretended. Numbers that reach a kernel as arguments (`x + 1.0`, `torch.full`) are no copies, on a card
+neither.
 """
 
 import contextlib
@@ -22,8 +22,6 @@ from collections.abc import Iterator
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
-
-from fprf.ops import triplane_triton
 
 CUDA = torch.device("cuda:0")
 MPS = torch.device("mps:0")
@@ -161,24 +159,6 @@ def _wrapped(x: torch.Tensor) -> torch.Tensor:
     return x if isinstance(x, Pretended) else Pretended(x)
 
 
-def _kernels(interpreted: bool) -> dict:
-    """Triton's bridge as it is to be while CUDA is pretended."""
-    if not interpreted:
-        return {"usable": lambda points, table: False}
-
-    def inside(function):
-        def call(*args, **kwargs):
-            return _each(function(*_each(args, _inner), **_each(kwargs, _inner)), _wrapped)
-
-        return call
-
-    usable = triplane_triton.usable
-    return {
-        "usable": lambda points, table: isinstance(points, Pretended) and usable(points, table),
-        **{name: inside(getattr(triplane_triton, name)) for name in ("forward", "backward")},
-    }
-
-
 def _masked(args) -> bool:
     """Whether indices are found from a mask: CUDA waits for their number, unless one value is written to all."""
     mask = any(isinstance(x, torch.Tensor) and x.dtype in (torch.bool, torch.uint8) for x in args[1])
@@ -196,10 +176,9 @@ class _Mode(TorchDispatchMode):
 
 
 @contextlib.contextmanager
-def pretend_cuda(memory: int = 1 << 34, *, triton: bool = False, mps: bool = False) -> Iterator[_Mode]:
+def pretend_cuda(memory: int = 1 << 34, *, mps: bool = False) -> Iterator[_Mode]:
     """Within it, `cuda:0` is a device of so many free bytes. Generators of it are the CPU's; inference mode is `no_grad`, which
-    wrappers allow. With `triton` its kernels are taken, interpreted (TRITON_INTERPRET=1 must be set before they are loaded),
-    else none of them, also where Triton is installed. With `mps` it is Apple's device instead, `mps:0`, which has no float64.
+    wrappers allow. With `mps` it is Apple's device instead, `mps:0`, which has no float64.
     """
     real, made, given = torch.Generator, torch.tensor, torch.as_tensor
 
@@ -248,7 +227,6 @@ def pretend_cuda(memory: int = 1 << 34, *, triton: bool = False, mps: bool = Fal
             "is_bf16_supported": lambda including_emulation=True: True,
         },
         torch.mps: {"recommended_max_memory": lambda: memory, "driver_allocated_memory": lambda: 0},
-        triplane_triton: _kernels(triton),
     }
     kept = {(owner, name): getattr(owner, name) for owner, names in replaced.items() for name in names}
     for owner, names in replaced.items():

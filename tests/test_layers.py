@@ -1,4 +1,4 @@
-"""Packages import each other in one direction: every module-level import leads to a layer before, so that there is no cycle."""
+"""Packages import each other in one direction, and no module imports itself by way of others, not even within functions."""
 
 import ast
 from collections.abc import Iterator
@@ -8,13 +8,13 @@ import fprf
 
 ROOT = Path(fprf.__file__).parent
 ORDER = (
-    *("version", "errors", "types", "memory", "checks", "process", "io", "interfaces", "configs"),
-    *("ops", "town", "rendering", "datamanagers", "style", "fields", "plugins", "blocks", "testing"),
+    *("version", "errors", "types", "memory", "checks", "process", "progress", "io", "interfaces", "configs", "outputs"),
+    *("ops", "rendering", "datamanagers", "style", "fields", "plugins", "blocks", "testing"),
     *("training", "splats", "pretraining", "reconstruction", "evaluation", "export"),
     *("viewer", "api", "cli", "__main__"),
 )
 """Layers from the lowest to the highest. Imports within functions, such as those of `build`, may lead anywhere."""
-MECHANISM = ("config.py", "methods.py", "layouts.py")
+MECHANISM = ("config.py", "methods.py")
 """Files of any package that belong to the configs, as do the modules of `plugins` itself: none of them imports torch."""
 
 
@@ -22,8 +22,10 @@ def layer(parts: tuple[str, ...]) -> str:
     """The layer of a module by its path below `fprf`."""
     if parts in ((), ("__init__",)):
         return "version"
+    if parts in (("testing", "breaches"), ("testing", "outputs")):  # which the program uses as well
+        return "outputs"
     plugins = parts[0] == "plugins" and len(parts) <= 2 and parts[-1] != "weights"
-    return "configs" if plugins or (f"{parts[-1]}.py" in MECHANISM and parts[0] not in ("blocks", "export")) else parts[0]
+    return "configs" if plugins or (f"{parts[-1]}.py" in MECHANISM and parts[0] != "export") else parts[0]
 
 
 def imported(file: Path) -> Iterator[tuple[str, ...]]:
@@ -48,3 +50,41 @@ def test_imports_lead_to_lower_layers() -> None:
                 if ORDER.index(other) > ORDER.index(own):
                     breaches.add(f"{file.relative_to(ROOT)}: {own} imports {other}")
     assert not breaches
+
+
+EXPECTED = frozenset({"fprf.config", "fprf.cli.doctor"})
+"""Modules whose circles are known: `RunConfig.verbs` imports verbs, `doctor_scene` and `doctor` each other."""
+
+
+def imports(tree: ast.AST) -> Iterator[ast.ImportFrom]:
+    """Relative imports anywhere in a module but in a config's `build`, which finds its implementation, and for types alone."""
+    for node in ast.iter_child_nodes(tree):
+        for_types = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+        if for_types or (isinstance(node, ast.FunctionDef) and node.name == "build"):
+            continue
+        if isinstance(node, ast.ImportFrom) and node.level:
+            yield node
+        yield from imports(node)
+
+
+def test_no_module_imports_itself_by_way_of_others() -> None:
+    names = {".".join(("fprf", *file.relative_to(ROOT).with_suffix("").parts)): file for file in ROOT.rglob("*.py")}
+    modules = {name.removesuffix(".__init__"): file for name, file in names.items()}
+    leads: dict[str, set[str]] = {name: set() for name in modules}
+    for name, file in modules.items():
+        package = name.split(".") if file.name == "__init__.py" else name.split(".")[:-1]
+        for node in imports(ast.parse(file.read_text())):
+            base = ".".join([*package[: len(package) - node.level + 1], *(node.module or "").split(".")]).removesuffix(".")
+            leads[name] |= {f"{base}.{each.name}" if f"{base}.{each.name}" in modules else base for each in node.names} - {name}
+
+    def reached(start: str) -> set[str]:
+        found, todo = set(), [start]
+        while todo:
+            new = leads[todo.pop()] - found
+            found |= new
+            todo += new
+        return found
+
+    reach = {name: reached(name) for name in modules}
+    circles = {tuple(sorted(other for other in reach[name] if name in reach[other])) for name in modules if name in reach[name]}
+    assert not [circle for circle in circles if not EXPECTED & set(circle)]

@@ -15,7 +15,6 @@ from typing import Any
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-from fprf.cli.completion import _FIRST, _WORDS
 from fprf.cli.main import VERBS, Verb
 from fprf.cli.parsing import DESCRIBE
 
@@ -95,7 +94,7 @@ def verb_page(verb: str, about: Verb) -> str:
         f"fprf {verb} {about.usage}",
         "```",
     ]
-    words = _WORDS.get(verb, ()) if verb in _FIRST else ("fprf-lite",) if verb == "train" else (None,)
+    words: tuple[str | None, ...] = {"pretrain": ("decoder",), "train": ("fprf-lite",)}.get(verb, (None,))
     for word in words:
         found = described(verb, word)
         if found is None:

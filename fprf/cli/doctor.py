@@ -160,7 +160,7 @@ def method_needs(name: str) -> Iterator[Finding]:
     from ..plugins.codec import method_config
 
     config = method_config(name)
-    for need in config.verbs().needs():
+    for need in config.needs():
         later = ", is downloaded when it is needed" if need.downloaded else " is missing"
         yield Finding("needs", need.what + later, need.remedy, optional=need.downloaded)
     filled = (f"{slot.path} {registry.name_of(slot.kind.group, type(slot.value))}" for slot in slots(config) if slot.value)
@@ -265,7 +265,7 @@ def _trouble(folder: Path) -> Iterator[Finding]:
         return
     if notes:
         more = f" and {len(notes) - 1} more" if len(notes) > 1 else ""
-        yield Finding("events", notes[-1] + more, f"fprf report {shlex.quote(str(folder))}", True)
+        yield Finding("events", notes[-1] + more, f"read {shlex.quote(str(folder / 'events.jsonl'))}", True)
 
 
 def _packages() -> Iterator[Finding]:
@@ -290,10 +290,6 @@ def _torch() -> Iterator[Finding]:
         for at in range(torch.cuda.device_count()):
             device = torch.cuda.get_device_properties(at)
             yield Finding(f"cuda:{at}", f"{device.name}, {device.total_memory / 1024**3:.0f} GiB")
-        if triton := _version("triton"):
-            yield Finding("triton", f"{triton}, kernels for CUDA")
-        else:
-            yield Finding("triton", "not installed: no kernels for CUDA", "pip install triton", optional=True)
     elif torch.backends.mps.is_available():
         yield Finding("mps", "Apple GPU")
     else:

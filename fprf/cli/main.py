@@ -40,16 +40,12 @@ VERBS = {
     "eval": Verb("RUN", "measure a run: quality, speed, consistency"),
     "stylize": Verb("RUN --references A.jpg ...", "restyle captured views with photographs"),
     "restyle": Verb("A.ply --references A.jpg ...", "restyle a capture of 3D Gaussians from its file alone"),
-    "gallery": Verb("RUN --references DIR", "every view in every style, as one page that can be sent"),
+    "gallery": Verb("RUN --references DIR", "a run in every style, as one page to walk through"),
     "render": Verb("RUN --path PATH --output X.mp4", "fly through a scene, plain or restyled"),
     "view": Verb("[RUN]", "in the browser: make a scene, drop a photograph on it"),
-    "report": Verb("RUN", "how training went: charts of loss, PSNR, speed, time per part"),
-    "bench": Verb("speed|restyle|peer [RUN]", "time and error; restyling against the truth; frames of peers"),
     "export": Verb("RUN [ply splat glb cameras lut]", "points, splats, meshes, cameras, lookup tables as files"),
-    "cluster": Verb("[--head HOST]", "how to train blocks on many machines"),
     "pretrain": Verb("decoder", "train the decoder of an encoder"),
     "plugins": Verb("[--check]", "list what is installed, and check that it loads"),
-    "completion": Verb("bash|zsh|fish", "a script by which a shell completes verbs and flags"),
     "doctor": Verb("[RUN|DIR|METHOD]", "look over this machine, a run, a scene or a method's needs"),
 }
 

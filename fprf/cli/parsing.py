@@ -191,8 +191,6 @@ _SCALARS = {bool: "True or False", int: "a whole number", float: "a number", str
 
 
 C = TypeVar("C")
-LIST_FLAGS = "--list-flags"
-"""Asks any verb for its flags, one a line: for shells that complete them."""
 DESCRIBE = "--describe"
 """Asks any verb for all of its flags with their meanings, as JSON."""
 _COLUMNS = 100
@@ -205,9 +203,6 @@ def parse(default: C, args: Sequence[str], *, prog: str, description: str, posit
     `none` empties whatever may be None. Fields named in `positional` are given without a flag, in that order, and must
     be given. `--help` prints all of it and exits. Raises UsageError, PluginError or ConfigError with one line.
     """
-    if LIST_FLAGS in args:
-        print("\n".join(sorted({*flags_of(default), *(f"--{_dashed(slot.path)}" for slot in slots(default))})))
-        raise SystemExit(0)
     if DESCRIBE in args:
         print(describe(default, prog=prog, description=description, positional=positional))
         raise SystemExit(0)
@@ -255,8 +250,10 @@ def load_method(name: str) -> "tuple[RunConfig, str]":
 
 def load_field_method(name: str) -> "tuple[TrainConfig, str]":
     """The same for what is made of fields alone. Raises UsageError for a method of another kind."""
+    from ..config import fields_only
+
     config, method = load_method(name)
-    return config.fields_only(Path(name)), method
+    return fields_only(config, Path(name)), method
 
 
 def methods() -> Iterator[tuple[str, str]]:

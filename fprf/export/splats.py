@@ -76,7 +76,7 @@ def write_gaussians(
         harmonics=((colour.double() - 0.5) / HARMONIC).float()[:, None],
     )
     added, beside = added_and_beside(origin, local)
-    write_bytes(path, ply_bytes(gaussians, False, splats.normal.float().numpy(), added))
+    write_bytes(path, ply_bytes(gaussians, False, added))
     write_offset(path, beside)
 
 

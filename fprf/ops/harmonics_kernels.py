@@ -7,12 +7,11 @@ import math
 import numba
 import numpy as np
 
-from .harmonics import MAX_COLOUR
 from .lanes import dot, scaled
 from .simd import NARROW
 
 _C0, _HALF, _TINY = np.float32(0.28209479177387814), np.float32(0.5), np.float32(1e-5)
-_0, _MAX_COLOUR = np.float32(0), np.float32(MAX_COLOUR)
+_0 = np.float32(0)
 _REACH = tuple(np.float32(math.sqrt((2 * degree + 1) / (4 * math.pi))) for degree in range(4))
 _BLOCK = 512
 
@@ -55,8 +54,11 @@ def _cut(rows, at, count, values, fit, size, colour, drawn):
 
 
 @numba.njit(parallel=True, cache=True, nogil=True)
-def recolour(rows, change, weight, values, fit, count, out):
-    """out [N K 3] of rows [N K 3], change [N 4 3], weight [N], values and fit [count D], D whole vectors."""
+def recolour(rows, change, weight, values, fit, count, most, out):
+    """out [N K 3] of rows [N K 3], change [N 4 3], weight [N], values and fit [count D], D whole vectors.
+
+    `most` is the highest mean colour that is mapped to.
+    """
     total, size = len(weight), len(values) // count
     run = len(rows) // total
     for task in numba.prange((total + _BLOCK - 1) // _BLOCK):
@@ -80,5 +82,5 @@ def recolour(rows, change, weight, values, fit, count, out):
             for c in range(3):
                 mine = _HALF + _C0 * drawn[c]
                 moved = mine + (x * change[to + c] + y * change[to + 3 + c] + z * change[to + 6 + c]) + change[to + 9 + c]
-                moved = min(moved, max(mine, _MAX_COLOUR))
+                moved = min(moved, max(mine, most))
                 out[at + c] = (moved - _HALF) / _C0

@@ -1,4 +1,10 @@
-"""One step of training Gaussians on compiled kernels, without torch; and how to have them compiled by another process.
+"""3D Gaussians in training, on compiled kernels: parameters with Adam's moments, and a step of learning from a photograph.
+
+What the kernels want (padded blocks of parameters, planes of whole tiles, room for projections) is known here and in the
+kernels alone. Whoever trains sees rows [N R] of parameters, one a Gaussian, in these columns:
+
+    MEANS 0-2 · LOG_SCALES 3-5 (natural logarithms) · QUATERNION 6-9 (w x y z) · LOGIT 10 (of the opacity)
+    HARMONICS 11-R (coefficient after coefficient, red green blue; those of degree 0 first)          R = 11 + 3 K
 
 Numba keeps what it compiled in its cache. `python -m fprf.ops.rasterise_training BANDS PART` puts there what half of a step
 needs, in three seconds; a command starts these first and has its kernels when it has read its images.
@@ -7,23 +13,29 @@ needs, in three seconds; a command starts these first and has its kernels when i
 import subprocess
 import sys
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import photometric, rasterise_gradient_kernels, rasterise_kernels
+from . import photometric
+from . import rasterise_gradient_kernels as backward
+from . import rasterise_kernels as forward
 from .rasterise_kernels import FIXED, SIDE, SLOTS
-from .simd import LANES
+from .simd import LANES, aligned
+
+if TYPE_CHECKING:
+    from .rasterise import Pinhole
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 
-
-_PARTS = "forward", "backward"
+MEANS, LOG_SCALES, QUATERNION, LOGIT, HARMONICS = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 11), slice(FIXED, None)
+_UNUSED = -20
+"""Logit of the opacity in rows that hold no Gaussian: they are never drawn."""
 
 
 class Target(NamedTuple):
-    """One photograph at one size, as the kernels take it."""
+    """One photograph at one size, in the kernels' layout (see `target_of`)."""
 
     width: int
     height: int
@@ -37,14 +49,61 @@ class Target(NamedTuple):
     sky: Floats | None = None
     """1 where the photograph shows sky, 0 elsewhere, [H16, W16] flat; None = not known."""
 
+    @property
+    def axes(self) -> Annotated[NDArray[np.float64], "3 3"]:
+        """Rows: the camera's right, down and forward axes in the world."""
+        return self.camera[:9].reshape(3, 3).astype(np.float64)
+
+    @property
+    def centre(self) -> Annotated[NDArray[np.float64], "3"]:
+        """The camera's place in the world."""
+        return self.camera[16:19].astype(np.float64)
+
+    def seen_from(self, axes: Annotated[NDArray[np.float64], "3 3"], centre: Annotated[NDArray[np.float64], "3"]) -> "Target":
+        """The same photograph, taken with other axes from another place."""
+        camera = self.camera.copy()
+        camera[:9], camera[9:12], camera[16:19] = axes.reshape(-1), -axes @ centre, centre
+        return self._replace(camera=camera)
+
+    @property
+    def area(self) -> int:
+        """Pixels of a plane: whole tiles."""
+        return -(-self.width // SIDE) * SIDE * -(-self.height // SIDE) * SIDE
+
+
+def target_of(
+    camera: "Pinhole",
+    colours: Annotated[Floats, "H W 3"],
+    valid: Annotated[NDArray[np.bool_], "H W"] | None = None,
+    sky: Annotated[NDArray[np.bool_], "H W"] | None = None,
+    *,
+    antialiased: bool = True,
+) -> Target:
+    """A photograph in [0, 1] with its camera; pixels that are not valid do not count. None = all are, no sky is known."""
+    from .rasterise import camera_array  # here, as it imports torch, which compilation need not wait for
+
+    width, height = camera.width, camera.height
+    planes = _planes(colours, photometric.slack(width + -width % SIDE))
+    used = None if valid is None or valid.all() else _planes(np.repeat(valid[..., None], 3, 2), 64)
+    above = None if sky is None else _planes(sky[..., None], 0)
+    blurred = photometric.blurred(planes, width, height)
+    return Target(width, height, camera_array(camera, antialiased), planes, blurred, used, above)
+
+
+def _planes(image: NDArray[Any], behind: int) -> Floats:
+    """An image [H W C] as the kernels take it, [C H16 W16] flat and float32, with so many zeros behind."""
+    height, width, _ = image.shape
+    padded = np.pad(image, ((0, -height % SIDE), (0, -width % SIDE), (0, 0))).transpose(2, 0, 1)
+    return np.append(padded, np.zeros(behind, np.float32)).astype(np.float32, copy=False)
+
 
 class Learnt(NamedTuple):
     """Measurements of a step, taken before it moved anything."""
 
     l1: float
     ssim: float
-    image: Floats
-    """Planes like those of the target, times the factors."""
+    squared: float
+    """Mean squared error."""
     pull: Annotated[Floats, "3"]
     """Gradient of the loss by the logarithms of the factors."""
     of_camera: Annotated[NDArray[np.float64], "6"]
@@ -52,126 +111,195 @@ class Learnt(NamedTuple):
     that centre (world axes)."""
 
 
-def learn(
-    blocks: Floats,
-    moments: tuple[Floats, Floats, Floats],
-    count: int,
-    bands: int,
-    splats: Floats,
-    target: Target,
-    *,
-    background: tuple[float, float, float],
-    ssim: float,
-    rates: Floats,
-    factors: Annotated[Floats, "3"] | None = None,
-) -> Learnt:
-    """Render `count` Gaussians, compare, and move them by a step of Adam. Where the loss is not finite nothing is changed.
+class TrainableGaussians:
+    """At most `room` Gaussians of K harmonics with Adam's moments; rows are those of the module's docstring.
 
-    `moments` are the first, the second and the weight in it (`rasterise_gradient_kernels.adam`). `splats` is room for SLOTS
-    numbers a Gaussian; `ssim` the share of 1 - SSIM in the loss; renders are multiplied by `factors`, one a channel, before
-    they are compared.
+    Moments are the first [N R], the second [N R] and the weight in the second [N], 1 - 0.99^k after k steps: what is seen for
+    the first time moves as it would have in the first step (`rasterise_gradient_kernels.adam`).
     """
-    width, height, camera, planes, blurred, valid, _ = target
-    entries, out, left = _render(blocks, count, bands, splats, target, background)
-    shown, pull = _exposed(out, target, factors), np.zeros(3, np.float32)
-    l1, similar, slope = photometric.loss(shown, planes, blurred, width, height, ssim)
-    if not np.isfinite(l1 + similar):
-        return Learnt(l1, similar, shown, pull, np.zeros(6))
-    if valid is not None:
-        slope *= valid
-    if factors is not None:
-        area = _area(target)
-        channels = slope[: 3 * area].reshape(3, area)
-        pull[:] = np.einsum("ca,ca->c", channels, shown[: 3 * area].reshape(3, area))
-        channels *= factors[:, None]
-    gradients = rasterise_gradient_kernels.composite_back(
-        3, entries, splats, splats, SLOTS, 6, width, height, out, left, slope, np.zeros_like(left)
-    )
-    of_camera = rasterise_gradient_kernels.adam(blocks, *moments, count, bands, camera, gradients, entries.first_slot, rates)
-    return Learnt(l1, similar, shown, pull, of_camera)
+
+    def __init__(self, room: int, bands: int) -> None:
+        self.bands, self.rows = bands, FIXED + 3 * bands
+        self.count = 0
+        self._room = -(-room // LANES) * LANES
+        # One array for each of parameters, first and second moment: [blocks, R, LANES], flat.
+        self._blocks, self._first, self._second = (aligned(self.rows * self._room) for _ in range(3))
+        self._weight, self._splats = aligned(self._room), aligned(self._room * SLOTS)
+        for part in (self._blocks, self._first, self._second, self._weight):
+            part[:] = 0
+
+    def start(
+        self,
+        parameters: Annotated[Floats, "N R"],
+        first: Annotated[Floats, "N R"] | None = None,
+        second: Annotated[Floats, "N R"] | None = None,
+        weight: Annotated[Floats, "N"] | float = 0.0,
+    ) -> None:
+        """Begin with N <= `room` Gaussians and their moments, which are 0 where none are given."""
+        self.count = len(parameters)
+        for part, values in ((self._blocks, parameters), (self._first, first), (self._second, second)):
+            part[:] = 0
+            if part is self._blocks:  # rows without a Gaussian are never drawn, and are turned like nothing
+                self._by_block(part)[:, QUATERNION.start], self._by_block(part)[:, LOGIT] = 1, _UNUSED
+            if values is not None:
+                self._put(part, np.arange(self.count), values)
+        self._weight[:], self._weight[: self.count] = 0, weight
+
+    def read(self, columns: slice = slice(None), index: NDArray[np.int64] | None = None) -> Annotated[Floats, "M c"]:
+        """A copy of some columns of the parameters, of all Gaussians or of some."""
+        return self._read(self._blocks, columns, index)
+
+    def moments(self) -> tuple[Annotated[Floats, "N R"], Annotated[Floats, "N R"], Annotated[Floats, "N"]]:
+        """Copies of the first moments, the second ones, and the weights in the second."""
+        return self._read(self._first), self._read(self._second), self._weight[: self.count].copy()
+
+    def multiply(self, columns: slice, factor: float) -> None:
+        """Multiply columns of the parameters of all Gaussians."""
+        self._by_block(self._blocks)[: -(-self.count // LANES), columns] *= np.float32(factor)
+
+    def limit_scales(self, most: Annotated[Floats, "M"], index: NDArray[np.int64] | None = None) -> None:
+        """Cut logarithms of standard deviations that are above `most`, of all Gaussians or of some."""
+        scales = self._by_block(self._blocks)[:, LOG_SCALES]
+        if index is not None:
+            scales[index // LANES, :, index % LANES] = np.minimum(self.read(LOG_SCALES, index), most[:, None])
+            return
+        used = scales[: -(-self.count // LANES)]
+        every = np.pad(most, (0, used.size // 3 - self.count), constant_values=np.inf)
+        np.minimum(used, every.reshape(-1, 1, LANES), out=used)
+
+    def split(
+        self, index: NDArray[np.int64], to: NDArray[np.int64], one: Annotated[Floats, "M R"], other: Annotated[Floats, "M R"]
+    ) -> None:
+        """Put `one` in the place of M Gaussians and `other` to `to`: in the place of others, or behind the last one.
+
+        Both begin without a first moment and with half of the second, as the gradients of halves are half as large.
+        """
+        self._put(self._blocks, index, one)
+        self._put(self._blocks, to, other)
+        second = 0.5 * self._read(self._second, index=index)
+        for place in (index, to):
+            self._put(self._first, place, np.zeros_like(second))
+            self._put(self._second, place, second)
+        self._weight[to] = self._weight[index]
+        self.count = max(self.count, int(to.max()) + 1)
+
+    def reorder(self, order: Annotated[NDArray[np.int64], "N"]) -> None:
+        """Sort all Gaussians: the i-th becomes what the order[i]-th was. Neighbours in space should be neighbours here."""
+        for part in (self._blocks, self._first, self._second):  # one after the other: a copy takes as much again
+            self._put(part, np.arange(self.count), self._read(part, index=order))
+        self._weight[: self.count] = self._weight[order]
+
+    def learn(
+        self,
+        target: Target,
+        *,
+        background: tuple[float, float, float],
+        ssim: float,
+        rates: Annotated[Floats, "R"],
+        factors: Annotated[Floats, "3"] | None = None,
+    ) -> Learnt:
+        """Render, compare with a photograph, and move by a step of Adam. Where the loss is not finite nothing is changed.
+
+        `ssim` is the share of 1 - SSIM in the loss, `rates` a learning rate a column; renders are multiplied by `factors`, one
+        a channel, before they are compared.
+        """
+        width, height, camera, planes, blurred, valid, _ = target
+        area, pull = target.area, np.zeros(3, np.float32)
+        tiles, out, left = self._render(target, background)
+        shown = _exposed(out, area, factors)
+        l1, similar, slope = photometric.loss(shown, planes, blurred, width, height, ssim)
+        if not np.isfinite(l1 + similar):
+            return Learnt(l1, similar, np.nan, pull, np.zeros(6))
+        if valid is not None:
+            slope *= valid
+        if factors is not None:
+            # Of a factor e^g the slope by g is that by the render times the render; of the render it is that times the factor.
+            channels = slope[: 3 * area].reshape(3, area)
+            pull[:] = np.einsum("ca,ca->c", channels, shown[: 3 * area].reshape(3, area))
+            channels *= factors[:, None]
+        # Pixels to sums for each entry (Gaussian in a tile), and these to parameters, which are moved at once.
+        sums = backward.composite_back(tiles, 3, self._splats, SLOTS, 6, out, left, slope, np.zeros_like(left))
+        moments = self._first, self._second, self._weight
+        of_camera = backward.adam(tiles, self._blocks, moments, self.bands, camera, sums, rates)
+        tall, wide = -(-height // SIDE) * SIDE, -(-width // SIDE) * SIDE
+        apart = (shown - planes)[: 3 * area].reshape(3, tall, wide)[:, :height, :width]
+        return Learnt(l1, similar, float(np.square(apart).mean()), pull, of_camera)
+
+    def errors(
+        self, target: Target, background: tuple[float, float, float], factors: Annotated[Floats, "3"] | None = None
+    ) -> Annotated[Floats, "N 3"]:
+        """Sums over the pixels of a view of each Gaussian's weight: times |render - photograph|, where there is sky, and of
+        all."""
+        tiles, out, _ = self._render(target, background)
+        area = target.area
+        apart = np.abs(_exposed(out, area, factors) - target.planes)[: 3 * area]
+        if target.valid is not None:
+            apart *= target.valid[: 3 * area]
+        # Three images to be carried back to the Gaussians, of the eight that the kernel takes at once.
+        pixels, sums = np.zeros(8 * area, np.float32), np.empty((self.count, 8), np.float32)
+        pixels[:area], pixels[2 * area : 3 * area] = apart.reshape(3, area).sum(0), 1
+        if target.sky is not None:
+            pixels[area : 2 * area] = target.sky
+        backward.lift_values(tiles, backward.lift(tiles, 8, pixels), sums.reshape(-1), 8, 0, 8, skipped=0)
+        return sums[:, :3]
+
+    def _render(self, target: Target, background: tuple[float, float, float]) -> tuple[forward.Tiles, Floats, Floats]:
+        """The Gaussians that a view sees, its planes of colours and its transmittance."""
+        tiles = forward.see(
+            self._blocks, self.count, self.bands, target.camera, target.width, target.height, self._splats
+        )  # fmt: skip
+        out, left = np.zeros(len(target.planes), np.float32), np.empty(len(target.planes) // 3, np.float32)
+        forward.composite(tiles, 3, self._splats, SLOTS, 6, np.array(background, np.float32), out, left)
+        return tiles, out, left
+
+    def _by_block(self, part: Floats) -> Annotated[Floats, "B R L"]:
+        return part.reshape(-1, self.rows, LANES)
+
+    def _read(
+        self, part: Floats, columns: slice = slice(None), index: NDArray[np.int64] | None = None
+    ) -> Annotated[Floats, "M c"]:
+        blocks = self._by_block(part)[:, columns]
+        if index is None:
+            return blocks.transpose(0, 2, 1).reshape(-1, blocks.shape[1])[: self.count].copy()
+        return blocks[index // LANES, :, index % LANES]
+
+    def _put(self, part: Floats, index: NDArray[np.int64], values: Annotated[Floats, "M R"]) -> None:
+        self._by_block(part)[index // LANES, :, index % LANES] = values
 
 
-def errors(
-    blocks: Floats,
-    count: int,
-    bands: int,
-    splats: Floats,
-    target: Target,
-    background: tuple[float, float, float],
-    factors: Annotated[Floats, "3"] | None = None,
-) -> Annotated[Floats, "count 3"]:
-    """Sums over the pixels of a view of each Gaussian's weight: times |render - photograph|, where there is sky, and of all."""
-    entries, out, _ = _render(blocks, count, bands, splats, target, background)
-    area = _area(target)
-    apart = np.abs(_exposed(out, target, factors) - target.planes)[: 3 * area]
-    if target.valid is not None:
-        apart *= target.valid[: 3 * area]
-    pixels, sums = np.zeros(8 * area, np.float32), np.empty((count, 8), np.float32)
-    pixels[:area], pixels[2 * area : 3 * area] = apart.reshape(3, area).sum(0), 1
-    if target.sky is not None:
-        pixels[area : 2 * area] = target.sky
-    summed = rasterise_gradient_kernels.lift(entries, splats, target.width, target.height, pixels)
-    rasterise_gradient_kernels.lift_values(summed, entries.first_slot, count, sums.reshape(-1), 8, 0, 8)
-    return sums[:, :3]
-
-
-def _area(target: Target) -> int:
-    """Padded pixels of a plane."""
-    return -(-target.width // SIDE) * SIDE * -(-target.height // SIDE) * SIDE
-
-
-def _exposed(image: Floats, target: Target, factors: Annotated[Floats, "3"] | None) -> Floats:
+def _exposed(image: Floats, area: int, factors: Annotated[Floats, "3"] | None) -> Floats:
     """A render times the factors of its channels, a copy; itself where there are none."""
     if factors is None:
         return image
-    area, shown = _area(target), image.copy()
+    shown = image.copy()
     shown[: 3 * area].reshape(3, area)[:] *= factors[:, None]
     return shown
 
 
-def _render(
-    blocks: Floats, count: int, bands: int, splats: Floats, target: Target, background: tuple[float, float, float]
-) -> tuple[rasterise_kernels.Entries, Floats, Floats]:
-    width, height = target.width, target.height
-    rasterise_kernels.project(blocks, count, bands, target.camera, width, height, splats)
-    entries = rasterise_kernels.bins(splats, count, width, height)
-    out, left = np.zeros(len(target.planes), np.float32), np.empty(len(target.planes) // 3, np.float32)
-    behind = np.array(background, np.float32)
-    rasterise_kernels.composite(3, entries, splats, splats, SLOTS, 6, behind, width, height, out, left)
-    return entries, out, left
-
-
 def compile_beside(bands: int) -> "list[subprocess.Popen[bytes]]":
     """Start compilation in two other processes, to be waited for before `learn`; none where numba's cache holds something."""
-    cache = Path(rasterise_gradient_kernels.cache_path(bands))
-    if any(cache.glob(f"{rasterise_gradient_kernels.__name__.rpartition('.')[2]}*.nbi")):
+    cache = Path(backward.cache_path(bands))
+    if any(cache.glob(f"{backward.__name__.rpartition('.')[2]}*.nbi")):
         return []
     quiet = subprocess.DEVNULL
     line = [sys.executable, "-m", __name__, str(bands)]
-    return [subprocess.Popen([*line, part], stdin=quiet, stdout=quiet, stderr=quiet) for part in _PARTS]
+    return [subprocess.Popen([*line, part], stdin=quiet, stdout=quiet, stderr=quiet) for part in ("forward", "backward")]
 
 
 def _compile(bands: int, part: str) -> None:
-    size, rows = LANES, FIXED + 3 * bands
+    """Run half of a step on nothing: a tile, and a block of Gaussians of which none is drawn."""
     camera = np.array([1, 0, 0, 0, 1, 0, 0, 0, 1, *[0] * 10, -1, 1, -1, 1, 1, 0], np.float32)
-    planes, left = np.zeros(3 * size * size + photometric.slack(size), np.float32), np.zeros((size, size), np.float32)
-    blocks, first, second, splats = np.zeros((4, rows * LANES), np.float32)
-    nothing = np.zeros(0, np.int32)
-    entries = rasterise_kernels.Entries(
-        np.zeros(2, np.int32), nothing, nothing, nothing, np.zeros(size + LANES + 1, np.int32), nothing
-    )
+    planes, left = np.zeros(3 * SIDE * SIDE + photometric.slack(SIDE), np.float32), np.zeros(SIDE * SIDE, np.float32)
+    blocks, first, second, splats = np.zeros((4, (FIXED + 3 * bands) * LANES), np.float32)
     if part == "forward":
-        rasterise_kernels.project(blocks, size, bands, camera, size, size, splats)
-        entries = rasterise_kernels.bins(splats, size, size, size)
-        rasterise_kernels.composite(3, entries, splats, splats, SLOTS, 6, camera[:3], size, size, planes, left.reshape(-1))
+        tiles = forward.see(blocks, LANES, bands, camera, SIDE, SIDE, splats)
+        forward.composite(tiles, 3, splats, SLOTS, 6, camera[:3], planes, left)
     else:
-        slope = photometric.loss(planes, planes, photometric.blurred(planes, size, size), size, size, 0.2)[2]
-        gradients = rasterise_gradient_kernels.composite_back(
-            3, entries, splats, splats, SLOTS, 6, size, size, planes, left.reshape(-1), slope, left.reshape(-1)
-        )  # fmt: skip
-        rasterise_gradient_kernels.adam(
-            blocks, first, second, splats, size, bands, camera, gradients, entries.first_slot, np.zeros(rows, np.float32)
-        )  # fmt: skip
+        slots, none = np.zeros(LANES + LANES + 1, np.int32), np.zeros(0, np.int32)
+        tiles = forward.Tiles(splats, LANES, SIDE, SIDE, np.zeros(2, np.int32), none, none, none, slots, none)
+        slope = photometric.loss(planes, planes, photometric.blurred(planes, SIDE, SIDE), SIDE, SIDE, 0.2)[2]
+        sums = backward.composite_back(tiles, 3, splats, SLOTS, 6, planes, left, slope, left)
+        backward.adam(tiles, blocks, (first, second, splats), bands, camera, sums, np.zeros(FIXED + 3 * bands, np.float32))
 
 
 if __name__ == "__main__":

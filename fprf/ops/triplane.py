@@ -5,22 +5,31 @@ agree on it. A point outside takes the value at the border. Plane p spans the ax
 in one table [rows, channels] of channel vectors: scale after scale, plane after plane, row v after row, node u after node.
 One table means one parameter, one optimiser state and one pass.
 
-The torch form is the reference for every device and dtype; in float32 fused kernels take over, those of `triplane_numba` on
-the CPU and those of `triplane_triton` on a GPU. All keep coordinates and arithmetic in the dtype of the points, never half
-(half coordinates cost 3.5e-2 of the feature at 512 nodes); a table that nobody trains may be stored in half. Gradients go to
-the table, and to points that ask for them (poses that are refined); on a GPU the latter are found in the plain form. A sample
-has a kink at each node: there its slope is that of the cell above.
+The torch form is the reference for every device and dtype; in float32 on the CPU fused kernels take over (`triplane_kernels`,
+compiled by numba on first use and cached). Both keep coordinates and arithmetic in the dtype of the points, never half (half
+coordinates cost 3.5e-2 of the feature at 512 nodes). Gradients go to the table, and to points that ask for them (poses that are
+refined). A sample has a kink at each node: there its slope is that of the cell above.
 """
+
+# The checker takes compiled functions to have one argument.
+# mypy: disable-error-code="call-arg"
 
 from collections.abc import Sequence
 from typing import Annotated, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from . import triplane_numba, triplane_triton
+from .backend import compiled
+from .dense import array
 
 AXES = ((0, 1), (0, 2), (1, 2))
+"""Axes that each plane spans, along its rows first."""
+_LANES = 8
+"""Channels of the kernels' vectors."""
+_SLICES, _SMALL = 4, 2**19
+"""Parts of the points whose gradients are summed apart, and numbers of a table below which that is worth the memory."""
 
 
 def rows(resolutions: Sequence[int]) -> int:
@@ -79,52 +88,85 @@ def variation_reference(table: Annotated[Tensor, "rows F"], resolutions: Sequenc
     return total
 
 
-class _Lookup(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, points: Tensor, table: Tensor, resolutions: tuple[int, ...], kernels: Any) -> Tensor:
-        ctx.save_for_backward(points, table)
-        ctx.resolutions, ctx.kernels = resolutions, kernels
-        result: Tensor = kernels.forward(points, table, resolutions)
-        return result
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
-        points, table = ctx.saved_tensors
-        to_points, to_table, given = None, None, (points, table, ctx.resolutions, grads[0].contiguous())
-        if ctx.needs_input_grad[0]:
-            to_points = (triplane_numba.point_slopes if ctx.kernels is triplane_numba else point_slopes_reference)(*given)
-        if ctx.needs_input_grad[1]:
-            to_table = ctx.kernels.backward(*given)
-        return to_points, to_table, None, None
+def usable(points: Tensor, table: Tensor) -> bool:
+    """Return whether kernels apply: float32 on the CPU, whole vectors of channels, and numba is installed."""
+    on_cpu = points.device.type == "cpu" and table.device.type == "cpu"
+    return compiled() and on_cpu and points.dtype == table.dtype == torch.float32 and table.shape[1] % _LANES == 0
 
 
 def lookup(
     points: Annotated[Tensor, "N 3"], table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]
 ) -> Annotated[Tensor, "N scales*F"]:
     """The fastest form that this device and dtype have; equal to the reference within 4u (r |slope| + 3 |value|)."""
-    for kernels in (triplane_triton, triplane_numba):
-        if kernels.usable(points, table):
-            result: Tensor = _Lookup.apply(points.contiguous(), table, tuple(resolutions), kernels)  # type: ignore[no-untyped-call]
-            return result
-    return lookup_reference(points, table, resolutions)
+    if not usable(points, table):
+        return lookup_reference(points, table, resolutions)
+    result: Tensor = _Lookup.apply(points.contiguous(), table, tuple(resolutions))  # type: ignore[no-untyped-call]
+    return result
+
+
+def variation(table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]) -> Tensor:
+    """`variation_reference`, fused and accumulated in float64 where the device has it."""
+    if not usable(table, table):
+        return variation_reference(table, resolutions)
+    result: Tensor = _Variation.apply(table, tuple(resolutions))  # type: ignore[no-untyped-call]
+    return result
+
+
+class _Lookup(torch.autograd.Function):
+    """Forward runs over points. Backward runs over (scale, group of channels): no two tasks write the same number, so no locks,
+    and the sum over points has one order: bitwise the same for any number of threads."""
+
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> Tensor:
+        from . import triplane_kernels as kernels
+
+        ctx.save_for_backward(points, table)
+        ctx.resolutions = resolutions
+        out = torch.empty(len(points), len(resolutions) * table.shape[1])
+        kernels.forward(array(points), *_laid_out(table, resolutions), out.view(-1).numpy())
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+        from . import triplane_kernels as kernels
+
+        points, table = ctx.saved_tensors
+        given = array(points), *_laid_out(table, ctx.resolutions), array(grads[0])
+        to_points = to_table = None
+        if ctx.needs_input_grad[0]:
+            to_points = torch.empty(len(points), 3)
+            kernels.point_slopes(*given, to_points.view(-1).numpy())
+        if ctx.needs_input_grad[1]:
+            # A table of few scales gives few tasks, so a small one is summed up in parts. Sizes alone decide: the order of the
+            # sums must not depend on the machine.
+            slices = _SLICES if table.numel() <= _SMALL and grads[0].numel() > table.numel() else 1
+            parts = torch.zeros(slices, *table.shape)
+            kernels.backward(*given, slices, parts.view(-1).numpy())
+            to_table = parts.sum(0) if slices > 1 else parts[0]
+        return to_points, to_table, None
 
 
 class _Variation(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, table: Tensor, resolutions: tuple[int, ...]) -> Tensor:
+        from . import triplane_kernels as kernels
+
         ctx.save_for_backward(table)
         ctx.resolutions = resolutions
-        return triplane_numba.variation(table, resolutions)
+        return torch.tensor(kernels.variation(*_laid_out(table, resolutions)), dtype=table.dtype)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        from . import triplane_kernels as kernels
+
         (table,) = ctx.saved_tensors
-        return triplane_numba.variation_gradient(table, ctx.resolutions, float(grads[0])), None
+        out = torch.empty_like(table, memory_format=torch.contiguous_format)
+        kernels.variation_gradient(*_laid_out(table, ctx.resolutions), float(grads[0]), out.view(-1).numpy())
+        return out, None
 
 
-def variation(table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]) -> Tensor:
-    """`variation_reference`, fused where the device has it."""
-    if not triplane_numba.usable(table, table):
-        return variation_reference(table, resolutions)
-    result: Tensor = _Variation.apply(table, tuple(resolutions))  # type: ignore[no-untyped-call]
-    return result
+def _laid_out(table: Tensor, resolutions: Sequence[int]) -> tuple[Any, ...]:
+    """A table, its channels, and nodes a side and first row of every scale, as kernels take them."""
+    sizes = np.asarray(resolutions, dtype=np.int64)
+    starts = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(3 * sizes * sizes)[:-1]])
+    return array(table), table.shape[1], sizes, starts

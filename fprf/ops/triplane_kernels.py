@@ -1,4 +1,4 @@
-"""The compiled loops behind `triplane_numba`. Conventions are those of `triplane`; arrays are flat, contiguous float32."""
+"""The compiled loops behind `triplane`. Conventions are those of `triplane`; arrays are flat, contiguous float32."""
 
 # numba passes the typing context of an intrinsic by itself, which the checker cannot know: call-arg.
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, call-arg"
@@ -8,8 +8,9 @@ import numpy as np
 
 from .lanes import BLOCK
 from .simd import NARROW, WIDE, load, narrow, store, traced
-from .triplane import AXES
 
+AXES = ((0, 1), (0, 2), (1, 2))
+"""Those of `triplane`, which imports this module."""
 GROUP = 16
 """Channels of one backward task: a cache line of float32."""
 

@@ -1,28 +1,31 @@
 """Training 3D Gaussians step by step, on the CPU: one view a step, Adam, splits where views err.
 
-The parameters live in the blocks of `ops.rasterise_kernels`, padded to a fixed room; Adam's moments beside them. Every draw is
-a function of (seed, step), so parameters, moments and the step are all the state there is.
+Parameters and Adam's moments are those of `ops.rasterise_training.TrainableGaussians`, a row a Gaussian. Every draw is a
+function of (seed, step), so parameters, moments and the step are all the state there is.
 """
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from ..interfaces import Figures, Learner, State
 from ..ops.harmonics import HARMONIC
-from ..ops.rasterise_kernels import FIXED, SLOTS
-from ..ops.rasterise_training import Target, errors, learn
-from ..ops.simd import LANES, aligned
+from ..ops.rasterise_training import HARMONICS, LOG_SCALES, LOGIT, MEANS, QUATERNION, Target, TrainableGaussians
 from ..rendering.splines import rotations
 from ..training.camera_optimizers import Poses, Tones
+from ..training.model import Facts
+from ..training.run import Known, Run
 from .config import GaussiansConfig
-from .gaussians import Gaussians, from_arrays
+from .gaussians import Gaussians, from_arrays, from_tensors, tensors_of
 from .initial import Points, spacing, spatial_order
-from .photographs import Floats, Level, moved_camera
+from .photographs import Floats, Level, moved
+from .scene import Semantics, SplatScene, find_semantics
 
 _DEAD = 0.005
 """Opacity below which a Gaussian is moved elsewhere."""
@@ -38,32 +41,34 @@ _START_OPACITY, _START_SCALE, _FAR_OPACITY = 0.3, 0.7, 0.9
 _DECAY, _DECAY_EVERY = 3e-3, 20
 """Weight decay of the harmonics above degree 0, a step, and the steps between its uses; it falls as the rates do. From where no
 photograph looks they would become any colour, which a style that refits cut colours brings into view as specks."""
+_SMOOTHING = 0.95
+"""Decay of running means."""
 _GAIN, _EXPONENT = 0.005, 2e-3
 """Learning rates of the logarithms of a view's factors, whenever it is seen, and of the exponent. They fall to a tenth."""
 
 
-Narrow = Callable[[Annotated[Floats, "B R L"], int], None]
-"""Cuts standard deviations (logarithms in rows 3 to 5 of the blocks) in place after a step."""
+Narrow = Callable[[TrainableGaussians, int], None]
+"""Cuts standard deviations in place after a step."""
 
 
-class Step(NamedTuple):
-    """Measurements of a step, taken before it moved anything."""
+class Part(NamedTuple):
+    """The part of a whole schedule that a learner is given to train."""
 
-    l1: float
-    ssim: float
-    squared: float
-    """Mean squared error."""
-    gaussians: int
-    pixels: int
+    before: int = 0
+    """Steps that its Gaussians were trained for elsewhere."""
+    first: float = 0.0
+    last: float = 1.0
+    """Shares of the schedule where its training begins and ends."""
 
 
-class Learner:
+class GaussianLearner(Learner):
     """Gaussians in training. `reach` is the radius of the cameras' positions in world units: the unit of the means' rate.
 
     Only Gaussians whose means are `inside` are split or moved; None = all. After each step `narrow` may cut the standard
-    deviations in the blocks; None = none is limited.
+    deviations; None = none is limited. Nothing nearer to a camera than `near` is drawn.
     With `tones` each view's factors are learnt as well, with `poses` where each view was taken. `only` colours learns harmonics
-    alone, `only` poses neither Gaussians nor factors.
+    alone, `only` poses neither Gaussians nor factors. `known` is what scene.json will hold, for learners of a run; `origin`
+    says where the first Gaussians come from.
     """
 
     def __init__(
@@ -75,18 +80,20 @@ class Learner:
         inside: Callable[[Annotated[Tensor, "N 3"]], Annotated[Tensor, "N"]] | None = None,
         narrow: Narrow | None = None,
         *,
+        near: float = 0.01,
         tones: Tones | None = None,
         poses: Poses | None = None,
         only: Literal["colours", "poses"] | None = None,
+        part: Part | None = None,
+        known: Known | None = None,
+        origin: str = "",
     ) -> None:
-        self.inside, self.narrow = inside, narrow
-        self.config, self.levels, self.reach = config, levels, reach
+        self.inside, self.narrow, self.near, self.known, self.origin = inside, narrow, near, known, origin
+        self.config, self.levels, self.reach, self.part = config, levels, reach, part or Part()
         self.bands = (config.degree + 1) ** 2
-        self.room = -(-room // LANES) * LANES
-        self.count = self.begun = 0
-        self.blocks, self.first, self.second = (_blocks(np.zeros((self.rows, self.room), np.float32)) for _ in range(3))
-        self.weight, self.splats = aligned(self.room), aligned(self.room * SLOTS)
-        self.weight[:] = 0
+        self.begun = self.pixels = self.skipped = self.failed = 0
+        self.means: dict[str, float] = {}
+        self.model = TrainableGaussians(room, self.bands)
         self.tones, self.poses, self.only = tones, poses, only
         self.corrections = {
             f"{kind}.{name}": (each.detach(), torch.zeros_like(each), torch.zeros_like(each), torch.zeros(each.shape[:1]))
@@ -96,11 +103,21 @@ class Learner:
         """Corrections of views by name: the parameter, its moments and the steps of each view."""
 
     @property
-    def rows(self) -> int:
-        """Parameters of a Gaussian."""
-        return FIXED + 3 * self.bands
+    def device(self) -> torch.device:
+        """The CPU."""
+        return torch.device("cpu")
 
-    def begin(self, points: Points, rng: np.random.Generator, surroundings: Points | None = None) -> None:
+    @property
+    def facts(self) -> Facts:
+        assert self.known is not None  # learners of a run have it
+        return self.known.facts
+
+    @property
+    def count(self) -> int:
+        """Gaussians at this time."""
+        return self.model.count
+
+    def begin_at(self, points: Points, rng: np.random.Generator, surroundings: Points | None = None) -> None:
         """Put a Gaussian at each point: as wide as the points lie apart, in any direction; those of surroundings are opaque."""
         order = spatial_order(points.position)
         position, colour = points.position[order], points.colour[order]
@@ -116,47 +133,51 @@ class Learner:
         turns, sizes = rng.normal(size=(4, len(position))).T, np.repeat(np.log(size)[:, None], 3, 1)
         self.start_from(from_arrays(position, turns, sizes, logit, harmonics))
 
-    def step(self, step: int, share: float) -> Step | None:
-        """Learn from one view; None where the loss was not finite, and nothing was changed."""
+    def step(self, index: int, share: float) -> None:
+        """Learn from one view."""
+        step, share = self.part.before + index, self.part.first + (self.part.last - self.part.first) * share
         # Half the size until `coarse`, a quarter until a third of that, and so on.
         reduced = sum(share < self.config.coarse / 3**k for k in range(len(self.levels) - 1))
         level = self.levels[reduced]
+        # Each epoch sees every view once, in an order of its own.
         views = list(level)
         epoch, turn = divmod(step, len(views))
         view = views[np.random.default_rng((self.config.seed, epoch)).permutation(len(views))[turn]]
         target = self._target(level, view)
-        measured = learn(
-            self.blocks, (self.first, self.second, self.weight), self.count, self.bands, self.splats, target,
-            background=self.config.background, ssim=self.config.ssim, rates=self._rates(share),
-            factors=self._factors(view),
-        )  # fmt: skip
+        # Render, compare, and move every Gaussian that the view sees; nothing moves where the loss is not finite.
+        background, ssim, rates, factors = self.config.background, self.config.ssim, self._rates(share), self._factors(view)
+        measured = self.model.learn(target, background=background, ssim=ssim, rates=rates, factors=factors)
         if not math.isfinite(measured.l1 + measured.ssim):
-            return None
-        used = self.blocks.reshape(-1, self.rows, LANES)[: -(-self.count // LANES)]
+            self.skipped, self.failed = self.skipped + 1, self.failed + 1
+            return
+        self.failed = 0
         if step % _DECAY_EVERY == 0 and self.only is None:
-            used[:, FIXED + 3 :] *= np.float32(1 - _DECAY_EVERY * _DECAY * 0.2**share)
+            self.model.multiply(slice(HARMONICS.start + 3, None), 1 - _DECAY_EVERY * _DECAY * 0.2**share)
         if self.narrow is not None:
-            self.narrow(used, step)
+            self.narrow(self.model, step)
+        # Exposure and pose of the view, which learn more slowly towards the end.
         self._learn_tones(view, torch.from_numpy(measured.pull), self.config.rate * 0.1**share)
         self._learn_pose(view, target, torch.from_numpy(measured.of_camera), self.config.poses * 0.1**share)
         moved = (step + 1) % self.config.relocate_every == 0 and self.only is None
         if moved and step >= _SETTLE and share < max(self.config.grow, _LAST):
             self._relocate(step, level, share)
-        height, width = target.height, target.width
-        tall, wide = -(-height // LANES) * LANES, -(-width // LANES) * LANES
-        apart = (measured.image - target.planes)[: 3 * tall * wide].reshape(3, tall, wide)[:, :height, :width]
-        squared = float(np.square(apart).mean())
-        return Step(measured.l1, measured.ssim, squared, self.count, width * height)
+        self.pixels += target.width * target.height
+        for name, value in (("rgb", measured.squared), ("l1", measured.l1), ("ssim", measured.ssim)):
+            self.means[name] = _SMOOTHING * self.means.get(name, value) + (1 - _SMOOTHING) * value
+
+    def figures(self) -> Figures:
+        means = self.means | {"gaussians": float(self.count)}
+        return Figures(means, self.pixels, self.skipped, self.failed, "the loss" if self.failed else "")
 
     def _rates(self, share: float) -> Floats:
-        """Learning rates of the rows of a block. They fall to a fifth, those of the means to a twentieth."""
+        """Learning rates of the columns of the parameters. They fall to a fifth, those of the means to a twentieth."""
         rest = np.full(3 * (self.bands - 1), 0.01)
         rates = np.concatenate(
             [np.full(3, 2.5e-3 * self.reach), np.full(3, 0.08), np.full(4, 0.016), [0.1], np.full(3, 0.07), rest]
         )
         falls = np.where(np.arange(len(rates)) < 3, 0.05**share, 0.2**share)
         if self.only is not None:
-            rates[: FIXED if self.only == "colours" else None] = 0
+            rates[: HARMONICS.start if self.only == "colours" else None] = 0
         scaled: Floats = (self.config.rate * rates * falls).astype(np.float32)
         return scaled
 
@@ -180,8 +201,7 @@ class Learner:
         """
         if self.poses is None:
             return
-        axes = torch.from_numpy(target.camera[:9].reshape(3, 3)).double()
-        slope = torch.cat([axes.T @ gradient[:3], self.poses.reach * gradient[3:]]).float()
+        slope = torch.cat([torch.from_numpy(target.axes).T @ gradient[:3], self.poses.reach * gradient[3:]]).float()
         _adam([each[view] for each in self.corrections["poses.offset"]], slope, rate)
 
     def _target(self, level: Level, view: int) -> Target:
@@ -190,7 +210,7 @@ class Learner:
         if self.poses is None:
             return target
         move = self.poses.moved_by()[view]
-        return target._replace(camera=moved_camera(target.camera, move[:3], move[3:]))
+        return moved(target, move[:3], move[3:])
 
     def _factors(self, view: int) -> Floats | None:
         """Return the factors of renders of a view."""
@@ -209,17 +229,13 @@ class Learner:
         views = draw.permutation(list(level))[:_JUDGES]
         shown = np.zeros((self.count, 3))
         for view in views:
-            target, background = self._target(level, view), self.config.background
-            shown += errors(self.blocks, self.count, self.bands, self.splats, target, background, self._factors(view))
-        parts = [each.reshape(-1, self.rows, LANES) for each in (self.blocks, self.first, self.second)]
-        blocks, first, second = parts
-        means = blocks[:, :3].transpose(0, 2, 1).reshape(-1, 3)
-        opacity = 1 / (1 + np.exp(-blocks[:, 10].reshape(-1)[: self.count].astype(np.float64)))
+            shown += self.model.errors(self._target(level, view), self.config.background, self._factors(view))
+        opacity = 1 / (1 + np.exp(-self.model.read(LOGIT)[:, 0].astype(np.float64)))
         chance = np.nan_to_num(shown[:, 0] * opacity)
         # What shows almost only in the sky floats before it.
         transparent = (opacity < _DEAD) | (shown[:, 1] > _SKY * np.maximum(shown[:, 2], _SEEN))
         if self.inside is not None:
-            inside = self.inside(torch.from_numpy(means[: self.count])).numpy()
+            inside = self.inside(torch.from_numpy(self.model.read(MEANS))).numpy()
             chance, transparent = chance * inside, transparent & inside
         dead = np.flatnonzero(transparent)
         chance[dead] = 0
@@ -230,77 +246,88 @@ class Learner:
         if many > 0:
             picked = draw.choice(self.count, many, replace=False, p=chance / chance.sum())
             to = np.concatenate([dead, np.arange(self.count, self.count + more)])[:many]
-            halves = blocks[_at(picked)]
-            longest = np.arange(many), 3 + halves[:, 3:6].argmax(1)
-            turns: Floats = rotations(torch.from_numpy(halves[:, 6:10])).numpy()
-            across = turns[longest[0], :, longest[1] - 3] * np.exp(halves[longest])[:, None]
+            halves = self.model.read(index=picked)
+            longest = np.arange(many), LOG_SCALES.start + halves[:, LOG_SCALES].argmax(1)
+            turns: Floats = rotations(torch.from_numpy(halves[:, QUATERNION])).numpy()
+            across = turns[longest[0], :, longest[1] - LOG_SCALES.start] * np.exp(halves[longest])[:, None]
             halves[longest] += math.log(_SPLIT_SIZE)
             each = np.clip(_SPLIT_OPACITY * opacity[picked], _DEAD, 0.995)
-            halves[:, 10] = np.log(each / (1 - each))
+            halves[:, LOGIT] = np.log(each / (1 - each))[:, None]
             others = halves.copy()
-            halves[:, :3] += _SPLIT_DISTANCE * across
-            others[:, :3] -= _SPLIT_DISTANCE * across
-            blocks[_at(picked)], blocks[_at(to)] = halves, others
-            first[_at(picked)] = first[_at(to)] = 0
-            second[_at(picked)] *= 0.5
-            second[_at(to)] = second[_at(picked)]
-            self.weight[to] = self.weight[picked]
-            self.count += max(0, many - len(dead))
+            halves[:, MEANS] += _SPLIT_DISTANCE * across
+            others[:, MEANS] -= _SPLIT_DISTANCE * across
+            self.model.split(picked, to, halves, others)
         if (step + 1) % (_SORT_EVERY * self.config.relocate_every) == 0 or more > 0.3 * self.count:
-            means = blocks[:, :3].transpose(0, 2, 1).reshape(-1, 3)
-            order = spatial_order(means[: self.count])
-            for part in parts:  # one after the other: a copy takes as much again
-                part[_at(np.arange(self.count))] = part[_at(order)]
-            self.weight[: self.count] = self.weight[order]
+            self.model.reorder(spatial_order(self.model.read(MEANS)))
 
     def gaussians(self) -> Gaussians:
         """The Gaussians as they are now."""
-        rows = self._by_gaussian(self.blocks)
-        parts = (rows[:, :3], rows[:, 6:10], rows[:, 3:6], rows[:, 10], rows[:, 11:].reshape(-1, self.bands, 3))
+        rows = torch.from_numpy(self.model.read())
+        harmonics = rows[:, HARMONICS].reshape(-1, self.bands, 3)
+        parts = (rows[:, MEANS], rows[:, QUATERNION], rows[:, LOG_SCALES], rows[:, LOGIT.start], harmonics)
         return Gaussians(*(part.contiguous() for part in parts))
 
-    def _by_gaussian(self, blocks: Floats) -> Annotated[Tensor, "N R"]:
-        """A copy of blocks, a row a Gaussian."""
-        rows = blocks.reshape(-1, self.rows, LANES).transpose(0, 2, 1).reshape(-1, self.rows)
-        return torch.from_numpy(rows[: self.count].copy())
-
-    def moments(self) -> dict[str, Tensor]:
-        """Return the rest of a checkpoint: Adam's moments and the weight in the second, exposures, poses, the number at the
-        start."""
-        first, second = self._by_gaussian(self.first), self._by_gaussian(self.second)
-        weight = torch.from_numpy(self.weight[: self.count].copy())
+    def state(self) -> State:
+        """Gaussians; Adam's moments and the weight in the second, exposures, poses, the number at the start."""
+        first, second, weight = (torch.from_numpy(part) for part in self.model.moments())
         tensors = {"first": first, "second": second, "weight": weight, "begun": torch.tensor(self.begun)}
         for name, kept in self.corrections.items():
             tensors |= {f"{name}.{key}": each.clone() for key, each in zip(_KEPT, kept, strict=True)}
         if self.poses is not None:
             tensors[MOVES] = self.poses.moved_by()
-        return tensors
+        return State(tensors_of(self.gaussians(), self.near), tensors)
 
     def start_from(self, gaussians: Gaussians) -> None:
         """Begin with Gaussians, of the config's degree, as they are."""
-        self.count = self.begun = len(gaussians)
-        parts = (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logits[:, None])
-        rows = np.zeros((self.rows, self.room), np.float32)
-        rows[6], rows[10] = 1, -20
-        rows[:, : self.count] = torch.cat([*parts, gaussians.harmonics.flatten(1)], 1).T.numpy()
-        self.blocks = _blocks(rows)
+        self.begun = len(gaussians)
+        self.model.start(_rows(gaussians))
 
-    def restore(self, gaussians: Gaussians, moments: dict[str, Tensor]) -> None:
-        """Go on from what a checkpoint holds; without their moments, tones and poses go on as they are.
+    def load(self, state: State) -> None:
+        """Go on from a checkpoint; without their moments, tones and poses go on as they are.
 
         Checkpoints of before have no weights: their second moments are taken as they are.
         """
-        self.start_from(gaussians)
-        self.begun = int(moments["begun"])
-        for name in ("first", "second"):
-            rows = np.zeros((self.rows, self.room), np.float32)
-            rows[:, : self.count] = moments[name].T.numpy()
-            setattr(self, name, _blocks(rows))
-        self.weight[: self.count] = moments["weight"].numpy() if "weight" in moments else 1
+        moments = state.optimizer
+        self.begun, self.failed = int(moments["begun"]), 0
+        weight = moments["weight"].numpy() if "weight" in moments else 1
+        self.model.start(_rows(from_tensors(state.model)), moments["first"].numpy(), moments["second"].numpy(), weight)
         for name, kept in self.corrections.items():
             for key, each in zip(_KEPT, kept, strict=True):
                 if f"{name}.{key}" in moments:
                     each.copy_(moments[f"{name}.{key}"])
+
+    def scene(self) -> SplatScene:
+        """The Gaussians as they are now, seen from where the cameras are now."""
+        assert self.known is not None  # learners of a run have it
+        cameras = self.known.cameras if self.poses is None else self.poses.refined(self.known.cameras)
+        return run_scene(self.config, replace(self.known, cameras=cameras), self.gaussians(), self.near)
+
+    def begin(self, run: Run) -> str:
+        most = self.config.limited(len(self.levels[0]))
+        passes = f"; at most {most} steps: {self.config.passes} passes over the photographs (--passes)"
+        light = ", tones" if self.tones is not None else ""
+        return f", {self.count} Gaussians at {self.origin}{light}{passes if most < self.config.steps else ''}"
+
+
+_VIEWS = 32
+"""Training views that semantics are found in, at most."""
+
+
+def run_scene(config: GaussiansConfig, known: Known, gaussians: Gaussians, near: float) -> SplatScene:
+    """The scene of a run; its semantics are found when they are first asked for."""
+    encoder = cache(config.semantic.encoder.build)
+
+    def found() -> Semantics:
+        every = torch.tensor(known.train)
+        views = known.cameras.select(every[torch.linspace(0, len(every) - 1, min(_VIEWS, len(every))).round().long()])
+        views = views.scaled(max(1.0, float(views.size.amax()) / config.semantic_size))
+        return find_semantics(gaussians, True, encoder(), views, config.regions, near=near)
+
+    longest = min(config.semantic_size, int(known.cameras.size.amax()))
+    return SplatScene(
+        gaussians, True, known.cameras, known.names, cache(found), encoder, longest, near, config.background,
+        origin=known.facts.origin,
+    )  # fmt: skip
 
 
 MOVES = "poses.moves"
@@ -318,12 +345,7 @@ def _adam(kept: Sequence[Tensor], gradient: Tensor, rate: float) -> None:
     value -= rate * first / (1 - 0.9**steps) / ((second / (1 - 0.999**steps)).sqrt() + 1e-8)
 
 
-def _at(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], slice, NDArray[np.int64]]:
-    """Index of Gaussians in blocks [B rows LANES]."""
-    return index // LANES, slice(None), index % LANES
-
-
-def _blocks(rows: Annotated[Floats, "R room"]) -> Floats:
-    blocks = aligned(rows.size)
-    blocks.reshape(-1, len(rows), LANES)[:] = rows.reshape(len(rows), -1, LANES).transpose(1, 0, 2)
-    return blocks
+def _rows(gaussians: Gaussians) -> Annotated[Floats, "N R"]:
+    parts = (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logits[:, None])
+    rows: Floats = torch.cat([*parts, gaussians.harmonics.flatten(1)], 1).numpy()
+    return rows

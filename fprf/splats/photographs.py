@@ -1,6 +1,7 @@
 """Photographs as the rasteriser sees the world: through a pinhole, with what lies beyond a lens's picture left out."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any
 
@@ -10,15 +11,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..datamanagers.images import Image
+from ..datamanagers.images import Image, load_images, load_mask
 from ..datamanagers.scene import Scene
 from ..errors import DataError
-from ..ops.photometric import WINDOW, blurred, slack
-from ..ops.rasterise import Pinhole, camera_array
-from ..ops.rasterise_kernels import SIDE
-from ..ops.rasterise_training import Target
+from ..ops.photometric import WINDOW
+from ..ops.rasterise import Pinhole
+from ..ops.rasterise_training import Target, target_of
 from ..rendering.cameras import Cameras, pixel_grid, project, rays_through
 from ..training.camera_optimizers import rotated
+from .config import GaussiansConfig
 
 Floats = NDArray[np.float32]
 _PANORAMA = 3
@@ -121,8 +122,27 @@ def make_levels(
             shrink = torch.tensor([[size[0] / camera.width], [size[1] / camera.height], [1.0]], dtype=torch.float64)
             small = camera._replace(intrinsics=camera.intrinsics * shrink, width=size[0], height=size[1])
             reduced: Floats = np.asarray(cv2.resize(colours, size, interpolation=cv2.INTER_AREA), np.float32) if k else colours
-            level[view] = _target(small, reduced, _resized(valid, size), _resized(sky, size))
+            level[view] = target_of(small, reduced, _resized(valid, size), _resized(sky, size))
     return levels
+
+
+def load_photographs(
+    config: GaussiansConfig, scene: Scene, views: list[int]
+) -> tuple[dict[int, Image], dict[int, NDArray[np.bool_]]]:
+    """Images of views, and the masks of those that have one."""
+    images = dict(zip(views, load_images(scene, config.background, views), strict=True))
+    return images, _load_masks(scene.masks if config.masks else (), images)
+
+
+def load_skies(config: GaussiansConfig, scene: Scene, images: Mapping[int, Image]) -> dict[int, NDArray[np.bool_]]:
+    """The masks of the sky of the views that have one; none without surroundings: nothing else could show the sky."""
+    return _load_masks(scene.sky_masks if config.masks and config.surroundings else (), images)
+
+
+def _load_masks(paths: tuple[Path | None, ...], images: Mapping[int, Image]) -> dict[int, NDArray[np.bool_]]:
+    """The masks of the views that have one, at the size of their images."""
+    named = {view: paths[view] for view in images} if paths else {}
+    return {view: load_mask(path, images[view].shape[1::-1]) for view, path in named.items() if path is not None}
 
 
 def _undistorted_mask(cameras: Cameras, view: int, mask: NDArray[np.bool_], camera: Pinhole) -> NDArray[np.bool_]:
@@ -136,28 +156,10 @@ def _resized(mask: NDArray[np.bool_] | None, size: tuple[int, int]) -> NDArray[n
     return np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999)
 
 
-def moved_camera(camera: Floats, turn: Annotated[Tensor, "3"], shift: Annotated[Tensor, "3"]) -> Floats:
-    """A camera of `camera_array`, turned about its own centre by a rotation vector and shifted, both float64 in world axes."""
-    axes = rotated(torch.from_numpy(camera[:9].reshape(3, 3)).double(), turn.expand(3, 3))
-    centre = torch.from_numpy(camera[16:19]).double() + shift
-    out = camera.copy()
-    out[:9], out[9:12], out[16:19] = axes.reshape(-1), -axes @ centre, centre
-    return out
-
-
-def _target(camera: Pinhole, colours: Floats, valid: NDArray[np.bool_] | None, sky: NDArray[np.bool_] | None) -> Target:
-    width, height = camera.width, camera.height
-    planes = _planes(colours, slack(width + -width % SIDE))
-    used = None if valid is None or valid.all() else _planes(np.repeat(valid[..., None], 3, 2), 64)
-    above = None if sky is None else _planes(sky[..., None], 0)
-    return Target(width, height, camera_array(camera, True), planes, blurred(planes, width, height), used, above)
-
-
-def _planes(image: NDArray[Any], behind: int) -> Floats:
-    """An image [H W C] as the kernels take it, [C H16 W16] flat and float32, with so many zeros behind."""
-    height, width, _ = image.shape
-    padded = np.pad(image, ((0, -height % SIDE), (0, -width % SIDE), (0, 0))).transpose(2, 0, 1)
-    return np.append(padded, np.zeros(behind, np.float32)).astype(np.float32, copy=False)
+def moved(target: Target, turn: Annotated[Tensor, "3"], shift: Annotated[Tensor, "3"]) -> Target:
+    """A photograph whose camera is turned about its own centre by a rotation vector and shifted, float64, world axes."""
+    axes = rotated(torch.from_numpy(target.axes), turn.expand(3, 3))
+    return target.seen_from(axes.numpy(), target.centre + shift.numpy())
 
 
 def _sampled(image: NDArray[Any], place: NDArray[np.float64], interpolation: int = _SHARPEST) -> NDArray[Any]:

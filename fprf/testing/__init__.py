@@ -1,5 +1,6 @@
 """Contract tests for a plug-in's own package: `from fprf.testing import check_encoder`."""
 
+from .contracts import check_capture_format as check_capture_format
 from .contracts import check_config as check_config
 from .contracts import check_content_field as check_content_field
 from .contracts import check_data_manager as check_data_manager

@@ -13,7 +13,7 @@ from torch import Tensor
 from ..config import ContentConfig, RenderConfig, SemanticConfig, TrainConfig
 from ..fields.config import PlanesConfig, SemanticPlanesConfig
 from ..memory import free_memory
-from ..ops import backend, march, triplane_triton
+from ..ops import backend, march
 from ..ops.precision import double
 from ..plugins.encoders.config import BundledContentConfig
 from ..plugins.samplers.config import ProposalConfig
@@ -72,8 +72,6 @@ def fast_paths(device: torch.device) -> Iterator[tuple[str, str]]:
         compiled = march.usable(probe)
     if compiled:
         yield "kernels", "numba's: tri-planes, networks, marching, matching, guided filter"
-    elif triplane_triton.usable(probe, probe):
-        yield "kernels", "Triton's for tri-planes; the rest by torch"
     else:
         yield "kernels", "none: everything by torch"
     if device.type == "cuda":

@@ -14,13 +14,11 @@ from typing import Literal, NamedTuple, TypeAlias
 from ..datamanagers.images import IMAGE_SUFFIXES
 from ..datamanagers.parsers.config import recognise
 from ..errors import DataError, UsageError
+from ..plugins.captures import endings, format_name, format_of
 from ..reconstruction.images import VIDEO_SUFFIXES
 from .uploads import check_photograph
 
-CAPTURE_SUFFIXES = frozenset({".ply", ".splat", ".spz", ".sog"})
-"""Files of 3D Gaussians, in lower case."""
 SourceKind: TypeAlias = Literal["run", "capture", "scene", "photographs", "video"]
-_SINGLE: tuple[tuple[SourceKind, frozenset[str]], ...] = (("capture", CAPTURE_SUFFIXES), ("video", VIDEO_SUFFIXES))
 _FEWEST = 3
 """Photographs that poses can be found for."""
 _MODEL = frozenset({"cameras", "images", "points3D", "rigs", "frames"})
@@ -33,7 +31,6 @@ _MAX_BYTES = 16 << 30
 _ROOM = 1 << 30
 """Bytes of the disk that are left free."""
 _MAX_DEPTH, _MAX_NAME = 6, 120
-_KINDS = "photographs, a video, or a capture of 3D Gaussians (.ply .splat .spz .sog)"
 
 
 class Source(NamedTuple):
@@ -44,9 +41,18 @@ class Source(NamedTuple):
     path: Path
 
 
+def capture_suffixes() -> frozenset[str]:
+    """Last endings of files of 3D Gaussians, in lower case: .ply of .compressed.ply too."""
+    return frozenset(f".{ending.rpartition('.')[2]}" for ending in endings())
+
+
+def _kinds() -> str:
+    return f"photographs, a video, or a capture of 3D Gaussians ({' '.join(sorted(capture_suffixes()))})"
+
+
 def is_capture(path: Path) -> bool:
     """True for a path that is named like a capture of 3D Gaussians."""
-    return path.suffix.lower() in CAPTURE_SUFFIXES or path.name == "meta.json" or (path / "meta.json").is_file()
+    return format_name(path) is not None or (path / "meta.json").is_file()
 
 
 def find_source(path: Path) -> Source:
@@ -60,7 +66,7 @@ def find_source(path: Path) -> Source:
     if not path.exists():
         raise DataError(f"{path}: no such file or folder")
     if not path.is_dir():
-        raise DataError(f"{path}: no scene can be made of it; give {_KINDS}")
+        raise DataError(f"{path}: no scene can be made of it; give {_kinds()}")
     files = [each for each in path.rglob("*") if each.is_file() and not each.name.startswith(".")]
     try:
         recognise(path)
@@ -70,7 +76,8 @@ def find_source(path: Path) -> Source:
     photographs = [each for each in files if each.suffix.lower() in IMAGE_SUFFIXES]
     if len(photographs) >= _FEWEST:
         return Source("photographs", path)
-    for kind, suffixes in _SINGLE:
+    singles: tuple[tuple[SourceKind, frozenset[str]], ...] = (("capture", capture_suffixes()), ("video", VIDEO_SUFFIXES))
+    for kind, suffixes in singles:
         single = [each for each in files if each.suffix.lower() in suffixes]
         if len(single) == 1 and not photographs:
             return Source(kind, single[0])
@@ -80,7 +87,7 @@ def find_source(path: Path) -> Source:
     if photographs:
         few = "1 photograph is" if len(photographs) == 1 else f"{len(photographs)} photographs are"
         raise DataError(f"{few} no scene: take at least {_FEWEST}, better 20 to 60, from places around it")
-    raise DataError(f"{path.name}: nothing that a scene can be made of; give {_KINDS}")
+    raise DataError(f"{path.name}: nothing that a scene can be made of; give {_kinds()}")
 
 
 def check_file(name: str, head: bytes, size: int) -> None:
@@ -90,10 +97,7 @@ def check_file(name: str, head: bytes, size: int) -> None:
         check_photograph(head, name)
         return
     whole = {
-        ".ply": head.startswith(b"ply"),
-        ".splat": size > 0 and size % 32 == 0,
-        ".spz": head.startswith((b"\x1f\x8b", b"NGSP")),
-        ".sog": head.startswith(b"PK"),
+        **({suffix: format_of(Path(name)).recognises(head, size)} if suffix in capture_suffixes() else {}),
         ".npz": head.startswith(b"PK"),
         ".npy": head.startswith(b"\x93NUMPY"),
         ".json": head.lstrip()[:1] in (b"{", b"["),
@@ -101,7 +105,7 @@ def check_file(name: str, head: bytes, size: int) -> None:
         **dict.fromkeys((".bin", ".txt") if stem in _MODEL else (), True),
     }
     if suffix not in whole:
-        raise DataError(f"{name}: cannot become a scene; give {_KINDS}")
+        raise DataError(f"{name}: cannot become a scene; give {_kinds()}")
     if not whole[suffix]:
         raise DataError(f"{name}: damaged, or no {suffix} file; export it again")
 

@@ -12,13 +12,6 @@ from fprf.cli import main as cli
 
 LOOSE = "--tolerance 0.3 --agree 1"
 MISTAKES = f"""
-    bench sped | no such benchmark
-    bench speed nowhere | nowhere: no config.json
-    bench profile run | python -m benchmarks profiling
-    bench restyle run --device cpu --seeds 0 1 2 | is the town of the run itself
-    bench restyle run --device cpu --palettes noon | noon
-    bench restyle nowhere | nowhere
-    bench restyle --frames 7 | --frames
     doctor run --device x | --device
     doctor absent | absent
     doctor empty | empty
@@ -64,7 +57,6 @@ MISTAKES = f"""
     render run --keyframes absent.json | absent.json
     render run --keyframes keys.json --references A.png | --keyframes
     report absent | no such folder
-    report empty | no events.jsonl
     stylize run | --references
     stylize run --references A.png --forbid 0=0 | region 0
     stylize run --references A.png --keep 0000:99,1 | 0000:99,1

@@ -57,6 +57,15 @@ def test_formats_are_told_by_their_files(tmp_path: Path) -> None:
     assert recognise(tmp_path) == TransformsConfig()
 
 
+def test_the_embedded_garden_is_read_by_name_where_no_such_folder_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    scene = parse_scene(Path("garden"), 4, None)
+    assert scene.name == "garden" and len(scene.paths) == 25 and len(scene.test) == 4 and scene.points is not None
+    Path("garden").mkdir()
+    with pytest.raises(DataError, match="but nothing"):
+        parse_scene(Path("garden"), 4, None)
+
+
 PARSER = """
 from dataclasses import dataclass
 from fprf.datamanagers.parsers.config import DataParserConfig, Recognised
@@ -96,7 +105,7 @@ def test_a_strangers_parser_recognises_its_folders(tmp_path: Path) -> None:
         (PARSER.format(answer="True"), "TypeError"),
         (PARSER.format(answer='Recognised(2.0, "x")'), "ConfigError: confidence: 2.0 must lie in"),
         (PARSER.format(answer='Recognised(float("nan"), "x")'), "ConfigError"),
-        ("from fprf.fields.layouts import SingleConfig as ScanConfig", "not a DataParserConfig"),
+        ("from fprf.blocks.config import SingleConfig as ScanConfig", "not a DataParserConfig"),
     ],
 )
 def test_a_broken_parser_is_named_and_skipped(

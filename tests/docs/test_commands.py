@@ -28,13 +28,12 @@ from fprf.testing import check_encoder
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
-RUN = ("eval", "stylize", "restyle", "render", "gallery", "report", "export", "cluster", "plugins", "doctor", "completion")
+RUN = ("eval", "stylize", "restyle", "render", "gallery", "export", "plugins", "doctor")
 """Verbs whose commands are run here."""
 PARSED = {
     "demo": "minutes; tests/cli/test_demo_verb.py runs it small",
     "process": "needs pycolmap; tests/reconstruction/test_town_sfm.py runs it",
     "train": "minutes; run below with `-m slow`",
-    "bench": "minutes; tests/cli/test_bench_verb.py and tests/evaluation run them small",
     "view": "stays up; tests/viewer run it",
     "pretrain": "hours; tests/pretraining run it small",
 }
@@ -154,7 +153,7 @@ def test_it_is_understood(place: Path, lines: list[list[str]], monkeypatch: pyte
         config = parsed(smaller(words), monkeypatch)
         for name in ("data", "run", "source"):
             value = getattr(config, name, None)
-            if isinstance(value, Path) and value != Path() and str(value) != "town":
+            if isinstance(value, Path) and value != Path() and str(value) != "garden":
                 assert value.exists(), shlex.join(words)
 
 

@@ -9,14 +9,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.town.layout import build_town
+from benchmarks.town.palettes import palette
+from benchmarks.town.render import geometry, render, walk
+from benchmarks.town.truth import short_path, town_view
 from fprf.errors import DataError, NumericsError
 from fprf.evaluation.consistency import consistency, published, steadiness, warp
-from fprf.evaluation.town_truth import short_path, town_view
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
 from fprf.rendering.paths import look_at, pinhole
-from fprf.town.layout import build_town
-from fprf.town.palettes import palette
-from fprf.town.render import geometry, render, walk
 
 WIDTH, HEIGHT = 48, 36
 

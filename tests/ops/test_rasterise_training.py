@@ -5,13 +5,12 @@ import pytest
 import torch
 from test_rasterise import ROUGH, camera, cloud
 
-from fprf.ops import photometric, rasterise, rasterise_kernels
+from fprf.ops import rasterise
 from fprf.ops.rasterise_reference import rasterise_reference, view_colours
-from fprf.ops.rasterise_training import Target, learn
-from fprf.ops.simd import LANES, aligned
+from fprf.ops.rasterise_training import TrainableGaussians, target_of
 from fprf.training.camera_optimizers import rotated
 
-WIDTH, HEIGHT, SIDE = 40, 30, 16
+WIDTH, HEIGHT = 40, 30
 
 
 @pytest.mark.parametrize(("bands", "antialiased"), [(9, True), (1, False)])
@@ -27,20 +26,12 @@ def test_the_gradient_of_the_camera_is_that_of_float64(bands: int, antialiased: 
     shape = means, quaternions, log_scales, logits, harmonics
     there = view._replace(world_to_camera=beside)
     wanted = rasterise.rasterise(*shape, there, background=background, antialiased=antialiased).image.permute(2, 0, 1)
-    tall, wide = -(-HEIGHT // SIDE) * SIDE, -(-WIDTH // SIDE) * SIDE
-    planes = np.zeros(3 * tall * wide + photometric.slack(wide), np.float32)
-    planes[: 3 * tall * wide].reshape(3, tall, wide)[:, :HEIGHT, :WIDTH] = wanted.numpy()
-    blurred = photometric.blurred(planes, WIDTH, HEIGHT)
-    target = Target(WIDTH, HEIGHT, rasterise.camera_array(view, antialiased), planes, blurred, None)
-    rows, room = rasterise_kernels.FIXED + 3 * bands, -(-60 // LANES) * LANES
-    blocks, first, second = (aligned(rows * room) for _ in range(3))
-    for moment in (first, second):
-        moment[:] = 0
-    rasterise_kernels.pack(*(x.numpy() for x in shape), blocks)
-    splats = aligned(room * rasterise_kernels.SLOTS)
-    found = learn(
-        blocks, (first, second, np.zeros(room, np.float32)), 60, bands, splats, target,
-        background=tuple(background.tolist()), ssim=0.0, rates=np.zeros(rows, np.float32),
+    rows = [means, log_scales, quaternions, logits[:, None], harmonics.flatten(1)]
+    gaussians = TrainableGaussians(60, bands)
+    gaussians.start(torch.cat(rows, 1).numpy())
+    found = gaussians.learn(
+        target_of(view, wanted.permute(1, 2, 0).numpy(), antialiased=antialiased),
+        background=tuple(background.tolist()), ssim=0.0, rates=np.zeros(gaussians.rows, np.float32),
     )  # fmt: skip
 
     move = torch.zeros(6, dtype=torch.float64, requires_grad=True)

@@ -1,7 +1,7 @@
 """Tri-plane lookup, its slopes in points, total variation: fused and plain forms against fp64 loops."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numba
 import pytest
@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fprf.ops import triplane_numba
-from fprf.ops.triplane import lookup, lookup_reference, point_slopes_reference, rows, split, variation, variation_reference
+from fprf.ops.triplane import lookup, lookup_reference, rows, split, usable, variation, variation_reference
 
 QUICK = settings(max_examples=20, deadline=None)
+Form = Callable[[Tensor, Tensor, Sequence[int]], Tensor]
 U = 2.0**-24
 """Unit round-off of float32."""
 
@@ -34,7 +34,7 @@ def points_of(count: int, seed: int = 0) -> Tensor:
 @pytest.mark.parametrize("smooth", [False, True])
 def test_both_forms_stay_within_the_bound(resolutions: tuple[int, ...], channels: int, smooth: bool) -> None:
     table, points = table_of(resolutions, channels, smooth=smooth), (points_of(30) * 256).round() / 256
-    assert triplane_numba.usable(points, table) == (channels % 8 == 0)
+    assert usable(points, table) == (channels % 8 == 0)
     value = lookup_reference(points.double(), table.double(), resolutions)
     for form in (lookup, lookup_reference):
         found = form(points, table, resolutions)
@@ -187,6 +187,12 @@ def differences(points: Tensor, table: Tensor, resolutions: Sequence[int], grad:
     return torch.stack(columns, -1)
 
 
+def slopes(form: Form, points: Tensor, table: Tensor, resolutions: tuple[int, ...], grad: Tensor) -> Tensor:
+    """Gradient of the points for one of the features."""
+    given = points.clone().requires_grad_()
+    return torch.autograd.grad(form(given, table, resolutions), given, grad)[0]
+
+
 def bound(points: Tensor, table: Tensor, resolutions: Sequence[int], grad: Tensor) -> Tensor:
     """What rounding may change. A slope is at most 4 + 4 times the product of magnitudes, at quarters of a cell; twenty
     operations lead to it, then come the sums over channels and scales.
@@ -204,11 +210,9 @@ def test_both_forms_are_the_differences(resolutions: tuple[int, ...], channels: 
     points, table = points_in_cells(count, resolutions[0]), table_of(resolutions, channels)
     grad = torch.randn(count, len(resolutions) * channels, generator=torch.Generator().manual_seed(3))
     exact = differences(points, table, resolutions, grad, 1 / 512)
-    assert triplane_numba.usable(points, table)
-    for found in (
-        triplane_numba.point_slopes(points, table, resolutions, grad),
-        point_slopes_reference(points, table, resolutions, grad),
-    ):
+    assert usable(points, table)
+    for form in (lookup, lookup_reference):
+        found = slopes(form, points, table, resolutions, grad)
         assert found.dtype == torch.float32 and found.shape == (count, 3)
         assert ((found - exact).abs() <= bound(points, table, resolutions, grad) + 1e-11).all()
 
@@ -222,7 +226,7 @@ def test_outside_the_border_holds(place: float, axis: int) -> None:
     inside = point.clone()
     inside[0, axis] = 1.0 if place > 0 else -1.0
     grad = torch.randn(1, 8, generator=torch.Generator().manual_seed(2))
-    wanted = point_slopes_reference(inside, table, (5,), grad)
+    wanted = slopes(lookup_reference, inside, table, (5,), grad)
     wanted[0, axis] = 0
-    for form in (triplane_numba.point_slopes, point_slopes_reference):
-        assert torch.allclose(form(point, table, (5,), grad), wanted, atol=1e-5)
+    for form in (lookup, lookup_reference):
+        assert torch.allclose(slopes(form, point, table, (5,), grad), wanted, atol=1e-5)

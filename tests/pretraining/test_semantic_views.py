@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from photo_folder import teacher_files
 
-from fprf.town.palettes import PALETTES
-from fprf.town.surface import CLASSES
+from benchmarks.town.palettes import PALETTES
+from benchmarks.town.surface import CLASSES
 from tools.distil.semantic import (
     LOOKS,
     STRIDE,

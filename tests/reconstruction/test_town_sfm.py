@@ -9,10 +9,10 @@ import cv2
 import pytest
 from alignment import misses
 
+from benchmarks.town.write import write_town
 from fprf.cli import main as cli
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.video import write_video
-from fprf.town.write import write_town
 
 pytestmark = pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap is not installed (extra sfm)")
 

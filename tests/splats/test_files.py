@@ -15,9 +15,10 @@ import torch
 from splat_ball import ball
 
 from fprf.errors import DataError
+from fprf.plugins.captures import endings
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import look_at, pinhole
-from fprf.splats.files import ENDINGS, Capture, read_capture, write_capture, write_gaussians, write_ply_parts
+from fprf.splats.files import Capture, read_capture, write_capture, write_gaussians, write_ply_parts
 from fprf.splats.files.base import spatial_order
 from fprf.splats.files.sog import bundle, unbundle
 from fprf.splats.gaussians import Gaussians
@@ -65,7 +66,10 @@ def from_the_front(side: int, fov: float) -> Cameras:
     return pinhole(pose, width=side, height=side, fov=fov)
 
 
-@pytest.fixture(params=[(e, d) for e in ENDINGS for d in (0, 2) if e != ".splat" or d == 0], ids=lambda p: f"{p[0]}-{p[1]}")
+@pytest.fixture(
+    params=[(e, d) for e in (*endings(), "meta.json") for d in (0, 2) if e != ".splat" or d == 0],
+    ids=lambda p: f"{p[0]}-{p[1]}",
+)
 def capture(request: pytest.FixtureRequest, tmp_path: Path) -> Capture:
     ending, degree = request.param
     name = ending if ending == "meta.json" else f"x{ending}"

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks.town.write import write_town
 from fprf.datamanagers.images import load_images
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import Scene
 from fprf.rendering.paths import pinhole
 from fprf.splats.initial import initial_points
-from fprf.town.write import write_town
 
 
 def test_matches_between_views_give_points_on_the_surface() -> None:

@@ -16,28 +16,27 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from benchmarks.town.layout import build_town
+from benchmarks.town.palettes import PALETTES
+from benchmarks.town.render import geometry, render, walk
+from benchmarks.town.surface import CLASSES
 from fprf.errors import UsageError, WeightsError
 from fprf.interfaces import Encoder
 from fprf.ops.precision import double
 from fprf.plugins.encoders.bundled import SEMANTIC_KIND, SemanticStudent, load_semantic_encoder
 from fprf.plugins.encoders.frozen import replicate_to_multiple
-from fprf.plugins.encoders.mobilenet import CLASSIFIER, DEEPLAB, TENSORFLOW_EPS, MobileNetV2, fold
 from fprf.plugins.weights import read_weights, write_weights
 from fprf.pretraining.loop import generator_of, train
 from fprf.pretraining.photos import find_photos, load_photo, split
-from fprf.town.layout import build_town
-from fprf.town.palettes import PALETTES
-from fprf.town.render import geometry, render, walk
-from fprf.town.surface import CLASSES
 from fprf.training.prepare import device_of
 
 from .config import SemanticDistilConfig
 from .content import Basis, fit_basis
 from .examples import crop, nightfall, prepared, prepared_path, toned
+from .mobilenet import CLASSIFIER, DEEPLAB, MobileNetV2, fold
 
 CELL = 16
 """Pixels per feature."""
-GREY = torch.full((3,), 0.5)
 
 
 class MobileNetTeacher:
@@ -67,12 +66,10 @@ def load_teacher(path: Path) -> MobileNetTeacher:
     """MobileNetV2 (`features.N`, up to block 13) or DeepLab's backbone (`backbone.N`, folded, up to block 17)."""
     tensors, _ = read_weights(path)
     if "backbone.17.conv.2.weight" in tensors:
-        folded = fold(tensors, "backbone.", TENSORFLOW_EPS)
-        network = MobileNetV2(folded, layout=DEEPLAB, last=17, same=True, mean=GREY, std=GREY)
+        network = MobileNetV2(fold(tensors, "backbone."), layout=DEEPLAB, last=17)
         return MobileNetTeacher("deeplab-mobilenetv2:backbone.17", network)
     if "features.13.conv.3.running_var" in tensors:
-        folded = fold(tensors, "features.", TENSORFLOW_EPS)
-        network = MobileNetV2(folded, layout=CLASSIFIER, last=13, same=True, mean=GREY, std=GREY)
+        network = MobileNetV2(fold(tensors, "features."), layout=CLASSIFIER, last=13)
         return MobileNetTeacher("mobilenetv2:features.13", network)
     raise WeightsError(f"{path}: neither MobileNetV2 (features.N) nor DeepLab's MobileNetV2 backbone (backbone.N)")
 

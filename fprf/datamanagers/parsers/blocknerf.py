@@ -15,6 +15,7 @@ only their mean.
 import functools
 import hashlib
 import json
+import os
 import re
 import struct
 from collections.abc import Callable, Iterator
@@ -36,7 +37,6 @@ from ...rendering.lens import OPENCV
 from ..images import opened
 from ..scene import Scene
 from .config import BlockNerfConfig, is_record
-from .town import cache_folder
 from .views import View, assemble_scene, read_views, rigid_pose, split_by
 
 
@@ -280,7 +280,8 @@ class BlockNerfParser(DataParser):
         # By what tells files apart without reading hundreds of gigabytes: place, size and time.
         facts = [(str(f.relative_to(data)), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
         key = hashlib.sha256(json.dumps([str(data.resolve()), facts]).encode()).hexdigest()[:12]
-        folder = cache_folder() / f"blocknerf-{key}"
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        folder = cache / "fprf" / f"blocknerf-{key}"
         entries = _unpacked(folder)
         if not entries:
             (folder / "images").mkdir(parents=True, exist_ok=True)

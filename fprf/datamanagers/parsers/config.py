@@ -1,4 +1,4 @@
-"""Parser configs, and the choice among all that are installed. `build` and `recognises` import the implementation.
+"""Parser configs, the files that each format is known by, and the choice among all parsers that are installed.
 
 Confidence of the built-in formats: 0.6 to 0.9 where files were prepared for training, 0.5 for a reconstruction that comes
 with its images, 0.3 for raw recordings. Prepared folders often hold the reconstruction that they were made of.
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from ..scene import Scene
 
 
+ODM_FILES = "opensfm/reconstruction.json", "odm_report/shots.geojson"
+
+
 class Recognised(NamedTuple):
     """A parser's confidence that it reads a folder."""
 
@@ -29,6 +32,41 @@ class Recognised(NamedTuple):
     """In (0, 1]: the parser with the highest one reads the folder; a tie is an error."""
     reason: str
     """The file or folder that it was recognised by, for example `transforms.json`."""
+
+
+def model_folders(data: Path) -> list[Path]:
+    """Folders of COLMAP's models in a scene folder: sparse/0, sparse/1, ... sparse, the folder itself, colmap/sparse/0, ..."""
+    numbered = [sorted(path for path in (data / place).glob("*")) for place in ("sparse", "colmap/sparse")]
+    folders = [*numbered[0], data / "sparse", data, *numbered[1]]
+    return [each for each in folders if (each / "cameras.bin").is_file() or (each / "cameras.txt").is_file()]
+
+
+def is_record(name: str) -> bool:
+    """Return whether a file name is that of a TFRecord file or of one of its shards."""
+    return re.search(r"\.tfrecord(-\d+-of-\d+)?$", name) is not None
+
+
+def keyframes(data: Path) -> list[tuple[Path, Path]]:
+    """Folders of Polycam's images and cameras, corrected ones first; they lie in `keyframes`, which `data` may be."""
+    for root in (data / "keyframes", data):
+        pairs = [(root / f"{kind}images", root / f"{kind}cameras") for kind in ("corrected_", "")]
+        there = [(images, cameras) for images, cameras in pairs if images.is_dir() and next(cameras.glob("*.json"), None)]
+        if there:
+            return there
+    return []
+
+
+def recording(data: Path) -> tuple[Path, Path] | None:
+    """Record3D's metadata and its folder of images, or None."""
+    names = (("metadata.json", "rgb"), ("metadata", "rgbd"), ("metadata", "rgb"), ("metadata.json", "rgbd"))
+    pairs = ((data / file, data / images) for file, images in names)
+    return next(((file, images) for file, images in pairs if file.is_file() and images.is_dir()), None)
+
+
+def project_file(data: Path) -> Path | None:
+    """File with the poses of an OpenDroneMap project, or None."""
+    files = (data / name for name in ODM_FILES)
+    return next((file for file in files if file.is_file()), None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,8 +133,6 @@ class ColmapConfig(DataParserConfig):
     """Image folder. `images_N` holds images reduced by N: the model's cameras are then scaled to their size."""
 
     def recognises(self, data: Path) -> Recognised | None:
-        from .colmap import model_folders
-
         folder = next(iter(model_folders(data)), None)
         return Recognised(0.5, f"a model in {folder}") if folder is not None else None
 
@@ -107,42 +143,17 @@ class ColmapConfig(DataParserConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TownConfig(DataParserConfig):
-    """The embedded scene: a small procedural town, rendered when it is asked for."""
-
-    seed: int = 0
-    """Decides where houses, trees and cars stand."""
-    palette: str = "day"
-    """Light and colours."""
-    views: int = 40
-    """Number of images."""
-    width: int = 160
-    """Pixels across an image."""
-    height: int = 120
-    """Pixels down an image."""
-    extra: float = 0.0
-    """Metres by which the street is longer than the usual 49: a scene for many blocks."""
-
-    def __post_init__(self) -> None:
-        at_least("parser.extra", self.extra, 0.0)
-        at_least("parser.seed", self.seed, 0)
-        at_least("parser.views", self.views, 2)
-        at_least("parser.width", self.width, 8)
-        at_least("parser.height", self.height, 8)
+class GardenConfig(DataParserConfig):
+    """The embedded scene: 25 photographs of a garden in Seattle, with their poses. Reads no folder."""
 
     def recognises(self, data: Path) -> Recognised | None:
-        """By the path `town`, where there is no such folder."""
-        return Recognised(1.0, "the embedded scene") if data == Path("town") and not data.exists() else None
+        """By the path `garden`, where there is no such folder."""
+        return Recognised(1.0, "the embedded scene") if data == Path("garden") and not data.exists() else None
 
     def build(self) -> DataParser:
-        from .town import TownParser
+        from .transforms import GardenParser
 
-        return TownParser(self)
-
-
-def is_record(name: str) -> bool:
-    """Return whether a file name is that of a TFRecord file or of one of its shards."""
-    return re.search(r"\.tfrecord(-\d+-of-\d+)?$", name) is not None
+        return GardenParser()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,8 +204,6 @@ class PhotoTourismConfig(DataParserConfig):
 
     def recognises(self, data: Path) -> Recognised | None:
         """By the only *.tsv beside a model, or beside `dense` with a model."""
-        from .colmap import model_folders
-
         tables = [path.name for path in data.glob("*.tsv")]
         modelled = model_folders(data) or model_folders(data / "dense")
         return Recognised(0.6, tables[0]) if len(tables) == 1 and modelled else None
@@ -210,8 +219,6 @@ class PolycamConfig(DataParserConfig):
     """Polycam's raw data: `keyframes` with images and a JSON file for each camera, corrected ones first."""
 
     def recognises(self, data: Path) -> Recognised | None:
-        from .polycam import keyframes
-
         folders = keyframes(data)
         return Recognised(0.3, str(folders[0][1])) if folders else None
 
@@ -232,8 +239,6 @@ class Record3DConfig(DataParserConfig):
         at_least("parser.frames", self.frames, 1)
 
     def recognises(self, data: Path) -> Recognised | None:
-        from .record3d import recording
-
         record = recording(data)
         return Recognised(0.3, record[0].name) if record is not None else None
 
@@ -251,8 +256,6 @@ class OdmConfig(DataParserConfig):
     """Folder of the photographs, of any size."""
 
     def recognises(self, data: Path) -> Recognised | None:
-        from .odm import project_file
-
         record = project_file(data)
         return Recognised(0.3, record.name) if record is not None else None
 
@@ -263,7 +266,7 @@ class OdmConfig(DataParserConfig):
 
 
 def recognise(data: Path) -> DataParserConfig:
-    """The parser with the highest confidence, with its defaults; `town`, where no such folder exists, is the embedded scene.
+    """The parser with the highest confidence, with its defaults; `garden`, where no such folder exists, is the embedded scene.
 
     A parser that raises is skipped, with a warning on standard error. Raises DataError where no parser recognises the folder,
     or where several have the same confidence.
@@ -290,7 +293,7 @@ def recognise(data: Path) -> DataParserConfig:
     for config, _ in surest.values():
         return config
     if not data.exists():
-        raise DataError(f"{data}: no such folder; give a scene folder, or `town` for the embedded scene")
+        raise DataError(f"{data}: no such folder; give a scene folder, or `garden` for the embedded one")
     if not data.is_dir():
         raise DataError(f"{data}: a file; give the scene folder that it lies in, and name it with the parser's own field")
     names = sorted(path.name + "/" * path.is_dir() for path in data.iterdir())

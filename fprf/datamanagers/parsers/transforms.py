@@ -8,6 +8,7 @@ COLMAP model, in `sparse/0` or elsewhere, that it was made of, whose points are 
 """
 
 import math
+from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
 
@@ -81,6 +82,13 @@ class TransformsParser(DataParser):
         if len(others) == 1:
             return [(others[0], "")]
         raise DataError(f"{data}: neither transforms.json nor transforms_train.json; name the file with parser.file")
+
+
+class GardenParser(DataParser):
+    """Reads the scene that ships with the package, whatever folder is named."""
+
+    def parse(self, data: Path, downscale: int) -> Scene:
+        return TransformsParser(TransformsConfig()).parse(Path(str(resources.files("fprf") / "garden")), downscale)
 
 
 def _cloud(

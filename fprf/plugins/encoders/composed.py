@@ -1,10 +1,8 @@
 """Several encoders side by side: what they see together, each counting by its weight whatever its units and channels.
 
-A part's unit is the root mean square length of its centred features on four views of the embedded town, so that an
+A part's unit is the root mean square length of its centred features on five views of a rendered town (`street`), so that an
 image's features depend on the image alone. On photographs the units of nine encoders were 0.7 to 1.3 of that (measured;
 0.4 to 1.5 with noise of a photograph's spectrum in the town's place).
-
-An encoder can also be averaged over mirrored and resized images: steadier, and finer where a size is above 1.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,32 +14,6 @@ from torch import Tensor, nn
 
 from ...interfaces import Encoder
 from .frozen import FrozenEncoder, finest, freeze, street
-
-
-class AveragedEncoder(FrozenEncoder):
-    """Mean of `inner` over `scales` of the image, and over its mirror images if `flip`."""
-
-    def __init__(self, inner: Encoder, *, flip: bool, scales: Sequence[float]) -> None:
-        sizes = "+".join(repr(scale) for scale in scales)
-        super().__init__(f"averaged:{'flip' if flip else 'plain'}:{sizes}:[{inner.identity}]", inner.channels)
-        self.inner = inner
-        self._flip, self._scales = flip, tuple(scales)
-        freeze(self)
-
-    @torch.no_grad()
-    def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
-        return torch.stack(finest([self._look(image, scale) for scale in self._scales])).mean(dim=0)
-
-    def _look(self, image: Tensor, scale: float) -> Tensor:
-        size = tuple(max(1, round(n * scale)) for n in image.shape[-2:])
-        if size != tuple(image.shape[-2:]):
-            image = F.interpolate(image, size, mode="bilinear", align_corners=False, antialias=True)
-        features: Tensor = self.inner(image)
-        if self._flip:
-            mirrored: Tensor = self.inner(image.flip(-1)).flip(-1)
-            features = (features + mirrored) / 2
-        return features
-
 
 Cells = Literal["finest", "first"]
 DIGITS = 3

@@ -1,10 +1,12 @@
 """Parts of frozen encoders: padding that any size survives, tensors that no optimiser sees, pictures to measure them on."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
+from importlib.resources import files
 from typing import Annotated
 
+import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -13,34 +15,6 @@ from torch import Tensor, nn
 from ...errors import WeightsError
 from ...interfaces import Encoder
 from ..weights import tensors_hash
-
-
-class FrozenTensors(nn.Module):
-    """Tensors by the names that they have in their file; they move with the module that holds them."""
-
-    def __init__(self, tensors: Mapping[str, Tensor]) -> None:
-        super().__init__()
-        for name, value in tensors.items():
-            self.register_buffer(_undotted(name), value)
-
-    def get(self, name: str) -> Tensor | None:
-        """The tensor of that name, if there is one."""
-        return self._buffers.get(_undotted(name))
-
-    def __getitem__(self, name: str) -> Tensor:
-        """Raises KeyError with the name where there is none."""
-        value = self.get(name)
-        if value is None:
-            raise KeyError(name)
-        return value
-
-    def __contains__(self, name: str) -> bool:
-        return _undotted(name) in self._buffers
-
-
-def _undotted(name: str) -> str:
-    """Modules keep the dot for themselves."""
-    return name.replace(".", "/")
 
 
 def finest(maps: Sequence[Annotated[Tensor, "B C h w"]]) -> list[Tensor]:
@@ -139,16 +113,10 @@ def fitting(source: str, what: str, flag: str) -> Iterator[None]:
         ) from error
 
 
-WIDTH, HEIGHT = 160, 128
-
-
 @cache
-def street() -> Annotated[Tensor, "B 3 H W"]:
-    """Sky, plants, walls and a road, from day to night; made once, in half a second."""
-    from ...town.layout import build_town
-    from ...town.palettes import PALETTES
-    from ...town.render import render, walk
-
-    town, views = build_town(0), walk(seed=0, views=len(PALETTES), width=WIDTH, height=HEIGHT)
-    pictures = [render(town, view, look).rgb for view, look in zip(views, PALETTES.values(), strict=True)]
-    return torch.from_numpy(np.stack(pictures)).permute(0, 3, 1, 2).float() / 255
+def street() -> Annotated[Tensor, "5 3 128 160"]:
+    """Sky, plants, walls and a road, from day to night, in [0, 1]: five views of the town of benchmarks/town, seed 0."""
+    stored = np.frombuffer((files(__package__) / "weights/street.webp").read_bytes(), np.uint8)
+    strip = cv2.imdecode(stored, cv2.IMREAD_COLOR_RGB)  # lossless, one view below the other
+    assert strip is not None
+    return torch.from_numpy(strip).reshape(5, 128, 160, 3).permute(0, 3, 1, 2).float() / 255

@@ -40,7 +40,7 @@ class SerialConfig(ExecutorConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class RayConfig(ExecutorConfig):
-    """Tasks on many processes or machines, by Ray (`pip install "fprf[cluster]"`; `fprf cluster` explains)."""
+    """Tasks on many processes or machines, by Ray (`pip install "fprf[cluster]"`; docs/large-scenes.md)."""
 
     address: str = ""
     """Address of a running cluster, HOST:PORT, or auto for the one of this machine; empty = one is started here."""

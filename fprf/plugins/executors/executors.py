@@ -86,7 +86,9 @@ class RayExecutor(Executor):
             ray.init(address="local", num_cpus=count, include_dashboard=False, **common)
         except (ConnectionError, RuntimeError, ValueError, OSError) as error:
             where = self.config.address or "this machine"
-            raise PluginError(f"executor: no Ray cluster at {where} ({error}); `fprf cluster` says how to start one") from error
+            raise PluginError(
+                f"executor: no Ray cluster at {where} ({error}); docs/large-scenes.md says how to start one"
+            ) from error
 
 
 def _ray(*, private: bool) -> Any:

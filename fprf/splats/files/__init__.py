@@ -1,4 +1,4 @@
-"""Files of 3D Gaussians, read and written: .ply, .compressed.ply, .splat, .spz, .sog and SOG folders (meta.json)."""
+"""Files of 3D Gaussians, read, recoloured and written in the formats that are installed (see `plugins.captures`)."""
 
 import glob
 import os
@@ -14,36 +14,23 @@ import torch
 from torch import Tensor
 
 from ...errors import DataError
-from ...io.atomic import unwritable, write_bytes
+from ...io.atomic import unwritable
+from ...plugins.captures import format_of
 from ...rendering.cameras import Cameras
 from ...rendering.local_frame import added_and_beside, read_offset, write_offset
 from ...training.run import held
 from ...types import Origin
 from ..gaussians import Gaussians, bulk_of
 from ..views import seen_means
-from .base import Bools, Capture
-from .ply import compressed_bytes, compressed_keeps, is_compressed, ply_bytes, ply_head, ply_rows, read_ply
-from .sog import folder_of, read_sog, sog_bytes, sog_keeps, unbundle
-from .splat import read_splat, splat_bytes
-from .spz import read_spz, spz_bytes, spz_keeps, spz_notes
+from .base import Capture
+from .ply import ply_head, ply_rows
 
-__all__ = ["ENDINGS", "Capture", "Written", "read_capture", "write_capture", "write_gaussians", "write_ply_parts"]
+__all__ = ["Capture", "Written", "read_capture", "write_capture", "write_gaussians", "write_ply_parts"]
 
 _ROWS = 1 << 17
 """Gaussians that are in memory at a time while a large scene is written."""
 _TESTED = 1 << 12
 """Gaussians of which it is asked at a time whether any can be drawn."""
-
-
-class _Format(NamedTuple):
-    read: Callable[[Path, bytes], Capture]
-    pack: Callable[[Gaussians, bool], bytes]
-    plain: bool = False
-    """It holds neither view dependence nor whether opacities are compensated."""
-    keeps: Callable[[Gaussians], Bools] = lambda gaussians: np.ones(len(gaussians), bool)
-    """Which of the Gaussians that can be drawn it holds: all but outliers that would cost the others their precision."""
-    notes: Callable[[Gaussians], list[str]] = lambda gaussians: []
-    """What else it cannot hold of them."""
 
 
 class Written(NamedTuple):
@@ -61,28 +48,17 @@ class Written(NamedTuple):
         return [*([f"{self.far} far from the others left out"] if self.far else []), *self.notes]
 
 
-_FORMATS = {
-    ".compressed.ply": _Format(read_ply, compressed_bytes, keeps=compressed_keeps),
-    ".ply": _Format(read_ply, ply_bytes),
-    ".splat": _Format(read_splat, splat_bytes, plain=True),
-    ".spz": _Format(read_spz, spz_bytes, keeps=spz_keeps, notes=spz_notes),
-    ".sog": _Format(read_sog, sog_bytes, keeps=sog_keeps),
-    "meta.json": _Format(read_sog, sog_bytes, keeps=sog_keeps),
-}
-ENDINGS = tuple(_FORMATS)
-
-
 def read_capture(path: Path) -> Capture:
     """Read a file of Gaussians, or a SOG folder. Raises DataError for another ending, or a file that is not what it says."""
     if path.is_dir():
         path = path / "meta.json"
-    reader = _FORMATS[_ending(path)].read
+    form = format_of(path)
     try:
         data = path.read_bytes()
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
     with np.errstate(over="ignore", invalid="ignore"):  # damaged files hold numbers of any kind
-        capture = reader(path, data)
+        capture = form.read(path, data)
     if not len(capture.gaussians):
         raise DataError(f"{path}: holds no Gaussian")
     parts = (capture.gaussians.select(slice(start, start + _TESTED)) for start in range(0, len(capture.gaussians), _TESTED))
@@ -128,23 +104,27 @@ def write_gaussians(
     renderers that do not compensate. Where the Gaussians' `origin` is not 0, .ply holds float64 positions in the world; the
     others, and .ply where `local`, hold those relative to the origin, with a file beside them that says so.
     """
-    form, faulty, far = _FORMATS[_ending(path)], False, 0
-    if form.pack is not ply_bytes:
+    form, faulty, far = format_of(path), False, 0
+    # What the format cannot hold is left out first, so that it decides nothing about the rest.
+    if not form.exact:
         finite = gaussians.finite
         faulty = not bool(finite.all())
         gaussians = gaussians.select(finite) if faulty else gaussians
-        kept = torch.from_numpy(form.keeps(gaussians))
-        far = int((~kept).sum())
-        gaussians = gaussians.select(kept) if far else gaussians
+        kept = form.keeps(gaussians)
+        far = 0 if kept is None else int((~kept).sum())
+        gaussians = gaussians.select(torch.from_numpy(kept)) if far else gaussians
         if far and not len(gaussians):
             raise DataError(f"{path}: all Gaussians lie too far from the origin for this format; write a .ply")
-    if views is not None and len(views) and ((form.plain and gaussians.degree) or (antialiased and (form.plain or plain))):
+    # Renderers that know less are given what views show of colours and opacities.
+    bare = not form.view_dependent
+    if views is not None and len(views) and ((bare and gaussians.degree) or (antialiased and (bare or plain))):
         seen = seen_means(gaussians, views, antialiased=antialiased)
-        gaussians = seen.gaussians(gaussians) if form.plain else seen.plain(gaussians)
+        gaussians = seen.gaussians(gaussians) if bare else seen.plain(gaussians)
         antialiased = False
-    added, beside = added_and_beside(origin, local or form.pack is not ply_bytes)
-    data = ply_bytes(gaussians, antialiased, origin=added) if any(added) else form.pack(gaussians, antialiased)
-    _write(path, data, beside)
+    added, beside = added_and_beside(origin, local or not form.exact)
+    data = form.pack(gaussians, antialiased, added)
+    write_offset(path, beside)
+    form.write(path, data)
     return Written(faulty, far, tuple(form.notes(gaussians)))
 
 
@@ -164,8 +144,8 @@ def write_ply_parts(
     `write_gaussians`. Raises DataError where another process is at it, or the system refuses.
     """
     added, beside = added_and_beside(origin, local)
-    first = part(slice(0, 1))
-    head, row = ply_head(first, antialiased, count, added), ply_rows(first, origin=added).nbytes
+    first = ply_rows(part(slice(0, 1)), added)
+    head, row = ply_head({"vertex": first}, antialiased, count), first.nbytes
     unfinished = path.with_name(f".{path.stem[:40]}.{key[:16]}")
     for other in path.parent.glob(f".{glob.escape(path.stem[:40])}.{'[0-9a-f]' * 16}"):
         if other != unfinished:
@@ -183,8 +163,7 @@ def write_ply_parts(
                 file.truncate(len(head) + begun * row * _ROWS)
                 file.seek(0, os.SEEK_END)
                 for start in range(begun * _ROWS, count, _ROWS):
-                    rows_here = part(slice(start, min(start + _ROWS, count)))
-                    file.write(ply_rows(rows_here, origin=added).tobytes())
+                    file.write(ply_rows(part(slice(start, min(start + _ROWS, count))), added).tobytes())
                     file.flush()
                     os.fsync(file.fileno())
             os.replace(rows, path)
@@ -199,38 +178,15 @@ def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N 
     In the format that it was read from everything else stays as it was, bit for bit; where no harmonic differs from those
     read, that is the whole file. Another format gets what `write_gaussians` gives it, and no Gaussians that cannot be drawn.
     """
-    finite, before = capture.gaussians.finite, capture.gaussians.harmonics
+    finite, before, form = capture.gaussians.finite, capture.gaussians.harmonics, format_of(path)
     if len(harmonics) < len(finite):
         harmonics = before.index_copy(0, finite.nonzero()[:, 0], harmonics)
-    ending, here = _ending(path), _ending(capture.path)
-    # A compressed file may be called .ply; under the same ending it stays what it is.
-    plain = ending == ".ply" and here == ".compressed.ply"
-    packed = ending == ".compressed.ply" and not is_compressed(capture.data)
-    if _FORMATS[ending].read is not _FORMATS[here].read or plain or packed:
+    if not form.holds(capture, format_of(capture.path)):
         drawn = capture.gaussians.recoloured(harmonics).select(finite)
         written = write_gaussians(path, drawn, antialiased=capture.antialiased, views=views, origin=capture.origin)
         return written._replace(faulty=not bool(finite.all()))
     changed = (harmonics != before).flatten(1).any(1) & harmonics.isfinite().flatten(1).all(1)
     data = capture.data if not bool(changed.any()) else capture.recolour(harmonics.numpy(), np.asarray(changed))
-    _write(path, data, capture.offset)
+    write_offset(path, capture.offset)
+    form.write(path, data)
     return Written()
-
-
-def _ending(path: Path) -> str:
-    for ending in ENDINGS:
-        if path.name.lower().endswith(ending):
-            return ending
-    raise DataError(f"{path}: no file of Gaussians by its name; known endings are {', '.join(ENDINGS)}")
-
-
-def _write(path: Path, data: bytes, offset: Origin) -> None:
-    write_offset(path, offset)
-    if _ending(path) != "meta.json":
-        write_bytes(path, data)
-        return
-    files = unbundle(path, data)
-    folder = folder_of(path, files)
-    for name, content in files.items():
-        own = name.removeprefix(folder)
-        if name.startswith(folder) and own and "/" not in own:
-            write_bytes(path.with_name(own), content)

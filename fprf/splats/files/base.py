@@ -1,4 +1,4 @@
-"""What all files of Gaussians have in common: the capture that was read, rounding to integers, packed rotations.
+"""What files of Gaussians have in common: the capture that was read, rounding to integers, packed rotations, outliers.
 
 Arrays are NumPy's. A reader never allocates on a file's word: what a header claims is held against the size of the file.
 """
@@ -29,6 +29,8 @@ _MOST = 64.0
 _ROOT = 2**0.5
 _APART = 4.0
 """Extents of the bulk from it, from which on Gaussians are ordered and bounded apart from it."""
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+"""Of the four components of a quaternion those that are stored, by the one that is not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +58,12 @@ class Capture:
     def origin(self) -> Origin:
         """Of the local frame that the Gaussians are in."""
         return self.shift[0] + self.offset[0], self.shift[1] + self.offset[1], self.shift[2] + self.offset[2]
+
+
+def arrays(gaussians: Gaussians) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Means [N 3], quaternions [N 4], ln-scales [N 3], logits [N] and harmonics [N K 3]."""
+    means, turns, scales, logits, harmonics = (part.detach().cpu().numpy() for part in vars(gaussians).values())
+    return means, turns, scales, logits, harmonics
 
 
 def centred(means: Floats) -> tuple[NDArray[np.float64], Origin]:
@@ -154,11 +162,5 @@ def precise(means: Floats, step: Callable[[Floats, Floats], float], share: float
     inner = means[bulk.apart <= 0.5]
     tried = [np.inf, *(2.0**k for k in range(14, -1, -1))]
     wanted = max(share * bulk.side, step(means[bulk.apart <= tried[-1]], inner))
-    for reach in tried:
-        kept = bulk.apart <= reach
-        if step(means[kept], inner) <= wanted:
-            break
-    return np.asarray(kept)
-
-
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+    # The widest reach that is precise enough: the last one is by the definition of `wanted`.
+    return next(kept for kept in (bulk.apart <= reach for reach in tried) if step(means[kept], inner) <= wanted)

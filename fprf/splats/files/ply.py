@@ -10,15 +10,16 @@ compressed  element `chunk`: bounds of positions, ln-scales and, mostly, colours
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError
+from ...plugins.captures import CaptureFormat
 from ...rendering.cameras import Cameras, ideal_cameras
 from ...types import Origin
 from ..gaussians import COUNTS, Gaussians, from_arrays
@@ -26,6 +27,7 @@ from .base import (
     Bools,
     Capture,
     Floats,
+    arrays,
     centred,
     colours_of,
     constants_of,
@@ -65,6 +67,138 @@ _SPAN = 8.0
 """Harmonics of compressed files lie in [-4, 4]."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Ply(CaptureFormat):
+    """INRIA's layout; SuperSplat's is read as well."""
+
+    exact: ClassVar[bool] = True
+
+    def recognises(self, head: bytes, size: int) -> bool:
+        return head.startswith(b"ply")
+
+    def read(self, path: Path, data: bytes) -> Capture:
+        """A PLY of either layout. Raises DataError for others, 2D Gaussians among them."""
+        header = _header(data)
+        if header is None:
+            raise DataError(f"{path}: no PLY header from `ply` to `end_header`; the file is damaged or of another kind")
+        elements = _elements(path, data, header)
+        # What comments say; of several on how opacities are meant the last counts.
+        texts = (" ".join(words[1:]) for words in header.lines if words[0] in ("comment", "obj_info"))
+        said = {found[1].lower(): found[2].lower() for text in texts if (found := _COMMENT.match(text))}
+        modes = [key for key in said if key != "vertical axis"]
+        mode = said[modes[-1]] if modes else ""
+        if mode == "2dgs":
+            raise DataError(f"{path}: 2D Gaussians (SplatRenderMode: 2dgs); only 3D Gaussians are read")
+        read = _read_compressed if header.packed else _read_inria
+        up, camera = _up(said.get("vertical axis", "")), _camera(elements)
+        if up is None and camera is not None:
+            up = (float(camera.pose[0, 0, 1]), float(camera.pose[0, 1, 1]), float(camera.pose[0, 2, 1]))
+        return replace(read(path, data, elements), antialiased=mode in ("mip", "1"), up=up, camera=camera)
+
+    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> bytes:
+        return ply_bytes(gaussians, antialiased, origin)
+
+    def holds(self, capture: Capture, read_as: CaptureFormat) -> bool:
+        """A compressed file may be called .ply: under the same ending it stays what it is."""
+        return type(read_as) is Ply
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompressedPly(Ply):
+    """SuperSplat's .compressed.ply."""
+
+    exact: ClassVar[bool] = False
+
+    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> bytes:
+        """Gaussians are put in spatial order, so that the bounds of chunks are narrow.
+
+        No chunk holds both the bulk and what is far from it: before the latter transparent Gaussians fill up the last one.
+        """
+        order, level = spatial_order(gaussians.means.numpy()), levels_of(gaussians.means.numpy())
+        parts = [order[level[order] == k] for k in range(int(level.max(initial=0)) + 1)]
+        parts = [np.append(part, np.full(-len(part) % _CHUNK, part[-1])) for part in parts[:-1]] + parts[-1:]
+        index = np.concatenate(parts)
+        filled = index[1:] == index[:-1]
+        means, turns, scales, logits, harmonics = arrays(gaussians.select(torch.from_numpy(index)))
+        # Each property as shares of the bounds of its chunk, several in one word.
+        bounds: list[Floats] = []
+        words = np.zeros((len(means), 4), np.uint32)
+        for column, values in ((0, means), (2, np.clip(scales, -20, 20))):
+            share, low, high = _in_chunks(values)
+            words[:, column] = _pack(share, (11, 10, 11))
+            bounds += [low, high]
+        largest, three = smallest_three(turns)
+        words[:, 1] = largest << 30 | _pack(three / 2 + 0.5, (10, 10, 10))
+        share, low, high = _in_chunks(colours_of(harmonics).clip(*_COLOURS))
+        opacity = sigmoid(logits)
+        opacity[1:][filled] = 0
+        words[:, 3] = _pack(np.concatenate([share, opacity[:, None]], 1), (8, 8, 8, 8))
+        bounds += [low, high]
+        names = [name for pair in (_POSITION, _SCALE, _COLOUR) for of in pair for name in of]
+        chunk = np.concatenate(bounds, 1).astype("<f4").view([(name, "<f4") for name in names])[:, 0]
+        tables = {"chunk": chunk, "vertex": words.astype("<u4").view([(name, "<u4") for name in _PACKED])[:, 0]}
+        if harmonics.shape[1] > 1:
+            rest = _rest_bytes(harmonics)
+            tables["sh"] = rest.view([(f"f_rest_{i}", "u1") for i in range(rest.shape[1])])[:, 0]
+        return ply_file(tables, antialiased)
+
+    def keeps(self, gaussians: Gaussians) -> Bools:
+        """All but a few outliers, which would need chunks of their own."""
+        level = levels_of(gaussians.means.numpy())
+        beyond = len(level) - np.cumsum(np.bincount(level, minlength=1))
+        return level <= int((beyond <= _FEW).argmax())
+
+    def holds(self, capture: Capture, read_as: CaptureFormat) -> bool:
+        header = _header(capture.data) if isinstance(read_as, Ply) else None
+        return header is not None and header.packed
+
+
+def ply_bytes(gaussians: Gaussians, antialiased: bool, origin: Origin = (0.0, 0.0, 0.0)) -> bytes:
+    """The INRIA file, exact; with an origin positions are in the world, float64."""
+    return ply_file({"vertex": ply_rows(gaussians, origin)}, antialiased)
+
+
+def ply_rows(gaussians: Gaussians, origin: Origin) -> NDArray[np.void]:
+    """Rows of the INRIA file. Normals, which nobody reads and some demand, are 0."""
+    means, turns, scales, logits, harmonics = arrays(gaussians)
+    names = [*"xyz", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
+    names += [f"f_rest_{i}" for i in range(3 * harmonics.shape[1] - 3)]
+    names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    columns = np.concatenate([means, np.zeros_like(means), _flat(harmonics), logits[:, None], scales, turns], 1)
+    return in_world(np.ascontiguousarray(columns, "<f4").view([(name, "<f4") for name in names])[:, 0], means, origin)
+
+
+def in_world(table: NDArray[np.void], local: Floats, origin: Origin) -> NDArray[np.void]:
+    """Rows with local x y z [N 3] about an origin as float64 of the world; as they are where the origin is 0."""
+    if not any(origin):
+        return table
+    kinds = {name: "<f8" if name in ("x", "y", "z") else table.dtype[name] for name in table.dtype.names or ()}
+    out = table.astype([*kinds.items()])
+    for name, column, of in zip("xyz", local.astype(np.float64).T, origin, strict=True):
+        out[name] = column + of
+    return out
+
+
+def ply_file(tables: Mapping[str, NDArray[np.void]], antialiased: bool = False) -> bytes:
+    """A little-endian binary PLY of elements by name, a property a field; a field of (count, values) is a list.
+
+    trimesh would write meshes too, but keeps neither comments nor colours without alpha.
+    """
+    return ply_head(tables, antialiased) + b"".join(table.tobytes() for table in tables.values())
+
+
+def ply_head(tables: Mapping[str, NDArray[np.void]], antialiased: bool, count: int | None = None) -> bytes:
+    """What stands before the rows of `ply_file`; `count`: of a file with so many rows such as these."""
+    lines = ["ply", "format binary_little_endian 1.0", *(["comment SplatRenderMode: mip"] if antialiased else [])]
+    for name, table in tables.items():
+        lines.append(f"element {name} {len(table) if count is None else count}")
+        for field in table.dtype.names or ():
+            kind = table.dtype[field]
+            of = [kind] if kind.names is None else [kind[part].base for part in kind.names]
+            lines.append(f"property {'list ' * (len(of) > 1)}{' '.join(_NAMES[each.str[1:]] for each in of)} {field}")
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
+
+
 class _Element(NamedTuple):
     table: NDArray[np.void]
     offset: int
@@ -77,39 +211,24 @@ class _Header(NamedTuple):
     size: int
     """Bytes before the first row."""
 
-    def texts(self) -> list[str]:
-        """Comments."""
-        return [" ".join(words[1:]) for words in self.lines if words[0] in ("comment", "obj_info")]
+    @property
+    def packed(self) -> bool:
+        """SuperSplat's layout."""
+        return any(words[0] == "property" and words[-1] == _PACKED[0] for words in self.lines)
 
 
-def read_ply(path: Path, data: bytes) -> Capture:
-    """A PLY of either layout. Raises DataError for others, 2D Gaussians among them."""
-    header = _header(data)
-    if header is None:
-        raise DataError(f"{path}: no PLY header from `ply` to `end_header`; the file is damaged or of another kind")
-    elements = _elements(path, data, header)
-    said = {found[1].lower(): found[2].lower() for text in header.texts() if (found := _COMMENT.match(text))}
-    modes = [key for key in said if key != "vertical axis"]
-    mode = said[modes[-1]] if modes else ""
-    antialiased = mode in ("mip", "1")
-    up, camera = _up(said.get("vertical axis", "")), _camera(elements)
-    if up is None and camera is not None:
-        up = (float(camera.pose[0, 0, 1]), float(camera.pose[0, 1, 1]), float(camera.pose[0, 2, 1]))
-    if _is_compressed(header):
-        return replace(_read_compressed(path, data, elements, antialiased), up=up, camera=camera)
-    if mode == "2dgs":
-        raise DataError(f"{path}: 2D Gaussians (SplatRenderMode: 2dgs); only 3D Gaussians are read")
+def _read_inria(path: Path, data: bytes, elements: Mapping[str, _Element]) -> Capture:
     vertex = elements.get("vertex")
     if vertex is None:
         raise DataError(f"{path}: no element `vertex`; not a file of 3D Gaussians")
     table, known = vertex.table, set(vertex.table.dtype.names or ())
     if {"scale_0", "scale_1"} <= known and "scale_2" not in known:
         raise DataError(f"{path}: 2D Gaussians (no scale_2); only 3D Gaussians are read")
+    # Properties may stand in any order, among any others.
     rest = sum(bool(re.fullmatch(r"f_rest_\d+", name)) for name in known)
     colours = [*(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest))]
     count = 1 + rest // 3
-    wanted = [*"xyz", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)), *colours]
-    for name in wanted:
+    for name in [*"xyz", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)), *colours]:
         if name not in known:
             raise DataError(f"{path}: no property {name}; not a file of 3D Gaussians")
         if table.dtype[name].kind != "f" and name not in "xyz":
@@ -123,6 +242,7 @@ def read_ply(path: Path, data: bytes) -> Capture:
     harmonics = columns(*colours[:3])[:, None]
     if rest:
         harmonics = np.concatenate([harmonics, columns(*colours[3:]).reshape(-1, 3, count - 1).transpose(0, 2, 1)], 1)
+    # Positions may be of any type; far from 0 they lose nothing by their local origin.
     means, shift = centred(np.stack([table[name] for name in "xyz"], 1))
     gaussians = from_arrays(
         means,
@@ -139,100 +259,10 @@ def read_ply(path: Path, data: bytes) -> Capture:
             target[name][changed] = column[changed]
         return bytes(out)
 
-    return Capture(path, gaussians, antialiased, data, recolour, up, camera, shift)
+    return Capture(path, gaussians, False, data, recolour, shift=shift)
 
 
-def ply_bytes(
-    gaussians: Gaussians, antialiased: bool, normals: Floats | None = None, origin: Origin = (0.0, 0.0, 0.0)
-) -> bytes:
-    """The INRIA file, exact. Normals [N 3] are 0 unless given; with an origin positions are in the world, float64."""
-    return ply_file({"vertex": ply_rows(gaussians, normals, origin)}, _comments(antialiased))
-
-
-def ply_head(of: Gaussians, antialiased: bool, count: int, origin: Origin) -> bytes:
-    """What stands before the rows of an INRIA file of `count` Gaussians such as these."""
-    return _head({"vertex": ply_rows(of, origin=origin)}, _comments(antialiased), [count])
-
-
-def ply_rows(gaussians: Gaussians, normals: Floats | None = None, origin: Origin = (0.0, 0.0, 0.0)) -> NDArray[np.void]:
-    """Rows of the INRIA file, as `ply_bytes` has them."""
-    names = [*"xyz", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
-    names += [f"f_rest_{i}" for i in range(3 * gaussians.harmonics.shape[1] - 3)]
-    names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-    means, turns, scales, logits, harmonics = _arrays(gaussians)
-    parts = [means, np.zeros_like(means) if normals is None else normals, _flat(harmonics), logits[:, None], scales, turns]
-    return in_world(
-        np.ascontiguousarray(np.concatenate(parts, 1), "<f4").view([(name, "<f4") for name in names])[:, 0], means, origin
-    )
-
-
-def in_world(table: NDArray[np.void], local: Floats, origin: Origin) -> NDArray[np.void]:
-    """Rows with local x y z [N 3] about an origin as float64 of the world; as they are where the origin is 0."""
-    if not any(origin):
-        return table
-    kinds = {name: "<f8" if name in ("x", "y", "z") else table.dtype[name] for name in table.dtype.names or ()}
-    out = table.astype([*kinds.items()])
-    for name, column, of in zip("xyz", local.astype(np.float64).T, origin, strict=True):
-        out[name] = column + of
-    return out
-
-
-def _comments(antialiased: bool) -> list[str]:
-    return ["SplatRenderMode: mip"] if antialiased else []
-
-
-def is_compressed(data: bytes) -> bool:
-    """True for a PLY with SuperSplat's layout."""
-    header = _header(data)
-    return header is not None and _is_compressed(header)
-
-
-def _is_compressed(header: _Header) -> bool:
-    return any(words[0] == "property" and words[-1] == _PACKED[0] for words in header.lines)
-
-
-def compressed_keeps(gaussians: Gaussians) -> Bools:
-    """Which Gaussians a compressed file holds: all but a few outliers, which would need chunks of their own."""
-    level = levels_of(gaussians.means.numpy())
-    beyond = len(level) - np.cumsum(np.bincount(level, minlength=1))
-    return level <= int((beyond <= _FEW).argmax())
-
-
-def compressed_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
-    """SuperSplat's file. Gaussians are put in spatial order, so that the bounds of chunks are narrow.
-
-    No chunk holds both the bulk and what is far from it: before the latter transparent Gaussians fill up the last one.
-    """
-    order, level = spatial_order(gaussians.means.numpy()), levels_of(gaussians.means.numpy())
-    parts = [order[level[order] == k] for k in range(int(level.max(initial=0)) + 1)]
-    parts = [np.append(part, np.full(-len(part) % _CHUNK, part[-1])) for part in parts[:-1]] + parts[-1:]
-    index = np.concatenate(parts)
-    filled = index[1:] == index[:-1]
-    gaussians = gaussians.select(torch.from_numpy(index))
-    means, turns, scales, logits, harmonics = _arrays(gaussians)
-    bounds: list[Floats] = []
-    words = np.zeros((len(means), 4), np.uint32)
-    for column, values in ((0, means), (2, np.clip(scales, -20, 20))):
-        share, low, high = _in_chunks(values)
-        words[:, column] = _pack(share, (11, 10, 11))
-        bounds += [low, high]
-    largest, three = smallest_three(turns)
-    words[:, 1] = largest << 30 | _pack(three / 2 + 0.5, (10, 10, 10))
-    share, low, high = _in_chunks(colours_of(harmonics).clip(*_COLOURS))
-    opacity = sigmoid(logits)
-    opacity[1:][filled] = 0
-    words[:, 3] = _pack(np.concatenate([share, opacity[:, None]], 1), (8, 8, 8, 8))
-    bounds += [low, high]
-    names = [name for pair in (_POSITION, _SCALE, _COLOUR) for of in pair for name in of]
-    chunk = np.concatenate(bounds, 1).astype("<f4").view([(name, "<f4") for name in names])[:, 0]
-    tables = {"chunk": chunk, "vertex": words.astype("<u4").view([(name, "<u4") for name in _PACKED])[:, 0]}
-    if harmonics.shape[1] > 1:
-        rest = _rest_bytes(_flat(harmonics)[:, 3:])
-        tables["sh"] = rest.view([(f"f_rest_{i}", "u1") for i in range(rest.shape[1])])[:, 0]
-    return ply_file(tables, _comments(antialiased))
-
-
-def _read_compressed(path: Path, data: bytes, elements: dict[str, _Element], antialiased: bool) -> Capture:
+def _read_compressed(path: Path, data: bytes, elements: Mapping[str, _Element]) -> Capture:
     chunk, vertex, sh = (elements.get(name) for name in ("chunk", "vertex", "sh"))
     tinted = chunk is not None and _COLOUR[0][0] in (chunk.table.dtype.names or ())
     bounds = [name for pair in (_POSITION, _SCALE, *([_COLOUR] if tinted else [])) for of in pair for name in of]
@@ -243,8 +273,7 @@ def _read_compressed(path: Path, data: bytes, elements: dict[str, _Element], ant
     assert chunk is not None and vertex is not None
     count, of = len(vertex.table), np.arange(len(vertex.table)) // _CHUNK
     rest = [] if sh is None else list(sh.table.dtype.names or ())
-    names = [f"f_rest_{i}" for i in range(len(rest))]
-    wrong = 1 + len(rest) // 3 not in COUNTS or len(rest) % 3 or rest != names
+    wrong = 1 + len(rest) // 3 not in COUNTS or len(rest) % 3 or rest != [f"f_rest_{i}" for i in range(len(rest))]
     if sh is not None and (wrong or len(sh.table) != count or any(sh.table.dtype[name] != "u1" for name in rest)):
         raise DataError(f"{path}: element `sh` with {len(rest)} properties and {len(sh.table)} rows; not SuperSplat's layout")
     if len(chunk.table) != -(-count // _CHUNK):
@@ -256,8 +285,7 @@ def _read_compressed(path: Path, data: bytes, elements: dict[str, _Element], ant
 
     words = {name: vertex.table[name] for name in _PACKED}
     rgba = _unpack(words["packed_color"], (8, 8, 8, 8))
-    colours = unpacked(rgba[:, :3], _COLOUR) if tinted else rgba[:, :3]
-    harmonics = constants_of(colours)
+    harmonics = constants_of(unpacked(rgba[:, :3], _COLOUR) if tinted else rgba[:, :3])
     if sh is not None:
         raw = np.stack([sh.table[name] for name in rest], 1)
         share = np.where(raw == 0, 0.0, np.where(raw == 255, 1.0, (raw + 0.5) / 256))
@@ -274,8 +302,8 @@ def _read_compressed(path: Path, data: bytes, elements: dict[str, _Element], ant
 
     def recolour(harmonics: Floats, changed: Bools) -> bytes:
         out = bytearray(data)
-        target = np.frombuffer(out, vertex.table.dtype, count, vertex.offset)
         share = colours_of(finite(harmonics))
+        changed_here = changed
         if tinted:  # a chunk in which anything changes gets new bounds, and all of its colours are rounded again
             share, *limits = _in_chunks(share.clip(*_COLOURS))
             there = np.unique(of[changed])
@@ -284,17 +312,16 @@ def _read_compressed(path: Path, data: bytes, elements: dict[str, _Element], ant
             for names, values in zip(_COLOUR, limits, strict=True):
                 for name, column in zip(names, values.T, strict=True):
                     bounds[name][there] = column[there]
-        else:
-            changed_here = changed
         colour = _pack(share, (8, 8, 8)).astype(np.uint32) << 8 | (words["packed_color"] & 255)
+        target = np.frombuffer(out, vertex.table.dtype, count, vertex.offset)
         target["packed_color"][changed_here] = colour[changed_here]
         if sh is not None:
             into = np.frombuffer(out, sh.table.dtype, count, sh.offset)
-            for name, column in zip(rest, _rest_bytes(_flat(harmonics)[:, 3:]).T, strict=True):
+            for name, column in zip(rest, _rest_bytes(harmonics).T, strict=True):
                 into[name][changed] = column[changed]
         return bytes(out)
 
-    return Capture(path, gaussians, antialiased, data, recolour, shift=shift)
+    return Capture(path, gaussians, False, data, recolour, shift=shift)
 
 
 def _header(data: bytes) -> _Header | None:
@@ -372,11 +399,12 @@ def _after_lists(data: bytes, offset: int, count: int, fields: Sequence[Sequence
 def _up(text: str) -> tuple[float, float, float] | None:
     """The direction up of `Vertical axis: z` or `0 0 1`; a letter with a sign is that direction."""
     numbers = text.replace(",", " ").strip("[]() ").split()
-    if numbers and numbers[0].lstrip("+-") in _UP:
-        letter = numbers[0].lstrip("+-")
+    letter = numbers[0].lstrip("+-") if numbers else ""
+    if letter in _UP:
+        if numbers[0] == letter:
+            return _UP[letter]
         sign = -1.0 if numbers[0][0] == "-" else 1.0
-        named = [sign * (letter == axis) for axis in _UP]
-        return _UP[letter] if numbers[0] == letter else (named[0], named[1], named[2])
+        numbers = [str(sign * (letter == axis)) for axis in _UP]
     try:
         x, y, z = map(float, numbers)
     except ValueError:
@@ -412,38 +440,15 @@ def _camera(elements: Mapping[str, _Element]) -> Cameras | None:
     return replace(cameras, focal=torch.from_numpy(focal)[None], centre=torch.from_numpy(centre)[None])
 
 
-def ply_file(tables: dict[str, NDArray[np.void]], comments: Sequence[str] = ()) -> bytes:
-    """A little-endian binary PLY of elements by name, a property a field; a field of (count, values) is a list.
-
-    trimesh would write meshes too, but keeps neither comments nor colours without alpha.
-    """
-    head = _head(tables, comments, [len(table) for table in tables.values()])
-    return head + b"".join(table.tobytes() for table in tables.values())
-
-
-def _head(tables: dict[str, NDArray[np.void]], comments: Sequence[str], counts: Sequence[int]) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
-    for (name, table), count in zip(tables.items(), counts, strict=True):
-        lines.append(f"element {name} {count}")
-        for field in table.dtype.names or ():
-            kind = table.dtype[field]
-            of = [kind] if kind.names is None else [kind[part].base for part in kind.names]
-            lines.append(f"property {'list ' * (len(of) > 1)}{' '.join(_NAMES[each.str[1:]] for each in of)} {field}")
-    return "\n".join([*lines, "end_header", ""]).encode("ascii")
-
-
-def _arrays(gaussians: Gaussians) -> tuple[Floats, ...]:
-    parts = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits, gaussians.harmonics)
-    return tuple(part.detach().cpu().numpy() for part in parts)
-
-
 def _flat(harmonics: Floats) -> Floats:
     """Columns as files have them [N 3 K]: the three constants, then channel by channel."""
     rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(len(harmonics), 3 * harmonics.shape[1] - 3)
     return np.concatenate([harmonics[:, 0], rest], 1)
 
 
-def _rest_bytes(rest: Floats) -> NDArray[np.uint8]:
+def _rest_bytes(harmonics: Floats) -> NDArray[np.uint8]:
+    """All but the constants as compressed files have them."""
+    rest = _flat(harmonics)[:, 3:]
     return np.asarray(np.clip(np.floor((finite(rest) / _SPAN + 0.5) * 256), 0, 255), np.uint8)
 
 

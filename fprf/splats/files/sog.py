@@ -15,6 +15,7 @@ import json
 import zipfile
 import zlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -25,11 +26,15 @@ from numpy.typing import NDArray
 
 from ...datamanagers.images import header_of
 from ...errors import DataError
+from ...io.atomic import write_bytes
+from ...plugins.captures import CaptureFormat
+from ...types import Origin
 from ..gaussians import COUNTS, Gaussians, from_arrays
 from .base import (
     Bools,
     Capture,
     Floats,
+    arrays,
     centred,
     finite,
     logit,
@@ -57,118 +62,137 @@ _FIRST = (1980, 1, 1, 0, 0, 0)
 """Time of archived files: the same capture gives the same bytes."""
 
 
-def read_sog(path: Path, data: bytes) -> Capture:
-    """A .sog archive, or the meta.json of a folder. Raises DataError for what is neither."""
-    if not data.startswith(b"PK"):
-        data = bundle(_folder(path, data))
-    files = unbundle(path, data)
-    folder = folder_of(path, files)
-    parts = {name.removeprefix(folder): content for name, content in files.items() if name.startswith(folder)}
-    meta = _json(path, parts["meta.json"])
-    version = meta.get("version", 1)
-    if version not in (1, 2):
-        raise DataError(f"{path}: SOG of version {version!r}; versions 1 and 2 are read")
-    if meta.get("model") == "2dgs":
-        raise DataError(f"{path}: 2D Gaussians (model 2dgs); only 3D Gaussians are read")
-    pictures = _Pictures(path, parts, meta)
-    count = pictures.count
-    low, high = (pictures.rows("means", i)[:, :3].astype(np.int64) for i in (0, 1))
-    least, most = pictures.numbers("means", "mins", 3), pictures.numbers("means", "maxs", 3)
-    bent = least + (high << 8 | low) / 65535 * (most - least)
-    turn, scale, base = pictures.rows("quats", 0), pictures.rows("scales", 0), pictures.rows("sh0", 0)
-    tag = turn[:, 3].astype(np.int64) - 252
-    quaternions = three_to_four(np.clip(tag, 0, 3), turn[:, :3] / 255 * 2 - 1)
-    quaternions[tag < 0] = (1, 0, 0, 0)
-    labels, rest = pictures.palette()
-    alpha = base[:, 3:] if version == 2 else pictures.decoded("sh0", base, 4)[:, 3:]
-    constants = pictures.decoded("sh0", base[:, :3] if version == 2 else base, 3 if version == 2 else 4)[:, :3]
-    means, shift = centred(np.sign(bent) * np.expm1(np.minimum(np.abs(bent), 80)))
-    gaussians = from_arrays(
-        means,
-        quaternions,
-        pictures.decoded("scales", scale[:, :3], 3),
-        logit(alpha[:, 0] / 255) if version == 2 else alpha[:, 0],
-        np.concatenate([constants[:, None], rest[labels]], 1) if len(rest) else constants[:, None],
-    )
+@dataclass(frozen=True, kw_only=True)
+class Sog(CaptureFormat):
+    """PlayCanvas' .sog, or the meta.json of a folder, read in versions 1 and 2 and written in version 2."""
 
-    def recolour(harmonics: Floats, changed: Bools) -> bytes:
-        new, said = {}, json.loads(parts["meta.json"])
-        names = said["sh0"]["files"][0]
-        index, said["sh0"] = _quantized(harmonics[:, 0], said["sh0"])
-        picture = pictures.picture(names)
-        picture.reshape(-1, 4)[:count, :3] = index
-        new[names] = _webp(picture)
-        if len(rest):
-            mixed = _means(harmonics[:, 1:].reshape(count, -1), labels, len(rest)).reshape(rest.shape)
-            seen = np.bincount(labels, minlength=len(rest)) > 0
-            entries = np.where(seen[:, None, None], mixed, rest)
-            name = said["shN"]["files"][0]
-            index, said["shN"] = _quantized(entries, said["shN"])
-            new[name] = _webp(_palette_picture(index))
-        new["meta.json"] = json.dumps(said, separators=(",", ":")).encode()
-        new = {folder + name: content for name, content in new.items()}
-        return bundle(files | new, like=data)
+    def recognises(self, head: bytes, size: int) -> bool:
+        return head.startswith(b"PK")
 
-    antialiased = meta.get("antialias") is True or meta.get("model") == "antialiased"
-    return Capture(path, gaussians, antialiased, data, recolour, shift=shift)
+    def read(self, path: Path, data: bytes) -> Capture:
+        """A .sog archive, or the meta.json of a folder. Raises DataError for what is neither."""
+        if not data.startswith(b"PK"):
+            data = bundle(_folder(path, data))
+        files = unbundle(path, data)
+        folder = folder_of(path, files)
+        parts = {name.removeprefix(folder): content for name, content in files.items() if name.startswith(folder)}
+        meta = _json(path, parts["meta.json"])
+        version = meta.get("version", 1)
+        if version not in (1, 2):
+            raise DataError(f"{path}: SOG of version {version!r}; versions 1 and 2 are read")
+        if meta.get("model") == "2dgs":
+            raise DataError(f"{path}: 2D Gaussians (model 2dgs); only 3D Gaussians are read")
+        pictures = _Pictures(path, parts, meta)
+        count = pictures.count
+        low, high = (pictures.rows("means", i)[:, :3].astype(np.int64) for i in (0, 1))
+        least, most = pictures.numbers("means", "mins", 3), pictures.numbers("means", "maxs", 3)
+        bent = least + (high << 8 | low) / 65535 * (most - least)
+        turn, scale, base = pictures.rows("quats", 0), pictures.rows("scales", 0), pictures.rows("sh0", 0)
+        tag = turn[:, 3].astype(np.int64) - 252
+        quaternions = three_to_four(np.clip(tag, 0, 3), turn[:, :3] / 255 * 2 - 1)
+        quaternions[tag < 0] = (1, 0, 0, 0)
+        labels, rest = pictures.palette()
+        # The alpha of sh0: opacities as they are, or, in version 1, logits of a range of their own.
+        if version == 2:
+            constants, logits = pictures.decoded("sh0", base[:, :3], 3), logit(base[:, 3] / 255)
+        else:
+            constants, logits = np.split(pictures.decoded("sh0", base, 4), [3], 1)
+        means, shift = centred(np.sign(bent) * np.expm1(np.minimum(np.abs(bent), 80)))
+        gaussians = from_arrays(
+            means,
+            quaternions,
+            pictures.decoded("scales", scale[:, :3], 3),
+            logits.reshape(-1),
+            np.concatenate([constants[:, None], rest[labels]], 1) if len(rest) else constants[:, None],
+        )
 
+        def recolour(harmonics: Floats, changed: Bools) -> bytes:
+            new, said = {}, json.loads(parts["meta.json"])
+            name = said["sh0"]["files"][0]
+            index, said["sh0"] = _quantized(harmonics[:, 0], said["sh0"])
+            picture = pictures.picture(name)
+            picture.reshape(-1, 4)[:count, :3] = index
+            new[name] = _webp(picture)
+            if len(rest):
+                mixed = _means(harmonics[:, 1:].reshape(count, -1), labels, len(rest)).reshape(rest.shape)
+                seen = np.bincount(labels, minlength=len(rest)) > 0
+                name = said["shN"]["files"][0]
+                index, said["shN"] = _quantized(np.where(seen[:, None, None], mixed, rest), said["shN"])
+                new[name] = _webp(_palette_picture(index))
+            new["meta.json"] = json.dumps(said, separators=(",", ":")).encode()
+            return bundle(files | {folder + name: content for name, content in new.items()}, like=data)
 
-def sog_keeps(gaussians: Gaussians) -> Bools:
-    """Which Gaussians a file holds: all but outliers that would cost the others their 16 bits."""
+        antialiased = meta.get("antialias") is True or meta.get("model") == "antialiased"
+        return Capture(path, gaussians, antialiased, data, recolour, shift=shift)
 
-    def step(kept: Floats, inner: Floats) -> float:
-        ends = [_bent(kept.min(0)), _bent(kept.max(0))]
-        return float(((ends[1] - ends[0]) / 65535 * (1 + np.abs(inner).max(0))).max())
+    def keeps(self, gaussians: Gaussians) -> Bools:
+        """All but outliers that would cost the others their 16 bits."""
 
-    return precise(gaussians.means.numpy().astype(np.float64), step, _PRECISION)
+        def step(kept: Floats, inner: Floats) -> float:
+            ends = [_bent(kept.min(0)), _bent(kept.max(0))]
+            return float(((ends[1] - ends[0]) / 65535 * (1 + np.abs(inner).max(0))).max())
+
+        return precise(gaussians.means.numpy().astype(np.float64), step, _PRECISION)
+
+    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> bytes:
+        """A bundled file of version 2. Gaussians are put in spatial order, by which the images shrink."""
+        gaussians = gaussians.select(torch.from_numpy(spatial_order(gaussians.means.numpy())))
+        means, turns, log_scales, logits, harmonics = arrays(gaussians)
+        count = len(means)
+        width = -(-int(np.ceil(count**0.5)) // 4) * 4
+        shape = (-(-count // max(width, 1)), width)
+        bent = _bent(means.astype(np.float64))
+        least, most = bent.min(0), bent.max(0)
+        at = steps((bent - least) / np.where(most > least, most - least, 1.0), 65535)
+        largest, three = smallest_three(turns)
+        opacity = steps(sigmoid(logits), 255)
+        scale, scales = _quantized(log_scales.clip(-20, 20), {"files": ["scales.webp"], "codebook": []})
+        base, sh0 = _quantized(harmonics[:, 0], {"files": ["sh0.webp"], "codebook": []})
+        pictures = {
+            "means_l.webp": _picture(at & 255, shape),
+            "means_u.webp": _picture(at >> 8, shape),
+            "quats.webp": _picture(np.concatenate([steps(three / 2 + 0.5, 255), largest[:, None] + 252], 1), shape),
+            "scales.webp": _picture(scale, shape),
+            "sh0.webp": _picture(np.concatenate([base, opacity[:, None]], 1), shape),
+        }
+        meta: dict[str, Any] = {
+            "version": 2,
+            "count": count,
+            **({"antialias": True, "model": "antialiased"} if antialiased else {}),
+            "means": {"mins": least.tolist(), "maxs": most.tolist(), "files": ["means_l.webp", "means_u.webp"]},
+            "scales": scales,
+            "quats": {"files": ["quats.webp"]},
+            "sh0": sh0,
+        }
+        if gaussians.degree > 0:
+            # Whole rows of harmonics share a palette, whose entries share a codebook.
+            labels = _labels(harmonics[:, 1:].reshape(count, -1))
+            used = int(labels.max()) + 1
+            entries = _means(harmonics[:, 1:].reshape(count, -1), labels, used).reshape(used, -1, 3)
+            files = ["shN_centroids.webp", "shN_labels.webp"]
+            index, meta["shN"] = _quantized(entries, {"count": used, "bands": gaussians.degree, "codebook": [], "files": files})
+            pictures[files[0]] = _palette_picture(index)
+            pictures[files[1]] = _picture(np.stack([labels & 255, labels >> 8, 0 * labels], 1), shape)
+        return bundle(
+            {name: _webp(picture) for name, picture in pictures.items()}
+            | {"meta.json": json.dumps(meta, separators=(",", ":")).encode()}
+        )
+
+    def write(self, path: Path, data: bytes) -> None:
+        """An archive; of a meta.json its files, into the same folder."""
+        if path.name.lower() != "meta.json":
+            write_bytes(path, data)
+            return
+        files = unbundle(path, data)
+        folder = folder_of(path, files)
+        for name, content in files.items():
+            own = name.removeprefix(folder)
+            if name.startswith(folder) and own and "/" not in own:
+                write_bytes(path.with_name(own), content)
 
 
 def _bent(means: Floats) -> Floats:
     return np.sign(means) * np.log1p(np.abs(means))
-
-
-def sog_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
-    """A bundled file of version 2. Gaussians are put in spatial order, by which the images shrink."""
-    gaussians = gaussians.select(torch.from_numpy(spatial_order(gaussians.means.numpy())))
-    count = len(gaussians)
-    width = -(-int(np.ceil(count**0.5)) // 4) * 4
-    shape = (-(-count // max(width, 1)), width)
-    bent = _bent(gaussians.means.numpy().astype(np.float64))
-    least, most = bent.min(0), bent.max(0)
-    at = steps((bent - least) / np.where(most > least, most - least, 1.0), 65535)
-    largest, three = smallest_three(gaussians.quaternions.numpy())
-    harmonics = gaussians.harmonics.numpy()
-    opacity = steps(sigmoid(gaussians.logits.numpy()), 255)
-    scale, scales = _quantized(gaussians.log_scales.numpy().clip(-20, 20), {"files": ["scales.webp"], "codebook": []})
-    base, sh0 = _quantized(harmonics[:, 0], {"files": ["sh0.webp"], "codebook": []})
-    pictures = {
-        "means_l.webp": _picture(at & 255, shape),
-        "means_u.webp": _picture(at >> 8, shape),
-        "quats.webp": _picture(np.concatenate([steps(three / 2 + 0.5, 255), largest[:, None] + 252], 1), shape),
-        "scales.webp": _picture(scale, shape),
-        "sh0.webp": _picture(np.concatenate([base, opacity[:, None]], 1), shape),
-    }
-    meta: dict[str, Any] = {
-        "version": 2,
-        "count": count,
-        **({"antialias": True, "model": "antialiased"} if antialiased else {}),
-        "means": {"mins": least.tolist(), "maxs": most.tolist(), "files": ["means_l.webp", "means_u.webp"]},
-        "scales": scales,
-        "quats": {"files": ["quats.webp"]},
-        "sh0": sh0,
-    }
-    if gaussians.degree > 0:
-        labels = _labels(harmonics[:, 1:].reshape(count, -1))
-        used = int(labels.max()) + 1
-        entries = _means(harmonics[:, 1:].reshape(count, -1), labels, used).reshape(used, -1, 3)
-        index, meta["shN"] = _quantized(
-            entries,
-            {"count": used, "bands": gaussians.degree, "codebook": [], "files": ["shN_centroids.webp", "shN_labels.webp"]},
-        )
-        pictures["shN_centroids.webp"] = _palette_picture(index)
-        pictures["shN_labels.webp"] = _picture(np.stack([labels & 255, labels >> 8, 0 * labels], 1), shape)
-    files = {name: _webp(picture) for name, picture in pictures.items()}
-    return bundle({**files, "meta.json": json.dumps(meta, separators=(",", ":")).encode()})
 
 
 def unbundle(path: Path, data: bytes) -> dict[str, bytes]:

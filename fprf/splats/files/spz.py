@@ -15,6 +15,7 @@ import math
 import struct
 import zlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,9 +24,25 @@ import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ...fields.planes import harmonics as harmonic_functions
+from ...ops.harmonics import spherical_harmonics
+from ...plugins.captures import CaptureFormat
+from ...types import Origin
 from ..gaussians import COUNTS, Gaussians, bulk_of, from_arrays
-from .base import Bools, Capture, Floats, centred, finite, logit, precise, short, sigmoid, smallest_three, steps, three_to_four
+from .base import (
+    Bools,
+    Capture,
+    Floats,
+    arrays,
+    centred,
+    finite,
+    logit,
+    precise,
+    short,
+    sigmoid,
+    smallest_three,
+    steps,
+    three_to_four,
+)
 
 _MAGIC = 0x5053474E
 _HEADER, _WIDE_HEADER = struct.Struct("<IIIBBBB"), struct.Struct("<IIIBBBBI12x")
@@ -64,78 +81,106 @@ class _Header(NamedTuple):
         return [self.number * each for each in (position, 1, 3, 3, turn, 3 * (COUNTS[self.degree] - 1))]
 
 
-def read_spz(path: Path, data: bytes) -> Capture:
-    """A .spz file of versions 1 to 4. Raises DataError for others, and for version 4 where `zstandard` is not installed."""
-    packed = data[:2] == b"\x1f\x8b"
-    unpacked, after = _unzip(path, data) if packed else (data, b"")
-    header = _header(path, unpacked)
-    if header.version < 4:
-        ends = np.cumsum([header.size, *header.sizes]).tolist()
-        if ends[-1] > len(unpacked):
-            raise short(path, len(unpacked), ends[-1], f"{header.number} Gaussians{' unpacked' * packed}")
-        streams = [unpacked[start:stop] for start, stop in itertools.pairwise(ends)]
-        extensions = unpacked[ends[-1] :]
-    else:
-        streams = _frames(path, data, header)
-        extensions = data[header.size : _WIDE_HEADER.unpack_from(data)[-1]]
-    axes = _axes(path, _coordinates(extensions) if header.flags & 2 else _RUB, header.degree)
-    means, opacity, tint, scales, turns, rest = (np.frombuffer(each, np.uint8) for each in streams)
-    count, bands = header.number, COUNTS[header.degree]
-    if header.version == 1:
-        points: Floats = means.view("<f2").reshape(count, 3).astype(np.float64)
-    else:
-        low, middle, high = means.reshape(count, 3, 3).astype(np.int32).transpose(2, 0, 1)
-        points = (((low | middle << 8 | high << 16) ^ 0x800000) - 0x800000) / 2.0**header.fraction
-    if header.version < 3:
-        three = turns.reshape(count, 3) / 127.5 - 1
-        quaternions = np.concatenate([np.sqrt(np.maximum(0, 1 - (three**2).sum(1, keepdims=True))), three], 1)
-    else:
-        word = turns.view("<u4")
-        parts = np.stack([word >> shift & 1023 for shift in (20, 10, 0)], 1).astype(np.int64)
-        found = three_to_four((word >> 30).astype(np.int64), (parts & 511) / 511 * np.where(parts >> 9, -1.0, 1.0))
-        quaternions = np.empty_like(found)
-        quaternions[:, _TURN] = found
-    bits = rest.reshape(count, bands - 1, 3).astype(np.float64)
-    harmonics = np.concatenate([(tint.reshape(count, 1, 3) / 255 - 0.5) / _TINT, (bits - 128) / 128], 1)
-    points, shift = centred(axes.points(points))
-    gaussians = from_arrays(
-        points,
-        axes.quaternions(quaternions),
-        scales.reshape(count, 3) / 16 - 10,
-        logit(opacity / 255),
-        axes.harmonics(harmonics),
-    )
+@dataclass(frozen=True, kw_only=True)
+class Spz(CaptureFormat):
+    """Niantic's .spz, read in versions 1 to 4 and written in version 3."""
 
-    def recolour(harmonics: Floats, changed: Bools) -> bytes:
-        colours = (tint.reshape(count, 3).copy(), rest.reshape(count, bands - 1, 3).copy())
-        for stream, bytes_ in zip(colours, _colour_bytes(axes.inverse(finite(harmonics[changed]))), strict=True):
-            stream[changed] = bytes_
-        new = dict(zip((2, 5), (stream.tobytes() for stream in colours), strict=True))
-        if header.version > 3:
-            return _framed(path, data, header, new)
-        parts = [new.get(i, each) for i, each in enumerate(streams)]
-        whole = b"".join([unpacked[: header.size], *parts, extensions])
-        return _zipped(whole) + after if packed else whole
+    def recognises(self, head: bytes, size: int) -> bool:
+        return head.startswith((b"\x1f\x8b", b"NGSP"))
 
-    return Capture(path, gaussians, bool(header.flags & 1), data, recolour, shift=shift)
+    def read(self, path: Path, data: bytes) -> Capture:
+        """A .spz file of versions 1 to 4. Raises DataError for others, and for version 4 where `zstandard` is not installed."""
+        # The streams, packed together or each alone.
+        packed = data[:2] == b"\x1f\x8b"
+        unpacked, after = _unzip(path, data) if packed else (data, b"")
+        header = _header(path, unpacked)
+        if header.version < 4:
+            ends = np.cumsum([header.size, *header.sizes]).tolist()
+            if ends[-1] > len(unpacked):
+                raise short(path, len(unpacked), ends[-1], f"{header.number} Gaussians{' unpacked' * packed}")
+            streams = [unpacked[start:stop] for start, stop in itertools.pairwise(ends)]
+            extensions = unpacked[ends[-1] :]
+        else:
+            streams = _frames(path, data, header)
+            extensions = data[header.size : _WIDE_HEADER.unpack_from(data)[-1]]
+        axes = _axes(path, _coordinates(extensions) if header.flags & 2 else _RUB, header.degree)
+        means, opacity, tint, scales, turns, rest = (np.frombuffer(each, np.uint8) for each in streams)
+        count, bands = header.number, COUNTS[header.degree]
+        # Positions and rotations are stored otherwise in each version; the rest never changed.
+        if header.version == 1:
+            points: Floats = means.view("<f2").reshape(count, 3).astype(np.float64)
+        else:
+            low, middle, high = means.reshape(count, 3, 3).astype(np.int32).transpose(2, 0, 1)
+            points = (((low | middle << 8 | high << 16) ^ 0x800000) - 0x800000) / 2.0**header.fraction
+        if header.version < 3:
+            three = turns.reshape(count, 3) / 127.5 - 1
+            quaternions = np.concatenate([np.sqrt(np.maximum(0, 1 - (three**2).sum(1, keepdims=True))), three], 1)
+        else:
+            word = turns.view("<u4")
+            parts = np.stack([word >> shift & 1023 for shift in (20, 10, 0)], 1).astype(np.int64)
+            found = three_to_four((word >> 30).astype(np.int64), (parts & 511) / 511 * np.where(parts >> 9, -1.0, 1.0))
+            quaternions = np.empty_like(found)
+            quaternions[:, _TURN] = found
+        bits = rest.reshape(count, bands - 1, 3).astype(np.float64)
+        harmonics = np.concatenate([(tint.reshape(count, 1, 3) / 255 - 0.5) / _TINT, (bits - 128) / 128], 1)
+        points, shift = centred(axes.points(points))
+        gaussians = from_arrays(
+            points,
+            axes.quaternions(quaternions),
+            scales.reshape(count, 3) / 16 - 10,
+            logit(opacity / 255),
+            axes.harmonics(harmonics),
+        )
 
+        def recolour(harmonics: Floats, changed: Bools) -> bytes:
+            colours = (tint.reshape(count, 3).copy(), rest.reshape(count, bands - 1, 3).copy())
+            for stream, bytes_ in zip(colours, _colour_bytes(axes.inverse(finite(harmonics[changed]))), strict=True):
+                stream[changed] = bytes_
+            new = dict(zip((2, 5), (stream.tobytes() for stream in colours), strict=True))
+            if header.version > 3:
+                return _framed(path, data, header, new)
+            parts = [new.get(i, each) for i, each in enumerate(streams)]
+            whole = b"".join([unpacked[: header.size], *parts, extensions])
+            return _zipped(whole) + after if packed else whole
 
-def spz_keeps(gaussians: Gaussians) -> Bools:
-    """Which Gaussians a file holds: those within the reach of 24 bits whose steps suit the bulk."""
-    means = gaussians.means.numpy()
-    return np.asarray(precise(means, lambda kept, _: _step(kept), _PRECISION) & (np.abs(means) <= 2**23 - 1).all(1))
+        return Capture(path, gaussians, bool(header.flags & 1), data, recolour, shift=shift)
 
+    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> bytes:
+        """Version 3, with as many fractional bits as the largest coordinate leaves."""
+        means, turns, scales, logits, harmonics = arrays(gaussians)
+        axes, fraction = _Axes(False, (1.0, -1.0, -1.0)), -int(np.log2(_step(means)))
+        points = axes.points(means.astype(np.float64)) * 2.0**fraction
+        at = np.clip(np.rint(points), -(2**23), 2**23 - 1).astype(np.int64) & 0xFFFFFF
+        most, three = smallest_three(axes.quaternions(turns.astype(np.float64))[:, _TURN])
+        word = most.astype(np.uint32)
+        for column in three.T:
+            word = word << 10 | (column < 0).astype(np.uint32) << 9 | steps(np.abs(column), 511).astype(np.uint32)
+        tint, rest = _colour_bytes(axes.harmonics(finite(harmonics)))
+        parts = [
+            _HEADER.pack(_MAGIC, 3, len(gaussians), gaussians.degree, fraction, int(antialiased), 0),
+            np.stack([at & 255, at >> 8 & 255, at >> 16], -1).astype(np.uint8).tobytes(),
+            steps(sigmoid(logits), 255).astype(np.uint8).tobytes(),
+            tint.tobytes(),
+            np.clip(np.rint((finite(scales) + 10) * 16), 0, 255).astype(np.uint8).tobytes(),
+            word.astype("<u4").tobytes(),
+            rest.tobytes(),
+        ]
+        return _zipped(b"".join(parts))
 
-def spz_notes(gaussians: Gaussians) -> list[str]:
-    """What else of Gaussians a file cannot hold."""
-    means, largest = gaussians.means.numpy(), gaussians.log_scales.amax(1).numpy()
-    step, side, notes = _step(means), bulk_of(means).side, []
-    if step > 1e-3 * side > 0:
-        notes.append(f"positions in steps of {step:g}, as they lie {float(np.abs(means).max()):.2g} from the origin")
-    limited = int(((largest < _SIZES[0] - 1 / 32) | (largest > _SIZES[1] + 1 / 32)).sum())
-    if limited:
-        notes.append(f"{limited} with sizes that .spz limits to {np.exp(_SIZES[0]):.2g} to {np.exp(_SIZES[1]):.3g}")
-    return notes
+    def keeps(self, gaussians: Gaussians) -> Bools:
+        """Those within the reach of 24 bits whose steps suit the bulk."""
+        means = gaussians.means.numpy()
+        return np.asarray(precise(means, lambda kept, _: _step(kept), _PRECISION) & (np.abs(means) <= 2**23 - 1).all(1))
+
+    def notes(self, gaussians: Gaussians) -> list[str]:
+        means, largest = gaussians.means.numpy(), gaussians.log_scales.amax(1).numpy()
+        step, side, notes = _step(means), bulk_of(means).side, []
+        if step > 1e-3 * side > 0:
+            notes.append(f"positions in steps of {step:g}, as they lie {float(np.abs(means).max()):.2g} from the origin")
+        limited = int(((largest < _SIZES[0] - 1 / 32) | (largest > _SIZES[1] + 1 / 32)).sum())
+        if limited:
+            notes.append(f"{limited} with sizes that .spz limits to {np.exp(_SIZES[0]):.2g} to {np.exp(_SIZES[1]):.3g}")
+        return notes
 
 
 def _step(means: Floats) -> float:
@@ -144,29 +189,6 @@ def _step(means: Floats) -> float:
     if largest > 2**23 - 1:
         return np.inf
     return float(2.0 ** -np.clip(np.floor(np.log2((2**23 - 1) / max(largest, 1e-9))), 0, _FRACTION))
-
-
-def spz_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
-    """A file of version 3, with as many fractional bits as the largest coordinate leaves."""
-    axes, means = _Axes(False, (1.0, -1.0, -1.0)), gaussians.means.numpy().astype(np.float64)
-    fraction = -int(np.log2(_step(means)))
-    at = np.clip(np.rint(axes.points(means) * 2.0**fraction), -(2**23), 2**23 - 1).astype(np.int64) & 0xFFFFFF
-    most, three = smallest_three(axes.quaternions(gaussians.quaternions.numpy().astype(np.float64))[:, _TURN])
-    word = most.astype(np.uint32)
-    for column in three.T:
-        word = word << 10 | (column < 0).astype(np.uint32) << 9 | steps(np.abs(column), 511).astype(np.uint32)
-    tint, rest = _colour_bytes(axes.harmonics(finite(gaussians.harmonics.numpy())))
-    flags = 1 if antialiased else 0
-    parts = [
-        _HEADER.pack(_MAGIC, 3, len(gaussians), gaussians.degree, fraction, flags, 0),
-        np.stack([at & 255, at >> 8 & 255, at >> 16], -1).astype(np.uint8).tobytes(),
-        steps(sigmoid(gaussians.logits.numpy()), 255).astype(np.uint8).tobytes(),
-        tint.tobytes(),
-        np.clip(np.rint((finite(gaussians.log_scales.numpy()) + 10) * 16), 0, 255).astype(np.uint8).tobytes(),
-        word.astype("<u4").tobytes(),
-        rest.tobytes(),
-    ]
-    return _zipped(b"".join(parts))
 
 
 class _Axes(NamedTuple):
@@ -215,7 +237,7 @@ def _turn(bands: int) -> Floats:
     there = torch.nn.functional.normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(0)).double(), dim=1)
     before = torch.stack([there[:, 0], -there[:, 2], there[:, 1]], 1)
     degree = math.isqrt(bands)
-    return np.asarray(torch.linalg.lstsq(harmonic_functions(there, degree), harmonic_functions(before, degree)).solution)
+    return np.asarray(torch.linalg.lstsq(spherical_harmonics(there, degree), spherical_harmonics(before, degree)).solution)
 
 
 def _axes(path: Path, number: int, degree: int) -> _Axes:

@@ -1,4 +1,4 @@
-"""Averages over mirrored and resized images."""
+"""Encoders side by side."""
 
 import pytest
 import torch
@@ -7,35 +7,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fprf.plugins.encoders.composed import UNITS, AveragedEncoder, ConcatEncoder, unit_of
+from fprf.plugins.encoders.composed import UNITS, ConcatEncoder, unit_of
 from fprf.plugins.encoders.config import (
     SEMANTICS,
-    AveragedConfig,
     ConcatConfig,
     Dinov2Config,
     RandomConfig,
 )
 from fprf.plugins.encoders.frozen import street
-
-
-@settings(max_examples=15, deadline=None)
-@given(st.integers(1, 40), st.integers(1, 40), st.sampled_from([(1.0,), (1.0, 1.5), (0.5, 2.0)]))
-def test_a_mirrored_image_has_mirrored_features(height: int, width: int, scales: tuple[float, ...]) -> None:
-    encoder = AveragedConfig(inner=RandomConfig(stride=3), scales=scales).build()
-    image = torch.rand(1, 3, height, width)
-    torch.testing.assert_close(encoder(image.flip(-1)), encoder(image).flip(-1))
-
-
-@pytest.mark.parametrize("flip", [False, True])
-def test_it_is_the_mean_over_mirror_images_and_sizes_on_the_finest_ones_cells(flip: bool) -> None:
-    image, inner = torch.rand(1, 3, 32, 48), RandomConfig(stride=4).build()
-    both = AveragedEncoder(inner, flip=flip, scales=(0.5, 1.0))(image)
-    looks = []
-    for seen in (image, image.flip(-1))[: 1 + flip]:
-        small = F.interpolate(seen, (16, 24), mode="bilinear", antialias=True)
-        found = F.interpolate(inner(small), (8, 12), mode="bilinear") + inner(seen)
-        looks.append(found if seen is image else found.flip(-1))
-    torch.testing.assert_close(both, sum(looks) / (2 * len(looks)))
 
 
 def length(features: Tensor) -> Tensor:

@@ -7,19 +7,15 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from network_files import deeplab_file, espnet_file, mobilenet_file, vgg_file
+from network_files import vgg_file
 
 from fprf.interfaces import Encoder
 from fprf.plugins.encoders.config import (
-    AveragedConfig,
     BundledContentConfig,
     BundledSemanticConfig,
     ConcatConfig,
-    DeepLabConfig,
     Dinov2Config,
     EncoderConfig,
-    EspNetConfig,
-    MobileNetV2Config,
     RandomConfig,
     Vgg16Config,
     Vgg19Config,
@@ -34,17 +30,8 @@ ENCODERS: dict[str, tuple[Make, int]] = {
     "vgg16": (lambda folder: Vgg16Config(weights=vgg_file(folder), layer="relu2_2"), 2),
     "vgg19-normalised": (lambda folder: Vgg19Config(weights=vgg_file(folder)), 2),
     "vgg19-plain": (lambda folder: Vgg19Config(weights=vgg_file(folder), normalise=False, layer="conv3_1"), 4),
-    "mobilenet-torchvision": (lambda folder: MobileNetV2Config(weights=mobilenet_file(folder, tensorflow=False)), 16),
-    "mobilenet-keras": (
-        lambda folder: MobileNetV2Config(weights=mobilenet_file(folder, tensorflow=True), layer="features.18"),
-        32,
-    ),
-    "deeplab": (lambda folder: DeepLabConfig(weights=deeplab_file(folder)), 16),
-    "deeplab-logits": (lambda folder: DeepLabConfig(weights=deeplab_file(folder), layer="logits"), 16),
-    "espnet": (lambda folder: EspNetConfig(weights=espnet_file(folder)), 16),
     "dinov2": (lambda _: Dinov2Config(layer=3, stride=5), 5),
     "dinov2-keys": (lambda _: Dinov2Config(layer=2, features="keys", stride=20), 20),
-    "averaged": (lambda _: AveragedConfig(inner=RandomConfig(stride=4), scales=(1.0, 2.0)), 2),
     "concat": (lambda _: ConcatConfig(first=RandomConfig(stride=8), second=RandomConfig(stride=4, channels=3)), 4),
 }
 
@@ -91,17 +78,12 @@ def test_a_bright_spot_answers_where_it_is(built: tuple[Encoder, int]) -> None:
 
 def test_identities_differ_with_settings(tmp_path: Path) -> None:
     file, other = vgg_file(tmp_path), vgg_file(tmp_path, normalisation=False)
-    keras, one, two = mobilenet_file(tmp_path, tensorflow=True), RandomConfig(), RandomConfig(seed=1)
+    one, two = RandomConfig(), RandomConfig(seed=1)
     configs = [
-        one, two, AveragedConfig(), ConcatConfig(),
+        one, two, ConcatConfig(),
         RandomConfig(stride=2), RandomConfig(channels=3), BundledContentConfig(), BundledSemanticConfig(),
         Vgg16Config(weights=file), Vgg19Config(weights=file), Vgg19Config(weights=file, normalise=False),
         Vgg19Config(weights=file, layer="conv2_1"), Vgg19Config(weights=other),
-        MobileNetV2Config(weights=mobilenet_file(tmp_path, tensorflow=False)), MobileNetV2Config(weights=keras),
-        MobileNetV2Config(weights=keras, layer="features.12"), DeepLabConfig(weights=deeplab_file(tmp_path)),
-        DeepLabConfig(weights=deeplab_file(tmp_path), layer="logits"), EspNetConfig(weights=espnet_file(tmp_path)),
-        EspNetConfig(weights=espnet_file(tmp_path), layer="level3"), AveragedConfig(inner=one), AveragedConfig(inner=two),
-        AveragedConfig(inner=one, flip=False), AveragedConfig(inner=one, scales=(1.0, 2.0)),
         Dinov2Config(layer=3), Dinov2Config(layer=2), Dinov2Config(layer=3, stride=8), Dinov2Config(layer=3, features="keys"),
         ConcatConfig(first=one, second=two), ConcatConfig(first=two, second=one),
         ConcatConfig(first=one, second=two, cells="first"), ConcatConfig(first=one, second=two, weights=(0.5,)),

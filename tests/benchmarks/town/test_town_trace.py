@@ -1,0 +1,85 @@
+"""The vectorised tracer against one ray at a time, written from the definitions of the solids."""
+
+import math
+
+import numpy as np
+import pytest
+
+from benchmarks.town.layout import build_town
+from benchmarks.town.render import cast, directions, shadowed, walk
+from benchmarks.town.shapes import Cylinder, Ellipsoid, Material, Polyhedron
+
+TOWN = build_town(0)
+
+
+def slow_enter(shape, o, d):
+    """Entry distance of one ray in plain floats, inf where it misses."""
+    if isinstance(shape, Polyhedron):
+        start, stop = -math.inf, math.inf
+        for n, offset in zip(shape.normals, shape.offsets, strict=True):
+            room = offset - sum(float(n[i]) * o[i] for i in range(3))
+            slope = sum(float(n[i]) * d[i] for i in range(3))
+            if slope == 0:
+                if room < 0:
+                    return math.inf
+            elif slope < 0:
+                start = max(start, room / slope)
+            else:
+                stop = min(stop, room / slope)
+        return start if 1e-4 < start <= stop else math.inf
+    if isinstance(shape, Ellipsoid):
+        p, q = ([(v[i] - w[i]) / shape.radii[i] for i in range(3)] for v, w in ((o, shape.centre), (d, (0, 0, 0))))
+    else:
+        p, q = (
+            [(v[i] - w[i]) / shape.radius for i in range(2) for v, w in ((o, shape.centre),)],
+            [d[i] / shape.radius for i in range(2)],
+        )
+    a, b, c = sum(v * v for v in q), 2 * sum(v * w for v, w in zip(p, q, strict=True)), sum(v * v for v in p) - 1
+    if b * b - 4 * a * c <= 0:
+        return math.inf
+    t = (-b - math.sqrt(b * b - 4 * a * c)) / (2 * a)
+    if isinstance(shape, Cylinder) and not shape.low[2] <= o[2] + t * d[2] <= shape.high[2]:
+        return math.inf
+    return t if t > 1e-4 else math.inf
+
+
+def test_depth_and_face_are_those_of_a_plain_loop():
+    town, rng = build_town(3), np.random.default_rng(3)
+    for view in walk(seed=3, views=5, width=40, height=30):
+        d = np.stack(directions(view, 1), -1)
+        distance, face = cast(town, view, directions(view, 1), 1)
+        for row, column in zip(rng.integers(0, 30, 24), rng.integers(0, 40, 24), strict=True):
+            place, way = view.pose[:, 3].tolist(), d[row, column].tolist()
+            ground = -place[2] / way[2] if way[2] < 0 else math.inf
+            slow = min(ground, *(slow_enter(shape, place, way) for shape in town.shapes))
+            assert distance[row, column] == pytest.approx(slow, rel=1e-10)
+            assert (face[row, column] < 0) == (slow == math.inf)
+        # Every ray meets its flat face from outside, on its plane and within its extent.
+        flat = (face > 0) & ~town.faces.curve[face].any(-1)
+        u, v, origin = (part[face[flat]] for part in (town.faces.u, town.faces.v, town.faces.origin))
+        normal, at = np.cross(u, v), view.pose[:, 3] + distance[flat][:, None] * d[flat] - origin
+        assert flat.sum() > 100 and ((normal * d[flat]).sum(1) < 0).all()
+        assert np.abs((at * normal).sum(1)).max() < 1e-9
+        within = np.stack([(at * u).sum(1), (at * v).sum(1)], 1)
+        assert (within > -1e-9).all() and (within < town.faces.extent[face[flat]] + 1e-9).all()
+
+
+def test_finer_grids_and_smaller_windows_change_no_ray():
+    view = walk(seed=0, views=5, width=30, height=20)[1]
+    triple = cast(TOWN, view, directions(view, 3), 3)
+    single = cast(TOWN, view, directions(view, 1), 1)
+    np.testing.assert_allclose(triple.distance[1::3, 1::3], single.distance, rtol=1e-12)
+    assert (triple.face[1::3, 1::3] == single.face).mean() > 0.999
+
+
+def test_shadows_are_those_of_a_plain_loop():
+    rng = np.random.default_rng(5)
+    points = np.column_stack([rng.uniform(-5, 40, 150), rng.uniform(-8, 8, 150), rng.uniform(0, 3, 150)])
+    sun = np.array([-0.5, -0.6, 0.6])
+    sun /= np.linalg.norm(sun)
+    leafy = np.array([TOWN.faces.material[k] == Material.FOLIAGE for k in TOWN.first])
+    solid, leaves = shadowed(TOWN, points, sun, leafy)
+    for k, p in enumerate(points.tolist()):
+        hits = np.array([slow_enter(shape, p, sun.tolist()) < math.inf for shape in TOWN.shapes])
+        assert (solid[k], leaves[k]) == (bool((hits & ~leafy).any()), bool((hits & leafy).any()))
+    assert 0.1 < (solid | leaves).mean() < 0.9
