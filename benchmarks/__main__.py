@@ -124,11 +124,11 @@ def main(args: list[str]) -> int:
                 flags.remove("--quick")
                 town, run = cached_town(views=8, width=48, height=36), f"{folder}/run"
                 if "{run}" in chosen.quick:
-                    from fprf.cli.train import train_scene
+                    from fprf.training.driver import train
 
                     from .kills import tiny
 
-                    train_scene(replace(tiny(town, steps=20), output=Path(run), checkpoint_minutes=5.0), "fprf-lite")
+                    train(replace(tiny(town, steps=20), output=Path(run), checkpoint_minutes=5.0), "fprf-lite")
                 flags = [*shlex.split(chosen.quick.format(town=town, run=run, folder=folder)), *flags]
             return importlib.import_module(f".{name}", __package__).main(flags) or 0
     except FprfError as error:

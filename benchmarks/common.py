@@ -17,10 +17,10 @@ from rich.console import Console
 
 from fprf.checks import at_least
 from fprf.cli.parsing import as_flag, load_field_method, parse
-from fprf.cli.progress import Display
-from fprf.cli.train import train_scene
 from fprf.errors import FprfError
 from fprf.io.atomic import write_json, write_text
+from fprf.progress import Display
+from fprf.training.driver import train
 
 from .report import Outcome, provenance
 from .town.write import scene_folder
@@ -154,7 +154,7 @@ def train_run(output: Path, method: str, data: Path | None, *, steps: int, devic
     """Train fields for the steps; without data on the method's own, or else on the town. Returns the run folder."""
     chosen, name = load_field_method(method)
     scene = scene_folder(data or chosen.data or Path("town"))
-    return train_scene(replace(chosen, data=scene, output=output, steps=steps, minutes=None, device=device), name)
+    return train(replace(chosen, data=scene, output=output, steps=steps, minutes=None, device=device), name)
 
 
 def console() -> Console:

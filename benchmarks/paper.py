@@ -20,7 +20,6 @@ from torch import Tensor, nn
 
 from fprf.checks import at_least, between
 from fprf.cli.parsing import load_field_method, parse
-from fprf.cli.progress import Display
 from fprf.config import TrainConfig
 from fprf.datamanagers.images import load_image
 from fprf.evaluation.metrics import image_metrics, matched_regions, mean_metrics, structure
@@ -30,16 +29,18 @@ from fprf.io.images import shrink, to_uint8, write_image
 from fprf.plugins.decoders.config import DecoderConfig, MlpDecoderConfig
 from fprf.plugins.encoders.config import Vgg19Config
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionToneConfig, StylizerConfig
+from fprf.progress import Display
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
 from fprf.style.references import Encoders
 from fprf.style.restyle import apply_style
+from fprf.training.driver import Report, learn, schedule_of
+from fprf.training.learner import FieldLearner
 from fprf.training.loading import Trained, encoders_of
-from fprf.training.prepare import prepare, scene_of
+from fprf.training.prepare import device_of, prepare, read_scene
 from fprf.training.run import Run
 from fprf.training.style_pass import measure_style
-from fprf.training.trainer import Report, train
 from fprf.training.views import cache_view, render_view
 
 from .common import Progress, console, origin
@@ -182,7 +183,7 @@ class Short(NamedTuple):
 
 def short_training(config: TrainConfig, folder: Path, progress: Progress) -> Short:
     """Prepare, train and measure the scene's style, without a run folder that others could read."""
-    prepared = prepare(config)
+    prepared = prepare(config, read_scene(config))
     run = Run(folder)
     run.root.mkdir(parents=True)
     assert config.data is not None
@@ -192,7 +193,9 @@ def short_training(config: TrainConfig, folder: Path, progress: Progress) -> Sho
     def report(event: Report) -> None:
         progress(event.step, config.steps, "training")
 
-    model = train(config, prepared, run, report).requires_grad_(False).eval()
+    learner = FieldLearner(config, prepared, device_of(config.device))
+    learn(learner, run, schedule_of(config, len(prepared.scene.train)), report)
+    model = learner.model.requires_grad_(False).eval()
     trained = Trained(run, config, "", run.load_known(), model, config.steps, time.perf_counter() - start)
     scene = measure_style(config, model, prepared.scene.cameras, prepared.scene.train)
     return Short(trained, encoders_of(trained, scene, prepared.basis))
@@ -201,7 +204,7 @@ def short_training(config: TrainConfig, folder: Path, progress: Progress) -> Sho
 def held_out(trained: Trained, views: int) -> Row:
     """PSNR, SSIM and LPIPS of held-out views against their photographs."""
     known, config = trained.known, trained.config
-    scene, found = scene_of(config), []
+    scene, found = read_scene(config), []
     for view in (known.test or known.train)[:views]:
         render = render_view(trained.model, known.facts, known.cameras, view, config.render).rgb
         size = (render.shape[1], render.shape[0])

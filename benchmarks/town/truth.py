@@ -32,6 +32,7 @@ from fprf.rendering.cameras import Cameras
 from fprf.style.dictionary import StyleDictionary
 from fprf.style.references import Encoders
 from fprf.style.statistics import monge
+from fprf.training.prepare import read_scene
 from fprf.training.run import Known
 
 from ..single_image import encoded
@@ -101,7 +102,7 @@ def set_stage(
 
 def town_folder(config: RunConfig) -> Path | None:
     """Folder of the town that a run was trained on; None where it was another scene."""
-    folder = config.read_scene().paths[0].parents[1]
+    folder = read_scene(config).paths[0].parents[1]
     return folder if is_town(folder) else None
 
 

@@ -16,7 +16,7 @@ _ROWS = 20_480
 """Rows worth clustering: more do not move the centroids, and cost more than half a second."""
 
 _FEW = 4096
-"""Rows on which Lloyd's steps start: neighbouring pixels are alike, and these find the same clusters at a quarter of the cost."""
+"""Rows on which Lloyd's steps start: neighbouring pixels are alike; they find the same clusters at a quarter of the cost."""
 
 _ITERATIONS, _REFINED = 40, 4
 """Lloyd steps at most on few rows (photographs settle in 10 to 40, pure noise never does), and on all of them after that."""
