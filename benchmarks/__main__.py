@@ -36,7 +36,7 @@ BENCHMARKS = {
     "exports": Benchmark("exported files drawn again, against the scene's own renders", "{run} --views 1", _TRAINED),
     "fuzz": Benchmark("every reader on a million mutated files", "--rounds 40", "hours for the million; Linux"),
     "fuzz_guided": Benchmark(
-        "every reader under libFuzzer", "--minutes 0.2 --only png", "the package atheris; Linux", ("atheris",)
+        "every reader under libFuzzer", '--minutes 0.2 --only "image, png"', "the package atheris; Linux", ("atheris",)
     ),
     "gaussians": Benchmark("the rasteriser of 3D Gaussians: time and error", "--count 500 --times 2"),
     "kernels": Benchmark("what each compiled kernel brings end to end", "{run} --repeats 1", _TRAINED),
@@ -54,7 +54,7 @@ BENCHMARKS = {
     ),
     "paper": Benchmark(
         "the paper's ablations on the town, or on another scene by photographs",
-        "--data {town} --steps 5 --views 1 --palettes night --device cpu",
+        "--method {run}/config.json --data {town} --steps 5 --views 1 --palettes night --device cpu",
         "a scene of --data; VGG-19's weights in the cache where photographs restyle it",
     ),
     "pareto": Benchmark("time against error, knob by knob", _RUN, _TRAINED),

@@ -43,7 +43,7 @@ def inside(name: str, corpora: list[str], options: list[str]) -> None:
 
     for module in THIRD_PARTY:
         importlib.import_module(module)
-    for module in [module for module in sys.modules if module.split(".")[0] == "fprf"]:
+    for module in [each for each in sys.modules if each.split(".")[0] == "fprf" or each == "benchmarks.readers"]:
         del sys.modules[module]  # this script's own, which nobody watched
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
         with atheris.instrument_imports(include=["fprf"]):
