@@ -47,6 +47,7 @@ def fit_gaussians(
     What is rendered are `views` and as many between them. `points` are where Gaussians begin; at most 0.7 `cap` of them are
     taken, and there are at most `cap` Gaussians in the end.
     """
+    # The field is photographed from the views and between them, and learnt like any scene.
     cameras, facts = _with_midpoints(trained.known.cameras.select(torch.tensor(views))), trained.known.facts
     count, every = len(cameras), torch.arange(len(cameras))
     paths = (Path("field"),) * count
@@ -61,6 +62,7 @@ def fit_gaussians(
     for number, look in enumerate(looks):
         images = _renders(trained, cameras, look, report)
         levels = make_levels(scene, images, {}, near)
+        # The first look decides the geometry; in further ones the same Gaussians learn their colours at full size.
         if learner is None:
             learner = GaussianLearner(config, levels, reach, cap)
             learner.begin_at(points, draw)

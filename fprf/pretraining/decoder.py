@@ -143,6 +143,7 @@ def prepare_crops(
 
     `measure` sets the network's units from these crops. Encoder and network must be on `device`; None = the CPU.
     """
+    # Crops of one size, small enough for every photograph.
     loaded = [load_photo(path, longest).to(device) for path in photos]
     side = min(side, *(min(photo.shape[:2]) for photo in loaded))
     made = [filtered_crop(encoder, photo, side, generator_of(seed, i)) for i, photo in enumerate(loaded)]

@@ -112,6 +112,7 @@ def train(
             show(event.step)
             shown = now
 
+    # The folder is a run's, as far as the driver needs one; it goes when the weights are there.
     run = Run(training_folder(output))
     schedule = Schedule(config.steps, None if config.steps is not None else config.minutes, _SAVED / 60)
     with held(run.root):

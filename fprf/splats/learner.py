@@ -231,8 +231,8 @@ class GaussianLearner(SceneLearner):
                 _adam(self.corrections["tones.exponent"], slope, _EXPONENT * rate)
         if self.poses is not None:
             # The gradient of a rotation vector is taken for that of a further turn: exact to first order in how far views turn.
-            turn, shift = torch.from_numpy(measured.of_camera).split(3)
-            slope = torch.cat([torch.from_numpy(target.axes).T @ turn, self.poses.reach * shift]).float()
+            gradient = torch.from_numpy(measured.of_camera)
+            slope = torch.cat([torch.from_numpy(target.axes).T @ gradient[:3], self.poses.reach * gradient[3:]]).float()
             _adam([each[view] for each in self.corrections["poses.offset"]], slope, self.config.poses * 0.1**share)
 
     def _relocate(self, step: int, level: Level, share: float) -> None:
@@ -330,17 +330,18 @@ def halves(
     return first, second
 
 
-def run_scene(config: GaussiansConfig, known: Known, gaussians: Gaussians, near: float) -> SplatScene:
-    """The scene of a run; its semantics are found when they are first asked for."""
+def run_scene(config: GaussiansConfig, known: Known, gaussians: Gaussians, near: float, *, quick: bool = False) -> SplatScene:
+    """The scene of a run; its semantics are found when they are first asked for, `quick` in few, small views."""
     encoder = cache(config.semantic.encoder.build)
+    count, side = (_VIEWS // 4, config.semantic_size // 2) if quick else (_VIEWS, config.semantic_size)
 
     def found() -> Semantics:
         every = torch.tensor(known.train)
-        views = known.cameras.select(every[torch.linspace(0, len(every) - 1, min(_VIEWS, len(every))).round().long()])
-        views = views.scaled(max(1.0, float(views.size.amax()) / config.semantic_size))
+        views = known.cameras.select(every[torch.linspace(0, len(every) - 1, min(count, len(every))).round().long()])
+        views = views.scaled(max(1.0, float(views.size.amax()) / side))
         return find_semantics(gaussians, True, encoder(), views, config.regions, near=near)
 
-    longest = min(config.semantic_size, int(known.cameras.size.amax()))
+    longest = min(side, int(known.cameras.size.amax()))
     return SplatScene(
         gaussians, True, known.cameras, known.names, cache(found), encoder, longest, near, config.background,
         origin=known.facts.origin,
