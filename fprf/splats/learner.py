@@ -51,7 +51,7 @@ Narrow = Callable[[TrainableGaussians, int], None]
 """Cuts standard deviations in place after a step."""
 
 
-class Part(NamedTuple):
+class Stage(NamedTuple):
     """The part of a whole schedule that a learner is given to train."""
 
     before: int = 0
@@ -84,12 +84,12 @@ class GaussianLearner(Learner):
         tones: Tones | None = None,
         poses: Poses | None = None,
         only: Literal["colours", "poses"] | None = None,
-        part: Part | None = None,
+        stage: Stage | None = None,
         known: Known | None = None,
         origin: str = "",
     ) -> None:
         self.inside, self.narrow, self.near, self.known, self.origin = inside, narrow, near, known, origin
-        self.config, self.levels, self.reach, self.part = config, levels, reach, part or Part()
+        self.config, self.levels, self.reach, self.stage = config, levels, reach, stage or Stage()
         self.bands = (config.degree + 1) ** 2
         self.begun = self.pixels = self.skipped = self.failed = 0
         self.means: dict[str, float] = {}
@@ -135,7 +135,7 @@ class GaussianLearner(Learner):
 
     def step(self, index: int, share: float) -> None:
         """Learn from one view."""
-        step, share = self.part.before + index, self.part.first + (self.part.last - self.part.first) * share
+        step, share = self.stage.before + index, self.stage.first + (self.stage.last - self.stage.first) * share
         # Half the size until `coarse`, a quarter until a third of that, and so on.
         reduced = sum(share < self.config.coarse / 3**k for k in range(len(self.levels) - 1))
         level = self.levels[reduced]
