@@ -41,12 +41,13 @@ def never(*tensors: object) -> bool:
     return False
 
 
-def plain_lookups(store: FeatureStore, *given: Tensor) -> None:
+KERNEL_LOOKUPS = FeatureStore.at
+
+
+def plain_lookups(store: FeatureStore, view: Tensor, pixel: Tensor, rgb: Tensor) -> Tensor:
     """Guided features by `guided.apply_packed`."""
-    *asked, out = given
     there = packed.setdefault(id(store), store.to(torch.device("cpu")))
-    slots = torch.tensor(list(store._slots))
-    out.copy_(there.at(slots[asked[0]], asked[1], asked[2]))
+    return KERNEL_LOOKUPS(there, view, pixel, rgb)
 
 
 packed: dict[int, FeatureStore] = {}
@@ -61,7 +62,7 @@ SWITCHES: dict[str, Patches] = {
     "styles at points": [(mixture, "usable", never), (matching, "usable", never)],
     "styles at points: matching": [(matching, "usable", never)],
     "styles at points: maps": [(mixture, "usable", never)],
-    "guided features": [(FeatureStore, "_compiled", plain_lookups)],
+    "guided features": [(FeatureStore, "at", plain_lookups)],
 }
 """What is replaced where a kernel is off."""
 
