@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import torch
 
     from .datamanagers.scene import Scene as ParsedScene
-    from .interfaces import Learner, Partition
+    from .interfaces import Partition, SceneLearner
     from .training.model import Facts
 
 
@@ -232,7 +232,7 @@ class RunConfig:
         *,
         saved: "Facts | None" = None,
         progress: Callable[[int, int, str], None] | None = None,
-    ) -> "Learner | Partition":
+    ) -> "SceneLearner | Partition":
         """Build what learns a scene, with its images read; imports its implementation.
 
         `saved` are the facts of a run that goes on: nothing that was measured for them is measured again. `progress` is told
@@ -357,7 +357,7 @@ class TrainConfig(RunConfig):
         *,
         saved: "Facts | None" = None,
         progress: Callable[[int, int, str], None] | None = None,
-    ) -> "Learner | Partition":
+    ) -> "SceneLearner | Partition":
         """Extract the features and build the model; blocks where the scene is cut."""
         from .training.learner import FieldLearner
         from .training.prepare import prepare

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import torch
 
     from ..datamanagers.scene import Scene
-    from ..interfaces import Learner, Partition
+    from ..interfaces import Partition, SceneLearner
     from ..training.model import Facts
 
 
@@ -134,7 +134,7 @@ class GaussiansConfig(RunConfig):
         *,
         saved: "Facts | None" = None,
         progress: Callable[[int, int, str], None] | None = None,
-    ) -> "Learner | Partition":
+    ) -> "SceneLearner | Partition":
         """Read the photographs and find the first points; cells where there are to be some."""
         if self.cells > 1:
             from .cells import Cells
