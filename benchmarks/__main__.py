@@ -94,6 +94,7 @@ BENCHMARKS = {
     "town": Benchmark(
         "write a town as a scene folder", "{folder}/town --views 2 --width 24 --height 18", "a folder to write into"
     ),
+    "tables": Benchmark("tables of the documents, made from the results", "--check", "a clone"),
     "viewer_speed": Benchmark(
         "response times and memory of the viewer", "{run} --parts start", "the extra viewer, playwright and a Chromium"
     ),
