@@ -42,25 +42,6 @@ def cells(points, first, count, apart, across, size, start, channels, corner, pa
         corner[2 * BLOCK + n] = (start + 2 * plane + k * size + j) * channels
 
 
-@numba.njit(inline="always", cache=True)
-def features(points, first, count, table, channels, sizes, starts, corner, part, out, to):
-    """For `count` <= BLOCK points [3] the products of their samples, scales side by side, to out[to :]."""
-    scales = len(sizes)
-    for scale in range(scales):
-        size = sizes[scale]
-        cells(points, first, count, 3, 1, size, starts[scale], channels, corner, part)
-        for n in range(count):
-            a, b, c = corner[n], corner[BLOCK + n], corner[2 * BLOCK + n]
-            u, v, w = part[n], part[BLOCK + n], part[2 * BLOCK + n]
-            o = to + (n * scales + scale) * channels
-            if channels % WIDE == 0:
-                for s in range(0, channels, WIDE):
-                    product_forward(table, out, a + s, b + s, c + s, o + s, channels, size * channels, u, v, w, WIDE)
-            else:
-                for s in range(0, channels, NARROW):
-                    product_forward(table, out, a + s, b + s, c + s, o + s, channels, size * channels, u, v, w, NARROW)
-
-
 # The inner steps take several channels at a time: left to the compiler they are 3 times slower on 196 608 points, forward and
 # backward. Offsets are in numbers from the start of flat arrays; `step` and `stride` lead to the next node along the row and
 # to the next row; u, v, w are the shares of the next nodes.
@@ -115,12 +96,25 @@ def product_slopes(table, grad, sums, a, b, c, o, step, stride, u, v, w):
 @_jit
 def forward(points, table, channels, sizes, starts, out):
     """out[n, scale, c] = product over the planes of the bilinear sample at point n."""
-    total = len(points) // 3
+    total, scales = len(points) // 3, len(sizes)
     for task in numba.prange((total + BLOCK - 1) // BLOCK):
         first = task * BLOCK
         corner, part = np.empty(3 * BLOCK, np.int64), np.empty(3 * BLOCK, np.float32)
         count = min(BLOCK, total - first)
-        features(points, first, count, table, channels, sizes, starts, corner, part, out, first * len(sizes) * channels)
+        for scale in range(scales):
+            size = sizes[scale]
+            cells(points, first, count, 3, 1, size, starts[scale], channels, corner, part)
+            for n in range(count):
+                a, b, c = corner[n], corner[BLOCK + n], corner[2 * BLOCK + n]
+                u, v, w = part[n], part[BLOCK + n], part[2 * BLOCK + n]
+                o = ((first + n) * scales + scale) * channels
+                # The number of channels at a time is a constant of the compiled code.
+                if channels % WIDE == 0:
+                    for s in range(0, channels, WIDE):
+                        product_forward(table, out, a + s, b + s, c + s, o + s, channels, size * channels, u, v, w, WIDE)
+                else:
+                    for s in range(0, channels, NARROW):
+                        product_forward(table, out, a + s, b + s, c + s, o + s, channels, size * channels, u, v, w, NARROW)
 
 
 @_jit

@@ -97,12 +97,6 @@ def fit_poses(
     return poses.moved_by()
 
 
-def load_tones(run: Run) -> Tones | None:
-    """The exposure of each view of a run; None where that was not learnt."""
-    saved, _ = checkpoint.load_latest(run.checkpoints)
-    return None if saved is None else tones_in(saved, run.load_known().facts)
-
-
 def tones_in(saved: checkpoint.Saved, facts: Facts) -> Tones | None:
     """The exposures that a checkpoint holds; None where they were not learnt."""
     tones = tones_of(facts)

@@ -84,7 +84,7 @@ def surroundings(config: TrainConfig, facts: Facts, cells: Sequence[Cell]) -> Bu
     """The coarse scene that everything starts from. Raises PluginError where a part breaks its contract at once."""
     decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
     member = Member(surroundings_of(cells), *build_fields(config, facts))
-    model = assemble(config, facts, Held([member]), Everywhere(), decoder, tones_of(facts), poses_of(config, facts))
+    model = assemble(config, facts, Held([member]), Everywhere(), decoder, tones_of(facts), poses_of(facts, config.poses))
     check_parts(config, model.parts, facts.channels, facts.dim)
     return Built(model, member)
 

@@ -181,7 +181,7 @@ def learn(
     first, clock, went_back = step, before, -1
     begun = last_report = last_saved = time.perf_counter()
     pause = longest = 60 * schedule.checkpoint_minutes
-    cost = _SAVING_SHARE
+    cost = 0.1  # seconds of a checkpoint, until one is measured
     figures: Figures | None = None
 
     def save() -> None:
@@ -230,7 +230,10 @@ def learn(
         except Exception as error:
             if not out_of_memory(error):
                 raise
-            raise shortage(f"training step {step}", error, _less_memory(run)) from error
+            steps = [] if run is None else checkpoint.steps(run.checkpoints)
+            kept = f"the checkpoint of step {steps[-1]} is kept" if steps else "there is no checkpoint yet"
+            remedy = f"lower --datamanager.rays (of fields), or begin anew with a larger --downscale ({kept})"
+            raise shortage(f"training step {step}", error, remedy) from error
     if saved is None or step > saved.step:
         save()
     if step > first and figures is not None:
@@ -264,13 +267,6 @@ def _go_back(learner: Learner, run: Run | None, figures: Figures, step: int, bef
     learner.load(saved.state)
     run.log({"step": step, "gone_back_to": saved.step, "because": why})
     return saved.step
-
-
-def _less_memory(run: Run | None) -> str:
-    """Advice where there is not enough memory for a step."""
-    steps = [] if run is None else checkpoint.steps(run.checkpoints)
-    kept = f"the checkpoint of step {steps[-1]} is kept" if steps else "there is no checkpoint yet"
-    return f"lower --datamanager.rays (of fields), or begin anew with a larger --downscale ({kept})"
 
 
 def watch(root: Path) -> None:
