@@ -40,7 +40,7 @@ VERBS = {
     "eval": Verb("RUN", "measure a run: quality, speed, consistency"),
     "stylize": Verb("RUN --references A.jpg ...", "restyle captured views with photographs"),
     "restyle": Verb("A.ply --references A.jpg ...", "restyle a capture of 3D Gaussians from its file alone"),
-    "gallery": Verb("RUN --references DIR", "every view in every style, as one page that can be sent"),
+    "gallery": Verb("RUN --references DIR", "a run in every style, as one page to walk through"),
     "render": Verb("RUN --path PATH --output X.mp4", "fly through a scene, plain or restyled"),
     "view": Verb("[RUN]", "in the browser: make a scene, drop a photograph on it"),
     "export": Verb("RUN [ply splat glb cameras lut]", "points, splats, meshes, cameras, lookup tables as files"),
@@ -118,7 +118,8 @@ def run_verb(verb: str, args: list[str]) -> int:
 
 
 def _help() -> str:
-    bold, dim, plain = ("\x1b[1m", "\x1b[2m", "\x1b[0m") if _colour() else ("", "", "")
+    colour = sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+    bold, dim, plain = ("\x1b[1m", "\x1b[2m", "\x1b[0m") if colour else ("", "", "")
     others = packaged()
     width = max(map(len, [*VERBS, *others]))
     broad = max(len(verb.usage) for verb in VERBS.values())
@@ -134,10 +135,6 @@ def _help() -> str:
         "`fprf VERB --help` shows every flag of a verb, `fprf train` lists the methods. Start with `fprf demo`.",
     ]
     return "\n".join(lines)
-
-
-def _colour() -> bool:
-    return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 
 
 def _our_fault(error: Exception) -> str:

@@ -119,8 +119,8 @@ def _composite_block(entry, block, memory, places, found, geometry):
 
 
 @traced
-def _keep(summed, geometry, found, at):
-    store(found, at, sums(summed if geometry else [*[splat(summed[0], 0)] * GEOMETRY, *summed]))
+def _keep(summed, found, at):
+    store(found, at, sums(summed))
 
 
 def _composite_back(channels, geometry):
@@ -155,7 +155,7 @@ def _composite_back(channels, geometry):
                         while todo != 0:
                             summed = _composite_block(entry, lowest_bit(todo), memory, places, summed, geometry)
                             todo &= todo - 1
-                    _keep(summed, geometry, found, slots[q] * SUMS)
+                    _keep(summed, found, slots[q] * SUMS)
                 k = stop
                 unsaturated = open_blocks(memory)
             for q in range(k, end):
@@ -165,7 +165,7 @@ def _composite_back(channels, geometry):
 
 
 _COMPOSITE_BACK = {channels: _composite_back(channels, 1) for channels in (3, 4, 8)}
-_LIFT = _composite_back(8, 0)
+_LIFT = {channels: _composite_back(channels, 0) for channels in (8, SUMS)}
 
 
 def composite_back(
@@ -176,10 +176,10 @@ def composite_back(
     return _summed(_COMPOSITE_BACK[channels], tiles, values, stride, offset, out, left, grad, grad_left)
 
 
-def lift(tiles: Tiles, pixels: Floats) -> Floats:
-    """The sums of 8 channels alone, of weight times pixel; those of the shape are 0."""
+def lift(tiles: Tiles, channels: int, pixels: Floats) -> Floats:
+    """SUMS of each slot that begin with those of 8 or 16 channels, of weight times pixel; there are none of the shape."""
     nothing = np.empty(0, np.float32)
-    return _summed(_LIFT, tiles, tiles.splats, SLOTS, 0, nothing, nothing, pixels, nothing)
+    return _summed(_LIFT[channels], tiles, tiles.splats, SLOTS, 0, nothing, nothing, pixels, nothing)
 
 
 def _summed(kernel: Any, tiles: Tiles, values: Floats, stride: int, offset: int, *planes: Floats) -> Floats:
@@ -192,7 +192,7 @@ def _summed(kernel: Any, tiles: Tiles, values: Floats, stride: int, offset: int,
 
 
 @jit
-def _lift_values(counters, found, first_slot, count, out, stride, offset, channels):
+def _lift_values(counters, found, first_slot, count, out, stride, offset, channels, skipped):
     while True:
         begin = take(counters, 0) * BLOCKS * LANES
         if begin >= count:
@@ -201,13 +201,15 @@ def _lift_values(counters, found, first_slot, count, out, stride, offset, channe
             for c in range(channels):
                 total = np.float32(0)
                 for slot in range(first_slot[i], first_slot[i + 1]):
-                    total += found[slot * SUMS + GEOMETRY + c]
+                    total += found[slot * SUMS + skipped + c]
                 out[i * stride + offset + c] = total
 
 
-def lift_values(tiles: Tiles, found: Floats, out: Floats, stride: int, offset: int, channels: int) -> None:
-    """out[stride * i + offset ...] = the sums of the channels of each Gaussian."""
-    on_threads(_lift_values, found, tiles.first_slot, tiles.count, out, stride, offset, channels)
+def lift_values(
+    tiles: Tiles, found: Floats, out: Floats, stride: int, offset: int, channels: int, *, skipped: int = GEOMETRY
+) -> None:
+    """out[stride * i + offset ...] = the sums of the channels of each Gaussian, which follow on `skipped` others."""
+    on_threads(_lift_values, found, tiles.first_slot, tiles.count, out, stride, offset, channels, skipped)
 
 
 @traced

@@ -42,7 +42,7 @@ class Facts:
 
     space: Space
     channels: int
-    """Content channels."""
+    """Content channels; 0 = the scene is not of fields."""
     dim: int
     """Semantic channels of the field; 0 = no semantics."""
     content_encoder: str
@@ -122,11 +122,11 @@ def tones_of(facts: Facts) -> Tones | None:
     return Tones(torch.tensor(facts.exposure), facts.held) if facts.exposure else None
 
 
-def poses_of(config: TrainConfig, facts: Facts) -> Poses | None:
-    """Poses as the capture says; None where they are not refined."""
+def poses_of(facts: Facts, pace: float) -> Poses | None:
+    """Poses as the capture says, to be learnt at a `pace`; None where they are not refined."""
     if not facts.centres:
         return None
-    return Poses(torch.tensor(facts.centres, dtype=torch.float64), facts.held, reach=facts.reach, pace=config.poses)
+    return Poses(torch.tensor(facts.centres, dtype=torch.float64), facts.held, reach=facts.reach, pace=pace)
 
 
 def build_fields(config: TrainConfig, facts: Facts) -> tuple[Sampler, ContentField, SemanticField | None]:
@@ -146,4 +146,4 @@ def build_model(config: TrainConfig, facts: Facts) -> Model:
     decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
     parts = Parts(facts.space, *build_fields(config, facts), decoder)
     check_parts(config, parts, facts.channels, facts.dim)
-    return Model(parts, tones_of(facts), poses_of(config, facts))
+    return Model(parts, tones_of(facts), poses_of(facts, config.poses))
