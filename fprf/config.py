@@ -317,7 +317,7 @@ class TrainConfig(RunConfig):
     memory, and each batch is copied one step ahead."""
     precision: Literal["float32", "tf32", "bfloat16"] = "float32"
     """Of matrix products on a GPU in training: tf32 rounds their factors to 11 bits (CUDA), bfloat16 those of the networks to 8
-    bits; geometry and sums stay in float32. docs/speed.md has the errors."""
+    bits; geometry and sums stay in float32. docs/measurements.md has the errors."""
     datamanager: DataManagerConfig = RayBatchesConfig()
     """Feeds training."""
     sampler: SamplerConfig = ProposalConfig()

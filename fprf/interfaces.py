@@ -40,7 +40,7 @@ OPAQUE = 0.005
 
 
 class Encoder(nn.Module, ABC):
-    """Images to features. Frozen; deterministic; normalises its input itself."""
+    """Images to features. Frozen; deterministic; normalises its input itself; may be called by several threads at once."""
 
     @property
     @abstractmethod

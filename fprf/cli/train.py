@@ -14,7 +14,7 @@ from .parsing import load_method, methods, parse
 from .view import check_viewer
 
 DEFAULT_METHOD = "fprf-splats"
-"""Where none is named: the best quality for the time on every capture that was measured (docs/photographs.md)."""
+"""Where none is named: the best quality for the time on every capture that was measured (docs/measurements.md)."""
 VIEW, CHANGED = "--view", "--changed-images"
 
 

@@ -68,7 +68,7 @@ Narrow = Callable[[TrainableGaussians, int], None]
 """Cuts standard deviations in place after a step."""
 
 
-class Part(NamedTuple):
+class Stage(NamedTuple):
     """The part of a whole schedule that a learner is given to train."""
 
     before: int = 0
@@ -101,12 +101,12 @@ class GaussianLearner(SceneLearner):
         tones: Tones | None = None,
         poses: Poses | None = None,
         only: Literal["colours", "poses"] | None = None,
-        part: Part | None = None,
+        stage: Stage | None = None,
         known: Known | None = None,
         origin: str = "",
     ) -> None:
         self.inside, self.narrow, self.near, self.known, self.origin = inside, narrow, near, known, origin
-        self.config, self.levels, self.reach, self.part = config, levels, reach, part or Part()
+        self.config, self.levels, self.reach, self.stage = config, levels, reach, stage or Stage()
         self.bands = (config.degree + 1) ** 2
         self.model = TrainableGaussians(room, self.bands)
         self.begun = self.pixels = self.skipped = self.failed = 0
@@ -160,7 +160,7 @@ class GaussianLearner(SceneLearner):
     def step(self, index: int, share: float) -> None:
         """Learn from one view."""
         config = self.config
-        step, share = self.part.before + index, self.part.first + (self.part.last - self.part.first) * share
+        step, share = self.stage.before + index, self.stage.first + (self.stage.last - self.stage.first) * share
         # Coarse photographs first: half the size until `coarse`, a quarter until a third of that, and so on.
         level = self.levels[sum(share < config.coarse / 3**k for k in range(len(self.levels) - 1))]
         # Each epoch sees every view once, in an order of its own.
