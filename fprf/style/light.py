@@ -20,8 +20,8 @@ Confidence has two factors. One is a ramp over the likeness of a point and its r
 of the cosines between the scene's own regions: encoders differ in these as they do in the scores of unlike things. The other
 asks the scene itself, where both sides come from the same pictures (`unrivalled`): a code that another, unlike region of the
 scene resembles more belongs to that region's kind. Where the references lack trees, trees take the road's code, which the road
-claims. Both are set on painted pairs of photographs (`benchmarks/semantic_matching.py`), so that confidence is about the rate at
-which matches are right where a right one is as likely as none.
+claims. Both are set on painted pairs of photographs (`benchmarks/semantic_matching.py`): confidence is about the rate at which
+matches are right where a right one is as likely as none.
 """
 
 from collections.abc import Callable
@@ -56,7 +56,7 @@ _EXPOSURE = (0.05, 2.5)
 _SATURATION = (0.35, 1.1)
 """Least and largest gain of saturation: black and white takes colour away, a neon street adds little to a wall."""
 _SKY_SATURATION = 0.7
-"""Gain of saturation of sources of light besides: what they show is light and no material, and an overcast sky is never wrong."""
+"""Gain of saturation of sources of light besides: what they show is light, no material, and an overcast sky is never wrong."""
 _CAST = 0.36
 """Largest cast along an axis, in logarithms of sRGB."""
 _BRIGHT = 0.15
