@@ -186,7 +186,7 @@ def _dry(kind):
 
 def traced(function):
     """Let kernels call a function that runs while they are compiled. It stays what it is for other traced functions."""
-    results = {}  # the kind of the result, by those of the arguments
+    results: dict[Any, Any] = {}  # the kind of the result, by those of the arguments
 
     class Template(AbstractTemplate):
         key = function
