@@ -49,8 +49,7 @@ BENCHMARKS = {
     "stress": "every stage on adversarial inputs, against a reference and a bound",
     "styles": "every stylizer on painted photographs and on runs",
     "town": "write a town as a scene folder",
-    "viewer_speed": "response times and memory of the viewer",
-    "viewer_tour": "film and pictures of the viewer's page",
+    "page": "the page: pictures against the rasteriser, frames, sorting, memory, and a dropped photograph",
 }
 """Module of this package and one line for each. `benchmarks/gpu.sh` measures a machine with a GPU."""
 

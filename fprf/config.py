@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from .interfaces import Scene
     from .training.loading import LoadedRun
     from .training.quality import QualityConfig
-    from .training.unfinished import UnfinishedRun
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,10 +216,6 @@ class RunConfig:
             f"{type(self).__name__} does not say how its runs are read; its method has to give a config that does"
         )
 
-    def load_unfinished(self, run: Path, device: str, block: int | None) -> "UnfinishedRun":
-        """A run of this config in the middle of its training, or one of its blocks, for `fprf train --view`."""
-        raise ConfigError(f"{type(self).__name__} does not say how its runs are shown while they train; leave --view out")
-
     def read_scene(self) -> "ParsedScene":
         """The scene that the config names, at its size. Raises UsageError for no scene, DataError for an unreadable one."""
         raise ConfigError(f"{type(self).__name__} does not say how its scene is read; its method has to give one that does")
@@ -288,12 +283,6 @@ class TrainConfig(RunConfig):
         from .training.loading import open_fields
 
         return open_fields(run, device, quality)
-
-    def load_unfinished(self, run: Path, device: str, block: int | None) -> "UnfinishedRun":
-        """Build the model; its parameters come from training."""
-        from .training.unfinished import UnfinishedFields
-
-        return UnfinishedFields(run, device, block)
 
     def read_scene(self) -> "ParsedScene":
         """Parse the folder with the data manager's parser."""

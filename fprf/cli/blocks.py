@@ -11,10 +11,8 @@ if TYPE_CHECKING:
     from ..config import TrainConfig
     from ..datamanagers.scene import Scene
     from ..training.blocks import BlockTask
-    from ..training.model import Model
     from ..training.run import Run
     from ..training.trainer import Report
-    from ..viewer.live import LiveViewer
 
 SHARE = 0.2
 """Share of a time limit that the surroundings take, which all blocks start from; the blocks share the rest."""
@@ -28,12 +26,8 @@ def train_blocks(
     plan: "Plan",
     display: Display,
     start: float,
-    view: "LiveViewer | None" = None,
 ) -> None:
-    """Features of all views, the surroundings, the blocks, largest first, and the style of the whole. Finished ones stay.
-
-    With a `view` all is trained here, where it can be looked at, whatever the executor.
-    """
+    """Features of all views, the surroundings, the blocks, largest first, and the style of the whole. Finished ones stay."""
     from ..style.scene import to_tensors
     from ..training.block_plan import lay_out, write_down
     from ..training.blocks import SURROUNDINGS, BlockTask
@@ -55,12 +49,8 @@ def train_blocks(
 
     rays = plan.rays
     tasks = [task(block, each) for block in rays.argsort(descending=True).tolist()]
-    if view is None:
-        executor.map(run_block, [task(SURROUNDINGS, around)])
-        executor.map(run_block, tasks)
-    else:
-        for one in (task(SURROUNDINGS, around), *tasks):
-            run_block(one, view)
+    executor.map(run_block, [task(SURROUNDINGS, around)])
+    executor.map(run_block, tasks)
     display.say("measuring the scene's own style")
     trained = load_run(folder.root, config.device)
     folder.save_tensors("style", to_tensors(measure_style(config, trained.model, scene.cameras, scene.train)))
@@ -74,25 +64,18 @@ def block_minutes(config: "TrainConfig", blocks: int, spent: float) -> tuple[flo
     return SHARE * left, (1 - SHARE) * left / blocks
 
 
-def run_block(task: "BlockTask", view: "LiveViewer | None" = None) -> None:
+def run_block(task: "BlockTask") -> None:
     """Train one block, here or on a worker, and show how it goes."""
     from ..training.blocks import SURROUNDINGS, folder_of, train_block
     from ..training.run import Run
 
     name = "surroundings" if task.block == SURROUNDINGS else f"block {task.block:02d}"
     log = EventLog(Run(folder_of(Path(task.root), task.block)))
-    device = Run(Path(task.root)).load_config()[0].fields_only(Path(task.root)).device
     with Display(quiet=task.quiet) as display:
 
         def report(event: "Report") -> None:
             display.training(event, name)
             log(event)
-            if view is not None:
-                view(event)
 
-        def begun(model: "Model") -> None:
-            if view is not None:
-                view.begin(Path(task.root), model.state_dict, device, block=task.block, what=name)
-
-        if not train_block(task, report, begun):
+        if not train_block(task, report):
             display.say(f"{name} is finished already")

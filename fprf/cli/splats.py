@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from ..training.run import Run
     from ..training.trainer import Report
     from ..types import View
-    from ..viewer.live import LiveViewer
     from .eval import EvalConfig
 
 _KINDS = ("ply", "splat", "cameras")
@@ -34,13 +33,11 @@ class SplatVerbs(Verbs):
     def __init__(self, config: "GaussiansConfig") -> None:
         self.config = config
 
-    def train(self, method: str, *, quiet: bool = False, view: "LiveViewer | None" = None, others: bool = False) -> Path:
-        if view is not None and self.config.cells > 1:
-            raise UsageError("--view: cells are not shown while they train; leave --view or --cells out")
+    def train(self, method: str, *, quiet: bool = False, others: bool = False) -> Path:
         for need in self.needs():
             if not need.downloaded:
                 raise UsageError(f"fprf train {method}: {need.what}: {need.remedy}")
-        return _train(self.config, method, quiet, view, others)
+        return _train(self.config, method, quiet, others)
 
     def needs(self) -> "list[Need]":
         from ..training.prepare import plugin_needs
@@ -147,7 +144,7 @@ class SplatVerbs(Verbs):
             )
 
 
-def _train(config: "GaussiansConfig", method: str, quiet: bool, view: "LiveViewer | None", others: bool) -> Path:
+def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) -> Path:
     """Train to the end, or go on; see `train.train_scene` for fields."""
     from ..ops.rasterise_training import compile_beside
 
@@ -155,9 +152,9 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, view: "LiveViewe
     from ..datamanagers.images import load_images, useless_masks
     from ..io.atomic import remove_unfinished
     from ..splats.cell_training import OVERVIEW
-    from ..splats.training import facts_of, lit, prepare, scene_of, state_of, train, with_downscale
+    from ..splats.training import facts_of, lit, prepare, scene_of, train, with_downscale
     from ..training.run import Run, check_images, held, image_hashes, save_image_hashes
-    from .train import check_same, default_output, finish_view
+    from .train import check_same, default_output
 
     start = time.perf_counter()
     output = config.output or default_output(config, method)
@@ -165,8 +162,6 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, view: "LiveViewe
     folder = Run(output)
     with held(output), Display(quiet=quiet) as display:
         display.say(f"{method} on {config.data}, run folder {output}")
-        if view is not None:
-            display.say(f"live at {view.address}")
         if config.downscale is None and folder.exists:
             config = replace(config, downscale=folder.load_config()[0].downscale)
         config = with_downscale(config)
@@ -197,12 +192,9 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, view: "LiveViewe
             return output
         light = ", tones" if prepared.learner.tones is not None else ""
         display.say(f"{_described(scene)}, {prepared.learner.count} Gaussians at {prepared.origin}{light}")
-        report = _reporter(display, folder, view=view)
+        report = _reporter(display, folder)
         spent = time.perf_counter() - start
         folder.log({"part": "preparing", "seconds": round(spent, 3)})
-        if view is not None:
-            learner, near = prepared.learner, prepared.near
-            view.begin(output, lambda: state_of(learner.gaussians(), near), "cpu")
         if compiling:
             display.say("compiling kernels, once after installation")
             for process in compiling:
@@ -213,7 +205,6 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, view: "LiveViewe
             display.say(f"at most {most} steps: {config.passes} passes over {len(scene.train)} photographs (--passes)")
         train(replace(config, steps=min(config.steps, most)), prepared, folder, report, spent=spent)
         display.say(f"done after {time.perf_counter() - start:.0f} s: fprf eval {output}")
-    finish_view(view, display)
     return output
 
 
@@ -256,16 +247,12 @@ def run_cell(task: "CellTask") -> None:
             display.say(f"{name} is finished already")
 
 
-def _reporter(
-    display: Display, folder: "Run", name: str = "training", view: "LiveViewer | None" = None
-) -> "Callable[[Report], None]":
-    """Progress of what is trained for the display, the run folder and the viewer."""
+def _reporter(display: Display, folder: "Run", name: str = "training") -> "Callable[[Report], None]":
+    """Progress of what is trained for the display and the run folder."""
     log = EventLog(folder)
 
     def report(event: "Report") -> None:
         display.training(event, name)
         log(event)
-        if view is not None:
-            view(event)
 
     return report

@@ -2,6 +2,7 @@
 
 import contextlib
 import shlex
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,7 +13,6 @@ from ..errors import UsageError
 from .blocks import train_blocks
 from .parsing import load_method, methods, parse
 from .progress import EventLog
-from .view import check_viewer
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -53,29 +53,31 @@ def take_view(args: Sequence[str]) -> "tuple[list[str], ViewAddress | None]":
     return rest, address
 
 
-def open_view(address: "ViewAddress") -> "LiveViewer":
-    """Start the viewer's process. Raises UsageError where packages are missing or it cannot listen."""
-    check_viewer(VIEW, f", or train without {VIEW}")
+def open_view(address: "ViewAddress", run: Path) -> "LiveViewer":
+    """Start the viewer's process on a run folder. Raises UsageError where it cannot listen."""
     from ..viewer.live import LiveViewer
 
-    return LiveViewer(address)
+    return LiveViewer(address, run)
 
 
-def finish_view(view: "LiveViewer | None", display: "Display") -> None:
+def finish_view(view: "LiveViewer") -> None:
     """After training, keep the view on a terminal as long as somebody looks. Ctrl-C is then no failure."""
-    if view is None:
-        return
-    if view.fault is not None:
-        display.say(f"{VIEW}: the viewer has ended ({view.fault}); training did not need it")
-    if display.live and view.looked_at:
-        display.say("somebody is looking; Ctrl-C ends the view as well")
-    with contextlib.suppress(KeyboardInterrupt):
-        view.finish(stay=display.live)
+    from .progress import Display
+
+    with Display() as display:
+        if view.fault is not None:
+            display.say(f"{VIEW}: the viewer has ended ({view.fault}); training did not need it")
+        elif display.live and view.looked_at:
+            display.say("somebody is looking; Ctrl-C ends the view as well")
+            with contextlib.suppress(KeyboardInterrupt):
+                view.wait()
 
 
 DEFAULT_METHOD = "fprf-splats"
 """Where none is named: the best quality for the time on every capture that was measured (docs/photographs.md)."""
 CHANGED = "--changed-images"
+_SEEN_MINUTES = 0.2
+"""Minutes between checkpoints while a viewer follows them, at most."""
 _TIMED_VIEWS = 2
 """Views after which the time of all features is estimated."""
 _SMALL = 96
@@ -108,8 +110,13 @@ def run(args: list[str]) -> int:
     if place is None:
         config.verbs().train(method, others=others)
     else:
-        with open_view(place) as view:
-            config.verbs().train(method, view=view, others=others)
+        # What is seen are checkpoints: they are written as often as one likes to see them.
+        config = replace(config, checkpoint_minutes=min(config.checkpoint_minutes, _SEEN_MINUTES))
+        root = config.output or default_output(config, method)
+        with open_view(place, root) as view:
+            print(f"live at {view.address}", file=sys.stderr, flush=True)
+            config.verbs().train(method, others=others)
+            finish_view(view)
     return 0
 
 
@@ -119,13 +126,9 @@ def default_output(config: "RunConfig", method: str) -> Path:
     return Path("runs") / f"{name or 'scene'}-{method}"
 
 
-def train_scene(
-    config: "TrainConfig", method: str, *, quiet: bool = False, view: "LiveViewer | None" = None, others: bool = False
-) -> Path:
+def train_scene(config: "TrainConfig", method: str, *, quiet: bool = False, others: bool = False) -> Path:
     """Train to the end and return the run folder. An existing run there is resumed if its config and its images fit;
     with `others` the images may have changed.
-
-    `view` shows how it goes; where there is a terminal, and somebody looks at the end, it stays until they leave.
 
     Raises UsageError where packages, weights or the scene are missing, DataError where another process is training there.
     """
@@ -134,7 +137,6 @@ def train_scene(
     from ..style.scene import to_tensors
     from ..training import prepare, style_pass, trainer
     from ..training.block_plan import plan_scene
-    from ..training.model import build_model
     from ..training.prepare import Forecast
     from ..training.run import Run, check_images, held, image_hashes, save_image_hashes
     from .progress import Display
@@ -147,8 +149,6 @@ def train_scene(
         _check_needs(config, method, display)  # before there is a folder
     with held(output), Display(quiet=quiet) as display:
         display.say(f"{method} on {config.data}, run folder {output}")
-        if view is not None:
-            display.say(f"live at {view.address}")
         config = _sized(folder, config, display)
         check_same(folder, config)
         for place in (output, *output.glob("blocks/*")):
@@ -170,9 +170,8 @@ def train_scene(
             if len(plan.cells) > 1:
                 look(scene)
                 save_image_hashes(output, marks)
-                train_blocks(config, method, folder, scene, plan, display, start, view)
+                train_blocks(config, method, folder, scene, plan, display, start)
                 _say_outcome(folder, config, scene, display, time.perf_counter() - start)
-                finish_view(view, display)
                 return output
         prepared = prepare.prepare(config, _told_features(config, display), look, folder.saved_facts())
         folder.root.mkdir(parents=True, exist_ok=True)
@@ -190,20 +189,13 @@ def train_scene(
             log(event)
             if line := forecast(event):
                 display.say(line)
-            if view is not None:
-                view(event)
 
         def train(model: "Model | None") -> "Model":
             return trainer.train(config, prepared, folder, report, spent=spent, model=model)
 
         spent = time.perf_counter() - start
         folder.log({"part": "preparing", "seconds": round(spent, 3)})
-        if view is None:
-            model = config.executor.on(device.type).build().map(train, [None])[0]
-        else:  # here, where its parameters can be looked at
-            model = build_model(config, prepared.facts).to(device)
-            view.begin(output, model.state_dict, config.device)
-            model = train(model)
+        model = config.executor.on(device.type).build().map(train, [None])[0]
         trained = time.perf_counter()
         folder.log({"part": "training", "seconds": round(trained - start - spent, 3)})
         display.say("measuring the scene's own style")
@@ -211,7 +203,6 @@ def train_scene(
         folder.save_tensors("style", to_tensors(style))
         folder.log({"part": "own style", "seconds": round(time.perf_counter() - trained, 3)})
         _say_outcome(folder, config, prepared.scene, display, time.perf_counter() - start)
-    finish_view(view, display)
     return output
 
 

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from ..plugins.config import Need
     from ..style.files import StyleFile
     from ..training.run import Known
-    from ..viewer.live import LiveViewer
     from .eval import EvalConfig
 
 
@@ -25,10 +24,10 @@ class Verbs(ABC):
     """
 
     @abstractmethod
-    def train(self, method: str, *, quiet: bool = False, view: "LiveViewer | None" = None, others: bool = False) -> Path:
+    def train(self, method: str, *, quiet: bool = False, others: bool = False) -> Path:
         """Train to the end and return the run folder; go on with a run that is there.
 
-        `view` shows how it goes; `others` lets the images differ from those that the run was begun with.
+        `others` lets the images differ from those that the run was begun with.
         """
 
     @abstractmethod
@@ -72,10 +71,10 @@ class FieldVerbs(Verbs):
     def __init__(self, config: "TrainConfig") -> None:
         self.config = config
 
-    def train(self, method: str, *, quiet: bool = False, view: "LiveViewer | None" = None, others: bool = False) -> Path:
+    def train(self, method: str, *, quiet: bool = False, others: bool = False) -> Path:
         from .train import train_scene
 
-        return train_scene(self.config, method, quiet=quiet, view=view, others=others)
+        return train_scene(self.config, method, quiet=quiet, others=others)
 
     def needs(self) -> "list[Need]":
         from ..training.prepare import decoder_needs, plugin_needs

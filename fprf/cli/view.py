@@ -1,16 +1,16 @@
 """`fprf view [RUN|CAPTURE.ply]`: a scene in the browser, or the page that makes one; a photograph dropped on it restyles it."""
 
 import contextlib
-import importlib.util
 import os
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..checks import at_least, between
-from ..errors import CheckpointError, UsageError
+from ..errors import CheckpointError
 from ..splats.config import GaussianSemanticsConfig
 from ..training.quality import QualityConfig
 from .parsing import parse
@@ -19,7 +19,7 @@ from .style_flags import say
 if TYPE_CHECKING:
     from ..viewer.server import ViewerServer
     from ..viewer.session import Viewed
-    from ..viewer.start_page import StartPage
+    from ..viewer.start import Start
 
 _EXIT_TIMEOUT = 15.0
 """Seconds after an interrupt within which all must have ended."""
@@ -52,6 +52,8 @@ class ViewConfig(QualityConfig):
     """Longest side of the sharpest picture, 64 to 2048."""
     max_memory: float | None = None
     """MiB that blocks of a large scene may take; none = no limit."""
+    wait: bool = False
+    """Wait for a run's first checkpoint, where it has none yet."""
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
 
@@ -66,23 +68,26 @@ def run(args: list[str]) -> int:
     """Serve until interrupted."""
     description = "Look at a run in the browser; without one, make a scene there of photographs, a video or a capture."
     config = parse(ViewConfig(), args, prog="fprf view", description=description, positional=("run",))
-    check_viewer("fprf view")
     from ..viewer.server import ViewerServer, make_access
 
     access = make_access(config.host, config.token)
     with contextlib.ExitStack() as stack:
         server = stack.enter_context(ViewerServer(access, config.port))
-        from ..viewer.scene_files import is_capture
+        from ..viewer.scene_files import is_capture, newest_step
 
         path = config.run
-        if path is not None and not (is_capture(path) or (path / "config.json").is_file()):
+        if path is not None and not (config.wait or is_capture(path) or (path / "config.json").is_file()):
             raise CheckpointError(f"{path}: no config.json here, so it is no run folder; `fprf train` makes one")
         references = _photographs(config.references)
         print(server.address, flush=True)
         if path is None:
             stack.callback(_start(server, config, references).close)
         else:
-            server.open(lambda: _load(config, path, None, server.notify), references, config.pixels)
+            while config.wait and not is_capture(path) and newest_step(path) < 0:
+                time.sleep(0.5)
+            session = server.open(lambda: _load(config, path, None, server.notify), references, config.pixels)
+            if not is_capture(path):
+                session.follow(_newer(config, path, session.viewed.step))
         try:
             threading.Event().wait()
         except KeyboardInterrupt:
@@ -94,13 +99,6 @@ def run(args: list[str]) -> int:
     return 0
 
 
-def check_viewer(asked: str, otherwise: str = "") -> None:
-    """Raise UsageError where packages of the extra `viewer` are missing."""
-    missing = [name for name in ("viser", "uvicorn", "websockets") if importlib.util.find_spec(name) is None]
-    if missing:
-        raise UsageError(f"{asked}: needs {', '.join(missing)}; install with pip install 'fprf[viewer]'{otherwise}")
-
-
 def _photographs(references: Sequence[Path]) -> Sequence[Path]:
     """The images of folders in the folders' place. Raises DataError where there are none."""
     if not any(path.is_dir() for path in references):  # decoding needs a library that the page does not wait for
@@ -110,18 +108,18 @@ def _photographs(references: Sequence[Path]) -> Sequence[Path]:
     return photographs(references, say)
 
 
-def _start(server: "ViewerServer", config: ViewConfig, references: Sequence[Path]) -> "StartPage":
-    from ..viewer.start_page import StartPage
+def _start(server: "ViewerServer", config: ViewConfig, references: Sequence[Path]) -> "Start":
+    from ..viewer.start import Start
 
     def show(path: Path, name: str) -> None:
         server.open(lambda: _load(config, path, name, server.notify), references, config.pixels)
 
     def leave() -> None:
-        server.show_start(page.routes)
+        server.show_start(start)
 
-    page = StartPage(config.output, show, leave)
+    start = Start(config.output, show, leave, server.post)
     leave()
-    return page
+    return start
 
 
 def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[str], None]) -> "Viewed":
@@ -133,7 +131,7 @@ def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[st
         from ..training.loading import open_run
 
         run = open_run(path, config.device, config)
-        viewed = view_of_run(run.scene, run.run, run.known)
+        viewed = view_of_run(run.scene, run.run, run.known, run.step)
         return viewed if name is None else replace(viewed, name=name)
     from ..plugins.stylizers.config import RegionToneConfig
     from ..splats.config import LookConfig
@@ -148,3 +146,21 @@ def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[st
     scene = seen_capture(capture, look, progress=progress)
     name = name or path.resolve().name.partition(".")[0]
     return Viewed(scene, name, 0, root=config.output / name, capture=capture, stylizer=RegionToneConfig(centred=False))
+
+
+def _newer(config: ViewConfig, path: Path, step: int) -> "Callable[[], Viewed | None]":
+    """Return the run as its newest checkpoint has it, whenever that is another one."""
+    shown = step
+
+    from ..viewer.scene_files import newest_step
+
+    def load() -> "Viewed | None":
+        nonlocal shown
+        newest = newest_step(path)
+        if newest <= shown:
+            return None
+        viewed = _load(config, path, None, lambda text: None)
+        shown = max(newest, viewed.step)
+        return viewed
+
+    return load

@@ -7,10 +7,9 @@ import base64
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
-from importlib.resources import files
 from itertools import groupby
 from pathlib import Path
 from string import Template
@@ -30,6 +29,7 @@ from ..rendering.cameras import Cameras
 from ..rendering.paths import upwards
 from ..splats.photographs import camera_of
 from ..splats.scene import SplatScene
+from .live import read, script
 from .pack import colour_header, colour_section, header, importance, pack, sections
 
 CAPTURED = "Captured"
@@ -151,26 +151,32 @@ def packed_scene(
         colours = packed.colours(each)
         styles.append(colour_header(colours))
         parts[f"style-{k}"] = colour_section(colours)
-    return {**header(packed), **about(scene, start), "styles": styles}, parts
+    return {**header(packed), **about_gaussians(scene, start), "styles": styles}, parts
 
 
-def about(scene: SplatScene, start: int) -> dict[str, Any]:
-    """Cameras of a scene and what drawing it needs, for the page's script."""
-    cameras = scene.views
-    others = torch.linspace(0, len(cameras) - 1, min(_CAMERAS, len(cameras))).round().long().unique().tolist()
+def about(cameras: Cameras, start: int, depth: Callable[[int], float]) -> dict[str, Any]:
+    """Cameras of a scene, that at `start` first, and where one may go; `depth` is the distance that a camera turns about."""
+    others = sorted({*torch.linspace(0, len(cameras) - 1, min(_CAMERAS, len(cameras))).round().long().tolist()})
     chosen = [start, *(view for view in others if view > start), *(view for view in others if view < start)]
-    depths = [_depth(scene, view) for view in chosen]
+    depths = [depth(view) for view in chosen]
     up = torch.nn.functional.normalize(upwards(cameras).double(), dim=0)
     place = cameras.pose[:, :, 3].double()
     centre = place.mean(0)
     radius = _ROOM * float((place - centre).norm(dim=1).max()) + 0.5 * sorted(depths)[len(depths) // 2]
     return {
+        "up": up.tolist(),
+        "reach": {"centre": centre.tolist(), "radius": radius},
+        "cameras": [_camera(cameras, view, far) for view, far in zip(chosen, depths, strict=True)],
+    }
+
+
+def about_gaussians(scene: SplatScene, start: int) -> dict[str, Any]:
+    """What drawing a scene's Gaussians needs beside them."""
+    return {
         "antialiased": scene.antialiased,
         "near": scene.near,
         "background": list(scene.background),
-        "up": up.tolist(),
-        "reach": {"centre": centre.tolist(), "radius": radius},
-        "cameras": [_camera(cameras, view, depth) for view, depth in zip(chosen, depths, strict=True)],
+        **about(scene.views, start, lambda view: _depth(scene, view)),
     }
 
 
@@ -217,15 +223,8 @@ def _check(page: Page) -> None:
                 raise DataError(f"page: style {style.name} names reference {name}; known are {', '.join(sorted(known))}")
 
 
-def script(*names: str) -> str:
-    """The page's scripts, one after the other."""
-    here = files(__package__)
-    return "\n".join((here / name).read_text("utf-8") for name in ("splats.js", "place.js", "page.js", *names))
-
-
 def _text(page: Page, film: str, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]) -> str:
     """The page; `head` None = without Gaussians."""
-    here = files(__package__)
     names = [CAPTURED, *(style.name for style in page.styles)]
     # With Gaussians one picture a style is enough: it stands in until the first frame, and where there is no WebGL 2.
     most = 1 if page.scene is not None else len(page.views)
@@ -253,14 +252,14 @@ def _text(page: Page, film: str, head: Mapping[str, Any] | None, parts: Mapping[
     ]
     present = [(name, part) for name, part in below if part]
     code = f"{script()}\nopen(JSON.parse(at('data').textContent));\n"
-    return Template((here / "page.html").read_text("utf-8")).substitute(
+    return Template(read("page.html")).substitute(
         title=escape(page.title),
         lead=f'<p class="lead">{escape(page.lead)}</p>' if page.lead else "",
-        css=(here / "page.css").read_text("utf-8"),
+        css=read("page.css"),
         hash=f"'sha256-{base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()}'",
         nav="\n".join(f'<a href="#{name.lower()}">{name}</a>' for name, _ in present),
-        stage=Template((here / "stage.html").read_text("utf-8")).substitute(
-            still=f'src="{stills[0][0]}"', ratio=f"{width / height:.4f}", facts=_facts(page.facts)
+        stage=Template(read("stage.html")).substitute(
+            still=f'src="{stills[0][0]}"', ratio=f'style="--ratio:{width / height:.4f}"', facts=_facts(page.facts)
         ),
         body="\n".join(f'<section id="{name.lower()}"><h2>{name}</h2>\n{part}\n</section>' for name, part in present),
         credits="\n".join(f"<p>{escape(line)}</p>" for line in page.credits),

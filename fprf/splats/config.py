@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from ..datamanagers.scene import Scene
     from ..training.loading import LoadedRun
     from ..training.quality import QualityConfig
-    from ..training.unfinished import UnfinishedRun
     from .scene import SplatScene
 
 
@@ -132,12 +131,6 @@ class GaussiansConfig(RunConfig):
         from .training import open_gaussians
 
         return open_gaussians(run, self, quality)
-
-    def load_unfinished(self, run: Path, device: str, block: int | None) -> "UnfinishedRun":
-        """Its Gaussians come from training; they are drawn on the CPU, whatever the device."""
-        from .training import UnfinishedGaussians
-
-        return UnfinishedGaussians(run, self)
 
     def read_scene(self) -> "Scene":
         """Parse the folder."""

@@ -21,7 +21,6 @@ from ..errors import CheckpointError, NumericsError, UsageError
 from ..interfaces import Encoder
 from ..ops.rasterise_training import LOG_SCALES, MEANS, TrainableGaussians
 from ..rendering.cameras import Cameras
-from ..style.references import Encoders
 from ..training import checkpoint
 from ..training.camera_optimizers import Poses, Tones, moved_cameras
 from ..training.loading import LoadedRun
@@ -32,7 +31,6 @@ from ..training.prepare import reach_of as sight_distance
 from ..training.quality import PRESETS, QualityConfig, mixed_tone
 from ..training.run import Known, Run
 from ..training.trainer import REPORT_SECONDS, Report
-from ..training.unfinished import UnfinishedRun
 from .config import GaussiansConfig
 from .gaussians import Gaussians
 from .initial import Points, initial_points, projected, surroundings
@@ -389,34 +387,6 @@ def open_gaussians(root: Path, config: GaussiansConfig, quality: QualityConfig) 
         origin=known.facts.origin,
     )
     return LoadedRun(run, run.load_config()[1], known, saved.step, saved.seconds, scene)
-
-
-class UnfinishedGaussians(UnfinishedRun):
-    """A run of Gaussians; what a style needs is found from few, small views. Raises CheckpointError where it has not begun."""
-
-    def __init__(self, root: Path, config: GaussiansConfig) -> None:
-        self.run, self.known, self.config = Run(root), Run(root).load_known(), config
-        self._encoder = cache(config.semantic.encoder.build)
-        self._scene: SplatScene | None = None
-
-    def scene(self, tensors: Mapping[str, Tensor]) -> SplatScene:
-        gaussians, near = _gaussians(tensors), float(tensors["near"])
-        views = _some_views(self.known, _VIEWS // 4, self.config.semantic_size // 2)
-
-        def found() -> Semantics:
-            return find_semantics(gaussians, True, self._encoder(), views, self.config.regions, near=near)
-
-        cameras, longest = self.known.cameras, int(views.size.amax())
-        self._scene = SplatScene(
-            gaussians, True, cameras, self.known.names, cache(found), self._encoder, longest, near, self.config.background,
-            origin=self.known.facts.origin,
-        )  # fmt: skip
-        return self._scene
-
-    def encoders(self, before: Encoders | None) -> Encoders:
-        if self._scene is None:
-            raise CheckpointError(f"{self.run.root}: no parameters have come from training yet; wait for them")
-        return self._scene.encoders()
 
 
 def _some_views(known: Known, count: int, longest: int) -> Cameras:

@@ -1,20 +1,24 @@
-import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from stand_in_viewers import DEAD, GREEDY, viewer
 from tiny_world import World, flags, parameters, same
 
 from fprf.cli import main as cli
 from fprf.cli import train
 from fprf.cli.train import take_view
 from fprf.errors import UsageError
-from fprf.training import trainer
 from fprf.training.run import Run
-from fprf.training.unfinished import UnfinishedFields
-from fprf.viewer import live
 from fprf.viewer.live import LiveViewer, ViewAddress
+
+ADDRESS = "import sys, time; print('http://127.0.0.1:9/', flush=True); time.sleep(600)"
+DEAD = "print('http://127.0.0.1:9/', flush=True)"
+REFUSED = "import sys; sys.exit('error: --port 1: cannot listen there')"
+
+
+def viewer(script: str, address: ViewAddress, run: Path) -> LiveViewer:
+    return LiveViewer(address, run, (sys.executable, "-c", script))
 
 
 @pytest.mark.parametrize(
@@ -39,40 +43,29 @@ def test_what_is_no_place_is_refused(words: str) -> None:
         take_view(words.split())
 
 
-@pytest.mark.parametrize("script", [GREEDY, DEAD])
+@pytest.mark.parametrize("script", [ADDRESS, DEAD])
 def test_what_is_trained_is_the_same_to_the_bit_whoever_looks(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log = tmp_path / "log"
-    monkeypatch.setattr(train, "open_view", lambda place: LiveViewer(place, viewer(script, str(log))))
-    monkeypatch.setattr(trainer, "REPORT_SECONDS", 0.0)  # look after every step
+    monkeypatch.setattr(train, "open_view", lambda place, run: viewer(script, place, run))
     assert cli.main(["train", "fprf-lite", *flags(world, tmp_path / "run"), "--view"]) == 0
     run = Run(tmp_path / "run")
-    assert run.load_config() == (replace(world.config, output=None), "fprf-lite")
+    config = replace(world.config, output=None, checkpoint_minutes=0.2)
+    assert run.load_config() == (config, "fprf-lite")
     assert same(parameters(run, 15), parameters(Run(world.run), 15))
     assert (tmp_path / "run" / "style.safetensors").read_bytes() == (world.run / "style.safetensors").read_bytes()
-    assert "live at http://here/" in capsys.readouterr().err
-    if script is GREEDY:
-        assert "snapshot" in log.read_text()
+    told = capsys.readouterr().err
+    assert "live at http://127.0.0.1:9/" in told and ("the viewer has ended" in told) == (script is DEAD)
 
 
-def test_blocks_are_shown_one_after_the_other_and_trained_the_same(
-    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(train, "open_view", lambda place: LiveViewer(place, viewer(GREEDY, str(tmp_path / "log"))))
-    monkeypatch.setattr(trainer, "REPORT_SECONDS", 0.0)
-    monkeypatch.setattr(live, "_COPY_SHARE", 1e6)  # so short a training gives no time for more than one copy
-    blocks = ["--blocks", "grid", "--blocks.cells", "2", "1", "--steps", "6"]
-    for name, view in (("plain", []), ("shown", ["--view"])):
-        assert cli.main(["train", "fprf-lite", *flags(world, tmp_path / name), *blocks, *view]) == 0
-    for file in ("blocks/surroundings/block.safetensors", "blocks/00/block.safetensors", "style.safetensors"):
-        assert (tmp_path / "plain" / file).read_bytes() == (tmp_path / "shown" / file).read_bytes()
-    heard = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
-    told = [(line["block"], line["what"]) for line in heard if "run" in line]
-    assert told[0][1] == "surroundings" and {what for _, what in told} == {"surroundings", "block 00", "block 01"}
-    shown = None
-    for line in heard:
-        shown = line["block"] if "run" in line else shown
-        if "names" in line:  # what was handed over fits the model that the viewer builds
-            assert line["names"] == sorted(UnfinishedFields(tmp_path / "shown", "cpu", shown).trained.model.state_dict())
-    assert any("names" in line for line in heard)
+def test_a_viewer_that_does_not_start_says_why(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--view: --port 1: cannot listen there"):
+        viewer(REFUSED, ViewAddress("127.0.0.1", 1, True), tmp_path)
+
+
+def test_the_viewer_follows_the_run_folder_and_ends_with_training(world: World) -> None:
+    with LiveViewer(ViewAddress("127.0.0.1", 0, True), world.run) as found:
+        assert found.address.startswith("http://127.0.0.1:") and not found.looked_at and found.fault is None
+        process = found._process
+        found.wait()  # nobody looks
+    assert process is not None and process.poll() is not None

@@ -11,17 +11,14 @@ import numpy as np
 import pytest
 import torch
 from splat_ball import equal
-from stand_in_viewers import GREEDY, viewer
 from torch import Tensor
 
 import fprf
 from benchmarks.town.write import write_town
-from fprf.cli import train as cli_train
 from fprf.cli.main import main
 from fprf.datamanagers.images import load_image, load_images
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import Scene
-from fprf.errors import CheckpointError
 from fprf.evaluation.metrics import psnr
 from fprf.io.images import write_image
 from fprf.ops.rasterise import lift
@@ -36,11 +33,8 @@ from fprf.splats.learner import Learner
 from fprf.splats.photographs import camera_of
 from fprf.splats.training import prepare, reach_of
 from fprf.splats.views import draw
-from fprf.training import checkpoint
 from fprf.training.camera_optimizers import Tones, moved_cameras
 from fprf.training.loading import open_run
-from fprf.training.run import Run
-from fprf.viewer.live import LiveViewer
 
 STEPS = 260
 
@@ -284,31 +278,6 @@ def test_verbs_of_a_run(run: Path, tmp_path: Path) -> None:
     encoder = RandomConfig(channels=6).build().identity
     assert other.semantic_encoder == other.encoders().semantic.identity == encoder and len(other.measured()[0].share) == 3
     assert main(["train", str(run / "config.json"), "--semantic.encoder", "vgg16", "--semantic.encoder.weights", "no.pth"]) == 2
-
-
-def test_training_is_looked_at_and_changes_no_bit(
-    run: Path, config: GaussiansConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What the viewer is handed makes the scene of the moment, which takes a style."""
-    monkeypatch.setattr(cli_train, "open_view", lambda place: LiveViewer(place, viewer(GREEDY, str(tmp_path / "log"))))
-    monkeypatch.setattr(training, "REPORT_SECONDS", 0.0)
-    assert main([*command(config, tmp_path / "run"), "--view"]) == 0
-    alone, seen = (checkpoint.load_latest(each / "checkpoints")[0] for each in (run, tmp_path / "run"))
-    assert alone is not None and seen is not None
-    assert all(torch.equal(tensor, seen.model[name]) for name, tensor in alone.model.items())
-    heard = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
-    names = [line["names"] for line in heard if "names" in line]
-    assert names and all(each == sorted(alone.model) for each in names)
-    unfinished = Run(tmp_path / "run").load_config()[0].load_unfinished(tmp_path / "run", "cpu", None)
-    with pytest.raises(CheckpointError):
-        unfinished.encoders(None)
-    scene = unfinished.scene(alone.model)
-    view = open_run(run, "cpu").scene.render(scene.cameras, 0)
-    assert torch.equal(scene.render(scene.cameras, 0).rgb, view.rgb)
-    encoders = unfinished.encoders(None)
-    assert encoders.semantic is not None and len(encoders.scene.share) > 3
-    assert unfinished.encoders(encoders).semantic is encoders.semantic
-    assert main([*command(config, tmp_path / "no"), "--cells", "2", "--view"]) == 2
 
 
 def test_styles_on_a_run(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
