@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from ..errors import DataError
+from ..interfaces import Scene
 from ..io.atomic import write_text
 from ..io.figures import Metrics, figures, number
 from ..io.images import Picture, data_uri, shrink, to_uint8
@@ -29,6 +30,7 @@ from ..rendering.cameras import Cameras
 from ..rendering.paths import upwards
 from ..splats.photographs import camera_of
 from ..splats.scene import SplatScene
+from ..style.look import Restyle
 from .live import read, script
 from .pack import colour_header, colour_section, header, importance, pack, sections
 
@@ -105,34 +107,49 @@ def write_page(path: Path, page: Page, *, megabytes: float | None = None) -> int
     With `megabytes` (2^20 bytes), Gaussians that show least are left out until the file is no larger. Raises DataError where
     pictures do not belong together, or where the page without any Gaussian is larger.
     """
+    text, count = page_html(page, megabytes=megabytes, path=path)
+    write_text(path, text)
+    return count
+
+
+def page_html(page: Page, *, megabytes: float | None = None, path: Path = Path("page.html")) -> tuple[str, int]:
+    """The text of a page that lies at `path`, and how many Gaussians it shows. Raises as `write_page`."""
     _check(page)
     room = None if megabytes is None else int(megabytes * 2**20)
     film = "" if page.film is None else _film(page.film, path, _SMALL_FILM if room is None else min(_SMALL_FILM, room / 3))
     fixed = _text(page, film, None, {})
-    if page.scene is None:
-        write_text(path, fixed)
-        return 0
-    count, kept = len(page.scene.gaussians), None
-    weight: Tensor | None = None
+    if (scene := page.scene) is None:
+        return fixed, 0
+    harmonics = [scene.shown.harmonics, *(style.harmonics for style in page.styles if style.harmonics is not None)]
+    empty, kept, weight = len(fixed.encode()), None, None
     for _ in range(4):
-        head, parts = packed_scene(page.scene, [page.scene.shown.harmonics, *_harmonics(page)], kept, page.start)
+        head, parts = packed_scene(scene, harmonics, kept, page.start)
         text = _text(page, film, head, parts)
-        size = len(text.encode())
+        size, count = len(text.encode()), int(head["count"])
         if room is None or size <= room:
-            write_text(path, text)
-            return int(head["count"])
-        share = (room - len(fixed.encode())) / max(1, size - len(fixed.encode()))
+            return text, count
+        share = (room - empty) / max(1, size - empty)
         if share <= 0.02:
-            raise DataError(
-                f"{path}: {len(fixed.encode()) / 2**20:.1f} MiB without any Gaussian; allow more than {megabytes} MiB"
-            )
+            break
         if weight is None:
-            scene = page.scene
             weight = importance(scene.gaussians, scene.views, antialiased=scene.antialiased, near=scene.near)
         # A little less than would fit by the mean: what shows most compresses least.
-        now = count if kept is None else len(kept)
-        kept = weight.topk(max(1, int(0.98 * share * now))).indices.sort().values
-    raise DataError(f"{path}: no fit into {megabytes} MiB; allow more")
+        kept = weight.topk(max(1, int(0.98 * share * count))).indices.sort().values
+    raise DataError(f"{path}: {empty / 2**20:.1f} MiB without any Gaussian; allow more than {megabytes:g} MiB")
+
+
+def notebook_html(scene: Scene, name: str, view: int, styled: tuple[str, Restyle] | None) -> str:
+    """A page of a scene, as captured or in a style with its name, in an iframe; its stage is all of it."""
+    gaussians = scene if isinstance(scene, SplatScene) else None
+    styles = []
+    if styled is not None:
+        shown = scene.restyled(styled[1])
+        harmonics = shown.shown.harmonics if isinstance(shown, SplatScene) else None
+        styles = [Style(styled[0], [to_uint8(shown.render(scene.cameras, view).rgb)], harmonics)]
+    views = [PageView(scene.names[view], to_uint8(scene.render(scene.cameras, view).rgb))]
+    text, _ = page_html(Page(title=name, facts={}, views=views, styles=styles, scene=gaussians, start=view))
+    # Scripts without this page's origin: they reach nothing of the notebook.
+    return f'<iframe srcdoc="{escape(text)}" sandbox="allow-scripts" width="100%" height="620" style="border:0"></iframe>'
 
 
 def packed_scene(
@@ -201,10 +218,6 @@ def _depth(scene: SplatScene, view: int) -> float:
     size = torch.tensor([camera.width, camera.height]).double()
     inside = (at[:, 2] > scene.near) & ((middle - size / 2).abs() < size / 3).all(1)
     return float(depth[inside].median()) if bool(inside.any()) else 1.0
-
-
-def _harmonics(page: Page) -> list[Tensor]:
-    return [style.harmonics for style in page.styles if style.harmonics is not None]
 
 
 def _check(page: Page) -> None:
