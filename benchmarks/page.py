@@ -1,13 +1,13 @@
 """The page against the rasteriser, and what it costs in a headless Chromium with software GL.
 
-    python -m benchmarks page RUN ... --reference photo.jpg [--parts pictures frames million drop] [--quick]
+    python -m benchmarks page RUN ... --reference photo.jpg [--parts pictures frames million drop] [--few]
 
 pictures  captured views as the page draws them, against the rasteriser: PSNR, the worst and the mean
 frames    seconds a frame at 1280 x 720, as for a moving camera at full resolution and at rest; seconds until the first picture
 million   a page of a million Gaussians: milliseconds of a sort, memory of the page
 drop      `fprf view RUN`: seconds from a dropped photograph to its colours on the page, the third of three
 
-Writes benchmarks/results/page.json; parts that are not run keep what is there. Needs playwright and a Chromium. Times want free
+Needs playwright and a Chromium. Times want free
 cores: the load average is written down.
 """
 
@@ -26,6 +26,7 @@ import cv2
 import numpy as np
 import torch
 
+from fprf.errors import UsageError
 from fprf.page.writer import Page, PageView, write_page
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.rendering.cameras import Cameras
@@ -36,7 +37,7 @@ from fprf.splats.scene import SplatScene, look_at_capture
 from fprf.splats.views import draw
 from fprf.training.loading import open_run
 
-from .common import RESULTS, ROOT, arguments, report
+from .common import ROOT, arguments, report
 
 sys.path.insert(0, str(ROOT / "tests"))
 
@@ -87,7 +88,7 @@ def pictures(page: Any, scene: SplatScene, count: int) -> dict[str, float]:
     found = []
     for view in sorted({*torch.linspace(0, len(scene.views) - 1, count).round().long().tolist()}):
         drawn = page.evaluate(DRAW, [*view_of(scene.views, view, scene.near), {}])["picture"]
-        mine = cv2.imdecode(np.frombuffer(base64.b64decode(drawn.split(",")[1]), np.uint8), 1)[..., ::-1] / 255
+        mine = np.asarray(cv2.imdecode(np.frombuffer(base64.b64decode(drawn.split(",")[1]), np.uint8), 1))[..., ::-1] / 255
         camera = camera_of(scene.views, view, scene.near)
         theirs = (
             draw(scene.gaussians, camera, antialiased=scene.antialiased, background=scene.background).image.clamp(0, 1).numpy()
@@ -152,18 +153,20 @@ def drop(browser: Any, run: Path, reference: Path) -> dict[str, float]:
 
 def main(argv: list[str]) -> None:
     parser = arguments("page", __doc__)
-    parser.add_argument("runs", type=Path, nargs="+")
-    parser.add_argument("--reference", type=Path, required=True)
+    parser.add_argument("runs", type=Path, nargs="*")
+    parser.add_argument("--reference", type=Path)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--output", type=Path, default=RESULTS / "page.json")
+    parser.add_argument("--few", action="store_true", help="few views, frames and Gaussians")
+    parser.add_argument("--output", type=Path, help="JSON to write; parts that are not run keep what is there")
     args = parser.parse_args(argv)
-    found: dict[str, Any] = json.loads(args.output.read_text()) if args.output.is_file() else {}
+    found: dict[str, Any] = json.loads(args.output.read_text()) if args.output and args.output.is_file() else {}
     found |= {"format": 1, "targets": TARGETS}
-    few = 2 if args.quick else 5
+    few = 2 if args.few else 5
     with chromium() as browser, tempfile.TemporaryDirectory() as name:
         for run in args.runs:
             scene = open_run(run, "cpu").scene
+            if not isinstance(scene, SplatScene):
+                raise UsageError(f"{run}: a run of fields; name runs of Gaussians")
             page = opened(browser, scene, Path(name))
             for part, measure in (("pictures", pictures), ("frames", frames)):
                 if part in args.parts:
@@ -172,9 +175,9 @@ def main(argv: list[str]) -> None:
                     print(part, run.name, found[part][run.name], flush=True)
             page.close()
         if "million" in args.parts:
-            found["million"] = million(browser, Path(name), 50_000 if args.quick else 1_000_000)
+            found["million"] = million(browser, Path(name), 50_000 if args.few else 1_000_000)
             print("million", found["million"], flush=True)
-        if "drop" in args.parts:
+        if "drop" in args.parts and args.runs and args.reference:
             load = round(os.getloadavg()[0], 2)
             found["drop"] = drop(browser, args.runs[0], args.reference) | {"load_average_before": load}
             print("drop", found["drop"], flush=True)

@@ -8,7 +8,7 @@ import fprf
 
 ROOT = Path(fprf.__file__).parent
 ORDER = (
-    *("version", "errors", "types", "memory", "checks", "process", "io", "interfaces", "configs"),
+    *("version", "errors", "types", "memory", "checks", "process", "progress", "io", "interfaces", "configs", "outputs"),
     *("ops", "rendering", "datamanagers", "style", "fields", "plugins", "blocks", "testing"),
     *("training", "splats", "pretraining", "reconstruction", "evaluation", "export"),
     *("page", "viewer", "api", "cli", "__main__"),
@@ -22,6 +22,8 @@ def layer(parts: tuple[str, ...]) -> str:
     """The layer of a module by its path below `fprf`."""
     if parts in ((), ("__init__",)):
         return "version"
+    if parts in (("testing", "breaches"), ("testing", "outputs")):  # which the program uses as well
+        return "outputs"
     plugins = parts[0] == "plugins" and len(parts) <= 2 and parts[-1] != "weights"
     return "configs" if plugins or (f"{parts[-1]}.py" in MECHANISM and parts[0] != "export") else parts[0]
 

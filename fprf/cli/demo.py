@@ -13,10 +13,10 @@ from statistics import fmean
 from typing import TYPE_CHECKING
 
 from ..checks import at_least, positive
+from ..progress import Display
 from ..style.config import StyleConfig
 from ..style.files import StyleFile
 from .parsing import parse
-from .progress import Display
 from .showcase import frames_of, photographs_of, restyled, write_shown
 
 if TYPE_CHECKING:
@@ -71,18 +71,19 @@ def run(args: list[str]) -> int:
     from ..methods import fprf_splats
     from ..rendering.paths import make_path
     from ..splats.files import write_gaussians
-    from ..splats.training import open_gaussians
+    from ..splats.loading import open_gaussians
+    from ..training.driver import train
     from ..training.quality import QualityConfig
-    from .eval import EvalConfig
+    from ..training.run import Run
+    from .eval import EvalConfig, evaluate
 
     garden = Path(str(files("fprf") / "garden"))
     output = config.output / "run"
     training = replace(fprf_splats(), data=garden, downscale=config.downscale, output=output, minutes=config.minutes)
-    verbs = training.verbs()
     with compiling():  # waited for at the end
-        root = verbs.train("fprf-splats")
-        metrics = verbs.evaluate(EvalConfig(run=root, images=False))
-    opened = open_gaussians(root, training, QualityConfig())
+        root = train(training, "fprf-splats")
+        metrics = evaluate(EvalConfig(run=root, images=False))
+    opened = open_gaussians(Run(root), training, "cpu", QualityConfig())
     scene, views = opened.scene, opened.known.test
     references = {name: garden / "references" / f"{name}.jpg" for name in LOOKS}
     with Display() as display:

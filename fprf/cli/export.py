@@ -1,5 +1,6 @@
 """`fprf export RUN [ply splat cameras ...]`: a scene, plain or restyled, as files that other programs open."""
 
+import hashlib
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -8,9 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import DataError, UsageError
 from ..export.config import KINDS, ExportConfig, Look, Plan, look_file, make_looks, plan, styles_of
-from .progress import Display
+from ..progress import Display
 from .style_flags import read_flags, say
-from .verbs import verbs_of
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from ..training.loading import Trained
     from ..training.run import Known
 
+_OF_GAUSSIANS = ("ply", "splat", "cameras")
+"""Kinds that there are of Gaussians; the last one not unless it is asked for."""
 _FEW = 0.5
 """A smaller share of what there was is worth a warning."""
 
@@ -39,8 +41,26 @@ def run(args: list[str]) -> int:
     config, file = read_flags(
         ExportConfig(), _kinds_as_flag(args), prog="fprf export", description=_DESCRIPTION, positional=("run",)
     )
-    verbs_of(config.run).export(config, file)
+    from ..training.run import Run
+
+    kind = Run(config.run).load_config()[0].kind
+    {"fields": export_fields, "gaussians": export_gaussians}.get(kind, _export_other)(config, file)
     return 0
+
+
+def _export_other(config: ExportConfig, file: "StyleFile") -> None:
+    """Write the cameras and pictures of a run of a kind that is neither of fields nor of Gaussians."""
+    what = plan(config.kinds or ("cameras",), config.output or config.run / "exports")
+    if what.kinds != ("cameras",):
+        raise UsageError(f"fprf export: of this run there are cameras, not {', '.join(what.kinds)}")
+    from ..training.loading import open_run
+
+    opened = open_run(config.run, config.device)
+    with Display() as display:
+        export_cameras(
+            opened.scene, opened.known, config, what, make_looks(opened.scene, styles_of(config, file, say)), display
+        )
+    print(f"cameras in {what.single or what.folder / 'transforms.json'}")
 
 
 def export_fields(config: ExportConfig, file: "StyleFile") -> None:
@@ -302,3 +322,71 @@ def _kinds_as_flag(args: list[str]) -> list[str]:
     if end == 1 or args[0].startswith("-"):
         return args
     return [args[0], "--kinds", *args[1:end], *args[end:]]
+
+
+def export_gaussians(config: ExportConfig, file: "StyleFile") -> None:
+    """Write a run of Gaussians."""
+    from ..plugins.captures import format_name
+    from ..splats.files import write_gaussians, write_ply_parts
+    from ..splats.loading import open_gaussians
+    from ..training.checkpoint import digest
+    from ..training.quality import QualityConfig
+    from ..training.run import Run
+
+    for kind in config.kinds:
+        if kind not in _OF_GAUSSIANS:
+            raise UsageError(
+                f"fprf export: of Gaussians there are {', '.join(_OF_GAUSSIANS)}, not {kind}; a run of fields has all kinds, "
+                "or `export RUN cameras --images` makes a scene folder that other programs reconstruct"
+            )
+    if config.fit:
+        raise UsageError("--fit: the run is of Gaussians already; leave it out")
+    output = config.output or config.run / "exports"
+    kinds, gaussians = tuple(dict.fromkeys(config.kinds or _OF_GAUSSIANS[:2])), format_name(output) is not None
+    table = output.suffix.lower() == ".json" and not gaussians
+    single = (gaussians or table) and not output.is_dir()
+    if single and config.kinds and table != ("cameras" in kinds):
+        raise UsageError(f"--output {output}: cameras are written to a .json file, Gaussians to others; name a folder")
+    styles = styles_of(config, file, say)
+    if single and len(styles) > 1:
+        raise UsageError(f"--output {output}: one file holds one style, {len(styles)} are asked for; name a folder")
+    run = Run(config.run)
+    opened = open_gaussians(run, run.load_config()[0], config.device, QualityConfig())
+    scene, paths, losses = opened.scene, [], dict[str, None]()
+    looks = make_looks(scene, styles)[-1 if single else 0 :]
+    if table or "cameras" in kinds:
+        what = Plan(("cameras",), output.parent if single else output, output if single else None)
+        with Display() as display:
+            export_cameras(scene, opened.known, config, what, looks, display)
+        print(f"cameras in {what.single or what.folder / 'transforms.json'}")
+    kinds = () if table else tuple(kind for kind in kinds if kind != "cameras")
+    for look in looks if kinds else ():
+        shown = scene.restyled(look.restyle)
+        for kind in kinds:
+            paths.append(path := output if single else output / look_file("splats", look.name, f".{kind}"))
+            if path.suffix.lower() == ".ply" and not path.name.lower().endswith(".compressed.ply") and not config.plain:
+                style = "" if look.restyle is None else look.restyle.digest
+                key = f"{digest(opened.run.checkpoints)} {style}{' local' * config.local}"
+                key = hashlib.sha256(key.encode()).hexdigest()
+                write_ply_parts(
+                    path,
+                    shown.part,
+                    len(scene.gaussians),
+                    key,
+                    antialiased=True,
+                    origin=scene.origin,
+                    local=config.local,
+                )
+            else:
+                written = write_gaussians(
+                    path,
+                    shown.shown,
+                    antialiased=True,
+                    views=scene.views,
+                    plain=config.plain,
+                    origin=scene.origin,
+                    local=config.local,
+                )
+                losses |= {f", {path.name}: {loss}": None for loss in written.losses()}
+    if paths:
+        print(f"{len(scene.gaussians)} Gaussians in {', '.join(str(path) for path in dict.fromkeys(paths))}{''.join(losses)}")

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any, Literal
 from ..checks import at_least, positive
 from ..errors import UsageError
 from ..plugins.stylizers.config import StylizerConfig
+from ..progress import Display
 from ..style.config import StyleConfig
 from ..style.files import StyleFile, check_photographs, read_style
 from ..training.quality import QualityConfig
 from .parsing import parse
-from .progress import Display
 from .showcase import frames_of, photographs_of, restyled, write_shown
 from .style_flags import read_preset, say, with_presets_named
-from .verbs import views_of
 
 if TYPE_CHECKING:
     from ..training.run import Known
@@ -169,7 +168,7 @@ def _named(first: Sequence[Path], more: Sequence[Path]) -> dict[str, Path]:
 
 def _views(known: "Known", config: GalleryConfig) -> list[int]:
     """The views to show. Raises UsageError for a name that the run does not hold, or an empty split."""
-    views = views_of(known, config.split, config.views)
+    views = known.views(config.split, config.views)
     count = len(views) if config.views else min(config.most, len(views))
     return [views[k * len(views) // count] for k in range(count)]
 

@@ -11,10 +11,10 @@ from ..checks import at_least, positive
 from ..errors import CheckpointError, UsageError
 from ..plugins.captures import endings, format_name
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
+from ..progress import Display
 from ..splats.config import LookConfig
 from ..style.config import StyleConfig
 from ..style.files import StyleFile, write_style
-from .progress import Display
 from .style_flags import read_flags
 from .stylize import print_explained
 

@@ -7,7 +7,7 @@ from statistics import fmean
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import FprfError
-from .progress import Display
+from ..progress import Display
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
@@ -158,10 +158,11 @@ def write_shown(
 def photographs_of(run: "Run", known: "Known", views: Sequence[int]) -> "dict[int, Picture]":
     """Photographs of views, as far as the scene's folder is still where it was."""
     from ..datamanagers.images import load_images
+    from ..training.prepare import read_scene
     from ..training.run import view_names
 
     try:
-        captured = run.load_config()[0].read_scene()
+        captured = read_scene(run.load_config()[0])
         if tuple(view_names(captured.paths)) != known.names:
             return {}
         return dict(zip(views, load_images(captured, views=views), strict=True))

@@ -3,7 +3,6 @@
 import contextlib
 import os
 import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -50,10 +49,10 @@ class ViewConfig(QualityConfig):
     """Secret that the address must carry (?token=...), at least 16 characters; none = made where one is needed."""
     pixels: int = 640
     """Longest side of the sharpest picture, 64 to 2048."""
+    follow: bool = False
+    """Wait for the first checkpoint of a training that has only begun. A run in training is followed without."""
     max_memory: float | None = None
     """MiB that blocks of a large scene may take; none = no limit."""
-    wait: bool = False
-    """Wait for a run's first checkpoint, where it has none yet."""
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
 
@@ -73,21 +72,25 @@ def run(args: list[str]) -> int:
     access = make_access(config.host, config.token)
     with contextlib.ExitStack() as stack:
         server = stack.enter_context(ViewerServer(access, config.port))
-        from ..viewer.scene_files import is_capture, newest_step
+        from ..viewer.scene_files import is_capture
 
         path = config.run
-        if path is not None and not (config.wait or is_capture(path) or (path / "config.json").is_file()):
+        if path is not None and not (config.follow or is_capture(path) or (path / "config.json").is_file()):
             raise CheckpointError(f"{path}: no config.json here, so it is no run folder; `fprf train` makes one")
         references = _photographs(config.references)
         print(server.address, flush=True)
         if path is None:
             stack.callback(_start(server, config, references).close)
         else:
-            while config.wait and not is_capture(path) and newest_step(path) < 0:
-                time.sleep(0.5)
-            session = server.open(lambda: _load(config, path, None, server.notify), references, config.pixels)
+
+            def load() -> "Viewed":
+                return _load(config, path, None, server.notify)
+
+            session = None if config.follow else server.open(load, references, config.pixels)
             if not is_capture(path):
-                session.follow(_newer(config, path, session.viewed.step))
+                from ..viewer.live import TrainingFollower
+
+                stack.enter_context(TrainingFollower(server, path, load, session, config.pixels))
         try:
             threading.Event().wait()
         except KeyboardInterrupt:
@@ -146,21 +149,3 @@ def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[st
     scene = seen_capture(capture, look, progress=progress)
     name = name or path.resolve().name.partition(".")[0]
     return Viewed(scene, name, 0, root=config.output / name, capture=capture, stylizer=RegionToneConfig(centred=False))
-
-
-def _newer(config: ViewConfig, path: Path, step: int) -> "Callable[[], Viewed | None]":
-    """Return the run as its newest checkpoint has it, whenever that is another one."""
-    shown = step
-
-    from ..viewer.scene_files import newest_step
-
-    def load() -> "Viewed | None":
-        nonlocal shown
-        newest = newest_step(path)
-        if newest <= shown:
-            return None
-        viewed = _load(config, path, None, lambda text: None)
-        shown = max(newest, viewed.step)
-        return viewed
-
-    return load

@@ -19,7 +19,7 @@ from ..rendering.cameras import Cameras
 from ..splats.config import GaussiansConfig
 from ..splats.gaussians import Gaussians
 from ..splats.initial import Points
-from ..splats.learner import Learner
+from ..splats.learner import GaussianLearner
 from ..splats.photographs import make_levels
 from ..splats.training import find_near, reach_of
 from ..style.look import Restyle
@@ -61,12 +61,12 @@ def fit_gaussians(
         images = _renders(trained, cameras, look, report)
         levels = make_levels(scene, images, {}, near)
         if learner is None:
-            learner = Learner(config, levels, reach, cap)
-            learner.begin(points, draw)
+            learner = GaussianLearner(config, levels, reach, cap)
+            learner.begin_at(points, draw)
             seconds = 60 * minutes
         else:
             before = learner
-            learner = Learner(replace(config, coarse=0.0), levels, reach, cap, only="colours")
+            learner = GaussianLearner(replace(config, coarse=0.0), levels, reach, cap, only="colours")
             learner.start_from(before.gaussians())
             seconds = 60 * minutes * _COLOURS
         start, step, share = time.perf_counter(), 0, 0.0

@@ -1,4 +1,4 @@
-"""Affine maps of view-dependent colours: harmonics in, harmonics out.
+"""Spherical harmonics, and affine maps of the view-dependent colours that they express: harmonics in, harmonics out.
 
     colour' = colour A + b,   0.5 + Y0 dc' = (0.5 + Y0 dc) A + b,   higher harmonics' = harmonics A
 
@@ -36,6 +36,36 @@ class Directions(NamedTuple):
     """Their coefficients out of values in the directions, in least squares."""
 
 
+def spherical_harmonics(direction: Annotated[Tensor, "N 3"], degree: int) -> Annotated[Tensor, "N degree**2"]:
+    """Values of the real spherical harmonics below a degree, 1 to 4, at unit directions.
+
+    In the order and with the signs of 3D Gaussian splatting files, where a colour is 0.5 + their sum with the coefficients.
+    """
+    x, y, z = direction.unbind(-1)
+    columns = [torch.full_like(x, 0.28209479177387814)]
+    if degree > 1:
+        columns += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
+    if degree > 2:
+        columns += [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (3 * z * z - 1),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (x * x - y * y),
+        ]
+    if degree > 3:
+        columns += [
+            -0.5900435899266435 * y * (3 * x * x - y * y),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (5 * z * z - 1),
+            0.3731763325901154 * z * (5 * z * z - 3),
+            -0.4570457994644658 * x * (5 * z * z - 1),
+            1.445305721320277 * z * (x * x - y * y),
+            -0.5900435899266435 * x * (x * x - 3 * y * y),
+        ]
+    return torch.stack(columns, -1)
+
+
 def as_drawn(harmonics: Annotated[Tensor, "N K 3"], directions: Directions) -> Annotated[Tensor, "N K 3"]:
     """Harmonics of the colours that renderers show, which are cut at 0: a map would lift what was hidden below.
 
@@ -57,7 +87,7 @@ def as_drawn(harmonics: Annotated[Tensor, "N K 3"], directions: Directions) -> A
     return out
 
 
-def recoloured_reference(
+def recoloured(
     harmonics: Annotated[Tensor, "N K 3"],
     change: Annotated[Tensor, "N 4 3"],
     weight: Annotated[Tensor, "N"],
@@ -65,8 +95,16 @@ def recoloured_reference(
 ) -> Annotated[Tensor, "N K 3"]:
     """Harmonics as drawn, mapped by A = 1 + change[:, :3] and b = change[:, 3]; those of no weight stay, bit for bit.
 
-    Mean colours stay below `MAX_COLOUR`, but for those that were above it.
+    Mean colours stay below `MAX_COLOUR`, but for those that were above it. Both forms agree within 60 u of the largest harmonic
+    and change, u = 2^-24; the compiled one has no gradients.
     """
+    if usable(harmonics):
+        from . import harmonics_kernels as kernels
+
+        out = torch.empty_like(harmonics, memory_format=torch.contiguous_format)
+        flat = [array(x.float()) for x in (harmonics, change, weight, directions.values, directions.fit)]
+        kernels.recolour(*flat, len(directions.values), np.float32(MAX_COLOUR), out.view(-1).numpy())
+        return out
     drawn = as_drawn(harmonics, directions)
     matrix = torch.eye(3).to(change) + change[:, :3]
     colour = 0.5 + HARMONIC * drawn[:, 0]
@@ -75,21 +113,3 @@ def recoloured_reference(
     new = torch.einsum("nkc,ncd->nkd", drawn, matrix)
     new[:, 0] = (moved - 0.5) / HARMONIC
     return torch.where((weight > 0)[:, None, None], new, harmonics)
-
-
-def recoloured(
-    harmonics: Annotated[Tensor, "N K 3"],
-    change: Annotated[Tensor, "N 4 3"],
-    weight: Annotated[Tensor, "N"],
-    directions: Directions,
-) -> Annotated[Tensor, "N K 3"]:
-    """`recoloured_reference`, within 60 u of the largest harmonic and change, u = 2^-24; without gradients."""
-    if not usable(harmonics):
-        return recoloured_reference(harmonics, change, weight, directions)
-    from . import harmonics_kernels as kernels
-
-    out = torch.empty_like(harmonics, memory_format=torch.contiguous_format)
-    parts = (harmonics, change, weight, directions.values, directions.fit)
-    flat = [array(part.float()) for part in parts]
-    kernels.recolour(*flat, len(directions.values), np.float32(MAX_COLOUR), out.view(-1).numpy())
-    return out

@@ -11,8 +11,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from .simd import LANES, absolute, as_float, lanes, load, splat, store, take, total, traced, where_greater
-from .threads import on_threads
+from .simd import LANES, absolute, as_float, lanes, load, on_threads, splat, store, take, total, traced, where_greater
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 WINDOW = 11
@@ -130,11 +129,6 @@ def _difference(image, target, at, width, x, slope, grad):
     return absolute(d) * inside
 
 
-@traced
-def _zero(array, at):
-    store(array, at, 0)
-
-
 @_jit
 def _loss(counters, image, target, target_blurred, width, height, share, rooms, grad, sums):
     padded = (width + LANES - 1) // LANES * LANES
@@ -162,7 +156,7 @@ def _loss(counters, image, target, target_blurred, width, height, share, rooms, 
                 if y < 0 or y >= down:
                     for x in range(0, room, LANES):
                         for layers in range(3):
-                            _zero(moves, layers * layer + d + x)
+                            store(moves, layers * layer + d + x, 0)
                     continue
                 for x in range(0, width, LANES):
                     _down_both(image, target, at + x, padded, line, x, room)

@@ -52,6 +52,7 @@ class Live {
     else if (message.type === "loading") this.mode("loading");
     else if (message.type === "scene") await this.open(message);
     else if (message.type === "state") this.fill(message);
+    else if (message.type === "training") this.trained(message);
     else if (message.type === "colours") await this.recolour(message);
   }
 
@@ -76,7 +77,6 @@ class Live {
       if (scene.gaussians) { await this.place.splats.replace(head, parts); await this.place.splats.add("Captured", head.styles[0], parts["style-0"]); }
       this.place.scene = head;
       this.place.touch();
-      say(`step ${scene.step}`);
       return;
     }
     let splats = null;
@@ -90,6 +90,13 @@ class Live {
     this.stage = new Stage(this.place, [{ name: "Captured" }]);
     this.stage.listeners.chosen = (name) => this.chosen(name);
     window.fprf = { place: this.place, stage: this.stage, live: this };
+  }
+
+  trained({ step, share, psnr, seconds_left: left }) {
+    const clock = `${Math.floor(left / 60)}:${String(left % 60).padStart(2, "0")} left`;
+    at("training").hidden = false;
+    at("training").children[0].value = share;
+    at("training").children[1].textContent = share < 1 ? `training, step ${step} · ${psnr.toFixed(1)} dB · ${clock}` : `trained, ${step} steps`;
   }
 
   async recolour({ name, version }) {

@@ -13,9 +13,8 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from ..fields.planes import harmonics
 from ..interfaces import Encoder, Stylizer
-from ..ops.harmonics import Directions, recoloured
+from ..ops.harmonics import Directions, recoloured, spherical_harmonics
 from ..ops.precision import double
 from ..plugins.stylizers.config import StylizerConfig
 from ..style.colours import ColourMaps, carried_colours
@@ -74,7 +73,7 @@ def all_around(bands: int) -> Directions:
     height, turn = 1 - 2 * at / _DIRECTIONS, at * (math.pi * (5**0.5 - 1))
     flat = (1 - height.square()).sqrt()
     around = torch.stack([flat * turn.cos(), flat * turn.sin(), height], 1)
-    values = harmonics(around, math.isqrt(min(bands, 16)))
+    values = spherical_harmonics(around, math.isqrt(min(bands, 16)))
     return Directions(values.T.contiguous(), torch.linalg.pinv(values))
 
 
@@ -100,17 +99,21 @@ def _change(
 def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N 4 3"]:
     """A and b of one part at full strength."""
     if part.light is None:
-        return _painted(part, semantic)
-    paint = part.light.paint(semantic)
-    return paint[..., None] * _painted(part, semantic) + part.light.change(semantic, paint)
+        return _painted(part, semantic, None)
+    # Light and paint are of one scene, and so are the regions that they ask about.
+    belongs = part.light.membership(semantic)
+    paint = part.light.paint(semantic, belongs)
+    return paint[..., None] * _painted(part, semantic, belongs) + part.light.change(semantic, paint, belongs)
 
 
-def _painted(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N 4 3"]:
-    """A and b of one part's stylizer and colours."""
+def _painted(
+    part: Restyle, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None
+) -> Annotated[Tensor, "N 4 3"]:
+    """A and b of one part's stylizer and colours; `belongs` are the points' shares in the regions, where they are known."""
     if part.colours is not None:
         maps = part.colours
-        belongs: Tensor = maps.membership(semantic)
-        return (belongs @ torch.cat([maps.matrix, maps.bias[:, None]], 1).flatten(1)).view(-1, 4, 3)
+        share: Tensor = maps.membership(semantic) if belongs is None else belongs
+        return (share @ torch.cat([maps.matrix, maps.bias[:, None]], 1).flatten(1)).view(-1, 4, 3)
     # An affine stylizer is known by what it makes of black and of each channel alone.
     black = part.stylizer(semantic.new_zeros(len(semantic), 3), semantic)
     rows = [part.stylizer(axis.expand(len(semantic), 3), semantic) - black - axis for axis in torch.eye(3)]

@@ -14,8 +14,8 @@ from ..config import LossConfig
 from ..errors import ConfigError, PluginError
 from ..interfaces import LossTerm
 from ..plugins.registry import nearest
-from ..rendering.plugin_checks import check_term
 from ..rendering.stepfun import distortion, interlevel, midpoints
+from ..testing.outputs import check_term
 from ..types import Batch, Rendered, Want
 from .model import Facts, Model
 

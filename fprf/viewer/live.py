@@ -1,111 +1,88 @@
-"""`fprf train --view`: `fprf view` on the run folder, in a process of its own.
-
-It reads checkpoints as they come; whatever becomes of it, training goes on.
+"""Follow a training in the viewer. The run folder is the only channel: its newest checkpoint is shown, and as long as somebody
+looks the folder says so (`training.driver.watch`), for which training saves more often.
 """
 
-import contextlib
 import json
-import signal
-import subprocess
-import sys
-import tempfile
 import threading
-import urllib.request
+from collections.abc import Callable
 from pathlib import Path
-from queue import Empty, Queue
-from typing import NamedTuple
-from urllib.parse import urlsplit
+from typing import TYPE_CHECKING, Any
 
-from ..errors import UsageError
+from ..errors import FprfError
+from ..training.driver import schedule_of, watch
+from ..training.run import Run
+from .scene_files import newest_step
 
-_START_TIMEOUT = 60.0
-"""Seconds within which the viewer must say where it listens."""
+if TYPE_CHECKING:
+    from .server import ViewerServer
+    from .session import Session, Viewed
 
-
-class ViewAddress(NamedTuple):
-    """Address to listen at."""
-
-    host: str = "127.0.0.1"
-    port: int = 8080
-    strict: bool = False
-    """True where another free port will not do."""
+_POLL = 0.5
+"""Seconds between looks at the folder."""
+_TAIL = 4096
+"""Bytes of the end of events.jsonl that hold its last line."""
 
 
-class LiveViewer:
-    """The viewer's process; a context manager, which ends it. Raises UsageError where the viewer does not start."""
+class TrainingFollower:
+    """Keeps the scene that a server shows at the newest checkpoint of a run. A context manager, which ends its thread.
 
-    def __init__(self, address: ViewAddress, run: Path, command: tuple[str, ...] = (sys.executable, "-m", "fprf")) -> None:
-        self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115  closed with the process
-        self._process: subprocess.Popen[str] | None = None
-        ports = (address.port,) if address.strict else (address.port, 0)
-        for port in ports:
-            self.address = self._started([*command, "view", str(run), "--host", address.host, "--port", str(port), "--wait"])
-            if self.address:
-                return
-        why = self.fault or "the viewer did not start; try `fprf view` on a run, or train without --view"
-        self.close()
-        raise UsageError(f"--view: {why}")
+    `load` opens the run, and `opened` is the session where it is open already; without, it is opened at the first checkpoint.
+    """
 
-    def __enter__(self) -> "LiveViewer":
+    def __init__(
+        self,
+        server: "ViewerServer",
+        root: Path,
+        load: "Callable[[], Viewed]",
+        opened: "Session | None" = None,
+        pixels: int = 640,
+    ) -> None:
+        self._server, self._root, self._load, self._session, self._pixels = server, root, load, opened, pixels
+        self._shown = -1 if opened is None else opened.viewed.step
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._follow, name="fprf-follow", daemon=True)
+
+    def __enter__(self) -> "TrainingFollower":
+        self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
+        self._over.set()
+        self._thread.join(5)
 
-    @property
-    def looked_at(self) -> bool:
-        """True while a page is open."""
-        place = urlsplit(self.address)
-        asked = urllib.request.Request(f"{place.scheme}://{place.netloc}/pages")
-        asked.add_header("authorization", f"Bearer {place.query.removeprefix('token=')}")
-        try:
-            with urllib.request.urlopen(asked, timeout=5) as answer:  # nosec B310  our own address
-                return bool(json.load(answer)["pages"])
-        except (OSError, ValueError, KeyError):
-            return False
+    def _follow(self) -> None:
+        while not self._over.wait(_POLL):
+            try:
+                self.tick()
+            except (FprfError, OSError) as error:  # the page says so; the next checkpoint may be better
+                self._server.notify(str(error))
 
-    @property
-    def fault(self) -> str | None:
-        """Why the viewer has ended, in one line; None where it has not."""
-        if self._process is None or self._process.poll() is None:
-            return None
-        self._log.seek(0)
-        lines = [line.strip() for line in self._log if line.strip()]
-        return lines[-1].removeprefix("error: ")[:200] if lines else "it said nothing"
+    def tick(self) -> None:
+        """Say that somebody looks, and show what is new."""
+        if self._server.pages:
+            watch(self._root)
+        newest = newest_step(self._root)
+        if newest <= self._shown:
+            return
+        self._shown = newest
+        if self._session is None:
+            self._session = self._server.open(self._load, (), self._pixels, warm=False)
+        else:
+            self._session.reload(self._load())
+        if (progress := training_progress(self._root)) is not None:
+            self._session.trained(progress)
 
-    def wait(self) -> None:
-        """Return when no page is open any more, or the viewer has ended."""
-        assert self._process is not None
-        while self.looked_at:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(1)
 
-    def close(self) -> None:
-        """End the viewer, by force if it does not react."""
-        if self._process is not None and self._process.poll() is None:
-            self._process.send_signal(signal.SIGINT)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(5)
-            self._process.kill()
-            self._process.wait()
-        if self._process is not None and self._process.stdout is not None:
-            self._process.stdout.close()
-        self._log.close()
-
-    def _started(self, command: list[str]) -> str:
-        """Start the process; the address that it prints, or nothing."""
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=self._log,
-            text=True,
-            start_new_session=True,  # an interrupt at the terminal is training's
-        )
-        first: Queue[str] = Queue()
-        output = self._process.stdout
-        assert output is not None
-        threading.Thread(target=lambda: first.put(output.readline().strip()), daemon=True).start()
-        with contextlib.suppress(Empty):
-            return first.get(timeout=_START_TIMEOUT)
-        return ""
+def training_progress(root: Path) -> dict[str, Any] | None:
+    """How far a run is, by the last line of its events.jsonl: step, share, psnr, seconds left; None where it does not say."""
+    run = Run(root)
+    try:
+        with (root / "events.jsonl").open("rb") as file:
+            file.seek(max(0, file.seek(0, 2) - _TAIL))
+            lines = [json.loads(line) for line in file.read().decode(errors="replace").splitlines()[1:]]
+        last = next(line for line in reversed(lines) if "psnr" in line)
+        share = schedule_of(run.load_config()[0], len(run.load_known().train)).share(last["step"], last["seconds"])
+        left = last["seconds"] * (1 - share) / max(share, 1e-3)
+        return {"step": int(last["step"]), "share": share, "psnr": float(last["psnr"]), "seconds_left": round(left)}
+    except (OSError, ValueError, KeyError, StopIteration):
+        return None

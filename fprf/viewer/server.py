@@ -268,6 +268,11 @@ class ViewerServer:
         token = "" if self.access.token is None else f"?token={quote(self.access.token)}"
         return f"http://{host}:{self.port}/{token}"
 
+    @property
+    def pages(self) -> int:
+        """Number of pages that are open."""
+        return len(self._clients)
+
     def show_start(self, start: "Start") -> None:
         """Show the start page in the place of a scene; pages can come back to it from then on."""
         self._start = start
@@ -334,7 +339,6 @@ class ViewerServer:
             Route("/gaussians", self._gaussians),
             Route("/film", self._film),
             Route("/picture", self._picture),
-            Route("/pages", self._pages),
             Route("/photograph", self._photograph, methods=["POST"]),
             *start_routes(lambda: self._start, self.body),
         ]
@@ -395,9 +399,6 @@ class ViewerServer:
     async def _colours(self, request: Request) -> Response:
         data = self.session.colours(request.query_params.get("name", ""))
         return Response(data, media_type="application/octet-stream")
-
-    async def _pages(self, request: Request) -> Response:
-        return JSONResponse({"pages": len(self._clients)})
 
     async def _card(self, request: Request) -> Response:
         from ..io.images import encode

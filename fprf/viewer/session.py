@@ -8,7 +8,6 @@ import threading
 from collections.abc import Callable, Generator, Hashable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import count
 from pathlib import Path
 from queue import Queue
@@ -46,8 +45,6 @@ SHELF = 12
 """Photographs on the shelf; the oldest that no look needs makes room."""
 _POLL = 0.5
 """Seconds between looks whether the worker is closed."""
-_FOLLOW = 2.0
-"""Seconds between looks for a newer checkpoint."""
 _MAX_KEYS = 64
 _QUALITY = {False: 72, True: 90}
 NOW = "Now"
@@ -131,7 +128,7 @@ class Session:
         self._version = count(1)
         self._colours: dict[str, tuple[int, bytes]] = {}
         self._coloured: Shown | None = None
-        self._closed = threading.Event()
+        self._progress: dict[str, Any] | None = None
         self._load()
 
     def __enter__(self) -> "Session":
@@ -139,7 +136,6 @@ class Session:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._closed.set()
         self._worker.close()  # a film that is being made is left unfinished
         self.uploads.close()
 
@@ -169,7 +165,8 @@ class Session:
         """What a new client has to know."""
         scene = {"type": "scene", "name": self.viewed.name, "gaussians": self.drawn_there, "step": self.viewed.step}
         ready = [("colours " + name, self._colours_message(name)) for name in self._colours]
-        return [("scene", scene), ("state", self._described()), *ready]
+        training = [] if self._progress is None else [("training", self._progress)]
+        return [("scene", scene), ("state", self._described()), *ready, *training]
 
     def handle(self, client: Hashable, message: messages.AnyMessage) -> None:
         """Do what a client asks for. Raises FprfError with what is wrong with it."""
@@ -259,18 +256,14 @@ class Session:
 
         self._worker.run_when_idle(work())
 
-    def follow(self, load: Callable[[], Viewed | None]) -> None:
-        """Show newer states of a training as they come: `load` returns one, or None where there is nothing newer."""
+    def reload(self, viewed: Viewed) -> None:
+        """Show another state of the scene, from the next step of the worker on."""
+        self._worker.run("reload", lambda: self._reload(viewed))
 
-        def work() -> None:
-            while not self._closed.wait(_FOLLOW):
-                try:
-                    if (viewed := load()) is not None:
-                        self._worker.run("reload", partial(self._reload, viewed))
-                except (FprfError, OSError):
-                    continue  # it is saved or replaced just now
-
-        threading.Thread(target=work, name="fprf-follow", daemon=True).start()
+    def trained(self, progress: Mapping[str, Any]) -> None:
+        """Tell all clients how far the scene's training is."""
+        self._progress = {"type": "training", **progress}
+        self._post(None, "training", self._progress)
 
     def colours(self, name: str) -> bytes:
         """Colours of the present look or of a kept one, for a browser. Raises UsageError where there are none."""

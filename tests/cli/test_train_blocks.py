@@ -6,9 +6,7 @@ from pathlib import Path
 import pytest
 from tiny_world import World, flags
 
-from fprf.cli.blocks import SHARE, block_minutes
 from fprf.cli.main import main
-from fprf.config import TrainConfig
 
 BLOCKS = ["--blocks", "grid", "--blocks.cells", "2", "1", "--steps", "4"]
 
@@ -30,14 +28,3 @@ def test_from_training_to_styles(world: World, tmp_path: Path, capsys: pytest.Ca
     assert main(command) == 0
     assert "block 00 is finished already" in capsys.readouterr().err
     assert (run / "blocks/00/done.json").read_bytes() == before
-
-
-def test_time_is_shared_between_the_surroundings_and_the_blocks() -> None:
-    config = TrainConfig(minutes=10.0)
-    around, each = block_minutes(config, 4, 60.0)
-    assert around == pytest.approx(9 * SHARE) and each is not None
-    assert around + 4 * each == pytest.approx(9.0)
-    assert block_minutes(TrainConfig(), 4, 60.0) == (None, None)
-    # Features that took longer than the limit leave a little all the same.
-    late = block_minutes(config, 4, 1e4)
-    assert late[0] == pytest.approx(0.5 * SHARE)

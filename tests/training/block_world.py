@@ -11,10 +11,10 @@ from tiny_world import tiny
 
 from benchmarks.town.write import write_town
 from fprf.blocks.config import GridConfig, LayoutConfig
-from fprf.cli.train import train_scene
 from fprf.config import StatisticsConfig, TrainConfig
 from fprf.training import tensorfiles
 from fprf.training.blocks import folder_of
+from fprf.training.driver import train
 
 STEPS = 6
 BLOCKS = GridConfig(cells=(3, 1))
@@ -51,7 +51,7 @@ def made(folder: Path) -> TrainConfig:
     town = folder / "town"
     write_town(town, seed=0, palette="day", views=12, width=32, height=24)
     config = small(town, folder / "run")
-    train_scene(config, "fprf-lite", quiet=True)
+    train(config, "fprf-lite", quiet=True)
     return config
 
 

@@ -13,7 +13,6 @@ from tiny_world import World
 from fprf.errors import FprfError, UsageError
 from fprf.splats.files import read_capture
 from fprf.viewer import messages
-from fprf.viewer import session as session_module
 from fprf.viewer.messages import cameras_of
 from fprf.viewer.render_worker import Steps
 from fprf.viewer.session import SHELF, Session, State
@@ -151,27 +150,18 @@ def test_the_warm_up_leaves_nothing_behind(session: Session, listener: Listener)
     assert session.state == State() and listener.sent == [] and not session.restyler._styles
 
 
-def test_newer_states_of_a_training_are_shown_as_they_come(
-    splats: Session, listener: Listener, world: World, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(session_module, "_FOLLOW", 0.05)
+def test_newer_states_of_a_training_are_shown_as_they_come(splats: Session, listener: Listener, world: World) -> None:
     splats.upload(world.references[0].read_bytes(), "dusk.png")
     listener.until(lambda: any(kind == "colours Now" for _, kind, _ in listener.sent))
-    before, newer = splats.geometry, replace(splats.viewed, step=9)
-    scene = splats.viewed.scene
+    before, scene = splats.geometry, splats.viewed.scene
     moved = replace(scene, gaussians=replace(scene.gaussians, means=scene.gaussians.means + 0.1))  # type: ignore[type-var]
-    waiting = [replace(newer, scene=moved)]
-
-    def load() -> object:
-        if not waiting:
-            raise OSError("it is written just now")
-        return waiting.pop()
-
     count = len(listener.sent)
-    splats.follow(load)  # type: ignore[arg-type]
+    splats.reload(replace(splats.viewed, scene=moved, step=9))
     listener.until(lambda: any(kind == "colours Now" for _, kind, _ in listener.sent[count:]))
     scenes = [message for _, kind, message in listener.sent[count:] if kind == "scene"]
     assert scenes[-1]["step"] == 9 and splats.geometry != before
+    splats.trained({"step": 9, "share": 0.5})
+    assert ("training", {"type": "training", "step": 9, "share": 0.5}) in splats.hello()
 
 
 def test_a_client_is_a_camera_of_the_captured_world(session: Session) -> None:

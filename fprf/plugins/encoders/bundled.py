@@ -6,6 +6,7 @@ from typing import Annotated
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from ...errors import WeightsError
 from ..weights import read_weights
@@ -65,7 +66,7 @@ class _ConvNorm(nn.Module):
         super().__init__()
         padding = dilation * (size // 2)
         self.conv = nn.Conv2d(inputs, outputs, size, stride, padding, dilation, groups, bias=False)
-        self.norm = nn.BatchNorm2d(outputs)
+        self.norm: nn.BatchNorm2d | nn.Identity = nn.BatchNorm2d(outputs)
 
     def forward(self, x: Tensor) -> Tensor:
         return F.relu(self.norm(self.conv(x)))
@@ -131,7 +132,16 @@ def _loaded(name: str, student: nn.Module, tensors: dict[str, Tensor], path: Pat
     except RuntimeError as error:
         first = str(error).splitlines()[-1].strip()
         raise WeightsError(f"{path}: does not fit this version's network ({first}); train it again") from error
-    return NetworkEncoder(name, student, stride=stride)
+    encoder = NetworkEncoder(name, student, stride=stride)
+    # Once its identity is known: normalisation as part of the convolutions before it, and channels last, as they are computed
+    # on the CPU. 1.5 times as fast on two threads, and the same features up to rounding.
+    for module in student.modules():
+        if isinstance(module, _ConvNorm) and isinstance(module.norm, nn.BatchNorm2d):
+            module.conv, module.norm = fuse_conv_bn_eval(module.conv, module.norm), nn.Identity()
+    for parameter in student.parameters():
+        if parameter.ndim == 4:
+            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+    return encoder
 
 
 class RandomEncoder(FrozenEncoder):

@@ -4,9 +4,9 @@ import json
 import pytest
 from rich.console import Console
 
-from fprf.cli import progress
-from fprf.cli.progress import Display
-from fprf.training.trainer import Report
+from fprf import progress
+from fprf.progress import Display
+from fprf.training.driver import Report
 
 
 def report(step: int, share: float) -> Report:

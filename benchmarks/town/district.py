@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from fprf.io.atomic import write_bytes, write_json
 
-from .town.layout import Town, build_town
-from .town.palettes import palette
-from .town.render import FIELD_OF_VIEW, View, cast, directions, is_test, shade, walk
+from .layout import Town, build_town
+from .palettes import palette
+from .render import FIELD_OF_VIEW, View, cast, directions, is_test, shade, walk
 
 SKY = (0.72, 0.8, 0.88)
 """sRGB."""

@@ -32,14 +32,15 @@ from fprf.rendering.cameras import Cameras
 from fprf.style.dictionary import StyleDictionary
 from fprf.style.references import Encoders
 from fprf.style.statistics import monge
+from fprf.training.prepare import read_scene
 from fprf.training.run import Known
 
-from .single_image import encoded
-from .town.layout import Town, build_town
-from .town.palettes import palette
-from .town.render import View, geometry, render, walk
-from .town.surface import CAR, CLASSES, DOOR, FACADE, FOLIAGE, LAMP, LAWN, ROAD, ROOF, SIDEWALK, SKY, TRUNK, WINDOW
-from .town.write import TownSettings, is_town
+from ..single_image import encoded
+from .layout import Town, build_town
+from .palettes import palette
+from .render import View, geometry, render, walk
+from .surface import CAR, CLASSES, DOOR, FACADE, FOLIAGE, LAMP, LAWN, ROAD, ROOF, SIDEWALK, SKY, TRUNK, WINDOW
+from .write import TownSettings, is_town
 
 _STEP = 0.12
 """Metres between frames of the path: 7 frames on, near things have moved by a quarter of a small picture."""
@@ -101,7 +102,7 @@ def set_stage(
 
 def town_folder(config: RunConfig) -> Path | None:
     """Folder of the town that a run was trained on; None where it was another scene."""
-    folder = config.read_scene().paths[0].parents[1]
+    folder = read_scene(config).paths[0].parents[1]
     return folder if is_town(folder) else None
 
 
@@ -368,14 +369,17 @@ def true_class_maps(plain: Labelled, references: Labelled) -> list[Picture]:
 
 
 def mean_rows(tables: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
-    """Mean of every figure over tables with the same methods; what is None somewhere is left out there."""
-    means: dict[str, Row] = {}
-    for method in tables[0]:
-        means[method] = {}
-        for key in tables[0][method]:
-            values = [value for table in tables if (value := table[method][key]) is not None]
-            means[method][key] = math.fsum(values) / len(values) if values else None
-    return means
+    """Mean of every figure of every method over tables; where a table does not have it, or has None, it is left out there."""
+    gathered: dict[str, dict[str, list[float]]] = {}
+    for table in tables:
+        for method, row in table.items():
+            for key, value in row.items():
+                kept = gathered.setdefault(method, {}).setdefault(key, [])
+                kept += [] if value is None else [value]
+    return {
+        method: {key: math.fsum(values) / len(values) if values else None for key, values in row.items()}
+        for method, row in gathered.items()
+    }
 
 
 def _flat(pictures: Labelled) -> tuple[Annotated[Tensor, "N 3"], Annotated[Tensor, "N"]]:
