@@ -112,8 +112,8 @@ def frames(page: Any, scene: SplatScene, count: int) -> dict[str, float]:
 
 def million(browser: Any, folder: Path, count: int) -> dict[str, float]:
     draw_ = torch.Generator().manual_seed(0)
-    parts = (torch.randn(count, 3, generator=draw_), torch.randn(count, 4, generator=draw_), torch.full((count, 3), -5.0))
-    gaussians = Gaussians(*parts, torch.zeros(count), 0.3 * torch.randn(count, 1, 3, generator=draw_))
+    parts = (torch.randn(count, 3, generator=draw_), torch.randn(count, 4, generator=draw_), torch.full((count, 3), -3.5))
+    gaussians = Gaussians(*parts, torch.full((count,), 2.0), 0.3 * torch.randn(count, 1, 3, generator=draw_))
     scene = look_at_capture(
         gaussians, True, BundledSemanticConfig().build(), LookConfig(views=4, size=(160, 120), inside=False)
     )
