@@ -4,9 +4,9 @@ Geometry is learnt once, from the first look; a further look learns colours alon
 Gaussians in the same order.
 """
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from ..splats.learner import GaussianLearner
 from ..splats.photographs import make_levels
 from ..splats.training import find_near, reach_of
 from ..style.look import Restyle
+from ..training.driver import Report, Schedule, learn
 from ..training.loading import Trained
 
 _ALIKE = 0.7
@@ -46,6 +47,7 @@ def fit_gaussians(
     What is rendered are `views` and as many between them. `points` are where Gaussians begin; at most 0.7 `cap` of them are
     taken, and there are at most `cap` Gaussians in the end.
     """
+    # The field is photographed from the views and between them, and learnt like any scene.
     cameras, facts = _with_midpoints(trained.known.cameras.select(torch.tensor(views))), trained.known.facts
     count, every = len(cameras), torch.arange(len(cameras))
     paths = (Path("field"),) * count
@@ -60,6 +62,7 @@ def fit_gaussians(
     for number, look in enumerate(looks):
         images = _renders(trained, cameras, look, report)
         levels = make_levels(scene, images, {}, near)
+        # The first look decides the geometry; in further ones the same Gaussians learn their colours at full size.
         if learner is None:
             learner = GaussianLearner(config, levels, reach, cap)
             learner.begin_at(points, draw)
@@ -69,13 +72,13 @@ def fit_gaussians(
             learner = GaussianLearner(replace(config, coarse=0.0), levels, reach, cap, only="colours")
             learner.start_from(before.gaussians())
             seconds = 60 * minutes * _COLOURS
-        start, step, share = time.perf_counter(), 0, 0.0
-        while share < 1:
-            learner.step(step, share)
-            step, share = step + 1, (time.perf_counter() - start) / seconds
-            if step % 50 == 0:
-                report(round(100 * min(share, 1)), 100, "fitting Gaussians" if number == 0 else "fitting colours")
+        what = "fitting Gaussians" if number == 0 else "fitting colours"
+        learn(learner, None, Schedule(None, seconds / 60), partial(_tell, report, what))
         yield learner.gaussians()
+
+
+def _tell(report: Callable[[int, int, str], None], what: str, event: Report) -> None:
+    report(round(100 * event.share), 100, what)
 
 
 def _renders(
