@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 from ..errors import UsageError
 from .parsing import load_method, methods, parse
-from .view import check_viewer
 
 DEFAULT_METHOD = "fprf-splats"
 """Where none is named: the best quality for the time on every capture that was measured (docs/measurements.md)."""
@@ -45,7 +44,6 @@ def run(args: list[str]) -> int:
     if address is None:
         train(config, method, changed_images=changed)
         return 0
-    check_viewer(VIEW, f", or train without {VIEW}")
     with viewed(config.output or default_output(config, method), address):
         train(config, method, changed_images=changed)
     return 0

@@ -385,7 +385,7 @@ def _decoding(kind: str, name: object, room: int = 0) -> Iterator[None]:
         raise
     except ImportError as error:
         raise DataError(
-            f"{name}: is HEIC, which needs the package pillow-heif: pip install 'fprf[heic]', or convert the image to JPEG"
+            f"{name}: is HEIC, which needs the package pillow-heif: pip install pillow-heif, or convert the image to JPEG"
         ) from error
     except Exception as error:
         np.empty(room, np.uint8)  # raises MemoryError where that is what the decoder lacked: few of them say so

@@ -115,7 +115,6 @@ def test_a_mistake_is_one_line(
 ) -> None:
     command, _, told = line.partition(" | ")
     if command.startswith("view"):
-        pytest.importorskip("uvicorn", reason="the extra `viewer` is not installed")
         monkeypatch.setattr("importlib.util.find_spec", lambda name: object())
     monkeypatch.chdir(_place)
     before = files(_place)

@@ -20,13 +20,14 @@ from fprf.io.images import write_image
 from fprf.rendering.camera_path import read_camera_path
 from fprf.rendering.local_frame import read_offset
 from fprf.splats.files import read_capture
+from fprf.splats.photographs import camera_of
 from fprf.splats.scene import SplatScene
 from fprf.training.driver import train
 from fprf.training.loading import load_run, open_run
 from fprf.training.run import Run
-from fprf.viewer.cameras import page_transform
-from fprf.viewer.film import FilmPlan, write_film_files
-from fprf.viewer.state import Key, Look
+from fprf.viewer.film import FilmPlan, Key, write_film_files
+from fprf.viewer.look import Look
+from fprf.viewer.messages import Camera
 
 SPLATS = ["--downscale", "1", "--initial", "300", "--cap", "400", "--steps", "40"]
 
@@ -186,9 +187,10 @@ def test_paths_and_places_are_given_in_the_capture_s_coordinates(world: World, s
     assert float((scene.render(aimed).rgb - wanted).abs().mean()) < 0.05, "level, where the photograph may lean a little"
     # The viewer's film says where it flew in the capture's coordinates, too.
     cameras, origin = scene.trained.known.cameras, scene.trained.scene.origin
-    transform = page_transform(cameras)
-    key = Key(transform.camera_state(cameras, 2), Look())
-    write_film_files(tmp_path, transform, FilmPlan((key, key), 0.5, 4.0, (32, 24)), "", None, origin)
+    pinhole = camera_of(cameras, 2)
+    axes = tuple(tuple(row) for row in pinhole.world_to_camera[:3, :3].tolist())
+    key = Key(Camera(tuple(cameras.pose[2, :, 3].tolist()), axes, (30, 30, 16, 12), (32, 24)), Look())
+    write_film_files(tmp_path, FilmPlan((key, key), 0.5, 4.0, 32), "", None, origin)
     written = json.loads((tmp_path / "path.json").read_text())["camera_path"][0]["camera_to_world"]
     assert np.abs(np.array(written).reshape(4, 4)[:3, 3] - at).max() < 1e-6
     back = read_camera_path(tmp_path / "path.json", origin)[0]

@@ -1,18 +1,16 @@
-"""The start page without a browser: the programs that find poses and train are stood in for by a script."""
+"""The start without a browser: the programs that find poses and train are stood in for by a script."""
 
-import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from session_helpers import ask, post, until
+from session_helpers import until
 
 from fprf.errors import DataError, FprfError, UsageError
-from fprf.viewer import start_page
-from fprf.viewer.routes import Response
-from fprf.viewer.start_page import StartPage
+from fprf.viewer import start as start_module
+from fprf.viewer.start import Start
 
 PROGRAM = f"""#!{sys.executable}
 import json, pathlib, signal, sys, time
@@ -40,39 +38,33 @@ if args[args.index("--minutes") + 1] != "1":
 """
 
 
-class ShownPage(StartPage):
-    """A start page that notes what it would open the viewer on."""
+class Shown(Start):
+    """A start that notes what it would open the viewer on, and what it posts."""
 
     def __init__(self, output: Path) -> None:
         self.shown: list[tuple[Path, str]] = []
-        super().__init__(output, self.open, self.shown.clear)
+        self.posted: list[Any] = []
+        super().__init__(output, self.view, self.shown.clear, lambda client, kind, message: self.posted.append(message))
 
-    def open(self, path: Path, name: str) -> None:
+    def view(self, path: Path, name: str) -> None:
         if path.suffix == ".ply":
             raise DataError("of two dimensions")
         self.shown.append((path, name))
 
     def reached(self, **wanted: object) -> Any:
         """The state, as soon as it is so."""
-        state: dict[str, Any] = {}
-        until(lambda: wanted.items() <= state.items(), lambda: state.update(json.loads(self.ask("GET", "").body)))
-        return state
-
-    def ask(self, method: str, path: str, body: bytes = b"", /, **query: object) -> Response:
-        return ask(self.routes, method, f"/fprf/start{path}", body, **query)
-
-    def post(self, path: str, /, **asked: object) -> Any:
-        return post(self.routes, f"/fprf/start/{path}", **asked)
+        until(lambda: wanted.items() <= self.state().items())
+        return self.state()
 
 
 @pytest.fixture
-def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ShownPage]:
+def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Shown]:
     program = tmp_path / "python"
     program.write_text(PROGRAM)
     program.chmod(0o755)
-    monkeypatch.setattr(start_page.sys, "executable", str(program))
+    monkeypatch.setattr(start_module.sys, "executable", str(program))
     monkeypatch.chdir(tmp_path)
-    page = ShownPage(tmp_path / "made")
+    page = Shown(tmp_path / "made")
     yield page
     page.close()
 
@@ -86,48 +78,49 @@ def photographs(tmp_path: Path) -> Path:
     return folder
 
 
-def test_photographs_are_posed_trained_and_shown(page: ShownPage, photographs: Path, tmp_path: Path) -> None:
-    page.post("open", path=f' "{photographs}" ', minutes=1)
+def test_photographs_are_posed_trained_and_shown(page: Shown, photographs: Path, tmp_path: Path) -> None:
+    page.open({"path": f' "{photographs}" ', "minutes": 1})
     state = page.reached(stage="open")
     assert page.shown == [(tmp_path / "made" / "yard" / "run", "yard")] and state["error"] is None
-    assert state["lines"] == ["hello from process", "hello from train"]
-    page.post("leave")
+    assert [each["stage"] for each in page.posted if each["stage"] != "training"][-2:] == ["opening", "open"]
+    assert list(state["lines"]) == ["hello from process", "hello from train"]
+    page.leave({})
     recent = page.reached(stage="idle")["recent"]
     assert page.shown == [] and [(row["name"], row["kind"]) for row in recent] == [("yard", "trained")]
-    page.post("open", path=recent[0]["path"])
+    page.open({"path": recent[0]["path"]})
     page.reached(stage="open")
     assert page.shown == [(tmp_path / "made" / "yard" / "run", "yard")]
 
 
 @pytest.mark.parametrize("then", ["show", "leave"])
-def test_training_is_stopped_to_show_what_there_is_or_to_leave_it(page: ShownPage, photographs: Path, then: str) -> None:
-    page.post("open", path=str(photographs), minutes=2)
+def test_training_is_stopped_to_show_what_there_is_or_to_leave_it(page: Shown, photographs: Path, then: str) -> None:
+    page.open({"path": str(photographs), "minutes": 2})
     state = page.reached(stage="training", share=0.5)
     assert state["picture"] == 7 and state["detail"] == "step 7 · 20.0 dB · 1:01 left"
     with pytest.raises(UsageError, match="yard is being made"):
-        page.post("open", path=str(photographs))
-    page.post("stop", then=then)
+        page.open({"path": str(photographs)})
+    page.stop({"then": then})
     page.reached(stage="open" if then == "show" else "idle")
     assert len(page.shown) == (then == "show")
 
 
-def test_a_failure_is_told_and_nothing_is_lost(page: ShownPage, photographs: Path, tmp_path: Path) -> None:
+def test_a_failure_is_told_and_nothing_is_lost(page: Shown, photographs: Path, tmp_path: Path) -> None:
     (photographs / "bad.jpg").touch()
-    page.post("open", path=str(photographs))
+    page.open({"path": str(photographs)})
     page.reached(stage="poses", error="3 photographs show nothing in common")
-    page.post("stop")
+    page.stop({})
     page.reached(stage="idle", error=None)
-    scene = page.post("new", name="../../x/My capture.ply")["scene"]
+    scene = page.new({"name": "../../x/My capture.ply"})["scene"]
     assert scene == "My-capture-ply"
-    page.ask("POST", "/piece", b"ply\n", scene=scene, name="x.ply", at=0, size=4)
-    page.post("make", scene=scene)
+    page.piece({"scene": scene, "name": "x.ply", "at": "0", "size": "4"}, b"ply\n")
+    page.make({"scene": scene})
     page.reached(error="of two dimensions")
     assert (tmp_path / "made" / scene / "files" / "x.ply").read_bytes() == b"ply\n"
-    assert page.post("new", name="My capture.ply")["scene"] == "My-capture-ply-2"
+    assert page.new({"name": "My capture.ply"})["scene"] == "My-capture-ply-2"
 
 
-def test_requests_that_make_no_sense_are_refused(page: ShownPage, photographs: Path) -> None:
-    empty = page.post("new", name="")["scene"]
+def test_requests_that_make_no_sense_are_refused(page: Shown, photographs: Path) -> None:
+    empty = page.new({"name": ""})["scene"]
     place = str(photographs)
     refused: list[tuple[str, dict[str, object]]] = [
         ("make", {"scene": empty}),
@@ -139,8 +132,8 @@ def test_requests_that_make_no_sense_are_refused(page: ShownPage, photographs: P
     ]
     for path, asked in refused:
         with pytest.raises(FprfError):
-            page.post(path, **asked)
+            getattr(page, path)(asked)
     with pytest.raises(UsageError):
-        page.ask("POST", "/piece", b"x", scene=empty, name="a.ply", at="-1", size=4)
-    assert page.ask("GET", "/picture").status == 404
+        page.piece({"scene": empty, "name": "a.ply", "at": "-1", "size": "4"}, b"x")
+    assert page.picture() == b""
     assert page.reached(stage="idle")["folder"] == ""

@@ -1,4 +1,4 @@
-"""The page of `fprf view` without a run: photographs, a video or a capture come in, and become a scene that the viewer shows.
+"""The start of `fprf view` without a run: photographs, a video or a capture come in, and become a scene that the viewer shows.
 
 Poses and training are `fprf process` and `fprf train` in processes of their own; the page shows the lines that they print. A
 scene has one folder: its `files`, the `scene` with their poses, and the run folder `run`.
@@ -12,18 +12,24 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+
 from ..errors import DataError, FprfError, UsageError
-from .routes import Handler, Request, Response, asset, integer, json_body, json_response, number, text_response
-from .scene_files import SceneFiles, Source, find_source, is_capture
+from .scene_files import SceneFiles, Source, find_source, is_capture, newest_step
 
 METHOD = "fprf-splats"
 _FILES, _SCENE, _RUN = "files", "scene", "run"
+_MAX_JSON = 4096
+"""Bytes of a request that is JSON."""
 _LINES = 40
 """Lines of a process that are kept."""
 _RECENT = 12
@@ -59,11 +65,20 @@ class _Left(Exception):
     """The user wants nothing more of a scene."""
 
 
-class StartPage:
-    """`output` holds a folder a scene; `show` opens the viewer on a run folder or a capture, `leave` closes it."""
+class Start:
+    """`output` holds a folder a scene; `show` opens the viewer on a run folder or a capture, `leave` closes it.
 
-    def __init__(self, output: Path, show: Callable[[Path, str], None], leave: Callable[[], None]) -> None:
-        self._output, self._show, self._leave = output.resolve(), show, leave
+    `post` sends all pages how far it is.
+    """
+
+    def __init__(
+        self,
+        output: Path,
+        show: Callable[[Path, str], None],
+        leave: Callable[[], None],
+        post: Callable[[None, str, Mapping[str, Any]], None] = lambda client, kind, message: None,
+    ) -> None:
+        self._output, self._show, self._leave, self._post = output.resolve(), show, leave, post
         self._uploads: dict[str, SceneFiles] = {}
         self._progress = Progress()
         self._lock, self._drawing = threading.Lock(), threading.Lock()
@@ -73,99 +88,68 @@ class StartPage:
         self._thread: threading.Thread | None = None
         self._picture: tuple[int, bytes] = (-1, b"")
 
-    @property
-    def routes(self) -> dict[tuple[str, str], Handler]:
-        """Handlers by method and path; those but `/` serve the viewer's page as well."""
-        return {
-            ("GET", "/"): asset("start.html"),
-            ("GET", "/fprf/start.js"): asset("start.js"),
-            ("GET", "/fprf/start.css"): asset("start.css"),
-            ("GET", "/fprf/start"): self._state,
-            ("GET", "/fprf/start/picture"): self._draw,
-            ("POST", "/fprf/start/new"): self._new,
-            ("POST", "/fprf/start/piece"): self._piece,
-            ("POST", "/fprf/start/make"): self._make_uploaded,
-            ("POST", "/fprf/start/open"): self._make_path,
-            ("POST", "/fprf/start/stop"): self._stop,
-            ("POST", "/fprf/start/leave"): self._close_scene,
-        }
-
     def close(self) -> None:
         """End what is being made, as an interrupt at the terminal would."""
         self._interrupt("leave")
         if self._thread is not None:
             self._thread.join(_EXIT_TIMEOUT)
 
-    async def _state(self, request: Request) -> Response:
+    def state(self) -> dict[str, Any]:
+        """How far it is, as the page reads it; idle, what can be opened."""
         progress = self._progress
-        idle = progress.stage == "idle"
-        return json_response(
-            {
-                **asdict(progress),
-                "picture": -1 if progress.stage != "training" else _newest(self._output / progress.name / _RUN),
-                "output": str(self._output),
-                "recent": await asyncio.to_thread(self._recent) if idle else [],
-            }
-        )
+        step = newest_step(self._output / progress.name / _RUN) if progress.stage == "training" else -1
+        recent = self._recent() if progress.stage == "idle" else []
+        return {"type": "start", **asdict(progress), "picture": step, "output": str(self._output), "recent": recent}
 
-    async def _draw(self, request: Request) -> Response:
-        picture = await asyncio.to_thread(self._drawn, self._output / self._progress.name / _RUN)
-        if not picture:
-            return text_response(404, "no picture yet")
-        return Response(200, "image/jpeg", picture)
+    def picture(self) -> bytes:
+        """A view of the newest checkpoint as a JPEG; empty where there is none."""
+        return self._drawn(self._output / self._progress.name / _RUN)
 
-    async def _new(self, request: Request) -> Response:
+    def new(self, asked: Mapping[str, Any]) -> dict[str, str]:
         """Begin a scene under a name like the one that is asked for."""
-        name = self._unused(str(json_body(request).get("name", "")))
+        name = self._unused(str(asked.get("name", "")))
         self._uploads[name] = SceneFiles(self._output / name / _FILES)
-        return json_response({"scene": name})
+        return {"scene": name}
 
-    async def _piece(self, request: Request) -> Response:
-        query = request.query
+    def piece(self, query: Mapping[str, str], data: bytes) -> None:
+        """Take a piece of a file. Raises as `SceneFiles.add`."""
         upload = self._upload(query.get("scene"))
-        at, size = integer(query, "at"), integer(query, "size")
-        await asyncio.to_thread(upload.add, query.get("name", ""), at, size, request.body)
-        return json_response({})
+        upload.add(query.get("name", ""), integer(query, "at"), integer(query, "size"), data)
 
-    async def _make_uploaded(self, request: Request) -> Response:
-        asked = json_body(request)
+    def make(self, asked: Mapping[str, Any]) -> None:
+        """Make a scene of the files that came. Raises UsageError or DataError where none can be made."""
         name = str(asked.get("scene"))
         folder = self._upload(name).folder
         if not folder.is_dir():
             raise UsageError("none of these files can become a scene; give photographs, a video or a capture")
-        self._begin(await asyncio.to_thread(find_source, folder), name, _minutes(asked))
-        return json_response({})
+        self._begin(find_source(folder), name, _minutes(asked))
 
-    async def _make_path(self, request: Request) -> Response:
+    def open(self, asked: Mapping[str, Any]) -> None:
         """Open, or make a scene of, a file or folder of this machine."""
-        asked = json_body(request)
         text = str(asked.get("path", "")).strip().strip("\"'")
         if not text:
             raise UsageError("name a run folder, a capture, a video or a folder of photographs")
         path = Path(text).expanduser()
-        source = await asyncio.to_thread(find_source, path)
-        whole = path.resolve()
+        source, whole = find_source(path), path.resolve()
         if source.kind == "run":
             name = whole.parent.name if whole.name == _RUN else whole.name
         else:
             ours = whole.name == _FILES and whole.parent.parent == self._output
             name = whole.parent.name if ours else self._unused(path.stem)
         self._begin(source, name, _minutes(asked))
-        return json_response({})
 
-    async def _stop(self, request: Request) -> Response:
+    def stop(self, asked: Mapping[str, Any]) -> None:
         """Stop what is being made, to show what there is, or to leave it; a failure is put away."""
         busy = self._thread is not None and self._thread.is_alive()  # asked before it ends by this very request
-        self._interrupt("show" if json_body(request).get("then") == "show" else "leave")
+        self._interrupt("show" if asked.get("then") == "show" else "leave")
         if not busy:
-            self._progress = Progress()
-        return json_response({})
+            self._reset()
 
-    async def _close_scene(self, request: Request) -> Response:
+    def leave(self, asked: Mapping[str, Any]) -> None:
+        """Close the scene that is shown."""
         if self._progress.stage in ("idle", "open"):
-            await asyncio.to_thread(self._leave)
             self._progress = Progress()
-        return json_response({})
+            self._leave()
 
     def _begin(self, source: Source, name: str, minutes: float) -> None:
         with self._lock:
@@ -176,6 +160,7 @@ class StartPage:
             self._progress = Progress(name=name, stage="opening", folder=str(folder))
             self._thread = threading.Thread(target=self._make, args=(source, name, minutes), name="fprf-make", daemon=True)
             self._thread.start()
+        self._post(None, "start", self.state())
 
     def _make(self, source: Source, name: str, minutes: float) -> None:
         """Find poses, train, and open the viewer, as far as the source needs it."""
@@ -195,7 +180,7 @@ class StartPage:
             self._show(path, name)
             self._set(stage="open")
         except _Left:
-            self._progress = Progress()
+            self._reset()
         except FprfError as error:
             self._set(error=str(error))
         except Exception as error:  # whatever it is, the page goes on and the files are there
@@ -217,7 +202,7 @@ class StartPage:
                     last = line.strip()
                     self._follow(last)
         self._process = None
-        if self._stopped == "leave" or (self._stopped and _newest(self._output / self._progress.name / _RUN) < 0):
+        if self._stopped == "leave" or (self._stopped and newest_step(self._output / self._progress.name / _RUN) < 0):
             raise _Left
         if process.returncode and not self._stopped:
             raise DataError(last.removeprefix("error: ") or f"fprf {args[0]} has ended with {process.returncode}")
@@ -254,6 +239,11 @@ class StartPage:
 
     def _set(self, **changes: Any) -> None:
         self._progress = replace(self._progress, **changes)
+        self._post(None, "start", self.state())
+
+    def _reset(self) -> None:
+        self._progress = Progress()
+        self._post(None, "start", self.state())
 
     def _upload(self, name: str | None) -> SceneFiles:
         upload = self._uploads.get(name or "")
@@ -270,7 +260,7 @@ class StartPage:
 
     def _recent(self) -> list[dict[str, str]]:
         """Scenes and runs on this machine, the newest first."""
-        runs = [(path.parent, path.parent.name) for path in Path("runs").glob("*/config.json") if _newest(path.parent) >= 0]
+        runs = [(path.parent, path.parent.name) for path in Path("runs").glob("*/config.json") if newest_step(path.parent) >= 0]
         scenes = [*_scenes(self._output), *runs, (Path("demo/run"), "demo")]
         dated = [(path.stat().st_mtime, path, name) for path, name in scenes if path.is_dir()]
         return [
@@ -286,7 +276,7 @@ class StartPage:
     def _drawn(self, run: Path) -> bytes:
         """A view of the newest checkpoint as a JPEG; empty where there is none."""
         with self._drawing:
-            step = _newest(run)
+            step = newest_step(run)
             if step > self._picture[0]:
                 with contextlib.suppress(FprfError, OSError):  # while it is saved or replaced the one before is good
                     self._picture = (step, _render(run))
@@ -305,12 +295,6 @@ def _render(run: Path) -> bytes:
     return encode(to_uint8(opened.scene.render(opened.known.cameras, view, resolution=small).rgb), "jpg")
 
 
-def _newest(run: Path) -> int:
-    """Step of the newest whole checkpoint; -1 where there is none."""
-    steps = (path.parent.name.removeprefix("step-") for path in run.glob("checkpoints/step-*/manifest.json"))
-    return max((int(step) for step in steps if step.isdigit()), default=-1)
-
-
 def _kind(path: Path) -> str:
     """Kind of a scene on the list: `trained`, a `capture`, or photographs that are `not trained yet`."""
     if path.name != _FILES:
@@ -321,10 +305,64 @@ def _kind(path: Path) -> str:
 def _scenes(output: Path) -> Iterator[tuple[Path, str]]:
     """Path that each scene's folder is opened by: its run, or its files where there is none yet."""
     for folder in output.glob("*/"):
-        opened = folder / _RUN if _newest(folder / _RUN) >= 0 else folder / _FILES
+        opened = folder / _RUN if newest_step(folder / _RUN) >= 0 else folder / _FILES
         if opened.is_dir():
             yield opened, folder.name
 
 
-def _minutes(asked: dict[str, Any]) -> float:
-    return number({"minutes": 2, **asked}, "minutes", 0.05, 600)
+def _minutes(asked: Mapping[str, Any]) -> float:
+    value = asked.get("minutes", 2)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.05 <= value <= 600:
+        raise UsageError("minutes: must be a number from 0.05 to 600")
+    return float(value)
+
+
+def start_routes(start: "Callable[[], Start | None]", body: Callable[[Request], Awaitable[bytes]]) -> list[Route]:
+    """Requests of the start page; it may be there or not."""
+
+    def found() -> Start:
+        if (each := start()) is None:
+            raise HTTPException(404, "no start page here")
+        return each
+
+    def asked(name: str, act: Callable[[Start, dict[str, Any]], dict[str, str] | None]) -> Route:
+        async def respond(request: Request) -> Response:
+            return JSONResponse(await asyncio.to_thread(act, found(), json_body(await body(request))) or {})
+
+        return Route(f"/start/{name}", respond, methods=["POST"])
+
+    async def piece(request: Request) -> Response:
+        await asyncio.to_thread(found().piece, request.query_params, await body(request))
+        return JSONResponse({})
+
+    async def picture(request: Request) -> Response:
+        data = await asyncio.to_thread(found().picture)
+        if not data:
+            raise HTTPException(404, "no picture yet")
+        return Response(data, media_type="image/jpeg")
+
+    actions = {"new": Start.new, "make": Start.make, "open": Start.open, "stop": Start.stop, "leave": Start.leave}
+    return [
+        Route("/start/piece", piece, methods=["POST"]),
+        Route("/start/picture", picture),
+        *(asked(name, act) for name, act in actions.items()),
+    ]
+
+
+def json_body(body: bytes) -> dict[str, Any]:
+    """The object that a body holds. Raises UsageError where it holds none."""
+    try:
+        asked = json.loads(body) if len(body) <= _MAX_JSON else None
+    except (ValueError, RecursionError):
+        asked = None
+    if not isinstance(asked, dict):
+        raise UsageError("request: no short JSON object")
+    return asked
+
+
+def integer(asked: Mapping[str, Any], name: str) -> int:
+    """A whole number from 0 on, of at most 12 digits, in a query. Raises UsageError for anything else."""
+    text = str(asked.get(name))
+    if not (text.isdigit() and text.isascii() and len(text) <= 12):
+        raise UsageError(f"{name}: {text[:20]!r} is no number from 0")
+    return int(text)
