@@ -170,7 +170,7 @@ class Overview(Part):
         held = other_views(scene, scene.train.tolist()) if facts.exposure or facts.centres else ()
         return build(self.config, scene, replace(facts, held=held))
 
-    def whole(self) -> bool:
+    def is_intact(self) -> bool:
         """Verify the checkpoint, once for all cells. Raises CheckpointError where it is damaged."""
         kept = checkpoint.steps(self.folder / "checkpoints")
         try:

@@ -88,7 +88,7 @@ class Part(ABC):
         """Write what is kept of a finished part beside its checkpoints; its manifest."""
         return {}
 
-    def whole(self) -> bool:
+    def is_intact(self) -> bool:
         """Return whether all files of a finished part are still there."""
         return True
 
@@ -100,7 +100,7 @@ def train_part(part: Part, report: Callable[[Report], None]) -> bool:
     """
     with held(part.folder):
         done = read_done(part.folder)
-        if done is not None and done.asked == part.asked and part.whole():
+        if done is not None and done.asked == part.asked and part.is_intact():
             return False
         begin(part.folder, part.asked["task"])
         learner = part.build()
