@@ -4,7 +4,7 @@
 
 The views are the captured ones that nothing was trained on, as pinholes. Figures are PSNR in dB: of the whole picture, over
 black where nothing is drawn, and of the pixels that are covered. Files made before are taken as they are (`--folder`). Splats
-that `--fit` trained have view-dependent colours and an antialiased opacity: they are drawn by fprf's rasteriser.
+have view-dependent colours and an antialiased opacity: they are drawn by fprf's rasteriser, meshes by `rasters`.
 """
 
 import json
@@ -30,12 +30,8 @@ from fprf.splats.files import Capture, read_capture
 from fprf.splats.photographs import camera_of
 from fprf.splats.views import draw as draw_capture
 
-from .common import ROOT, report
-from .rasters import draw_points, draw_triangles, psnr
-
-sys.path.insert(0, str(ROOT / "tests" / "export"))  # the tests' own readers and renderers are the judges
-
-from splatter import draw, read_gaussians, read_splat
+from .common import report
+from .rasters import draw_triangles, psnr
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,12 +46,12 @@ class ExportsConfig:
     """Where the exported files are; made there if they are absent. None = RUN/exports."""
     views: int = 4
     """Held-out views, at most."""
-    fit: float = 0.0
-    """Minutes of training the splats, where the files are made."""
+    fit: float = 4.0
+    """Minutes of fitting the splats, where the files are made."""
     output: Path | None = None
     """JSON file for the figures."""
     picture: Path | None = None
-    """A picture of the first view: the field, splats, mesh and points, plain and in the style."""
+    """A picture of the first view: the field, splats and mesh, plain and in the style."""
 
 
 def main(argv: list[str]) -> None:
@@ -63,10 +59,8 @@ def main(argv: list[str]) -> None:
     folder = config.folder or config.run / "exports"
     if not (folder / "export.json").is_file():
         style = ["--styles", "style=" + ",".join(map(str, config.references))] if config.references else []
-        words = ["export", str(config.run), "ply", "splat", "glb", "cameras", "--local", "true", *style]
-        command = [sys.executable, "-m", "fprf", *words]
-        command += ["--fit", str(config.fit)] if config.fit else []
-        subprocess.run([*command, "--output", str(folder)], check=True)
+        words = ["export", str(config.run), "splats", "glb", "cameras", "--local", "true", "--fit", str(config.fit), *style]
+        subprocess.run([sys.executable, "-m", "fprf", *words, "--output", str(folder)], check=True)
     scene = fprf.load(config.run)
     known = scene.trained.known
     if not known.test:
@@ -101,10 +95,7 @@ def judge(
 ) -> tuple[dict[str, dict[str, float]], np.ndarray]:
     """Means over the views for each kind of file, and a row of pictures of the first."""
     end = f".{look}" if look else ""
-    files = [folder / f"splats{end}.ply", folder / f"splats{end}.splat"]
-    ply, splat, captures = read_gaussians(files[0].read_bytes()), read_splat(files[1].read_bytes()), [*map(read_capture, files)]
-    fitted = captures[0].antialiased
-    points = trimesh.load(folder / f"points{end}.ply")
+    captures = {name: read_capture(folder / f"splats{end}{name}") for name in (".ply", ".splat")}
     mesh = trimesh.load(folder / f"mesh{end}.ply", process=False)
     [glb] = trimesh.load_scene(folder / f"mesh{end}.glb", process=False).geometry.values()
     figures: dict[str, list[dict[str, float]]] = {}
@@ -115,19 +106,17 @@ def judge(
         pose[:, 3] -= origin
         view = (pose, float(camera.focal[0, 0]), (int(camera.size[0, 0]), int(camera.size[0, 1])))
         start = time.process_time()
-        drawn = {"splats.ply": drawn_by_fprf(captures[0], camera, origin) if fitted else draw(ply, *view)}
-        seconds = time.process_time() - start
-        drawn["splats.splat"] = drawn_by_fprf(captures[1], camera, origin) if fitted else draw(splat, *view)
+        drawn = {f"splats{name}": drawn_by_fprf(capture, camera, origin) for name, capture in captures.items()}
+        seconds = (time.process_time() - start) / len(captures)
         drawn["mesh.ply"] = draw_triangles(mesh.vertices, mesh.faces, mesh.visual.vertex_colors[:, :3] / 255, *view)
         drawn["mesh.glb"] = draw_triangles(glb.vertices, glb.faces, shown(glb), *view)
-        drawn["points.ply"] = draw_points(points.vertices, points.colors[:, :3] / 255, *view)
         for name, (image, covered) in drawn.items():
             where = np.asarray(covered) > 0.5
             figure = {"psnr": psnr(image, truth), "psnr_covered": psnr(image, truth, where), "covered": float(where.mean())}
             figures.setdefault(name, []).append(figure)
         if not row:
             print(f"{look or 'plain'}: {seconds:.1f} s a view of splats")
-            row = [truth, *(drawn[name][0] for name in ("splats.ply", "mesh.ply", "points.ply"))]
+            row = [truth, *(drawn[name][0] for name in ("splats.ply", "mesh.ply"))]
     means = {name: {key: float(np.mean([f[key] for f in every])) for key in every[0]} for name, every in figures.items()}
     return means, np.concatenate(row, 1)
 

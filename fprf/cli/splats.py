@@ -1,6 +1,5 @@
 """Runs of 3D Gaussians on the command line."""
 
-import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,23 +12,18 @@ from .verbs import Verbs
 
 if TYPE_CHECKING:
     from ..datamanagers.scene import Scene
-    from ..export.config import ExportConfig
     from ..plugins.config import Need
     from ..splats.cell_training import CellTask
     from ..splats.config import GaussiansConfig
-    from ..style.files import StyleFile
     from ..training.run import Run
     from ..training.trainer import Report
     from ..types import View
     from ..viewer.live import LiveViewer
     from .eval import EvalConfig
 
-_KINDS = ("ply", "splat", "cameras")
-"""Kinds of `fprf export`; the last one not unless it is asked for."""
-
 
 class SplatVerbs(Verbs):
-    """Training from photographs, measuring, and files of Gaussians."""
+    """Training from photographs, and measuring."""
 
     def __init__(self, config: "GaussiansConfig") -> None:
         self.config = config
@@ -79,75 +73,6 @@ class SplatVerbs(Verbs):
             scores["fitted_poses"] = {known.names[view]: described(moves[view]) for view in views}
         scores |= {"train_seconds": opened.seconds, "train_steps": opened.step, "gaussians": len(shown.gaussians)}
         return store(config, known, opened.method, views, scores, images)
-
-    def export(self, config: "ExportConfig", file: "StyleFile") -> None:
-        from ..export.config import Plan, look_file, make_looks, styles_of
-        from ..plugins.captures import format_name
-        from ..splats.files import write_gaussians, write_ply_parts
-        from ..splats.training import open_gaussians
-        from ..training.checkpoint import digest
-        from ..training.quality import QualityConfig
-        from .export import export_cameras
-        from .style_flags import say
-
-        for kind in config.kinds:
-            if kind not in _KINDS:
-                raise UsageError(
-                    f"fprf export: of Gaussians there are {', '.join(_KINDS)}, not {kind}; a run of fields has all kinds, or "
-                    "`export RUN cameras --images` makes a scene folder that other programs reconstruct"
-                )
-        if config.fit:
-            raise UsageError("--fit: the run is of Gaussians already; leave it out")
-        output = config.output or config.run / "exports"
-        kinds, gaussians = tuple(dict.fromkeys(config.kinds or _KINDS[:2])), format_name(output) is not None
-        table = output.suffix.lower() == ".json" and not gaussians
-        single = (gaussians or table) and not output.is_dir()
-        if single and config.kinds and table != ("cameras" in kinds):
-            raise UsageError(f"--output {output}: cameras are written to a .json file, Gaussians to others; name a folder")
-        styles = styles_of(config, file, say)
-        if single and len(styles) > 1:
-            raise UsageError(f"--output {output}: one file holds one style, {len(styles)} are asked for; name a folder")
-        opened = open_gaussians(config.run, self.config, QualityConfig())
-        scene, paths, losses = opened.scene, [], dict[str, None]()
-        looks = make_looks(scene, styles)[-1 if single else 0 :]
-        if table or "cameras" in kinds:
-            what = Plan(("cameras",), output.parent if single else output, output if single else None)
-            with Display() as display:
-                export_cameras(scene, opened.known, config, what, looks, display)
-            print(f"cameras in {what.single or what.folder / 'transforms.json'}")
-        kinds = () if table else tuple(kind for kind in kinds if kind != "cameras")
-        for look in looks if kinds else ():
-            shown = scene.restyled(look.restyle)
-            for kind in kinds:
-                paths.append(path := output if single else output / look_file("splats", look.name, f".{kind}"))
-                if path.suffix.lower() == ".ply" and not path.name.lower().endswith(".compressed.ply") and not config.plain:
-                    style = "" if look.restyle is None else look.restyle.digest
-                    key = f"{digest(opened.run.checkpoints)} {style}{' local' * config.local}"
-                    key = hashlib.sha256(key.encode()).hexdigest()
-                    write_ply_parts(
-                        path,
-                        shown.part,
-                        len(scene.gaussians),
-                        key,
-                        antialiased=True,
-                        origin=scene.origin,
-                        local=config.local,
-                    )
-                else:
-                    written = write_gaussians(
-                        path,
-                        shown.shown,
-                        antialiased=True,
-                        views=scene.views,
-                        plain=config.plain,
-                        origin=scene.origin,
-                        local=config.local,
-                    )
-                    losses |= {f", {path.name}: {loss}": None for loss in written.losses()}
-        if paths:
-            print(
-                f"{len(scene.gaussians)} Gaussians in {', '.join(str(path) for path in dict.fromkeys(paths))}{''.join(losses)}"
-            )
 
 
 def _train(config: "GaussiansConfig", method: str, quiet: bool, view: "LiveViewer | None", others: bool) -> Path:

@@ -10,16 +10,14 @@ from ..plugins.registry import nearest
 
 if TYPE_CHECKING:
     from ..config import TrainConfig
-    from ..export.config import ExportConfig
     from ..plugins.config import Need
-    from ..style.files import StyleFile
     from ..training.run import Known
     from ..viewer.live import LiveViewer
     from .eval import EvalConfig
 
 
 class Verbs(ABC):
-    """`train`, `eval` and `export` for a config of one kind, which a run to be measured was trained with.
+    """`train` and `eval` for a config of one kind, which a run to be measured was trained with.
 
     Each raises UsageError for flags that the kind does not know.
     """
@@ -42,10 +40,6 @@ class Verbs(ABC):
     @abstractmethod
     def evaluate(self, config: "EvalConfig") -> dict[str, object]:
         """Measure a run, write metrics.json and renders, and return the metrics."""
-
-    @abstractmethod
-    def export(self, config: "ExportConfig", file: "StyleFile") -> None:
-        """Write a run for other programs."""
 
 
 def verbs_of(run: Path) -> Verbs:
@@ -99,8 +93,3 @@ class FieldVerbs(Verbs):
         from .eval import evaluate_fields
 
         return evaluate_fields(config)
-
-    def export(self, config: "ExportConfig", file: "StyleFile") -> None:
-        from .export import export_fields
-
-        export_fields(config, file)

@@ -30,10 +30,9 @@ from typing import Annotated, NamedTuple
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from ..errors import DataError, NumericsError
-from ..rendering.cameras import Cameras, grid_rays, project
+from ..rendering.cameras import Cameras, grid_rays, look_up, project
 from .lpips import lpips
 
 SHORT, LONG = 1, 7
@@ -75,12 +74,12 @@ def warp(
     size = cameras.size[b].to(there)
     # Half a pixel from the border there is no neighbour to interpolate with. The slack is rounding.
     inside = ((there >= 0.5 - 1e-6) & (there <= size - 0.5 + 1e-6)).all(dim=-1) & (ahead > 0)
-    place = torch.where(inside[:, None], 2 * there / size - 1, torch.zeros_like(there))
+    pixel = torch.where(inside[:, None], there, size / 2)
     distance = (points - cameras.pose[b, :, 3]).norm(dim=-1)
-    met = _at(torch.where(torch.isfinite(depth_b), depth_b, 0.0).to(place)[..., None], place)[:, 0]
+    met = look_up(torch.where(torch.isfinite(depth_b), depth_b, 0.0)[..., None], pixel)[:, 0]
     same = (met - distance).abs() <= _TOLERANCE * distance
     valid = (solid & inside & same).reshape(depth_a.shape)
-    colour = _at(image_b.to(place), place).reshape(*depth_a.shape, 3).to(image_b)
+    colour = look_up(image_b, pixel).reshape(*depth_a.shape, 3).to(image_b)
     return Warped(torch.where(valid[..., None], colour, torch.zeros_like(colour)), valid)
 
 
@@ -139,14 +138,6 @@ class WarpError:
             "valid_share": self.compared / self.pixels if self.pixels else 0.0,
             "pairs": self.pairs,
         }
-
-
-def _at(image: Annotated[Tensor, "H W C"], place: Annotated[Tensor, "N 2"]) -> Annotated[Tensor, "N C"]:
-    """Bilinear values; `place` runs from -1 to 1 between the outer edges of the image."""
-    sampled = grid_sample(
-        image.permute(2, 0, 1)[None], place[None, None], mode="bilinear", padding_mode="border", align_corners=False
-    )
-    return sampled[0, :, 0].T
 
 
 def _sized(shape: Sequence[int], cameras: Cameras, view: int, what: str) -> None:
