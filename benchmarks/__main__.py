@@ -1,73 +1,128 @@
 """`python -m benchmarks NAME [flags]`: run one benchmark, or list them all."""
 
 import importlib
+import importlib.util
+import shlex
 import sys
+import tempfile
+from typing import NamedTuple
 
-from fprf.errors import FprfError
+from fprf.errors import FprfError, UsageError
 from fprf.process import keep_memory
 
+from .town.write import cached_town
+
+
+class Benchmark(NamedTuple):
+    """A module of this package with `main(argv)`."""
+
+    about: str
+    quick: str
+    """Flags that `--quick` stands for: the whole way, in about a minute, with figures that mean nothing.
+
+    {town} is the folder of a small town, {folder} one that is thrown away.
+    """
+    needs: str = "nothing but fprf"
+    """Data, extras and time; said before it starts."""
+    packages: tuple[str, ...] = ()
+    """Modules that must be there."""
+
+
+_RUN = "--data {town} --steps 5 --repeats 1 --rays 256 --device cpu"
+_TRAINED = "a run of fields; without one it trains fprf-lite on the town first"
 BENCHMARKS = {
-    "blocks_scenes": "a capture in blocks against one field, for the same seconds",
-    "cells": "captures in cells of Gaussians against one piece and blocks of fields",
-    "coordinates": "a capture in projected, Earth-centred, very large and very small coordinates against its own",
-    "decoders": "fidelity of decoders, and what a style loss buys",
-    "district": "a district of 2000 images in cells: seconds, memory and killed workers",
-    "district_style": "a style on millions of Gaussians: seconds and memory, part by part, killed half-way",
-    "evidence": "all pages of docs/evidence",
-    "executors": "blocks on workers of Ray against one after the other",
-    "exports": "exported files drawn again, against the field's own renders",
-    "false_edges": "how often styles cut through things",
-    "feature_store": "size, error and speed of feature targets by stride",
-    "first_use": "quality of small captures at equal steps",
-    "fuzz": "every reader on a million mutated files",
-    "fuzz_guided": "every reader under libFuzzer",
-    "gallery": "the pictures and figures of docs/gallery",
-    "gaussians": "the rasteriser of 3D Gaussians: time and error",
-    "hosts": "a cluster of two hosts that loses one",
-    "images": "time and error of decoding photographs",
-    "kernels": "what each compiled kernel brings end to end",
-    "kills": "training that is killed a hundred times",
-    "large_scene": "a town of 400 images in blocks: quality, seams, memory, time",
-    "many_images": "more images than memory",
-    "match_confidence": "what scores of matches say, on painted pairs of photographs",
-    "methods": "fields and Gaussians on the same captures for the same seconds",
-    "mutants": "how many small mistakes in the mathematics the tests notice",
-    "paper": "the paper's tables on any scene",
-    "pareto": "time against error, knob by knob",
-    "peak_memory": "peak memory of each part of the work, each in a process of its own",
-    "peer": "frames of any system, scored by the code that scores ours",
-    "phone": "photographs without poses to a restyled scene",
-    "poses": "wrong poses, and what refining wins back",
-    "precision": "errors of bfloat16 and TF32",
-    "profiling": "where the time of a training step and of a view goes",
-    "restyle": "every stylizer against the truth: a town in the light of other towns",
-    "roofline": "how near the tri-plane lookup comes to the memory's speed",
-    "scaling": "cost against the number of images, pixels, references and points",
-    "semantic_matching": "which encoder finds like with like",
-    "speed": "training, views and styles against the naive path, with their errors",
-    "splat_restyle": "time and memory of restyling captures of Gaussians",
-    "stress": "every stage on adversarial inputs, against a reference and a bound",
-    "styles": "every stylizer on painted photographs and on runs",
-    "town": "write a town as a scene folder",
-    "viewer_speed": "response times and memory of the viewer",
-    "viewer_tour": "film and pictures of the viewer's page",
+    "exports": Benchmark("exported files drawn again, against the scene's own renders", "--steps 30 --views 1", _TRAINED),
+    "fuzz": Benchmark("every reader on a million mutated files", "--rounds 40", "hours for the million; Linux"),
+    "fuzz_guided": Benchmark(
+        "every reader under libFuzzer", "--minutes 0.2 --only png", "the package atheris; Linux", ("atheris",)
+    ),
+    "gaussians": Benchmark("the rasteriser of 3D Gaussians: time and error", "--count 500 --times 2"),
+    "kernels": Benchmark("what each compiled kernel brings end to end", "--data {town} --steps 5 --repeats 1", _TRAINED),
+    "kills": Benchmark("training that is killed a hundred times", "--kills 3 --steps 25", "ten minutes; Linux"),
+    "large_scene": Benchmark(
+        "a district of towns in cells: seconds, memory, fidelity, workers of Ray",
+        "--images 24 --towns 2 --size 48 36 --parts 1 --steps 20 --frames 2",
+        "an hour for 16 towns; the extra cluster for --workers",
+    ),
+    "mutants": Benchmark(
+        "how many small mistakes in the mathematics the tests notice",
+        "--only fprf/rendering/splines.py --sample 2",
+        "the extra test; hours for all modules; Linux",
+        ("pytest", "hypothesis"),
+    ),
+    "paper": Benchmark(
+        "the paper's ablations on the town, or on another scene by photographs",
+        "--data {town} --steps 5 --views 1 --palettes night --device cpu",
+        "a scene of --data; VGG-19's weights in the cache where photographs restyle it",
+    ),
+    "pareto": Benchmark("time against error, knob by knob", _RUN, _TRAINED),
+    "peer": Benchmark(
+        "frames of any system, scored by the code that scores ours",
+        "{town}/images --cameras {town}/transforms.json --plain {town}/images --depth {town}/depth --truth {town}/images",
+        "a folder of frames and their cameras",
+    ),
+    "profiling": Benchmark("where the time of a training step and of a view goes", f"{_RUN} --operators 3", _TRAINED),
+    "restyle": Benchmark(
+        "every stylizer against the truth: a town in the light of other towns",
+        "--minutes 0.05 --views 1 --longest 48 --palettes night --missing sky --clusters 4 --device cpu",
+        "a run of a town; without one it trains fprf-lite on one first",
+    ),
+    "scenes": Benchmark(
+        "methods on captures for the same time, judged on the same views",
+        "--steps 20 --side 80",
+        "captures; without any, the garden",
+    ),
+    "semantic_matching": Benchmark(
+        "which encoder finds like with like, and what its scores say",
+        "--most 1 --seeds 0 --views 1 --size 64 48",
+        "painted triplets in --triplets; without them the town alone",
+    ),
+    "speed": Benchmark(
+        "training, views and styles against the naive path, with their errors", f"{_RUN} --points 500 --clusters 4", _TRAINED
+    ),
+    "splat_restyle": Benchmark("time and memory of restyling captures of Gaussians", "--synthetic 2000"),
+    "stress": Benchmark(
+        "every stage on adversarial inputs, against a reference and a bound", f"{_RUN} --mutations 2 --flips 5", _TRAINED
+    ),
+    "styles": Benchmark(
+        "every stylizer on painted photographs and on runs",
+        "--triplets 0 --steps 20 --views 2 --longest 64",
+        "triplets, photographs and VGG-19's weights in --shared; without them a run of the town",
+    ),
+    "town": Benchmark(
+        "write a town as a scene folder", "{folder}/town --views 2 --width 24 --height 18", "a folder to write into"
+    ),
+    "viewer_speed": Benchmark(
+        "response times and memory of the viewer", "--parts start --steps 20", "the extra viewer, playwright and a Chromium"
+    ),
 }
-"""Module of this package and one line for each. `benchmarks/gpu.sh` measures a machine with a GPU."""
+"""`benchmarks/gpu.sh` measures a machine with a GPU."""
 
 
 def main(args: list[str]) -> int:
-    """0 done; 2 for a mistake in the arguments, which one line on standard error names."""
+    """0 done; 2 for a mistake in the arguments or a package that is absent, which one line on standard error names."""
     if not args or args[0] in ("-h", "--help"):
         width = max(map(len, BENCHMARKS))
-        print("usage: python -m benchmarks NAME [flags]\n")
-        print("\n".join(f"  {name:<{width}}  {about}" for name, about in BENCHMARKS.items()))
+        print("usage: python -m benchmarks NAME [--quick] [flags]\n")
+        print("\n".join(f"  {name:<{width}}  {each.about}" for name, each in BENCHMARKS.items()))
         return 0 if args else 2
-    if args[0] not in BENCHMARKS:
-        print(f"error: {args[0]}: no such benchmark; allowed are {', '.join(BENCHMARKS)}", file=sys.stderr)
-        return 2
-    keep_memory()  # as the command line does: else large gradients are mapped anew in every step
+    name, flags = args[0], args[1:]
     try:
-        return importlib.import_module(f".{args[0]}", __package__).main(args[1:]) or 0
+        if name not in BENCHMARKS:
+            raise UsageError(f"{name}: no such benchmark; allowed are {', '.join(BENCHMARKS)}")
+        chosen = BENCHMARKS[name]
+        if not {"-h", "--help"} & set(flags):
+            print(f"{name} needs {chosen.needs}", file=sys.stderr)
+            absent = [package for package in chosen.packages if importlib.util.find_spec(package) is None]
+            if absent:
+                raise UsageError(f"{name}: {', '.join(absent)} not installed; pip install {' '.join(absent)}")
+        keep_memory()  # as the command line does: else large gradients are mapped anew in every step
+        with tempfile.TemporaryDirectory(prefix="fprf-quick-") as folder:
+            if "--quick" in flags:
+                flags.remove("--quick")
+                town = cached_town(views=8, width=48, height=36)
+                flags = [*shlex.split(chosen.quick.format(town=town, folder=folder)), *flags]
+            return importlib.import_module(f".{name}", __package__).main(flags) or 0
     except FprfError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -1,29 +1,31 @@
-"""What all benchmarks share: folders, arguments, the subject that is measured, and the report that each writes."""
+"""What all benchmarks share: folders, arguments, the run that is measured, costs of commands, and the JSON that each writes."""
 
 import argparse
 import json
 import os
 import shlex
+import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from rich.console import Console
 
 from fprf.checks import at_least
 from fprf.cli.parsing import as_flag, load_field_method, parse
-from fprf.cli.progress import Display
-from fprf.cli.train import train_scene
+from fprf.errors import FprfError
 from fprf.io.atomic import write_json, write_text
+from fprf.progress import Display
+from fprf.training.driver import train
 
 from .report import Outcome, provenance
 from .town.write import scene_folder
 
 ROOT = Path(__file__).resolve().parents[1]
-RESULTS = ROOT / "benchmarks" / "results"
 SHARED = Path(os.environ.get("FPRF_SHARED", ROOT.parent / "shared"))
 """Folder with `data` and `weights` that the repository does not hold: $FPRF_SHARED, or `shared` beside the checkout."""
 
@@ -35,31 +37,47 @@ def arguments(name: str, about: str | None) -> argparse.ArgumentParser:
     )
 
 
-def split_flags(argv: list[str]) -> tuple[list[str], list[str]]:
-    """The arguments before `--`, and those behind it."""
-    at = argv.index("--") if "--" in argv else len(argv)
-    return argv[:at], argv[at + 1 :]
-
-
 def origin(device: str = "cpu") -> dict[str, object]:
     """Where figures come from: `commit`, `fprf`, `torch`, `machine`, `command`."""
     return provenance(device) | {"command": shlex.join(["python", "-m", "benchmarks", *sys.argv[1:]])}
 
 
-def report(path: Path, figures: Mapping[str, Any], device: str = "cpu") -> None:
-    """Write figures as JSON, behind their origin; what they say themselves takes precedence."""
-    write_json(path, {**origin(device), **figures})
+def report(path: Path | None, figures: Mapping[str, Any], device: str = "cpu") -> None:
+    """Write figures as JSON, behind their origin; what they say themselves takes precedence. None writes nothing."""
+    if path is not None:
+        write_json(path, {**origin(device), **figures})
 
 
-def add_entry(path: Path, name: str, figures: Mapping[str, Any], device: str = "cpu") -> None:
-    """Write figures with their origin as one entry of a JSON file; other entries stay."""
-    write_json(path, read_report(path) | {name: {**origin(device), **figures}})
+def add_entry(path: Path | None, name: str, figures: Mapping[str, Any], device: str = "cpu") -> None:
+    """Print figures and write them, with their origin, as one entry of a JSON file; other entries stay."""
+    print(name, json.dumps(figures), flush=True)
+    if path is not None:
+        known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        write_json(path, known | {name: {**origin(device), **figures}})
 
 
-def read_report(path: Path) -> dict[str, Any]:
-    """The JSON of a file; empty where there is none."""
-    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    return found
+class Cost(NamedTuple):
+    """What a command took."""
+
+    seconds: float
+    processor_seconds: float
+    """Of all its threads and processes."""
+    peak_rss_mib: float
+    """Of the largest of its processes."""
+
+
+def cost_of(*args: str | Path) -> Cost:
+    """Run `fprf ARGS` in a process of its own without showing its output. Raises FprfError with its last lines."""
+    words, start = [str(each) for each in args], time.perf_counter()
+    with tempfile.TemporaryFile() as said:
+        process = subprocess.Popen([sys.executable, "-m", "fprf", *words], stdout=subprocess.DEVNULL, stderr=said)
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
+            said.seek(0)
+            lines = said.read().decode(errors="replace").splitlines()
+            raise FprfError(f"fprf {shlex.join(words)}: exit code {process.returncode}; {' | '.join(lines[-3:])}")
+    return Cost(time.perf_counter() - start, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,12 +140,7 @@ def bench_run(prog: str, default: C, args: list[str], measure: Callable[[C, Path
     config = parse(default, as_flag(args, "--run"), prog=f"{prog} [RUN]", description=about)
     with tempfile.TemporaryDirectory(prefix="fprf-bench-") as made:
         folder = Path(made)
-        root = config.run
-        if root is None:
-            method, name = load_field_method(config.method)
-            data = scene_folder(config.data or method.data or Path("town"))
-            training = replace(method, data=data, output=folder / "run", steps=config.steps, minutes=None, device=config.device)
-            root = train_scene(training, name)
+        root = config.run or train_run(folder / "run", config.method, config.data, steps=config.steps, device=config.device)
         with Display() as display:
             outcome = measure(config, root, folder, display.count)
         for table in outcome.tables:
@@ -135,6 +148,13 @@ def bench_run(prog: str, default: C, args: list[str], measure: Callable[[C, Path
         if config.output is not None:
             write_json(config.output, outcome.document)
     return 0
+
+
+def train_run(output: Path, method: str, data: Path | None, *, steps: int, device: str = "cpu") -> Path:
+    """Train fields for the steps; without data on the method's own, or else on the town. Returns the run folder."""
+    chosen, name = load_field_method(method)
+    scene = scene_folder(data or chosen.data or Path("town"))
+    return train(replace(chosen, data=scene, output=output, steps=steps, minutes=None, device=device), name)
 
 
 def console() -> Console:

@@ -1,16 +1,13 @@
-"""Exported files, read again by other programs' means and drawn as viewers draw them, against the field's own render.
+"""Exported files, read again and drawn as viewers draw them, against the scene's own renders.
 
-    python -m benchmarks exports RUN --references A.jpg [--output benchmarks/results/exports_NAME.json] [--picture FILE.jpg]
+    python -m benchmarks exports [RUN] [--references A.jpg] [--fit MINUTES] [--output FILE.json] [--picture FILE.jpg]
 
-The views are the captured ones that nothing was trained on, as pinholes. Figures are PSNR in dB: of the whole picture, over
-black where nothing is drawn, and of the pixels that are covered. Files made before are taken as they are (`--folder`). Splats
-have view-dependent colours and an antialiased opacity: they are drawn by fprf's rasteriser, meshes by `rasters`.
+`fprf export` writes splats and a mesh, plain and in one style; the views are held-out ones as pinholes. Figures are PSNR in dB:
+of the whole picture, over black where nothing is drawn, and of the pixels that are covered.
 """
 
 import json
-import subprocess
-import sys
-import time
+import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,124 +15,169 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
+from numpy.typing import NDArray
 
-import fprf
-from fprf.api import TrainedScene
-from fprf.cli.parsing import parse
+from fprf.cli.parsing import as_flag, parse
 from fprf.errors import UsageError
+from fprf.interfaces import Scene
 from fprf.io.images import write_image
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import pinhole
-from fprf.splats.files import Capture, read_capture
+from fprf.splats.files import read_capture
 from fprf.splats.photographs import camera_of
-from fprf.splats.views import draw as draw_capture
+from fprf.splats.views import draw
+from fprf.style.config import StyleConfig
+from fprf.style.files import StyleFile
+from fprf.style.look import Restyle
+from fprf.style.restyle import apply_style
+from fprf.training.loading import open_run
 
-from .common import report
-from .rasters import draw_triangles, psnr
+from .common import cost_of, report, train_run
+from .subject import town_references
+
+Floats = NDArray[np.floating[Any]]
+_NEAR = 0.02
+"""World units before a camera in which triangles are left out."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportsConfig:
     """What is exported, and where the figures go."""
 
-    run: Path = Path()
-    """A trained run."""
+    run: Path | None = None
+    """A trained run; none = fprf-lite is trained on the town first."""
+    steps: int = 300
+    """Steps to train it."""
     references: tuple[Path, ...] = ()
-    """Photographs of one style, judged as well."""
-    folder: Path | None = None
-    """Where the exported files are; made there if they are absent. None = RUN/exports."""
+    """Photographs of one style; none = a picture of another town."""
     views: int = 4
     """Held-out views, at most."""
-    fit: float = 4.0
-    """Minutes of fitting the splats, where the files are made."""
+    fit: float = 0.0
+    """Minutes of fitting Gaussians to a scene of fields; 0 = as `fprf export` does."""
     output: Path | None = None
     """JSON file for the figures."""
     picture: Path | None = None
-    """A picture of the first view: the field, splats and mesh, plain and in the style."""
+    """A picture of the first view: the scene, splats and mesh, plain and in the style."""
 
 
 def main(argv: list[str]) -> None:
-    config = parse(ExportsConfig(), argv, prog="python -m benchmarks exports", description=__doc__ or "", positional=("run",))
-    folder = config.folder or config.run / "exports"
-    if not (folder / "export.json").is_file():
-        style = ["--styles", "style=" + ",".join(map(str, config.references))] if config.references else []
-        words = ["export", str(config.run), "splats", "glb", "cameras", "--local", "true", "--fit", str(config.fit), *style]
-        subprocess.run([sys.executable, "-m", "fprf", *words, "--output", str(folder)], check=True)
-    scene = fprf.load(config.run)
-    known = scene.trained.known
-    if not known.test:
-        raise UsageError(f"{config.run}: no held-out views to judge by")
-    chosen = known.test[:: max(1, len(known.test) // config.views)][: config.views]
-    cameras = [straight(known.cameras, view) for view in chosen]
-    made = json.loads((folder / "export.json").read_text())
-    found: dict[str, Any] = {"scene": known.name, "step": scene.trained.step, "files": sizes(folder), "export": made}
-    looks = {"": scene} | ({"style": scene.stylize(list(config.references))} if config.references else {})
-    rows: list[np.ndarray] = []
-    for look, styled in looks.items():
-        figures, row = judge(folder, look, styled, cameras, np.asarray(made["origin"]))
-        found[look or "plain"] = figures
-        rows.append(row)
-    found["views"] = [known.names[view] for view in chosen]
-    print(json.dumps({key: found[key] for key in ("plain", "style") if key in found}, indent=1))
-    if config.output is not None:
+    """`python -m benchmarks exports [RUN] [flags]`."""
+    about = __doc__ or ""
+    config = parse(ExportsConfig(), as_flag(argv, "--run"), prog="python -m benchmarks exports [RUN]", description=about)
+    with tempfile.TemporaryDirectory(prefix="fprf-exports-") as made:
+        folder = Path(made) / "files"
+        run = config.run or train_run(Path(made) / "run", "fprf-lite", None, steps=config.steps)
+        references = config.references or town_references(Path(made))[:1]
+        opened = open_run(run, "cpu")
+        scene, known = opened.scene, opened.known
+        if not known.test:
+            raise UsageError(f"{run}: no held-out views to judge by")
+        flags = ["--styles", "style=" + ",".join(map(str, references)), "--local", "true"]
+        flags += ["--fit", str(config.fit)] if config.fit else []
+        cost = cost_of("export", run, "ply", "splat", "glb", *flags, "--output", folder)
+        sizes = {path.name: path.stat().st_size for path in sorted(folder.iterdir())}
+        found: dict[str, Any] = {"scene": known.name, "step": opened.step, "export": cost._asdict(), "bytes": sizes}
+        moved = np.asarray(json.loads((folder / "export.json").read_text()).get("origin", (0.0, 0.0, 0.0)))
+        chosen = known.test[:: max(1, len(known.test) // config.views)][: config.views]
+        cameras = [straight(known.cameras, view) for view in chosen]
+        look = apply_style(scene, StyleFile(StyleConfig(references=references))).restyle
+        rows = []
+        for name, restyle in (("plain", None), ("style", look)):
+            found[name], row = judge(folder, "" if restyle is None else ".style", scene, restyle, cameras, moved)
+            rows.append(np.concatenate(row, 1))
+        print(json.dumps(found, indent=1))
         report(config.output, found)
-    if config.picture is not None:
-        write_image(config.picture, (np.concatenate(rows).clip(0, 1) * 255 + 0.5).astype(np.uint8))
+        if config.picture is not None:
+            write_image(config.picture, (np.concatenate(rows).clip(0, 1) * 255 + 0.5).astype(np.uint8))
 
 
 def straight(cameras: Cameras, view: int) -> Cameras:
     """A captured view as a pinhole with its centre in the middle: what any viewer can draw."""
     width, height = (int(side) for side in cameras.size[view])
     fov = 2 * np.degrees(np.arctan(height / 2 / float(cameras.focal[view].mean())))
-    return pinhole(cameras.pose[view : view + 1], width=width, height=height, fov=fov)
+    return pinhole(cameras.pose[view : view + 1], width=width, height=height, fov=float(fov))
 
 
 def judge(
-    folder: Path, look: str, scene: TrainedScene, cameras: list[Cameras], origin: np.ndarray
-) -> tuple[dict[str, dict[str, float]], np.ndarray]:
-    """Means over the views for each kind of file, and a row of pictures of the first."""
-    end = f".{look}" if look else ""
-    captures = {name: read_capture(folder / f"splats{end}{name}") for name in (".ply", ".splat")}
-    mesh = trimesh.load(folder / f"mesh{end}.ply", process=False)
-    [glb] = trimesh.load_scene(folder / f"mesh{end}.glb", process=False).geometry.values()
-    figures: dict[str, list[dict[str, float]]] = {}
-    row: list[np.ndarray] = []
-    for camera in cameras:
-        truth = scene.render(camera).rgb.numpy().astype(float)
-        pose = camera.pose[0].numpy().copy()
-        pose[:, 3] -= origin
-        view = (pose, float(camera.focal[0, 0]), (int(camera.size[0, 0]), int(camera.size[0, 1])))
-        start = time.process_time()
-        drawn = {f"splats{name}": drawn_by_fprf(capture, camera, origin) for name, capture in captures.items()}
-        seconds = (time.process_time() - start) / len(captures)
-        drawn["mesh.ply"] = draw_triangles(mesh.vertices, mesh.faces, mesh.visual.vertex_colors[:, :3] / 255, *view)
-        drawn["mesh.glb"] = draw_triangles(glb.vertices, glb.faces, shown(glb), *view)
-        for name, (image, covered) in drawn.items():
-            where = np.asarray(covered) > 0.5
-            figure = {"psnr": psnr(image, truth), "psnr_covered": psnr(image, truth, where), "covered": float(where.mean())}
-            figures.setdefault(name, []).append(figure)
-        if not row:
-            print(f"{look or 'plain'}: {seconds:.1f} s a view of splats")
-            row = [truth, *(drawn[name][0] for name in ("splats.ply", "mesh.ply"))]
-    means = {name: {key: float(np.mean([f[key] for f in every])) for key in every[0]} for name, every in figures.items()}
-    return means, np.concatenate(row, 1)
-
-
-def drawn_by_fprf(capture: Capture, camera: Cameras, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Image [H W 3] and opacity [H W] of a pinhole view; a .splat cannot say that it is antialiased, and viewers are larger."""
-    pose = camera.pose.clone()
-    pose[0, :, 3] -= torch.from_numpy(origin)
-    seen = draw_capture(capture.gaussians, camera_of(replace(camera, pose=pose), 0), antialiased=True)
-    return seen.image.clamp(0, 1).double().numpy(), seen.opacity.numpy()
-
-
-def shown(mesh: trimesh.Trimesh) -> np.ndarray:
-    """sRGB of a glTF's vertices, whose colours are linear."""
+    folder: Path, end: str, scene: Scene, look: Restyle | None, cameras: list[Cameras], origin: Floats
+) -> tuple[dict[str, dict[str, float]], list[Floats]]:
+    """Means over the views for each file of a look, and pictures of the first view: the scene's, then the files'."""
+    captures = {path.name: read_capture(path) for path in (folder / f"splats{end}.ply", folder / f"splats{end}.splat")}
+    [mesh] = trimesh.load_scene(folder / f"mesh{end}.glb", process=False).geometry.values()
     colour = np.asarray(mesh.visual.vertex_attributes["color"])[:, :3]
     linear = colour / np.iinfo(colour.dtype).max if colour.dtype.kind == "u" else colour
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+    figures: dict[str, list[dict[str, float]]] = {}
+    pictures: list[Floats] = []
+    for camera in cameras:
+        truth = scene.cached(camera, 0).restyled(look).rgb.numpy().astype(float)
+        pose = camera.pose.clone()
+        pose[0, :, 3] -= torch.from_numpy(origin)
+        local = replace(camera, pose=pose)
+        drawn: dict[str, tuple[Floats, Floats]] = {}
+        for name, capture in captures.items():
+            seen = draw(capture.gaussians, camera_of(local, 0), antialiased=capture.antialiased)
+            drawn[name] = seen.image.clamp(0, 1).double().numpy(), seen.opacity.numpy()
+        drawn[f"mesh{end}.glb"] = draw_triangles(np.asarray(mesh.vertices), np.asarray(mesh.faces), shown, local)
+        for name, (image, covered) in drawn.items():
+            where = covered > 0.5
+            figure = {"psnr": psnr(image - truth), "psnr_covered": psnr((image - truth)[where])}
+            figures.setdefault(name, []).append(figure | {"covered": float(where.mean())})
+        pictures = pictures or [truth, *(image for image, _ in drawn.values())]
+    means = {name: {key: float(np.mean([f[key] for f in every])) for key in every[0]} for name, every in figures.items()}
+    return means, pictures
 
 
-def sizes(folder: Path) -> dict[str, int]:
-    """Bytes of every file."""
-    return {str(path.relative_to(folder)): path.stat().st_size for path in sorted(folder.rglob("*.*")) if path.is_file()}
+def psnr(error: Floats) -> float:
+    """Of differences of colours in [0, 1], in dB; at most 99."""
+    return float(-10 * np.log10(max(float(np.square(error).mean()) if error.size else 0.0, 10**-9.9)))
+
+
+def draw_triangles(point: Floats, face: NDArray[np.integer[Any]], colour: Floats, camera: Cameras) -> tuple[Floats, Floats]:
+    """Image [H W 3] and where it is covered [H W], by a pinhole: colours of vertices are interpolated in the world.
+
+    Triangles are seen from both sides; behind them is black.
+    """
+    width, height = (int(side) for side in camera.size[0])
+    pose = camera.pose[0].numpy()
+    local = (point - pose[:, 3]) @ (pose[:, :3] * [1, -1, -1])
+    depth = local[:, 2]
+    pixel = float(camera.focal[0, 0]) * local[:, :2] / np.where(depth > 0, depth, 1)[:, None] + np.array([width, height]) / 2
+    face = face[(depth[face] > _NEAR).all(1)]
+    low = np.ceil(pixel[face].min(1) - 0.5).clip(0, (width, height)).astype(int)
+    high = np.floor(pixel[face].max(1) - 0.5).clip(-1, (width - 1, height - 1)).astype(int)
+    reach, some = (high - low + 1).max(1), ((high - low) >= 0).all(1)
+    where, far, shade = [np.zeros(0, int)], [np.zeros(0)], [np.zeros((0, 3))]
+    # Triangles of like size share a grid of candidate pixels.
+    for side in (2**k for k in range(12)):
+        group = np.flatnonzero(some & (reach <= side) & (reach > side // 2))
+        for chunk in np.array_split(group, 1 + len(group) * side**2 // 2_000_000):
+            at = low[chunk][:, None] + np.stack(np.meshgrid(*(np.arange(side),) * 2), -1).reshape(-1, 2)
+            share = _barycentric(at + 0.5, pixel[face[chunk]])
+            row, cell = np.nonzero((share >= 0).all(-1) & (at <= high[chunk][:, None]).all(-1))
+            # Straight in 1 / depth and colour / depth, as perspective is.
+            part = share[row, cell] / depth[face[chunk]][row]
+            inverse = part.sum(1)
+            where.append(at[row, cell, 1] * width + at[row, cell, 0])
+            far.append(1 / inverse)
+            shade.append((part[:, :, None] * colour[face[chunk]][row]).sum(1) / inverse[:, None])
+    # The nearest candidate of each pixel that has one.
+    every, z, tint = np.concatenate(where), np.concatenate(far), np.concatenate(shade)
+    order = np.lexsort((z, every))
+    picked, first = np.unique(every[order], return_index=True)
+    image, covered = np.zeros((width * height, 3)), np.zeros(width * height)
+    image[picked], covered[picked] = tint[order[first]], 1.0
+    return image.reshape(height, width, 3), covered.reshape(height, width)
+
+
+def _barycentric(at: Floats, corner: Floats) -> Floats:
+    """Shares [F P 3] of the corners [F 3 2] at places [F P 2]; negative outside, also for triangles without area."""
+    a, b, c = (corner[:, None, k] for k in range(3))
+
+    def area(u: Floats, v: Floats, w: Floats) -> Floats:
+        return (v[..., 0] - u[..., 0]) * (w[..., 1] - u[..., 1]) - (v[..., 1] - u[..., 1]) * (w[..., 0] - u[..., 0])
+
+    whole = area(a, b, c)
+    parts = np.stack([area(b, c, at), area(c, a, at), area(a, b, at)], -1)
+    flat = np.abs(whole) < 1e-12
+    return np.where(flat[..., None], -1.0, parts / np.where(flat, 1.0, whole)[..., None])

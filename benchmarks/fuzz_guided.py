@@ -83,7 +83,8 @@ def _last(pattern: str, text: str) -> int:
 def search(name: str, corpus: Path, seconds: float) -> dict[str, Any]:
     """Search with one reader for so long, begun anew behind every fault; what came of it."""
     corpus.mkdir(parents=True, exist_ok=True)
-    faults, rounds, reached, begun = [], 0, 0, time.monotonic()
+    faults: list[dict[str, Any]] = []
+    rounds, reached, begun = 0, 0, time.monotonic()
     with tempfile.TemporaryDirectory() as found:
         while (left := seconds - (time.monotonic() - begun)) > 1 and len(faults) < 10:
             options = [f"-max_total_time={int(left) + 1}", f"-timeout={PATIENCE}", "-rss_limit_mb=4096", "-print_final_stats=1"]

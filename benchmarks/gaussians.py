@@ -1,21 +1,13 @@
-"""3D Gaussians: the rasteriser's time and error, and what training from photographs reaches.
+"""The rasteriser of 3D Gaussians: kernels against the plain torch form, time and error.
 
     python -m benchmarks gaussians [--count 50000] [--threads 1] [--output FILE.json]
-    python -m benchmarks gaussians --scenes FOLDER [--only fox ...] [--output FILE.json]
 
-The first compares kernels and the plain torch form on a cloud in front of a camera of 500 x 375 pixels; most Gaussians are a
-pixel or two wide, as in a trained scene. Seconds are the least of several calls: of wall time, and of processor time, which
-counts all threads. The plain form runs once. The second trains the scenes of SCENES that lie in a folder and judges whole
-held-out photographs by `fprf eval`; processor seconds and memory are those of the command, its imports included. Each scene is
-an entry of the file with its own commit; the others stay.
+A cloud in front of a camera of 500 x 375 pixels; most Gaussians are a pixel or two wide, as in a trained scene. Seconds are the
+least of several calls: of wall time, and of processor time, which counts all threads. The plain form runs once.
 """
 
 import json
 import math
-import os
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -28,25 +20,16 @@ from torch import Tensor
 from fprf.ops import backend
 from fprf.ops.rasterise import Pinhole, Rasterised, lift, rasterise
 
-from .common import add_entry, arguments, report
+from .common import arguments, report
 
 WIDTH, HEIGHT, BANDS, CHANNELS = 500, 375, 4, 32
-SCENES = {
-    "flower-252": ("llff_flower", "--downscale 2 --minutes 1"),
-    "flower-504": ("llff_flower", "--downscale 1 --minutes 2"),
-    "fox-135": ("fox", "--downscale 2 --minutes 1.5"),
-    "garden-356": ("garden_seattle", "--downscale 1 --minutes 1.5"),
-    "bonsai-480": ("m360_bonsai", "--downscale 1 --minutes 5"),
-    "drone-500": ("drone_caliterra", "--downscale 1 --minutes 5"),
-    "flower-1008": (
-        "llff_flower",
-        "--downscale 1 --minutes 5 --cap 120000 --parser transforms --parser.file transforms_4.json",
-    ),
-}
-"""Folder and flags of each training."""
 
 
-def cloud(count: int) -> list[Tensor]:
+Cloud = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+"""Means, quaternions, log scales, logits, harmonics."""
+
+
+def cloud(count: int) -> Cloud:
     draw = torch.Generator().manual_seed(0)
 
     def normal(*shape: int) -> Tensor:
@@ -58,7 +41,7 @@ def cloud(count: int) -> list[Tensor]:
     pixel = depth / (0.8 * WIDTH)
     # Standard deviations of about a pixel where there are 50 000; fewer are larger, so that they cover the image as well.
     scales = (math.sqrt(50_000 / count) * pixel).log()[:, None] + 0.5 * normal(count, 3)
-    return [means, normal(count, 4), scales, 2 * normal(count), 0.4 * normal(count, BANDS, 3)]
+    return means, normal(count, 4), scales, 2 * normal(count), 0.4 * normal(count, BANDS, 3)
 
 
 def camera() -> Pinhole:
@@ -77,11 +60,11 @@ def least(call: Callable[[], object], times: int) -> dict[str, float]:
     return {"seconds": min(wall), "processor_seconds": min(processor)}
 
 
-def learn(given: list[Tensor], pull: Tensor) -> list[Tensor]:
-    learnt = [x.detach().clone().requires_grad_() for x in given]
-    found = rasterise(*learnt, camera())
-    (found.image * pull.to(found.image)).sum().backward()
-    return [x.grad for x in learnt if x.grad is not None]
+def learn(given: Cloud, pull: Tensor) -> tuple[Tensor, ...]:
+    """Gradients of the image's product with `pull`."""
+    a, b, c, d, e = (x.detach().clone().requires_grad_() for x in given)
+    found = rasterise(a, b, c, d, e, camera())
+    return torch.autograd.grad((found.image * pull.to(found.image)).sum(), (a, b, c, d, e))
 
 
 def measure(count: int, times: int) -> dict[str, Any]:
@@ -98,7 +81,8 @@ def measure(count: int, times: int) -> dict[str, Any]:
         "render_and_gradients": least(lambda: learn(given, pull), times),
         f"lift_{CHANNELS}_channels": least(lambda: lift(*given[:4], camera(), pixels), times),
     }
-    exact = [x.double() for x in given]
+    a, b, c, d, e = (x.double() for x in given)
+    exact = a, b, c, d, e
     with backend.plain():
         rows["render_plain"] = least(render, 1)
         true = rasterise(*exact, camera())
@@ -118,57 +102,15 @@ def measure(count: int, times: int) -> dict[str, Any]:
     }
 
 
-def command(*args: str) -> tuple[float, float, float]:
-    """Run fprf: wall seconds, processor seconds and the largest memory in MiB."""
-    start = time.perf_counter()
-    line = [sys.executable, "-c", "import sys; from fprf.cli.main import main; sys.exit(main(sys.argv[1:]))", *args]
-    process = subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    _, status, used = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise SystemExit(f"fprf {' '.join(args)}: exit code {process.returncode}")
-    return time.perf_counter() - start, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
-
-
-def trained(name: str, folder: Path, flags: str) -> dict[str, Any]:
-    with tempfile.TemporaryDirectory() as place:
-        run = Path(place) / "run"
-        first = ("--output", str(run.with_name("first")), "--steps", "1")
-        command("train", "fprf-splats", "--data", str(folder), *flags.split(), *first)  # so that kernels are compiled
-        wall, processor, memory = command(
-            "train", "fprf-splats", "--data", str(folder), "--output", str(run), "--steps", "100000", *flags.split()
-        )  # fmt: skip
-        command("eval", str(run))
-        found = json.loads((run / "metrics.json").read_text())
-    return {
-        "scene": folder.name,
-        "command": f"fprf train fprf-splats --data {folder.name} --steps 100000 {flags}",
-        "wall_seconds": wall,
-        "processor_seconds": processor,
-        "peak_rss_mib": memory,
-        "steps": found["train_steps"],
-    } | {key: found[key] for key in ("gaussians", "views", "psnr", "ssim")}
-
-
 def main(argv: list[str]) -> None:
     parser = arguments("gaussians", __doc__)
     parser.add_argument("--count", type=int, default=50_000)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--times", type=int, default=30)
-    parser.add_argument("--scenes", type=Path, help="folder of the scenes to train")
-    parser.add_argument("--only", nargs="+", choices=SCENES, default=[*SCENES])
     parser.add_argument("--output", type=Path)
     args = parser.parse_args(argv)
-    if args.scenes is None:
-        torch.set_num_threads(args.threads)
-        numba.set_num_threads(args.threads)
-        found: dict[str, Any] = {"threads": args.threads, **measure(args.count, args.times)}
-        print(json.dumps(found, indent=1))
-        if args.output is not None:
-            report(args.output, found)
-        return
-    for name in args.only:
-        row = trained(name, args.scenes / SCENES[name][0], SCENES[name][1]) | {"load_average": os.getloadavg()[0]}
-        print(name, json.dumps(row), flush=True)
-        if args.output is not None:
-            add_entry(args.output, name, row)
+    torch.set_num_threads(args.threads)
+    numba.set_num_threads(args.threads)
+    found: dict[str, Any] = {"threads": args.threads, **measure(args.count, args.times)}
+    print(json.dumps(found, indent=1))
+    report(args.output, found)

@@ -2,7 +2,7 @@
 
     python -m benchmarks.gpu_rows WORK --output FILE
 
-WORK holds steps.jsonl, a log of each step and, as far as the steps came, run/metrics.json, speed.json, roofline.json,
+WORK holds steps.jsonl, a log of each step and, as far as the steps came, run/metrics.json, speed.json,
 profile.json and long/metrics.json. Rows of what is missing are left out. The exit status is 1 where a step failed.
 """
 
@@ -74,8 +74,6 @@ def rows(work: Path, form: str) -> Iterator[Row]:
         if name.startswith("tri-plane forward + backward"):
             kept = ("figure", "unit", "low", "high", "peer", "error", "error_kind", "peer_error", "note")
             yield Row(name=f"{form} {name}", **{key: row[key] for key in kept})
-    for row in (read(work / "roofline.json") or {}).get("rows", []):
-        yield Row(name=row["name"], figure=row["figure"], unit="%", goal=50.0, more_is_better=True, note=row["note"])
 
 
 def kernels(device: torch.device) -> str:

@@ -1,6 +1,6 @@
 """What each compiled kernel of `fprf.ops` brings, end to end: steps and views with one at a time switched to plain torch.
 
-    OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m benchmarks kernels RUN [--data DIR] [--repeats 7] [--output FILE.json]
+    OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m benchmarks kernels [RUN] [--data DIR] [--repeats 7] [--output FILE.json]
 
 Every form does the same work on the same model in one process, in turn, by the processor's clock. The fastest of all rounds
 counts, which other programs on the machine disturb least.
@@ -28,7 +28,7 @@ from fprf.style.look import Restyle
 from fprf.style.restyle import restyle
 from fprf.training.views import render_view
 
-from .common import RESULTS, arguments, report
+from .common import arguments, report, train_run
 from .report import Watch
 from .speed import STYLES, SpeedConfig
 from .subject import Subject, find, fresh_model, loop_of, stepper, test_view
@@ -117,16 +117,18 @@ def drawn(subject: Subject, camera: Cameras, render: RenderConfig, look: Restyle
 def main(argv: list[str]) -> None:
     """Measure and write."""
     parser = arguments("kernels", __doc__)
-    parser.add_argument("run", type=Path)
+    parser.add_argument("run", type=Path, nargs="?", help="run of fields; by default fprf-lite is trained on the town first")
     parser.add_argument("--data", type=Path)
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--output", type=Path, default=RESULTS / "kernels.json")
+    parser.add_argument("--steps", type=int, default=300, help="of the run that is trained")
+    parser.add_argument("--output", type=Path)
     args = parser.parse_args(argv)
-    config = SpeedConfig(run=args.run, data=args.data, repeats=args.repeats, clock="processor", device="cpu")
     names = ["", *SWITCHES, "all"]
     rows: dict[str, dict[str, object]] = {name: {} for name in names}
     with tempfile.TemporaryDirectory() as folder:
-        subject = find(args.run, config, Path(folder))
+        run = args.run or train_run(Path(folder) / "run", "fprf-lite", args.data, steps=args.steps)
+        config = SpeedConfig(run=run, data=args.data, repeats=args.repeats, clock="processor", device="cpu")
+        subject = find(run, config, Path(folder))
         watch = Watch(args.repeats, torch.device("cpu"), "processor")
         for task, call in tasks(subject, config).items():
             seconds = watch.in_turn({name: switched(name, call) for name in names})

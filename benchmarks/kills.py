@@ -25,13 +25,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from fprf.cli.train import train_scene
 from fprf.config import StatisticsConfig, TrainConfig
 from fprf.datamanagers.config import RayBatchesConfig
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.methods import fprf_lite
 from fprf.plugins.samplers.config import ProposalConfig
-from fprf.training import block_plan, prepare, style_pass, trainer
+from fprf.training import block_training, driver, prepare, style_pass
 from fprf.training.checkpoint import load
 from fprf.training.checkpoint import steps as saved
 
@@ -39,7 +38,7 @@ from .common import arguments, report
 from .town.write import write_town
 
 KILLED = -9
-PARTS = (block_plan, prepare, style_pass, trainer)
+PARTS = (block_training, prepare, style_pass, driver)
 """What a training imports when it begins: here already, so that children start at once."""
 SPAN = 0.7
 """Seconds after a process's first save within which it is killed."""
@@ -154,7 +153,7 @@ def measure(
     config = tiny(folder / "town", steps)
 
     def train(name: str) -> Callable[[], object]:
-        return lambda: train_scene(replace(config, output=folder / name), "fprf-lite", quiet=True)
+        return lambda: driver.train(replace(config, output=folder / name), "fprf-lite", quiet=True)
 
     import_as(train("warm-up"), folder / "modules")  # this one makes the features, too
     start = time.monotonic()

@@ -1,223 +1,103 @@
-"""A town as a large scene: blocks against one field of as many parameters, seams, memory, time with ever more blocks.
+"""A district of towns in cells: seconds, memory and fidelity of every verb against the size of the scene, and workers of Ray.
 
-    python -m benchmarks large_scene [--views 400] [--blocks 16] [--minutes 9] [--output benchmarks/results/large_scene.json]
+    python -m benchmarks large_scene [--images 2000] [--towns 16] [--parts 1 4 16] [--workers 2] [--output FILE.json]
 
-Both sides get the same seconds in all, features not counted: they are extracted before. Seconds are those of the processor,
-so that a busy machine favours neither (`--clock wall` takes the others; with one thread both agree where nobody disturbs).
-The row of blocks for memory and time is made of the trained ones (see `blocks_cost`): beyond as many as were trained it
-repeats itself.
+The district (`benchmarks/town/district.py`) is written into `--work`; each part is its first towns, with four cells a town and
+the same steps and Gaussians a cell. A part is trained, judged on its held-out views, flown through and written as a restyled
+.ply, each by a verb in a process of its own: processor seconds, and the most memory that it held. With `--workers` the
+part is trained again by Ray: how much sooner it is done, and whether its file is the same bytes.
 """
 
-import argparse
 import json
 import os
-import statistics
-import time
-from dataclasses import replace
+import tempfile
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-import torch
+import numpy as np
 
-from fprf.cli import blocks as blocks_verb
-from fprf.cli import train as train_verb
-from fprf.cli.train import train_scene
-from fprf.config import TrainConfig
-from fprf.datamanagers.config import RayBatchesConfig
-from fprf.datamanagers.images import load_image
-from fprf.datamanagers.parsers.config import parse_scene
-from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
-from fprf.fields.layouts import SingleConfig, StreetConfig
-from fprf.io.images import to_uint8, write_image
-from fprf.methods import fprf_lite
-from fprf.plugins.samplers.config import ProposalConfig
-from fprf.style.config import StyleConfig
-from fprf.style.files import StyleFile
-from fprf.style.restyle import apply_style
-from fprf.training import trainer
-from fprf.training.block_plan import lay_out, plan_scene
-from fprf.training.blocks import load_boxes
-from fprf.training.loading import Trained, load_run
-from fprf.training.views import render_view
+from .common import add_entry, arguments, cost_of
+from .subject import town_references
+from .town.district import SKY, write_district
 
-from .blocks import costs, jumps, ratios
-from .common import RESULTS, arguments, report
-from .town.write import cached_town, write_town
-
-METRES = 17.0
-"""Of street in a block."""
-PALETTES = ("sunset", "autumn", "winter")
-
-
-def configs(options: argparse.Namespace) -> tuple[TrainConfig, TrainConfig]:
-    """Blocks, and the single field with as many parameters as all of them and their surroundings."""
-    lite, n = fprf_lite(), options.blocks
-    width, height = options.size
-    town = cached_town(views=options.views, width=width, height=height, extra=max(0.0, round(METRES * n - 26.0)))
-    nodes = tuple(options.nodes)
-    blocks = replace(
-        lite,
-        data=town,
-        output=options.scratch / "blocks",
-        steps=10**6,
-        minutes=options.minutes,
-        device="cpu",
-        checkpoint_minutes=60.0,
-        datamanager=RayBatchesConfig(rays=options.rays, semantic_share=0.25),
-        sampler=replace(lite.sampler, resolutions=(nodes[-1] // 2,)),
-        content=replace(lite.content, field=PlanesConfig(resolutions=nodes, channels=16, hidden=64, layers=1)),
-        semantic=replace(lite.semantic, field=replace(lite.semantic.field, resolutions=(nodes[0], nodes[-2]))),
-        blocks=StreetConfig(segments=n),
-    )
-    # Parameters go with the square of the nodes; the surroundings are one block more.
-    single = replace(widened(blocks, (n + 1) ** 0.5), output=options.scratch / "single", blocks=SingleConfig())
-    return blocks, single
-
-
-def widened(config: TrainConfig, factor: float) -> TrainConfig:
-    """The config with so many times the nodes along every side of its planes."""
-    sampler, field, semantic = config.sampler, config.content.field, config.semantic.field
-    assert isinstance(sampler, ProposalConfig) and isinstance(field, PlanesConfig)
-    assert isinstance(semantic, SemanticPlanesConfig)
-    return replace(
-        config,
-        sampler=replace(sampler, resolutions=_times(sampler.resolutions, factor)),
-        content=replace(config.content, field=replace(field, resolutions=_times(field.resolutions, factor))),
-        semantic=replace(config.semantic, field=replace(semantic, resolutions=_times(semantic.resolutions, factor))),
-    )
-
-
-def _times(nodes: tuple[int, ...], factor: float) -> tuple[int, ...]:
-    return tuple(round(factor * r) for r in nodes)
-
-
-def psnr(trained: Trained, folder: Path | None = None) -> list[float]:
-    """Of each held-out view."""
-    scene = parse_scene(trained.config.data, trained.config.downscale, trained.config.datamanager.parser)
-    found = []
-    for view in scene.test.tolist():
-        truth = torch.from_numpy(load_image(scene.paths[view])).float() / 255
-        size = scene.cameras.size[view].tolist()
-        if [truth.shape[1], truth.shape[0]] != size:
-            truth = torch.from_numpy(load_image(scene.paths[view], (size[0], size[1]))).float() / 255
-        tones = trained.model.tones
-        factor = None if tones is None else tones(torch.tensor([view]))[0].detach()
-        image = render_view(trained.model, trained.known.facts, scene.cameras, view, trained.config.render, factor=factor).rgb
-        found.append(float(-10 * (image - truth).square().mean().log10()))
-        if folder is not None and len(found) % 10 == 1:
-            write_image(folder / f"{view:04d}.png", to_uint8(torch.cat([truth, image], 1)))
-    return found
-
-
-def parameters(config: TrainConfig, root: Path) -> int:
-    """That are learnt, blocks and surroundings added up."""
-    files = sorted((root / "blocks").glob("*/done.json"))
-    if not files:
-        return sum(p.numel() for n, p in load_run(root, "cpu").model.named_parameters() if not n.startswith("decoder"))
-    from safetensors import safe_open
-
-    total = 0
-    for file in files:
-        with safe_open(file.with_name("block.safetensors"), "pt") as tensors:
-            for name in tensors.keys():  # noqa: SIM118  (not a mapping)
-                if name.startswith("member."):
-                    shape = tensors.get_slice(name).get_shape()
-                    total += int(torch.tensor(shape).prod()) if shape else 1
-    return total
-
-
-def use_processor_time() -> None:
-    """Time limits of training count what this process has used, whatever else the machine does."""
-    clock = SimpleNamespace(perf_counter=time.process_time)
-    for module in (trainer, train_verb, blocks_verb):
-        vars(module)["time"] = clock
-
-
-def trained_seconds(root: Path) -> dict[str, Any]:
-    """What training took, and how evenly blocks were served."""
-    done = {p.parent.name: json.loads(p.read_text()) for p in (root / "blocks").glob("*/done.json")}
-    if not done:
-        run = load_run(root, "cpu")
-        return {"seconds": run.seconds, "steps": run.step, "seconds_per_step": run.seconds / max(1, run.step)}
-    each = [d["seconds"] / max(1, d["step"]) for name, d in done.items() if name != "surroundings"]
-    return {
-        "seconds": sum(d["seconds"] for d in done.values()),
-        "steps": sum(d["step"] for d in done.values()),
-        "seconds_per_step": statistics.mean(each),
-        "cheapest_and_dearest_block_to_mean": [min(each) / statistics.mean(each), max(each) / statistics.mean(each)],
-    }
-
-
-def references(folder: Path) -> tuple[Path, ...]:
-    """Three towns in other lights."""
-    found = []
-    for k, palette in enumerate(PALETTES):
-        town = folder / f"reference-{palette}"
-        write_town(town, seed=11 + k, palette=palette, views=2, width=160, height=120)
-        found.append(town / "images/0001.png")
-    return tuple(found)
+CELLS, COARSE_STEPS, POINTS, GAUSSIANS = 4, 100, 3000, 8000
+"""Cells of a town; steps of the whole for each town; Gaussians of a cell at the start and at the end."""
 
 
 def main(argv: list[str]) -> None:
     parser = arguments("large_scene", __doc__)
-    parser.add_argument("--views", type=int, default=400)
-    parser.add_argument("--size", type=int, nargs=2, default=(96, 72))
-    parser.add_argument("--blocks", type=int, default=16)
-    parser.add_argument("--minutes", type=float, default=9.0, help="of training in all, for each side")
-    parser.add_argument("--clock", choices=("processor", "wall"), default="processor")
-    parser.add_argument("--rays", type=int, default=2048)
-    parser.add_argument("--nodes", type=int, nargs="+", default=(16, 32, 64, 128), help="of a block's planes")
-    parser.add_argument("--pairs", type=int, default=256, help="rays at each border")
-    parser.add_argument("--rows", type=int, nargs="+", default=(4, 16, 64), help="lengths of rows that are timed")
-    parser.add_argument("--frames", type=int, default=6, help="views rendered for times and memory")
-    parser.add_argument("--scratch", type=Path, default=Path("runs/large_scene"))
-    parser.add_argument("--output", type=Path, default=RESULTS / "large_scene.json")
-    options = parser.parse_args(argv)
-    options.scratch = options.scratch.resolve()
-    os.environ.setdefault("XDG_CACHE_HOME", str(options.scratch / "cache"))
-    torch.manual_seed(0)
-    started = time.perf_counter()
+    parser.add_argument("--images", type=int, default=2000)
+    parser.add_argument("--towns", type=int, default=16)
+    parser.add_argument("--size", type=int, nargs=2, default=(480, 360))
+    parser.add_argument("--parts", type=int, nargs="+", default=(1, 4, 16), help="towns that are trained")
+    parser.add_argument("--steps", type=int, default=400, help="of a cell")
+    parser.add_argument("--frames", type=int, default=60, help="of the flight")
+    parser.add_argument("--workers", type=int, default=0, help="of Ray, which train each part again; 0 = none")
+    parser.add_argument("--work", type=Path, help="folder of the district and the runs; by default they are thrown away")
+    parser.add_argument("--output", type=Path, help="JSON file that the figures are added to")
+    asked = parser.parse_args(argv)
+    with tempfile.TemporaryDirectory(prefix="fprf-district-") as made:
+        work = (asked.work or Path(made)).resolve()
+        district, (width, height) = work / "scene", asked.size
+        workers = os.cpu_count() or 1
+        write_district(district, images=asked.images, tiles=asked.towns, width=width, height=height, workers=workers)
+        reference = town_references(work / "references")[0]
+        for towns in asked.parts:
+            row = measured(part(district, work / f"towns{towns}", towns), work, reference, towns, asked.steps, asked.frames)
+            if asked.workers:
+                row["ray"] = by_ray(work, towns, asked.steps, asked.workers)
+                row["ray"]["speedup"] = row["train"]["seconds"] / row["ray"]["seconds"]
+            add_entry(asked.output, f"{CELLS * towns} cells", row | {"load_average": os.getloadavg()[0]})
 
-    def say(text: str) -> None:
-        print(f"[{time.perf_counter() - started:6.0f} s] {text}", flush=True)
 
-    if options.clock == "processor":
-        use_processor_time()
-    blocks, single = configs(options)
-    scene, plan = plan_scene(blocks)
-    lay_out(blocks, scene, plan)
-    say(f"{len(scene.paths)} images, features extracted, {len(plan.boxes.low)} blocks")
-    result: dict[str, Any] = {
-        "images": len(scene.paths),
-        "size": list(options.size),
-        "blocks": len(plan.boxes.low),
-        "minutes_each_side": options.minutes,
-        "clock": options.clock,
-        "threads": torch.get_num_threads(),
+def part(district: Path, folder: Path, towns: int) -> Path:
+    """The first towns of a district as a scene folder of its own."""
+    folder.mkdir(parents=True, exist_ok=True)
+    document = json.loads((district / "transforms.json").read_text())
+    count = towns * -(-len(document["frames"]) // document["towns"][1])
+    document["frames"] = document["frames"][:count]
+    names = {frame["file_path"] for frame in document["frames"]}
+    for split in ("train_filenames", "test_filenames"):
+        document[split] = [name for name in document[split] if name in names]
+    (folder / "transforms.json").write_text(json.dumps(document))
+    if not (folder / "images").exists():
+        (folder / "images").symlink_to((district / "images").resolve())
+    with np.load(district / "points.npz") as found:
+        seen = found["seen"][found["seen"][:, 0] < count]
+        used, number = np.unique(seen[:, 1], return_inverse=True)
+        np.savez(folder / "points.npz", xyz=found["xyz"][used], rgb=found["rgb"][used], seen=np.stack([seen[:, 0], number], 1))
+    return folder
+
+
+def train(work: Path, run: Path, towns: int, steps: int) -> list[str]:
+    """Words of the training: `--steps` covers the whole, then one cell."""
+    cells, coarse = CELLS * towns, COARSE_STEPS * towns * steps // 400 + 1
+    words = f"""train fprf-splats --data {work}/towns{towns} --output {run} --downscale 1 --cells {cells}
+        --steps {coarse + steps} --overview {coarse / (coarse + steps)} --initial {POINTS * cells} --cap {GAUSSIANS * cells}
+        --background"""
+    return [*words.split(), *map(str, SKY)]
+
+
+def measured(data: Path, work: Path, reference: Path, towns: int, steps: int, frames: int) -> dict[str, Any]:
+    """What each verb takes, and how good the scene is."""
+    run = work / f"run{towns}"
+    verbs: dict[str, list[str]] = {
+        "train": train(work, run, towns, steps),
+        "eval": ["eval", str(run), "--no-images"],
+        "flight": ["render", str(run), "--path", "interpolate", "--frames", str(frames), "--output", f"{run}.mp4"],
+        "export": ["export", str(run), "ply", "--output", f"{run}.ply"],
+        "style": ["export", str(run), "ply", "--styles", f"look={reference}", "--output", f"{run}-styled"],
     }
-    for name, config in (("blocks", blocks), ("single", single)):
-        assert config.output is not None
-        train_scene(config, "fprf-lite", quiet=True)
-        run = load_run(config.output, "cpu")
-        values = psnr(run, options.scratch / f"{name}-views")
-        result[name] = {
-            "psnr": statistics.mean(values),
-            "psnr_of_worst_view": min(values),
-            "parameters": parameters(config, config.output),
-            **trained_seconds(config.output),
-        }
-        say(f"{name}: {result[name]}")
-    result["blocks_minus_single_db"] = result["blocks"]["psnr"] - result["single"]["psnr"]
-    root = options.scratch / "blocks"
-    run = load_run(root, "cpu")
-    style = StyleFile(StyleConfig(references=references(options.scratch)))
-    rows = jumps(run, load_boxes(root), apply_style(run, style).restyle, count=options.pairs, say=lambda text: None)
-    result["seams"] = {"borders": len(rows), **ratios(rows), "rows": rows}
-    say(f"seams: { {k: v for k, v in result['seams'].items() if k != 'rows'} }")
-    result["costs"] = costs(root, options.scratch, tuple(options.rows), options.frames, cache_blocks=4)
-    memory = result["costs"]["memory"]
-    result["peak_rss_many_over_two"] = memory[1]["peak_rss_mib"] / memory[0]["peak_rss_mib"]
-    say(f"costs: {result['costs']}")
-    report(options.output, result)
-    say(f"written to {options.output}")
+    row: dict[str, Any] = {"towns": towns, "cells": CELLS * towns}
+    for name, words in verbs.items():
+        row[name] = cost_of(*words)._asdict()
+    found = json.loads((run / "metrics.json").read_text())
+    return row | {name: found[name] for name in ("psnr", "ssim", "views", "gaussians")}
+
+
+def by_ray(work: Path, towns: int, steps: int, workers: int) -> dict[str, Any]:
+    """The same training by Ray's workers, and whether its export is the same file."""
+    run, cluster = work / f"run{towns}", work / f"ray{towns}"
+    cost = cost_of(*train(work, cluster, towns, steps), "--executor", "ray", "--executor.workers", str(workers))
+    cost_of("export", cluster, "ply", "--output", f"{cluster}.ply")
+    return cost._asdict() | {"same_bits": Path(f"{run}.ply").read_bytes() == Path(f"{cluster}.ply").read_bytes()}

@@ -29,62 +29,23 @@ from typing import Any, NamedTuple, TypeGuard
 from .common import ROOT, arguments, report
 
 OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
-    ast.Add: ast.Sub,
-    ast.Sub: ast.Add,
-    ast.Mult: ast.Div,
-    ast.Div: ast.Mult,
-    ast.FloorDiv: ast.Mult,
-    ast.Mod: ast.FloorDiv,
-    ast.Pow: ast.Mult,
-    ast.MatMult: ast.Add,
-    ast.BitAnd: ast.BitOr,
-    ast.BitOr: ast.BitAnd,
-    ast.BitXor: ast.BitAnd,
-    ast.LShift: ast.RShift,
-    ast.RShift: ast.LShift,
-    ast.And: ast.Or,
-    ast.Or: ast.And,
-}
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult, ast.Mod: ast.FloorDiv,
+    ast.Pow: ast.Mult, ast.MatMult: ast.Add, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd, ast.BitXor: ast.BitAnd,
+    ast.LShift: ast.RShift, ast.RShift: ast.LShift, ast.And: ast.Or, ast.Or: ast.And,
+}  # fmt: skip
 COMPARISONS: dict[type[ast.AST], tuple[type[ast.AST], ...]] = {
-    ast.Lt: (ast.LtE, ast.GtE),
-    ast.LtE: (ast.Lt, ast.Gt),
-    ast.Gt: (ast.GtE, ast.LtE),
-    ast.GtE: (ast.Gt, ast.Lt),
-    ast.Eq: (ast.NotEq,),
-    ast.NotEq: (ast.Eq,),
-    ast.Is: (ast.IsNot,),
-    ast.IsNot: (ast.Is,),
-    ast.In: (ast.NotIn,),
+    ast.Lt: (ast.LtE, ast.GtE), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.LtE), ast.GtE: (ast.Gt, ast.Lt),
+    ast.Eq: (ast.NotEq,), ast.NotEq: (ast.Eq,), ast.Is: (ast.IsNot,), ast.IsNot: (ast.Is,), ast.In: (ast.NotIn,),
     ast.NotIn: (ast.In,),
-}
+}  # fmt: skip
 CLAMPS = ("clamp", "clamp_min", "clamp_max", "nan_to_num", "clip", "abs", "sqrt", "square", "exp", "expm1")
 """Methods that are left out."""
 SWAPS = {
-    "min": "max",
-    "max": "min",
-    "minimum": "maximum",
-    "maximum": "minimum",
-    "amin": "amax",
-    "amax": "amin",
-    "sum": "mean",
-    "mean": "sum",
-    "floor": "ceil",
-    "ceil": "floor",
-    "sin": "cos",
-    "cos": "sin",
-    "fadd": "fsub",
-    "fsub": "fadd",
-    "fmul": "fadd",
-    "fdiv": "fmul",
-    "argmin": "argmax",
-    "argmax": "argmin",
-    "any": "all",
-    "all": "any",
-    "cumsum": "cumprod",
-    "zeros_like": "ones_like",
-    "zeros": "ones",
-    "logical_and": "logical_or",
-}
+    "min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum", "amin": "amax", "amax": "amin", "sum": "mean",
+    "mean": "sum", "floor": "ceil", "ceil": "floor", "sin": "cos", "cos": "sin", "fadd": "fsub", "fsub": "fadd",
+    "fmul": "fadd", "fdiv": "fmul", "argmin": "argmax", "argmax": "argmin", "any": "all", "all": "any",
+    "cumsum": "cumprod", "zeros_like": "ones_like", "zeros": "ones", "logical_and": "logical_or",
+}  # fmt: skip
 AXES = ("sum", "mean", "cumsum", "cat", "stack", "amax", "amin", "softmax", "diff", "sort", "unbind", "gather", "squeeze",
         "norm", "unsqueeze", "median", "all", "any", "cross", "prod", "argmax", "argmin", "new_zeros", "view", "reshape",
         "flatten", "logsumexp", "repeat_interleave", "movedim", "log_softmax", "normalize")  # fmt: skip
@@ -121,7 +82,8 @@ def mutated(source: str, mutation: Mutation) -> ast.Module:
     tree = ast.parse(source)
     target = next(node for number, node in enumerate(_nodes(tree)) if number == mutation.node)
     replacement = _changes(target)[mutation.which][1]
-    changed: ast.Module = _Replace(target, replacement).visit(tree)
+    changed = _Replace(target, replacement).visit(tree)
+    assert isinstance(changed, ast.Module)
     return ast.fix_missing_locations(changed)
 
 
@@ -202,7 +164,8 @@ def _constants(node: ast.Constant) -> list[tuple[str, ast.AST]]:
 
 
 def _calls(node: ast.Call) -> list[tuple[str, ast.AST]]:
-    function, made = node.func, []
+    function = node.func
+    made: list[tuple[str, ast.AST]] = []
     if isinstance(function, ast.Attribute):
         name, owner = function.attr, function.value
         if name in CLAMPS:
@@ -250,19 +213,9 @@ MODULES: dict[str, tuple[str, ...]] = {
 """Each numerics module and its tests."""
 COMPILED = ("_kernels.py", "lanes.py", "simd.py")
 THIRD_PARTY = (
-    "torch",
-    "torch.distributed.tensor",
-    "hypothesis.extra.pytestplugin",
-    "hypothesis.internal.conjecture.engine",
-    "numpy",
-    "cv2",
-    "numba",
-    "llvmlite",
-    "safetensors",
-    "pytest",
-    "hypothesis",
-    "kornia.color",
-)
+    "torch", "torch.distributed.tensor", "hypothesis.extra.pytestplugin", "hypothesis.internal.conjecture.engine", "numpy",
+    "cv2", "numba", "llvmlite", "safetensors", "pytest", "hypothesis", "kornia.color",
+)  # fmt: skip
 """Imported before processes are forked."""
 ROOM = 16 << 30
 """Bytes of address space: a wrong size of an array must not take the machine down."""
@@ -299,14 +252,15 @@ def compiled_anew(wanted: bool) -> Iterator[None]:
         return
     import numba
 
+    config: Any = numba.config
     base = "/dev/shm" if Path("/dev/shm").is_dir() else None
-    usual = numba.config.CACHE_DIR, numba.config.BOUNDSCHECK
-    numba.config.CACHE_DIR, numba.config.BOUNDSCHECK = tempfile.mkdtemp(prefix="fprf-numba-", dir=base), 1
+    usual = config.CACHE_DIR, config.BOUNDSCHECK
+    config.CACHE_DIR, config.BOUNDSCHECK = tempfile.mkdtemp(prefix="fprf-numba-", dir=base), 1
     try:
         yield
     finally:
-        shutil.rmtree(numba.config.CACHE_DIR, ignore_errors=True)
-        numba.config.CACHE_DIR, numba.config.BOUNDSCHECK = usual
+        shutil.rmtree(config.CACHE_DIR, ignore_errors=True)
+        config.CACHE_DIR, config.BOUNDSCHECK = usual
 
 
 def run_tests(module: str, code: CodeType | None, seconds: float, root: Path) -> tuple[int, float]:

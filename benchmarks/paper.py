@@ -1,39 +1,112 @@
-"""The page of one of the paper's tables, from its document alone."""
+"""A table of the paper, from short trainings of one scene: the method as it is, and with one thing changed.
 
-import inspect
+    python -m benchmarks paper --table ablation|guided-filter|clusters [--data SCENE --references A.jpg ...] [any field]
+
+A town is restyled by other towns and judged by its truth; another scene by photographs, judged by what is left of its structure
+and by VGG-19's relu1_1 and relu2_1 statistics, in regions that the run's semantic encoder finds in both. One reference and
+three, pictures alone and seconds are rows of `restyle`.
+"""
+
+import math
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from fprf.checks import at_least, between
 from fprf.cli.parsing import load_field_method, parse
-from fprf.cli.progress import Display
 from fprf.config import TrainConfig
 from fprf.datamanagers.images import load_image
-from fprf.errors import UsageError
-from fprf.evaluation.metrics import image_metrics, mean_metrics
+from fprf.evaluation.metrics import image_metrics, matched_regions, mean_metrics, structure
 from fprf.interfaces import Decoder
-from fprf.plugins.decoders.config import DecoderConfig, MlpDecoderConfig, ResidualDecoderConfig
-from fprf.plugins.decoders.decoders import ColourHead
-from fprf.plugins.stylizers.config import LocalAdainConfig, RegionToneConfig
+from fprf.io.atomic import write_json
+from fprf.io.images import shrink, to_uint8, write_image
+from fprf.plugins.decoders.config import DecoderConfig, MlpDecoderConfig
+from fprf.plugins.encoders.config import Vgg19Config
+from fprf.plugins.stylizers.config import LocalAdainConfig, RegionToneConfig, StylizerConfig
+from fprf.progress import Display
+from fprf.style.config import StyleConfig
+from fprf.style.files import StyleFile
+from fprf.style.look import Restyle
 from fprf.style.references import Encoders
-from fprf.training.loading import Trained, encoders_of, load_run
-from fprf.training.prepare import prepare, scene_of
+from fprf.style.restyle import apply_style
+from fprf.training.driver import Report, learn, schedule_of
+from fprf.training.learner import FieldLearner
+from fprf.training.loading import Trained, encoders_of
+from fprf.training.prepare import device_of, prepare, read_scene
 from fprf.training.run import Run
 from fprf.training.style_pass import measure_style
-from fprf.training.trainer import Report, train
-from fprf.training.views import render_view
+from fprf.training.views import cache_view, render_view
 
-from .common import origin, write_report
-from .paper_styles import Bench, PaperConfig, restyled, set_up, style_rows, styled_by_photographs
-from .report import Column, markdown, provenance, words
+from .common import Progress, console, origin
+from .report import Column, printed
+from .restyle import PLAIN, dictionary_of, in_scene
+from .styles import Exhibit, judge_exhibit
+from .town.truth import (
+    Row,
+    code_classes,
+    match_rates,
+    mean_rows,
+    photograph,
+    places,
+    score,
+    set_stage,
+    town_folder,
+    town_settings,
+    true_views,
+    winners,
+)
 from .town.write import scene_folder
-from .town_truth import Row, mean_rows, town_folder
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperConfig:
+    """A table of the paper, from short trainings of one scene: the method as it is, and with one thing changed."""
+
+    table: Literal["ablation", "guided-filter", "clusters"] = "ablation"
+    """Which."""
+    data: Path = Path("town")
+    """Scene folder; the town is also restyled, and judged by its truth."""
+    references: tuple[Path, ...] = ()
+    """Photographs that another scene is restyled by; none = not restyled."""
+    downscale: int = 1
+    """Images at 1/downscale of their size."""
+    method: str = "fprf-lite"
+    """Method that is changed: its name, or the config.json of a run."""
+    steps: int = 400
+    """Steps of each training."""
+    trainings: tuple[int, ...] = (0,)
+    """Seeds: every row is the mean over trainings with these."""
+    views: int = 4
+    """Held-out views that are judged."""
+    palettes: tuple[str, ...] = ("autumn", "night")
+    """Lights that a town is restyled in, with three references."""
+    clusters: tuple[int, ...] = (1, 2, 5, 10, 20, 50)
+    """Style codes per reference, of the table of that name."""
+    codes: int = StyleConfig.clusters
+    """Style codes per reference, of all others."""
+    blend: float = StyleConfig.blend
+    """Share of the overall style in each local one, in [0, 1]."""
+    output: Path | None = None
+    """JSON file for the figures; none = only the table."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto."""
+
+    def __post_init__(self) -> None:
+        at_least("downscale", self.downscale, 1)
+        at_least("steps", self.steps, 1)
+        at_least("trainings", len(self.trainings), 1)
+        at_least("views", self.views, 1)
+        at_least("palettes", len(self.palettes), 1)
+        at_least("codes", self.codes, 1)
+        between("blend", self.blend, 0.0, 1.0)
+        for value in self.clusters:
+            at_least("clusters", value, 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,51 +115,34 @@ class SceneDecoderConfig(DecoderConfig):
 
     def build(self, *, encoder: str, channels: int, seed: int = 0) -> Decoder:
         """As large as the shipped decoder of that encoder; starts from the seed."""
-        from fprf.plugins.decoders.decoders import load_decoder
-
-        hidden = load_decoder(MlpDecoderConfig().weights, encoder=encoder, channels=channels).first.out_features
+        shipped = MlpDecoderConfig().build(encoder=encoder, channels=channels)
+        hidden = next(shipped.parameters()).shape[0]
         return SceneDecoder(channels, hidden, torch.Generator().manual_seed(seed))
 
 
 class SceneDecoder(Decoder):
-    """rgb = sigmoid(head(content)), every weight the scene's own."""
+    """rgb = sigmoid(W2 relu(W1 f + b1) + b2), every weight the scene's own; grey before it is trained.
+
+    Weights are kept times the root of their fan-in, since Adam moves each by the learning rate, whatever its size.
+    """
 
     def __init__(self, channels: int, hidden: int, generator: torch.Generator) -> None:
         super().__init__()
-        self.head = ColourHead(channels, hidden, generator)
+        bound = 6**0.5
+        self.first = nn.Parameter(torch.empty(hidden, channels).uniform_(-bound, bound, generator=generator))
+        self.first_bias = nn.Parameter(torch.zeros(hidden))
+        self.second = nn.Parameter(torch.zeros(3, hidden))
+        self.second_bias = nn.Parameter(torch.zeros(3))
 
     def forward(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"]:
-        """sRGB in [0, 1]; grey before it is trained."""
-        return torch.sigmoid(self.head(content))
-
-    def restyled(
-        self,
-        content: Annotated[Tensor, "N C"],
-        styled: Annotated[Tensor, "N C"],
-        strength: float | Annotated[Tensor, "N 1"],
-    ) -> Annotated[Tensor, "N 3"]:
-        """The decoded style."""
-        colour: Tensor = self(styled)
-        return colour
-
-    def frozen_colour(self, content: Annotated[Tensor, "N C"]) -> None:
-        """None: there is nothing besides."""
-
-
-Progress = Callable[[int, int, str], None]
-Change = Callable[[TrainConfig], TrainConfig]
-
-
-def _same(config: TrainConfig) -> TrainConfig:
-    return config
+        """sRGB in [0, 1]."""
+        first, second = (weight / weight.shape[1] ** 0.5 for weight in (self.first, self.second))
+        hidden = torch.relu(content @ first.T + self.first_bias)
+        return torch.sigmoid(hidden @ second.T + self.second_bias)
 
 
 def _scene_decoder(config: TrainConfig) -> TrainConfig:
     return replace(config, content=replace(config.content, decoder=SceneDecoderConfig()))
-
-
-def _residual(config: TrainConfig) -> TrainConfig:
-    return replace(config, content=replace(config.content, decoder=ResidualDecoderConfig()))
 
 
 def _no_content_loss(config: TrainConfig) -> TrainConfig:
@@ -99,21 +155,23 @@ def _no_guide(config: TrainConfig) -> TrainConfig:
     return replace(config, datamanager=replace(manager, guided=replace(manager.guided, radius=0.0)))
 
 
-TRAINED: Mapping[str, Mapping[str, Change]] = {
-    "reconstruction": {
-        "frozen decoder": _same,
-        "frozen and residual": _residual,
-        "decoder trained with the scene": _scene_decoder,
-    },
+TRAINED: Mapping[str, Mapping[str, Callable[[TrainConfig], TrainConfig]]] = {
     "ablation": {
-        "as it is": _same,
+        "as it is": lambda config: config,
         "without content loss": _no_content_loss,
         "without pre-trained decoder": _scene_decoder,
         "without either": lambda config: _scene_decoder(_no_content_loss(config)),
     },
-    "guided-filter": {"with guided filter": _same, "without": _no_guide},
+    "guided-filter": {"with guided filter": lambda config: config, "without": _no_guide},
+    "clusters": {"": lambda config: config},
 }
-"""By table: what each of its rows changes."""
+"""By table: what each of its rows changes in the training."""
+SEEDS = (7, 11, 13)
+"""Towns of the references."""
+_REGIONS = 6
+"""Regions that views and photographs are compared in, where nobody knows the true ones."""
+_SIDE = 11
+"""Smaller pictures have no structure that could be judged."""
 
 
 class Short(NamedTuple):
@@ -121,102 +179,111 @@ class Short(NamedTuple):
 
     trained: Trained
     encoders: Encoders
-    seconds: float
-
-
-def paper(config: PaperConfig, method: TrainConfig, name: str, progress: Progress) -> dict[str, Any]:
-    """The document of one table; `method` is the config that `config.method` stands for, `name` that of its method."""
-    base = replace(method, data=scene_folder(config.data), downscale=config.downscale, device=config.device)
-    base = replace(base, steps=config.steps, minutes=None, output=None)
-    steps = config.steps
-    if config.run is not None and config.table not in TRAINED:
-        steps = load_run(config.run, "cpu").step
-    tables = []
-    with tempfile.TemporaryDirectory(prefix="fprf-paper-") as made:
-        for k, seed in enumerate(config.trainings):
-            folder = Path(made) / str(k)
-            tables.append(_table(config, replace(base, seed=seed), folder, progress))
-    return {
-        "benchmark": "paper",
-        "table": config.table,
-        "settings": {
-            "data": config.data.name,
-            "method": name,
-            "references": [path.stem for path in config.references],
-            "steps": steps,
-            "trainings": list(config.trainings),
-            "views": config.views,
-            "palettes": list(config.palettes),
-            "downscale": config.downscale,
-            "codes": config.codes,
-            "blend": config.blend,
-        },
-        "rows": mean_rows(tables),
-    }
 
 
 def short_training(config: TrainConfig, folder: Path, progress: Progress) -> Short:
     """Prepare, train and measure the scene's style, without a run folder that others could read."""
-    prepared = prepare(config)
+    prepared = prepare(config, read_scene(config))
     run = Run(folder)
     run.root.mkdir(parents=True)
-    run.save_known(prepared.scene, scene_folder(config.data), prepared.facts)
-    last: list[Report] = []
+    assert config.data is not None
+    run.save_known(prepared.scene, config.data, prepared.facts)
+    start = time.perf_counter()
 
     def report(event: Report) -> None:
-        last[:] = [event]
         progress(event.step, config.steps, "training")
 
-    start = time.perf_counter()
-    model = train(config, prepared, run, report).requires_grad_(False).eval()
-    spent = time.perf_counter() - start
+    learner = FieldLearner(config, prepared, device_of(config.device))
+    learn(learner, run, schedule_of(config, len(prepared.scene.train)), report)
+    model = learner.model.requires_grad_(False).eval()
+    trained = Trained(run, config, "", run.load_known(), model, config.steps, time.perf_counter() - start)
     scene = measure_style(config, model, prepared.scene.cameras, prepared.scene.train)
-    trained = Trained(run, config, "", run.load_known(), model, config.steps, spent)
-    return Short(trained, encoders_of(trained, scene, prepared.basis), spent)
+    return Short(trained, encoders_of(trained, scene, prepared.basis))
 
 
-def _table(config: PaperConfig, base: TrainConfig, folder: Path, progress: Progress) -> dict[str, Row]:
-    if config.table in TRAINED:
-        rows = {}
-        for k, (name, change) in enumerate(TRAINED[config.table].items()):
-            short = short_training(change(base), folder / str(k), progress)
-            rows[name] = _held_out(short.trained, config.views) | {"train_seconds": short.seconds}
-            if town_folder(short.trained.config) is not None:
-                rows[name] |= _styled(set_up(short.trained, short.encoders, config, folder / f"references-{k}"))
-            elif config.references:
-                rows[name] |= styled_by_photographs(short.trained, short.encoders, config)
-        return rows
-    short = short_training(base, folder / "run", progress) if config.run is None else _finished(config.run, config.device)
-    if town_folder(short.trained.config) is None:
-        raise UsageError(f"--table {config.table}: judged by a town's truth; --run or --data is another scene, leave it out")
-    steady = config.table in ("statistics", "large-scale")
-    return style_rows(set_up(short.trained, short.encoders, config, folder / "references", path=steady))
-
-
-def _styled(bench: Bench) -> Row:
-    """The recommended stylizer on a training, and the paper's own, which has nothing but features."""
-    paper = restyled(bench, LocalAdainConfig())
-    shown = {f"paper_{key}": paper[key] for key in ("styled_psnr", "styled_delta_e", "structure") if key in paper}
-    return restyled(bench, RegionToneConfig()) | shown
-
-
-def _finished(root: Path, device: str) -> Short:
-    """A run that is trained already."""
-    trained = load_run(root, device)
-    return Short(trained, trained.encoders(), trained.seconds)
-
-
-def _held_out(trained: Trained, views: int) -> Row:
+def held_out(trained: Trained, views: int) -> Row:
+    """PSNR, SSIM and LPIPS of held-out views against their photographs."""
     known, config = trained.known, trained.config
-    scene = scene_of(config)
-    chosen = (known.test or known.train)[:views]
-    found = []
-    for view in chosen:
+    scene, found = read_scene(config), []
+    for view in (known.test or known.train)[:views]:
         render = render_view(trained.model, known.facts, known.cameras, view, config.render).rgb
         size = (render.shape[1], render.shape[0])
         truth = torch.from_numpy(load_image(scene.paths[view], size, known.facts.background)).float() / 255
         found.append(image_metrics(render, truth))
     return dict(mean_metrics(found))
+
+
+def by_truth(short: Short, config: PaperConfig, folder: Path, stylizer: StylizerConfig, clusters: int) -> Row:
+    """Figures of a style from three other towns, means over the palettes: nearness to the truth, match rates, structure."""
+    trained, encoders = short
+    folder.mkdir(exist_ok=True)
+    side = int(trained.known.cameras.size.amax())
+    stage = set_stage(trained, trained.known, town_settings(trained.config), views=config.views, frames=0, longest=side)
+    width, height = (int(v) for v in trained.known.cameras.size[0])
+    labels, plain, rows = [each.labels for each in stage.truth], [view.restyled().rgb for view in stage.shown], []
+    for light in config.palettes:
+        shown = [photograph(place, light) for place in places(SEEDS, (width, height))["three"]]
+        paths = [folder / f"{reference.name}.png" for reference in shown]
+        for path, reference in zip(paths, shown, strict=True):
+            write_image(path, to_uint8(reference.image))
+        dictionary, seconds = dictionary_of(paths, encoders, clusters=clusters, blend=config.blend)
+        found = in_scene(trained, stage.shown, stylizer, dictionary, encoders, paths)
+        near, _ = score(found.pictures, true_views(stage, light), labels)
+        row: Row = {f"styled_{name}": value for name, value in near.items()}
+        if min(plain[0].shape[:2]) >= _SIDE:
+            kept = [structure(a, b) for a, b in zip(plain, found.pictures, strict=True)]
+            row["structure"] = math.fsum(kept) / len(kept)
+        if found.taken is not None:
+            known = dict(zip((path.name for path in paths), shown, strict=True))
+            classes = code_classes(dictionary, known, encoders, trained.config.datamanager.guided)
+            taken = [winners(share, classes).view(like.shape) for share, like in zip(found.taken, labels, strict=True)]
+            row |= match_rates(taken, labels, shown)._asdict()
+        rows.append({"": row | {"style_seconds": seconds + found.style_seconds, "view_seconds": found.view_seconds}})
+    return mean_rows(rows)[""]
+
+
+def by_photographs(short: Short, config: PaperConfig, stylizers: Mapping[str, StylizerConfig], clusters: int) -> Row:
+    """Figures of each stylizer, its name before their keys: distance to the photographs' style, and the structure kept."""
+    trained, encoders = short
+    looks: dict[str, Restyle | None] = {PLAIN: None}
+    for name, stylizer in stylizers.items():
+        style = StyleConfig(references=config.references, stylizer=stylizer, clusters=clusters, blend=config.blend)
+        looks[name] = apply_style(trained, StyleFile(style), encoders).restyle
+    known, render = trained.known, trained.config.render
+    views = (known.test or known.train)[: config.views]
+    cached = (cache_view(trained.model, known.facts, known.cameras, view, render) for view in views)
+    shown = [{name: view.restyled(look).rgb for name, look in looks.items()} for view in cached]
+    plain = [pictures[PLAIN] for pictures in shown]
+    side = max(plain[0].shape[:2])
+    images = [torch.from_numpy(shrink(load_image(path, upright=True), side)).float() / 255 for path in config.references]
+    observer = encoders.semantic if encoders.semantic is not None else encoders.content
+    here, there = matched_regions(observer.cpu(), plain, images, regions=_REGIONS, seed=0)
+    styled = {name: [pictures[name] for pictures in shown] for name in stylizers}
+    judges = {layer: Vgg19Config(layer=layer).build() for layer in ("relu1_1", "relu2_1")}
+    rows = judge_exhibit(Exhibit(plain, styled, here, images, there), judges)
+    return {f"{name}{key}": rows[name][key] for name in stylizers for key in ("style_distance", "structure")}
+
+
+def styled(short: Short, config: PaperConfig, folder: Path, clusters: int) -> Row:
+    """The recommended stylizer on a training, and as `paper_*` the paper's own, which has nothing but features."""
+    if town_folder(short.trained.config) is None:
+        stylizers: Mapping[str, StylizerConfig] = {"": RegionToneConfig(), "paper_": LocalAdainConfig()}
+        return by_photographs(short, config, stylizers, clusters) if config.references else {}
+    paper = by_truth(short, config, folder, LocalAdainConfig(), clusters)
+    shown = {f"paper_{key}": paper[key] for key in ("styled_psnr", "styled_delta_e", "structure") if key in paper}
+    return by_truth(short, config, folder, RegionToneConfig(), clusters) | shown
+
+
+def rows_of(config: PaperConfig, base: TrainConfig, folder: Path, progress: Progress) -> Iterator[tuple[str, Row]]:
+    """The rows of the table, from trainings with one seed."""
+    for k, (name, change) in enumerate(TRAINED[config.table].items()):
+        short = short_training(change(base), folder / f"run-{k}", progress)
+        row = held_out(short.trained, config.views) | {"train_seconds": short.trained.seconds}
+        if config.table == "clusters":
+            for count in config.clusters:
+                yield f"{count} clusters", row | styled(short, config, folder / f"references-{k}", count)
+        else:
+            yield name, row | styled(short, config, folder / f"references-{k}", config.codes)
 
 
 COLUMNS: tuple[Column, ...] = (
@@ -233,56 +300,42 @@ COLUMNS: tuple[Column, ...] = (
     ("paper_styled_delta_e", "local-adain ΔE2000", ".1f"),
     ("paper_style_distance", "local-adain style distance", ".3f"),
     ("paper_structure", "local-adain structure", ".3f"),
-    ("consistency", "consistency", ".3f"),
-    ("warp_short", "error to the next frame", ".3f"),
-    ("warp_long", "error seven frames on", ".3f"),
     ("train_seconds", "training s", ".1f"),
     ("style_seconds", "style s", ".2f"),
     ("view_seconds", "view s", ".3f"),
 )
-_ABOUT = {
-    "reconstruction": "The frozen, scene-agnostic decoder against one that the scene trains for itself, from nothing.",
-    "ablation": "What the content loss and the pre-trained decoder are good for: the scene as it is, and restyled.",
-    "guided-filter": "Feature targets with the guided filter, and merely interpolated between cells.",
-    "clusters": "Local styles per reference, one training; and no clusters, every cell of 8x8 pixels a style of its own.",
-    "multi-reference": "One reference, and three that share the work (see [restyle.md](restyle.md)), one training.",
-    "time": "Seconds to train, to make a style of three references, and to colour a view whose geometry is there.",
-    "statistics": "What styles start from: statistics and regions of the whole scene, or of each view by itself.",
-    "large-scale": "The same places seen from far apart (frames half a metre and 3 degrees from each other): every picture "
-    "restyled alone, and the scene restyled once.",
-}
-_KEPT = " *Structure*: of the unstylised render, 1 = all of it."
-_DISTANCE = (
-    " *Style distance*: of VGG-19's relu1_1 and relu2_1 statistics in regions that the run's semantic encoder finds in both, "
-    "0 = the references' own, 1 = no change."
-)
-_STEADY = " *Consistency*: what a style adds to the error between frames, and loses in sharpness; 0 is best."
-
-
-def paper_page(document: Mapping[str, Any]) -> str:
-    """Markdown. Columns that no row has are left out."""
-    settings, rows = document["settings"], document["rows"]
-    columns = [each for each in COLUMNS if any(row.get(each[0]) is not None for row in rows.values())]
-    seeds = ", ".join(map(str, settings["trainings"]))
-    styled = any("styled_psnr" in row for row in rows.values())
-    how = f" *Styled*: against the truth of the palettes {', '.join(settings['palettes'])}.{_KEPT}" if styled else ""
-    if settings.get("references"):
-        how += f" Restyled by {', '.join(settings['references'])}.{_DISTANCE}{_KEPT}"
-    how += _STEADY if any("consistency" in row for row in rows.values()) else ""
-    return (
-        f"# {document['table'].capitalize()}\n\n{_ABOUT[document['table']]}{how}\n\n"
-        f"{settings['data']} at 1/{settings['downscale']}, {settings['method']}, {settings['steps']} steps, seeds {seeds}, "
-        f"{settings['views']} held-out views. {words(document['provenance'])}.\n\n{markdown(rows, columns)}\n"
-    )
 
 
 def main(argv: list[str]) -> int:
-    """`python -m benchmarks paper --table NAME [flags]`: the table's page is printed, and written where asked for."""
-    config = parse(PaperConfig(), argv, prog="python -m benchmarks paper", description=inspect.getdoc(PaperConfig) or "")
-    with Display() as display:
-        document = paper(config, *load_field_method(config.method), display.count)
-    document |= {"provenance": provenance(config.device), "command": origin(config.device)["command"]}
-    page = paper_page(document)
-    print(page)
-    write_report(config, document, lambda: page)
+    """`python -m benchmarks paper --table NAME [flags]`."""
+    config = parse(PaperConfig(), argv, prog="python -m benchmarks paper", description=__doc__ or "")
+    method, name = load_field_method(config.method)
+    base = replace(method, data=scene_folder(config.data), downscale=config.downscale, device=config.device)
+    base = replace(base, steps=config.steps, minutes=None, output=None)
+    tables = []
+    with Display() as display, tempfile.TemporaryDirectory(prefix="fprf-paper-") as made:
+        for seed in config.trainings:
+            tables.append(dict(rows_of(config, replace(base, seed=seed), Path(made) / str(seed), display.count)))
+    document: dict[str, Any] = {
+        "benchmark": "paper",
+        "table": config.table,
+        "settings": {
+            "data": config.data.name,
+            "method": name,
+            "references": [path.stem for path in config.references],
+            "steps": config.steps,
+            "trainings": list(config.trainings),
+            "views": config.views,
+            "palettes": list(config.palettes),
+            "downscale": config.downscale,
+            "codes": config.codes,
+            "blend": config.blend,
+        },
+        "rows": mean_rows(tables),
+        **origin(config.device),
+    }
+    columns = [each for each in COLUMNS if any(row.get(each[0]) is not None for row in document["rows"].values())]
+    console().print(printed(f"{config.table}, {name} on {config.data.name}, {config.steps} steps", document["rows"], columns))
+    if config.output is not None:
+        write_json(config.output, document)
     return 0

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from fprf.cli.parsing import parse
-from fprf.cli.progress import Display
 from fprf.datamanagers.images import IMAGE_SUFFIXES, load_image
 from fprf.datamanagers.parsers.files import Record, as_record, read_bytes, read_json, read_npy, read_npz
 from fprf.datamanagers.parsers.views import rigid_pose
@@ -18,6 +17,7 @@ from fprf.errors import DataError
 from fprf.evaluation.consistency import published, steadiness
 from fprf.evaluation.metrics import matched_regions, mean_scores, structure, style_distances
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig
+from fprf.progress import Display
 from fprf.rendering.cameras import Cameras, grid_rays
 from fprf.training.loading import load_run
 from fprf.training.views import render_view

@@ -263,7 +263,7 @@ def commit(folder: Path) -> str | None:
     return answer.stdout.strip() or None
 
 
-def words(origin: dict[str, object]) -> str:
+def words(origin: Mapping[str, object]) -> str:
     """A line for a page."""
     where = f"commit {origin['commit']}, " if origin["commit"] else ""
     return f"{where}fprf {origin['fprf']}, torch {origin['torch']}, {origin['machine']}"
@@ -284,13 +284,8 @@ def markdown(rows: Rows, columns: Sequence[Column], *, first: str = "") -> str:
 
 def printed(title: str, rows: Rows, columns: Sequence[Column]) -> Table:
     """The same for a terminal."""
-    made = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    made.add_column("", no_wrap=True)
-    for _, heading, _ in columns:
-        made.add_column(heading, justify="right")
-    for name, row in rows.items():
-        made.add_row(name, *_figures(row, columns))
-    return made
+    headings = ["", *(heading for _, heading, _ in columns)]
+    return table(title, headings, ([name, *_figures(row, columns)] for name, row in rows.items()))
 
 
 def _figures(row: Mapping[str, Any], columns: Sequence[Column]) -> list[str]:

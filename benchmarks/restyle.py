@@ -14,8 +14,6 @@ from torch import Tensor
 
 from fprf.checks import at_least, between, positive
 from fprf.cli.parsing import as_flag, parse
-from fprf.cli.progress import Display
-from fprf.cli.train import train_scene
 from fprf.errors import ConfigError, UsageError
 from fprf.evaluation.consistency import published, steadiness
 from fprf.interfaces import Scene, SceneView
@@ -25,24 +23,24 @@ from fprf.plugins import registry
 from fprf.plugins.stylizers.config import (
     AdainConfig,
     LocalAdainConfig,
-    RegionAdainConfig,
     RegionOtConfig,
     RegionToneConfig,
     StylizerConfig,
 )
+from fprf.progress import Display
 from fprf.style.config import StyleConfig, labels
 from fprf.style.dictionary import StyleDictionary, build_dictionary
 from fprf.style.files import StyleFile
 from fprf.style.references import Encoders, encode_photograph
 from fprf.style.restyle import dress
+from fprf.training.driver import train
 from fprf.training.loading import open_run
 from fprf.types import Want
 
 from .common import ReportConfig, console, write_report
 from .report import Column, contact_sheet, markdown, printed, provenance, words
 from .single_image import encoded, flat_look, flat_scene, histogram_matching, reinhard, render_flat
-from .town.write import cached_town
-from .town_truth import (
+from .town.truth import (
     CUT,
     Matched,
     Reference,
@@ -63,6 +61,7 @@ from .town_truth import (
     winners,
     without,
 )
+from .town.write import cached_town
 
 PLAIN = "no change"
 FLAT = "2d"
@@ -72,7 +71,6 @@ GLOBAL = ("reinhard", "histogram", "adain")
 STYLIZERS: Mapping[str, StylizerConfig] = {
     "adain": AdainConfig(),
     "local-adain": LocalAdainConfig(),
-    "region-adain": RegionAdainConfig(),
     "region-ot": RegionOtConfig(),
     "region-tone": RegionToneConfig(),
 }
@@ -570,7 +568,7 @@ def main(argv: list[str]) -> int:
         if root is None:
             run = Path(made) / "run"
             town = replace(fprf_lite(), data=cached_town(), output=run, minutes=config.minutes, device=config.device)
-            root = train_scene(town, "fprf-lite")
+            root = train(town, "fprf-lite")
         with Display() as display:
             document, found = restyle(config, root, Path(made), display.count)
     document["provenance"] = provenance(config.device)

@@ -3,11 +3,15 @@
     python -m benchmarks semantic_matching [--encoder NAME [--encoder.FIELD VALUE ...]] [--triplets DIR] [--output JSON]
 
 One encoder a call; its row replaces the row of the same encoder in the output. Without triplets the town alone is measured.
+
+`confidence` is what a score of `fprf.style.light` says: each painted region that both photographs show is asked for twice, with
+the style photograph as it is, and without the region. A pixel of the region has a right match the first time and none the
+second; both times weigh alike. The rate of a bin of scores (in spreads of the scene's regions) is the share of the pixels with
+a right match in it.
 """
 
 import json
 import math
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,13 +24,20 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from fprf.cli.parsing import parse
+from fprf.datamanagers.basis import Basis, fit_basis
+from fprf.datamanagers.config import GuidedConfig
 from fprf.datamanagers.images import load_image
-from fprf.errors import DataError, FprfError
+from fprf.errors import DataError
 from fprf.evaluation.metrics import MIXED, whole_cells
 from fprf.interfaces import Encoder
 from fprf.plugins.encoders.config import SEMANTICS, EncoderConfig
+from fprf.plugins.stylizers.config import RegionToneConfig
+from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
+from fprf.style.light import SURE, UNSURE, certainty, light_of
+from fprf.style.references import semantic_samples
+from fprf.style.scene import scene_style
 
-from .common import RESULTS, SHARED, report
+from .common import SHARED, report
 from .town.layout import build_town
 from .town.palettes import PALETTES, palette
 from .town.render import colours, geometry, walk
@@ -238,6 +249,83 @@ def town_cells(
     return {name: (torch.cat(parts), torch.cat(labels)) for name, parts in features.items()}
 
 
+_CHANNELS, _REGIONS, _STEP, _WIDTH = 31, 16, 5, 0.2
+"""Principal components and regions, as of a capture; pixels between samples; of a bin, in spreads."""
+_FEWEST = 50
+"""Samples that a style must have left."""
+
+
+@torch.inference_mode()
+def measured_scores(encoder: Encoder, triplet: Triplet) -> tuple[list[Tensor], list[Tensor]]:
+    """Scores, in spreads, of pixels with a right match and of those without, one tensor for each region."""
+    cells = encoder(triplet.content.permute(2, 0, 1)[None])[0].float()
+    basis = fit_basis(cells.flatten(1).T, _CHANNELS)
+    here, _, _, kinds = _sampled(triplet.content, triplet.content_regions, encoder, basis)
+    there, beyond, colour, shown = _sampled(triplet.style, triplet.style_regions, encoder, basis)
+    scene = scene_style(here[:, :3], here, torch.ones(len(here)), None, _REGIONS, 0)
+
+    def match(dictionary: StyleDictionary) -> Tensor:
+        return RegionToneConfig().build(dictionary=dictionary, scene=scene).region_match(scene.keys)
+
+    regions, right, wrong = shared_regions(triplet), [], []
+    for gone in (None, *regions):
+        left = shown != gone if gone is not None else torch.ones_like(shown, dtype=torch.bool)
+        if int(left.sum()) < _FEWEST:
+            continue
+        dictionary = build_dictionary(
+            [Reference("style", there[left, :3], there[left], colour=colour[left], beyond=beyond[left])]
+        )
+        light = light_of(scene, dictionary, match, (scene.region_mean, scene.region_covariance), bold=0.5)
+        assert light is not None  # a photograph has several regions
+        score = light.score(here)[:, 0]
+        if gone is None:
+            right = [score[kinds == region] for region in regions]
+        else:
+            wrong.append(score[kinds == gone])
+    return right, wrong
+
+
+def rates(encoder: Encoder, triplets: Sequence[Triplet]) -> dict[str, object]:
+    """Share of right matches by bins of the score, all regions alike; and that a right one scores higher than a wrong one."""
+    right: list[Tensor] = []
+    wrong: list[Tensor] = []
+    for triplet in triplets:
+        if len(shared_regions(triplet)) > 1:
+            found = measured_scores(encoder, triplet)
+            right, wrong = right + found[0], wrong + found[1]
+    edges = torch.arange(-0.4, 2.4001, _WIDTH)
+    counts = []
+    for side in (right, wrong):
+        shares = [torch.histogram(part.clamp(-0.39, 2.39).cpu(), edges)[0] / len(part) for part in side if len(part)]
+        counts.append(torch.stack(shares).double().mean(0))
+    rate = counts[0] / (counts[0] + counts[1]).clamp_min(1e-9)
+    middle = (edges[:-1] + edges[1:]) / 2
+    above = counts[1].cumsum(0) - counts[1] / 2
+    return {
+        "score": [round(float(x), 2) for x in middle],
+        "rate": [round(float(x), 3) for x in rate],
+        "right": [round(float(x), 4) for x in counts[0]],
+        "wrong": [round(float(x), 4) for x in counts[1]],
+        "confidence": [round(float(x), 3) for x in certainty(middle)],
+        "auc": round(float(counts[0] @ above), 4),
+        "rms": round(math.sqrt(float(((certainty(middle) - rate).square() * (counts[0] + counts[1]) / 2).sum())), 4),
+        "unsure": UNSURE,
+        "sure": SURE,
+    }
+
+
+def _sampled(
+    image: Annotated[Tensor, "H W 3"], painted: Annotated[Tensor, "h w"], encoder: Encoder, basis: Basis
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Semantics, what lies beyond the basis, colours and painted regions at every n-th pixel."""
+    height, width = image.shape[:2]
+    y, x = torch.meshgrid(torch.arange(_STEP // 2, height, _STEP), torch.arange(_STEP // 2, width, _STEP), indexing="ij")
+    x, y = x.flatten(), y.flatten()
+    semantic, beyond = semantic_samples(image, torch.stack([x, y], 1), encoder, basis, GuidedConfig())
+    kinds = painted[y * painted.shape[0] // height, x * painted.shape[1] // width]
+    return semantic, beyond, image[y, x], kinds
+
+
 GOALS = {"matching": 0.88, "match": 0.90}
 
 
@@ -251,6 +339,8 @@ class BenchmarkConfig:
     """Measure plain colours instead of the encoder: the floor."""
     triplets: Path = SHARED / "data/pst"
     """Folder with content, style and segmentation."""
+    most: int = 1000
+    """Triplets that are measured, at most."""
     palette: str = "day"
     """Palette of the town whose class centroids are used; the cells of all the others are classified."""
     seeds: tuple[int, ...] = (0, 1)
@@ -259,8 +349,8 @@ class BenchmarkConfig:
     """Views of each town."""
     size: tuple[int, int] = (256, 192)
     """Width and height of a view."""
-    output: Path = RESULTS / "semantic_matching.json"
-    """Where the rows are kept."""
+    output: Path | None = None
+    """JSON file that the row is added to."""
 
 
 class Colours(Encoder):
@@ -281,7 +371,8 @@ def measure(config: BenchmarkConfig) -> dict[str, object]:
     row: dict[str, object] = {"encoder": encoder.identity, "channels": encoder.channels}
     start = time.perf_counter()
     if config.triplets.is_dir():
-        row |= {"triplets": semantic_matching(encoder, read_triplets(config.triplets))}
+        painted = read_triplets(config.triplets)[: config.most]
+        row |= {"triplets": semantic_matching(encoder, painted), "confidence": rates(encoder, painted)}
     cells = town_cells(encoder, list(PALETTES), seeds=config.seeds, views=config.views, size=config.size)
     row |= {"town": {"known": config.palette, **palette_match(cells, config.palette)}}
     return row | {"seconds": time.perf_counter() - start}
@@ -289,14 +380,11 @@ def measure(config: BenchmarkConfig) -> dict[str, object]:
 
 def main(argv: list[str]) -> int:
     torch.set_num_threads(1)
-    try:
-        config = parse(BenchmarkConfig(), argv, prog="python -m benchmarks semantic_matching", description=__doc__ or "")
-        row = measure(config)
-    except FprfError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    kept = json.loads(config.output.read_text())["rows"] if config.output.is_file() else []
-    rows = [r for r in kept if r["encoder"] != row["encoder"]] + [row]
-    report(config.output, {"goals": GOALS, "rows": rows})
+    config = parse(BenchmarkConfig(), argv, prog="python -m benchmarks semantic_matching", description=__doc__ or "")
+    row = measure(config)
     print(json.dumps({**row, "goals": GOALS}, indent=1))
+    if config.output is not None:
+        kept = json.loads(config.output.read_text())["rows"] if config.output.is_file() else []
+        rows = [r for r in kept if r["encoder"] != row["encoder"]]
+        report(config.output, {"goals": GOALS, "rows": [*rows, row]})
     return 0

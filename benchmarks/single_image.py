@@ -74,18 +74,7 @@ class _Colours(Decoder):
     """Colours that are their own content, as those of Gaussians are."""
 
     def forward(self, content: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
-        return content
-
-    def restyled(
-        self,
-        content: Annotated[Tensor, "N 3"],
-        styled: Annotated[Tensor, "N 3"],
-        strength: float | Annotated[Tensor, "N 1"],
-    ) -> Annotated[Tensor, "N 3"]:
-        return styled.clamp(0, 1)
-
-    def frozen_colour(self, content: Annotated[Tensor, "N 3"]) -> None:
-        return None
+        return content.clamp(0, 1)
 
 
 def flat_look(flat: Flat, dictionary: StyleDictionary, config: StylizerConfig, decoder: Decoder | None) -> Restyle:

@@ -14,7 +14,6 @@ from fprf.config import RenderConfig
 from fprf.datamanagers.bounds import find_space
 from fprf.datamanagers.scene import Scene
 from fprf.errors import FprfError
-from fprf.io.atomic import write_text
 from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.renderer import render_rays
@@ -29,7 +28,7 @@ from fprf.types import Rays, Want
 from .common import BenchConfig, bench_run
 from .readers import fuzz, targets
 from .report import Outcome, machine, table
-from .stress_operators import Check, clusters, guided, markdown, matching, sampling, statistics, stylizers, weights
+from .stress_operators import Check, clusters, guided, matching, sampling, statistics, stylizers, weights
 from .subject import attempt, exact, find, settings, test_view, view_rays
 
 
@@ -43,8 +42,6 @@ class StressConfig(BenchConfig):
     """Mutated files for each reader."""
     flips: int = 200
     """Flipped bits in a file of tensors."""
-    markdown: Path | None = None
-    """The rows as a Markdown table; none = don't."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -86,8 +83,6 @@ def stress(config: StressConfig, root: Path, folder: Path, progress: Progress) -
         "rows": [check.json() for check in checks],
         "falls_short": [f"{check.stage}: {check.input}" for check in broken],
     }
-    if config.markdown is not None:
-        write_text(config.markdown, markdown(checks))
     title = f"{len(checks)} checks, {len(broken)} broken"
     shown = table(title, ("", "input", "reference", "bound", "measured", ""), (_cells(check) for check in checks))
     return Outcome(document, [shown])

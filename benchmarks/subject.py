@@ -19,11 +19,11 @@ from fprf.ops import backend
 from fprf.rendering.cameras import Cameras, PixelRays
 from fprf.rendering.renderer import Parts, march, render_rays
 from fprf.style.look import Restyle
+from fprf.training.learner import FieldLearner
 from fprf.training.loading import Trained, load_run
 from fprf.training.model import Facts, Model, background_of, build_model
-from fprf.training.prepare import Prepared, prepare
+from fprf.training.prepare import Prepared, prepare, read_scene
 from fprf.training.run import view_names
-from fprf.training.trainer import Loop, optimizer_of
 from fprf.training.views import view_rays as world_rays
 from fprf.types import Batch, Rays, Want
 
@@ -55,7 +55,8 @@ def find(root: Path, config: BenchConfig, folder: Path) -> Subject:
     data = config.data or trained.config.data or Path(trained.known.data)
 
     def prepared(chosen: TrainConfig) -> Prepared:
-        made = prepare(replace(chosen, data=data), saved=trained.known.facts)
+        chosen, saved = replace(chosen, data=data), trained.known.facts
+        made = prepare(chosen, read_scene(chosen, saved), saved)
         if tuple(view_names(made.scene.paths)) != trained.known.names:
             raise UsageError(f"{data}: its images are not those of the run; name the folder with --data")
         for kind in ("content_encoder", "semantic_encoder"):
@@ -135,12 +136,12 @@ SHARE = 0.5
 """Place in the learning-rate schedule at which a step is taken."""
 
 
-def loop_of(config: TrainConfig, prepared: Prepared, model: Model) -> Loop:
-    """The trainer's own loop around a model."""
-    return Loop(config, prepared, model, optimizer_of(config, model), model.device)
+def loop_of(config: TrainConfig, prepared: Prepared, model: Model) -> FieldLearner:
+    """What training takes its steps with, around a model."""
+    return FieldLearner(config, prepared, model.device, model)
 
 
-def stepper(loop: Loop, first: int) -> Callable[[], None]:
+def stepper(loop: FieldLearner, first: int) -> Callable[[], None]:
     """A call that takes the next step, from `first` on."""
     step = first
 

@@ -1,27 +1,31 @@
 """The knob tree of a run. Imports no torch: help and parsing stay fast."""
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
 
+from .blocks.config import LayoutConfig, SingleConfig
 from .checks import at_least, between, positive
 from .datamanagers.config import DataManagerConfig, RayBatchesConfig
-from .errors import ConfigError, UsageError
+from .datamanagers.parsers.config import DataParserConfig
+from .errors import ConfigError, PluginError, UsageError, WeightsError
 from .fields.config import ContentFieldConfig, PlanesConfig, SemanticFieldConfig, SemanticPlanesConfig
-from .fields.layouts import LayoutConfig, SingleConfig
-from .plugins.decoders.config import DecoderConfig, MlpDecoderConfig
+from .plugins.config import Need
+from .plugins.decoders.config import DecoderConfig, MlpDecoderConfig, pretrain_line
 from .plugins.encoders.config import SEMANTICS, EncoderConfig, Vgg19Config
 from .plugins.executors.config import ExecutorConfig, SerialConfig
 from .plugins.losses.config import LossTermConfig
 from .plugins.samplers.config import ProposalConfig, SamplerConfig
+from .plugins.slots import slots
 
 if TYPE_CHECKING:
-    from .cli.verbs import Verbs
+    import torch
+
     from .datamanagers.scene import Scene as ParsedScene
-    from .interfaces import Scene
-    from .training.loading import LoadedRun
-    from .training.quality import QualityConfig
-    from .training.unfinished import UnfinishedRun
+    from .interfaces import Learner, Partition
+    from .training.model import Facts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,10 +177,24 @@ class StatisticsConfig:
         at_least("statistics.regions", self.regions, 1)
 
 
+RESUMABLE = ("steps", "minutes", "output", "data", "device", "device_memory", "precision", "checkpoint_minutes")
+"""Fields of a run's config that may differ when a run is resumed."""
+FREE_IN_BLOCKS = (*RESUMABLE, "blocks", "executor", "statistics", "render")
+"""Fields of a config that do not decide what a block of given bounds and rays learns."""
+_WHOLE_PIXELS = 640 * 360
+"""Of an image, where nobody says how far to reduce them and each step sees a whole one."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RunConfig:
-    """Fields of every run, whatever its scene is made of."""
+    """Fields of every run, whatever its scene is made of.
 
+    A kind of scene is a subclass with `build`, returned by a method (entry point in `fprf.methods`), and a function that opens
+    its runs, by the name `kind` in the group `fprf.scenes` (`training.loading.open_run`).
+    """
+
+    kind: ClassVar[str] = ""
+    """Entry point in `fprf.scenes` of the function that opens such a run."""
     untrained: ClassVar[tuple[str, ...]] = ()
     """Fields that may differ when a run is resumed, beside RESUMABLE: nothing that is trained depends on them."""
     former: ClassVar[tuple[str, ...]] = ()
@@ -207,35 +225,90 @@ class RunConfig:
             positive("minutes", self.minutes)
         positive("checkpoint_minutes", self.checkpoint_minutes)
 
-    def verbs(self) -> "Verbs":
-        """Return the verbs that train, judge, film and export such a run; imports its implementation."""
+    def build(
+        self,
+        scene: "ParsedScene",
+        device: "torch.device",
+        *,
+        saved: "Facts | None" = None,
+        progress: Callable[[int, int, str], None] | None = None,
+    ) -> "Learner | Partition":
+        """Build what learns a scene, with its images read; imports its implementation.
+
+        `saved` are the facts of a run that goes on: nothing that was measured for them is measured again. `progress` is told
+        `(done, total, what)` of what takes long.
+        """
         raise ConfigError(f"{type(self).__name__} does not say how it is trained; its method has to give a config that does")
 
-    def load(self, run: Path, device: str, quality: "QualityConfig") -> "LoadedRun[Scene]":
-        """Read a run of this config. Raises CheckpointError with what is missing, UsageError for what it cannot do."""
-        raise ConfigError(
-            f"{type(self).__name__} does not say how its runs are read; its method has to give a config that does"
-        )
+    @property
+    def trained_on(self) -> str:
+        """Device of the training: cpu, cuda, mps or auto."""
+        return "cpu"
 
-    def load_unfinished(self, run: Path, device: str, block: int | None) -> "UnfinishedRun":
-        """A run of this config in the middle of its training, or one of its blocks, for `fprf train --view`."""
-        raise ConfigError(f"{type(self).__name__} does not say how its runs are shown while they train; leave --view out")
+    @property
+    def scene_parser(self) -> DataParserConfig | None:
+        """Format of the scene folder; None = recognised from what lies in it."""
+        return None
 
-    def read_scene(self) -> "ParsedScene":
-        """The scene that the config names, at its size. Raises UsageError for no scene, DataError for an unreadable one."""
-        raise ConfigError(f"{type(self).__name__} does not say how its scene is read; its method has to give one that does")
+    @property
+    def masked(self) -> bool:
+        """True where training and metrics leave out what the capture's masks name."""
+        return True
 
-    def fields_only(self, run: Path) -> "TrainConfig":
-        """This config where the run is of fields. Raises UsageError, with the way out, where it is of another kind."""
-        raise UsageError(
-            f"{run}: is of Gaussians, and this is for runs of fields alone; `fprf stylize`, `gallery`, `render`, `eval` and "
-            "`export` know both"
-        )
+    def limited(self, views: int) -> int:
+        """Optimiser steps on so many training views."""
+        return self.steps
+
+    def find_downscale(self, scene: "ParsedScene", device: str) -> int:
+        """Factor, at least 1, by which the images of a scene, at their own size, are reduced where none is said.
+
+        `device` is a kind of device: cpu, cuda, mps. Here the smallest at which no image has more pixels than 640 x 360.
+        """
+        return max(1, math.ceil(math.sqrt(int(scene.cameras.size.prod(1).max()) / _WHOLE_PIXELS)))
+
+    def changeable(self, before: "RunConfig") -> tuple[str, ...]:
+        """Fields that may differ from those that a run was begun with when it goes on."""
+        return *RESUMABLE, *self.untrained
+
+    def needs(self) -> list[Need]:
+        """Packages and weights that training needs and that are not here, each opened by the path of its slot.
+
+        Raises PluginError where a plug-in cannot say what it needs.
+        """
+        missing = []
+        for slot in slots(self):
+            try:
+                needs = () if slot.value is None else tuple(slot.value.needs())
+            except Exception as error:  # a stranger's
+                raise PluginError(f"{slot.path}: cannot say what it needs ({type(error).__name__}: {error})") from error
+            missing += [need._replace(what=f"{slot.path}: {need.what}") for need in needs]
+        return missing
+
+
+class _Pace(NamedTuple):
+    """Speed of a kind of device at training fields, within a factor of two."""
+
+    rays: float
+    """Rays trained in a second by `fprf-lite`."""
+    features: float
+    """Seconds that the features of a million pixels take."""
+    least: float
+    """Pixels of an image that are trained on however few rays there are."""
+
+
+_CPU = _Pace(rays=20e3, features=4.0, least=0.2e6)
+_ACCELERATOR = _Pace(rays=1e6, features=0.2, least=1e6)
+PASSES = 4
+"""Rays that larger images must leave for each of their pixels."""
+_FEATURE_SHARE = 0.5
+"""Share of a time limit that features may take before images are reduced below `least`, to a quarter of it at most."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig(RunConfig):
     """Everything that decides a run of fields."""
+
+    kind: ClassVar[str] = "fields"
 
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
@@ -277,37 +350,74 @@ class TrainConfig(RunConfig):
         between("device_memory", self.device_memory, 0.0, 1.0)
         between("poses", self.poses, 0.0, 1.0)
 
-    def verbs(self) -> "Verbs":
-        """Return the verbs that train, judge, film and export a run of fields."""
-        from .cli.verbs import FieldVerbs
+    def build(
+        self,
+        scene: "ParsedScene",
+        device: "torch.device",
+        *,
+        saved: "Facts | None" = None,
+        progress: Callable[[int, int, str], None] | None = None,
+    ) -> "Learner | Partition":
+        """Extract the features and build the model; blocks where the scene is cut."""
+        from .training.learner import FieldLearner
+        from .training.prepare import prepare
 
-        return FieldVerbs(self)
+        if self.blocks.cuts:
+            from .training.block_training import cut
 
-    def load(self, run: Path, device: str, quality: "QualityConfig") -> "LoadedRun[Scene]":
-        """Rebuild the model."""
-        from .training.loading import open_fields
+            blocks = cut(self, scene, saved, progress)
+            if blocks is not None:
+                return blocks
+        return FieldLearner(self, prepare(self, scene, saved, progress), device)
 
-        return open_fields(run, device, quality)
+    @property
+    def trained_on(self) -> str:
+        return self.device
 
-    def load_unfinished(self, run: Path, device: str, block: int | None) -> "UnfinishedRun":
-        """Build the model; its parameters come from training."""
-        from .training.unfinished import UnfinishedFields
+    @property
+    def scene_parser(self) -> DataParserConfig | None:
+        return self.datamanager.parser
 
-        return UnfinishedFields(run, device, block)
+    @property
+    def masked(self) -> bool:
+        return self.datamanager.masks
 
-    def read_scene(self) -> "ParsedScene":
-        """Parse the folder with the data manager's parser."""
-        from .training.prepare import scene_of
+    def find_downscale(self, scene: "ParsedScene", device: str) -> int:
+        """Factor at which training sees each pixel often enough, and at which features take no more than their time.
 
-        return scene_of(self)
+        From the mean of the training images: the square root of their pixels over those wanted, rounded to a whole factor, so
+        that images up to 2.25 times as large as wanted stay as they are.
+        """
+        sizes = scene.cameras.size[scene.train]
+        if not len(sizes):
+            return 1
+        pace = _CPU if device == "cpu" else _ACCELERATOR
+        rays = float(self.steps * self.datamanager.batch_rays())
+        if self.minutes is not None:
+            rays = min(rays, 60 * self.minutes * pace.rays)
+        wanted = max(pace.least, rays / PASSES / len(sizes))
+        if self.minutes is not None:
+            encoded = 1e6 * _FEATURE_SHARE * 60 * self.minutes / pace.features / len(sizes)
+            wanted = min(wanted, max(encoded, pace.least / 4))
+        return max(1, round(math.sqrt(float(sizes.double().prod(1).mean()) / wanted)))
 
-    def fields_only(self, run: Path) -> "TrainConfig":
-        """This config."""
-        return self
+    def changeable(self, before: RunConfig) -> tuple[str, ...]:
+        """The same; blocks may be cut anew: those that the cut does not concern are kept."""
+        former = getattr(before, "blocks", None)
+        anew = self.blocks.cuts and isinstance(former, LayoutConfig) and former.cuts
+        return *(FREE_IN_BLOCKS if anew else RESUMABLE), *self.untrained
 
-
-RESUMABLE = ("steps", "minutes", "output", "data", "device", "device_memory", "precision", "checkpoint_minutes")
-"""Fields of a run's config that may differ when a run is resumed."""
+    def needs(self) -> list[Need]:
+        """The same, and a decoder for the content encoder, whose weights are read where both could be built."""
+        missing = super().needs()
+        if any(need.what.startswith(("content.encoder", "content.decoder")) for need in missing):
+            return missing
+        try:
+            encoder = self.content.encoder.build()
+            self.content.decoder.build(encoder=encoder.identity, channels=encoder.channels, seed=self.seed)
+        except WeightsError as fault:
+            missing.append(Need(f"content.decoder: {fault}", pretrain_line(self.content.encoder)))
+        return missing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -320,3 +430,13 @@ class IncompleteConfig(TrainConfig):
     """The fields that the method added, as JSON text."""
     packages: str
     """The packages of the method and of the plug-ins in its fields, by path, as JSON text."""
+
+
+def fields_only(config: RunConfig, root: Path) -> TrainConfig:
+    """The config of a run of fields. Raises UsageError, with the way out, where it is of another kind."""
+    if isinstance(config, TrainConfig):
+        return config
+    raise UsageError(
+        f"{root}: is of {config.kind}, and this is for runs of fields alone; `fprf stylize`, `gallery`, `render`, `eval` and "
+        "`export` know all kinds"
+    )

@@ -5,20 +5,22 @@ Shapes use the letters of `fprf.types`.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeAlias, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from .types import Batch, Boxes, FieldSample, Origin, Rays, Rendered, Sampled, Site, View, Want
+from .errors import UsageError
+from .types import Batch, Cell, FieldSample, Origin, Rays, Rendered, Sampled, Site, View, Want
 
 if TYPE_CHECKING:
     from .datamanagers.basis import Basis
     from .datamanagers.features import FeatureStore
     from .datamanagers.scene import Scene as ParsedScene
     from .plugins.stylizers.config import StylizerConfig
+    from .progress import Display
     from .rendering.cameras import Cameras
     from .rendering.renderer import Parts
     from .rendering.space import Space
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
     from .style.look import Restyle
     from .style.references import Encoders
     from .style.scene import SceneStyle
+    from .training.model import Facts
+    from .training.run import Run
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -128,33 +132,14 @@ class Sampler(nn.Module, ABC):
 
 
 class Decoder(nn.Module, ABC):
-    """Content features to colour, point by point (paper, D_VGG).
+    """Content features to colour, point by point (paper, D_VGG): those of the scene as it is, and those of a style.
 
     What is scene-agnostic comes frozen. Parameters that want gradients are the scene's own and are trained with it.
     """
 
     @abstractmethod
     def forward(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"]:
-        """The scene as it is: sRGB in [0, 1]."""
-
-    @abstractmethod
-    def restyled(
-        self,
-        content: Annotated[Tensor, "N C"],
-        styled: Annotated[Tensor, "N C"],
-        strength: float | Annotated[Tensor, "N 1"],
-    ) -> Annotated[Tensor, "N 3"]:
-        """The scene in a new style, sRGB in [0, 1]. `styled` is blended already by `strength`, one for all or one a point.
-
-        Where `styled` is `content`, this is `forward(content)`: bit for bit at strength 0, else within rounding.
-        """
-
-    @abstractmethod
-    def frozen_colour(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"] | None:
-        """`forward` without the scene's own parameters; None where there are none.
-
-        Training asks for these colours as well: they are what a new style starts from.
-        """
+        """sRGB in [0, 1], for any features."""
 
 
 class Stylizer(nn.Module, ABC):
@@ -271,6 +256,24 @@ class Scene(ABC):
     def restyled(self, look: "Restyle | None") -> "Scene":
         """The scene in a look; None = as it was captured."""
 
+    def as_taken(self, view: int) -> "Scene":
+        """The scene in the light that one of its own views was taken in; itself where none was learnt."""
+        return self
+
+    def fit_poses(
+        self, captured: "ParsedScene", views: Sequence[int], progress: Callable[[int, int, str], None]
+    ) -> Annotated[Tensor, "V 6"]:
+        """Turns (radians) and shifts (world units), float64, that bring renders of some views nearest to their photographs.
+
+        `captured` has the photographs; those of all other views are 0. Raises UsageError where the scene cannot say.
+        """
+        raise UsageError("--fit-poses: this kind of scene fits no poses; leave it out")
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """Figures about the scene by name, for metrics.json."""
+        return {}
+
     @abstractmethod
     def cached(self, cameras: "Cameras", view: int) -> SceneView:
         """One view; what no look changes is computed once, as far as that saves time."""
@@ -303,6 +306,97 @@ class Scene(ABC):
         """
 
 
+class State(NamedTuple):
+    """The tensors of a checkpoint."""
+
+    model: Mapping[str, Tensor]
+    """All that a render needs."""
+    optimizer: Mapping[str, Tensor]
+    """What only further steps need: moments, counts."""
+
+
+class Figures(NamedTuple):
+    """Measurements of the last steps of a learner."""
+
+    means: Mapping[str, float]
+    """Running means of the loss terms by name; `rgb` is the mean squared error of colours in [0, 1]."""
+    rays: int
+    """Pixels that it has learnt from since it was built."""
+    skipped: int = 0
+    """Steps since it was built that changed nothing, because their loss or gradients were not finite."""
+    failed: int = 0
+    """The last ones of these in a row."""
+    fault: str = ""
+    """Names of what was not finite since the figures were last read; empty where nothing was."""
+    kept: float = 1.0
+    """Share of the samples along rays that met the content network."""
+
+
+class Learner(ABC):
+    """A scene that is being learnt, built by `RunConfig.build`; `training.driver` does everything else.
+
+    Every draw is a function of (seed, index), so that `state` and the number of steps are all that a resumed training needs.
+    """
+
+    @property
+    @abstractmethod
+    def device(self) -> torch.device:
+        """Device of its parameters. On the CPU figures are read after each step; elsewhere twice a second, since the host
+        waits for the device."""
+
+    @property
+    @abstractmethod
+    def facts(self) -> "Facts":
+        """What was found out about the scene before the first step, for scene.json."""
+
+    @abstractmethod
+    def step(self, index: int, share: float) -> None:
+        """Take one optimiser step, the `index`-th, when a `share` of the schedule in [0, 1) is over.
+
+        A step whose loss or gradients are not finite changes nothing but `figures`.
+        """
+
+    @abstractmethod
+    def figures(self) -> Figures:
+        """Measurements of the last steps; the host may wait for the device."""
+
+    @abstractmethod
+    def state(self) -> State:
+        """Everything that was learnt."""
+
+    @abstractmethod
+    def load(self, state: State) -> None:
+        """Go on from a `state`. Raises CheckpointError where it is that of another config."""
+
+    @abstractmethod
+    def scene(self) -> Scene:
+        """What is learnt so far, as a scene."""
+
+    def begin(self, run: "Run") -> str:
+        """Write further files of the run before the first step; return a line about what will be learnt, or nothing."""
+        return ""
+
+    def finish(self, run: "Run", display: "Display") -> None:
+        """Write further files of the run after the last step."""
+        return
+
+
+class Partition(ABC):
+    """A scene that is trained in parts, each a task of its own: what `RunConfig.build` gives in the place of a learner."""
+
+    @property
+    @abstractmethod
+    def facts(self) -> "Facts":
+        """What was found out about the whole scene, for scene.json."""
+
+    @abstractmethod
+    def train(self, run: "Run", display: "Display", *, spent: float) -> None:
+        """Train what is not finished, and write what a render needs; `spent` seconds of the time limit are over.
+
+        config.json and scene.json are written.
+        """
+
+
 class LossTerm(ABC):
     """A training term beside the built-in ones. Without parameters: nothing of it is saved.
 
@@ -330,8 +424,8 @@ class BlockLayout(ABC):
     """Division of a scene into blocks: geometry only, no parameters."""
 
     @abstractmethod
-    def cut(self, site: Site) -> Boxes:
-        """At least one cell; one alone means that the scene is not cut."""
+    def cut(self, site: Site) -> list[Cell]:
+        """At least one cell in the frame of the site, all with one border; one alone means that the scene is not cut."""
 
 
 class DataParser(ABC):

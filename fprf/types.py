@@ -1,20 +1,24 @@
 """Data that flows between the parts. Letters, used in every signature:
 
 R rays · S samples of a ray · E = S+1 edges · N points · C content channels · D semantic channels of the field ·
-L latent channels · T style codes · K scene regions · V views · H W pixels · B images · Z blocks · P sparse points.
+L latent channels · T style codes · K scene regions · V views · H W pixels · B images · Z cells · P sparse points.
 
 Images are [H W 3] sRGB in [0, 1] float32, channels last; encoders alone take [B 3 H W]. Camera axes are OpenGL's
 (x right, y up, the camera looks along -z); pixel centres lie at +0.5.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import Flag, auto
 from typing import Annotated, NamedTuple, TypeAlias
 
+import torch
 from torch import Tensor
 
 Origin: TypeAlias = tuple[float, float, float]
 """Of a local frame: world = local + origin (see `rendering.local_frame`)."""
+Window: TypeAlias = tuple[int, int, int, int]
+"""Part of an image: left, top, width, height in pixels."""
 
 
 class Want(Flag):
@@ -60,18 +64,32 @@ class Site(NamedTuple):
     """World units of one space unit."""
 
 
-class Boxes(NamedTuple):
-    """Z cells of a scene's blocks, in the scene's space, float64. Neighbours share faces; what no cell holds is surroundings.
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """A box of a partitioned scene: a block of fields or a cell of Gaussians. Neighbours share faces.
 
-    Point x lies in a cell where low <= turn x <= high.
+    Point x lies in it where low <= frame x < high; all are float64. Of blocks the frame is that of the scene's space.
     """
 
-    low: Annotated[Tensor, "Z 3"]
-    high: Annotated[Tensor, "Z 3"]
-    turn: Annotated[Tensor, "Z 3 3"]
-    """Rows: the axes of each cell; orthonormal."""
-    margin: float
-    """Margin of each block beyond its cell; there it blends with its neighbours."""
+    low: Annotated[Tensor, "3"]
+    """Lowest corner; -inf where the cell has no end."""
+    high: Annotated[Tensor, "3"]
+    border: Annotated[Tensor, "3"]
+    """Width of the surroundings that it learns as well; there blocks blend with their neighbours."""
+    frame: Annotated[Tensor, "3 3"] = field(default_factory=lambda: torch.eye(3, dtype=torch.float64))
+    """Rows: the axes of all cells of a scene; orthonormal."""
+    windows: Mapping[int, Window] = field(default_factory=dict)
+    """Parts of photographs that a cell of Gaussians learns from, by view."""
+
+    def holds(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
+        """True for points inside."""
+        local = points.double() @ self.frame.T
+        return ((local >= self.low) & (local < self.high)).all(1)
+
+    def around(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
+        """True for points inside and in the border."""
+        local = points.double() @ self.frame.T
+        return ((local >= self.low - self.border) & (local < self.high + self.border)).all(1)
 
 
 class Sampled(NamedTuple):
@@ -119,8 +137,6 @@ class Rendered(NamedTuple):
     sampled: Sampled | None = None
     counts: Mapping[str, int] = {}
     """Numbers of rays, samples, and kept samples."""
-    frozen_rgb: Annotated[Tensor, "R 3"] | None = None
-    """In training: the colour without the decoder's parameters that are the scene's own, if it has any."""
 
 
 class View(NamedTuple):

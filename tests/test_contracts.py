@@ -10,9 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from fprf import testing
+from fprf.blocks.config import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig
 from fprf.datamanagers.config import RayBatchesConfig
 from fprf.fields.config import ContentFieldConfig, PlanesConfig, SemanticFieldConfig, SemanticPlanesConfig
-from fprf.fields.layouts import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig, StreetConfig
 from fprf.interfaces import (
     BlockLayout,
     ContentField,
@@ -33,7 +33,7 @@ from fprf.plugins.losses.config import LossTermConfig
 from fprf.plugins.samplers.config import ProposalConfig, SamplerConfig, UniformConfig
 from fprf.plugins.stylizers.config import StylizerConfig
 from fprf.rendering.renderer import Parts
-from fprf.types import Batch, Boxes, FieldSample, Rendered, Sampled, Site, Want
+from fprf.types import Batch, Cell, FieldSample, Rendered, Sampled, Site, Want
 
 BUILT_IN: list[tuple[Callable[[Any], None], Any]] = [
     (testing.check_encoder, RandomConfig(channels=5, stride=3)),
@@ -44,7 +44,6 @@ BUILT_IN: list[tuple[Callable[[Any], None], Any]] = [
     (testing.check_layout, SingleConfig()),
     (testing.check_layout, GridConfig()),
     (testing.check_layout, AdaptiveConfig()),
-    (testing.check_layout, StreetConfig()),
     (testing.check_executor, SerialConfig()),
     (testing.check_data_manager, RayBatchesConfig(rays=64, semantic_share=0.5)),
     *(
@@ -254,12 +253,6 @@ class Bright(Decoder):
     def forward(self, content: Tensor) -> Tensor:
         return content[:, :3]
 
-    def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
-        return self(styled)
-
-    def frozen_colour(self, content: Tensor) -> None:
-        return None
-
 
 class Averaging(Stylizer):
     @property
@@ -274,9 +267,9 @@ class Averaging(Stylizer):
 
 
 class Halves(BlockLayout):
-    def cut(self, site: Site) -> Boxes:
-        low = torch.tensor([[-1.0, -1.0, -1.0], [0.0, -1.0, -1.0]])
-        return Boxes(low, low + 1, 2 * torch.eye(3).expand(2, 3, 3), 0.1)
+    def cut(self, site: Site) -> list[Cell]:
+        corners = torch.tensor([[0.0] * 3, [1.0] * 3], dtype=torch.float64)
+        return [Cell(low=low, high=low + 1, border=0.1 * (low + 1)) for low in corners]
 
 
 class Silent(Executor):
@@ -297,10 +290,10 @@ BREACHES: list[tuple[Callable[..., None], Any, dict[str, str]]] = [
         {
             "seed": "drawn from the seed alone",
             "batch": "must not depend on the others",
-            "rows": "points must not depend on others",
-            "negative": "at least 0",
+            "rows": "content: a point must not depend on the others",
+            "negative": r"expected numbers in \[0, inf\]",
             "infinite": "not finite",
-            "channels": "expected shape",
+            "channels": r"expected float32 \[",
             "idle": "no gradient reaches spare",
             "dtype": r"density: expected torch\.float64 on cpu .* found torch\.float32",
             "device": "density: makes a tensor that is not on the device",
@@ -314,7 +307,7 @@ BREACHES: list[tuple[Callable[..., None], Any, dict[str, str]]] = [
         testing.check_semantic_field,
         SemanticConfig,
         {
-            "channels": "expected shape",
+            "channels": r"expected float32 \[",
             "batch": "must not depend on the others",
             "frozen": "no gradient goes through its answer",
             "dtype": r"expected torch\.float64",
@@ -328,10 +321,10 @@ BREACHES: list[tuple[Callable[..., None], Any, dict[str, str]]] = [
             "item": "reads numbers of the device",
             "bool": "reads numbers of the device",
             "mask": "reads numbers of the device",
-            "log": "of rays that meet nothing: holds values that are not finite",
+            "log": "of rays that meet nothing: expected finite numbers",
             "root": "gradient for rays that meet nothing is not finite",
             "detached": "no gradient goes through",
-            "rays": "expected shape",
+            "rays": r"expected float32 \[",
             "random": "a function of its inputs",
             "device": "not on the device of its inputs",
         },
@@ -348,9 +341,9 @@ BREACHES: list[tuple[Callable[..., None], Any, dict[str, str]]] = [
             "outside": "must be centres",
             "colour": "the colour of the pixel",
             "none": "must bring what stores hold",
-            "channels": "semantic: expected shape",
-            "range": r"must lie in \[0, 1\]",
-            "turned": "image: expected shape",
+            "channels": r"semantic: expected float32 \[",
+            "range": r"expected numbers in \[0, 1\]",
+            "turned": r"image: expected float32 \[",
             "count": "the rays of a batch, 64",
         },
     ),
@@ -361,7 +354,7 @@ BREACHES: list[tuple[Callable[..., None], Any, dict[str, str]]] = [
             "unstable": "must be deterministic",
             "batch": "must not depend on its batch",
             "square": "do not keep the aspect",
-            "miscounted": "expected shape",
+            "miscounted": r"expected float32 \[",
             "divides": "not finite",
             "named": "identity must be the same",
             "training": "evaluation mode",
@@ -375,7 +368,7 @@ OTHERS: list[tuple[Callable[[Any], None], Any, str]] = [
     (testing.check_config, Typed(), "must not be called 'type'"),
     (testing.check_sampler, giving(SamplerConfig, Backwards()), "must be sorted"),
     (testing.check_stylizer, giving(StylizerConfig, Averaging()), "must not depend on the others"),
-    (testing.check_layout, giving(LayoutConfig, Halves()), "orthonormal"),
+    (testing.check_layout, giving(LayoutConfig, Halves()), "same border"),
     (partial(testing.check_decoder, encoder="any", channels=6), giving(DecoderConfig, Bright()), r"in \[0, 1\]"),
     (testing.check_executor, giving(ExecutorConfig, Silent()), "must reach the caller"),
 ]

@@ -17,7 +17,7 @@ from fprf.plugins.codec import Missing, load_config, save_config
 from fprf.plugins.encoders.config import EncoderConfig
 from fprf.plugins.losses.config import LossTermConfig
 from fprf.testing import check_encoder, check_loss_term
-from fprf.training.trainer import Report
+from fprf.training.driver import Report
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "plugin"
 

@@ -13,16 +13,16 @@ from typing import Any
 import pytest
 import torch
 from pretend_cuda import CUDA, pretend_cuda
-from tiny_world import World
+from tiny_world import World, prepared_for, taught
 
 from fprf.config import TrainConfig
 from fprf.ops import triplane
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from fprf.style.restyle import restyle
 from fprf.style.scene import to_tensors
-from fprf.training import trainer
+from fprf.training import driver, learner
+from fprf.training.driver import Report
 from fprf.training.loading import load_run
-from fprf.training.prepare import prepare
 from fprf.training.run import Run
 from fprf.training.style_pass import measure_style
 from fprf.training.views import render_view
@@ -88,21 +88,21 @@ def trained(
     config: TrainConfig, folder: Path, watch: Device | None = None, monkeypatch: pytest.MonkeyPatch | None = None
 ) -> Run:
     """A run that can be loaded; with `watch` no step but the first three, which meet constants, may wait."""
-    prepared, run = prepare(config), Run(folder)
+    prepared, run = prepared_for(config), Run(folder)
     folder.mkdir()
     run.save_config(replace(config, output=None), "fprf-lite")
     run.save_known(prepared.scene, config.data, prepared.facts)
     if watch is not None and monkeypatch is not None:
-        plain = trainer.Loop.step
+        plain = learner.FieldLearner.step
 
-        def step(loop: trainer.Loop, number: int, share: float) -> Any:
+        def step(loop: learner.FieldLearner, number: int, share: float) -> Any:
             with watch.watched() if number > 2 else nullcontext():
                 return plain(loop, number, share)
 
-        monkeypatch.setattr(trainer.Loop, "step", step)
-        monkeypatch.setattr(trainer, "REPORT_SECONDS", 1e9)
-    reports: list[trainer.Report] = []
-    trainer.train(config, prepared, run, reports.append)
+        monkeypatch.setattr(learner.FieldLearner, "step", step)
+        monkeypatch.setattr(driver, "REPORT_SECONDS", 1e9)
+    reports: list[Report] = []
+    taught(config, prepared, run, reports.append)
     assert reports[-1].skipped == 0 and all(torch.tensor(value).isfinite() for value in reports[-1].losses.values())
     return run
 
@@ -182,14 +182,14 @@ def test_memory_does_not_grow_with_the_steps(
     card: torch.device, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     taken: list[int] = []
-    plain = trainer.Loop.step
+    plain = learner.FieldLearner.step
 
-    def step(loop: trainer.Loop, number: int, share: float) -> Any:
+    def step(loop: learner.FieldLearner, number: int, share: float) -> Any:
         torch.cuda.reset_peak_memory_stats()
         result = plain(loop, number, share)
         taken.append(torch.cuda.max_memory_allocated())
         return result
 
-    monkeypatch.setattr(trainer.Loop, "step", step)
+    monkeypatch.setattr(learner.FieldLearner, "step", step)
     trained(replace(world.config, steps=50, device=str(card)), tmp_path / "run")
     assert max(taken[40:]) <= 1.1 * max(taken[5:15]) < 512 << 20

@@ -11,8 +11,8 @@ HEAVY = ("torch", "numpy", "cv2", "kornia", "trimesh", "numba", "safetensors", "
 BUILT_INS = """
 from fprf.plugins import registry
 for group in registry.groups():
-    # Of formats the names are all that is asked before a file is read.
-    for name in registry.installed(group) if group != "fprf.captures" else ():
+    # Of formats and kinds of scenes the names are all that is asked before a file is read.
+    for name in registry.installed(group) if group not in ("fprf.captures", "fprf.scenes") else ():
         if registry.entry(group, name).package.startswith("fprf "):
             registry.load_object(group, name)()
             report(f"{group} {name}")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from pretend_cuda import CUDA, pretend_cuda
-from tiny_world import World, trained_for
+from tiny_world import World, prepared_for, trained_for
 
 from fprf.cli.parsing import parse
 from fprf.config import TrainConfig
@@ -27,11 +27,11 @@ from fprf.plugins.slots import replace as replaced
 from fprf.plugins.slots import slots
 from fprf.plugins.typed_json import leaves
 from fprf.training import checkpoint
-from fprf.training.loop import progress
+from fprf.training.driver import schedule_of
+from fprf.training.learner import FieldLearner
 from fprf.training.model import build_model
-from fprf.training.prepare import device_of, prepare
+from fprf.training.prepare import device_of
 from fprf.training.style_pass import measure_style
-from fprf.training.trainer import Loop, optimizer_of
 from fprf.training.views import render_view
 
 SECOND: dict[str, tuple[Any, str]] = {
@@ -168,14 +168,14 @@ def test_it_changes_the_training(path: str, world: World, tmp_path: Path, _train
     if path.startswith("datamanager."):
         made = config.datamanager
         assert isinstance(made, type(world.config.datamanager)) and isinstance(world.prepared.manager, RayBatches)
-        world = replace(world, prepared=prepare(config))
+        world = replace(world, prepared=prepared_for(config))
     assert differ(_trained[soon], after(config, tmp_path / "other"))
 
 
 @pytest.mark.parametrize("path", shown("targets"))
 def test_it_changes_the_targets(path: str, world: World) -> None:
     def of(config: TrainConfig) -> dict[str, torch.Tensor]:
-        batch = prepare(config).manager.batch(0)
+        batch = prepared_for(config).manager.batch(0)
         assert batch.content is not None and batch.semantic is not None
         return {"content": batch.content, "semantic": batch.semantic}
 
@@ -215,15 +215,13 @@ def test_it_changes_what_an_accelerator_does(world: World) -> None:
     size = manager.held_bytes
     with pretend_cuda(memory=3 * size):
         for config, there in ((world.config, True), (replaced(world.config, "device_memory", 0.25), False)):
-            prepared = prepare(config)
-            loop = Loop(
-                config, prepared, model := build_model(config, prepared.facts).to(CUDA), optimizer_of(config, model), CUDA
-            )
+            prepared = prepared_for(config)
+            loop = FieldLearner(config, prepared, CUDA, build_model(config, prepared.facts))
             assert (loop.manager.batch(0).rgb.device == CUDA) == there
         products = []
         loop.model.learned()[0].register_hook(lambda gradient: products.append(torch.get_float32_matmul_precision()))
         loop.step(0, 0.0)
-        lower = Loop(replaced(config, "precision", "tf32"), prepared, model, optimizer_of(config, model), CUDA)
+        lower = FieldLearner(replaced(config, "precision", "tf32"), prepared, CUDA, loop.model)
         lower.step(0, 0.0)
         assert products == ["highest", "high"] and torch.get_float32_matmul_precision() == "highest"
 
@@ -231,7 +229,7 @@ def test_it_changes_what_an_accelerator_does(world: World) -> None:
 def test_tones_and_poses_are_facts_of_the_scene(world: World) -> None:
     assert shown("facts") == ["tones", "poses"]
     first, second, third = (
-        prepare(config).facts
+        prepared_for(config).facts
         for config in (world.config, *(replaced(world.config, path, SECOND[path][0]) for path in shown("facts")))
     )
     assert first.exposure == () and len(second.exposure) == 10 and len(second.held) == 2
@@ -271,7 +269,7 @@ def test_the_rest(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert second("output").output != world.config.output
     half = parse_scene(world.town, second("downscale").downscale, None)
     assert half.cameras.size.tolist()[0] == [16, 12]
-    assert progress(second("minutes"), 0, 15.0) == 1 > progress(world.config, 0, 15.0)
+    assert schedule_of(second("minutes"), 8).share(0, 15.0) == 1 > schedule_of(world.config, 8).share(0, 15.0)
     with pytest.raises(Exception, match="tpu"):
         device_of(second("device").device)
     run = trained_for(world, tmp_path / "a", replace(second("checkpoint_minutes"), steps=3))
@@ -292,6 +290,6 @@ def test_the_rest(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert (len(calls), plain.chunk) == (1, 8192)
     view(second("render.chunk"))
     assert len(calls) == 1 + 8, "768 rays a hundred at a time"
-    assert prepare(second("render.background")).facts.background == (1.0, 0.0, 1.0)
+    assert prepared_for(second("render.background")).facts.background == (1.0, 0.0, 1.0)
     places = ("scene", "command", "schedule", "device", "saving", "render", "chunks", "background")
     assert set(seen) == {path for place in places for path in shown(place)}

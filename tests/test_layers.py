@@ -8,13 +8,13 @@ import fprf
 
 ROOT = Path(fprf.__file__).parent
 ORDER = (
-    *("version", "errors", "types", "memory", "checks", "process", "io", "interfaces", "configs"),
+    *("version", "errors", "types", "memory", "checks", "process", "progress", "io", "interfaces", "configs", "outputs"),
     *("ops", "rendering", "datamanagers", "style", "fields", "plugins", "blocks", "testing"),
     *("training", "splats", "pretraining", "reconstruction", "evaluation", "export"),
     *("viewer", "api", "cli", "__main__"),
 )
 """Layers from the lowest to the highest. Imports within functions, such as those of `build`, may lead anywhere."""
-MECHANISM = ("config.py", "methods.py", "layouts.py")
+MECHANISM = ("config.py", "methods.py")
 """Files of any package that belong to the configs, as do the modules of `plugins` itself: none of them imports torch."""
 
 
@@ -22,8 +22,10 @@ def layer(parts: tuple[str, ...]) -> str:
     """The layer of a module by its path below `fprf`."""
     if parts in ((), ("__init__",)):
         return "version"
+    if parts in (("testing", "breaches"), ("testing", "outputs")):  # which the program uses as well
+        return "outputs"
     plugins = parts[0] == "plugins" and len(parts) <= 2 and parts[-1] != "weights"
-    return "configs" if plugins or (f"{parts[-1]}.py" in MECHANISM and parts[0] not in ("blocks", "export")) else parts[0]
+    return "configs" if plugins or (f"{parts[-1]}.py" in MECHANISM and parts[0] != "export") else parts[0]
 
 
 def imported(file: Path) -> Iterator[tuple[str, ...]]:

@@ -7,11 +7,10 @@ from typing import Any
 import pytest
 
 from benchmarks.restyle import RestyleConfig
+from fprf.blocks.config import AdaptiveConfig, GridConfig
 from fprf.config import LossConfig, OptimizerConfig, RenderConfig, SemanticConfig, StatisticsConfig, TrainConfig
 from fprf.errors import ConfigError
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
-from fprf.fields.layouts import AdaptiveConfig, GridConfig, StreetConfig
-from fprf.plugins.decoders.config import ResidualDecoderConfig
 from fprf.plugins.encoders.config import (
     ConcatConfig,
     DinoConfig,
@@ -22,7 +21,7 @@ from fprf.plugins.encoders.config import (
 )
 from fprf.plugins.executors.config import RayConfig
 from fprf.plugins.samplers.config import ProposalConfig, UniformConfig
-from fprf.plugins.stylizers.config import LocalAdainConfig, RegionAdainConfig, RegionOtConfig, RegionToneConfig
+from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig, RegionToneConfig
 from fprf.pretraining.config import PretrainDecoderConfig
 from fprf.style.config import NO_MASK, StyleConfig
 from fprf.training.quality import QualityConfig
@@ -46,7 +45,6 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
     SemanticPlanesConfig: PLANES,
     GridConfig: {"cells": [(0, 1)], "size": [0.0], "margin": [0.0, 0.6]},
     AdaptiveConfig: {"rays": [0], "smallest": [-1.0], "margin": [0.0]},
-    StreetConfig: {"segments": [0], "length": [0.0], "margin": [1.0]},
     UniformConfig: {"samples": [0, -3]},
     ProposalConfig: {
         "final": [0],
@@ -59,7 +57,6 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
         "samples": [(1, 8), ()],
         "resolutions": [(1, 8)],
     },
-    ResidualDecoderConfig: {"hidden": [0], "fade": [0.0, -1.0]},
     RandomConfig: {"channels": [0], "stride": [0], "seed": [-1]},
     Vgg16Config: {"layer": ["relu3_4", "fc7"]},
     Vgg19Config: {"layer": ["relu0_1", "relu2_3", "relu2_1 "]},
@@ -67,7 +64,6 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
     Dinov2Config: {"layer": [0], "stride": [0]},
     ConcatConfig: {"weights": [(0.0,), (1.0, -1.0), (inf,)]},
     LocalAdainConfig: {"temperature": [0.0, nan, inf]},
-    RegionAdainConfig: {"temperature": [-1.0], "gain": [0.99]},
     RegionOtConfig: {"temperature": [-1.0], "gain": [0.99]},
     RegionToneConfig: {"temperature": [-1.0], "gain": [0.99]},
     RayConfig: {"workers": [0], "processors": [0.0], "retries": [-1], "gpus": [-1.0]},

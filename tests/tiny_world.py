@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
+from benchmarks.town.truth import Stage, set_stage, town_settings
 from benchmarks.town.write import write_town
-from benchmarks.town_truth import Stage, set_stage, town_settings
-from fprf.cli.train import train_scene
 from fprf.config import StatisticsConfig, TrainConfig
 from fprf.datamanagers.config import RayBatchesConfig
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
@@ -21,11 +21,14 @@ from fprf.methods import fprf_lite
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.plugins.samplers.config import ProposalConfig
 from fprf.rendering.cameras import PixelRays
+from fprf.training import checkpoint
+from fprf.training.driver import Report, learn, schedule_of
+from fprf.training.driver import train as train_scene
+from fprf.training.learner import FieldLearner
 from fprf.training.loading import Trained, load_run
 from fprf.training.model import Model, build_model
-from fprf.training.prepare import Prepared, prepare
+from fprf.training.prepare import Prepared, device_of, prepare, read_scene
 from fprf.training.run import Run
-from fprf.training.trainer import Report, train
 from fprf.types import Batch, Rays
 
 Change = Callable[[int, Batch], Batch]
@@ -125,7 +128,7 @@ def make_world(folder: Path) -> World:
         write_image(path, (np.asarray(base) + noise).clip(0, 255).astype(np.uint8))
     config = tiny(town, folder / "run")
     train_scene(config, "fprf-lite", quiet=True)
-    return World(folder, town, folder / "run", references, config, prepare(config))
+    return World(folder, town, folder / "run", references, config, prepared_for(config))
 
 
 def stage_of(trained: Trained, *, views: int, frames: int, longest: int) -> Stage:
@@ -148,8 +151,30 @@ def trained_for(
         prepared = prepared._replace(manager=Altered(prepared.manager, change))
     folder.mkdir(exist_ok=True)
     run = Run(folder)
-    train(config, prepared, run, report)
+    taught(config, prepared, run, report)
     return run
+
+
+def prepared_for(config: TrainConfig) -> Prepared:
+    """Images and features of a config's scene."""
+    return prepare(config, read_scene(config))
+
+
+def taught(
+    config: TrainConfig,
+    prepared: Prepared,
+    run: Run,
+    report: Callable[[Report], None] = lambda event: None,
+    model: Model | None = None,
+) -> Model:
+    """The model that a run ends with."""
+    learner = FieldLearner(config, prepared, device_of(config.device), model)
+    learn(learner, run, schedule_of(config, len(prepared.scene.train)), report)
+    return learner.model
+
+
+def save_checkpoint(root: Path, model: nn.Module, optimizer: torch.optim.Optimizer, *, step: int, seconds: float) -> Path:
+    return checkpoint.write(root, model.state_dict(), checkpoint.moments_of(optimizer), step=step, seconds=seconds)
 
 
 def parameters(run: Run, step: int) -> dict[str, torch.Tensor]:

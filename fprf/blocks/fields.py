@@ -4,10 +4,9 @@ Densities blend by the weights of the router: sigma = sum_i w_i sigma_i. Feature
 f = sum_i w_i sigma_i f_i / sum_i w_i sigma_i: a block that finds a place empty has no say about its colour. Shares are formed
 in log space, since densities span thirty orders of magnitude.
 
-A block starts as the surroundings it is trained in: what they have learnt of its place is not learnt again.
-
-Planes are laid anew over the block's chart, each node with the value that the old planes have there; networks are copied. The
-finer nodes then hold the coarse scene, which training sharpens. Parts that consist of anything else start from their seed.
+A block starts as the surroundings it is trained in: what they have learnt of its place is not learnt again. Planes are laid
+anew over the block's chart, each node with the value that the old planes have there; networks are copied. The finer nodes then
+hold the coarse scene, which training sharpens. Parts that consist of anything else start from their seed.
 """
 
 from abc import ABC, abstractmethod
@@ -63,10 +62,6 @@ class Held(Members):
         return self.held[number]
 
 
-_SHARED = -1.0
-"""Instead of a member's number in the latent of a point that several members share."""
-
-
 def emission(density: Annotated[Tensor, "n m"], weight: Annotated[Tensor, "n m"]) -> Annotated[Tensor, "n m"]:
     """Share of each member in what is emitted at a point; rows sum to 1, also where no member has any density."""
     tiny = torch.finfo(density.dtype).tiny
@@ -74,9 +69,9 @@ def emission(density: Annotated[Tensor, "n m"], weight: Annotated[Tensor, "n m"]
 
 
 class BlockedField(ContentField):
-    """Density and content. A latent is the member's number, the point, and the member's own latent.
+    """Density and content. A latent is the point, then the latent of its member.
 
-    Points that several members share are looked up again for their content: only those that are kept, and few lie in margins.
+    Points that several members share are looked up again for their content: only those that are kept, and few lie in borders.
     """
 
     def __init__(self, members: Members, router: Router) -> None:
@@ -86,54 +81,38 @@ class BlockedField(ContentField):
 
     def density(self, points: Annotated[Tensor, "N 3"]) -> FieldSample:
         """Blended density; points are those of the scene's space."""
-        groups = self.router(points)
-        samples = [self._group(points, group) for group in groups]
-        return FieldSample(*_joined([group.at for group in groups], *zip(*samples, strict=True)))
+        groups, densities, latents = self.router(points), [], []
+        for group in groups:
+            here = points[group.at]
+            members = [self.members.member(number) for number in group.members]
+            samples = [member.field.density(member.chart.locate(here)) for member in members]
+            densities.append(_blended([sample.density for sample in samples], group))
+            latents.append(torch.cat([here, samples[0].latent], -1))
+        density, latent = (_joined([group.at for group in groups], parts) for parts in (densities, latents))
+        return FieldSample(density, latent)
 
     def content(self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "M C"]:
-        owner, points = latent[:, 0].detach(), latent[:, 1:4].detach()
-        whole = self.router.whole(points)
-        if whole is not None and whole.weight is None:
-            return self.members.member(whole.members[0]).field.content(latent[:, 4:], view)
-        if whole is not None:
-            return self._shared(points, view, whole)
-        features, places = [], []
-        for number in torch.unique(owner).tolist():
-            index = (owner == number).nonzero()[:, 0]
-            if number != _SHARED:
-                features.append(self.members.member(int(number)).field.content(latent[index, 4:], view[index]))
-                places.append(index)
+        points, own = latent[:, :3].detach(), latent[:, 3:]
+        groups, contents = self.router(points), []
+        for group in groups:
+            if group.weight is None:
+                at = slice(None) if len(groups) == 1 else group.at
+                contents.append(self.members.member(group.members[0]).field.content(own[at], view[at]))
                 continue
-            for group in self.router(points[index]):
-                place = index[group.at]
-                features.append(self._shared(points[place], view[place], group))
-                places.append(place)
-        if not features:
-            return self.members.held[0].field.content(latent[:, 4:], view)
-        return _joined(places, features)[0]
+            samples, features = [], []
+            for number in group.members:
+                member = self.members.member(number)
+                sample = member.field.density(member.chart.locate(points[group.at]))
+                samples.append(sample.density)
+                features.append(member.field.content(sample.latent, view[group.at]))
+            contents.append(_mixed(features, samples, group))
+        if not groups:  # of no point
+            return self.members.held[0].field.content(own, view)
+        return _joined([group.at for group in groups], contents)
 
     def penalties(self) -> dict[str, Tensor]:
         """Those of the members that are held, added up: each is regularised as if alone."""
         return add_penalties(member.field.penalties() for member in self.members.held)
-
-    def _group(self, points: Tensor, group: Group) -> tuple[Tensor, Tensor]:
-        here = points[group.at]
-        samples = [self.members.member(m).field.density(self.members.member(m).chart.locate(here)) for m in group.members]
-        if group.weight is None:
-            density, number = samples[0].density, here.new_full((len(here), 1), float(group.members[0]))
-        else:
-            density = (torch.stack([s.density for s in samples], -1) * group.weight).sum(-1)
-            number = here.new_full((len(here), 1), _SHARED)
-        return density, torch.cat([number, here, samples[0].latent], -1)
-
-    def _shared(self, points: Tensor, view: Tensor, group: Group) -> Tensor:
-        densities, contents = [], []
-        for number in group.members:
-            member = self.members.member(number)
-            sample = member.field.density(member.chart.locate(points))
-            densities.append(sample.density)
-            contents.append(member.field.content(sample.latent, view))
-        return _mixed(contents, densities, group)
 
 
 class BlockedSemantic(SemanticField):
@@ -145,11 +124,9 @@ class BlockedSemantic(SemanticField):
 
     def forward(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N D"]:
         """Blended features at points of the scene's space."""
-        groups = self.router(points)
-        outputs = []
+        groups, outputs = self.router(points), []
         for group in groups:
-            here = points[group.at]
-            features, densities = [], []
+            here, features, densities = points[group.at], [], []
             for number in group.members:
                 member = self.members.member(number)
                 assert member.semantic is not None
@@ -158,28 +135,34 @@ class BlockedSemantic(SemanticField):
                 if group.weight is not None:
                     densities.append(member.field.density(at).density)
             outputs.append(_mixed(features, densities, group))
-        return _joined([group.at for group in groups], outputs)[0]
+        return _joined([group.at for group in groups], outputs)
 
     def penalties(self) -> dict[str, Tensor]:
         """Those of the members that are held, added up."""
         return add_penalties(member.semantic.penalties() for member in self.members.held if member.semantic is not None)
 
 
-def _mixed(features: list[Tensor], densities: list[Tensor], group: Group) -> Tensor:
+def _blended(densities: list[Tensor], group: Group) -> Annotated[Tensor, "n"]:
+    """sum_i w_i sigma_i of a group's members."""
+    return densities[0] if group.weight is None else (torch.stack(densities, -1) * group.weight).sum(-1)
+
+
+def _mixed(features: list[Tensor], densities: list[Tensor], group: Group) -> Annotated[Tensor, "n C"]:
+    """sum_i e_i f_i of a group's members, e their `emission`."""
     if group.weight is None:
         return features[0]
     share = emission(torch.stack(densities, -1), group.weight)
     return (torch.stack(features, 1) * share[..., None]).sum(1)
 
 
-def _joined(at: list[Tensor], *columns: Sequence[Tensor]) -> list[Tensor]:
-    """Columns of values of groups in the order of the points; `at` are the points that the parts of a column belong to."""
+def _joined(at: list[Tensor], parts: list[Tensor]) -> Tensor:
+    """Values of groups in the order of the points; `at` are the points that each part belongs to."""
     if len(at) == 1:
-        return [parts[0] for parts in columns]
+        return parts[0]
     order = torch.cat(at)
     back = torch.empty_like(order)
     back[order] = torch.arange(len(order), device=order.device)
-    return [torch.cat(list(parts)).index_select(0, back) for parts in columns]
+    return torch.cat(parts).index_select(0, back)
 
 
 def add_penalties(terms: Iterable[dict[str, Tensor]]) -> dict[str, Tensor]:
@@ -198,13 +181,11 @@ class _Routed(nn.Module):
         self.members, self.router, self.level = members, router, level
 
     def forward(self, points: Tensor) -> Tensor:
-        groups = self.router(points)
-        outputs = []
+        groups, outputs = self.router(points), []
         for group in groups:
             here = points[group.at]
-            values = [self.members.member(number).proposal(self.level, here) for number in group.members]
-            outputs.append(values[0] if group.weight is None else (torch.stack(values, -1) * group.weight).sum(-1))
-        return _joined([group.at for group in groups], outputs)[0]
+            outputs.append(_blended([self.members.member(m).proposal(self.level, here) for m in group.members], group))
+        return _joined([group.at for group in groups], outputs)
 
 
 class BlockedSampler(Sampler):
@@ -236,13 +217,15 @@ class BlockedSampler(Sampler):
 
 def inherit(member: Member, around: Member) -> None:
     """Let a member of the same config start as `around` is where it lies."""
-    pairs: list[tuple[nn.Module | None, nn.Module | None]] = [
-        (member.sampler, around.sampler),
-        (member.field, around.field),
-        (member.semantic, around.semantic),
-    ]
-    for own, other in pairs:
-        if own is None or other is None or not _understood(own):
+    for name in ("sampler", "field", "semantic"):
+        own, other = getattr(member, name), getattr(around, name)
+        if own is None or other is None:
+            continue
+        # Only parts that consist of planes, linear maps and offsets: of others nobody knows what depends on the chart.
+        modules = [module for module in own.modules() if isinstance(module, Planes | nn.Linear)]
+        known = {id(parameter) for module in modules for parameter in module.parameters()}
+        planes = any(isinstance(module, Planes) for module in modules)
+        if not planes or not all(id(parameter) in known or parameter.ndim == 1 for parameter in own.parameters()):
             continue
         own.load_state_dict(other.state_dict())
         for mine, theirs in zip(own.modules(), other.modules(), strict=True):
@@ -252,38 +235,17 @@ def inherit(member: Member, around: Member) -> None:
 
 
 def relay(planes: Planes, chart: Chart, old: Chart) -> Annotated[Tensor, "rows F"]:
-    """The table of planes over `chart` that say what `planes` say over `old`: exact at the nodes where axes agree.
-
-    Of a turned chart each axis takes the plane of the old axis that it follows most.
-    """
-    follows = [int(row.abs().argmax()) for row in chart.turn @ old.turn.T]
-    if len(set(follows)) < len(follows):
-        follows = [0, 1, 2]
+    """The table of planes over `chart` that say what `planes` say over `old`, exact at the nodes."""
+    middle, half = (chart.low + chart.high) / 2, (chart.high - chart.low) / 2
     parts = []
     for grids in split(planes.table.detach(), planes.resolutions):
         nodes = torch.linspace(-1, 1, grids.shape[1], dtype=torch.float64)
-        for a, b in AXES:
+        for grid, (a, b) in zip(grids, AXES, strict=True):
+            # Nodes [R R 3] of the plane in the new cube, at 0 along the third axis, and where they lie in the old one.
             cube = torch.zeros(len(nodes), len(nodes), 3, dtype=torch.float64)
             cube[..., a], cube[..., b] = nodes[None, :], nodes[:, None]
-            at = old.locate(_leave(chart, cube.view(-1, 3))).view(cube.shape)
-            first, second = sorted((follows[a], follows[b]))
-            grid = grids[AXES.index((first, second))]
-            where = torch.stack([at[..., first], at[..., second]], -1)[None].to(grid)
+            at = old.locate((cube * half + middle).view(-1, 3)).view(cube.shape)
+            where = torch.stack([at[..., a], at[..., b]], -1)[None].to(grid)
             values = F.grid_sample(grid.permute(2, 0, 1)[None], where, align_corners=True, padding_mode="border")
             parts.append(values[0].permute(1, 2, 0).reshape(-1, grid.shape[2]))
     return torch.cat(parts)
-
-
-def _leave(chart: Chart, cube: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
-    """From the cube of a block's chart to the space."""
-    middle, half = (chart.low + chart.high) / 2, (chart.high - chart.low) / 2
-    return (cube * half + middle) @ chart.turn
-
-
-def _understood(part: nn.Module) -> bool:
-    """True if a part consists of planes, linear maps and offsets alone."""
-    modules = [module for module in part.modules() if isinstance(module, Planes | nn.Linear)]
-    known = {id(p) for module in modules for p in module.parameters()}
-    return any(isinstance(module, Planes) for module in modules) and all(
-        id(p) in known or p.ndim == 1 for p in part.parameters()
-    )

@@ -13,11 +13,11 @@ from statistics import fmean
 from typing import TYPE_CHECKING
 
 from ..checks import at_least, positive
+from ..progress import Display
 from ..style.config import StyleConfig
 from ..style.files import StyleFile
 from .parsing import parse
-from .progress import Display
-from .showcase import frames_of, restyled, write_page
+from .showcase import frames_of, photographs_of, restyled, write_shown
 
 if TYPE_CHECKING:
     from ..style.look import Restyle
@@ -52,8 +52,12 @@ class DemoConfig:
     downscale: int = 1
     """The photographs, 356x634, are reduced by this factor."""
 
+    megabytes: float = 4.0
+    """Size of the page, at most; Gaussians that show least are left out of it."""
+
     def __post_init__(self) -> None:
         positive("minutes", self.minutes)
+        positive("megabytes", self.megabytes)
         at_least("frames", self.frames, 2)
         at_least("downscale", self.downscale, 1)
 
@@ -67,18 +71,19 @@ def run(args: list[str]) -> int:
     from ..methods import fprf_splats
     from ..rendering.paths import make_path
     from ..splats.files import write_gaussians
-    from ..splats.training import open_gaussians
+    from ..splats.loading import open_gaussians
+    from ..training.driver import train
     from ..training.quality import QualityConfig
-    from .eval import EvalConfig
+    from ..training.run import Run
+    from .eval import EvalConfig, evaluate
 
     garden = Path(str(files("fprf") / "garden"))
     output = config.output / "run"
     training = replace(fprf_splats(), data=garden, downscale=config.downscale, output=output, minutes=config.minutes)
-    verbs = training.verbs()
     with compiling():  # waited for at the end
-        root = verbs.train("fprf-splats")
-        metrics = verbs.evaluate(EvalConfig(run=root, images=False))
-    opened = open_gaussians(root, training, QualityConfig())
+        root = train(training, "fprf-splats")
+        metrics = evaluate(EvalConfig(run=root, images=False))
+    opened = open_gaussians(Run(root), training, "cpu", QualityConfig())
     scene, views = opened.scene, opened.known.test
     references = {name: garden / "references" / f"{name}.jpg" for name in LOOKS}
     with Display() as display:
@@ -113,7 +118,7 @@ def run(args: list[str]) -> int:
     write_json(config.output / "metrics.json", metrics)
     width, height = (int(v) for v in scene.cameras.size[0])
     page = config.output / "garden.html"
-    write_page(
+    write_shown(
         page,
         scene,
         title=TITLE,
@@ -128,11 +133,13 @@ def run(args: list[str]) -> int:
         },
         views=views,
         originals=[scene.render(scene.cameras, view) for view in views],
+        photographs=photographs_of(opened.run, opened.known, views),
         shown=styles,
         references=references,
         metrics={name: value for name, value in metrics.items() if name != "per_view"},
         film=film,
         credits=CREDITS,
+        megabytes=config.megabytes,
     )
     print(
         f"PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.3f}; a new style in {metrics['new_style_seconds']:.2f} s "

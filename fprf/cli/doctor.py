@@ -140,7 +140,7 @@ def method_needs(name: str) -> Iterator[Finding]:
     from ..plugins.codec import method_config
 
     config = method_config(name)
-    for need in config.verbs().needs():
+    for need in config.needs():
         later = ", is downloaded when it is needed" if need.downloaded else " is missing"
         yield Finding("needs", need.what + later, need.remedy, optional=need.downloaded)
     filled = (f"{slot.path} {registry.name_of(slot.kind.group, type(slot.value))}" for slot in slots(config) if slot.value)

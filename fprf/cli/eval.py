@@ -4,22 +4,18 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from rich.console import Console
 from rich.table import Table
 
 from ..errors import UsageError
-from ..training.quality import QualityConfig, at_quality
+from ..progress import Display
+from ..training.quality import QualityConfig
 from .parsing import parse
-from .progress import Display
-from .verbs import verbs_of, views_of
 
 if TYPE_CHECKING:
-    from ..config import RunConfig
-    from ..datamanagers.images import Image
-    from ..datamanagers.scene import Scene
-    from ..training.run import History, Known
+    from ..training.run import History
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +43,7 @@ def run(args: list[str]) -> int:
     """Render the split, write metrics.json, print a table."""
     description = "Measure a run: PSNR, SSIM, speed, memory, consistency over views."
     config = parse(EvalConfig(), args, prog="fprf eval", description=description, positional=("run",))
-    metrics = verbs_of(config.run).evaluate(config)
+    metrics = evaluate(config)
     if config.tensorboard is not None:
         from ..training.run import read_history
 
@@ -56,49 +52,48 @@ def run(args: list[str]) -> int:
     return 0
 
 
-def evaluate_fields(config: EvalConfig) -> dict[str, object]:
-    """Judge a run of fields."""
-    from ..evaluation.evaluate import align, described, judge
-    from ..training.loading import load_run
+def evaluate(config: EvalConfig) -> dict[str, object]:
+    """Judge a run of any kind; write metrics.json and, if they are wanted, the renders, and return what is written.
 
-    trained = at_quality(load_run(config.run, config.device, config.max_memory), config)
-    scene, views = views_to_judge(config, trained.config, trained.known)
-    fitted: dict[str, object] = {}
-    with Display() as display:
-        if config.fit_poses:
-            trained, moves = align(trained, scene, views, display.count)
-            fitted = {"fitted_poses": {trained.known.names[view]: described(move) for view, move in moves.items()}}
-        metrics, images = judge(trained, scene, views, display.count)
-    return store(config, trained.known, trained.method, views, metrics | fitted, images)
-
-
-def views_to_judge(config: EvalConfig, trained: "RunConfig", known: "Known") -> "tuple[Scene, list[int]]":
-    """The scene that a run was trained on, from where it lies now, and the views of the split.
-
-    Raises UsageError where its images are not those of the run, or the split has no views.
+    Raises UsageError where the images at hand are not those of the run, or the split has no views.
     """
     from ..datamanagers.scene import at_origin
-    from ..training.run import view_names
-
-    trained = replace(trained, data=config.data or trained.data)
-    scene = at_origin(trained.read_scene(), known.facts.origin)
-    if tuple(view_names(scene.paths)) != known.names:
-        raise UsageError(f"{trained.data}: its images are not those of the run; name the folder with --data")
-    return scene, views_of(known, config.split)
-
-
-def store(
-    config: EvalConfig, known: "Known", method: str, views: Sequence[int], found: dict[str, Any], images: "list[Image]"
-) -> dict[str, object]:
-    """Write metrics.json and, if they are wanted, the renders; returns what is written."""
+    from ..evaluation.evaluate import described, judge
     from ..io.atomic import write_json
     from ..io.video import write_frames
+    from ..training.camera_optimizers import moved_cameras
+    from ..training.loading import open_run
+    from ..training.prepare import read_scene
+    from ..training.run import view_names
 
-    metrics = {"method": method, "scene": known.name, "split": config.split, "quality": config.quality, **found}
+    opened = open_run(config.run, config.device, config)
+    scene, known = opened.scene, opened.known
+    trained = opened.run.load_config()[0]
+    trained = replace(trained, data=config.data or trained.data)
+    captured = at_origin(read_scene(trained), known.facts.origin)
+    if tuple(view_names(captured.paths)) != known.names:
+        raise UsageError(f"{trained.data}: its images are not those of the run; name the folder with --data")
+    views, fitted = known.views(config.split), {}
+    with Display() as display:
+        if config.fit_poses:
+            moves = scene.fit_poses(captured, views, display.count)
+            known = replace(known, cameras=moved_cameras(known.cameras, moves))
+            fitted = {"fitted_poses": {known.names[view]: described(moves[view]) for view in views}}
+        found, images = judge(scene, known, captured, views, display.count, masks=trained.masked)
+    metrics = {
+        "method": opened.method,
+        "scene": known.name,
+        "split": config.split,
+        "quality": config.quality,
+        **found,
+        "train_seconds": opened.seconds,
+        "train_steps": opened.step,
+        **scene.counts,
+        **fitted,
+    }
     write_json(config.run / "metrics.json", metrics)
     if config.images:
-        names = [known.names[v] for v in views]
-        write_frames(config.run / "renders" / config.split, names, images)
+        write_frames(config.run / "renders" / config.split, [known.names[view] for view in views], images)
     return metrics
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import UsageError
 from ..export.config import FIT_MINUTES, KINDS, ExportConfig, Plan, plan
 from ..plugins.captures import endings
-from .progress import Display
+from ..progress import Display
 from .style_flags import Look, make_looks, named_style, named_styles, read_flags, say
 
 if TYPE_CHECKING:
@@ -130,13 +130,13 @@ class _Export:
         return {"gaussians": count, "losses": [*losses]}
 
     def _fitted(self) -> Iterator["GaussianRows"]:
-        from ..export.fit import fit_gaussians, seen_points
+        from ..export.fit import fit_gaussians
         from ..splats.gaussians import GaussianRows
 
         fitted = fit_gaussians(
             self.opened.scene,
             self.views,
-            seen_points(self.plain, self.config.fit_cap),
+            self.plain,
             [look.restyle for look in self.looks],
             minutes=self.config.fit or FIT_MINUTES,
             cap=self.config.fit_cap,

@@ -1,26 +1,25 @@
-"""`fprf gallery RUN --references DIR`: every view in every style, as one page that needs nothing else."""
+"""`fprf gallery RUN --references DIR`: a run in every style, as one page that needs nothing else."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ..checks import at_least
+from ..checks import at_least, positive
 from ..errors import UsageError
 from ..plugins.stylizers.config import StylizerConfig
+from ..progress import Display
 from ..style.config import StyleConfig
 from ..style.files import StyleFile, check_photographs, read_style
 from ..training.quality import QualityConfig
 from .parsing import parse
-from .progress import Display
-from .showcase import frames_of, restyled, write_page
+from .showcase import frames_of, photographs_of, restyled, write_shown
 from .style_flags import read_preset, say, with_presets_named
-from .verbs import views_of
 
 if TYPE_CHECKING:
     from ..training.run import Known
 
-_DESCRIPTION = """Every view in every style, as one page: wipes, match maps, depth, figures. It loads nothing and can be sent.
+_DESCRIPTION = """A run in every style, as one page to walk through, with match maps, depth and figures. It loads nothing.
 
 Each reference is a style of its own; with several of them all together are one more."""
 
@@ -59,6 +58,8 @@ class GalleryConfig(QualityConfig):
     """Path of the flight: spiral, orbit, interpolate, or a camera-path file."""
     title: str = ""
     """Headline; empty = the scene's name."""
+    megabytes: float = 16.0
+    """Size of the page, at most; Gaussians that show least are left out of it."""
     output: Path | None = None
     """The page; by default RUN/gallery.html."""
     device: str = "auto"
@@ -69,6 +70,7 @@ class GalleryConfig(QualityConfig):
         self.style_of()
         at_least("most", self.most, 1)
         at_least("frames", self.frames, 0)
+        positive("megabytes", self.megabytes)
 
     def style_of(self, *references: Path) -> StyleFile:
         """The style of some photographs. Raises ConfigError for a value out of its range."""
@@ -112,7 +114,7 @@ def run(args: list[str]) -> int:
             flight = make_path(known.cameras, known.split("all"), config.path, config.frames, scene.origin)
             write_video(film, frames_of(scene, flight, lambda _: shown[-1].styled.restyle, display), fps=24)
     width, height = known.cameras.size[views[0]].tolist()
-    write_page(
+    write_shown(
         output,
         scene,
         title=config.title or known.name,
@@ -125,10 +127,12 @@ def run(args: list[str]) -> int:
         },
         views=views,
         originals=originals,
+        photographs=photographs_of(opened.run, known, [view for view in views if view in known.test]),
         shown=shown,
         references=_named(photographs, [path for each in shown for path in each.sources]),
         metrics=_metrics(config.run),
         film=film,
+        megabytes=config.megabytes,
     )
     print(f"{len(views)} views in {len(shown)} styles: {output} ({output.stat().st_size / 2**20:.1f} MiB)")
     return 0
@@ -164,7 +168,7 @@ def _named(first: Sequence[Path], more: Sequence[Path]) -> dict[str, Path]:
 
 def _views(known: "Known", config: GalleryConfig) -> list[int]:
     """The views to show. Raises UsageError for a name that the run does not hold, or an empty split."""
-    views = views_of(known, config.split, config.views)
+    views = known.views(config.split, config.views)
     count = len(views) if config.views else min(config.most, len(views))
     return [views[k * len(views) // count] for k in range(count)]
 

@@ -40,7 +40,7 @@ VERBS = {
     "eval": Verb("RUN", "measure a run: quality, speed, consistency"),
     "stylize": Verb("RUN --references A.jpg ...", "restyle captured views with photographs"),
     "restyle": Verb("A.ply --references A.jpg ...", "restyle a capture of 3D Gaussians from its file alone"),
-    "gallery": Verb("RUN --references DIR", "every view in every style, as one page that can be sent"),
+    "gallery": Verb("RUN --references DIR", "a run in every style, as one page to walk through"),
     "render": Verb("RUN --path PATH --output X.mp4", "fly through a scene, plain or restyled"),
     "view": Verb("[RUN]", "in the browser: make a scene, drop a photograph on it"),
     "export": Verb("RUN [ply splat glb cameras lut]", "points, splats, meshes, cameras, lookup tables as files"),

@@ -250,8 +250,10 @@ def load_method(name: str) -> "tuple[RunConfig, str]":
 
 def load_field_method(name: str) -> "tuple[TrainConfig, str]":
     """The same for what is made of fields alone. Raises UsageError for a method of another kind."""
+    from ..config import fields_only
+
     config, method = load_method(name)
-    return config.fields_only(Path(name)), method
+    return fields_only(config, Path(name)), method
 
 
 def methods() -> Iterator[tuple[str, str]]:

@@ -8,11 +8,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from ..blocks.config import LayoutConfig
 from ..datamanagers.config import DataManagerConfig
 from ..datamanagers.parsers.config import DataParserConfig
 from ..errors import PluginError
 from ..fields.config import ContentFieldConfig, SemanticFieldConfig
-from ..fields.layouts import LayoutConfig
 from ..plugins import registry
 from ..plugins.captures import CaptureFormat
 from ..plugins.config import PluginConfig
@@ -25,7 +25,7 @@ from ..plugins.stylizers.config import StylizerConfig
 from .config import CommandConfig
 from .parsing import load_method, parse
 
-METHODS = "fprf.methods"
+METHODS, SCENES = "fprf.methods", "fprf.scenes"
 KINDS: dict[str, tuple[type[PluginConfig], ...]] = {
     "fprf.fields": (ContentFieldConfig, SemanticFieldConfig),
     "fprf.samplers": (SamplerConfig,),
@@ -86,7 +86,7 @@ def run(args: list[str]) -> int:
 
 def rows() -> Iterator[Row]:
     """Every entry point of every group of ours."""
-    for group in (METHODS, *KINDS):
+    for group in (METHODS, SCENES, *KINDS):
         for name, entries in registry.installed(group).items():
             for each in entries:
                 yield Row(group, name, each.point.value, each.package)
@@ -98,6 +98,8 @@ def faults() -> Iterator[tuple[Row, str]]:
         try:
             if row.group == METHODS:
                 load_method(row.name)
+            elif row.group == SCENES:
+                registry.load_object(row.group, row.name)
             else:
                 _check(row)
         except PluginError as fault:

@@ -12,9 +12,9 @@ from rich.table import Table
 
 from .. import __version__
 from ..errors import UsageError
+from ..progress import Display
 from ..reconstruction.config import SfmConfig
 from .parsing import parse
-from .progress import Display
 
 MINUTES = 3
 """Minutes of the printed training command."""
@@ -91,8 +91,9 @@ def _check(root: Path) -> None:
     """Read the scene as training will, and print the commands that come next. Raises DataError where it cannot be read."""
     from ..datamanagers.parsers.config import parse_scene
     from ..splats.config import GaussiansConfig
-    from ..splats.training import with_downscale
-    from .train import DEFAULT_METHOD, default_output
+    from ..training.driver import default_output
+    from ..training.prepare import with_downscale
+    from .train import DEFAULT_METHOD
 
     config = GaussiansConfig(data=root, minutes=MINUTES)
     delivered = parse_scene(root, 1, None)

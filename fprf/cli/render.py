@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Literal
 
 from ..checks import at_least
 from ..errors import ConfigError, UsageError
+from ..progress import Display
 from ..style.config import StyleConfig
 from ..style.keyframes import keyed_looks, read_keyframes
 from ..training.quality import QualityConfig
-from .progress import Display
 from .style_flags import named_styles, read_flags, say
-from .verbs import views_of
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
@@ -88,7 +87,7 @@ def run(args: list[str]) -> int:
         raise UsageError(f"--fps {config.fps:g}: a film has at most {MAX_FPS} frames a second")
     opened = open_run(config.run, config.device, config)
     known = opened.known
-    views = views_of(known, config.split) if config.path in ("interpolate", "dataset") else []
+    views = known.views(config.split) if config.path in ("interpolate", "dataset") else []
     cameras = make_path(known.cameras, views, config.path, config.frames, opened.scene.origin)
     # Captured views keep the stem of their image.
     names = [known.names[view] for view in views] if config.path == "dataset" else [f"{i:05d}" for i in range(len(cameras))]

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..checks import at_least
+from ..checks import at_least, positive
 from ..errors import CheckpointError, UsageError
 from ..plugins.captures import endings, format_name
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
+from ..progress import Display
 from ..splats.config import LookConfig
 from ..style.config import StyleConfig
 from ..style.files import StyleFile, write_style
-from .progress import Display
 from .style_flags import read_flags
 from .stylize import print_explained
 
@@ -52,7 +52,9 @@ class RestyleConfig(StyleConfig, LookConfig):
     sheet: Path | None = None
     """A picture (.png .jpg .webp) of views before and after."""
     page: Path | None = None
-    """A web page (.html) to compare views before and after; it loads nothing and can be sent."""
+    """A web page (.html) to walk through the capture before and after; it loads nothing and can be sent."""
+    megabytes: float = 16.0
+    """Size of that page, at most; Gaussians that show least are left out of it."""
     shown: int = 4
     """Views on the sheet and the page, at least 1."""
     explain: bool = False
@@ -64,6 +66,7 @@ class RestyleConfig(StyleConfig, LookConfig):
         StyleConfig.__post_init__(self)
         LookConfig.__post_init__(self)
         at_least("shown", self.shown, 1)
+        positive("megabytes", self.megabytes)
 
 
 def run(args: list[str]) -> int:
@@ -223,30 +226,32 @@ def _write_page(
     pictures: "list[tuple[str, list[Picture]]]",
 ) -> None:
     from ..datamanagers.images import load_image
-    from ..io.gallery import Reference, Style, write_gallery
+    from ..page.writer import Page, PageView, Reference, Style, write_page
     from ..style.config import labels
 
     assert config.page is not None
     names = labels(config.references)
     styles = []
-    for k, (name, styled, _, seconds) in enumerate(made):
+    for k, (name, styled, shown, seconds) in enumerate(made):
         of = [names[k]] if config.each else styled.dictionary.names
         styles.append(
             Style(
                 name or " + ".join(Path(label).stem for label in of),
                 [row[1 + k] for _, row in pictures],
+                shown.shown.harmonics,
                 references=of,
                 metrics={"new_style_seconds": seconds},
             )
         )
-    write_gallery(
-        config.page,
+    page = Page(
         title=config.capture.resolve().name.partition(".")[0] or "capture",
-        scene={"Gaussians": len(scene.gaussians), "Regions": len(scene.measured()[0].share), "Styles": len(styles)},
-        view_names=[view for view, _ in pictures],
-        originals=[row[0] for _, row in pictures],
+        facts={"Gaussians": len(scene.gaussians), "Regions": len(scene.measured()[0].share), "Styles": len(styles)},
+        views=[PageView(view, row[0]) for view, row in pictures],
+        styles=styles,
         references=[
             Reference(label, load_image(path, upright=True)) for label, path in zip(names, config.references, strict=True)
         ],
-        styles=styles,
+        scene=scene,
+        start=scene.names.index(pictures[0][0]),
     )
+    write_page(config.page, page, megabytes=config.megabytes)

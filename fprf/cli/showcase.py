@@ -1,4 +1,4 @@
-"""A run in several styles, as a gallery page: what `fprf demo` and `fprf gallery` have in common."""
+"""A run in several styles, as a page: what `fprf demo` and `fprf gallery` have in common."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -6,7 +6,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from .progress import Display
+from ..errors import FprfError
+from ..progress import Display
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from ..style.files import StyleFile
     from ..style.look import Restyle
     from ..style.restyle import Styled
+    from ..training.run import Known, Run
     from ..types import View
 
 
@@ -90,7 +92,7 @@ def frames_of(
     display.count(len(cameras), len(cameras), "rendering")
 
 
-def write_page(
+def write_shown(
     path: Path,
     scene: "Scene",
     *,
@@ -99,44 +101,73 @@ def write_page(
     facts: Mapping[str, str | int | float],
     views: Sequence[int],
     originals: "Sequence[View]",
+    photographs: "Mapping[int, Picture]",
     shown: Sequence[Shown],
     references: Mapping[str, Path],
     metrics: Mapping[str, Any],
     film: Path | None = None,
     credits: Sequence[str] = (),
-) -> None:
-    """Write the page: `lead` opens it, `credits` end it. `references` are all photographs by the names that it gives them."""
+    megabytes: float | None = None,
+) -> int:
+    """Write the page (`page.writer.Page`); how many Gaussians it shows.
+
+    `references` are all photographs by the names that the page gives them, `photographs` those of views.
+    """
     from ..datamanagers.images import load_image
-    from ..io.gallery import Reference, Style, write_gallery
     from ..io.images import to_uint8
     from ..io.maps import depth_image, depth_limits
+    from ..page.writer import Page, PageView, Reference, Style, write_page
+    from ..splats.scene import SplatScene
 
     limits = depth_limits([view.depth for view in originals], [view.opacity for view in originals])
     called = {path: name for name, path in references.items()}
-    write_gallery(
-        path,
+    gaussians = scene if isinstance(scene, SplatScene) else None
+    styles = [
+        Style(
+            each.name,
+            [to_uint8(view.rgb) for view in each.views],
+            None if gaussians is None else gaussians.restyled(each.styled.restyle).shown.harmonics,
+            references=[called[path] for path in each.sources],
+            shares=each.shares,
+            matches=each.maps,
+            metrics=each.metrics,
+        )
+        for each in shown
+    ]
+    page = Page(
         title=title,
         lead=lead,
-        scene=facts,
-        view_names=[scene.names[view] for view in views],
-        originals=[to_uint8(view.rgb) for view in originals],
-        references=[Reference(name, load_image(path, upright=True)) for name, path in references.items()],
-        styles=[
-            Style(
-                each.name,
-                [to_uint8(view.rgb) for view in each.views],
-                references=[called[path] for path in each.sources],
-                shares=each.shares,
-                matches=each.maps,
-                metrics=each.metrics,
+        facts=facts,
+        views=[
+            PageView(
+                scene.names[view], to_uint8(drawn.rgb), photographs.get(view), depth_image(drawn.depth, drawn.opacity, limits)
             )
-            for each in shown
+            for view, drawn in zip(views, originals, strict=True)
         ],
-        depth=[depth_image(view.depth, view.opacity, limits) for view in originals],
+        styles=styles,
+        references=[Reference(name, load_image(path, upright=True)) for name, path in references.items()],
+        scene=gaussians,
+        start=views[0],
         metrics=metrics,
-        video=film,
+        film=film,
         credits=credits,
     )
+    return write_page(path, page, megabytes=megabytes)
+
+
+def photographs_of(run: "Run", known: "Known", views: Sequence[int]) -> "dict[int, Picture]":
+    """Photographs of views, as far as the scene's folder is still where it was."""
+    from ..datamanagers.images import load_images
+    from ..training.prepare import read_scene
+    from ..training.run import view_names
+
+    try:
+        captured = read_scene(run.load_config()[0])
+        if tuple(view_names(captured.paths)) != known.names:
+            return {}
+        return dict(zip(views, load_images(captured, views=views), strict=True))
+    except FprfError:
+        return {}
 
 
 def _warped(scene: "Scene", views: Sequence[int], pictures: "Sequence[View]") -> float | None:

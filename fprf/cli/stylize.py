@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from ..progress import Display
 from ..style.config import StyleConfig
 from ..style.files import write_style
 from ..training.quality import QualityConfig
-from .progress import Display
 from .style_flags import read_flags
-from .verbs import views_of
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
@@ -74,7 +73,7 @@ def run(args: list[str]) -> int:
 
     opened = open_run(config.run, config.device, config)
     scene = opened.scene
-    views = views_of(opened.known, config.split, config.views)
+    views = opened.known.views(config.split, config.views)
     output = config.output or config.run / "styles" / _name(config)
     if config.explain and not config.references:
         print_explained(output, Regions(scene, *scene.measured()), None)

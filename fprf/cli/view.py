@@ -50,6 +50,8 @@ class ViewConfig(QualityConfig):
     """Secret that the address must carry (?token=...), at least 16 characters; none = made where one is needed."""
     pixels: int = 640
     """Longest side of the sharpest picture, 64 to 2048."""
+    follow: bool = False
+    """Wait for the first checkpoint of a training that has only begun. A run in training is followed without."""
     max_memory: float | None = None
     """MiB that blocks of a large scene may take; none = no limit."""
     device: str = "auto"
@@ -72,17 +74,24 @@ def run(args: list[str]) -> int:
     access = make_access(config.host, config.token)
     with contextlib.ExitStack() as stack:
         server = stack.enter_context(ViewerServer(access, config.port))
+        from ..viewer.live import TrainingFollower
         from ..viewer.scene_files import is_capture
 
         path = config.run
-        if path is not None and not (is_capture(path) or (path / "config.json").is_file()):
+        if path is not None and not (config.follow or is_capture(path) or (path / "config.json").is_file()):
             raise CheckpointError(f"{path}: no config.json here, so it is no run folder; `fprf train` makes one")
         references = _photographs(config.references)
         print(server.address, flush=True)
         if path is None:
             stack.callback(_start(server, config, references).close)
         else:
-            server.open(lambda: _load(config, path, None, server.notify), references, config.pixels)
+
+            def load() -> "Viewed":
+                return _load(config, path, None, server.notify)
+
+            session = None if config.follow else server.open(load, references, config.pixels)
+            if not is_capture(path):
+                stack.enter_context(TrainingFollower(server, path, load, session, config.pixels))
         try:
             threading.Event().wait()
         except KeyboardInterrupt:

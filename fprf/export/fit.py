@@ -20,7 +20,7 @@ from ..rendering.cameras import Cameras, grid_rays
 from ..splats.config import GaussiansConfig
 from ..splats.gaussians import Gaussians
 from ..splats.initial import Points
-from ..splats.learner import Learner
+from ..splats.learner import GaussianLearner
 from ..splats.photographs import make_levels
 from ..splats.training import find_near, reach_of
 from ..style.look import Restyle
@@ -30,8 +30,8 @@ _ALIKE = 0.7
 """Cosine between the axes of views that have a view between them."""
 _COLOURS = 0.3
 """Time for the colours of a further look, as a share of that for the geometry."""
-
-
+_BEGIN = 0.7
+"""Gaussians that are there at the start, as a share of the most."""
 _SKY = 3.0
 """Distance of points in the sky, in distances of the outermost of all others from the middle of the views."""
 
@@ -53,7 +53,7 @@ def seen_points(maps: Maps, most: int) -> Points:
 def fit_gaussians(
     scene: Scene,
     views: Cameras,
-    points: Points,
+    maps: Maps,
     looks: Sequence[Restyle | None],
     *,
     minutes: float,
@@ -63,16 +63,14 @@ def fit_gaussians(
 ) -> Iterator[Gaussians]:
     """Gaussians of each look, trained for `minutes` after rendering.
 
-    What is rendered are `views` and as many between them. `points` are where Gaussians begin; at most 0.7 `cap` of them are
-    taken, and there are at most `cap` Gaussians in the end.
+    What is rendered are `views` and as many between them. Gaussians begin where `maps` of the views have surfaces; there are at
+    most `cap` in the end.
     """
     cameras = _with_midpoints(views)
     every = torch.arange(len(cameras))
     paths = (Path("scene"),) * len(cameras)
     parsed = ParsedScene(name="scene", paths=paths, cameras=cameras, train=every, test=every[:0])
-    draw = np.random.default_rng(0)
-    some = np.sort(draw.permutation(len(points.position))[: max(1, round(0.7 * cap))])
-    points = Points(points.position[some], points.colour[some])
+    draw, points = np.random.default_rng(0), seen_points(maps, max(1, round(_BEGIN * cap)))
     near = find_near(parsed, points)
     config = GaussiansConfig(cap=cap, background=background or (0.0, 0.0, 0.0))
     reach = reach_of(parsed)
@@ -81,12 +79,12 @@ def fit_gaussians(
         images = _renders(scene, cameras, look, report)
         levels = make_levels(parsed, images, {}, near)
         if learner is None:
-            learner = Learner(config, levels, reach, cap)
-            learner.begin(points, draw)
+            learner = GaussianLearner(config, levels, reach, cap)
+            learner.begin_at(points, draw)
             seconds = 60 * minutes
         else:
             before = learner
-            learner = Learner(replace(config, coarse=0.0), levels, reach, cap, only="colours")
+            learner = GaussianLearner(replace(config, coarse=0.0), levels, reach, cap, only="colours")
             learner.start_from(before.gaussians())
             seconds = 60 * minutes * _COLOURS
         start, step, share = time.perf_counter(), 0, 0.0

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from ..interfaces import ContentField, SemanticField
 from ..ops import dense, march, triplane
+from ..ops.harmonics import spherical_harmonics
 from ..types import FieldSample
 from .config import PlanesConfig, SemanticPlanesConfig
 
@@ -62,33 +63,6 @@ def weights(network: nn.Sequential) -> list[Tensor]:
     return [layer.weight for layer in network if isinstance(layer, nn.Linear)]
 
 
-def harmonics(view: Annotated[Tensor, "N 3"], degree: int) -> Annotated[Tensor, "N degree**2"]:
-    """Values of the spherical harmonics below a degree, 1 to 4, at unit directions."""
-    x, y, z = view.unbind(-1)
-    columns = [torch.full_like(x, 0.28209479177387814)]
-    if degree > 1:
-        columns += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
-    if degree > 2:
-        columns += [
-            1.0925484305920792 * x * y,
-            -1.0925484305920792 * y * z,
-            0.31539156525252005 * (3 * z * z - 1),
-            -1.0925484305920792 * x * z,
-            0.5462742152960396 * (x * x - y * y),
-        ]
-    if degree > 3:
-        columns += [
-            -0.5900435899266435 * y * (3 * x * x - y * y),
-            2.890611442640554 * x * y * z,
-            -0.4570457994644658 * y * (5 * z * z - 1),
-            0.3731763325901154 * z * (5 * z * z - 3),
-            -0.4570457994644658 * x * (5 * z * z - 1),
-            1.445305721320277 * z * (x * x - y * y),
-            -0.5900435899266435 * x * (x * x - 3 * y * y),
-        ]
-    return torch.stack(columns, -1)
-
-
 class Planes(nn.Module):
     """Points of the unit cube to `out` = scales x channels features."""
 
@@ -137,7 +111,7 @@ class PlanesField(ContentField):
     def content(self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "M C"]:
         """Content features seen from a direction; what samples of one ray have in common is computed once."""
         first, run = dense.runs(view)
-        maps, shared = weights(self.to_content), harmonics(view.index_select(0, first), self.degree)
+        maps, shared = weights(self.to_content), spherical_harmonics(view.index_select(0, first), self.degree)
         biases = [None] * (len(maps) - 1) + [self.offset]
         return dense.network(latent, maps, biases, shared=shared, row=run)
 

@@ -1,1 +1,1 @@
-"""Files that people look at: pictures, videos, maps and the gallery. Everything is written whole or not at all."""
+"""Files that people look at: pictures, videos and maps. Everything is written whole or not at all."""

@@ -1,4 +1,4 @@
-"""Affine maps of view-dependent colours: harmonics in, harmonics out.
+"""Spherical harmonics, and affine maps of the view-dependent colours that they express: harmonics in, harmonics out.
 
     colour' = colour A + b,   0.5 + Y0 dc' = (0.5 + Y0 dc) A + b,   higher harmonics' = harmonics A
 
@@ -34,6 +34,36 @@ class Directions(NamedTuple):
     """Values of the first B = (degree + 1)^2 harmonics."""
     fit: Annotated[Tensor, "B D"]
     """Their coefficients out of values in the directions, in least squares."""
+
+
+def spherical_harmonics(direction: Annotated[Tensor, "N 3"], degree: int) -> Annotated[Tensor, "N degree**2"]:
+    """Values of the real spherical harmonics below a degree, 1 to 4, at unit directions.
+
+    In the order and with the signs of 3D Gaussian splatting files, where a colour is 0.5 + their sum with the coefficients.
+    """
+    x, y, z = direction.unbind(-1)
+    columns = [torch.full_like(x, 0.28209479177387814)]
+    if degree > 1:
+        columns += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
+    if degree > 2:
+        columns += [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (3 * z * z - 1),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (x * x - y * y),
+        ]
+    if degree > 3:
+        columns += [
+            -0.5900435899266435 * y * (3 * x * x - y * y),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (5 * z * z - 1),
+            0.3731763325901154 * z * (5 * z * z - 3),
+            -0.4570457994644658 * x * (5 * z * z - 1),
+            1.445305721320277 * z * (x * x - y * y),
+            -0.5900435899266435 * x * (x * x - 3 * y * y),
+        ]
+    return torch.stack(columns, -1)
 
 
 def as_drawn(harmonics: Annotated[Tensor, "N K 3"], directions: Directions) -> Annotated[Tensor, "N K 3"]:

@@ -44,6 +44,9 @@ def explained(
     """
     if not bool(solid.any()):
         return share
+    # What is not solid neither counts nor changes: where a single thing is seen, most of the picture is left out.
+    box = tuple(slice(int(at[0]), int(at[-1]) + 1) for at in (solid.any(1).nonzero(), solid.any(0).nonzero()))
+    whole, share, guide, solid = share.float().clone(), share[box], guide[box], solid[box]
     present = (share.mean((0, 1)) > _PRESENT).nonzero()[:, 0]
     before, radius = share[..., present].permute(2, 0, 1).float().contiguous(), max(1.0, radius)
     # Squares of what lies far from 0 would round.
@@ -60,7 +63,8 @@ def explained(
             likelihood[k] = ((rows @ coefficients @ columns.T) * monomials).sum(0)
         odds = (own * before + (1 - own) * prior).clamp_min(1e-9).log() + likelihood
         after = torch.where(solid, torch.softmax(odds, 0) * before.sum(0), before)
-    return share.float().index_copy(2, present, after.permute(1, 2, 0))
+    whole[box] = share.float().index_copy(2, present, after.permute(1, 2, 0))
+    return whole
 
 
 def _local_gaussians(

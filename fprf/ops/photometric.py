@@ -11,8 +11,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from .simd import LANES, absolute, as_float, lanes, load, splat, store, take, total, traced, where_greater
-from .threads import on_threads
+from .simd import LANES, absolute, as_float, lanes, load, on_threads, splat, store, take, total, traced, where_greater
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 WINDOW = 11

@@ -1,6 +1,15 @@
 """3D Gaussians to images, forward and backward, and image features back to Gaussians.
 
-`rasterise_reference` defines what is computed, in plain torch; on the CPU in float32 compiled kernels do (`rasterise_kernels`).
+N Gaussians, K harmonics of a colour channel (1, 4, 9 or 16), C feature channels, H W pixels; H16 W16 whole tiles of them.
+
+`rasterise_reference` defines what is computed, in plain torch, for every device and dtype. On the CPU in float32 compiled
+kernels do (`rasterise_kernels`, `rasterise_gradient_kernels`), by these steps:
+
+    project     mean -> image position and depth, Sigma' = J W Sigma W^T J^T + 0.3 I, colour from its harmonics
+    bin         every Gaussian into the tiles of 16 x 16 pixels that it reaches, each tile sorted by depth
+    composite   C = sum_i c_i alpha_i T_i + T_N background,  T_i = prod_j<i (1 - alpha_j),  front to back, tile by tile
+    back        the same tiles, front to back again, with what is still behind: dL/d ln alpha and dL/dc, then back to parameters
+
 These skip and count: Gaussians whose opacity stays below 1/255, behind the camera, outside the image, or not finite (exact:
 the reference gives them nothing either), and what lies behind blocks of 4 x 4 pixels through which less than 1/1000 of the
 light passes (an error of at most 1/1000 of the largest value). Their exponential errs by 1.1e-4 of alpha.
@@ -24,6 +33,8 @@ __all__ = ["Pinhole", "Rasterised", "lift", "rasterise"]
 
 _Array = np.ndarray[Any, Any]
 _SKIPPED = ("faint", "behind", "outside", "invalid")
+_WIDE = 8
+"""Feature channels that the kernels composite at once."""
 
 
 class Rasterised(NamedTuple):
@@ -38,25 +49,6 @@ class Rasterised(NamedTuple):
     """Composited on zeros; C = 0 where none were given."""
     counts: Mapping[str, int]
     """Gaussians left out: faint, behind, outside, invalid; then entries (Gaussians times tiles) and saturated ones, skipped."""
-
-
-class _View(NamedTuple):
-    """A camera and the Gaussians it sees, as the kernels take them."""
-
-    width: int
-    height: int
-    camera: _Array
-    blocks: _Array
-    bands: int
-    total: int
-    splats: _Array
-    entries: Any
-    counts: dict[str, int]
-
-    @property
-    def padded(self) -> tuple[int, int]:
-        """Height and width in whole tiles."""
-        return -(-self.height // 16) * 16, -(-self.width // 16) * 16
 
 
 def rasterise(
@@ -82,19 +74,19 @@ def rasterise(
     shape = (means, quaternions, log_scales)
     given = (*shape, logits, harmonics, features, background)
     counts: dict[str, int] = {}
-    if _fits(*given):
-        if torch.is_grad_enabled() and any(x.requires_grad for x in given):
-            planes, passing, counts = _Rasterise.apply(*given, camera, antialiased)  # type: ignore[no-untyped-call]
-        else:
-            planes, passing, counts = _forward(_view(*shape, logits, harmonics, camera, antialiased), features, background)[:3]
-    else:
+    if not _fits(*given):
         colours, fine = view_colours(means, harmonics, camera)
         logits = torch.where(fine, logits, torch.nan)  # what is not finite is not drawn
         behind = torch.cat([background, features.new_zeros(features.shape[1])])
         planes, passing = rasterise_reference(
             *shape, logits, torch.cat([colours, features], -1), camera, behind, antialiased=antialiased
         )
+        # In the kernels' order: colour, depth, features.
         planes = torch.cat([planes[..., :3], planes[..., -1:], planes[..., 3:-1]], -1)
+    elif torch.is_grad_enabled() and any(x.requires_grad for x in given):
+        planes, passing, counts = _Rasterise.apply(*given, camera, antialiased)  # type: ignore[no-untyped-call]
+    else:
+        planes, passing, counts, _ = _composite(_view(*shape, logits, harmonics, camera, antialiased), features, background)
     opacity = 1 - passing
     depth = planes[..., 3] / opacity.clamp_min(1e-6)  # a drawn alpha is at least 1/255
     return Rasterised(planes[..., :3], depth, opacity, planes[..., 4:], counts)
@@ -117,16 +109,25 @@ def lift(
     _check(means, quaternions, log_scales, logits, harmonics, None)
     if pixels.shape[:2] != (camera.height, camera.width):
         raise FprfError(f"pixels {tuple(pixels.shape)}: a camera of {camera.height} x {camera.width} has other ones")
-    pixels = pixels.detach()
+    pixels, channels = pixels.detach(), pixels.shape[-1]
     shape = (means.detach(), quaternions.detach(), log_scales.detach(), logits.detach())
-    if _fits(*shape, pixels):
-        lifted = _lifted(_view(*shape, harmonics, camera, antialiased), pixels)
-    else:
+    if not _fits(*shape, pixels):
+        # Rendering is linear in the values, so their gradient for given pixels is its transpose.
         with torch.enable_grad():
-            values = means.new_zeros(len(means), pixels.shape[-1], requires_grad=True)
-            image, _ = rasterise_reference(*shape, values, camera, pixels.new_zeros(pixels.shape[-1]), antialiased=antialiased)
+            values = means.new_zeros(len(means), channels, requires_grad=True)
+            image, _ = rasterise_reference(*shape, values, camera, pixels.new_zeros(channels), antialiased=antialiased)
             (lifted,) = torch.autograd.grad((image[..., :-1] * pixels).sum(), values)
-    return lifted
+        return lifted
+    from . import rasterise_gradient_kernels as kernels
+
+    tiles = _view(*shape, harmonics, camera, antialiased).tiles
+    # Sixteen channels fill the sums of an entry, and cost little more than eight: Gaussians are found, and entries read, once.
+    parts = [(first, 16 if channels - first > 8 else 8) for first in range(0, channels, 16)]
+    out = np.empty((len(means), sum(parts[-1]) if parts else 0), np.float32)
+    for first, size in parts:
+        sums = kernels.lift(tiles, size, _planes(tiles, pixels[..., first : first + size], size).reshape(-1))
+        kernels.lift_values(tiles, sums, out.reshape(-1), out.shape[1], first, size, skipped=0)
+    return torch.from_numpy(out)[:, :channels]
 
 
 class _Rasterise(torch.autograd.Function):
@@ -144,23 +145,41 @@ class _Rasterise(torch.autograd.Function):
         antialiased: bool,
     ) -> tuple[Tensor, Tensor, dict[str, int]]:
         view = _view(means, quaternions, log_scales, logits, harmonics, camera, antialiased)
-        planes, passing, counts, groups = _forward(view, features, background)
-        ctx.view, ctx.groups = view, groups
+        planes, passing, counts, made = _composite(view, features, background)
+        ctx.view, ctx.made = view, made
         ctx.save_for_backward(features, passing)
         return planes, passing, counts
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor, grad_passing: Tensor, _: None) -> tuple[Tensor | None, ...]:
-        features, passing = ctx.saved_tensors
-        blocks, of_features = _backward(ctx.view, ctx.groups, features, grad, grad_passing)
-        parts = (
-            blocks[:, :3],
-            blocks[:, 6:10],
-            blocks[:, 3:6],
-            blocks[:, 10],
-            blocks[:, 11:].reshape(-1, ctx.view.bands, 3),
-        )
-        return *parts, of_features, (grad[..., :3] * passing[..., None]).sum((0, 1)), None, None
+        from . import rasterise_gradient_kernels as kernels
+
+        (tiles, blocks, bands, camera, _), (features, passing) = ctx.view, ctx.saved_tensors
+        # Of the first group the sums of the shape, with the gradient of the transmittance, which is to be counted once.
+        of_left = _planes(tiles, grad_passing[..., None], 1)[0]
+        of_features = np.empty((tiles.count, features.shape[1] + -features.shape[1] % _WIDE), np.float32)
+        total, begin = None, 0
+        for (channels, values, stride, first), (out, left) in zip(_groups(ctx.view, features), ctx.made, strict=True):
+            slope = _planes(tiles, grad[..., begin : begin + channels], channels)
+            begin += channels
+            sums = kernels.composite_back(
+                tiles, channels, values, stride, first,
+                out.reshape(-1), left.reshape(-1), slope.reshape(-1), of_left.reshape(-1),
+            )  # fmt: skip
+            if total is None:
+                total, of_left = sums, np.zeros_like(of_left)
+            else:
+                # Features move alphas as colours do; the last slot is spare.
+                total.reshape(-1, kernels.SUMS)[:-1, :6] += sums.reshape(-1, kernels.SUMS)[:-1, :6]
+                kernels.lift_values(tiles, sums, of_features.reshape(-1), of_features.shape[1], first, channels)
+        # From sums over pixels to the parameters, in blocks; then a row a Gaussian.
+        assert total is not None
+        slopes = np.empty_like(blocks)
+        kernels.gradients(tiles, blocks, bands, camera, total, slopes)
+        rows = torch.from_numpy(slopes).view(-1, 11 + 3 * bands, 16).transpose(1, 2).reshape(-1, 11 + 3 * bands)[: tiles.count]
+        shape = rows[:, :3], rows[:, 6:10], rows[:, 3:6], rows[:, 10], rows[:, 11:].reshape(-1, bands, 3)
+        of_background = (grad[..., :3] * passing[..., None]).sum((0, 1))
+        return *shape, torch.from_numpy(of_features)[:, : features.shape[1]], of_background, None, None
 
 
 def _fits(*tensors: Tensor) -> bool:
@@ -174,29 +193,37 @@ def _check(
     count, bands = len(means), harmonics.shape[1] if harmonics.dim() == 3 else 0
     wanted = [(count, 3), (count, 4), (count, 3), (count,), (count, bands, 3)]
     given = [tuple(x.shape) for x in (means, quaternions, log_scales, logits, harmonics)]
-    if (
-        given != wanted
-        or bands not in (1, 4, 9, 16)
-        or (features is not None and (features.dim() != 2 or len(features) != count))
-    ):
+    fit = features is None or (features.dim() == 2 and len(features) == count)
+    if given != wanted or bands not in (1, 4, 9, 16) or not fit:
         raise FprfError(
             f"Gaussians of shapes {given}: [N 3], [N 4], [N 3], [N], [N K 3] with K 1, 4, 9 or 16 and features [N C] fit"
         )
 
 
 def camera_array(camera: Pinhole, antialiased: bool) -> _Array:
-    """A camera as the kernels take it."""
+    """A camera as the kernels take it (see `rasterise_kernels`)."""
     fx, fy, cx, cy = (float(camera.intrinsics[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
     pose = camera.world_to_camera.double().cpu()
+    turn, shift = pose[:3, :3], pose[:3, 3]
+    # J is taken at most 15 % of the image beyond its edges: further out the linear projection stretches without bound.
     limits = [
         -cx / fx - 0.15 * camera.width / fx,
         (camera.width - cx) / fx + 0.15 * camera.width / fx,
         -cy / fy - 0.15 * camera.height / fy,
         (camera.height - cy) / fy + 0.15 * camera.height / fy,
     ]
-    turn, shift = pose[:3, :3], pose[:3, 3]
     place = [*turn.flatten().tolist(), *shift.tolist(), fx, fy, cx, cy, *(-turn.T @ shift).tolist()]
     return np.array([*place, *limits, camera.near, float(antialiased)], np.float32)
+
+
+class _View(NamedTuple):
+    """A camera and the Gaussians it sees, as the kernels take them."""
+
+    tiles: Any
+    blocks: _Array
+    bands: int
+    camera: _Array
+    counts: dict[str, int]
 
 
 def _view(
@@ -209,98 +236,55 @@ def _view(
     antialiased: bool,
 ) -> _View:
     from . import rasterise_kernels as kernels
-    from .simd import aligned
+    from .simd import LANES, aligned
 
-    count, bands, seen = len(means), harmonics.shape[1], camera_array(camera, antialiased)
-    blocks = aligned(-(-count // kernels.LANES) * kernels.LANES * (kernels.FIXED + 3 * bands))
-    splats = aligned(-(-count // kernels.LANES) * kernels.LANES * kernels.SLOTS)
-    plain = (x.detach().contiguous().numpy() for x in (means, quaternions, log_scales, logits, harmonics))
-    kernels.pack(*plain, blocks)
-    kernels.project(blocks, count, bands, seen, camera.width, camera.height, splats)
-    entries = kernels.bins(splats, count, camera.width, camera.height)
-    counts = dict(zip(_SKIPPED, entries.skipped.tolist(), strict=True)) | {"entries": len(entries.ids), "saturated": 0}
-    return _View(camera.width, camera.height, seen, blocks, bands, count, splats, entries, counts)
+    bands, seen, whole = harmonics.shape[1], camera_array(camera, antialiased), -(-len(means) // LANES) * LANES
+    blocks, splats = aligned(whole * (kernels.FIXED + 3 * bands)), aligned(whole * kernels.SLOTS)
+    kernels.pack(*(x.detach().contiguous().numpy() for x in (means, quaternions, log_scales, logits, harmonics)), blocks)
+    tiles = kernels.see(blocks, len(means), bands, seen, camera.width, camera.height, splats)
+    counts = dict(zip(_SKIPPED, tiles.skipped.tolist(), strict=True)) | {"entries": len(tiles.ids), "saturated": 0}
+    return _View(tiles, blocks, bands, seen, counts)
 
 
 def _groups(view: _View, features: Tensor) -> list[tuple[int, _Array, int, int]]:
-    """Channels that are composited together: how many, the array that holds them, its stride and the first one."""
-    padded = -(-features.shape[1] // 8) * 8
+    """Channels that are composited together: how many, the array that holds them, its stride and the first one.
+
+    Colour and depth lie in the splats; features, in groups of 8, padded with zeros.
+    """
+    padded = features.shape[1] + -features.shape[1] % _WIDE
     values = torch.nn.functional.pad(features.detach(), (0, padded - features.shape[1])).contiguous().view(-1).numpy()
-    return [(4, view.splats, 16, 6), *((8, values, padded, c) for c in range(0, padded, 8))]
+    return [(4, view.tiles.splats, 16, 6), *((_WIDE, values, padded, c) for c in range(0, padded, _WIDE))]
 
 
-def _forward(
+def _composite(
     view: _View, features: Tensor, background: Tensor
 ) -> tuple[Tensor, Tensor, dict[str, int], list[tuple[_Array, _Array]]]:
     """Channels last: colour, depth, features; the transmittance left; counts; and planes and transmittance of each group."""
     from . import rasterise_kernels as kernels
 
-    height, width = view.padded
+    tiles = view.tiles
     made: list[tuple[_Array, _Array]] = []
     saturated = 0
     for channels, values, stride, first in _groups(view, features):
-        out, left = np.empty((channels, height, width), np.float32), np.empty((height, width), np.float32)
+        out, left = np.empty((channels, *_padded(tiles)), np.float32), np.empty(_padded(tiles), np.float32)
         behind = np.zeros(channels, np.float32)
         if not made:
             behind[:3] = background.detach().numpy()
-        saturated = kernels.composite(
-            channels, view.entries, view.splats, values, stride, first, behind, view.width, view.height,
-            out.reshape(-1), left.reshape(-1),
-        )  # fmt: skip
+        saturated = kernels.composite(tiles, channels, values, stride, first, behind, out.reshape(-1), left.reshape(-1))
         made.append((out, left))
-    planes = torch.cat([torch.from_numpy(out[:, : view.height, : view.width]) for out, _ in made])
+    planes = torch.cat([torch.from_numpy(out[:, : tiles.height, : tiles.width]) for out, _ in made])
     planes = planes[: 4 + features.shape[1]].permute(1, 2, 0)
-    passing = torch.from_numpy(made[0][1][: view.height, : view.width].copy())
+    passing = torch.from_numpy(made[0][1][: tiles.height, : tiles.width].copy())
     return planes, passing, view.counts | {"saturated": int(saturated)}, made
 
 
-def _backward(
-    view: _View, made: list[tuple[_Array, _Array]], features: Tensor, grad: Tensor, grad_passing: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Gradients [N 11+3K] of the parameters in the order of the blocks, and of the features."""
-    from . import rasterise_gradient_kernels as kernels
-
-    of_left = _planes(view, grad_passing[..., None])[0]
-    groups = _groups(view, features)
-    of_features = np.empty((view.total, 8 * (len(groups) - 1)), np.float32)
-    total: _Array | None = None
-    begin = 0
-    for (channels, values, stride, first), (out, left) in zip(groups, made, strict=True):
-        slope = _planes(view, grad[..., begin : begin + channels], channels)
-        gradients = kernels.composite_back(
-            channels, view.entries, view.splats, values, stride, first, view.width, view.height,
-            out.reshape(-1), left.reshape(-1), slope.reshape(-1), of_left.reshape(-1),
-        )  # fmt: skip
-        begin += channels
-        if total is None:
-            total, of_left = gradients, np.zeros_like(of_left)
-        else:
-            total.reshape(-1, kernels.SUMS)[:-1, :6] += gradients.reshape(-1, kernels.SUMS)[:-1, :6]  # the last is spare
-            kernels.lift_values(
-                gradients, view.entries.first_slot, view.total, of_features.reshape(-1), of_features.shape[1], first, channels
-            )
-    assert total is not None
-    blocks = np.empty_like(view.blocks)
-    kernels.gradients(view.blocks, view.total, view.bands, view.camera, total, view.entries.first_slot, blocks)
-    rows = torch.from_numpy(blocks).view(-1, 11 + 3 * view.bands, 16).transpose(1, 2).reshape(-1, 11 + 3 * view.bands)
-    return rows[: view.total], torch.from_numpy(of_features)[:, : features.shape[1]]
+def _padded(tiles: Any) -> tuple[int, int]:
+    """Height and width of an image in whole tiles."""
+    return -(-tiles.height // 16) * 16, -(-tiles.width // 16) * 16
 
 
-def _planes(view: _View, pixels: Tensor, channels: int = 1) -> _Array:
+def _planes(tiles: Any, pixels: Tensor, channels: int) -> _Array:
     """Pixels [H W C] as planes [channels, H16, W16], zeros around."""
-    height, width = view.padded
-    out = np.zeros((channels, height, width), np.float32)
-    out[: pixels.shape[2], : view.height, : view.width] = pixels.detach().permute(2, 0, 1).numpy()
+    out = np.zeros((channels, *_padded(tiles)), np.float32)
+    out[: pixels.shape[2], : tiles.height, : tiles.width] = pixels.detach().permute(2, 0, 1).numpy()
     return out
-
-
-def _lifted(view: _View, pixels: Tensor) -> Tensor:
-    from . import rasterise_gradient_kernels as kernels
-
-    channels = pixels.shape[-1]
-    out = np.empty((view.total, -(-channels // 8) * 8), np.float32)
-    for first in range(0, out.shape[1], 8):
-        slope = _planes(view, pixels[..., first : first + 8], 8)
-        sums = kernels.lift(view.entries, view.splats, view.width, view.height, slope.reshape(-1))
-        kernels.lift_values(sums, view.entries.first_slot, view.total, out.reshape(-1), out.shape[1], first, 8)
-    return torch.from_numpy(out)[:, :channels]

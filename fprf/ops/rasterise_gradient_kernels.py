@@ -20,16 +20,16 @@ from .rasterise_kernels import (
     SIDE,
     SLOTS,
     TILE,
-    Entries,
     Floats,
+    Tiles,
     alpha_of,
     axes,
     basis,
     block_places,
     colour,
     direction,
+    entry_of,
     footprint,
-    from_first_block,
     inside,
     jit,
     opacity,
@@ -40,6 +40,7 @@ from .simd import (
     aligned,
     load,
     lowest_bit,
+    on_threads,
     splat,
     square_root,
     stack,
@@ -51,7 +52,6 @@ from .simd import (
     transposed,
     where_greater,
 )
-from .threads import on_threads
 
 SUMS = LANES
 GEOMETRY = 6
@@ -82,11 +82,6 @@ def _begin(row, memory, channels, geometry, bx, by, width, height, out, left, gr
             behind = [behind[y] + g[y] * load(out, area * c + d + padded * y) for y in range(4)]
     for k, each in enumerate(swapped(behind) if geometry else ()):
         store(memory, at + k * LANES + TILE, each)
-
-
-@traced
-def _entry(splats_in, o, bx, by, values, at, channels):
-    return *from_first_block(splats_in, o, bx, by), *(values[at + c] for c in range(channels))
 
 
 @traced
@@ -124,8 +119,8 @@ def _composite_block(entry, block, memory, places, found, geometry):
 
 
 @traced
-def _keep(summed, geometry, found, at):
-    store(found, at, sums(summed if geometry else [*[splat(summed[0], 0)] * GEOMETRY, *summed]))
+def _keep(summed, found, at):
+    store(found, at, sums(summed))
 
 
 def _composite_back(channels, geometry):
@@ -156,11 +151,11 @@ def _composite_back(channels, geometry):
                 for q in range(k, stop):
                     todo, summed = blocks[q] & unsaturated, _nothing(memory, count)
                     if todo != 0:
-                        entry = _entry(splats_in, ids[q] * SLOTS, bx, by, values, ids[q] * stride + offset, channels)
+                        entry = entry_of(splats_in, ids[q] * SLOTS, bx, by, values, ids[q] * stride + offset, channels)
                         while todo != 0:
                             summed = _composite_block(entry, lowest_bit(todo), memory, places, summed, geometry)
                             todo &= todo - 1
-                    _keep(summed, geometry, found, slots[q] * SUMS)
+                    _keep(summed, found, slots[q] * SUMS)
                 k = stop
                 unsaturated = open_blocks(memory)
             for q in range(k, end):
@@ -170,43 +165,34 @@ def _composite_back(channels, geometry):
 
 
 _COMPOSITE_BACK = {channels: _composite_back(channels, 1) for channels in (3, 4, 8)}
-_LIFT = _composite_back(8, 0)
+_LIFT = {channels: _composite_back(channels, 0) for channels in (8, SUMS)}
 
 
 def composite_back(
-    channels: int,
-    entries: Entries,
-    splats_in: Floats,
-    values: Floats,
-    stride: int,
-    offset: int,
-    width: int,
-    height: int,
-    out: Floats,
-    left: Floats,
-    grad: Floats,
-    grad_left: Floats,
-) -> Floats:
+    tiles: Tiles, channels: int, values: Floats, stride: int, offset: int,
+    out: Floats, left: Floats, grad: Floats, grad_left: Floats,
+) -> Floats:  # fmt: skip
     """SUMS of each slot, from the planes of `composite` and their gradients, both padded to whole tiles."""
-    return _summed(
-        _COMPOSITE_BACK[channels], entries, splats_in, values, stride, offset, width, height, out, left, grad, grad_left
-    )  # fmt: skip
+    return _summed(_COMPOSITE_BACK[channels], tiles, values, stride, offset, out, left, grad, grad_left)
 
 
-def lift(entries: Entries, splats_in: Floats, width: int, height: int, pixels: Floats) -> Floats:
-    """The sums of 8 channels alone, of weight times pixel; those of the shape are 0."""
+def lift(tiles: Tiles, channels: int, pixels: Floats) -> Floats:
+    """SUMS of each slot that begin with those of 8 or 16 channels, of weight times pixel; there are none of the shape."""
     nothing = np.empty(0, np.float32)
-    return _summed(_LIFT, entries, splats_in, splats_in, SLOTS, 0, width, height, nothing, nothing, pixels, nothing)
+    return _summed(_LIFT[channels], tiles, tiles.splats, SLOTS, 0, nothing, nothing, pixels, nothing)
 
 
-def _summed(kernel: Any, entries: Entries, *args: Any) -> Floats:
-    sums = aligned((len(entries.ids) + 1) * SUMS)
-    on_threads(kernel, entries.start, entries.ids, entries.slots, entries.blocks, *args, sums)
+def _summed(kernel: Any, tiles: Tiles, values: Floats, stride: int, offset: int, *planes: Floats) -> Floats:
+    sums = aligned((len(tiles.ids) + 1) * SUMS)
+    on_threads(
+        kernel, tiles.start, tiles.ids, tiles.slots, tiles.blocks, tiles.splats, values, stride, offset,
+        tiles.width, tiles.height, *planes, sums,
+    )  # fmt: skip
     return sums
 
 
 @jit
-def _lift_values(counters, found, first_slot, count, out, stride, offset, channels):
+def _lift_values(counters, found, first_slot, count, out, stride, offset, channels, skipped):
     while True:
         begin = take(counters, 0) * BLOCKS * LANES
         if begin >= count:
@@ -215,13 +201,15 @@ def _lift_values(counters, found, first_slot, count, out, stride, offset, channe
             for c in range(channels):
                 total = np.float32(0)
                 for slot in range(first_slot[i], first_slot[i + 1]):
-                    total += found[slot * SUMS + GEOMETRY + c]
+                    total += found[slot * SUMS + skipped + c]
                 out[i * stride + offset + c] = total
 
 
-def lift_values(found: Floats, first_slot: Any, count: int, out: Floats, stride: int, offset: int, channels: int) -> None:
-    """out[stride * i + offset ...] = the sums of the channels of each Gaussian."""
-    on_threads(_lift_values, found, first_slot, count, out, stride, offset, channels)
+def lift_values(
+    tiles: Tiles, found: Floats, out: Floats, stride: int, offset: int, channels: int, *, skipped: int = GEOMETRY
+) -> None:
+    """out[stride * i + offset ...] = the sums of the channels of each Gaussian, which follow on `skipped` others."""
+    on_threads(_lift_values, found, tiles.first_slot, tiles.count, out, stride, offset, channels, skipped)
 
 
 @traced
@@ -444,33 +432,30 @@ _GRADIENTS = {bands: _gradients(bands) for bands in (1, 4, 9, 16)}
 _ADAM = {bands: _adam(bands) for bands in (1, 4, 9, 16)}
 
 
-def gradients(blocks: Floats, count: int, bands: int, view: Floats, found: Floats, first_slot: Any, out: Floats) -> None:
-    """The gradients of `count` Gaussians, in blocks, from the sums of their slots: shape, colour and depth."""
-    on_threads(_GRADIENTS[bands], blocks, count, view, found, first_slot, out)
+def gradients(tiles: Tiles, blocks: Floats, bands: int, view: Floats, found: Floats, out: Floats) -> None:
+    """The gradients of all Gaussians, in blocks, from the sums of their slots: shape, colour and depth."""
+    on_threads(_GRADIENTS[bands], blocks, tiles.count, view, found, tiles.first_slot, out)
 
 
 def adam(
+    tiles: Tiles,
     blocks: Floats,
-    first: Floats,
-    second: Floats,
-    weight: Floats,
-    count: int,
+    moments: tuple[Floats, Floats, Floats],
     bands: int,
     view: Floats,
     found: Floats,
-    first_slot: Any,
     rates: Floats,
 ) -> Annotated[np.ndarray[Any, np.dtype[np.float64]], "6"]:
     """One step of Adam, in place, for the blocks that have an entry; the others keep their moments as well.
 
     Returns the gradient of the camera, float64: its turn about its own centre (rotation vector in camera axes) and its shift.
 
-    found: sums of shape and colour. rates: a learning rate for each row of a block. weight: sum of the weights in the second
-    moment of a Gaussian, 1 - 0.99^k after k steps: what is seen for the first time moves as it would have in the first step.
-    The first moment is not corrected, so the rates rise over a Gaussian's first ten steps.
+    found: sums of shape and colour. rates: a learning rate for each row of a block. moments: the first, the second, and the sum
+    of the weights in the second of a Gaussian, 1 - 0.99^k after k steps: what is seen for the first time moves as it would have
+    in the first step. The first moment is not corrected, so the rates rise over a Gaussian's first ten steps.
     """
-    of_camera = np.zeros((-(-count // LANES), CAMERA, LANES), np.float32)
-    on_threads(_ADAM[bands], blocks, first, second, weight, count, view, found, first_slot, rates, of_camera.reshape(-1))
+    of_camera = np.zeros((-(-tiles.count // LANES), CAMERA, LANES), np.float32)
+    on_threads(_ADAM[bands], blocks, *moments, tiles.count, view, found, tiles.first_slot, rates, of_camera.reshape(-1))
     gradient: np.ndarray[Any, np.dtype[np.float64]] = of_camera.sum((0, 2), dtype=np.float64)
     return gradient
 

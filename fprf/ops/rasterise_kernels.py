@@ -1,14 +1,15 @@
 """Compiled forward pass of the rasteriser of 3D Gaussians: projection, tiles, compositing. `rasterise` is their bridge.
 
-Blocks: parameters of LANES Gaussians lie together, one row of LANES numbers each: mean 0-2, ln scale 3-5, quaternion wxyz 6-9,
-logit of the opacity 10, then harmonics [K 3]. A flat array of blocks, so that every load is one vector.
-
-Splats: SLOTS floats a Gaussian after projection: x y, A B C D with log2 alpha = A dx^2 + B dx dy + C dy^2 + D, red green blue,
-depth, half width and half height of the ellipse where alpha is 1/255, then what cuts it into columns: xy/yy, det/yy, 1/yy, and
-dy of its right end. A half width of no more than 0 says why there is nothing to draw: FAINT, BEHIND, OUTSIDE, INVALID.
-
-Tiles of 16 x 16 pixels consist of 16 blocks of 4 x 4, row by row; a block is a vector. Entries: a Gaussian in a tile, with
-a bit for each block that it may reach.
+Blocks     Parameters of LANES Gaussians lie together, one row of LANES numbers each: mean 0-2, ln scale 3-5, quaternion wxyz
+           6-9, logit of the opacity 10, then harmonics [K 3]. A flat array of blocks, so that every load is one vector.
+Camera     25 numbers: rotation world to camera 0-8, translation 9-11, fx fy cx cy 12-15, place in the world 16-18, limits of
+           the tangents (left right top bottom) 19-22, near 23, and 1 for anti-aliasing 24.
+Splats     SLOTS numbers a Gaussian after projection: x y 0-1, A B C D with log2 alpha = A dx^2 + B dx dy + C dy^2 + D 2-5, red
+           green blue 6-8, depth 9, half width and height of the ellipse where alpha is 1/255 10-11, then what cuts it into
+           columns 12-15: xy/yy, det/yy, 1/yy, and dy of its right end. A half width of no more than 0 says why there is nothing
+           to draw: FAINT, BEHIND, OUTSIDE, INVALID.
+Tiles      16 x 16 pixels in 16 blocks of 4 x 4, row by row; such a block of pixels is a vector.
+Entries    A Gaussian in a tile, with a bit for each block of pixels that it may reach.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg, var-annotated"
@@ -35,6 +36,7 @@ from .simd import (
     lowest_bit,
     maximum,
     minimum,
+    on_threads,
     splat,
     square_root,
     stack,
@@ -45,7 +47,6 @@ from .simd import (
     transposed,
     where_greater,
 )
-from .threads import on_threads
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 _Ints = np.ndarray[Any, np.dtype[np.int32]]
@@ -152,8 +153,13 @@ def colour(blocks, at, basis):
     return colours
 
 
-def rotation(w, x, y, z):
-    """The rows of the rotation of a quaternion, the unit quaternion and 1 / |q|; a quaternion of zeros is no rotation."""
+def axes(blocks, at, view):
+    """Camera coordinates of the means, and the scaled axes of the Gaussians in world and in camera coordinates."""
+    x, y, z = (load(blocks, at + c * LANES) for c in range(3))
+    mean = x, y, z
+    centre = [view[3 * r] * x + view[3 * r + 1] * y + view[3 * r + 2] * z + view[9 + r] for r in range(3)]
+    # The unit quaternion; one of zeros is no rotation.
+    w, x, y, z = (load(blocks, at + c * LANES) for c in range(6, 10))
     shrink = 1 / square_root(maximum(w * w + x * x + y * y + z * z, 1e-24))
     w, x, y, z = w * shrink, x * shrink, y * shrink, z * shrink
     rows = (
@@ -161,15 +167,7 @@ def rotation(w, x, y, z):
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     )  # fmt: skip
-    return rows, (w, x, y, z, shrink)
-
-
-def axes(blocks, at, view):
-    """Camera coordinates of the means, and the scaled axes of the Gaussians in world and in camera coordinates."""
-    x, y, z = (load(blocks, at + c * LANES) for c in range(3))
-    mean = x, y, z
-    centre = [view[3 * r] * x + view[3 * r + 1] * y + view[3 * r + 2] * z + view[9 + r] for r in range(3)]
-    rows, quaternion = rotation(*(load(blocks, at + c * LANES) for c in range(6, 10)))
+    # Columns of R S are the ellipsoid's half axes.
     scales = [exp2(load(blocks, at + c * LANES) * _LOG2E) for c in range(3, 6)]
     world = [rows[k] * scales[k % 3] for k in range(9)]
     camera = [
@@ -177,7 +175,7 @@ def axes(blocks, at, view):
         for r in range(3)
         for c in range(3)
     ]
-    return mean, centre, scales, quaternion, world, camera
+    return mean, centre, scales, (w, x, y, z, shrink), world, camera
 
 
 def footprint(centre, camera, view):
@@ -254,23 +252,23 @@ def _project(bands):
 _PROJECT = {bands: _project(bands) for bands in (1, 4, 9, 16)}
 
 
-def project(blocks: Floats, count: int, bands: int, view: Floats, width: int, height: int, splats_out: Floats) -> None:
-    """Fill SLOTS floats for each of `count` Gaussians, and for what is left of their last block."""
-    on_threads(_PROJECT[bands], blocks, count, view, width, height, splats_out)
-
-
-class Entries(NamedTuple):
-    """Entries of the Gaussians that are seen: sorted by tile, then by depth. All arrays are int32.
+class Tiles(NamedTuple):
+    """Gaussians as a camera sees them, and the entries of those that are seen: sorted by tile, then by depth. int32.
 
     Slots number entries Gaussian by Gaussian. Depths closer than 2^-20 of what is seen keep their order.
     """
 
+    splats: Floats
+    count: int
+    width: int
+    height: int
     start: Annotated[_Ints, "tiles+1"]
     """Start of each tile."""
     ids: _Ints
     """Gaussian of each entry."""
     slots: _Ints
     blocks: _Ints
+    """Bits of the blocks of pixels that each entry may reach."""
     first_slot: Annotated[_Ints, "N+1+LANES"]
     """Start of the slots of each Gaussian."""
     skipped: _Ints
@@ -387,24 +385,26 @@ def _sort(
             ids[at], slots[at], blocks[at] = i, slot, blocks_of[slot]
 
 
-def bins(splats_in: Floats, count: int, width: int, height: int) -> Entries:
-    """The Entries of `count` projected Gaussians in an image."""
+def see(blocks: Floats, count: int, bands: int, view: Floats, width: int, height: int, splats: Floats) -> Tiles:
+    """Project `count` Gaussians and sort them into the tiles of an image. `splats` is room for whole blocks of them."""
+    on_threads(_PROJECT[bands], blocks, count, view, width, height, splats)
     tiles = ((width + SIDE - 1) // SIDE) * ((height + SIDE - 1) // SIDE)
     room = 4 * count + 1024
     first_slot, (seen, key, *others) = np.empty(count + 1 + LANES, np.int32), np.empty((4, count), np.int32)
     while True:
+        # How many entries there are is known when all have been found: where room is too small, once more with enough.
         tile_of, blocks_of = np.empty((2, room), np.int32)
         start, skipped = np.zeros(tiles + 1, np.int32), np.zeros(4, np.int32)
         entries, visible, low, high = _find(
-            splats_in, splats_in.view(np.int32), count, width, height, first_slot, seen, key, tile_of, blocks_of, start, skipped
+            splats, splats.view(np.int32), count, width, height, first_slot, seen, key, tile_of, blocks_of, start, skipped
         )  # fmt: skip
         if entries <= room:
             break
         room = entries
     digits, fill = np.zeros((2, 2049), np.int32), np.empty(tiles, np.int32)
-    ids, slots, blocks = np.empty((3, entries), np.int32)
-    _sort(seen, key, visible, low, high, digits, *others, first_slot, tile_of, blocks_of, start, fill, ids, slots, blocks)
-    return Entries(start, ids, slots, blocks, first_slot, skipped)
+    ids, slots, bits = np.empty((3, entries), np.int32)
+    _sort(seen, key, visible, low, high, digits, *others, first_slot, tile_of, blocks_of, start, fill, ids, slots, bits)
+    return Tiles(splats, count, width, height, start, ids, slots, bits, first_slot, skipped)
 
 
 TILE = SIDE * SIDE
@@ -433,23 +433,19 @@ def open_blocks(memory):
     return greater_bits(most, STOP)
 
 
-def from_first_block(splats_in, o, bx, by):
-    """dx and dy of the pixels of a tile's first block, and the polynomial of log2 alpha."""
-    dx, dy = (
-        lanes(splats_in, _X) + 0.5 + as_float(bx) - splats_in[o],
-        lanes(splats_in, _Y) + 0.5 + as_float(by) - splats_in[o + 1],
-    )
-    return dx, dy, *(splats_in[o + k] for k in range(2, 6))
-
-
 def alpha_of(power):
     """Alpha from its log2, which is at most 0."""
     return where_greater(power, LOG_MIN, minimum(exp2_rough(power), MAX_ALPHA), 0)
 
 
 @traced
-def _entry(splats_in, o, bx, by, values, at, channels):
-    return *from_first_block(splats_in, o, bx, by), *(values[at + c] for c in range(channels))
+def entry_of(splats_in, o, bx, by, values, at, channels):
+    """dx and dy of the pixels of a tile's first block, the polynomial of log2 alpha, and the values of a Gaussian."""
+    dx, dy = (
+        lanes(splats_in, _X) + 0.5 + as_float(bx) - splats_in[o],
+        lanes(splats_in, _Y) + 0.5 + as_float(by) - splats_in[o + 1],
+    )
+    return dx, dy, *(splats_in[o + k] for k in range(2, 6)), *(values[at + c] for c in range(channels))
 
 
 @traced
@@ -508,7 +504,7 @@ def _composite(channels):
                 for q in range(k, stop):
                     todo = blocks[q] & unsaturated
                     if todo != 0:
-                        entry = _entry(splats_in, ids[q] * SLOTS, bx, by, values, ids[q] * stride + offset, channels)
+                        entry = entry_of(splats_in, ids[q] * SLOTS, bx, by, values, ids[q] * stride + offset, channels)
                         while todo != 0:
                             _composite_block(entry, lowest_bit(todo), memory, places)
                             todo &= todo - 1
@@ -526,23 +522,13 @@ _COMPOSITE = {channels: _composite(channels) for channels in (3, 4, 8)}
 
 
 def composite(
-    channels: int,
-    entries: Entries,
-    splats_in: Floats,
-    values: Floats,
-    stride: int,
-    offset: int,
-    background: Floats,
-    width: int,
-    height: int,
-    out: Floats,
-    left: Floats,
+    tiles: Tiles, channels: int, values: Floats, stride: int, offset: int, background: Floats, out: Floats, left: Floats
 ) -> int:
     """Planes out [channels, H16, W16] of values[stride * i + offset ...] and the transmittance left [H16, W16], both padded
     to whole tiles; returns how many entries were skipped because nothing passed any more. Channels: 3, 4 or 8 at once."""
     return sum(
         on_threads(
-            _COMPOSITE[channels], entries.start, entries.ids, entries.blocks, splats_in, values, stride, offset, background,
-            width, height, out, left,
+            _COMPOSITE[channels], tiles.start, tiles.ids, tiles.blocks, tiles.splats, values, stride, offset, background,
+            tiles.width, tiles.height, out, left,
         )
     )  # fmt: skip

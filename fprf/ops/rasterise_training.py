@@ -18,7 +18,9 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from . import photometric, rasterise_gradient_kernels, rasterise_kernels
+from . import photometric
+from . import rasterise_gradient_kernels as backward
+from . import rasterise_kernels as forward
 from .rasterise_kernels import FIXED, SIDE, SLOTS
 from .simd import LANES, aligned
 
@@ -30,7 +32,6 @@ Floats = np.ndarray[Any, np.dtype[np.float32]]
 MEANS, LOG_SCALES, QUATERNION, LOGIT, HARMONICS = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 11), slice(FIXED, None)
 _UNUSED = -20
 """Logit of the opacity in rows that hold no Gaussian: they are never drawn."""
-_PARTS = "forward", "backward"
 
 
 class Target(NamedTuple):
@@ -204,7 +205,7 @@ class TrainableGaussians:
         """
         width, height, camera, planes, blurred, valid, _ = target
         area, pull = target.area, np.zeros(3, np.float32)
-        entries, out, left = self._render(target, background)
+        tiles, out, left = self._render(target, background)
         shown = _exposed(out, area, factors)
         l1, similar, slope = photometric.loss(shown, planes, blurred, width, height, ssim)
         if not np.isfinite(l1 + similar):
@@ -217,13 +218,9 @@ class TrainableGaussians:
             pull[:] = np.einsum("ca,ca->c", channels, shown[: 3 * area].reshape(3, area))
             channels *= factors[:, None]
         # Pixels to sums for each entry (Gaussian in a tile), and these to parameters, which are moved at once.
-        gradients = rasterise_gradient_kernels.composite_back(
-            3, entries, self._splats, self._splats, SLOTS, 6, width, height, out, left, slope, np.zeros_like(left)
-        )
-        of_camera = rasterise_gradient_kernels.adam(
-            self._blocks, self._first, self._second, self._weight,
-            self.count, self.bands, camera, gradients, entries.first_slot, rates,
-        )  # fmt: skip
+        sums = backward.composite_back(tiles, 3, self._splats, SLOTS, 6, out, left, slope, np.zeros_like(left))
+        moments = self._first, self._second, self._weight
+        of_camera = backward.adam(tiles, self._blocks, moments, self.bands, camera, sums, rates)
         tall, wide = -(-height // SIDE) * SIDE, -(-width // SIDE) * SIDE
         apart = (shown - planes)[: 3 * area].reshape(3, tall, wide)[:, :height, :width]
         return Learnt(l1, similar, float(np.square(apart).mean()), pull, of_camera)
@@ -233,7 +230,7 @@ class TrainableGaussians:
     ) -> Annotated[Floats, "N 3"]:
         """Sums over the pixels of a view of each Gaussian's weight: times |render - photograph|, where there is sky, and of
         all."""
-        entries, out, _ = self._render(target, background)
+        tiles, out, _ = self._render(target, background)
         area = target.area
         apart = np.abs(_exposed(out, area, factors) - target.planes)[: 3 * area]
         if target.valid is not None:
@@ -243,21 +240,17 @@ class TrainableGaussians:
         pixels[:area], pixels[2 * area : 3 * area] = apart.reshape(3, area).sum(0), 1
         if target.sky is not None:
             pixels[area : 2 * area] = target.sky
-        summed = rasterise_gradient_kernels.lift(entries, self._splats, target.width, target.height, pixels)
-        rasterise_gradient_kernels.lift_values(summed, entries.first_slot, self.count, sums.reshape(-1), 8, 0, 8)
+        backward.lift_values(tiles, backward.lift(tiles, pixels), sums.reshape(-1), 8, 0, 8)
         return sums[:, :3]
 
-    def _render(
-        self, target: Target, background: tuple[float, float, float]
-    ) -> tuple[rasterise_kernels.Entries, Floats, Floats]:
-        """The entries of a view, its planes of colours and its transmittance."""
-        width, height = target.width, target.height
-        rasterise_kernels.project(self._blocks, self.count, self.bands, target.camera, width, height, self._splats)
-        entries = rasterise_kernels.bins(self._splats, self.count, width, height)
+    def _render(self, target: Target, background: tuple[float, float, float]) -> tuple[forward.Tiles, Floats, Floats]:
+        """The Gaussians that a view sees, its planes of colours and its transmittance."""
+        tiles = forward.see(
+            self._blocks, self.count, self.bands, target.camera, target.width, target.height, self._splats
+        )  # fmt: skip
         out, left = np.zeros(len(target.planes), np.float32), np.empty(len(target.planes) // 3, np.float32)
-        behind = np.array(background, np.float32)
-        rasterise_kernels.composite(3, entries, self._splats, self._splats, SLOTS, 6, behind, width, height, out, left)
-        return entries, out, left
+        forward.composite(tiles, 3, self._splats, SLOTS, 6, np.array(background, np.float32), out, left)
+        return tiles, out, left
 
     def _by_block(self, part: Floats) -> Annotated[Floats, "B R L"]:
         return part.reshape(-1, self.rows, LANES)
@@ -285,35 +278,28 @@ def _exposed(image: Floats, area: int, factors: Annotated[Floats, "3"] | None) -
 
 def compile_beside(bands: int) -> "list[subprocess.Popen[bytes]]":
     """Start compilation in two other processes, to be waited for before `learn`; none where numba's cache holds something."""
-    cache = Path(rasterise_gradient_kernels.cache_path(bands))
-    if any(cache.glob(f"{rasterise_gradient_kernels.__name__.rpartition('.')[2]}*.nbi")):
+    cache = Path(backward.cache_path(bands))
+    if any(cache.glob(f"{backward.__name__.rpartition('.')[2]}*.nbi")):
         return []
     quiet = subprocess.DEVNULL
     line = [sys.executable, "-m", __name__, str(bands)]
-    return [subprocess.Popen([*line, part], stdin=quiet, stdout=quiet, stderr=quiet) for part in _PARTS]
+    return [subprocess.Popen([*line, part], stdin=quiet, stdout=quiet, stderr=quiet) for part in ("forward", "backward")]
 
 
 def _compile(bands: int, part: str) -> None:
-    size, rows = LANES, FIXED + 3 * bands
+    """Run half of a step on nothing: a tile, and a block of Gaussians of which none is drawn."""
     camera = np.array([1, 0, 0, 0, 1, 0, 0, 0, 1, *[0] * 10, -1, 1, -1, 1, 1, 0], np.float32)
-    planes, left = np.zeros(3 * size * size + photometric.slack(size), np.float32), np.zeros((size, size), np.float32)
-    blocks, first, second, splats = np.zeros((4, rows * LANES), np.float32)
-    nothing = np.zeros(0, np.int32)
-    entries = rasterise_kernels.Entries(
-        np.zeros(2, np.int32), nothing, nothing, nothing, np.zeros(size + LANES + 1, np.int32), nothing
-    )
+    planes, left = np.zeros(3 * SIDE * SIDE + photometric.slack(SIDE), np.float32), np.zeros(SIDE * SIDE, np.float32)
+    blocks, first, second, splats = np.zeros((4, (FIXED + 3 * bands) * LANES), np.float32)
     if part == "forward":
-        rasterise_kernels.project(blocks, size, bands, camera, size, size, splats)
-        entries = rasterise_kernels.bins(splats, size, size, size)
-        rasterise_kernels.composite(3, entries, splats, splats, SLOTS, 6, camera[:3], size, size, planes, left.reshape(-1))
+        tiles = forward.see(blocks, LANES, bands, camera, SIDE, SIDE, splats)
+        forward.composite(tiles, 3, splats, SLOTS, 6, camera[:3], planes, left)
     else:
-        slope = photometric.loss(planes, planes, photometric.blurred(planes, size, size), size, size, 0.2)[2]
-        gradients = rasterise_gradient_kernels.composite_back(
-            3, entries, splats, splats, SLOTS, 6, size, size, planes, left.reshape(-1), slope, left.reshape(-1)
-        )  # fmt: skip
-        rasterise_gradient_kernels.adam(
-            blocks, first, second, splats, size, bands, camera, gradients, entries.first_slot, np.zeros(rows, np.float32)
-        )  # fmt: skip
+        slots, none = np.zeros(LANES + LANES + 1, np.int32), np.zeros(0, np.int32)
+        tiles = forward.Tiles(splats, LANES, SIDE, SIDE, np.zeros(2, np.int32), none, none, none, slots, none)
+        slope = photometric.loss(planes, planes, photometric.blurred(planes, SIDE, SIDE), SIDE, SIDE, 0.2)[2]
+        sums = backward.composite_back(tiles, 3, splats, SLOTS, 6, planes, left, slope, left)
+        backward.adam(tiles, blocks, (first, second, splats), bands, camera, sums, np.zeros(FIXED + 3 * bands, np.float32))
 
 
 if __name__ == "__main__":

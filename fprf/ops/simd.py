@@ -9,13 +9,21 @@ scalar: it cannot prove that their arrays do not overlap.
 The instructions are plain LLVM code for any processor; narrower ones split a vector. Multiply and add may fuse and a division
 may become a product with the reciprocal, nothing else: NaN and infinity keep their meaning. Only `sums` and `total` add lanes,
 in pairs: no other result depends on the width of vectors, but for that fusion. A number among vectors counts in every lane.
+
+Kernels run on threads of `on_threads`. Numba's own cost half of the compilation and split work evenly, which pixels and
+Gaussians are not.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg"
 
 import math
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import Any
 
+import numba
 import numpy as np
 from llvmlite import binding, ir
 from numba import types
@@ -23,20 +31,15 @@ from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, builtin_registry, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
-
-def _widest() -> int:
-    try:
-        return 16 if binding.get_host_cpu_features().get("avx512f") else 8
-    except RuntimeError:  # the features of some machines cannot be read
-        return 8
-
-
 LANES = 16
 """Numbers of a vector."""
 NARROW = 8
 """Numbers of one AVX register: channels of planes come in groups of so many."""
-WIDE = _widest()
-"""Numbers of the machine's widest register, at least 8."""
+try:
+    WIDE = 16 if binding.get_host_cpu_features().get("avx512f") else 8
+    """Numbers of the machine's widest register, at least 8."""
+except RuntimeError:  # the features of some machines cannot be read
+    WIDE = 8
 
 _LINE = 64
 _FLOAT, _INT, _LONG = ir.FloatType(), ir.IntType(32), ir.IntType(64)
@@ -89,21 +92,25 @@ class _Placeholder:
         self.build, self.value = build, value
 
 
+def _of_integers(instruction):
+    """The operator of an instruction on integers."""
+    return lambda self, other: _Index(self.build, getattr(self.build, instruction)(self.value, _long(other)))
+
+
+def _of_vectors(instruction, *, swapped=False):
+    """The operator of an instruction on vectors and constants, of which one is a vector."""
+
+    def operate(self, other):
+        x, y = (other, self) if swapped else (self, other)
+        return Vector(self.build, getattr(self.build, instruction)(self.same(x), self.same(y), flags=_FUSE))
+
+    return operate
+
+
 class _Index(_Placeholder):
     """An integer: a place in an array."""
 
-    def _with(self, instruction, other):
-        return _Index(self.build, getattr(self.build, instruction)(self.value, _long(other)))
-
-    def __add__(self, other):
-        return self._with("add", other)
-
-    def __sub__(self, other):
-        return self._with("sub", other)
-
-    def __mul__(self, other):
-        return self._with("mul", other)
-
+    __add__, __sub__, __mul__ = _of_integers("add"), _of_integers("sub"), _of_integers("mul")
     __radd__, __rmul__ = __add__, __mul__
 
 
@@ -132,36 +139,13 @@ class Vector(_Placeholder):
         """The LLVM value of a vector, or of a constant in every lane."""
         return other.value if isinstance(other, Vector) else _same(other, self.lanes)
 
-    def _with(self, instruction, x, y):
-        x, y = self.same(x), self.same(y)
-        return Vector(self.build, getattr(self.build, instruction)(x, y, flags=_FUSE))
-
-    def __add__(self, other):
-        return self._with("fadd", self, other)
-
-    def __radd__(self, other):
-        return self._with("fadd", other, self)
-
-    def __sub__(self, other):
-        return self._with("fsub", self, other)
-
-    def __rsub__(self, other):
-        return self._with("fsub", other, self)
-
-    def __mul__(self, other):
-        return self._with("fmul", self, other)
-
-    def __rmul__(self, other):
-        return self._with("fmul", other, self)
-
-    def __truediv__(self, other):
-        return self._with("fdiv", self, other)
-
-    def __rtruediv__(self, other):
-        return self._with("fdiv", other, self)
+    __add__, __radd__ = _of_vectors("fadd"), _of_vectors("fadd", swapped=True)
+    __sub__, __rsub__ = _of_vectors("fsub"), _of_vectors("fsub", swapped=True)
+    __mul__, __rmul__ = _of_vectors("fmul"), _of_vectors("fmul", swapped=True)
+    __truediv__, __rtruediv__ = _of_vectors("fdiv"), _of_vectors("fdiv", swapped=True)
 
     def __neg__(self):
-        return self._with("fsub", -0.0, self)
+        return -0.0 - self
 
 
 def _broadcast(build, value):
@@ -186,16 +170,6 @@ def _wrapped(context, build, kind, value):
     return Vector(build, value)
 
 
-def _kind_of(result):
-    if result is None:
-        return types.void
-    if isinstance(result, _Index):
-        return types.int64
-    if isinstance(result, tuple | list):
-        return types.UniTuple(_VectorType(result[0].lanes), len(result))
-    return _VectorType(result.lanes) if isinstance(result, Vector) else types.float32
-
-
 def _dry(kind):
     """The LLVM type of an argument in a trace that only asks what comes back."""
     if isinstance(kind, types.UniTuple):
@@ -209,18 +183,27 @@ def _dry(kind):
 
 def traced(function):
     """Let kernels call a function that runs while they are compiled. It stays what it is for other traced functions."""
-    results = {}
+    results = {}  # the kind of the result, by those of the arguments
 
     class Template(AbstractTemplate):
         key = function
         prefer_literal = True
 
         def generic(self, args, kws):
-            if args not in results:
-                body = ir.Function(ir.Module(), ir.FunctionType(ir.VoidType(), [_dry(kind) for kind in args]), "dry")
-                build = ir.IRBuilder(body.append_basic_block())
-                given = [_wrapped(None, build, kind, value) for kind, value in zip(args, body.args, strict=True)]
-                results[args] = _kind_of(function(*given))
+            if args in results:
+                return signature(results[args], *args)
+            # What comes back is seen in a trace whose code is thrown away.
+            body = ir.Function(ir.Module(), ir.FunctionType(ir.VoidType(), [_dry(kind) for kind in args]), "dry")
+            build = ir.IRBuilder(body.append_basic_block())
+            result = function(*(_wrapped(None, build, kind, value) for kind, value in zip(args, body.args, strict=True)))
+            if result is None:
+                results[args] = types.void
+            elif isinstance(result, tuple | list):
+                results[args] = types.UniTuple(_VectorType(result[0].lanes), len(result))
+            elif isinstance(result, Vector):
+                results[args] = _VectorType(result.lanes)
+            else:
+                results[args] = types.int64 if isinstance(result, _Index) else types.float32
             return signature(results[args], *args)
 
     builtin_registry.register_global(function, types.Function(Template))
@@ -277,6 +260,27 @@ def take(typing, counters, k):
         return build.atomic_rmw("add", place, ir.Constant(_LONG, 1), "monotonic")
 
     return types.int64(counters, k), generate
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="fprf-ops")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # a child has none of its parent's threads
+
+
+def on_threads(kernel: Callable[..., Any], *args: Any) -> list[Any]:
+    """kernel(counters, *args) on each of `numba.get_num_threads()` threads; what each returned.
+
+    `counters` are two zeros (int64) for `simd.take`: threads take what is to be done one by one, and numbers for themselves.
+    """
+    counters, others = np.zeros(2, np.int64), numba.get_num_threads() - 1
+    if others == 0:
+        return [kernel(counters, *args)]
+    running = [_pool(others).submit(kernel, counters, *args) for _ in range(others)]
+    return [kernel(counters, *args), *(each.result() for each in running)]
 
 
 @traced
@@ -363,37 +367,20 @@ def where_greater(p, q, x, y):
     return Vector(like.build, like.build.select(like.build.fcmp_ordered(">", p, q), x, y))
 
 
-def square_root(x):
-    """Square root."""
-    return Vector(x.build, _call("llvm.sqrt", x))
+def _lane_by_lane(name):
+    return lambda x: Vector(x.build, _call(f"llvm.{name}", x))
 
 
-def absolute(x):
-    """|x|."""
-    return Vector(x.build, _call("llvm.fabs", x))
+def _reduced(name, *start, flags=_FUSE):
+    return traced(lambda x: _Float(x.build, _call(f"llvm.vector.reduce.{name}", *start, x, flags=flags)))
 
 
-def floor(x):
-    """The largest whole number that is not above x."""
-    return Vector(x.build, _call("llvm.floor", x))
-
-
-@traced
-def least(x):
-    """The smallest of the lanes."""
-    return _Float(x.build, _call("llvm.vector.reduce.fmin", x))
-
-
-@traced
-def largest(x):
-    """The largest of the lanes."""
-    return _Float(x.build, _call("llvm.vector.reduce.fmax", x))
-
-
-@traced
-def total(x):
-    """The sum of the lanes."""
-    return _Float(x.build, _call("llvm.vector.reduce.fadd", ir.Constant(_FLOAT, 0.0), x, flags=_ADD_ANYHOW))
+square_root, absolute, floor = _lane_by_lane("sqrt"), _lane_by_lane("fabs"), _lane_by_lane("floor")
+"""Of every lane; the floor is the largest whole number that is not above it."""
+least, largest = _reduced("fmin"), _reduced("fmax")
+"""Of all lanes, as a number."""
+total = _reduced("fadd", ir.Constant(_FLOAT, 0.0), flags=_ADD_ANYHOW)
+"""The sum of the lanes."""
 
 
 @traced
@@ -474,13 +461,6 @@ def sums(values):
     return vectors[0]
 
 
-def _fit(function, degree, low, high):
-    """Coefficients of the polynomial of least relative error, in the mean, at Chebyshev points."""
-    x = np.cos(np.pi * (np.arange(400) + 0.5) / 400) * (high - low) / 2 + (high + low) / 2
-    powers = x[:, None] ** np.arange(degree + 1) / function(x)[:, None]
-    return np.linalg.lstsq(powers, np.ones_like(x), rcond=None)[0]
-
-
 def _polynomial(coefficients, x):
     value = coefficients[-1]
     for each in coefficients[-2::-1]:
@@ -490,7 +470,12 @@ def _polynomial(coefficients, x):
 
 _ROUND = 1.5 * 2**23
 """Added to a small number, the sum's last bits are the rounded number."""
-_EXP2 = {degree: _fit(np.exp2, degree, -0.5, 0.5) for degree in (3, 5)}
+# 2^x on [-1/2, 1/2]: polynomials of least relative error, in the mean, at Chebyshev points.
+_POINTS = np.cos(np.pi * (np.arange(400) + 0.5) / 400) / 2
+_EXP2 = {
+    degree: np.linalg.lstsq(_POINTS[:, None] ** np.arange(degree + 1) / np.exp2(_POINTS)[:, None], np.ones(400), rcond=None)[0]
+    for degree in (3, 5)
+}
 
 
 def _rounded(x):

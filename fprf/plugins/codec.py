@@ -7,10 +7,10 @@ Where that method is not installed, fields that fprf does not know are kept as d
 """
 
 import json
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .. import __version__
 from ..errors import ConfigError, FprfError, PluginError
 from ..io.atomic import write_text
 from ..io.strict_json import parse_json
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _METHODS = "fprf.methods"
 
-_FORMAT = 1
+_FORMAT, _VERSION = 1, version("fprf")
 _KEYS = ("format", "fprf", "method", "plugins", "config")
 
 
@@ -45,7 +45,7 @@ def save_config(path: Path, config: "RunConfig", method: str) -> None:
         if type(method_config(method)) is not type(config):
             raise ConfigError(f"method {method!r} gives no {type(config).__name__}, so its fields could not be read again")
         packages["method"] = registry.entry(_METHODS, method).package
-    whole = {"format": _FORMAT, "fprf": __version__, "method": method, "plugins": packages, "config": fields}
+    whole = {"format": _FORMAT, "fprf": _VERSION, "method": method, "plugins": packages, "config": fields}
     write_text(path, json.dumps(whole, indent=1, allow_nan=False) + "\n")
 
 
@@ -134,7 +134,7 @@ def _check(whole: Any) -> None:
     if whole["format"] != _FORMAT or type(whole["format"]) is not int:
         raise ConfigError(
             f"is of format {whole['format']!r}, written by fprf {whole.get('fprf', '(unknown)')}; "
-            f"fprf {__version__} reads format {_FORMAT}: use the version that wrote it"
+            f"fprf {_VERSION} reads format {_FORMAT}: use the version that wrote it"
         )
     for key in _KEYS:
         if key not in whole:

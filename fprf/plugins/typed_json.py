@@ -38,15 +38,17 @@ class Missing(PluginConfig):
     """Reason why it cannot be loaded."""
 
     def needs(self) -> tuple[Need, ...]:
-        package = self.package or "the package that provides it"
-        return (Need(self.reason, f"install {package}, or choose another with --{self.slot} NAME"),)
+        return (Need(self.reason, self._remedy() or "choose another"),)
 
     def build(self, *args: object, **kwargs: object) -> NoReturn:
         """Raise PluginError: takes what any kind's `build` takes."""
-        raise PluginError(
-            f"{self.slot}: {self.reason}; install {self.package or 'the package that provides it'}, "
-            f"or choose another with --{self.slot} NAME"
-        )
+        raise PluginError("; ".join(filter(None, (f"{self.slot}: {self.reason}", self._remedy()))))
+
+    def _remedy(self) -> str:
+        if (self.kind, self.name) in registry.REMOVED:
+            return ""  # which the reason says
+        package = self.package or "the package that provides it"
+        return f"install {package}, or choose another with --{self.slot} NAME"
 
 
 def to_json(config: object) -> Any:

@@ -195,7 +195,7 @@ def render_rays(
     """
     marched = march(rays, parts, budget=budget, step=step, generator=generator)
     kept, count = marched.kept, len(rays.near)
-    rgb = content = semantic = frozen_rgb = None
+    rgb = content = semantic = None
     if want & (Want.COLOUR | Want.CONTENT):
         features = parts.field.content(kept.latent, kept.view)
         if kept.gradient_scale is not None:
@@ -208,14 +208,10 @@ def render_rays(
             styled = restyle is not None and not restyle.idle and Want.SEMANTIC in restyle.needs
             semantics = parts.semantic(kept.point) if styled and parts.semantic is not None else None
             rgb = composite(kept, shade(parts.decoder, features, semantics, restyle), count) + backdrop
-            if step is not None and (alone := parts.decoder.frozen_colour(features)) is not None:
-                frozen_rgb = composite(kept, alone, count) + backdrop
     if Want.SEMANTIC in want and parts.semantic is not None:
         semantic = _semantics(marched, _fixed(rays), parts, count if semantic_rays is None else semantic_rays, semantic_samples)
     counts = {"rays": count, "samples": marched.weights.numel(), "kept": len(kept.ray)}
-    return Rendered(
-        marched.depth, marched.opacity, rgb, content, semantic, marched.weights, marched.sampled, counts, frozen_rgb
-    )
+    return Rendered(marched.depth, marched.opacity, rgb, content, semantic, marched.weights, marched.sampled, counts)
 
 
 def _semantics(marched: March, rays: Rays, parts: Parts, count: int, samples: int | None) -> Tensor:

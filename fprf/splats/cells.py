@@ -1,14 +1,18 @@
-"""Large scenes in cells: boxes that are trained apart and whose union is the scene.
+"""Scenes of Gaussians in cells, each a task of its own (`training.tasks`); how they are cut says `blocks.partition`.
 
-The space is bisected along the principal axes of the reconstruction's points, so that the points of each cell were seen about
-equally often; cells at the outside are unbounded. A cell learns from the windows of photographs that show its points and a
-border around it. It starts from Gaussians of the whole scene: those that its windows show explain what lies outside, and are
-dropped in the end. A cell's cost follows from its windows alone, and it can be trained on any machine, in any order (compare
-VastGaussian, Lin et al. 2024).
+The whole scene is trained first, on photographs of half the size, for most of the schedule. Each cell goes on from there, with
+the poses that were refined there. It starts from Gaussians of the whole scene: those that its windows show explain what lies
+outside, and are dropped in the end.
+
+    RUN/views.json          where images and masks lie, so that no cell reads the whole scene folder again
+    RUN/checkpoints/        the union of all cells
 """
 
 import math
+import shutil
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated, TypeVar
 
 import numpy as np
@@ -16,26 +20,46 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..datamanagers.scene import Scene, find_sightings
-from ..errors import ConfigError
+from ..blocks.partition import bisect_sightings, read_cells, write_cells
+from ..config import RESUMABLE
+from ..datamanagers.images import load_images
+from ..datamanagers.scene import Scene
+from ..errors import CheckpointError
+from ..interfaces import Partition, State
+from ..io.atomic import write_json
+from ..io.strict_json import open_json
 from ..ops.rasterise import lift
-from .gaussians import Gaussians
+from ..ops.rasterise_training import compile_beside
+from ..plugins.codec import from_json
+from ..progress import Display
+from ..training import checkpoint
+from ..training.camera_optimizers import Tones
+from ..training.driver import Schedule
+from ..training.model import Facts
+from ..training.prepare import read_scene
+from ..training.run import Run, known_of
+from ..training.tasks import WHOLE, Part, Task, digest_of, read_done, run_task, train_all
+from ..types import Cell
+from .config import GaussiansConfig
+from .gaussians import Gaussians, from_tensors, tensors_of
 from .initial import spatial_order
+from .learner import MOVES, GaussianLearner
+from .learner import Part as Share
 from .levels import in_view
-from .photographs import cover
+from .loading import refined
+from .photographs import cover, load_photographs, load_skies, make_levels
+from .training import build, limit_widths, lit_facts, reach_of
 
 Number = TypeVar("Number", bound=np.generic)
-Window = tuple[int, int, int, int]
-"""Left, top, width, height in pixels."""
-_BORDER = 0.05
-"""Of the cell's width to each side, from which it learns as well."""
-_SEEN = 8
-"""Points of a cell that a view shows, at least, where the cell learns from it."""
-_OWN = 0.15
-"""Share of the points in a window that are the cell's own, at least."""
-_LEAST, _ROOM = 64, 6
-"""Least width and height of a window; pixels around the points in it."""
-_OUTLIERS = 0.01
+_FORMAT = 6
+"""Of what a cell is trained as."""
+_MOMENTS = "first", "second", "weight"
+_PIXELS, _SMALLEST = 16_000_000, 4
+"""Pixels of all photographs that the whole scene is trained on, at most; how far they are reduced before some are left out."""
+_RATE = 0.5
+"""Factor of the learning rates in cells, whose windows are seen more often than the photographs of the whole scene."""
+_VISITS = 10
+"""Times that the whole scene sees each of them, at least, however few `steps` there are: cells do not make up for fewer."""
 _DEVIATIONS = 3.0
 """A Gaussian is shown as far as so many standard deviations from its mean."""
 _RUN, _LOOKED, _COARSER, _WEIGHT = 256, 40, 4, 0.003
@@ -43,156 +67,333 @@ _RUN, _LOOKED, _COARSER, _WEIGHT = 256, 40, 4, 0.003
 their size at which they are; the least that the weights of a Gaussian in all pixels of one sum to."""
 
 
+def folder_of(root: Path, cell: int) -> Path:
+    """Folder of a cell, or of the whole scene, in a run."""
+    return root / "overview" if cell == WHOLE else root / "cells" / f"{cell:02d}"
+
+
+def load_cells(root: Path) -> list[Cell]:
+    """The cells of a run. Raises CheckpointError where the file cannot be read."""
+    return read_cells(root / "cells.json")
+
+
+class Cells(Partition):
+    """A scene that is ready to be trained cell by cell."""
+
+    def __init__(self, config: GaussiansConfig, scene: Scene, saved: Facts | None) -> None:
+        self.config, self.scene = config, scene
+        self.compiling = compile_beside((config.degree + 1) ** 2)
+        self._facts = saved or lit_facts(config, scene, lambda view: load_images(scene, config.background, [view])[0])
+
+    @property
+    def facts(self) -> Facts:
+        return self._facts
+
+    def train(self, run: Run, display: Display, *, spent: float) -> None:
+        """The whole scene, all cells, those with the largest windows first, and their union. Finished ones stay."""
+        config, size = self.config, self.scene.cameras.size
+        for process in self.compiling:
+            process.wait()
+        cells = self.write(run)
+        pixels = [sum(width * height for _, _, width, height in cell.windows.values()) for cell in cells]
+        share = sum(pixels) / int(size[self.scene.train].prod(1).sum())
+        display.say(f"{len(cells)} cells, whose windows are {share:.2f} times the photographs")
+        order = sorted(range(len(cells)), key=lambda cell: -pixels[cell])
+        executor = config.executor.on("cpu").build()
+        train_all(config, run, executor, run_cell, order, whole_share=config.overview, spent=spent, quiet=display.quiet)
+        display.say(f"{unite(run.root, cells)} Gaussians")
+
+    def write(self, run: Run) -> list[Cell]:
+        """Cut the scene and write all that tasks read. Cells of another cut, which could be taken for these, are removed."""
+        scene, data = self.scene, self.config.data or Path()
+        cells = bisect_sightings(scene, self.config.cells)
+        if write_cells(run.root / "cells.json", cells):
+            shutil.rmtree(run.root / "cells", ignore_errors=True)
+        views = run.root / "views.json"
+        views.unlink(missing_ok=True)
+        files = {"paths": scene.paths, "masks": scene.masks, "sky_masks": scene.sky_masks}
+        if all(path is None or path.is_relative_to(data) for paths in files.values() for path in paths):
+            named = {name: [path and path.relative_to(data).as_posix() for path in paths] for name, paths in files.items()}
+            write_json(views, named)
+        return cells
+
+
+def read_views(root: Path, config: GaussiansConfig, data: Path) -> Scene:
+    """The views of a run's scene with their images in the folder `data`; parsed where the run does not list them.
+
+    Raises CheckpointError where the list cannot be read.
+    """
+    file, known = root / "views.json", Run(root).load_known()
+    if not file.is_file():
+        return read_scene(replace(config, data=data), known.facts)
+    with open_json(file, "train again to write it") as document:
+        paths = from_json(document["paths"], tuple[str, ...], path="paths")
+        masks = from_json(document["masks"], tuple[str | None, ...], path="masks")
+        skies = from_json(document.get("sky_masks", []), tuple[str | None, ...], path="sky_masks")  # older runs name none
+        if len(paths) != len(known.cameras) or not {len(masks), len(skies)} <= {0, len(paths)}:
+            raise ValueError(f"{len(paths)} images, {len(masks)} and {len(skies)} masks for {len(known.cameras)} cameras")
+    return Scene(
+        name=known.name,
+        paths=tuple(data / name for name in paths),
+        cameras=known.cameras,
+        train=torch.tensor(known.train),
+        test=torch.tensor(known.test, dtype=torch.int64),
+        masks=tuple(None if name is None else data / name for name in masks),
+        sky_masks=tuple(None if name is None else data / name for name in skies),
+        origin=known.facts.origin,
+    )
+
+
+def load_overview(root: Path) -> checkpoint.Saved:
+    """The whole scene, mapped: of large ones a cell reads a part. Raises CheckpointError where it was not trained."""
+    folder = folder_of(root, WHOLE) / "checkpoints"
+    saved, _ = checkpoint.load_latest(folder, verify=False)
+    if saved is None:
+        raise CheckpointError(f"{folder}: no checkpoint to start a cell from; train the run again")
+    return saved
+
+
 @dataclass(frozen=True, kw_only=True)
-class Cell:
-    """A box of space, half open, in the frame of the cut, and what it is learnt from."""
+class Overview(Part):
+    """The whole scene, on smaller photographs, for its part of the schedule.
 
-    frame: Annotated[Tensor, "3 3"]
-    """Rows are axes, float64: coordinates are `frame @ point`."""
-    low: Annotated[Tensor, "3"]
-    high: Annotated[Tensor, "3"]
-    border: Annotated[Tensor, "3"]
-    """Width of what it learns around it."""
-    windows: dict[int, Window]
-    """Photographs that it learns from, by view."""
+    Its rates fall as those of one piece do, so that cells start from the best there is.
+    """
 
-    def holds(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
-        """True for points inside."""
-        local = points.double() @ self.frame.T
-        return ((local >= self.low) & (local < self.high)).all(1)
+    config: GaussiansConfig
+    facts: Facts
+    every: int
+    """One of so many photographs is learnt from."""
 
-    def around(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
-        """True for points inside and in the border."""
-        local = points.double() @ self.frame.T
-        return ((local >= self.low - self.border) & (local < self.high + self.border)).all(1)
+    def build(self) -> GaussianLearner:
+        scene, facts = read_scene(self.config, self.facts), self.facts
+        scene = replace(scene, train=scene.train[:: self.every])
+        held = other_views(scene, scene.train.tolist()) if facts.exposure or facts.centres else ()
+        return build(self.config, scene, replace(facts, held=held))
 
-    def scene(self, scene: Scene) -> Scene:
-        """The scene that the cell sees: its windows are the training views."""
-        views = torch.tensor(list(self.windows), dtype=torch.int64)
-        window = torch.tensor(list(self.windows.values()), dtype=torch.int64)
-        centre, size = scene.cameras.centre.clone(), scene.cameras.size.clone()
-        centre[views] -= window[:, :2]
-        size[views] = window[:, 2:]
-        cameras = replace(scene.cameras, centre=centre, size=size)
-        return replace(scene, cameras=cameras, train=views)
-
-    def shown(self, scene: Scene, gaussians: Gaussians, near: float) -> Annotated[Tensor, "N"]:
-        """True for Gaussians that a window shows, and for all in the cell and its border.
-
-        What others hide, and what covers next to nothing, is not shown, so their number does not grow with the scene.
-        """
-        cameras = self.scene(scene).cameras
-        visible = self.around(gaussians.means)
-        order, centre, radius = _runs(gaussians)
-        means, quaternions, log_scales = (x[order] for x in (gaussians.means, gaussians.quaternions, gaussians.log_scales))
-        logits = gaussians.logits[order]
-        logits.view(-1)[len(gaussians) :] = -math.inf  # the last one, repeated
-        shown = torch.zeros(order.shape, dtype=torch.bool)
-        views = list(self.windows)
-        for view in views[:: -(-len(views) // _LOOKED)]:
-            camera = cover(cameras.select(torch.tensor([view])).scaled(_COARSER), 0, near)[0]
-            runs = torch.from_numpy(in_view(camera, centre, radius)[1]).nonzero()[:, 0]
-            mean, quaternion, log_scale = (x[runs].flatten(0, 1) for x in (means, quaternions, log_scales))
-            ones = torch.ones(camera.height, camera.width, 1)
-            weights = lift(mean, quaternion, log_scale, logits[runs].flatten(), camera, ones, antialiased=True)
-            shown[runs] |= weights.view(-1, _RUN) > _WEIGHT
-        visible[order[shown]] = True
-        return visible
-
-    def cut(self, view: int, image: NDArray[Number]) -> NDArray[Number]:
-        """The window of an image [H W ...] of a view."""
-        left, top, width, height = self.windows[view]
-        return image[top : top + height, left : left + width]
+    def whole(self) -> bool:
+        """Verify the checkpoint, once for all cells. Raises CheckpointError where it is damaged."""
+        kept = checkpoint.steps(self.folder / "checkpoints")
+        try:
+            return bool(kept) and checkpoint.load(self.folder / "checkpoints", kept[-1]).step == kept[-1]
+        except CheckpointError as e:
+            raise CheckpointError(f"{e}, or remove {self.folder} and train it again") from e
 
 
-def _runs(
-    gaussians: Gaussians,
-) -> tuple[Annotated[Tensor, "B R"], Annotated[NDArray[np.float64], "B 3"], Annotated[NDArray[np.float64], "B"]]:
-    """Indices of Gaussians near to each other, the last ones repeated, with balls around what they show."""
+@dataclass(frozen=True, kw_only=True)
+class CellPart(Part):
+    """A cell: its windows, and the Gaussians of the whole scene that they show."""
+
+    config: GaussiansConfig
+    scene: Scene
+    facts: Facts
+    cell: Cell
+    start: checkpoint.Saved
+
+    def build(self) -> GaussianLearner:
+        """Go on from the whole scene, at lower rates."""
+        config, cell, start = self.config, self.cell, self.start
+        scene = replace(self.scene, cameras=refined(self.scene.cameras, start))
+        images, masks = load_photographs(config, scene, list(cell.windows))
+        skies = load_skies(config, scene, images)
+        images, masks, skies = crop(cell, images), crop(cell, masks), crop(cell, skies)
+        near, whole = float(start.model["near"]), from_tensors(start.model)
+        shown = shown_in_windows(scene, cell, whole, near)
+        gaussians = whole.select(shown)
+        own = scene_in_windows(scene, cell)
+        # Only what lies inside and in the border becomes more: its share of all that may be added.
+        around = int(cell.around(gaussians.means).sum())
+        cap = len(gaussians) + round(max(config.cap - len(whole), 0) * around / len(whole))
+        tones = tones_in(self.facts, start)
+        learner = GaussianLearner(
+            replace(config, cap=cap, rate=_RATE * config.rate),
+            make_levels(own, images, masks, near, skies),
+            reach_of(own),
+            cap,
+            cell.around,
+            # Of all cameras: what lies before those of other cells is part of the union.
+            limit_widths(scene, near, cells=True),
+            near=near,
+            tones=tones and tones.going_on(other_views(scene, cell.windows)),
+            part=Share(start.step, config.overview, 1.0),
+            known=known_of(own, config.data, self.facts),
+            origin="the whole scene",
+        )
+        # As if the number had grown from the beginning of the schedule.
+        passed = min(config.overview / config.grow, 0.99)
+        begun = max(1, round((len(gaussians) / cap**passed) ** (1 / (1 - passed))))
+        moments = {name: start.optimizer[name][shown] for name in _MOMENTS}
+        learner.load(State(vars(gaussians), {**moments, "begun": torch.tensor(begun)}))
+        return learner
+
+
+def open_cell(task: Task) -> Overview | CellPart:
+    """The whole scene, or the cell, of a task.
+
+    Raises ConfigError where the images are not those of the run, CheckpointError where a cell's whole scene was not trained.
+    """
+    root, number = Path(task.root), task.part
+    folder, facts, config = folder_of(root, number), Run(root).load_known().facts, Run(root).load_config()[0]
+    assert isinstance(config, GaussiansConfig)
+    scene = read_views(root, config, Path(task.data))
+    free = (*RESUMABLE, *config.untrained, "cells")
+    if number == WHOLE:
+        own, every = reduced(replace(config, data=Path(task.data)), scene)
+        return Overview(
+            name="whole scene",
+            folder=folder,
+            # What is finished stays when a run is gone on with for more steps or minutes.
+            asked={"task": digest_of(config, free, scene, scene.train.tolist(), {"format": _FORMAT, "start": ""})},
+            schedule=Schedule(own.steps, task.minutes, config.checkpoint_minutes),
+            config=own,
+            facts=facts,
+            every=every,
+        )
+    cell = load_cells(root)[number]
+    parts = {
+        "format": _FORMAT,
+        "start": checkpoint.digest(folder_of(root, WHOLE) / "checkpoints"),
+        "bounds": [each.tolist() for each in (cell.frame, cell.low, cell.high, cell.border)],
+        "windows": sorted(cell.windows.items()),
+    }
+    task_digest = digest_of(config, free, scene, list(cell.windows), parts)
+    steps = max(1, round((1 - config.overview) * config.steps))
+    return CellPart(
+        name=f"cell {number:02d}",
+        folder=folder,
+        asked={"task": task_digest, "steps": config.steps, "minutes": config.minutes},
+        schedule=Schedule(steps, task.minutes, config.checkpoint_minutes),
+        config=config,
+        scene=scene,
+        facts=facts,
+        cell=cell,
+        start=load_overview(root),
+    )
+
+
+def reduced(config: GaussiansConfig, scene: Scene) -> tuple[GaussiansConfig, int]:
+    """How the whole scene is trained before its cells, and which one of so many photographs it learns from.
+
+    Of smaller images, then of fewer, where memory would not be bounded.
+    """
+    pixels, factor = int(scene.cameras.size[scene.train].prod(1).sum()), 2
+    while factor < _SMALLEST and pixels > factor**2 * _PIXELS:
+        factor += 1
+    every = -(-pixels // (factor**2 * _PIXELS))
+    own = replace(
+        config,
+        downscale=factor * (config.downscale or 1),
+        # The levels that one piece would be trained on, of images which are smaller already.
+        coarse=min(1.0, config.coarse / config.overview / 3 ** math.log2(factor)),
+        # As many as one piece would have by then.
+        cap=round(config.initial * (config.cap / config.initial) ** min(1.0, config.overview / config.grow)),
+        steps=max(1, round(config.overview * config.steps), _VISITS * len(scene.train[::every])),
+    )
+    return own, every
+
+
+def run_cell(task: Task) -> None:
+    """Train the whole scene or a cell, here or on a worker."""
+    run_task(task, open_cell)
+
+
+def other_views(scene: Scene, views: Iterable[int]) -> tuple[int, ...]:
+    """Numbers of the views that are not among some."""
+    return tuple(sorted(set(range(len(scene.paths))) - set(views)))
+
+
+def scene_in_windows(scene: Scene, cell: Cell) -> Scene:
+    """The scene that a cell sees: its windows are the training views."""
+    views = torch.tensor(list(cell.windows), dtype=torch.int64)
+    window = torch.tensor(list(cell.windows.values()), dtype=torch.int64)
+    centre, size = scene.cameras.centre.clone(), scene.cameras.size.clone()
+    centre[views] -= window[:, :2]
+    size[views] = window[:, 2:]
+    return replace(scene, cameras=replace(scene.cameras, centre=centre, size=size), train=views)
+
+
+def crop(cell: Cell, images: dict[int, NDArray[Number]]) -> dict[int, NDArray[Number]]:
+    """A cell's windows of images [H W ...] by view."""
+    cropped = {}
+    for view, image in images.items():
+        left, top, width, height = cell.windows[view]
+        cropped[view] = image[top : top + height, left : left + width]
+    return cropped
+
+
+def shown_in_windows(scene: Scene, cell: Cell, gaussians: Gaussians, near: float) -> Annotated[Tensor, "N"]:
+    """True for Gaussians that a window shows, and for all in the cell and its border.
+
+    What others hide, and what covers next to nothing, is not shown, so their number does not grow with the scene.
+    """
+    cameras = scene_in_windows(scene, cell).cameras
+    visible = cell.around(gaussians.means)
+    # Runs [B R] of Gaussians near to each other, the last one repeated, with balls around what they show: most windows
+    # show few of them.
     order = torch.from_numpy(spatial_order(gaussians.means.double().numpy()))
     order = torch.nn.functional.pad(order[None], (0, -len(order) % _RUN), mode="replicate").view(-1, _RUN)
-    means = gaussians.means.double()[order]
-    centre = (means.amin(1) + means.amax(1)) / 2
-    reach = _DEVIATIONS * gaussians.log_scales.amax(1).double().exp()
-    radius = ((means - centre[:, None]).norm(dim=2) + reach[order]).amax(1)
-    return order, centre.numpy(), radius.numpy()
+    means, quaternions, log_scales = (x[order] for x in (gaussians.means, gaussians.quaternions, gaussians.log_scales))
+    centre = (means.double().amin(1) + means.double().amax(1)) / 2
+    reach = _DEVIATIONS * log_scales.amax(2).double().exp()
+    radius = ((means.double() - centre[:, None]).norm(dim=2) + reach).amax(1)
+    logits = gaussians.logits[order]
+    logits.view(-1)[len(gaussians) :] = -math.inf  # the repeated ones
+    # Draw the runs in view of each window, coarsely, and keep what weighs anything there.
+    shown = torch.zeros(order.shape, dtype=torch.bool)
+    views = list(cell.windows)
+    for view in views[:: -(-len(views) // _LOOKED)]:
+        camera = cover(cameras.select(torch.tensor([view])).scaled(_COARSER), 0, near)[0]
+        runs = torch.from_numpy(in_view(camera, centre.numpy(), radius.numpy())[1]).nonzero()[:, 0]
+        mean, quaternion, log_scale = (x[runs].flatten(0, 1) for x in (means, quaternions, log_scales))
+        ones = torch.ones(camera.height, camera.width, 1)
+        weights = lift(mean, quaternion, log_scale, logits[runs].flatten(), camera, ones, antialiased=True)
+        shown[runs] |= weights.view(-1, _RUN) > _WEIGHT
+    visible[order[shown]] = True
+    return visible
 
 
-def cut(scene: Scene, count: int) -> list[Cell]:
-    """`count` cells, each with about as many sightings of points. Raises ConfigError where the points do not allow that."""
-    sightings = find_sightings(scene)
-    if sightings is None or len(sightings.view) < _SEEN * count:
-        raise ConfigError(
-            f"cells: {scene.name} has too few points of a reconstruction for {count} cells; train it in one piece"
-        )
-    ends = torch.searchsorted(sightings.view, torch.arange(len(scene.cameras) + 1))
-    centred = sightings.point - sightings.point.mean(0)
-    frame = torch.linalg.eigh(centred.T @ centred).eigenvectors.T.flip(0).contiguous()
-    local = sightings.point @ frame.T
-    cells = []
-    for low, high in _bisected(local, torch.full((3,), -math.inf).double(), torch.full((3,), math.inf).double(), count):
-        inside = ((local >= low) & (local < high)).all(1)
-        own = local[inside]
-        first, last = _extent(own)
-        border = _BORDER * (last - first)
-        near = ((local >= low - border) & (local < high + border)).all(1)
-        windows: dict[int, Window] = {}
-        for view in torch.unique(sightings.view[near]).tolist():
-            of_view = slice(int(ends[view]), int(ends[view + 1]))
-            pixel = sightings.pixel[of_view][near[of_view]]
-            if len(pixel) < _SEEN:
-                continue
-            width, height = scene.cameras.size[view].tolist()
-            first, last = _extent(pixel)
-            left, wide = _interval(float(first[0]), float(last[0]), width)
-            top, tall = _interval(float(first[1]), float(last[1]), height)
-            x, y = sightings.pixel[of_view].unbind(1)
-            shown = (x >= left) & (x < left + wide) & (y >= top) & (y < top + tall)
-            if int((inside[of_view] & shown).sum()) >= _OWN * int(shown.sum()):
-                windows[view] = (left, top, wide, tall)
-        if not windows:
-            raise ConfigError(f"cells: no view shows {_SEEN} points of one of {count} cells; take fewer")
-        cells.append(Cell(frame=frame, low=low, high=high, border=border, windows=windows))
-    return _widened(cells, scene)
+def tones_in(facts: Facts, start: checkpoint.Saved) -> Tones | None:
+    """The exposures that cells go on from; None where none are learnt."""
+    if "tones.gain.value" not in start.optimizer:
+        return None
+    gain, exponent = (start.optimizer[f"tones.{name}.value"] for name in ("gain", "exponent"))
+    never = (gain == 0).all(1).nonzero()[:, 0]  # views that only cells learn from
+    tones = Tones(torch.tensor(facts.exposure), tuple(never.tolist()))
+    tones.load_state_dict({"gain": gain, "exponent": exponent})
+    return tones
 
 
-def _widened(cells: list[Cell], scene: Scene) -> list[Cell]:
-    """The same cells with the outermost windows of each photograph reaching its edges: few points lie there, but it shows."""
-    widened: list[dict[int, Window]] = [{} for _ in cells]
-    for view in sorted({view for cell in cells for view in cell.windows}):
-        own = [k for k, cell in enumerate(cells) if view in cell.windows]
-        window = np.array([cells[k].windows[view] for k in own])
-        first, last = window[:, :2], window[:, :2] + window[:, 2:]
-        first = np.where(first == first.min(0), 0, first)
-        last = np.where(last == last.max(0), scene.cameras.size[view].numpy(), last)
-        for k, (left, top), (width, height) in zip(own, first.tolist(), (last - first).tolist(), strict=True):
-            widened[k][view] = (left, top, width, height)
-    return [replace(cell, windows=windows) for cell, windows in zip(cells, widened, strict=True)]
+def unite(root: Path, cells: Sequence[Cell]) -> int:
+    """Write the union of all cells as the run's checkpoint; the number of its Gaussians.
 
-
-def _bisected(
-    local: Annotated[Tensor, "O 3"], low: Annotated[Tensor, "3"], high: Annotated[Tensor, "3"], count: int
-) -> list[tuple[Tensor, Tensor]]:
-    """Boxes with equal numbers of rows in each, cut across the longest side of what is in them."""
-    if count == 1:
-        return [(low, high)]
-    inside = local[((local >= low) & (local < high)).all(1)]
-    first, last = _extent(inside)
-    axis = int((last - first).argmax())
-    at = float(np.quantile(inside[:, axis].numpy(), (count // 2) / count))
-    middle_high, middle_low = high.clone(), low.clone()
-    middle_high[axis] = middle_low[axis] = at
-    return _bisected(local, low, middle_high, count // 2) + _bisected(local, middle_low, high, count - count // 2)
-
-
-def _extent(values: Annotated[Tensor, "N K"]) -> tuple[Annotated[Tensor, "K"], Annotated[Tensor, "K"]]:
-    """Quantiles between which nearly all rows lie."""
-    low, high = np.quantile(values.numpy(), (_OUTLIERS, 1 - _OUTLIERS), axis=0)
-    return torch.from_numpy(low), torch.from_numpy(high)
-
-
-def _interval(first: float, last: float, size: int) -> tuple[int, int]:
-    """Start and length of a part of [0, size) around [first, last], at least `_LEAST` long where there is room."""
-    start = max(0, math.floor(first) - _ROOM)
-    length = min(max(math.ceil(last) + _ROOM - start, _LEAST), size)
-    return min(start, size - length), length
+    Each view has the mean exposure of the cells that have a window of it. Raises CheckpointError where one is not finished.
+    """
+    start = load_overview(root)
+    tones = tones_in(Run(root).load_known().facts, start)
+    parts: list[tuple[Tensor, ...]] = []
+    step, seconds = start.step, start.seconds
+    gain, count = torch.zeros(0), torch.zeros(0)
+    if tones is not None:
+        gain, count = torch.zeros_like(tones.gains()), torch.zeros(len(tones.exposure), 1)
+    for number, cell in enumerate(cells):
+        folder = folder_of(root, number)
+        saved, _ = checkpoint.load_latest(folder / "checkpoints")
+        if saved is None or read_done(folder) is None:
+            raise CheckpointError(f"{folder}: this cell is not finished; go on with `fprf train {root / 'config.json'}`")
+        gaussians = from_tensors(saved.model)
+        parts.append(tuple(vars(gaussians.select(cell.holds(gaussians.means))).values()))
+        step, seconds = max(step, start.step + saved.step), seconds + saved.seconds
+        if tones is not None:
+            used = list(cell.windows)
+            own = tones.going_on(tuple(sorted(set(range(len(gain))) - set(used))))
+            own.load_state_dict({name: saved.optimizer[f"tones.{name}.value"].clone() for name in ("gain", "exponent")})
+            gain[used] += own.gains().detach()[used]
+            count[used] += 1
+    gaussians = Gaussians(*(torch.cat(column) for column in zip(*parts, strict=True)))
+    corrections = {name: each for name, each in start.optimizer.items() if name == MOVES}
+    if tones is not None:
+        gain = torch.where(count > 0, gain / count.clamp_min(1), tones.gains().detach())
+        corrections |= {"tones.gain.value": gain, "tones.exponent.value": tones.exponent.detach()}
+    state = tensors_of(gaussians, float(start.model["near"]))
+    checkpoint.write(Run(root).checkpoints, state, corrections, step=step, seconds=seconds)
+    return len(gaussians)

@@ -1,7 +1,7 @@
 """Configs of runs of 3D Gaussians and of views of a capture. Imports no torch."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from ..checks import at_least, between, positive
@@ -12,12 +12,11 @@ from ..plugins.encoders.config import SEMANTICS, EncoderConfig
 from ..plugins.executors.config import ExecutorConfig, SerialConfig
 
 if TYPE_CHECKING:
-    from ..cli.verbs import Verbs
+    import torch
+
     from ..datamanagers.scene import Scene
-    from ..training.loading import LoadedRun
-    from ..training.quality import QualityConfig
-    from ..training.unfinished import UnfinishedRun
-    from .scene import SplatScene
+    from ..interfaces import Learner, Partition
+    from ..training.model import Facts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +54,7 @@ class LookConfig:
 class GaussiansConfig(RunConfig):
     """3D Gaussians, trained from photographs on the CPU."""
 
+    kind: ClassVar[str] = "gaussians"
     untrained: ClassVar[tuple[str, ...]] = ("semantic", "regions", "semantic_size", "executor")
     former: ClassVar[tuple[str, ...]] = ("rounds",)
 
@@ -127,26 +127,31 @@ class GaussiansConfig(RunConfig):
         for part in self.background:
             between("background", part, 0.0, 1.0)
 
-    def load(self, run: Path, device: str, quality: "QualityConfig") -> "LoadedRun[SplatScene]":
-        """Read the Gaussians; they are drawn on the CPU, whatever the device."""
-        from .training import open_gaussians
+    def build(
+        self,
+        scene: "Scene",
+        device: "torch.device",
+        *,
+        saved: "Facts | None" = None,
+        progress: Callable[[int, int, str], None] | None = None,
+    ) -> "Learner | Partition":
+        """Read the photographs and find the first points; cells where there are to be some."""
+        if self.cells > 1:
+            from .cells import Cells
 
-        return open_gaussians(run, self, quality)
+            return Cells(self, scene, saved)
+        from .training import build
 
-    def load_unfinished(self, run: Path, device: str, block: int | None) -> "UnfinishedRun":
-        """Its Gaussians come from training; they are drawn on the CPU, whatever the device."""
-        from .training import UnfinishedGaussians
+        return build(self, scene, saved, progress)
 
-        return UnfinishedGaussians(run, self)
+    @property
+    def scene_parser(self) -> DataParserConfig | None:
+        return self.parser
 
-    def read_scene(self) -> "Scene":
-        """Parse the folder."""
-        from .training import scene_of
+    @property
+    def masked(self) -> bool:
+        return self.masks
 
-        return scene_of(self)
-
-    def verbs(self) -> "Verbs":
-        """Return the verbs that train, judge, film and export such a run."""
-        from ..cli.splats import SplatVerbs
-
-        return SplatVerbs(self)
+    def limited(self, views: int) -> int:
+        """At most so many passes over them."""
+        return min(self.steps, self.passes * views)

@@ -5,8 +5,8 @@ the real spherical harmonics Y of `fields.harmonics`.
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..errors import DataError
+from ..errors import CheckpointError, DataError
 from ..ops.harmonics import HARMONIC
 
 COUNTS = (1, 4, 9, 16, 25)
@@ -121,6 +121,19 @@ def from_arrays(
     """Gaussians of arrays of any float type; what is beyond float32 becomes infinite."""
     parts = (means, quaternions, log_scales, logits, harmonics)
     return Gaussians(*(torch.from_numpy(np.array(part, np.float32, order="C")) for part in parts))
+
+
+def tensors_of(gaussians: Gaussians, near: float) -> dict[str, Tensor]:
+    """The tensors of a checkpoint; nothing nearer to a camera than `near` is drawn."""
+    return vars(gaussians) | {"near": torch.tensor(near, dtype=torch.float64)}
+
+
+def from_tensors(tensors: Mapping[str, Tensor]) -> Gaussians:
+    """The Gaussians of a checkpoint. Raises CheckpointError where it holds none."""
+    try:
+        return Gaussians(**{field.name: tensors[field.name] for field in fields(Gaussians)})
+    except KeyError as error:
+        raise CheckpointError(f"the checkpoint holds no {error}, so it is not of Gaussians") from error
 
 
 class Bulk(NamedTuple):

@@ -6,20 +6,26 @@ function of (seed, step), so parameters, moments and the step are all the state 
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ..interfaces import Figures, Learner, State
 from ..ops.harmonics import HARMONIC
 from ..ops.rasterise_training import HARMONICS, LOG_SCALES, LOGIT, MEANS, QUATERNION, Target, TrainableGaussians
 from ..rendering.splines import rotations
 from ..training.camera_optimizers import Poses, Tones
+from ..training.model import Facts
+from ..training.run import Known, Run
 from .config import GaussiansConfig
-from .gaussians import Gaussians, from_arrays
+from .gaussians import Gaussians, from_arrays, from_tensors, tensors_of
 from .initial import Points, spacing, spatial_order
 from .photographs import Floats, Level, moved
+from .scene import Semantics, SplatScene, find_semantics
 
 _DEAD = 0.005
 """Opacity below which a Gaussian is moved elsewhere."""
@@ -35,6 +41,8 @@ _START_OPACITY, _START_SCALE, _FAR_OPACITY = 0.3, 0.7, 0.9
 _DECAY, _DECAY_EVERY = 3e-3, 20
 """Weight decay of the harmonics above degree 0, a step, and the steps between its uses; it falls as the rates do. From where no
 photograph looks they would become any colour, which a style that refits cut colours brings into view as specks."""
+_SMOOTHING = 0.95
+"""Decay of running means."""
 _GAIN, _EXPONENT = 0.005, 2e-3
 """Learning rates of the logarithms of a view's factors, whenever it is seen, and of the exponent. They fall to a tenth."""
 
@@ -43,24 +51,24 @@ Narrow = Callable[[TrainableGaussians, int], None]
 """Cuts standard deviations in place after a step."""
 
 
-class Step(NamedTuple):
-    """Measurements of a step, taken before it moved anything."""
+class Part(NamedTuple):
+    """The part of a whole schedule that a learner is given to train."""
 
-    l1: float
-    ssim: float
-    squared: float
-    """Mean squared error."""
-    gaussians: int
-    pixels: int
+    before: int = 0
+    """Steps that its Gaussians were trained for elsewhere."""
+    first: float = 0.0
+    last: float = 1.0
+    """Shares of the schedule where its training begins and ends."""
 
 
-class Learner:
+class GaussianLearner(Learner):
     """Gaussians in training. `reach` is the radius of the cameras' positions in world units: the unit of the means' rate.
 
     Only Gaussians whose means are `inside` are split or moved; None = all. After each step `narrow` may cut the standard
-    deviations; None = none is limited.
+    deviations; None = none is limited. Nothing nearer to a camera than `near` is drawn.
     With `tones` each view's factors are learnt as well, with `poses` where each view was taken. `only` colours learns harmonics
-    alone, `only` poses neither Gaussians nor factors.
+    alone, `only` poses neither Gaussians nor factors. `known` is what scene.json will hold, for learners of a run; `origin`
+    says where the first Gaussians come from.
     """
 
     def __init__(
@@ -72,14 +80,19 @@ class Learner:
         inside: Callable[[Annotated[Tensor, "N 3"]], Annotated[Tensor, "N"]] | None = None,
         narrow: Narrow | None = None,
         *,
+        near: float = 0.01,
         tones: Tones | None = None,
         poses: Poses | None = None,
         only: Literal["colours", "poses"] | None = None,
+        part: Part | None = None,
+        known: Known | None = None,
+        origin: str = "",
     ) -> None:
-        self.inside, self.narrow = inside, narrow
-        self.config, self.levels, self.reach = config, levels, reach
+        self.inside, self.narrow, self.near, self.known, self.origin = inside, narrow, near, known, origin
+        self.config, self.levels, self.reach, self.part = config, levels, reach, part or Part()
         self.bands = (config.degree + 1) ** 2
-        self.begun = 0
+        self.begun = self.pixels = self.skipped = self.failed = 0
+        self.means: dict[str, float] = {}
         self.model = TrainableGaussians(room, self.bands)
         self.tones, self.poses, self.only = tones, poses, only
         self.corrections = {
@@ -90,11 +103,21 @@ class Learner:
         """Corrections of views by name: the parameter, its moments and the steps of each view."""
 
     @property
+    def device(self) -> torch.device:
+        """The CPU."""
+        return torch.device("cpu")
+
+    @property
+    def facts(self) -> Facts:
+        assert self.known is not None  # learners of a run have it
+        return self.known.facts
+
+    @property
     def count(self) -> int:
         """Gaussians at this time."""
         return self.model.count
 
-    def begin(self, points: Points, rng: np.random.Generator, surroundings: Points | None = None) -> None:
+    def begin_at(self, points: Points, rng: np.random.Generator, surroundings: Points | None = None) -> None:
         """Put a Gaussian at each point: as wide as the points lie apart, in any direction; those of surroundings are opaque."""
         order = spatial_order(points.position)
         position, colour = points.position[order], points.colour[order]
@@ -110,29 +133,41 @@ class Learner:
         turns, sizes = rng.normal(size=(4, len(position))).T, np.repeat(np.log(size)[:, None], 3, 1)
         self.start_from(from_arrays(position, turns, sizes, logit, harmonics))
 
-    def step(self, step: int, share: float) -> Step | None:
-        """Learn from one view; None where the loss was not finite, and nothing was changed."""
+    def step(self, index: int, share: float) -> None:
+        """Learn from one view."""
+        step, share = self.part.before + index, self.part.first + (self.part.last - self.part.first) * share
         # Half the size until `coarse`, a quarter until a third of that, and so on.
         reduced = sum(share < self.config.coarse / 3**k for k in range(len(self.levels) - 1))
         level = self.levels[reduced]
+        # Each epoch sees every view once, in an order of its own.
         views = list(level)
         epoch, turn = divmod(step, len(views))
         view = views[np.random.default_rng((self.config.seed, epoch)).permutation(len(views))[turn]]
         target = self._target(level, view)
+        # Render, compare, and move every Gaussian that the view sees; nothing moves where the loss is not finite.
         background, ssim, rates, factors = self.config.background, self.config.ssim, self._rates(share), self._factors(view)
         measured = self.model.learn(target, background=background, ssim=ssim, rates=rates, factors=factors)
         if not math.isfinite(measured.l1 + measured.ssim):
-            return None
+            self.skipped, self.failed = self.skipped + 1, self.failed + 1
+            return
+        self.failed = 0
         if step % _DECAY_EVERY == 0 and self.only is None:
             self.model.multiply(slice(HARMONICS.start + 3, None), 1 - _DECAY_EVERY * _DECAY * 0.2**share)
         if self.narrow is not None:
             self.narrow(self.model, step)
+        # Exposure and pose of the view, which learn more slowly towards the end.
         self._learn_tones(view, torch.from_numpy(measured.pull), self.config.rate * 0.1**share)
         self._learn_pose(view, target, torch.from_numpy(measured.of_camera), self.config.poses * 0.1**share)
         moved = (step + 1) % self.config.relocate_every == 0 and self.only is None
         if moved and step >= _SETTLE and share < max(self.config.grow, _LAST):
             self._relocate(step, level, share)
-        return Step(measured.l1, measured.ssim, measured.squared, self.count, target.width * target.height)
+        self.pixels += target.width * target.height
+        for name, value in (("rgb", measured.squared), ("l1", measured.l1), ("ssim", measured.ssim)):
+            self.means[name] = _SMOOTHING * self.means.get(name, value) + (1 - _SMOOTHING) * value
+
+    def figures(self) -> Figures:
+        means = self.means | {"gaussians": float(self.count)}
+        return Figures(means, self.pixels, self.skipped, self.failed, "the loss" if self.failed else "")
 
     def _rates(self, share: float) -> Floats:
         """Learning rates of the columns of the parameters. They fall to a fifth, those of the means to a twentieth."""
@@ -232,34 +267,67 @@ class Learner:
         parts = (rows[:, MEANS], rows[:, QUATERNION], rows[:, LOG_SCALES], rows[:, LOGIT.start], harmonics)
         return Gaussians(*(part.contiguous() for part in parts))
 
-    def moments(self) -> dict[str, Tensor]:
-        """Return the rest of a checkpoint: Adam's moments and the weight in the second, exposures, poses, the number at the
-        start."""
+    def state(self) -> State:
+        """Gaussians; Adam's moments and the weight in the second, exposures, poses, the number at the start."""
         first, second, weight = (torch.from_numpy(part) for part in self.model.moments())
         tensors = {"first": first, "second": second, "weight": weight, "begun": torch.tensor(self.begun)}
         for name, kept in self.corrections.items():
             tensors |= {f"{name}.{key}": each.clone() for key, each in zip(_KEPT, kept, strict=True)}
         if self.poses is not None:
             tensors[MOVES] = self.poses.moved_by()
-        return tensors
+        return State(tensors_of(self.gaussians(), self.near), tensors)
 
     def start_from(self, gaussians: Gaussians) -> None:
         """Begin with Gaussians, of the config's degree, as they are."""
         self.begun = len(gaussians)
         self.model.start(_rows(gaussians))
 
-    def restore(self, gaussians: Gaussians, moments: dict[str, Tensor]) -> None:
-        """Go on from what a checkpoint holds; without their moments, tones and poses go on as they are.
+    def load(self, state: State) -> None:
+        """Go on from a checkpoint; without their moments, tones and poses go on as they are.
 
         Checkpoints of before have no weights: their second moments are taken as they are.
         """
-        self.begun = int(moments["begun"])
+        moments = state.optimizer
+        self.begun, self.failed = int(moments["begun"]), 0
         weight = moments["weight"].numpy() if "weight" in moments else 1
-        self.model.start(_rows(gaussians), moments["first"].numpy(), moments["second"].numpy(), weight)
+        self.model.start(_rows(from_tensors(state.model)), moments["first"].numpy(), moments["second"].numpy(), weight)
         for name, kept in self.corrections.items():
             for key, each in zip(_KEPT, kept, strict=True):
                 if f"{name}.{key}" in moments:
                     each.copy_(moments[f"{name}.{key}"])
+
+    def scene(self) -> SplatScene:
+        """The Gaussians as they are now, seen from where the cameras are now."""
+        assert self.known is not None  # learners of a run have it
+        cameras = self.known.cameras if self.poses is None else self.poses.refined(self.known.cameras)
+        return run_scene(self.config, replace(self.known, cameras=cameras), self.gaussians(), self.near)
+
+    def begin(self, run: Run) -> str:
+        most = self.config.limited(len(self.levels[0]))
+        passes = f"; at most {most} steps: {self.config.passes} passes over the photographs (--passes)"
+        light = ", tones" if self.tones is not None else ""
+        return f", {self.count} Gaussians at {self.origin}{light}{passes if most < self.config.steps else ''}"
+
+
+_VIEWS = 32
+"""Training views that semantics are found in, at most."""
+
+
+def run_scene(config: GaussiansConfig, known: Known, gaussians: Gaussians, near: float) -> SplatScene:
+    """The scene of a run; its semantics are found when they are first asked for."""
+    encoder = cache(config.semantic.encoder.build)
+
+    def found() -> Semantics:
+        every = torch.tensor(known.train)
+        views = known.cameras.select(every[torch.linspace(0, len(every) - 1, min(_VIEWS, len(every))).round().long()])
+        views = views.scaled(max(1.0, float(views.size.amax()) / config.semantic_size))
+        return find_semantics(gaussians, True, encoder(), views, config.regions, near=near)
+
+    longest = min(config.semantic_size, int(known.cameras.size.amax()))
+    return SplatScene(
+        gaussians, True, known.cameras, known.names, cache(found), encoder, longest, near, config.background,
+        origin=known.facts.origin,
+    )  # fmt: skip
 
 
 MOVES = "poses.moves"

@@ -1,6 +1,7 @@
 """Photographs as the rasteriser sees the world: through a pinhole, with what lies beyond a lens's picture left out."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any
 
@@ -10,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..datamanagers.images import Image
+from ..datamanagers.images import Image, load_images, load_mask
 from ..datamanagers.scene import Scene
 from ..errors import DataError
 from ..ops.photometric import WINDOW
@@ -18,6 +19,7 @@ from ..ops.rasterise import Pinhole
 from ..ops.rasterise_training import Target, target_of
 from ..rendering.cameras import Cameras, pixel_grid, project, rays_through
 from ..training.camera_optimizers import rotated
+from .config import GaussiansConfig
 
 Floats = NDArray[np.float32]
 _PANORAMA = 3
@@ -122,6 +124,25 @@ def make_levels(
             reduced: Floats = np.asarray(cv2.resize(colours, size, interpolation=cv2.INTER_AREA), np.float32) if k else colours
             level[view] = target_of(small, reduced, _resized(valid, size), _resized(sky, size))
     return levels
+
+
+def load_photographs(
+    config: GaussiansConfig, scene: Scene, views: list[int]
+) -> tuple[dict[int, Image], dict[int, NDArray[np.bool_]]]:
+    """Images of views, and the masks of those that have one."""
+    images = dict(zip(views, load_images(scene, config.background, views), strict=True))
+    return images, _load_masks(scene.masks if config.masks else (), images)
+
+
+def load_skies(config: GaussiansConfig, scene: Scene, images: Mapping[int, Image]) -> dict[int, NDArray[np.bool_]]:
+    """The masks of the sky of the views that have one; none without surroundings: nothing else could show the sky."""
+    return _load_masks(scene.sky_masks if config.masks and config.surroundings else (), images)
+
+
+def _load_masks(paths: tuple[Path | None, ...], images: Mapping[int, Image]) -> dict[int, NDArray[np.bool_]]:
+    """The masks of the views that have one, at the size of their images."""
+    named = {view: paths[view] for view in images} if paths else {}
+    return {view: load_mask(path, images[view].shape[1::-1]) for view, path in named.items() if path is not None}
 
 
 def _undistorted_mask(cameras: Cameras, view: int, mask: NDArray[np.bool_], camera: Pinhole) -> NDArray[np.bool_]:

@@ -13,9 +13,8 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from ..fields.planes import harmonics
 from ..interfaces import Encoder, Stylizer
-from ..ops.harmonics import Directions, recoloured
+from ..ops.harmonics import Directions, recoloured, spherical_harmonics
 from ..ops.precision import double
 from ..plugins.stylizers.config import StylizerConfig
 from ..style.colours import ColourMaps, carried_colours
@@ -74,7 +73,7 @@ def all_around(bands: int) -> Directions:
     height, turn = 1 - 2 * at / _DIRECTIONS, at * (math.pi * (5**0.5 - 1))
     flat = (1 - height.square()).sqrt()
     around = torch.stack([flat * turn.cos(), flat * turn.sin(), height], 1)
-    values = harmonics(around, math.isqrt(min(bands, 16)))
+    values = spherical_harmonics(around, math.isqrt(min(bands, 16)))
     return Directions(values.T.contiguous(), torch.linalg.pinv(values))
 
 

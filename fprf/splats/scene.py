@@ -9,7 +9,7 @@ colours, which acts on harmonics exactly. Statistics are those of pixels: Gaussi
 
 import hashlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from typing import Annotated, NamedTuple
@@ -19,6 +19,7 @@ from torch import Tensor
 
 from ..datamanagers.basis import Basis, fit_basis
 from ..datamanagers.config import GuidedConfig
+from ..datamanagers.scene import Scene as ParsedScene
 from ..errors import CheckpointError, DataError
 from ..interfaces import Encoder, Scene, SceneView, Stylizer, Values
 from ..ops.guided import upsample
@@ -35,6 +36,7 @@ from ..style.references import Encoders
 from ..style.scene import SceneStyle, membership, region_contacts, region_units, scene_style
 from ..style.scene import from_tensors as style_from
 from ..style.scene import to_tensors as style_tensors
+from ..training.camera_optimizers import Tones
 from ..types import Origin, View
 from .config import LookConfig
 from .gaussians import GaussianRows, Gaussians, bulk_of
@@ -107,6 +109,10 @@ class SplatScene(Scene):
     """Levels of detail of the Gaussians as captured, for scenes that are drawn merged."""
     origin: Origin = (0.0, 0.0, 0.0)
     """Origin of the Gaussians and the views."""
+    tones: Tones | None = None
+    """Exposures of the views, where a run has learnt them."""
+    poses: Callable[[ParsedScene, Sequence[int]], Annotated[Tensor, "V 6"]] | None = None
+    """Fits poses of views to their photographs (`fit_poses`); None = there are no photographs."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -206,6 +212,23 @@ class SplatScene(Scene):
         at = y.clamp(0, camera.height - 1) * camera.width + x.clamp(0, camera.width - 1)
         opacity = drawn.opacity.flatten()[at]
         return drawn.features.flatten(0, 1)[at] / opacity.clamp_min(1e-10)[:, None], opacity
+
+    def as_taken(self, view: int) -> "SplatScene":
+        if self.tones is None:
+            return self
+        # Of a view that was held out, what its exposure says.
+        red, green, blue = self.tones(torch.tensor([view]))[0].tolist()
+        return replace(self, tone=(red, green, blue))
+
+    def fit_poses(
+        self, captured: ParsedScene, views: Sequence[int], progress: Callable[[int, int, str], None]
+    ) -> Annotated[Tensor, "V 6"]:
+        progress(0, 1, "fitting poses")
+        return super().fit_poses(captured, views, progress) if self.poses is None else self.poses(captured, views)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        return {"gaussians": len(self.gaussians)}
 
     def restyled(self, look: Restyle | None) -> "SplatScene":
         """The same Gaussians in other colours."""

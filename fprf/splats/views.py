@@ -18,8 +18,7 @@ import torch
 from torch import Tensor
 
 from ..errors import DataError
-from ..fields.planes import harmonics as harmonic_functions
-from ..ops.harmonics import HARMONIC
+from ..ops.harmonics import HARMONIC, spherical_harmonics
 from ..ops.rasterise import Pinhole, Rasterised, lift, rasterise
 from ..ops.rasterise_reference import project_reference
 from ..rendering.cameras import Cameras
@@ -129,7 +128,7 @@ def seen_means(gaussians: Gaussians, cameras: Cameras, *, antialiased: bool) -> 
         direction = torch.nn.functional.normalize(gaussians.means - cameras.pose[view, :, 3].float(), dim=1)
         pixels = torch.ones(camera.height, camera.width, 1)
         weight = _UNSEEN + lift(*shape, camera, pixels, antialiased=antialiased)
-        functions += weight * harmonic_functions(direction, bands)
+        functions += weight * spherical_harmonics(direction, bands)
         opacities += weight * project_reference(*shape, camera, antialiased=antialiased).opacity[:, None]
         weights += weight
     constant = torch.zeros(bands**2)

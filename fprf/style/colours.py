@@ -135,7 +135,7 @@ def decoded_colours(
         points = (double(scene.region_mean[k]).cpu() + draw @ root).float().to(device)
         key = scene.keys[k].to(device).expand(len(points), -1)
         styled = blend_strength(points, stylizer(points, key if Want.SEMANTIC in stylizer.needs else None), features)
-        colour = double(decoder.restyled(points, styled, features)).cpu()
+        colour = double(decoder(styled)).cpu()
         means.append(colour.mean(0))
         covariances.append(torch.cov(colour.T, correction=0))
     return torch.stack(means), torch.stack(covariances)

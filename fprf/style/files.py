@@ -13,10 +13,10 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from .. import __version__
 from ..errors import ConfigError, DataError
 from ..io.atomic import write_json
 from ..plugins.codec import from_json, packages_of, read_json, to_json
@@ -77,7 +77,7 @@ def write_style(path: Path, file: StyleFile, made: Mapping[str, Any] | None = No
     masks = [p for p in style.masks if p != NO_MASK]
     whole = {
         "format": _FORMAT,
-        "fprf": __version__,
+        "fprf": version("fprf"),
         "plugins": packages_of(style),
         "style": to_json(_with_paths(style, partial(_stored, path))),
         "sha256": {_stored(path, p).as_posix(): _hash(p) for p in (*style.references, *masks)},

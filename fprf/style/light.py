@@ -16,8 +16,8 @@ A point of confidence p takes p paint(c) + (1 - p) light(c) + 4 p (1 - p) u_k. O
 takes it out of the middle where both are opposite along red and blue.
 
 Confidence is the rate at which matches of that score are right where a right one is as likely as none, on painted pairs of
-photographs (`benchmarks/match_confidence.py`). Scores count in spreads of the cosines between the scene's own regions: encoders
-differ in these as they do in the scores of unlike things.
+photographs (`benchmarks/semantic_matching.py`). Scores count in spreads of the cosines between the scene's own
+regions: encoders differ in these as they do in the scores of unlike things.
 """
 
 from collections.abc import Callable

@@ -99,8 +99,8 @@ class Restyle:
     ) -> Annotated[Tensor, "N 3"]:
         """Colours of points in this look, in [0, 1]."""
         shown = [(part, part._alone(content, semantic)) for part in self.parts if part.share > 0]
-        styled, strength, luminance = _mix([(part.share, acting.applied) for part, acting in shown])
-        colour: Tensor = decoder.restyled(content, styled, strength)
+        styled, _, luminance = _mix([(part.share, acting.applied) for part, acting in shown])
+        colour: Tensor = decoder(styled)
         lit = any(acting.paint is not None for _, acting in shown)
         own = decoder(content) if luminance > 0 or lit else colour
         changes = (change for part, acting in shown for change in part._recoloured(colour, own, semantic, acting))

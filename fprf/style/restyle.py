@@ -11,7 +11,7 @@ from torch import Tensor
 from ..errors import ConfigError, UsageError
 from ..interfaces import Scene
 from ..plugins.stylizers.config import StylizerConfig
-from ..rendering.plugin_checks import check_stylizer
+from ..testing.outputs import check_stylizer
 from .colours import own_colours
 from .config import NO_MASK, Place, StyleConfig, find_reference, labels, parse_place, parse_region_value, parse_strength
 from .controls import allowed_references
@@ -86,7 +86,7 @@ def dress(here: Scene, file: StyleFile, encoders: Encoders, dictionary: StyleDic
 
     def look(allowed: Annotated[Tensor, "K references"]) -> Restyle:
         stylizer = regional(dictionary, scene, allowed, chosen)
-        check_stylizer(chosen, stylizer, dictionary, scene)
+        check_stylizer(chosen, stylizer, dictionary, scene, affine=here.decoder is None and chosen.colours <= 0)
         stylizer = stylizer.to(device)
         colours = here.colour_maps(stylizer, dictionary, scene, chosen, allowed)
         moved = None if colours is None else colours.to(device)

@@ -93,12 +93,6 @@ class _Sigmoid(Decoder):
     def forward(self, content: Tensor) -> Tensor:
         return content[:, :3].sigmoid()
 
-    def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
-        return styled[:, :3].sigmoid()
-
-    def frozen_colour(self, content: Tensor) -> None:
-        return None
-
 
 def dictionary(codes: int, channels: int, dims: int) -> StyleDictionary:
     """Style codes of one reference."""

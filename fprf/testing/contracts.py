@@ -4,20 +4,25 @@ Each builds the plug-in from its config, as the program does, and raises Asserti
 breach. They take a second or so on a CPU and need no data but what is passed to them.
 """
 
+# A plug-in is asked whether it is of an abstract kind.
+# mypy: disable-error-code="type-abstract"
+
 import dataclasses
 import math
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from torch import nn
 
-from ..blocks.routing import shares
+from ..blocks import routing
+from ..blocks.config import LayoutConfig
 from ..datamanagers.config import DataManagerConfig
 from ..datamanagers.parsers.config import DataParserConfig
 from ..errors import DataError
 from ..fields.config import ContentFieldConfig, SemanticFieldConfig
-from ..fields.layouts import LayoutConfig
 from ..interfaces import (
     BlockLayout,
     ContentField,
@@ -44,7 +49,10 @@ from ..plugins.typed_json import from_json, to_json
 from ..rendering.renderer import render_rays
 from ..types import Batch, Rays, Rendered, Sampled, Want
 from . import cases
-from .breaches import Unread, close, follows, penalties, pointwise, require, same, same_parameters, tensor, trainable
+from .breaches import Unread, close, follows, penalties, pointwise, require, same, shares, tensor, trainable
+from .outputs import check_affine, check_needs
+
+Kind = TypeVar("Kind")
 
 
 def check_config(config: PluginConfig) -> None:
@@ -62,11 +70,26 @@ def check_config(config: PluginConfig) -> None:
     )
 
 
+def _built(config: PluginConfig, kind: type[Kind], build: Callable[[], object], *, again: bool = True) -> tuple[Kind, str]:
+    """The plug-in of a config that keeps to the rules of configs, and the name that sentences about it begin with.
+
+    `again` builds it twice, to see that its parameters come from the seed.
+    """
+    check_config(config)
+    made, name = build(), type(config).__name__
+    require(isinstance(made, kind), f"{name}: build() gives {type(made).__name__}, not an fprf.interfaces.{kind.__name__}")
+    assert isinstance(made, kind)
+    other = build() if again and isinstance(made, nn.Module) else None
+    if isinstance(made, nn.Module) and isinstance(other, nn.Module):
+        mine, theirs = made.state_dict(), other.state_dict()
+        equal = mine.keys() == theirs.keys() and all(torch.equal(mine[key], theirs[key]) for key in mine)
+        require(equal, f"{name}: its parameters must be drawn from the seed alone")
+    return made, name
+
+
 def check_encoder(config: EncoderConfig) -> None:
     """Any size, any batch, frozen, deterministic, finite, and with an identity that is the same each time."""
-    check_config(config)
-    encoder, name = config.build(), type(config).__name__
-    require(isinstance(encoder, Encoder), f"{name}: build() gives {type(encoder).__name__}, not an fprf.interfaces.Encoder")
+    encoder, name = _built(config, Encoder, config.build, again=False)
     require(not encoder.training, f"{name}: must be in evaluation mode")
     require(not any(p.requires_grad for p in encoder.parameters()), f"{name}: its parameters must not want gradients")
     require(config.build().identity == encoder.identity, f"{name}: identity must be the same for the same config")
@@ -81,6 +104,7 @@ def check_encoder(config: EncoderConfig) -> None:
         require(not features.requires_grad, f"{name}: features must not carry gradients to the weights")
         same(encoder(image), features, 0.0, f"{name}: must be deterministic")
         same(encoder(image[1:]), features[1:], 1e-3, f"{name}: an image's features must not depend on its batch")
+        # Half of it cut out, and all of it.
         opaque = torch.ones(2, height, width)
         same(encoder.cutout(image, opaque), features, 1e-3, f"{name}: what is opaque must have the features of the image")
         for opacity in ((torch.arange(width) < width // 2).float() * opaque, 0 * opaque):
@@ -97,90 +121,66 @@ def check_encoder(config: EncoderConfig) -> None:
 
 
 def check_decoder(config: DecoderConfig, *, encoder: str, channels: int) -> None:
-    """Colours in [0, 1], point by point; at strength 0, or without a change, those of the scene as it is.
-
-    `encoder` is the identity of an encoder that it has weights for.
-    """
-    check_config(config)
-    decoder, name = config.build(encoder=encoder, channels=channels), type(config).__name__
-    require(isinstance(decoder, Decoder), f"{name}: build() gives {type(decoder).__name__}, not an fprf.interfaces.Decoder")
-    same_parameters(decoder, config.build(encoder=encoder, channels=channels), name)
+    """Colours in [0, 1], point by point. `encoder` is the identity of an encoder that it has weights for."""
+    decoder, name = _built(config, Decoder, lambda: config.build(encoder=encoder, channels=channels))
     content = torch.cat([cases.normal(9, channels, seed=21), cases.normal(9, channels, seed=12) * 1e3])
-    colour = decoder(content)
-    tensor(colour, (18, 3), name)
-    require(bool(((colour >= 0) & (colour <= 1)).all()), f"{name}: colours must lie in [0, 1], for any features")
+    tensor(decoder(content), (18, 3), name, low=0.0, high=1.0)
     pointwise(lambda points: decoder(points), content, name)
-    styled = content.flip(0)
-    for strength in (0.0, 0.3, 1.0, cases.uniform(18, 1, seed=15)):
-        restyled = decoder.restyled(content, styled, strength)
-        tensor(restyled, (18, 3), f"{name}.restyled")
-        require(bool(((restyled >= 0) & (restyled <= 1)).all()), f"{name}.restyled: colours must lie in [0, 1]")
-        same(decoder.restyled(content, content, strength), colour, 1e-5, f"{name}.restyled: no change, no other colour")
-    same(decoder.restyled(content, content, 0.0), colour, 0.0, f"{name}.restyled: must be forward at strength 0")
-    pointwise(lambda points: decoder.restyled(points, points + 1, 0.6), content, f"{name}.restyled")
-    own = [parameter for parameter in decoder.parameters() if parameter.requires_grad]
-    alone = decoder.frozen_colour(content)
-    require(
-        (alone is None) == (not own), f"{name}.frozen_colour: colours where it has parameters to train, None where it is frozen"
-    )
-    if alone is not None:
-        tensor(alone, (18, 3), f"{name}.frozen_colour")
-        moved = torch.autograd.grad(alone.sum() + colour.sum(), own, allow_unused=True)
-        require(all(each is not None for each in moved), f"{name}: no gradient reaches a parameter that wants one")
+    trainable(decoder, decoder(content).sum(), name)
     decoder.double()
-    content, styled = content.double(), styled.double()
+    content = content.double()
     follows(lambda: decoder(content), content, name)
-    follows(lambda: decoder.restyled(content, styled, 0.6), content, f"{name}.restyled")
 
 
 def check_stylizer(config: StylizerConfig) -> None:
-    """Point by point, finite, honest about what it needs; its matches are shares of the style codes."""
-    check_config(config)
+    """Point by point, finite, honest about what it needs; its matches are shares of the style codes; affine in content unless
+    the config carries colours over."""
     name = type(config).__name__
-    for codes, regions, dims in ((5, 3, 4), (1, 1, 4), (2, 1, 0)):
-        stylizer = config.build(dictionary=cases.dictionary(codes, 8, dims), scene=cases.scene(regions, 8, dims))
-        require(isinstance(stylizer, Stylizer), f"{name}: build() gives {type(stylizer).__name__}, not a Stylizer")
-        require(Want.CONTENT in stylizer.needs, f"{name}: needs must hold Want.CONTENT")
-        allowed = Want.CONTENT | Want.SEMANTIC
-        require(stylizer.needs | allowed == allowed, f"{name}: may need content and semantics, and nothing else")
+
+    def check(codes: int, regions: int, dims: int) -> None:
+        dictionary, scene = cases.dictionary(codes, 8, dims), cases.scene(regions, 8, dims)
+        stylizer = _built(config, Stylizer, lambda: config.build(dictionary=dictionary, scene=scene))[0]
+        check_needs(stylizer, f"{name}: needs")
         content, semantic = cases.normal(11, 8, seed=22), cases.normal(11, dims, seed=13)
         given = semantic if Want.SEMANTIC in stylizer.needs else None
         styled = stylizer(content, given)
         tensor(styled, (11, 8), name)
         same(stylizer(content, given), styled, 0.0, f"{name}: must be deterministic")
-        some = None if given is None else given[:4]
-        same(stylizer(content[:4], some), styled[:4], 1e-4, f"{name}: a point must not depend on the others")
-        none = None if given is None else given[:0]
-        tensor(stylizer(content[:0], none), (0, 8), f"{name} of no points")
-        match = stylizer.match(semantic)
-        tensor(match, (11, codes), f"{name}.match")
-        whole = bool((match >= 0).all()) and close(match.sum(1), torch.ones(11), 1e-4)
-        require(whole, f"{name}.match: rows must be shares that sum to 1")
-        match = stylizer.region_match(cases.scene(regions, 8, dims).keys)
-        tensor(match, (regions, codes), f"{name}.region_match")
-        whole = bool((match >= 0).all()) and close(match.sum(1), torch.ones(regions), 1e-4)
-        require(whole, f"{name}.region_match: rows must be shares that sum to 1")
-        _stylizer_follows(stylizer.double(), content.double(), semantic.double(), name)
+        for some in (slice(0, 4), slice(0, 0)):
+            part = stylizer(content[some], None if given is None else given[some])
+            same(part, styled[some], 1e-4, f"{name}: a point must not depend on the others")
+        if config.colours <= 0:
+            check_affine(stylizer, content, given, name)
+        shares(stylizer.match(semantic), (11, codes), f"{name}.match")
+        shares(stylizer.region_match(scene.keys), (regions, codes), f"{name}.region_match")
+        stylizer.double()
+        wide = None if given is None else given.double()
+        follows(lambda: stylizer(content.double(), wide), content.double(), name)
+        follows(lambda: stylizer.match(semantic.double()), content.double(), f"{name}.match")
+
+    for codes, regions, dims in ((5, 3, 4), (1, 1, 4), (2, 1, 0)):
+        check(codes, regions, dims)
     if config.handles_allowed_references:
         both = cases.dictionary(4, 8, 4)._replace(reference=torch.tensor([0, 0, 1, 1]), names=("one", "other"))
         pinned = both._replace(allowed=torch.tensor([[True, False]] * 3))
         match = config.build(dictionary=pinned, scene=cases.scene(3, 8, 4)).match(cases.normal(11, 4, seed=23))
-        require(
-            not bool(match[:, 2:].any()),
-            f"{name}: handles_allowed_references is true, but codes that are not allowed are taken",
-        )
+        taken = bool(match[:, 2:].any())
+        require(not taken, f"{name}: handles_allowed_references is true, but codes that are not allowed are taken")
 
 
 def check_sampler(config: SamplerConfig) -> None:
     """Sorted edges between near and far, the same without a generator and with one of the same seed."""
-    check_config(config)
-    sampler, name = config.build(seed=0), type(config).__name__
-    require(isinstance(sampler, Sampler), f"{name}: build() gives {type(sampler).__name__}, not an fprf.interfaces.Sampler")
-    same_parameters(sampler, config.build(seed=0), name)
+    sampler, name = _built(config, Sampler, lambda: config.build(seed=0))
+
+    def sample(rays: Rays, seed: int | None) -> Sampled:
+        generator = None if seed is None else torch.Generator().manual_seed(seed)
+        found: Sampled = sampler(rays, space=cases.space(), step=None if seed is None else 10, generator=generator)
+        return found
+
     for count in (6, 1, 0):
         rays = cases.rays(count)
         for seed in (None, 3):
-            sampled, again = (_sample(sampler, rays, seed) for _ in range(2))
+            sampled, again = sample(rays, seed), sample(rays, seed)
             require(sampled.t.shape[0] == count and sampled.t.shape[1] >= 2, f"{name}: t must be [R E], E = samples + 1")
             tensor(sampled.s, tuple(sampled.t.shape), f"{name}: s")
             tensor(sampled.t, tuple(sampled.s.shape), f"{name}: t")
@@ -191,31 +191,26 @@ def check_sampler(config: SamplerConfig) -> None:
                 inside = (edges >= low[:, None] - slack) & (edges <= high[:, None] + slack)
                 require(bool(inside.all()), f"{name}: edges must lie between near and far")
             for level in sampled.levels:
-                shape = (count, level.s.shape[1] - 1)
-                tensor(level.weights, shape, f"{name}: weights of a proposal level")
-                require(bool((level.weights >= 0).all()), f"{name}: proposal weights must be at least 0")
+                tensor(level.weights, (count, level.s.shape[1] - 1), f"{name}: weights of a proposal level", low=0.0)
     sampler.double()
     penalties(sampler, name)
     rays = Rays(*(x.double() for x in cases.rays(6)))
     for seed in (None, 3):
-        follows(lambda seed=seed: _sample(sampler, rays, seed).t, rays.near, f"{name}: t")  # type: ignore[misc]
+        follows(lambda seed=seed: sample(rays, seed).t, rays.near, f"{name}: t")  # type: ignore[misc]
 
 
 def check_content_field(config: ContentFieldConfig) -> None:
     """Density at least 0, content of so many channels, a function of its seed, trainable in every parameter."""
-    check_config(config)
-    field, name = config.build(channels=7, seed=0), type(config).__name__
-    require(isinstance(field, ContentField), f"{name}: build() gives {type(field).__name__}, not a ContentField")
-    same_parameters(field, config.build(channels=7, seed=0), name)
+    field, name = _built(config, ContentField, lambda: config.build(channels=7, seed=0))
     points, view = cases.points(13), nn.functional.normalize(cases.normal(13, 3, seed=14), dim=1)
     sample = field.density(points)
-    tensor(sample.density, (13,), f"{name}: density")
-    require(bool((sample.density >= 0).all()), f"{name}: density must be at least 0")
+    tensor(sample.density, (13,), f"{name}: density", low=0.0)
     content = field.content(sample.latent, view)
     tensor(content, (13, 7), f"{name}: content")
-    same(field.content(sample.latent[4:9], view[4:9]), content[4:9], 1e-4, f"{name}: points must not depend on others")
+    for some in (slice(4, 9), slice(0, 0)):
+        part = field.content(sample.latent[some], view[some])
+        same(part, content[some], 1e-4, f"{name}: content: a point must not depend on the others")
     pointwise(lambda some: field.density(some).density, points, name)
-    tensor(field.content(sample.latent[:0], view[:0]), (0, 7), f"{name}: content of no points")
     trainable(field, sample.density.sum() + content.square().sum(), name)
     field.double()
     penalties(field, name)
@@ -227,10 +222,7 @@ def check_content_field(config: ContentFieldConfig) -> None:
 
 def check_semantic_field(config: SemanticFieldConfig) -> None:
     """Features of so many channels, a function of its seed, trainable in every parameter."""
-    check_config(config)
-    field, name = config.build(channels=5, seed=0), type(config).__name__
-    require(isinstance(field, SemanticField), f"{name}: build() gives {type(field).__name__}, not a SemanticField")
-    same_parameters(field, config.build(channels=5, seed=0), name)
+    field, name = _built(config, SemanticField, lambda: config.build(channels=5, seed=0))
     points = cases.points(13)
     features = field(points)
     tensor(features, (13, 5), name)
@@ -243,33 +235,26 @@ def check_semantic_field(config: SemanticFieldConfig) -> None:
 
 
 def check_layout(config: LayoutConfig) -> None:
-    """Boxes with room in them and orthonormal axes, from any site, and weights of them that sum to 1 everywhere."""
-    check_config(config)
-    layout, name = config.build(), type(config).__name__
-    require(isinstance(layout, BlockLayout), f"{name}: build() gives {type(layout).__name__}, not a BlockLayout")
+    """Cells with room in them and one border, from any site, and weights of them that sum to 1 everywhere."""
+    layout, name = _built(config, BlockLayout, config.build)
     for site in (cases.site(40, 200), cases.site(3, 0), cases.site(1, 0)):
-        boxes = layout.cut(site)
-        count = len(boxes.low)
-        require(count > 0, f"{name}: at least one block is needed")
-        shapes = (tuple(boxes.low.shape), tuple(boxes.high.shape), tuple(boxes.turn.shape))
-        require(shapes == ((count, 3), (count, 3), (count, 3, 3)), f"{name}: expected [Z 3], [Z 3] and [Z 3 3], found {shapes}")
-        require(bool((boxes.low < boxes.high).all()), f"{name}: a box's lowest corner must lie below its highest")
-        apart = (boxes.turn @ boxes.turn.mT - torch.eye(3, dtype=boxes.turn.dtype)).abs().amax()
-        require(float(apart) < 1e-6, f"{name}: the axes of a box must be orthonormal")
-        require(boxes.margin > 0 or count == 1, f"{name}: blocks need a margin above 0 to blend in")
-        points = 4 * cases.points(64)
-        weight = shares(points, boxes)
-        whole = bool((weight >= 0).all()) and close(weight.sum(1), torch.ones(64), 1e-4)
-        require(whole, f"{name}: weights must be at least 0 and sum to 1")
-        again = layout.cut(site)
-        require(torch.equal(again.low, boxes.low) and torch.equal(again.high, boxes.high), f"{name}: must be deterministic")
+        cells, again = layout.cut(site), layout.cut(site)
+        require(len(cells) > 0, f"{name}: at least one block is needed")
+        for cell, other in zip(cells, again, strict=True):
+            shapes = {tuple(each.shape) for each in (cell.low, cell.high, cell.border)}
+            require(shapes == {(3,)}, f"{name}: low, high and border must be [3], found {shapes}")
+            require(bool((cell.low < cell.high).all()), f"{name}: a cell's lowest corner must lie below its highest")
+            require(torch.equal(cell.border, cells[0].border), f"{name}: all cells must have the same border")
+            same = torch.equal(cell.low, other.low) and torch.equal(cell.high, other.high)
+            require(same, f"{name}: must be deterministic")
+        require(bool((cells[0].border > 0).all()) or len(cells) == 1, f"{name}: blocks need a border above 0 to blend in")
+        weight = routing.shares(4 * cases.points(64), cells).float()
+        shares(weight, (64, len(cells) + 1), f"{name}: weights of cells and surroundings")
 
 
 def check_parser(config: DataParserConfig, data: Path) -> None:
     """A scene of `data`, a folder of that format: rigid poses, cameras that fit the paths, disjoint splits."""
-    check_config(config)
-    parser, name = config.build(), type(config).__name__
-    require(isinstance(parser, DataParser), f"{name}: build() gives {type(parser).__name__}, not a DataParser")
+    parser, name = _built(config, DataParser, config.build)
     scene, half = parser.parse(data, 1), parser.parse(data, 2)
     count, cameras = len(scene.paths), scene.cameras
     require(count > 0 and len(cameras) == count, f"{name}: {count} paths but {len(cameras)} cameras")
@@ -309,7 +294,9 @@ def check_data_manager(config: DataManagerConfig) -> None:
         require(isinstance(manager, DataManager), f"{name}: build() gives {type(manager).__name__}, not a DataManager")
         batch, later = manager.batch(3), manager.batch(4)
         for other in (manager, again, manager.to(torch.device("cpu"), room=0)):
-            _same_batch(other.batch(3), batch, f"{name}: a batch must be a function of the seed and the step")
+            for mine, theirs in zip(other.batch(3), batch, strict=True):
+                equal = mine is theirs is None or (mine is not None and theirs is not None and torch.equal(mine, theirs))
+                require(equal, f"{name}: a batch must be a function of the seed and the step")
         count = len(batch.rgb)
         require(config.batch_rays() == count, f"{name}: batch_rays() must be the rays of a batch, {count}")
         require(not torch.equal(batch.pixel, later.pixel), f"{name}: another step must bring other pixels")
@@ -323,8 +310,7 @@ def check_data_manager(config: DataManagerConfig) -> None:
         require(bool(inside.all()), f"{name}: pixels must be centres, at +0.5, within their image")
         images = [manager.image(view) for view in range(len(scene.paths))]
         for image, (width, height) in zip(images, scene.cameras.size.tolist(), strict=True):
-            tensor(image, (height, width, 3), f"{name}: image")
-            require(bool(((image >= 0) & (image <= 1)).all()), f"{name}: images must lie in [0, 1]")
+            tensor(image, (height, width, 3), f"{name}: image", low=0.0, high=1.0)
         shown = torch.stack([images[v][y, x] for v, (x, y) in zip(batch.view.tolist(), corner.long().tolist(), strict=True)])
         same(batch.rgb, shown, 1e-6, f"{name}: rgb must be the colour of the pixel, as image() gives it")
         content, semantic = manager.content_store, manager.semantic_store
@@ -344,9 +330,7 @@ def check_data_manager(config: DataManagerConfig) -> None:
 
 def check_loss_term(config: LossTermConfig) -> None:
     """A finite scalar with a gradient, a function of render, batch, step and generator, which reads no number of the device."""
-    check_config(config)
-    term, name = config.build(), type(config).__name__
-    require(isinstance(term, LossTerm), f"{name}: build() gives {type(term).__name__}, not an fprf.interfaces.LossTerm")
+    term, name = _built(config, LossTerm, config.build)
     require(isinstance(term.needs, Want), f"{name}: needs must be a Want")
     parts, count = cases.parts(), 6
     rendered = render_rays(
@@ -383,9 +367,7 @@ def check_loss_term(config: LossTermConfig) -> None:
 
 def check_executor(config: ExecutorConfig) -> None:
     """Results in the order of the tasks; an error reaches the caller."""
-    check_config(config)
-    executor, name = config.build(), type(config).__name__
-    require(isinstance(executor, Executor), f"{name}: build() gives {type(executor).__name__}, not an Executor")
+    executor, name = _built(config, Executor, config.build)
     require(executor.map(math.factorial, [5, 0, 3]) == [120, 1, 6], f"{name}: results must be in the order of the tasks")
     require(executor.map(math.factorial, []) == [], f"{name}: no tasks, no results")
     try:
@@ -393,25 +375,6 @@ def check_executor(config: ExecutorConfig) -> None:
     except ValueError:
         return
     raise AssertionError(f"{name}: an error in a task must reach the caller")
-
-
-def _stylizer_follows(stylizer: Stylizer, content: torch.Tensor, semantic: torch.Tensor, name: str) -> None:
-    given = semantic if Want.SEMANTIC in stylizer.needs else None
-    follows(lambda: stylizer(content, given), content, name)
-    follows(lambda: stylizer.match(semantic), content, f"{name}.match")
-
-
-def _same_batch(one: Batch, other: Batch, breach: str) -> None:
-    for mine, theirs in zip(one, other, strict=True):
-        equal = mine is theirs is None or (mine is not None and theirs is not None and torch.equal(mine, theirs))
-        require(equal, breach)
-
-
-def _sample(sampler: Sampler, rays: Rays, seed: int | None) -> Sampled:
-    generator = None if seed is None else torch.Generator().manual_seed(seed)
-    step = None if seed is None else 10
-    sampled: Sampled = sampler(rays, space=cases.space(), step=step, generator=generator)
-    return sampled
 
 
 def check_capture_format(form: CaptureFormat) -> None:

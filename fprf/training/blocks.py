@@ -1,59 +1,41 @@
-"""Scenes of blocks: models of one block for training, folders, tasks that can be run anywhere and again.
-
-    RUN/blocks.json              the cut: boxes, rays and views of each block
-    RUN/blocks/NN/rays.safetensors      views and tiles that block NN learns from
-    RUN/blocks/NN/task.json      what the block is trained as; another one starts it anew
-    RUN/blocks/NN/checkpoints/, events.jsonl       as of any run
-    RUN/blocks/NN/block.safetensors, done.json     the finished fields, and that they are
-    RUN/blocks/surroundings/     the same for what no block holds
+"""Fields of a scene of blocks: a block for training, all of them for rendering, and the files of finished ones.
 
 The surroundings are trained first, on everything: a coarse scene. A block is trained inside of a copy of them, which goes on
 learning with it and is then dropped: so each ray is whole while a block learns its part, and what the block cannot explain
-does not end up as a veil in it. The block itself starts as what they have learnt of its place (`blocks.inherit`): a street of
-four blocks came out 1.9 dB better after 200 steps each than from seeded planes.
+does not end up as a veil in it. The block itself starts as what they have learnt of its place (`blocks.fields.inherit`): a
+street of four blocks came out 1.9 dB better after 200 steps each than from seeded planes.
+
+    RUN/blocks.json                      the partition
+    RUN/blocks/NN/block.safetensors      a finished block, and what was learnt with it; `surroundings` is what no block holds
 """
 
 import copy
-import hashlib
-import json
-import zlib
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections import OrderedDict
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from ..blocks.fields import BlockedField, BlockedSampler, BlockedSemantic, Held, Member, Members, inherit
-from ..blocks.plan import boxes_from, pixel_mask
-from ..blocks.routing import Everywhere, Inset, Router, chart_of, surroundings_of
-from ..config import RESUMABLE, TrainConfig
-from ..datamanagers.basis import Basis
-from ..datamanagers.scene import Scene
-from ..errors import CheckpointError, ConfigError
-from ..interfaces import DataManager, Decoder
-from ..io.atomic import write_json
-from ..io.strict_json import open_json
-from ..plugins.codec import from_json, to_json
-from ..rendering.plugin_checks import check_parts
+from ..blocks.partition import read_cells
+from ..blocks.routing import Blend, Everywhere, Inset, Router, chart_of, surroundings_of
+from ..config import TrainConfig
+from ..errors import CheckpointError
+from ..interfaces import Decoder
 from ..rendering.renderer import Parts
-from ..types import Boxes
+from ..testing.outputs import check_parts
+from ..types import Cell
 from . import tensorfiles
 from .camera_optimizers import Poses, Tones
-from .checkpoint import misfit, reached
+from .checkpoint import misfit
 from .model import Facts, Model, build_decoder, build_fields, poses_of, tones_of
-from .prepare import Prepared, build_encoders, cache_folder, scene_of
-from .run import Run, begin, held
-from .trainer import Report, train
+from .tasks import WHOLE, Done, read_done
 
-FREE = (*RESUMABLE, "blocks", "executor", "statistics", "render")
-"""Fields of a config that do not decide what a block of given bounds and rays learns."""
-RAYS = "rays.safetensors"
-"""In a block's folder: the views and tiles that it learns from."""
-SURROUNDINGS = -1
-"""The number of what no block holds."""
-_FORMAT = 1
+FILE = "block.safetensors"
+"""In a block's folder: its fields, and what was learnt with them."""
+_MIB = 1 << 20
 
 
 class Built(NamedTuple):
@@ -62,31 +44,25 @@ class Built(NamedTuple):
     model: Model
     member: Member
 
+    def kept(self) -> dict[str, nn.Module]:
+        """Parts that stay when a block is finished, by their names in its file."""
+        parts = {"member": self.member, "decoder": self.model.decoder, "tones": self.model.tones, "poses": self.model.poses}
+        return {kind: part for kind, part in parts.items() if part is not None}
 
-@dataclass(frozen=True, kw_only=True)
-class Done:
-    """Content of a block's done.json."""
-
-    format: int
-    asked: dict[str, Any]
-    """See `asked_of`."""
-    step: int
-    seconds: float
-    tensors: dict[str, Any]
-    """Manifest of block.safetensors."""
-
-
-class Finished(NamedTuple):
-    """A finished block."""
-
-    step: int
-    seconds: float
-    tensors: dict[str, Tensor]
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Take what is kept from the tensors of a finished block, which are not copied."""
+        for kind, part in self.kept().items():
+            restore(part, kind, tensors)
 
 
 def folder_of(root: Path, block: int) -> Path:
     """Folder of a block in a run."""
-    return root / "blocks" / ("surroundings" if block == SURROUNDINGS else f"{block:02d}")
+    return root / "blocks" / ("surroundings" if block == WHOLE else f"{block:02d}")
+
+
+def load_blocks(root: Path) -> list[Cell]:
+    """The blocks of a run. Raises CheckpointError where the file cannot be read."""
+    return read_cells(root / "blocks.json")
 
 
 def assemble(
@@ -99,36 +75,26 @@ def assemble(
     poses: Poses | None,
 ) -> Model:
     """A model whose points are routed to members."""
-    return Model(
-        Parts(
-            facts.space,
-            BlockedSampler(config.sampler.build(seed=config.seed), members, router),
-            BlockedField(members, router),
-            BlockedSemantic(members, router) if facts.dim else None,
-            decoder,
-        ),
-        tones,
-        poses,
-    )
+    sampler = BlockedSampler(config.sampler.build(seed=config.seed), members, router)
+    semantic = BlockedSemantic(members, router) if facts.dim else None
+    return Model(Parts(facts.space, sampler, BlockedField(members, router), semantic, decoder), tones, poses)
 
 
-def surroundings(config: TrainConfig, facts: Facts, boxes: Boxes) -> Built:
+def surroundings(config: TrainConfig, facts: Facts, cells: Sequence[Cell]) -> Built:
     """The coarse scene that everything starts from. Raises PluginError where a part breaks its contract at once."""
     decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
-    member = Member(surroundings_of(boxes), *build_fields(config, facts))
+    member = Member(surroundings_of(cells), *build_fields(config, facts))
     model = assemble(config, facts, Held([member]), Everywhere(), decoder, tones_of(facts), poses_of(config, facts))
     check_parts(config, model.parts, facts.channels, facts.dim)
     return Built(model, member)
 
 
-def inset(
-    config: TrainConfig, facts: Facts, boxes: Boxes, block: int, around: Built, views: Annotated[Tensor, "M"] | None = None
-) -> Built:
+def inset(config: TrainConfig, facts: Facts, cell: Cell, around: Built, views: Annotated[Tensor, "M"]) -> Built:
     """A block inside of a copy of its surroundings; decoder and tones are theirs, as they learnt them.
 
     Poses start as theirs too, and are refined further from the `views` that the block learns from.
     """
-    chart = chart_of(boxes, block)
+    chart = chart_of(cell)
     member = Member(chart, *build_fields(config, facts))
     inherit(member, around.member)
     decoder = copy.deepcopy(around.model.decoder).requires_grad_(False)
@@ -136,43 +102,20 @@ def inset(
     if tones is not None:
         tones.requires_grad_(False)
     if poses is not None:
-        others = set(range(len(facts.centres))) - set([] if views is None else views.tolist())
+        others = set(range(len(facts.centres))) - set(views.tolist())
         poses = poses.going_on(torch.tensor(facts.centres, dtype=torch.float64), tuple(sorted(others)))
     members = Held([member, copy.deepcopy(around.member)])
     return Built(assemble(config, facts, members, Inset(chart), decoder, tones, poses), member)
 
 
-def _kept(built: Built) -> dict[str, nn.Module]:
-    """Parts that stay when a block is finished, by their names in its file."""
-    model = built.model
-    parts = {"member": built.member, "decoder": model.decoder, "tones": model.tones, "poses": model.poses}
-    return {kind: part for kind, part in parts.items() if part is not None}
-
-
-def save_finished(folder: Path, built: Built, *, asked: dict[str, Any], step: int, seconds: float) -> None:
-    """Write the kept member and the decoder, then that the block is done."""
-    tensors = {f"{kind}.{name}": t for kind, part in _kept(built).items() for name, t in part.state_dict().items()}
-    manifest = tensorfiles.save(folder / "block.safetensors", tensors)
-    write_json(folder / "done.json", {"format": _FORMAT, "asked": asked, "step": step, "seconds": seconds, "tensors": manifest})
-
-
-def read_done(folder: Path) -> Done | None:
-    """done.json, or None where the block is not finished. Raises CheckpointError."""
-    file = folder / "done.json"
-    if not file.is_file():
-        return None
-    with open_json(file, "remove it and train again") as document:
-        return from_json(document, Done, path="done") if document["format"] == _FORMAT else None
-
-
-def load_finished(folder: Path, *, verify: bool = True) -> Finished:
-    """The tensors of a finished block, memory-mapped; verifying reads them all. Raises CheckpointError."""
+def load_finished(folder: Path, *, verify: bool = True) -> tuple[Done, dict[str, Tensor]]:
+    """A finished block; its tensors are memory-mapped, and verifying reads them all. Raises CheckpointError."""
     done = read_done(folder)
     if done is None:
         again = f"fprf train {folder.parent.parent / 'config.json'}"
         raise CheckpointError(f"{folder}: this block is not finished; go on with `{again}`")
-    file = folder / "block.safetensors"
-    return Finished(done.step, done.seconds, tensorfiles.load(file, done.tensors) if verify else tensorfiles.read(file))
+    file = folder / FILE
+    return done, tensorfiles.load(file, done.tensors) if verify else tensorfiles.read(file)
 
 
 def restore(module: nn.Module, kind: str, tensors: dict[str, Tensor]) -> None:
@@ -184,135 +127,58 @@ def restore(module: nn.Module, kind: str, tensors: dict[str, Tensor]) -> None:
     module.load_state_dict(own, assign=True)
 
 
-def restore_all(built: Built, tensors: dict[str, Tensor]) -> None:
-    """Give a member and the rest of its model the tensors of a finished block."""
-    for kind, part in _kept(built).items():
-        restore(part, kind, tensors)
+class Shelf(Members):
+    """Blocks of a run, fetched as they are asked for, the last used first; the surroundings always at hand.
 
-
-def load_boxes(root: Path) -> Boxes:
-    """Read the boxes of a run's blocks. Raises CheckpointError."""
-    with open_json(root / "blocks.json", "train the scene again") as document:
-        if document["format"] != 1:
-            raise ValueError(f"format {document['format']!r}, this fprf reads 1")
-        return boxes_from(document["boxes"])
-
-
-def asked_of(
-    config: TrainConfig, facts: Facts, scene: Scene, boxes: Boxes, block: int, rays: dict[str, Tensor]
-) -> dict[str, Any]:
-    """Settings and data of a block's training; while they stay the same, the block stays valid. `rays` is its rays.safetensors.
-
-    A block is decided by its bounds and rays, its images, and the config but for what may change, not by its surroundings:
-    they are only its frame.
+    At most `limit` bytes of them stay, one at least.
     """
-    tree = to_json(config)
-    assert isinstance(tree, dict)
-    knobs = {name: value for name, value in tree.items() if name not in FREE}
-    views = rays["views"].tolist()
-    # What the surroundings span follows from all blocks together, not from how they are cut.
-    chart = surroundings_of(boxes) if block == SURROUNDINGS else chart_of(boxes, block)
-    parts = {
-        "config": knobs,
-        "bounds": [t.tolist() for t in (chart.low, chart.high, chart.turn)],
-        "space": [facts.space.centre, facts.space.rotation, facts.space.scale, facts.space.near, facts.space.far],
-        "views": views,
-        "cameras": [scene.cameras.pose[views].tolist(), scene.cameras.focal[views].tolist()],
-        "facts": [facts.channels, facts.dim, facts.content_encoder, facts.semantic_encoder, facts.background, facts.exposure],
-    }
-    digest = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode() + rays["seen"].numpy().tobytes())
-    for view in views:
-        digest.update(zlib.crc32(scene.paths[view].read_bytes()).to_bytes(4, "little"))
-    return {"task": digest.hexdigest()[:32], "steps": config.steps, "minutes": config.minutes}
+
+    def __init__(self, root: Path, cells: Sequence[Cell], around: Member, *, device: torch.device, limit: int | None) -> None:
+        self.root, self.cells, self.device = root, cells, device
+        self.held = (around,)
+        self.verified: set[int] = set()
+        self._here: OrderedDict[int, Member] = OrderedDict()
+        size = sum(t.numel() * t.element_size() for t in around.state_dict().values())
+        self.room = None if limit is None else max(1, limit // size - 1)
+
+    @property
+    def here(self) -> tuple[int, ...]:
+        """Blocks in memory, the least recently used first."""
+        return tuple(self._here)
+
+    def member(self, number: int) -> Member:
+        """A block by its number; the surroundings come after the last one. Raises CheckpointError for a missing block."""
+        if number == len(self.cells):
+            return self.held[0]
+        if number in self._here:
+            self._here.move_to_end(number)
+            return self._here[number]
+        # Make room first, so that no more than the limit is ever in memory; checksums are looked at once.
+        while self.room is not None and len(self._here) >= self.room:
+            self._here.popitem(last=False)
+        member = copy.deepcopy(self.held[0])
+        member.chart = chart_of(self.cells[number])
+        _, tensors = load_finished(folder_of(self.root, number), verify=number not in self.verified)
+        restore(member, "member", tensors)
+        self.verified.add(number)
+        self._here[number] = member.requires_grad_(False).to(self.device).eval()
+        return member
 
 
-WARM_UP = 20
-"""Most steps of warm-up of a block: what it inherits is no random start, only Adam's averages are new."""
+def load_blocked(
+    root: Path, config: TrainConfig, facts: Facts, device: torch.device, max_memory: float | None
+) -> tuple[Model, int, float]:
+    """The blended model of a run's blocks, the steps of the one trained least, and the seconds of all together.
 
-
-@dataclass(frozen=True, kw_only=True)
-class BlockTask:
-    """Message to a worker; the rest lies in the run folder. Small, so that it can be sent to other machines."""
-
-    root: str
-    """Run folder."""
-    data: str
-    """Scene folder."""
-    block: int
-    """Number of the block, or SURROUNDINGS."""
-    minutes: float | None
-    """Its part of the time limit."""
-    quiet: bool = False
-    """Show nothing."""
-
-
-def train_block(task: BlockTask, report: Callable[[Report], None], begun: Callable[[Model], None] = lambda model: None) -> bool:
-    """Train a block to its end, from its newest checkpoint; False where it was finished already. `begun` is given its model.
-
-    A folder that was trained as something else (other bounds, rays, images or knobs) is started anew. Raises ConfigError
-    where the images are not those of the run, DataError where another process trains the block at this moment.
+    Blocks are fetched as they are met; at most `max_memory` MiB of them stay. Raises CheckpointError where one is missing.
     """
-    with held(folder_of(Path(task.root), task.block)):
-        return _train_held(task, report, begun)
-
-
-def _train_held(task: BlockTask, report: Callable[[Report], None], begun: Callable[[Model], None]) -> bool:
-    root = Path(task.root)
-    run, folder = Run(root), folder_of(root, task.block)
-    config = run.load_config()[0].fields_only(root)
-    facts, boxes, rays = run.load_known().facts, load_boxes(root), tensorfiles.read(folder / RAYS)
-    scene, views = scene_of(replace(config, data=Path(task.data)), facts), rays["views"]
-    if len(views) and int(views.max()) >= len(scene.paths):
-        raise ConfigError(f"{folder}: its views are not those of {scene.name}; train with the scene that the run was cut from")
-    asked = asked_of(config, facts, scene, boxes, task.block, rays)
-    done = read_done(folder)
-    if done is not None and done.asked == asked:
-        return False
-    config = replace(config, minutes=task.minutes)  # its part alone is not what was asked: it changes from call to call
-    begin(folder, {"task": asked["task"]})
-    own = replace(scene, train=views)
-    built = built_block(root, config, facts, boxes, task.block, views)
-    block_run = Run(folder)
-    prepared, lead = Prepared(own, _manager(run, config, facts, own, rays), facts, None), 0
-    if task.block != SURROUNDINGS:
-        lead = load_finished(folder_of(root, SURROUNDINGS), verify=False).step
-        config = replace(config, optimizer=replace(config.optimizer, warm_up=min(config.optimizer.warm_up, WARM_UP)))
-    begun(built.model)
-    train(config, prepared, block_run, report, model=built.model, lead=lead)
-    step, seconds = reached(block_run.checkpoints)
-    save_finished(folder, built, asked=asked, step=step, seconds=seconds)
-    return True
-
-
-def _manager(run: Run, config: TrainConfig, facts: Facts, scene: Scene, rays: dict[str, Tensor]) -> DataManager:
-    """The block's own batches: its views, its pixels, the whole scene's basis; features are in the cache."""
-    slots = {view: slot for slot, view in enumerate(rays["views"].tolist())}
-
-    def seen(view: int) -> Tensor:
-        width, height = scene.cameras.size[view].tolist()
-        return pixel_mask(rays["seen"][slots[view]].bool(), (width, height))
-
-    content, semantic = build_encoders(config)
-    return config.datamanager.build(
-        scene=scene,
-        content=content,
-        semantic=semantic if facts.dim else None,
-        dim=config.semantic.dim,
-        cache=cache_folder() / "features",
-        seed=config.seed,
-        basis=Basis.from_tensors(run.load_tensors("basis")) if facts.dim else None,
-        seen=seen,
-        background=facts.background,
-    )
-
-
-def built_block(root: Path, config: TrainConfig, facts: Facts, boxes: Boxes, block: int, views: Tensor) -> Built:
-    """The model of a block, inside of its finished surroundings."""
-    around = surroundings(config, facts, boxes)
-    if block == SURROUNDINGS:
-        return around
-    finished = load_finished(folder_of(root, SURROUNDINGS)).tensors
-    own = {name: tensor.clone() for name, tensor in finished.items()}  # training writes to them, the file stays
-    restore_all(around, own)
-    around.member.requires_grad_(True)
-    return inset(config, facts, boxes, block, around, views)
+    cells = load_blocks(root)
+    around = surroundings(config, facts, cells)
+    whole, tensors = load_finished(folder_of(root, WHOLE))
+    around.restore(tensors)
+    limit = None if max_memory is None else int(max_memory * _MIB)
+    shelf = Shelf(root, cells, around.member.to(device), device=device, limit=limit)
+    model = assemble(config, facts, shelf, Blend(cells), around.model.decoder, around.model.tones, around.model.poses)
+    model.requires_grad_(False)
+    done = [load_finished(folder_of(root, block), verify=False)[0] for block in range(len(cells))]
+    return model.to(device).eval(), min(each.step for each in done), whole.seconds + sum(each.seconds for each in done)

@@ -194,5 +194,4 @@ def toned(rendered: Rendered, tones: Tones | None, view: Annotated[Tensor, "R"])
     if tones is None or rendered.rgb is None:
         return rendered
     factor = tones(view)
-    frozen_rgb = None if rendered.frozen_rgb is None else rendered.frozen_rgb * factor
-    return rendered._replace(rgb=rendered.rgb * factor, frozen_rgb=frozen_rgb)
+    return rendered._replace(rgb=rendered.rgb * factor)

@@ -16,10 +16,10 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import CheckpointError, DataError
+from ..interfaces import State
 from ..io.atomic import remove_unfinished, write_json
 from ..io.strict_json import open_json
 from . import tensorfiles
-from .model import Model
 
 KEEP = 2
 """Checkpoints that stay on disk."""
@@ -34,6 +34,11 @@ class Saved(NamedTuple):
     model: dict[str, Tensor]
     optimizer: dict[str, Tensor]
 
+    @property
+    def state(self) -> State:
+        """As a learner takes it."""
+        return State(self.model, self.optimizer)
+
 
 def _folder(root: Path, step: int) -> Path:
     return root / f"step-{step:07d}"
@@ -47,11 +52,6 @@ def steps(root: Path) -> list[int]:
         if digits.isdecimal():
             numbers.append(int(digits))
     return sorted(numbers)
-
-
-def save(root: Path, model: Model, optimizer: torch.optim.Optimizer, *, step: int, seconds: float) -> Path:
-    """Write the checkpoint of a model and its optimiser (see `write`)."""
-    return write(root, model.state_dict(), _moments(optimizer), step=step, seconds=seconds)
 
 
 def write(root: Path, model: Mapping[str, Tensor], optimizer: Mapping[str, Tensor], *, step: int, seconds: float) -> Path:
@@ -95,12 +95,6 @@ def load(root: Path, step: int, *, verify: bool = True) -> Saved:
         tensorfiles.load(*files[name]) if verify else tensorfiles.read(files[name][0]) for name in ("model", "optimizer")
     )
     return Saved(step, manifest.seconds, model, optimizer)
-
-
-def reached(root: Path) -> tuple[int, float]:
-    """Step and seconds of the newest checkpoint, (0, 0) without one. Raises CheckpointError."""
-    kept = steps(root)
-    return (kept[-1], _read(root, kept[-1]).seconds) if kept else (0, 0.0)
 
 
 def digest(root: Path) -> str:
@@ -155,23 +149,23 @@ def misfit(module: nn.Module, tensors: Mapping[str, Tensor]) -> str | None:
     return wrong[0] if wrong else None
 
 
-def restore(saved: Saved, model: Model, optimizer: torch.optim.Optimizer | None) -> None:
-    """Put a checkpoint into a model and its optimiser. Raises CheckpointError where they are of another config."""
-    wrong = misfit(model, saved.model)
+def restore(state: State, model: nn.Module, optimizer: torch.optim.Optimizer | None) -> None:
+    """Put a state into a model and its optimiser. Raises CheckpointError where they are of another config."""
+    wrong = misfit(model, state.model)
     if wrong is not None:
-        raise CheckpointError(f"checkpoint of step {saved.step}: {wrong} does not fit the config; it was changed since")
-    model.load_state_dict(saved.model)
+        raise CheckpointError(f"{wrong} does not fit the config; it was changed since")
+    model.load_state_dict(state.model)
     if optimizer is None:
         return
-    state = optimizer.state_dict()
-    state["state"] = {}
-    for name, tensor in saved.optimizer.items():
+    moments: dict[int, dict[str, Tensor]] = {}
+    for name, tensor in state.optimizer.items():
         index, key = name.split(".", 1)
-        state["state"].setdefault(int(index), {})[key] = tensor
-    optimizer.load_state_dict(state)
+        moments.setdefault(int(index), {})[key] = tensor
+    optimizer.load_state_dict(optimizer.state_dict() | {"state": moments})
 
 
-def _moments(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+def moments_of(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """The tensors of an optimiser by the number of their parameter and their own name, as `restore` reads them."""
     return {
         f"{index}.{key}": value
         for index, values in optimizer.state_dict()["state"].items()

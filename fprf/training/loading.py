@@ -1,7 +1,7 @@
 """A trained run, ready to render; blocks of a large scene are fetched as they are met."""
 
-import copy
-from collections import OrderedDict
+import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Generic, NamedTuple, TypeVar
@@ -9,12 +9,12 @@ from typing import Annotated, Generic, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from ..blocks.fields import Member, Members
-from ..blocks.routing import Blend, chart_of
-from ..config import TrainConfig
+from ..config import IncompleteConfig, RunConfig, TrainConfig, fields_only
 from ..datamanagers.basis import Basis
-from ..errors import CheckpointError, WeightsError
+from ..datamanagers.scene import Scene as ParsedScene
+from ..errors import CheckpointError, PluginError, WeightsError
 from ..interfaces import Decoder, Scene, Stylizer, Values
+from ..plugins.registry import entry, load_object
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.cameras import Cameras
 from ..rendering.local_frame import local_origin
@@ -23,62 +23,20 @@ from ..style.dictionary import StyleDictionary
 from ..style.look import Restyle
 from ..style.references import Encoders
 from ..style.scene import SceneStyle, from_tensors
-from ..types import Boxes, Origin, View
+from ..types import Origin, View
 from . import checkpoint
-from .blocks import SURROUNDINGS, assemble, folder_of, load_boxes, load_finished, read_done, restore, restore_all, surroundings
+from .blocks import load_blocked
 from .model import Model, build_model
-from .prepare import device_of
+from .prepare import device_of, reach_of
 from .quality import QualityConfig, at_quality
 from .run import Known, Run
-from .views import CachedView, cache_view, paint_pixels, render_view
+from .style_pass import measure_style
+from .views import CachedView, cache_view, fit_pose, paint_pixels, render_view
 
-
-class Shelf(Members):
-    """Blocks of a run, the last used first; the surroundings always at hand."""
-
-    def __init__(
-        self,
-        root: Path,
-        boxes: Boxes,
-        around: Member,
-        *,
-        device: torch.device,
-        limit: int | None,
-    ) -> None:
-        self._root, self._boxes, self._device = root, boxes, device
-        self.held = (around,)
-        self._here: OrderedDict[int, Member] = OrderedDict()
-        self._verified: set[int] = set()
-        size = sum(t.numel() * t.element_size() for t in around.state_dict().values())
-        self._room = None if limit is None else max(1, limit // size - 1)
-
-    @property
-    def here(self) -> tuple[int, ...]:
-        """Blocks in memory, the least recently used first."""
-        return tuple(self._here)
-
-    def member(self, number: int) -> Member:
-        """A block by its number; the surroundings come after the last one. Raises CheckpointError for a missing block."""
-        if number == len(self._boxes.low):
-            return self.held[0]
-        if number in self._here:
-            self._here.move_to_end(number)
-            return self._here[number]
-        while self._room is not None and len(self._here) >= self._room:
-            self._here.popitem(last=False)
-        self._here[number] = member = self._fetch(number)
-        return member
-
-    def _fetch(self, number: int) -> Member:
-        member = copy.deepcopy(self.held[0])
-        member.chart = chart_of(self._boxes, number)
-        finished = load_finished(folder_of(self._root, number), verify=number not in self._verified)
-        restore(member, "member", finished.tensors)
-        self._verified.add(number)
-        return member.requires_grad_(False).to(self._device).eval()
-
-
-_MIB = 1 << 20
+SCENES = "fprf.scenes"
+"""Entry points by the `kind` of configs: functions `(run, config, device, quality) -> LoadedRun` that open their runs."""
+_FEW_RAYS = 2**14
+"""Rays that the style of a run in training is measured with: 0.2 s instead of seconds, and it changes soon."""
 S = TypeVar("S", bound=Scene, covariant=True)
 
 
@@ -110,6 +68,8 @@ class Trained(Scene):
     """A line for each newer checkpoint that could not be used."""
     look: Restyle | None = None
     """Look that it is rendered in; None = as it was captured."""
+    style: Callable[[], tuple[SceneStyle, Basis | None]] | None = None
+    """The scene's own statistics and basis; None = those of the run folder."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -152,6 +112,26 @@ class Trained(Scene):
     def restyled(self, look: Restyle | None) -> "Trained":
         return replace(self, look=look)
 
+    def as_taken(self, view: int) -> "Trained":
+        if self.model.tones is None:
+            return self
+        # Of a view that was held out, what its exposure says.
+        red, green, blue = self.model.tones(torch.tensor([view]))[0].tolist()
+        return replace(self, config=replace(self.config, render=replace(self.config.render, tone=(red, green, blue))))
+
+    def fit_poses(
+        self, captured: ParsedScene, views: Sequence[int], progress: Callable[[int, int, str], None]
+    ) -> Annotated[Tensor, "V 6"]:
+        facts, moves = self.known.facts, torch.zeros(len(self.names), 6, dtype=torch.float64)
+        reach = facts.reach if facts.centres else reach_of(captured, facts.space)
+        for done, view in enumerate(views):
+            progress(done, len(views), "fitting poses")
+            truth, where = self.known.photograph(captured, view, masks=self.config.masked)
+            budget = self.config.render.budget
+            moves[view] = fit_pose(self.model, facts, self.cameras, view, truth, where, reach=reach, budget=budget)
+        progress(len(views), len(views), "fitting poses")
+        return moves
+
     def cached(self, cameras: Cameras, view: int) -> CachedView:
         """A view with its geometry and features, as it was captured."""
         return cache_view(self.model, self.known.facts, cameras, view, self.config.render)
@@ -161,6 +141,15 @@ class Trained(Scene):
         return self.model.decoder
 
     def measured(self) -> tuple[SceneStyle, Basis | None]:
+        """Statistics as training has written them; while it goes on those of now, from few rays."""
+        if self.style is not None:
+            return self.style()
+        if not (self.run.root / "style.safetensors").is_file():
+            few = replace(self.config.statistics, rays=min(_FEW_RAYS, self.config.statistics.rays))
+            style = measure_style(
+                replace(self.config, statistics=few), self.model, self.known.cameras, torch.tensor(self.known.train)
+            )
+            return style, None if style.keys.shape[1] == 0 else Basis.from_tensors(self.run.load_tensors("basis"))
         return load_style(self.run)
 
     @torch.inference_mode()
@@ -183,14 +172,24 @@ class Trained(Scene):
 
 
 def open_run(root: Path, device: str = "auto", quality: QualityConfig | None = None) -> LoadedRun[Scene]:
-    """A run of any kind. Raises CheckpointError with what is missing, and UsageError for qualities that it does not know."""
-    return Run(root).load_config()[0].load(root, device, QualityConfig() if quality is None else quality)
+    """A run of any kind, by the function that the entry-point group `fprf.scenes` names for the kind of its config.
+
+    Of a run in training it is the newest checkpoint. Raises CheckpointError with what is missing, UsageError for qualities
+    that the kind does not know, PluginError where the kind is not installed.
+    """
+    run = Run(root)
+    config = run.load_config()[0]
+    opened = load_object(SCENES, config.kind)
+    if not callable(opened):
+        raise PluginError(f"{SCENES}: {config.kind!r} ({entry(SCENES, config.kind).origin}) is no function; mend that package")
+    loaded: LoadedRun[Scene] = opened(run, config, device, QualityConfig() if quality is None else quality)
+    return loaded
 
 
-def open_fields(root: Path, device: str, quality: QualityConfig) -> LoadedRun[Trained]:
+def open_fields(run: Run, config: RunConfig, device: str, quality: QualityConfig) -> LoadedRun[Trained]:
     """A run of fields."""
-    trained = at_quality(load_run(root, device, quality.max_memory), quality)
-    return LoadedRun(trained.run, trained.method, trained.known, trained.step, trained.seconds, trained)
+    trained = at_quality(load_run(run.root, device, quality.max_memory), quality)
+    return LoadedRun(run, trained.method, trained.known, trained.step, trained.seconds, trained)
 
 
 @torch.inference_mode()
@@ -217,15 +216,19 @@ def load_run(root: Path, device: str = "auto", max_memory: float | None = None) 
     """
     run = Run(root)
     saved_config, method = run.load_config()
-    config = saved_config.fields_only(root)
+    config = fields_only(saved_config, root)
     known = _in_local_frame(run.load_known())
+    if isinstance(config, IncompleteConfig) and not known.facts.channels:
+        package = json.loads(config.packages)["method"]
+        raise PluginError(f"{root}: {config.reason}; to open a scene of its kind install {package}")
     if known.facts.space.kind == "open":
-        return _load_blocks(run, config, method, known, device_of(device), max_memory)
+        blended, step, seconds = load_blocked(root, config, known.facts, device_of(device), max_memory)
+        return Trained(run, config, method, _where_refined(known, blended), blended, step, seconds)
     saved, damaged = checkpoint.load_latest(run.checkpoints)
     if saved is None:
         raise CheckpointError(f"{root}: no checkpoint yet; go on with `fprf train {root / 'config.json'} --output {root}`")
     model = build_model(config, known.facts)
-    checkpoint.restore(saved, model, None)
+    checkpoint.restore(saved.state, model, None)
     model.requires_grad_(False)
     model = model.to(device_of(device)).eval()
     return Trained(run, config, method, _where_refined(known, model), model, saved.step, saved.seconds, tuple(damaged))
@@ -247,29 +250,6 @@ def _in_local_frame(known: Known) -> Known:
 
 def _sum(a: Origin, b: Origin) -> Origin:
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
-def _load_blocks(
-    run: Run, config: TrainConfig, method: str, known: Known, device: torch.device, max_memory: float | None
-) -> Trained:
-    """The surroundings in memory, the blocks on a shelf."""
-    boxes, facts = load_boxes(run.root), known.facts
-    around = surroundings(config, facts, boxes)
-    finished = load_finished(folder_of(run.root, SURROUNDINGS))
-    restore_all(around, finished.tensors)
-    limit = None if max_memory is None else int(max_memory * _MIB)
-    shelf = Shelf(run.root, boxes, around.member.to(device), device=device, limit=limit)
-    model = assemble(config, facts, shelf, Blend(boxes), around.model.decoder, around.model.tones, around.model.poses)
-    model.requires_grad_(False)
-    blocks = [read_done(folder_of(run.root, block)) for block in range(len(boxes.low))]
-    done = [each for each in blocks if each is not None]
-    if len(done) < len(blocks):
-        again = f"fprf train {run.root / 'config.json'}"
-        raise CheckpointError(
-            f"{run.root}: {len(blocks) - len(done)} of {len(blocks)} blocks are not finished; go on with `{again}`"
-        )
-    steps, seconds = [each.step for each in done], finished.seconds + sum(each.seconds for each in done)
-    return Trained(run, config, method, _where_refined(known, model), model.to(device).eval(), min(steps), seconds)
 
 
 def _where_refined(known: Known, model: Model) -> Known:

@@ -14,8 +14,8 @@ from ..config import LossConfig
 from ..errors import ConfigError, PluginError
 from ..interfaces import LossTerm
 from ..plugins.registry import nearest
-from ..rendering.plugin_checks import check_term
 from ..rendering.stepfun import distortion, interlevel, midpoints
+from ..testing.outputs import check_term
 from ..types import Batch, Rendered, Want
 from .model import Facts, Model
 
@@ -42,7 +42,7 @@ def check_penalties(config: LossConfig, model: Model) -> None:
                 f"loss.penalties: no part of this model has a penalty {name!r}{nearest(name, known)} "
                 f"(penalties that can be named: {', '.join(known) or 'none'})"
             )
-    for name in sorted(names & _weights(config, 1.0).keys()):
+    for name in sorted(names & _weights(config).keys()):
         raise PluginError(f"a penalty of a field or a sampler is called {name!r}, the name of a loss term; rename it there")
 
 
@@ -79,9 +79,6 @@ def terms(
     result: dict[str, Tensor] = {}
     if rendered.rgb is not None and config.rgb > 0:
         result["rgb"] = F.mse_loss(rendered.rgb, batch.rgb)
-        if rendered.frozen_rgb is not None:
-            # Else the scene's own part of a decoder would do the frozen part's work, and a new style would have nothing.
-            result["unaided"] = F.mse_loss(rendered.frozen_rgb, batch.rgb)
     if config.content > 0 and rendered.content is not None and batch.content is not None:
         result["content"] = F.mse_loss(rendered.content, batch.content) / facts.content_scale**2
     if config.semantic > 0 and rendered.semantic is not None and batch.semantic is not None:
@@ -160,8 +157,7 @@ def _mean_of(values: Annotated[Tensor, "R"], mask: Annotated[Tensor, "R"]) -> Te
 
 def total(config: LossConfig, parts: dict[str, Tensor], share: float = 0.0) -> Tensor:
     """Weighted sum, when a share of the training is over."""
-    # Both colours of a decoder with a part of the scene's own share one weight: the regularisers keep theirs.
-    weights = _weights(config, config.rgb / 2 if "unaided" in parts else config.rgb)
+    weights = _weights(config)
     weights["depth"] *= FADE**share
     every = config.penalty_every
     return torch.stack(
@@ -169,11 +165,10 @@ def total(config: LossConfig, parts: dict[str, Tensor], share: float = 0.0) -> T
     ).sum()
 
 
-def _weights(config: LossConfig, colour: float) -> dict[str, float]:
+def _weights(config: LossConfig) -> dict[str, float]:
     """Weights of the terms other than penalties."""
     return {
-        "rgb": colour,
-        "unaided": colour,
+        "rgb": config.rgb,
         "content": config.content,
         "semantic": config.semantic,
         "interlevel": config.interlevel,

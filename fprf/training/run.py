@@ -17,24 +17,25 @@ import errno
 import hashlib
 import json
 import os
-import shutil
 import socket
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..config import RunConfig
+from ..datamanagers.images import load_image, load_mask
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError, DataError, UsageError
 from ..io.atomic import unwritable, write_json
 from ..io.strict_json import open_json, parse_json
 from ..plugins.codec import from_json, load_config, save_config
+from ..plugins.registry import nearest
 from ..rendering.cameras import Cameras
 from ..rendering.paths import well_covered
 from . import tensorfiles
@@ -67,6 +68,29 @@ class Known:
         if name == "covered":
             return tuple(well_covered(self.cameras, self.train, self.facts.space, _SHOWN))
         return {"train": self.train, "test": self.test, "all": tuple(range(len(self.names)))}[name]
+
+    def views(self, split: str, names: Sequence[str] = ()) -> list[int]:
+        """Views by name, or those of a split where none is named.
+
+        Raises UsageError for a name that the run does not hold, or a split without views.
+        """
+        held = list(self.names)
+        for name in names:
+            if name not in held:
+                raise UsageError(f"--views {name}: no such view in the run{nearest(name, held)} ({held[0]} … {held[-1]})")
+        views = [held.index(name) for name in names] or list(self.split(split))
+        if not views:
+            raise UsageError(f"--split {split}: the run holds no such views; choose another split")
+        return views
+
+    def photograph(
+        self, captured: Scene, view: int, *, masks: bool
+    ) -> tuple[Annotated[Tensor, "H W 3"], Annotated[Tensor, "H W"] | None]:
+        """The image of a view at the size of its camera, in [0, 1], and where it counts by the masks; None = everywhere."""
+        width, height = self.cameras.size[view].tolist()
+        image = torch.from_numpy(load_image(captured.paths[view], (width, height), self.facts.background)).float() / 255
+        mask = captured.masks[view] if captured.masks and masks else None
+        return image, None if mask is None else torch.from_numpy(load_mask(mask, (width, height)))
 
 
 @dataclass(frozen=True)
@@ -155,6 +179,19 @@ class Run:
             f.write(b"\n" * torn + json.dumps(event, allow_nan=False).encode() + b"\n")
 
 
+def known_of(scene: Scene, data: Path | None, facts: Facts) -> Known:
+    """The content of scene.json of a scene whose images lie in the folder `data`."""
+    return Known(
+        name=scene.name,
+        data=str(data or ""),
+        names=tuple(view_names(scene.paths)),
+        cameras=scene.cameras,
+        train=tuple(scene.train.tolist()),
+        test=tuple(scene.test.tolist()),
+        facts=facts,
+    )
+
+
 def view_names(paths: Sequence[Path]) -> list[str]:
     """The stems of images; where two agree (a folder per camera), with one or two folders above, else a number, before them."""
     for folders in range(3):
@@ -162,29 +199,6 @@ def view_names(paths: Sequence[Path]) -> list[str]:
         if len(set(names)) == len(names):
             return names
     return [f"{i:05d}-{p.stem}" for i, p in enumerate(paths)]
-
-
-_TASK = "task.json"
-
-
-def task_of(folder: Path) -> Any:
-    """Task that a block or cell was begun as; None where its task.json is absent or damaged, which is as good as not begun."""
-    try:
-        with open_json(folder / _TASK, "") as task:
-            return task
-    except CheckpointError:
-        return None
-
-
-def begin(folder: Path, task: object) -> None:
-    """Begin a block or cell as `task`, a JSON value, or resume it: what was trained there as another one is removed."""
-    (folder / "done.json").unlink(missing_ok=True)
-    if task_of(folder) == task:
-        return
-    shutil.rmtree(folder / "checkpoints", ignore_errors=True)
-    for name in (_TASK, "block.safetensors", "events.jsonl"):
-        (folder / name).unlink(missing_ok=True)
-    write_json(folder / _TASK, task)
 
 
 try:

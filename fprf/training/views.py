@@ -1,5 +1,6 @@
 """Whole images from a trained model, and views whose geometry and features are kept."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated
@@ -11,10 +12,11 @@ from ..config import RenderConfig
 from ..interfaces import Decoder, SceneView, Values
 from ..memory import chunk_size, in_parts
 from ..ops.precision import float64_device
-from ..rendering.cameras import Cameras, grid_rays, rays_through
+from ..rendering.cameras import Cameras, PixelRays, grid_rays, rays_through
 from ..rendering.renderer import Kept, composite, composite_mean, enlarged, march, march_features, render_rays, shade
 from ..style.look import Restyle
 from ..types import Rays, Rendered, View, Want
+from .camera_optimizers import moving, rotated
 from .model import Facts, Model, background_of
 
 
@@ -236,3 +238,52 @@ def view_parts(model: Model, facts: Facts, cameras: Cameras, view: int, config: 
         return Part(bare, content, semantic, behind, len(chunk.near), depth, opacity, samples, tone)
 
     yield from in_parts(len(rays.near), chunk_size(config.chunk, rays.near.device), part)
+
+
+FIT_STEPS = 120
+"""Steps of Adam that fit the pose of a view."""
+_FIT_RAYS, _FIT_RATE = 512, 2e-3
+"""Pixels of such a step; radians, and distances that views commonly see, of the first one, falling along a cosine to none."""
+
+
+def fit_pose(
+    model: Model,
+    facts: Facts,
+    cameras: Cameras,
+    view: int,
+    truth: Annotated[Tensor, "H W 3"],
+    where: Annotated[Tensor, "H W"] | None,
+    *,
+    reach: float,
+    budget: float,
+) -> Annotated[Tensor, "6"]:
+    """Turn and shift (world units), float64, that bring the render of a view nearest to its image, `where` that counts.
+
+    Where training refines poses the scene moves with the training views, and a held-out view stays where the capture says: its
+    pose is fitted to its own image (BARF, section 4), six numbers a view. The scene is not changed.
+    """
+    device, tones = model.device, model.tones
+    through, background = PixelRays(cameras.select(torch.tensor([view]))), background_of(facts, device)
+    factor = torch.ones(3) if tones is None else tones(torch.tensor([view]))[0].detach().cpu()
+    pixels, generator = truth.reshape(-1, 3), torch.Generator().manual_seed(view)
+    used = None if where is None or not bool(where.any()) else where.reshape(-1).nonzero()[:, 0]
+    move = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.Adam([move], lr=_FIT_RATE, betas=(0.9, 0.95))
+    for step in range(FIT_STEPS):
+        optimizer.param_groups[0]["lr"] = 0.5 * _FIT_RATE * (1 + math.cos(math.pi * step / FIT_STEPS))
+        at = torch.randint(len(pixels) if used is None else len(used), (_FIT_RAYS,), generator=generator)
+        at = at if used is None else used[at]
+        pixel = torch.stack([at % truth.shape[1], at // truth.shape[1]], -1) + 0.5
+        origin, direction = through(torch.zeros_like(at), pixel)
+        turned = rotated(direction, move[:3].expand_as(direction))
+        rays = moving(model.space.rays(origin + reach * move[3:], turned))
+        rays = Rays(*(x.to(device) for x in rays))
+        rendered = render_rays(rays, model.parts, want=Want.COLOUR, budget=budget, background=background)
+        assert rendered.rgb is not None
+        loss = (rendered.rgb.cpu() * factor - pixels[at]).square().mean()
+        optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        # Where no ray meets anything there is no slope.
+        if move.grad is not None and bool(move.grad.isfinite().all()):
+            optimizer.step()
+    return move.detach() * torch.tensor([1.0, 1, 1, reach, reach, reach], dtype=torch.float64)

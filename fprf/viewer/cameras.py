@@ -20,7 +20,7 @@ from ..rendering.cameras import Cameras
 from ..rendering.paths import pinhole
 from ..rendering.space import Space
 from ..rendering.splines import quaternions, rotations
-from ..types import Boxes
+from ..types import Cell
 
 Segments = NDArray[np.float32]
 """Line segments [N 2 3], page units."""
@@ -136,12 +136,10 @@ def camera_frustums(transform: PageTransform, cameras: Cameras, size: float, *, 
     return _segments(points, ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1), (4, 5), (5, 3)))
 
 
-def box_edges(transform: PageTransform, space: Space, boxes: Boxes) -> Segments:
+def box_edges(transform: PageTransform, space: Space, cells: Sequence[Cell]) -> Segments:
     """The edges of a scene's blocks."""
     bits = torch.tensor([[c >> k & 1 for k in range(3)] for c in range(8)], dtype=torch.float64)
-    turned = boxes.low[:, None] + (boxes.high - boxes.low)[:, None] * bits
-    # x lies in a cell where low <= turn x <= high, so a corner is turn^T of its own coordinates.
-    place = turned @ boxes.turn
+    place = torch.stack([cell.low + (cell.high - cell.low) * bits for cell in cells])
     rotation, centre = torch.tensor(space.rotation, dtype=torch.float64), torch.tensor(space.centre, dtype=torch.float64)
     return _segments(transform.to_page(place / space.scale @ rotation + centre), _EDGES)
 

@@ -22,7 +22,7 @@ from ..interfaces import Scene
 from ..io.images import to_uint8
 from ..rendering.cameras import pixel_grid
 from ..splats.scene import SplatScene
-from ..training.blocks import load_boxes
+from ..training.blocks import load_blocks
 from .cameras import CameraState, Segments, box_edges, camera_frustums, checked_camera, path_segments
 from .film import film_cameras
 from .gaussian_renderer import Colours, page_gaussians
@@ -183,7 +183,7 @@ class ViserFrontend(Frontend):
         self._lines("cameras", None if cameras is None else camera_frustums(transform, cameras, 0.04), _BLUE)
         boxes = None
         if panel.blocks and viewed.root is not None and viewed.space is not None and viewed.space.kind == "open":
-            boxes = box_edges(transform, viewed.space, load_boxes(viewed.root))
+            boxes = box_edges(transform, viewed.space, load_blocks(viewed.root))
         elif panel.blocks:
             self.notify("this scene is not cut into blocks")
         self._lines("blocks", boxes, _YELLOW)

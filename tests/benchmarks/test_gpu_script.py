@@ -53,15 +53,15 @@ def script(folder: Path, *words: str, fails: str = "nothing") -> tuple[int, list
 def test_a_failed_step_is_reported_and_the_others_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code, commands = script(tmp_path / "run", "--dry", fails="speed")
     assert code == 1, "what gpu_rows.py says"
-    assert [next(w for w in c if w in ("pytest", "train", "eval", "speed", "profiling", "roofline")) for c in commands] == [
-        "pytest", "train", "eval", "speed", "profiling", "roofline"
+    assert [next(w for w in c if w in ("pytest", "train", "eval", "speed", "profiling")) for c in commands] == [
+        "pytest", "train", "eval", "speed", "profiling"
     ]  # fmt: skip
     output = tmp_path / "gpu.json"
     monkeypatch.setattr(sys, "argv", ["gpu_rows.py", str(tmp_path / "run" / "work"), "--output", str(output)])
     assert gpu_rows.main() == 1
     found = json.loads(output.read_text())
     assert {each["step"]: each["passed"] for each in found["steps"]} == {
-        "tests": True, "train": True, "eval": True, "speed": False, "profile": True, "roofline": True
+        "tests": True, "train": True, "eval": True, "speed": False, "profile": True
     }  # fmt: skip
     rows = {row["name"]: row for row in found["rows"]}
     assert rows["held-out PSNR"]["goal"] == 26 and rows["held-out PSNR"]["goal_is"] == "at least"

@@ -30,8 +30,7 @@ from benchmarks.restyle import (
 )
 from benchmarks.single_image import encoded
 from benchmarks.town.surface import SKY
-from benchmarks.town.write import read_truth
-from benchmarks.town_truth import (
+from benchmarks.town.truth import (
     PARTS,
     Reference,
     Row,
@@ -44,6 +43,7 @@ from benchmarks.town_truth import (
     true_class_maps,
     true_views,
 )
+from benchmarks.town.write import read_truth
 from fprf.datamanagers.images import load_image
 from fprf.errors import DataError, UsageError
 from fprf.evaluation.metrics import psnr

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.color import rgb_to_lab
 from torch import Tensor
+from two_sided import region_adain
 
 from benchmarks.single_image import encoded, flat_scene, histogram_matching, reinhard, render_flat
 from benchmarks.styles import flat_reference, painted
@@ -14,12 +15,12 @@ from fprf.datamanagers.config import GuidedConfig
 from fprf.interfaces import Decoder, Encoder
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import BundledContentConfig
-from fprf.plugins.stylizers.config import RegionAdainConfig, RegionOtConfig, StylizerConfig
+from fprf.plugins.stylizers.config import RegionOtConfig, StylizerConfig
 from fprf.style.dictionary import build_dictionary
 from fprf.style.look import Restyle
 
 GUIDED = GuidedConfig()
-TWO_SIDED = [RegionAdainConfig(), RegionOtConfig()]
+TWO_SIDED = [region_adain(), RegionOtConfig()]
 
 
 def photo(seed: int, height: int = 40, width: int = 56) -> Tensor:

@@ -1,6 +1,7 @@
 """Scenes without images: cameras over a plane or along a path, and points that they see; rows of blocks."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -10,7 +11,7 @@ from fprf.blocks.routing import surroundings_of
 from fprf.datamanagers.scene import Scene
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import pinhole
-from fprf.types import Boxes
+from fprf.types import Cell
 
 
 def cameras_at(position: Tensor, ahead: Tensor, upright: Tensor, size: tuple[int, int] = (64, 48)) -> Cameras:
@@ -60,13 +61,23 @@ def drone(side: float = 90.0, rows: int = 7, height: float = 30.0, points: int =
     return scene_of(cameras_at(position, ahead, north), ground)
 
 
-def boxes_in_a_row(count: int, margin: float = 0.3) -> Boxes:
-    low = torch.tensor([[2.0 * i, -1.0, 0.0] for i in range(count)], dtype=torch.float64)
-    return Boxes(low, low + torch.tensor([2.0, 2.0, 1.5]), torch.eye(3, dtype=torch.float64).expand(count, 3, 3), margin)
+def cell(low: Sequence[float], high: Sequence[float], border: float) -> Cell:
+    corners = (torch.tensor(corner, dtype=torch.float64) for corner in (low, high, [border] * 3))
+    return Cell(**dict(zip(("low", "high", "border"), corners, strict=True)))
 
 
-def points_around(boxes: Boxes, count: int, seed: int = 5) -> Tensor:
+def row(count: int, border: float = 0.3) -> list[Cell]:
+    """Cells side by side along axis 0."""
+    return [cell((2.0 * i, -1.0, 0.0), (2.0 * i + 2.0, 1.0, 1.5), border) for i in range(count)]
+
+
+def grid(columns: int, rows: int, border: float = 0.2) -> list[Cell]:
+    """Unit cubes."""
+    return [cell((i, j, 0.0), (i + 1.0, j + 1.0, 1.0), border) for i in range(columns) for j in range(rows)]
+
+
+def points_around(cells: Sequence[Cell], count: int, seed: int = 5) -> Tensor:
     """Uniform in the bounds of all blocks, widened by 1."""
-    whole = surroundings_of(boxes)
+    whole = surroundings_of(cells)
     draw = torch.rand(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
     return (whole.low - 1 + draw * (whole.high - whole.low + 2)).float()

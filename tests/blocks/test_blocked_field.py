@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from block_scenes import boxes_in_a_row as row
-from block_scenes import points_around
+from block_scenes import points_around, row
 from torch import Tensor, nn
 
 from fprf.blocks.fields import BlockedField, BlockedSampler, BlockedSemantic, Held, Member, emission, inherit
@@ -15,7 +14,7 @@ from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.fields.planes import Planes
 from fprf.plugins.samplers.config import ProposalConfig
 from fprf.rendering.space import Space
-from fprf.types import Boxes, Rays
+from fprf.types import Cell, Rays
 
 CHANNELS, DIMS = 5, 4
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -32,9 +31,9 @@ def member(chart: Chart, seed: int, resolutions: tuple[int, int] = (4, 8)) -> Me
     return Member(chart, sampler, field.build(channels=CHANNELS, seed=seed), semantic.build(channels=DIMS, seed=seed))
 
 
-def members(boxes: Boxes, spread: float = 3.0) -> list[Member]:
+def members(cells: list[Cell], spread: float = 3.0) -> list[Member]:
     """One a block and one for the surroundings, with densities that differ widely."""
-    charts = [*(chart_of(boxes, block) for block in range(len(boxes.low))), surroundings_of(boxes)]
+    charts = [*(chart_of(cell) for cell in cells), surroundings_of(cells)]
     made = [member(chart, number) for number, chart in enumerate(charts)]
     with torch.no_grad():
         for number, each in enumerate(made):
@@ -52,9 +51,9 @@ class Counting(Held):
         return super().member(number)
 
 
-def plain(boxes: Boxes, parts: Sequence[Member], points: Tensor, view: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def plain(cells: list[Cell], parts: Sequence[Member], points: Tensor, view: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Density, content and semantics by a loop over points and members."""
-    weight = shares(points.double(), boxes)
+    weight = shares(points.double(), cells)
     densities, contents, semantics = [], [], []
     for p, v, w in zip(points, view, weight, strict=True):
         sigma, content, semantic = [], [], []
@@ -74,14 +73,14 @@ def plain(boxes: Boxes, parts: Sequence[Member], points: Tensor, view: Tensor) -
 
 @torch.no_grad()
 def test_against_a_loop() -> None:
-    boxes = row(3)
-    parts = members(boxes)
-    points = points_around(boxes, 150)
+    cells = row(3)
+    parts = members(cells)
+    points = points_around(cells, 150)
     view = torch.nn.functional.normalize(torch.randn(150, 3), dim=1)
-    held, router = Held(parts), Blend(boxes)
+    held, router = Held(parts), Blend(cells)
     field, semantic = BlockedField(held, router), BlockedSemantic(held, router)
     sample = field.density(points)
-    density, content, semantics = plain(boxes, parts, points, view)
+    density, content, semantics = plain(cells, parts, points, view)
     assert torch.allclose(sample.density.double(), density, rtol=3e-5, atol=0)
     assert torch.allclose(field.content(sample.latent, view).double(), content, rtol=1e-4, atol=1e-5)
     assert torch.allclose(semantic(points).double(), semantics, rtol=1e-4, atol=1e-5)
@@ -89,10 +88,10 @@ def test_against_a_loop() -> None:
 
 @torch.no_grad()
 def test_only_the_blocks_that_points_meet_are_asked() -> None:
-    boxes = row(6)
-    counting = Counting(members(boxes))
+    cells = row(6)
+    counting = Counting(members(cells))
     counting.asked = set()
-    field, semantic = BlockedField(counting, Blend(boxes)), BlockedSemantic(counting, Blend(boxes))
+    field, semantic = BlockedField(counting, Blend(cells)), BlockedSemantic(counting, Blend(cells))
     points = torch.tensor([[3.0, 0.0, 0.7], [3.9, 0.1, 0.7]])
     field.content(field.density(points).latent, torch.eye(3)[:2])
     semantic(points)
@@ -100,9 +99,9 @@ def test_only_the_blocks_that_points_meet_are_asked() -> None:
 
 
 @torch.no_grad()
-def jumps(boxes: Boxes, x: float, apart: float) -> list[float]:
+def jumps(cells: list[Cell], x: float, apart: float) -> list[float]:
     """Of log density, content and semantics between points `apart` on both sides of a plane; blocks that agree on nothing."""
-    held, router = Held(members(boxes, spread=1.0)), Blend(boxes)
+    held, router = Held(members(cells, spread=1.0)), Blend(cells)
     field, semantic = BlockedField(held, router), BlockedSemantic(held, router)
     draw = torch.Generator().manual_seed(0)
     y, z = torch.rand(400, generator=draw) * 1.2 - 0.6, torch.rand(400, generator=draw) * 0.7 + 0.4
@@ -136,11 +135,11 @@ def test_emission_is_exact_over_thirty_orders_of_magnitude() -> None:
 
 
 def test_an_inset_block_learns_inside_and_its_surroundings_outside() -> None:
-    boxes = row(2)
-    parts = members(boxes)
-    chart = chart_of(boxes, 0)
+    cells = row(2)
+    parts = members(cells)
+    chart = chart_of(cells[0])
     field = BlockedField(Held([parts[0], parts[2]]), Inset(chart))
-    points = points_around(boxes, 200)
+    points = points_around(cells, 200)
     inside = chart.inside(points)
     view = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)
     for chosen, learns, rests in ((inside, 0, 1), (~inside, 1, 0)):
@@ -162,8 +161,8 @@ def rays(count: int = 20) -> Rays:
 
 def test_the_sampler_asks_the_blocks_where_to_look() -> None:
     """One member everywhere is the sampler itself; blocks that differ give other edges."""
-    boxes = row(1)
-    parts = members(boxes)
+    cells = row(1)
+    parts = members(cells)
 
     class Charted(nn.Module):
         def __init__(self, inner: nn.Module) -> None:
@@ -182,7 +181,7 @@ def test_the_sampler_asks_the_blocks_where_to_look() -> None:
     found = lone(r, space=SPACE, step=0, generator=None)
     wanted = itself(r, space=SPACE, step=0, generator=None)
     assert torch.equal(found.t, wanted.t) and len(found.levels) == len(wanted.levels) == 2
-    blended = BlockedSampler(SAMPLER.build(seed=9), Held(parts), Blend(boxes))(r, space=SPACE, step=0, generator=None)
+    blended = BlockedSampler(SAMPLER.build(seed=9), Held(parts), Blend(cells))(r, space=SPACE, step=0, generator=None)
     assert not torch.equal(blended.t, wanted.t) and bool((blended.t[:, 1:] >= blended.t[:, :-1]).all())
 
 
@@ -203,11 +202,11 @@ def smooth(part: nn.Module) -> None:
 
 @pytest.mark.parametrize("block", [0, 1])
 def test_a_block_says_what_its_surroundings_say(block: int) -> None:
-    boxes = row(3, 0.2)
-    around, own = member(surroundings_of(boxes), 0, (9, 17)), member(chart_of(boxes, block), 7, (9, 17))
+    cells = row(3, 0.2)
+    around, own = member(surroundings_of(cells), 0, (9, 17)), member(chart_of(cells[block]), 7, (9, 17))
     smooth(around)
     inherit(own, around)
-    points = points_around(boxes, 2000)
+    points = points_around(cells, 2000)
     # Within the bounds of all blocks the contraction is linear, and so are these planes: nothing is lost.
     inner = points[around.chart.inside(points) & own.chart.inside(points)]
     assert len(inner) > 100

@@ -29,7 +29,7 @@ MINE = ENCODER.format(name="N") + "\nthing = NConfig"
     ("group", "name", "source", "shown"),
     [
         ("fprf.encoders", "x", "import not_there", "ModuleNotFoundError"),
-        ("fprf.encoders", "x", "from fprf.fields.layouts import SingleConfig as thing", "is SingleConfig, not a EncoderConfig"),
+        ("fprf.encoders", "x", "from fprf.blocks.config import SingleConfig as thing", "is SingleConfig, not a EncoderConfig"),
         ("fprf.encoders", "none", MINE, "can never be chosen"),
         ("fprf.encoders", "x", MINE.replace("int = 224", "int"), "no defaults"),
         ("fprf.encoders", "vgg19", MINE, "several packages provide 'vgg19'"),

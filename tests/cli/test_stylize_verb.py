@@ -56,7 +56,7 @@ def test_style_json_and_the_dictionary(run: Path, world: World, tmp_path: Path) 
 
 
 def test_a_style_file_is_the_same_style_again_and_flags_come_over_it(run: Path, world: World, tmp_path: Path) -> None:
-    wishes = ["--clusters", "3", "--pin", "0002:15,20=snow", "--keep", "1", "--luminance", "0.5", "--stylizer", "region-adain"]
+    wishes = ["--clusters", "3", "--pin", "0002:15,20=snow", "--keep", "1", "--luminance", "0.5", "--stylizer", "region-ot"]
     first = stylize(run, world, tmp_path / "a", *wishes)
     file = ["--style", str(tmp_path / "a" / "style.json")]
     again = ["stylize", str(run), "--split", "test", *file, "--output"]

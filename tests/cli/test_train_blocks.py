@@ -1,4 +1,4 @@
-"""`fprf train` with blocks on the command line: plan, train, judge, restyle."""
+"""`fprf train` with blocks on the command line: train, judge, restyle."""
 
 import json
 from pathlib import Path
@@ -6,23 +6,9 @@ from pathlib import Path
 import pytest
 from tiny_world import World, flags
 
-from fprf.cli.blocks import SHARE, block_minutes
 from fprf.cli.main import main
-from fprf.config import TrainConfig
 
-BLOCKS = ["--blocks", "street", "--blocks.segments", "2", "--steps", "4"]
-
-
-def test_the_plan_runs_nothing(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["train", "fprf-lite", *flags(world, tmp_path / "run"), *BLOCKS, "--plan"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert "fprf-lite on town: 8 training images" in lines[0]
-    assert lines[1].split() == ["block", "images", "rays", "size", "memory", "disk", "time"]
-    assert [line.split()[0] for line in lines[2:6]] == ["surroundings", "00", "01", "together"]
-    assert sorted(p.name for p in (tmp_path / "run").iterdir()) == ["plan.json", "plan.png"]
-    document = json.loads((tmp_path / "run/plan.json").read_text())
-    assert [row["name"] for row in document["blocks"]] == ["surroundings", "00", "01", "together"]
-    assert all(row["images"] and row["rays"] and row["memory_mib"] > 0 for row in document["blocks"])
+BLOCKS = ["--blocks", "grid", "--blocks.cells", "2", "1", "--steps", "4"]
 
 
 def test_from_training_to_styles(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -42,14 +28,3 @@ def test_from_training_to_styles(world: World, tmp_path: Path, capsys: pytest.Ca
     assert main(command) == 0
     assert "block 00 is finished already" in capsys.readouterr().err
     assert (run / "blocks/00/done.json").read_bytes() == before
-
-
-def test_time_is_shared_between_the_surroundings_and_the_blocks() -> None:
-    config = TrainConfig(minutes=10.0)
-    around, each = block_minutes(config, 4, 60.0)
-    assert around == pytest.approx(9 * SHARE) and each is not None
-    assert around + 4 * each == pytest.approx(9.0)
-    assert block_minutes(TrainConfig(), 4, 60.0) == (None, None)
-    # Features that took longer than the limit leave a little all the same.
-    late = block_minutes(config, 4, 1e4)
-    assert late[0] == pytest.approx(0.5 * SHARE)

@@ -6,7 +6,6 @@ import pytest
 from tiny_world import World, flags, parameters, same
 
 from fprf.cli import main as cli
-from fprf.cli.train import train_scene
 from fprf.datamanagers.batches import RayBatches
 from fprf.errors import UsageError
 from fprf.methods import fprf_lite
@@ -15,6 +14,7 @@ from fprf.plugins.config import Need
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import EncoderConfig
 from fprf.training import checkpoint
+from fprf.training.driver import train
 from fprf.training.run import Run
 
 
@@ -74,7 +74,7 @@ def test_everything_that_is_missing_is_listed_at_once(
     decoder = MlpDecoderConfig(weights=tmp_path / "none.safetensors")
     config = replace(fprf_lite(), semantic=semantic, content=replace(fprf_lite().content, decoder=decoder))
     with pytest.raises(UsageError, match="4 things are missing; `fprf doctor m` looks again"):
-        train_scene(config, "m")
+        train(config, "m")
     told = capsys.readouterr().err
     for part in ("odd fetch odd-1", "odd labels", "none.safetensors: no such weights file", "no scene is named"):
         assert part in told

@@ -98,8 +98,8 @@ def test_eval_copies_each_frame_once(world: World, tmp_path: Path) -> None:
 
 
 def test_poses_are_fitted_on_the_device(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    few = {"steps": 2, "rays": 32, "rate": 2e-3}
-    monkeypatch.setattr("fprf.evaluation.evaluate.AlignmentConfig.__init__.__kwdefaults__", few)
+    monkeypatch.setattr("fprf.training.views.FIT_STEPS", 2)
+    monkeypatch.setattr("fprf.training.views._FIT_RAYS", 32)
     found = []
     for device in ("cpu", DEVICE):
         shutil.copytree(world.run, tmp_path / device)

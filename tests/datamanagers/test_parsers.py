@@ -24,7 +24,6 @@ from capture_files import (
     write_transforms,
 )
 
-from fprf.datamanagers.parsers.colmap import model_folders
 from fprf.datamanagers.parsers.config import (
     ColmapConfig,
     DataParserConfig,
@@ -35,6 +34,7 @@ from fprf.datamanagers.parsers.config import (
     PolycamConfig,
     Record3DConfig,
     TransformsConfig,
+    model_folders,
     parse_scene,
     recognise,
 )

@@ -105,7 +105,7 @@ def test_a_strangers_parser_recognises_its_folders(tmp_path: Path) -> None:
         (PARSER.format(answer="True"), "TypeError"),
         (PARSER.format(answer='Recognised(2.0, "x")'), "ConfigError: confidence: 2.0 must lie in"),
         (PARSER.format(answer='Recognised(float("nan"), "x")'), "ConfigError"),
-        ("from fprf.fields.layouts import SingleConfig as ScanConfig", "not a DataParserConfig"),
+        ("from fprf.blocks.config import SingleConfig as ScanConfig", "not a DataParserConfig"),
     ],
 )
 def test_a_broken_parser_is_named_and_skipped(

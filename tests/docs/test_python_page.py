@@ -14,6 +14,7 @@ from tiny_world import World
 
 from fprf.methods import fprf_splats
 from fprf.splats.files import read_capture
+from fprf.training.driver import train
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 PAGE, NOTEBOOK = DOCS / "python.md", DOCS / "tour.ipynb"
@@ -45,7 +46,7 @@ def test_every_cell_runs_in_order_on_the_garden(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     few = replace(fprf_splats(), steps=10, initial=800, cap=900, downscale=8)
-    replace(few, data=Path(str(files("fprf") / "garden")), output=Path("demo/run")).verbs().train("fprf-splats", quiet=True)
+    train(replace(few, data=Path(str(files("fprf") / "garden")), output=Path("demo/run")), "fprf-splats", quiet=True)
     names: dict[str, object] = {}
     for number, source in enumerate(cells("code"), 1):
         exec(compile(source, f"cell {number}", "exec"), names)

@@ -12,7 +12,7 @@ from torch import Tensor
 from benchmarks.town.layout import build_town
 from benchmarks.town.palettes import palette
 from benchmarks.town.render import geometry, render, walk
-from benchmarks.town_truth import short_path, town_view
+from benchmarks.town.truth import short_path, town_view
 from fprf.errors import DataError, NumericsError
 from fprf.evaluation.consistency import consistency, published, steadiness, warp
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through

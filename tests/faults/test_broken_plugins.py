@@ -17,9 +17,9 @@ from torch import Tensor
 from fprf.errors import PluginError
 from fprf.interfaces import Stylizer
 from fprf.plugins.stylizers.config import StylizerConfig
-from fprf.rendering.plugin_checks import check_parts, check_stylizer
 from fprf.style.scene import own_style
 from fprf.testing import cases
+from fprf.testing.outputs import check_parts, check_stylizer
 from fprf.training.model import build_model
 from fprf.types import FieldSample, Want
 

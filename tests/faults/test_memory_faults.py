@@ -74,8 +74,8 @@ print(json.dumps({"tried": tries, "apart": [float((a - b).abs().max() / b.abs().
 """
 
 TRAIN = """
-from fprf.training import trainer
-before, keep = trainer.Loop.step, []
+from fprf.training import learner
+before, keep = learner.FieldLearner.step, []
 
 def step(self, step, share):
     if step == 4:
@@ -87,7 +87,7 @@ def step(self, step, share):
             del keep[-3:]
     return before(self, step, share)
 
-trainer.Loop.step = step
+learner.FieldLearner.step = step
 raise SystemExit(cli.main(["train", "fprf-lite", *sys.argv[1:]]))
 """
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import safetensors.torch
 import torch
-from tiny_world import World, after_one_step
+from tiny_world import World, after_one_step, save_checkpoint
 
 from fprf.errors import CheckpointError, DataError
 from fprf.training import checkpoint
@@ -59,7 +59,7 @@ def root(trainer: Trainer, tmp_path: Path) -> Path:
     model, optimizer = trainer
     for step in (5, 9):
         mark(model, step)
-        checkpoint.save(tmp_path / "c", model, optimizer, step=step, seconds=step / 2)
+        save_checkpoint(tmp_path / "c", model, optimizer, step=step, seconds=step / 2)
     return tmp_path / "c"
 
 
@@ -71,7 +71,7 @@ def mark(model: Model, step: int) -> None:
 def marked(root: Path, model: Model) -> tuple[int, float]:
     saved, damaged = checkpoint.load_latest(root)
     assert saved is not None and not damaged
-    checkpoint.restore(saved, model, None)
+    checkpoint.restore(saved.state, model, None)
     return saved.step, float(model.learned()[0].detach().view(-1)[0])
 
 
@@ -86,7 +86,7 @@ def test_a_save_that_dies_at_any_call_leaves_the_old_or_the_new(root: Path, trai
             calls = count()
             for name in ("open", "fsync", "replace", "unlink", "rmdir", "mkdir", "close"):
                 monkeypatch.setattr(os, name, deadly(getattr(os, name), calls, at))
-            checkpoint.save(root, model, optimizer, step=12, seconds=6.0)
+            save_checkpoint(root, model, optimizer, step=12, seconds=6.0)
 
         code = forked(save)
         found = marked(root, model)
@@ -102,7 +102,7 @@ def test_a_save_that_dies_at_any_call_leaves_the_old_or_the_new(root: Path, trai
         shutil.rmtree(root)
         for step in (5, 9):
             mark(model, step)
-            checkpoint.save(root, model, optimizer, step=step, seconds=step / 2)
+            save_checkpoint(root, model, optimizer, step=step, seconds=step / 2)
     assert code == 0 and checkpoint.steps(root) == [9, 12]
     assert seen == sorted(seen) and seen.count(9) > 8 and seen.count(12) > 2, "kills before and after the manifest"
 
@@ -114,7 +114,7 @@ def test_a_file_that_the_system_cuts_off_is_one_line_and_costs_nothing(root: Pat
     def save() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
         try:
-            checkpoint.save(root, model, optimizer, step=12, seconds=6.0)
+            save_checkpoint(root, model, optimizer, step=12, seconds=6.0)
         except DataError as error:
             os.write(handle, str(error).encode())
 

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
-from fprf.fields.planes import LIMIT, PlanesField, density, harmonics
+from fprf.fields.planes import LIMIT, PlanesField, density
+from fprf.ops.harmonics import spherical_harmonics as harmonics
 from fprf.testing import check_content_field, check_semantic_field
 
 SMALL = PlanesConfig(resolutions=(4, 9), channels=8, hidden=16)

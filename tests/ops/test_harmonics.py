@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from fprf.fields.planes import harmonics as functions
 from fprf.ops.harmonics import HARMONIC, MAX_COLOUR, Directions, as_drawn, recoloured, recoloured_reference
+from fprf.ops.harmonics import spherical_harmonics as functions
 from fprf.splats.restyle import all_around
 
 U = 2.0**-24

@@ -13,7 +13,7 @@ from photo_folder import photo_folder, vgg_file
 from fprf.cli.pretrain import run
 from fprf.errors import WeightsError
 from fprf.methods import fprf_lite
-from fprf.plugins.decoders.config import MlpDecoderConfig, ResidualDecoderConfig
+from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.plugins.weights import read_weights
 from fprf.pretraining.loop import report_path, samples_folder
@@ -70,5 +70,5 @@ def test_the_line_that_users_are_told_makes_a_decoder_that_fits(photos: Path, tm
         build_decoder(config, encoder=encoder.build().identity, channels=4)
     line = str(raised.value).split("`")[1].replace("DIR", str(photos)).replace("decoder.safetensors", str(output))
     assert run([*shlex.split(line)[2:], "--steps", "1", "--pixels", "20", "--samples", "0"]) == 0
-    fitting = replace(config, content=replace(config.content, decoder=ResidualDecoderConfig(weights=output)))
+    fitting = replace(config, content=replace(config.content, decoder=MlpDecoderConfig(weights=output)))
     build_decoder(fitting, encoder=encoder.build().identity, channels=4)

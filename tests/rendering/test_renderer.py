@@ -235,20 +235,3 @@ def test_a_pose_learns_from_what_is_seen_but_not_from_semantics() -> None:
     assert gradient.isfinite().all() and (gradient.norm(dim=1) > 0).all()
     assert torch.autograd.grad(other.semantic.sum(), moved.origin, allow_unused=True, retain_graph=True) == (None,)
     assert not other.sampled.t.requires_grad
-
-
-class Aided(Squash):
-    """A decoder with a part that helps it: alone it answers half."""
-
-    def frozen_colour(self, content: Tensor) -> Tensor:  # type: ignore[override]
-        return self(content) / 2
-
-
-def test_training_also_renders_what_the_decoder_says_alone() -> None:
-    parts, rays = parts_of()._replace(decoder=Aided()), rays_of("contraction", 4)
-    behind = torch.tensor([0.2, 0.4, 0.6])
-    found = render_rays(rays, parts, want=Want.COLOUR, budget=0.0, step=0, background=behind)
-    transmittance = 1 - found.opacity[:, None]
-    assert found.rgb is not None and found.frozen_rgb is not None
-    assert torch.allclose(found.frozen_rgb - transmittance * behind, (found.rgb - transmittance * behind) / 2, atol=1e-5)
-    assert render_rays(rays, parts, want=Want.COLOUR, budget=0.0).frozen_rgb is None

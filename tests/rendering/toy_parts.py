@@ -22,12 +22,6 @@ class Squash(Decoder):
     def forward(self, content: Tensor) -> Tensor:
         return torch.sigmoid(content[:, :3])
 
-    def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
-        return self(styled)
-
-    def frozen_colour(self, content: Tensor) -> None:
-        return None
-
 
 class Uniform(ContentField):
     """One density everywhere, or one for each of the samples; one content everywhere."""

@@ -17,10 +17,10 @@ from splat_ball import ball
 
 from fprf.cli import main as cli
 from fprf.errors import DataError
-from fprf.fields.planes import harmonics as functions
-from fprf.ops.rasterise_reference import _rotations
+from fprf.ops.harmonics import spherical_harmonics as functions
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.rendering.local_frame import read_offset
+from fprf.rendering.splines import rotations
 from fprf.splats.config import LookConfig
 from fprf.splats.files import Capture, Written, read_capture, write_capture, write_gaussians
 from fprf.splats.files.ply import ply_bytes
@@ -302,7 +302,7 @@ def test_comments_say_what_points_up(said: str, up: tuple[float, ...] | None, en
 @pytest.mark.parametrize("legacy", [False, True])
 def test_the_camera_in_a_file_is_the_first_view(legacy: bool, tmp_path: Path) -> None:
     made = ball(400)
-    turn = _rotations(torch.tensor([[0.9, 0.1, -0.3, 0.2]]).double())[0].numpy()  # world to camera
+    turn = rotations(torch.tensor([[0.9, 0.1, -0.3, 0.2]]).double())[0].numpy()  # world to camera
     place = np.array([[0.3], [-0.2], [4.0]])
     world = np.concatenate([turn.T if legacy else turn, place], 1).astype("<f4")
     if not legacy:
@@ -422,7 +422,7 @@ def test_a_spz_says_its_axes(number: int, tmp_path: Path) -> None:
     assert torch.allclose(found.means.double(), plain.means.double() @ change.T)
 
     def covariance(of: Gaussians) -> torch.Tensor:
-        half = _rotations(of.quaternions.double()) * of.log_scales.double().exp()[:, None]
+        half = rotations(of.quaternions.double()) * of.log_scales.double().exp()[:, None]
         return half @ half.mT
 
     assert torch.allclose(covariance(found), change @ covariance(plain) @ change.T, atol=1e-6)

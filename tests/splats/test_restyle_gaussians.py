@@ -12,9 +12,9 @@ from splat_ball import ball
 
 from fprf.cli import main as cli
 from fprf.errors import CheckpointError, ConfigError, DataError, UsageError
-from fprf.fields.planes import harmonics as functions
 from fprf.interfaces import Encoder
 from fprf.ops.harmonics import as_drawn
+from fprf.ops.harmonics import spherical_harmonics as functions
 from fprf.plugins.encoders.config import BundledSemanticConfig, RandomConfig
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from fprf.splats.config import LookConfig

@@ -1,4 +1,4 @@
-"""Scenes in cells: the cut covers space once, cells can be lost and trained again, and their union is the scene."""
+"""Scenes in cells: what each goes on from, what it sees, and their union."""
 
 import json
 import shutil
@@ -10,14 +10,13 @@ import pytest
 import torch
 
 from benchmarks.town.write import write_town
+from fprf.blocks.partition import bisect_sightings
 from fprf.cli.main import main
 from fprf.datamanagers.parsers.config import parse_scene
-from fprf.datamanagers.scene import Scene, find_sightings
 from fprf.io.images import write_image
 from fprf.plugins.codec import load_config, save_config
-from fprf.splats import cell_training
-from fprf.splats.cell_training import CellTask, read_cells, train_cell
-from fprf.splats.cells import Cell, cut
+from fprf.splats import cells
+from fprf.splats.cells import CellPart, load_cells, open_cell
 from fprf.splats.config import GaussiansConfig
 from fprf.splats.files import read_capture
 from fprf.splats.learner import MOVES
@@ -25,8 +24,7 @@ from fprf.training.camera_optimizers import Tones
 from fprf.training.checkpoint import load_latest
 from fprf.training.loading import open_run
 from fprf.training.run import Run
-
-COUNT = 3
+from fprf.training.tasks import Task
 
 
 @pytest.fixture(scope="module")
@@ -42,49 +40,11 @@ def command(town: Path, run: Path, *flags: str) -> list[str]:
     return ["train", "fprf-splats", "--data", str(town), *small, *flags, "--output", str(run)]
 
 
-@pytest.fixture(scope="module")
-def scene(town: Path) -> Scene:
-    return parse_scene(town, 1, None)
-
-
-@pytest.fixture(scope="module")
-def cells(scene: Scene) -> list[Cell]:
-    return cut(scene, COUNT)
-
-
-def test_cells_cover_space_once_and_have_equally_many_sightings(scene: Scene, cells: list[Cell]) -> None:
-    draw = torch.Generator().manual_seed(0)
-    points = 1e3 * torch.randn(1000, 3, generator=draw, dtype=torch.float64) ** 3
-    assert torch.stack([cell.holds(points) for cell in cells]).sum(0).eq(1).all()
-    sightings = find_sightings(scene)
-    assert sightings is not None
-    shares = torch.stack([cell.holds(sightings.point).double().mean() for cell in cells])
-    assert (shares - 1 / COUNT).abs().max() < 0.02
-
-
-def test_windows_show_their_points_through_their_cameras(scene: Scene, cells: list[Cell]) -> None:
-    sightings = find_sightings(scene)
-    assert sightings is not None
-    for cell in cells:
-        assert not {*cell.windows} - {*scene.train.tolist()}
-        own = cell.scene(scene)
-        found = find_sightings(replace(own, seen=None))
-        assert found is not None and {*found.view.tolist()} == {*cell.windows}
-        mine = cell.holds(sightings.point)
-        inside = torch.zeros_like(mine)
-        for view, (left, top, width, height) in cell.windows.items():
-            x, y = sightings.pixel.unbind(1)
-            inside |= (sightings.view == view) & (x >= left) & (x < left + width) & (y >= top) & (y < top + height)
-        assert inside[mine].double().mean() > 0.9  # outliers and views with few points are left out
-
-
-def test_windows_of_a_photograph_reach_its_edges(scene: Scene, cells: list[Cell]) -> None:
-    for view in {view for cell in cells for view in cell.windows}:
-        width, height = scene.cameras.size[view].tolist()
-        windows = [cell.windows[view] for cell in cells if view in cell.windows]
-        assert min(left for left, _, _, _ in windows) == min(top for _, top, _, _ in windows) == 0
-        assert max(left + wide for left, _, wide, _ in windows) == width
-        assert max(top + tall for _, top, _, tall in windows) == height
+def part_of(run: Path, data: Path, cell: int) -> CellPart:
+    """A cell of a run, ready to be trained."""
+    part = open_cell(Task(root=str(run), data=str(data), part=cell, minutes=None))
+    assert isinstance(part, CellPart)
+    return part
 
 
 def test_a_run_of_before_with_its_rounds_is_read(tmp_path: Path) -> None:
@@ -96,39 +56,24 @@ def test_a_run_of_before_with_its_rounds_is_read(tmp_path: Path) -> None:
     assert load_config(file) == (GaussiansConfig(cells=3), "fprf-splats")
 
 
-def test_a_lost_cell_is_trained_again_and_changes_nothing(town: Path, scene: Scene, cells: list[Cell], tmp_path: Path) -> None:
+def test_the_union_holds_each_cell_s_own_and_workers_read_their_views_alone(town: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    words = command(town, run, "--cells", str(COUNT))
+    words = command(town, run, "--cells", "3")
     assert main(words) == 0
-
-    def exported(name: str) -> bytes:
-        assert main(["export", str(run), "ply", "--output", str(tmp_path / name)]) == 0
-        return (tmp_path / name).read_bytes()
-
-    first = exported("a.ply")
-    stamps = {path: path.stat().st_mtime_ns for path in run.glob("**/done.json")}
-    assert len(stamps) == 1 + COUNT
-    shutil.rmtree(run / "cells" / "01")
-    assert main(words) == 0
-    assert exported("b.ply") == first
-    changed = [path.parent.relative_to(run) for path, stamp in stamps.items() if path.stat().st_mtime_ns != stamp]
-    assert changed == [Path("cells/01")]
-    assert [*map(repr, read_cells(run))] == [*map(repr, cells)]
-    gaussians = read_capture(tmp_path / "a.ply").gaussians
-    assert len(gaussians) > 0 and torch.stack([cell.holds(gaussians.means) for cell in cells]).sum(0).eq(1).all()
-    # A worker reads its own views alone, not the scene folder's list of all.
-    shutil.rmtree(run / "cells" / "02")
+    assert main(["export", str(run), "ply", "--output", str(tmp_path / "a.ply")]) == 0
+    gaussians, cut = read_capture(tmp_path / "a.ply").gaussians, load_cells(run)
+    assert [*map(repr, cut)] == [*map(repr, bisect_sightings(parse_scene(town, 1, None), 3))]
+    assert len(gaussians) > 0 and torch.stack([cell.holds(gaussians.means) for cell in cut]).sum(0).eq(1).all()
+    before = part_of(run, town, 2).build().state().model["means"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fprf.splats.training.parse_scene", None)
-        task = CellTask(root=str(run), data=str(town), cell=2, minutes=None, quiet=True)
-        assert train_cell(task, lambda event: None)
-    assert main(words) == 0 and exported("c.ply") == first
+        patch.setattr("fprf.training.prepare.parse_scene", None)
+        assert torch.equal(part_of(run, town, 2).build().state().model["means"], before)
     assert main(["eval", str(run), "--split", "test"]) == 0
 
 
 def test_cells_go_on_from_the_exposures_of_the_whole_scene(town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Which knows those of the photographs that it had memory for. Each cell moves its own, and not their mean."""
-    monkeypatch.setattr(cell_training, "_PIXELS", 1500)
+    monkeypatch.setattr(cells, "_PIXELS", 1500)
     run = tmp_path / "run"
     assert main(command(town, run, "--steps", "60", "--tones", "true")) == 0
     overview, _ = load_latest(run / "overview" / "checkpoints")
@@ -140,7 +85,7 @@ def test_cells_go_on_from_the_exposures_of_the_whole_scene(town: Path, tmp_path:
     start = Tones(torch.tensor(facts.exposure), tuple((~learned).nonzero()[:, 0].tolist()))
     start.load_state_dict({name: overview.optimizer[f"tones.{name}.value"] for name in ("gain", "exponent")})
     means = []
-    for number, cell in enumerate(read_cells(run)):
+    for number, cell in enumerate(load_cells(run)):
         saved, _ = load_latest(run / "cells" / f"{number:02d}" / "checkpoints")
         assert saved is not None
         outside = torch.ones(len(gain), dtype=torch.bool)
@@ -167,29 +112,24 @@ def test_cells_see_from_where_the_whole_scene_found_its_views(town: Path, tmp_pa
     moves, given = overview.optimizer[MOVES], Run(run).load_known()
     assert torch.equal(union.optimizer[MOVES], moves)
     assert (moves[list(given.train)] != 0).any(1).all() and not moves[list(given.test)].any()
-    start, cell = cell_training._load_overview(run), read_cells(run)[0]
-    config = Run(run).load_config()[0]
-    assert isinstance(config, GaussiansConfig)
-    seen = cell_training._prepared(config, parse_scene(town, 1, None), given.facts, cell, start).scene.cameras
+    known = part_of(run, town, 0).build().known
     shown = open_run(run, "cpu").known.cameras
-    assert torch.equal(seen.pose, shown.pose) and not torch.equal(shown.pose, given.cameras.pose)
+    assert known is not None and torch.equal(known.cameras.pose, shown.pose)
+    assert not torch.equal(shown.pose, given.cameras.pose)
 
 
-def test_cells_know_where_the_sky_is(town: Path, scene: Scene, tmp_path: Path) -> None:
+def test_cells_know_where_the_sky_is(town: Path, tmp_path: Path) -> None:
     data, run = tmp_path / "town", tmp_path / "run"
     shutil.copytree(town, data)
     above = np.zeros((72, 96, 3), np.uint8)
     above[:30] = 255
-    for path in scene.paths:
+    for path in parse_scene(town, 1, None).paths:
         write_image(data / "sky_masks" / f"{path.name}.png", above)
     assert main(command(data, run)) == 0
-    config = Run(run).load_config()[0]
-    assert isinstance(config, GaussiansConfig)
-    views, start, cell = cell_training._read_views(run, config, data), cell_training._load_overview(run), read_cells(run)[0]
-    facts = Run(run).load_known().facts
-    seen = cell_training._prepared(config, views, facts, cell, start).learner.levels[0]
-    for view, (_, top, width, height) in cell.windows.items():
+    part = part_of(run, data, 0)
+    seen = part.build().levels[0]
+    for view, (_, top, width, height) in part.cell.windows.items():
         sky = seen[view].sky
         assert sky is not None and float(sky.sum()) == width * min(max(30 - top, 0), height)
-    bare = replace(config, surroundings=0)
-    assert all(each.sky is None for each in cell_training._prepared(bare, views, facts, cell, start).learner.levels[0].values())
+    bare = replace(part, config=replace(part.config, surroundings=0)).build()
+    assert all(each.sky is None for each in bare.levels[0].values())

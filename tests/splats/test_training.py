@@ -11,18 +11,16 @@ import numpy as np
 import pytest
 import torch
 from splat_ball import equal
-from stand_in_viewers import GREEDY, viewer
 from torch import Tensor
 
 import fprf
 from benchmarks.town.write import write_town
-from fprf.cli import train as cli_train
 from fprf.cli.main import main
 from fprf.datamanagers.images import load_image, load_images
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import Scene
-from fprf.errors import CheckpointError
 from fprf.evaluation.metrics import psnr
+from fprf.interfaces import State
 from fprf.io.images import write_image
 from fprf.ops.rasterise import lift
 from fprf.ops.rasterise_training import LOG_SCALES, TrainableGaussians
@@ -31,31 +29,32 @@ from fprf.rendering.cameras import Cameras, project
 from fprf.splats import initial, photographs, training
 from fprf.splats.config import GaussiansConfig
 from fprf.splats.files import read_capture
-from fprf.splats.gaussians import Gaussians
-from fprf.splats.learner import Learner
+from fprf.splats.gaussians import Gaussians, tensors_of
+from fprf.splats.learner import GaussianLearner
 from fprf.splats.photographs import camera_of
-from fprf.splats.training import prepare, reach_of
+from fprf.splats.training import build, reach_of
 from fprf.splats.views import draw
-from fprf.training import checkpoint
+from fprf.training import checkpoint, driver
 from fprf.training.camera_optimizers import Tones, moved_cameras
 from fprf.training.loading import open_run
-from fprf.training.run import Run
-from fprf.viewer.live import LiveViewer
 
 STEPS = 260
 
 
-def learnt(config: GaussiansConfig, scene: Scene, begin: int = 0, end: int = STEPS, before: Learner | None = None) -> Learner:
-    learner = prepare(config, scene).learner
+def learnt(
+    config: GaussiansConfig, scene: Scene, begin: int = 0, end: int = STEPS, before: GaussianLearner | None = None
+) -> GaussianLearner:
+    learner = build(config, scene)
     if before is not None:
-        learner.restore(before.gaussians(), before.moments())
+        learner.load(before.state())
     stepped(learner, end, begin)
     return learner
 
 
-def stepped(learner: Learner, end: int, begin: int = 0) -> None:
+def stepped(learner: GaussianLearner, end: int, begin: int = 0) -> None:
     for step in range(begin, end):
-        assert learner.step(step, step / STEPS) is not None
+        learner.step(step, step / STEPS)
+        assert not learner.failed
 
 
 @pytest.fixture(scope="module")
@@ -72,11 +71,11 @@ def scene(config: GaussiansConfig) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def trained(config: GaussiansConfig, scene: Scene) -> Learner:
+def trained(config: GaussiansConfig, scene: Scene) -> GaussianLearner:
     return learnt(config, scene)
 
 
-def test_it_learns_views_that_it_has_not_seen(config: GaussiansConfig, scene: Scene, trained: Learner) -> None:
+def test_it_learns_views_that_it_has_not_seen(config: GaussiansConfig, scene: Scene, trained: GaussianLearner) -> None:
     images = load_images(scene)
 
     def quality(found: Gaussians) -> float:
@@ -84,7 +83,7 @@ def test_it_learns_views_that_it_has_not_seen(config: GaussiansConfig, scene: Sc
         truth = {view: torch.from_numpy(images[view]).float() / 255 for view in drawn}
         return float(np.mean([psnr(image.clamp(0, 1), truth[view]) for view, image in drawn.items()]))
 
-    before = quality(prepare(config, scene).learner.gaussians())
+    before = quality(build(config, scene).gaussians())
     assert quality(trained.gaussians()) > before + 2
     assert 590 <= len(trained.gaussians()) <= 600
 
@@ -114,16 +113,17 @@ def test_every_field_changes_something(config: GaussiansConfig, scene: Scene, tm
 
 
 def test_a_view_without_numbers_changes_nothing(config: GaussiansConfig, scene: Scene) -> None:
-    learner = prepare(config, scene).learner
+    learner = build(config, scene)
     before = learner.gaussians()
     for photograph in learner.levels[1].values():
         photograph.planes[:] = np.nan
-    assert learner.step(0, 0.0) is None and equal(learner.gaussians(), before)
+    learner.step(0, 0.0)
+    assert learner.figures()[2:5] == (1, 1, "the loss") and equal(learner.gaussians(), before)
 
 
 def test_colours_that_no_view_shows_fall_back_to_their_mean(config: GaussiansConfig, scene: Scene) -> None:
     """Else a Gaussian could have any colour from where it was not photographed, and a style would bring that into view."""
-    learner = prepare(config, scene).learner
+    learner = build(config, scene)
     start = learner.gaussians()
     faint = replace(start, logits=torch.full_like(start.logits, -20), harmonics=torch.ones_like(start.harmonics))
     learner.start_from(faint)
@@ -148,7 +148,7 @@ def test_a_gaussian_learns_alike_however_late_it_is_seen(config: GaussiansConfig
     start = Gaussians(means.float(), quaternions.float(), torch.full((32, 3), -1.5), torch.zeros(32), harmonics)
 
     def learnt(order: list[int]) -> Tensor:
-        learner = Learner(config, levels, 1.0, 32)
+        learner = GaussianLearner(config, levels, 1.0, 32)
         learner.start_from(start)
         rates = np.full(learner.model.rows, 0.01, np.float32)
         for view in order:
@@ -173,10 +173,11 @@ def test_an_exposure_learns_alike_however_rarely_its_view_is_seen(config: Gaussi
     def gain(views: int) -> Tensor:
         tones = Tones(torch.zeros(many), ())
         levels = photographs.make_levels(replace(same, train=torch.arange(views)), images, {}, 0.01)
-        learner = Learner(replace(grey, degree=2), levels, 1.0, 16, tones=tones)
+        learner = GaussianLearner(replace(grey, degree=2), levels, 1.0, 16, tones=tones)
         learner.start_from(nothing)
         for step in range(3 * views):
-            assert learner.step(step, 0.0) is not None
+            learner.step(step, 0.0)
+            assert not learner.failed
         return tones.gain.detach()
 
     often, rarely = gain(1), gain(many)
@@ -187,7 +188,7 @@ def test_an_exposure_learns_alike_however_rarely_its_view_is_seen(config: Gaussi
 def test_tones_are_told_from_the_scene(config: GaussiansConfig, scene: Scene) -> None:
     """Photographs that were taken darker or warmer: factors are found up to their mean."""
     asked = replace(config, tones=True, ssim=0.0)  # what SSIM keeps of the targets would be that of the others
-    learner = prepare(asked, scene).learner
+    learner = build(asked, scene)
     wanted = torch.linspace(-0.3, 0.3, len(scene.paths))[:, None] * torch.tensor([1.0, 0.5, -0.5])
     for level in learner.levels:
         for view, target in level.items():
@@ -287,29 +288,29 @@ def test_verbs_of_a_run(run: Path, tmp_path: Path) -> None:
     assert main(["train", str(run / "config.json"), "--semantic.encoder", "vgg16", "--semantic.encoder.weights", "no.pth"]) == 2
 
 
-def test_training_is_looked_at_and_changes_no_bit(
+def test_training_is_watched_and_changes_no_bit(
     run: Path, config: GaussiansConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What the viewer is handed makes the scene of the moment, which takes a style."""
-    monkeypatch.setattr(cli_train, "open_view", lambda place: LiveViewer(place, viewer(GREEDY, str(tmp_path / "log"))))
-    monkeypatch.setattr(training, "REPORT_SECONDS", 0.0)
-    assert main([*command(config, tmp_path / "run"), "--view"]) == 0
-    alone, seen = (checkpoint.load_latest(each / "checkpoints")[0] for each in (run, tmp_path / "run"))
-    assert alone is not None and seen is not None
-    assert all(torch.equal(tensor, seen.model[name]) for name, tensor in alone.model.items())
-    heard = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
-    names = [line["names"] for line in heard if "names" in line]
-    assert names and all(each == sorted(alone.model) for each in names)
-    unfinished = Run(tmp_path / "run").load_config()[0].load_unfinished(tmp_path / "run", "cpu", None)
-    with pytest.raises(CheckpointError):
-        unfinished.encoders(None)
-    scene = unfinished.scene(alone.model)
-    view = open_run(run, "cpu").scene.render(scene.cameras, 0)
-    assert torch.equal(scene.render(scene.cameras, 0).rgb, view.rgb)
-    encoders = unfinished.encoders(None)
-    assert encoders.semantic is not None and len(encoders.scene.share) > 3
-    assert unfinished.encoders(encoders).semantic is encoders.semantic
-    assert main([*command(config, tmp_path / "no"), "--cells", "2", "--view"]) == 2
+    """While somebody looks there are checkpoints all the time, each a scene that takes a style."""
+    monkeypatch.setattr(driver, "REPORT_SECONDS", 0.0)
+    monkeypatch.setattr(driver, "_MIN_PAUSE", 0.0)
+    monkeypatch.setattr(driver, "_SAVING_SHARE", 1e9)
+    seen: list[tuple[int, int]] = []
+    plain = GaussianLearner.step
+
+    def step(learner: GaussianLearner, index: int, share: float) -> None:
+        driver.watch(tmp_path / "run")
+        if index == 30:
+            opened = open_run(tmp_path / "run", "cpu")
+            seen.append((opened.step, len(opened.scene.encoders().scene.share)))
+        plain(learner, index, share)
+
+    monkeypatch.setattr(GaussianLearner, "step", step)
+    assert main(command(config, tmp_path / "run")) == 0
+    assert seen[0][0] == 30 and seen[0][1] > 3
+    alone, watched = (checkpoint.load_latest(each / "checkpoints")[0] for each in (run, tmp_path / "run"))
+    assert alone is not None and watched is not None
+    assert all(torch.equal(tensor, watched.model[name]) for name, tensor in alone.model.items())
 
 
 def test_styles_on_a_run(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -415,12 +416,14 @@ def test_surroundings_fill_what_no_photograph_shows(scene: Scene) -> None:
 
 def after_a_step_of_wide_ones(config: GaussiansConfig, scene: Scene, restored: bool = False) -> tuple[Tensor, Tensor]:
     """Means of the first Gaussians, and their widths after a step that begins with 3000 times as wide ones."""
-    learner = prepare(config, scene).learner
+    learner = build(config, scene)
     before = learner.gaussians()
-    for each in (learner, prepare(config, scene).learner if restored else learner):
-        learner, moments = each, learner.moments()
-        learner.restore(replace(before, log_scales=before.log_scales + 8.0), moments)
-    assert learner.step(0, 0.0) is not None
+    for each in (learner, build(config, scene) if restored else learner):
+        wide = tensors_of(replace(before, log_scales=before.log_scales + 8.0), each.near)
+        moments, learner = learner.state().optimizer, each
+        learner.load(State(wide, moments))
+    learner.step(0, 0.0)
+    assert not learner.failed
     return before.means, learner.gaussians().log_scales.exp()
 
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fprf.interfaces import Decoder
-from fprf.plugins.stylizers.config import IdentityConfig, RegionToneConfig
+from fprf.interfaces import Decoder, Stylizer
+from fprf.plugins.stylizers.config import RegionToneConfig
 from fprf.style.colours import ColourMaps, colour_maps
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary, choose, load_dictionary, save_dictionary
 from fprf.style.look import Restyle
@@ -22,17 +22,27 @@ from fprf.types import Want
 COUNT, KINDS = 600, 3
 
 
+class Unchanged(Stylizer):
+    """Features stay; every point takes all codes alike."""
+
+    needs = Want.CONTENT
+
+    def __init__(self, codes: int) -> None:
+        super().__init__()
+        self.codes = codes
+
+    def forward(self, content: Tensor, semantic: Tensor | None) -> Tensor:
+        return content
+
+    def match(self, semantic: Tensor) -> Tensor:
+        return torch.full((len(semantic), self.codes), 1 / self.codes)
+
+
 class Straight(Decoder):
     """Colours are the first three channels: means and covariances carry over as they are."""
 
     def forward(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"]:
         return content[:, :3]
-
-    def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
-        return self.forward(styled)
-
-    def frozen_colour(self, content: Tensor) -> None:
-        return None
 
 
 def points(seed: int, spread: float = 0.03) -> tuple[Tensor, Tensor, Tensor]:
@@ -114,7 +124,7 @@ def test_how_much_colours_are_spread_out(own: float, theirs: float, gain: float,
     noise = torch.linalg.qr(noise - noise.mean(0)).Q * COUNT**0.5
     scene = scene_style(0.5 + own * noise, None, torch.ones(COUNT), None, 1, 0)
     d = build_dictionary([Reference("r", noise, torch.zeros(COUNT, 0), colour=0.5 + theirs * noise[:, 3:])])
-    maps = colour_maps(IdentityConfig().build(dictionary=d, scene=scene), d, scene, Straight())
+    maps = colour_maps(Unchanged(len(d.keys)), d, scene, Straight())
     assert maps is not None
     assert torch.linalg.svdvals(maps.matrix[0] + torch.eye(3)).tolist() == pytest.approx([gain] * 3, rel=error)
 

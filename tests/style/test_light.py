@@ -30,12 +30,6 @@ class Straight(Decoder):
     def forward(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"]:
         return content
 
-    def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
-        return styled
-
-    def frozen_colour(self, content: Tensor) -> None:
-        return None
-
 
 def samples(colours: Tensor, seed: int, *, turned: bool = False, spread: float = 0.04) -> tuple[Tensor, Tensor]:
     """Colours and semantics of points of each kind; `turned` = of kinds that the scene does not know."""

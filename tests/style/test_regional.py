@@ -3,12 +3,11 @@
 import pytest
 import torch
 from style_cases import points, references, scene_of, setting
+from two_sided import region_adain
 
 from fprf.plugins.stylizers.config import (
     AdainConfig,
-    IdentityConfig,
     LocalAdainConfig,
-    RegionAdainConfig,
     RegionOtConfig,
     StylizerConfig,
 )
@@ -18,7 +17,7 @@ from fprf.style.regional import regional
 from fprf.style.scene import Membership
 from fprf.types import Want
 
-ALL = (IdentityConfig(), AdainConfig(), LocalAdainConfig(), RegionAdainConfig(), RegionOtConfig())
+ALL = (AdainConfig(), LocalAdainConfig(), region_adain(), RegionOtConfig())
 
 
 def test_a_dictionary_of_some_references_is_the_one_built_of_them() -> None:
@@ -79,7 +78,7 @@ def test_a_scene_without_semantics_can_be_pinned_as_a_whole() -> None:
     d = build_dictionary([r._replace(semantic=torch.zeros(300, 0)) for r in references(1.0, 1.0)])
     allowed = torch.tensor([[False, True]])
     alone, _ = choose(d, allowed[0])
-    for config in (AdainConfig(), RegionAdainConfig(gain=1e6)):
+    for config in (AdainConfig(), region_adain(gain=1e6)):
         made = regional(d, scene, allowed, config)
         assert made.needs == Want.CONTENT
         torch.testing.assert_close(made(content, None).double().mean(0), whole_style(alone)[0], rtol=1e-4, atol=1e-4)

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import torch
 from tiny_world import World
+from two_sided import region_adain
 
 from fprf.errors import DataError, UsageError
-from fprf.plugins.stylizers.config import AdainConfig, RegionAdainConfig
+from fprf.plugins.stylizers.config import AdainConfig
 from fprf.style.config import StyleConfig
 from fprf.style.files import Key, StyleFile
 from fprf.style.match_maps import explain, region_row, region_tile
@@ -152,7 +153,7 @@ def test_the_place_of_a_region_is_in_the_view_that_shows_most_of_it(world: World
             assert find_regions(regions, f"{each.view}:{each.pixel[0]},{each.pixel[1]}")[0].number == k
 
 
-@pytest.mark.parametrize("stylizer", [AdainConfig(), RegionAdainConfig()], ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize("stylizer", [AdainConfig(), region_adain()], ids=lambda s: type(s).__name__)
 def test_what_regions_take_is_the_stylizers_match_at_their_keys(world: World, stylizer: object) -> None:
     trained = world.load()
     style = StyleConfig(references=world.references, clusters=3, keep=("1",), forbid=("0=0",))

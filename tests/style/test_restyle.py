@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 from tiny_world import World
+from two_sided import region_adain
 
 from fprf.errors import ConfigError
-from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionAdainConfig, RegionOtConfig, StylizerConfig
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, StylizerConfig
 from fprf.style.config import NO_MASK, StyleConfig
 from fprf.style.files import StyleFile, write_style
 from fprf.style.references import Encoders
@@ -30,7 +31,7 @@ SECOND: dict[str, object] = {
     "keep": ("0",),
     "region_strength": ("0=0.5",),
     "keep_below": 0.99,
-    "stylizer": RegionAdainConfig(),
+    "stylizer": region_adain(),
 }
 """Those of `references`, `masks`, `between` and `at` need files: see below."""
 

@@ -10,14 +10,14 @@ import torch
 from tiny_world import tiny
 
 from benchmarks.town.write import write_town
-from fprf.cli.train import train_scene
+from fprf.blocks.config import GridConfig, LayoutConfig
 from fprf.config import StatisticsConfig, TrainConfig
-from fprf.fields.layouts import LayoutConfig, StreetConfig
 from fprf.training import tensorfiles
 from fprf.training.blocks import folder_of
+from fprf.training.driver import train
 
 STEPS = 6
-BLOCKS = StreetConfig(segments=3)
+BLOCKS = GridConfig(cells=(3, 1))
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def made(folder: Path) -> TrainConfig:
     town = folder / "town"
     write_town(town, seed=0, palette="day", views=12, width=32, height=24)
     config = small(town, folder / "run")
-    train_scene(config, "fprf-lite", quiet=True)
+    train(config, "fprf-lite", quiet=True)
     return config
 
 

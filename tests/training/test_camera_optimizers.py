@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from tiny_world import World, parameters, trained_for
 from torch import Tensor
 
-from fprf.cli.train import train_scene
 from fprf.rendering.cameras import rays_through
 from fprf.training.camera_optimizers import Poses, Tones, refined, relative, rotated
+from fprf.training.driver import train
 from fprf.training.loading import load_run
 from fprf.training.model import poses_of
 from fprf.types import Batch
@@ -113,7 +113,7 @@ def test_cameras_that_were_turned_come_back(world: World, tmp_path: Path) -> Non
 def test_blocks_start_from_what_their_surroundings_found(block_world: BlockWorld, tmp_path: Path) -> None:
     """Their poses move on from those; their tones are the same."""
     config = replace(small(block_world.config.data, tmp_path / "run"), poses=0.05, tones=True)
-    train_scene(config, "fprf-lite", quiet=True)
+    train(config, "fprf-lite", quiet=True)
     root = tmp_path / "run"
     trained = load_run(root, "cpu")
     poses = trained.model.poses

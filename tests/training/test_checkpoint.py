@@ -5,7 +5,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny_world import World, after_one_step
+from tiny_world import World, after_one_step, save_checkpoint
 
 from fprf.errors import CheckpointError
 from fprf.training import checkpoint
@@ -17,20 +17,20 @@ def root(world: World, tmp_path: Path) -> Path:
     """Checkpoints of steps 5 and 9."""
     model, optimizer = after_one_step(world)
     for step in (5, 9):
-        checkpoint.save(tmp_path / "c", model, optimizer, step=step, seconds=step / 2)
+        save_checkpoint(tmp_path / "c", model, optimizer, step=step, seconds=step / 2)
     return tmp_path / "c"
 
 
 def test_everything_comes_back(world: World, tmp_path: Path) -> None:
     model, optimizer = after_one_step(world)
-    assert checkpoint.reached(tmp_path) == (0, 0.0) and not checkpoint.digest(tmp_path)
-    checkpoint.save(tmp_path, model, optimizer, step=3, seconds=1.5)
+    assert checkpoint.load_latest(tmp_path) == (None, []) and not checkpoint.digest(tmp_path)
+    save_checkpoint(tmp_path, model, optimizer, step=3, seconds=1.5)
     saved, damaged = checkpoint.load_latest(tmp_path)
     assert saved is not None and not damaged
-    assert (saved.step, saved.seconds) == checkpoint.reached(tmp_path) == (3, 1.5) and checkpoint.digest(tmp_path)
+    assert (saved.step, saved.seconds) == (3, 1.5) and checkpoint.digest(tmp_path)
     other = build_model(world.config, world.prepared.facts)
     again = torch.optim.Adam(other.learned(), lr=1e-3, fused=True)
-    checkpoint.restore(saved, other, again)
+    checkpoint.restore(saved.state, other, again)
     torch.testing.assert_close(other.state_dict(), model.state_dict(), atol=0, rtol=0)
     torch.testing.assert_close(again.state_dict(), optimizer.state_dict(), atol=0, rtol=0)
 
@@ -38,7 +38,7 @@ def test_everything_comes_back(world: World, tmp_path: Path) -> None:
 def test_a_past_that_was_gone_back_from_is_dropped(world: World, root: Path) -> None:
     """Else a damaged newest one would keep its place, and only one intact would be left."""
     model, optimizer = after_one_step(world)
-    checkpoint.save(root, model, optimizer, step=7, seconds=0.0)
+    save_checkpoint(root, model, optimizer, step=7, seconds=0.0)
     assert checkpoint.steps(root) == [5, 7]
 
 
@@ -95,7 +95,7 @@ def test_no_harm_to_a_manifest_is_more_than_damage(root: Path, data: st.DataObje
 def test_parameters_that_are_not_finite_are_not_resumed_from(world: World, root: Path) -> None:
     model, optimizer = after_one_step(world)
     model.learned()[0].detach().view(-1)[0] = float("nan")
-    checkpoint.save(root, model, optimizer, step=12, seconds=0.0)
+    save_checkpoint(root, model, optimizer, step=12, seconds=0.0)
     saved, damaged = checkpoint.load_latest(root)
     assert saved is not None and saved.step == 9 and "was not finite when saved" in damaged[0]
 
@@ -111,4 +111,4 @@ def test_a_checkpoint_of_another_config_is_refused(world: World, root: Path) -> 
         saved.model | {"extra": torch.zeros(3)},
     ):
         with pytest.raises(CheckpointError):
-            checkpoint.restore(saved._replace(model=tensors), model, None)
+            checkpoint.restore(saved._replace(model=tensors).state, model, None)

@@ -8,9 +8,9 @@ from fake_packages import METHOD, packages_in
 from tiny_world import World
 
 from fprf.cli.parsing import load_method
-from fprf.cli.train import train_scene
 from fprf.config import IncompleteConfig
 from fprf.errors import CheckpointError, UsageError
+from fprf.training.driver import train
 from fprf.training.loading import load_run
 
 
@@ -63,7 +63,7 @@ def test_a_run_of_a_method_with_fields_of_its_own(world: World, moved: Path, tmp
         trained.run.save_config(config, "acme")
         saved = (moved / "config.json").read_text()
         with pytest.raises(UsageError, match=r"a run with knob 2 \(8 is asked\)"):
-            train_scene(replace(config, knob=8, output=moved), "acme", quiet=True)  # type: ignore[call-arg]
+            train(replace(config, knob=8, output=moved), "acme", quiet=True)  # type: ignore[call-arg]
     there = load_run(moved)
     assert isinstance(there.config, IncompleteConfig) and there.method == "acme"
     assert torch.equal(trained.render(trained.cameras, 0).rgb, there.render(there.cameras, 0).rgb)

@@ -15,13 +15,13 @@ from tiny_world import World, parameters, tiny
 
 import fprf
 from fprf.cli.main import main
-from fprf.cli.train import train_scene
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.images import write_image
 from fprf.rendering.camera_path import read_camera_path
 from fprf.rendering.local_frame import read_offset
 from fprf.splats.files import read_capture
 from fprf.splats.scene import SplatScene
+from fprf.training.driver import train
 from fprf.training.loading import load_run, open_run
 from fprf.training.run import Run
 from fprf.viewer.cameras import page_transform
@@ -42,7 +42,7 @@ def utm(world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def fields(utm: Path) -> Path:
     run = utm.parent / "fields"
     if not run.exists():
-        train_scene(tiny(utm, run), "fprf-lite", quiet=True)
+        train(tiny(utm, run), "fprf-lite", quiet=True)
     return run
 
 
@@ -66,8 +66,8 @@ def test_fields_are_as_good_and_go_on_as_they_are(world: World, fields: Path, ut
     assert psnr(fields) == pytest.approx(psnr(tmp_path / "own"), abs=0.1)
     shutil.copytree(fields, tmp_path / "more")
     config = replace(tiny(utm, tmp_path / "more"), steps=20)
-    train_scene(config, "fprf-lite", quiet=True)
-    train_scene(replace(config, output=tmp_path / "once"), "fprf-lite", quiet=True)
+    train(config, "fprf-lite", quiet=True)
+    train(replace(config, output=tmp_path / "once"), "fprf-lite", quiet=True)
     assert Run(tmp_path / "more").load_known().facts.origin == known.facts.origin
     assert parameters(Run(tmp_path / "more"), 20).keys() == parameters(Run(tmp_path / "once"), 20).keys()
 
@@ -89,7 +89,7 @@ def test_older_runs_open_where_they_were(fields: Path, utm: Path, tmp_path: Path
     assert torch.allclose(shown[0].rgb, shown[1].rgb, atol=1e-4) and torch.allclose(shown[0].depth, shown[1].depth, rtol=1e-3)
     assert psnr(old) == pytest.approx(psnr(fields), abs=0.01)
     assert Run(old).load_known().facts.origin == (0, 0, 0)
-    train_scene(replace(tiny(utm, old), steps=16), "fprf-lite", quiet=True)
+    train(replace(tiny(utm, old), steps=16), "fprf-lite", quiet=True)
     assert Run(old).load_known().facts.origin == (0, 0, 0), "the run goes on in its own coordinates"
     assert np.abs(Run(old).load_known().cameras.pose[:, :, 3].numpy() - pose[:, :, 3]).max() < 1e-8
 
@@ -155,14 +155,14 @@ def test_cells_and_blocks_are_in_the_local_frame(world: World, utm: Path, tmp_pa
             str(tmp_path / f"{name} cells"),
         ]
         assert main(words) == 0
-        train_scene(small(data, tmp_path / f"{name} blocks"), "fprf-lite", quiet=True)
+        train(small(data, tmp_path / f"{name} blocks"), "fprf-lite", quiet=True)
         scores.append([psnr(tmp_path / f"{name} {kind}") for kind in ("cells", "blocks")])
     assert scores[1] == pytest.approx(scores[0], abs=0.25)
     bounds = json.loads((tmp_path / "utm cells" / "cells.json").read_text())["cells"]
     assert max(abs(x) for cell in bounds for x in (*cell["low"], *cell["high"]) if x is not None) < 1000
     done = tmp_path / "utm blocks" / "blocks" / "00" / "done.json"
     stamp = done.stat().st_mtime_ns
-    train_scene(small(tmp_path / "utm", tmp_path / "utm blocks"), "fprf-lite", quiet=True)
+    train(small(tmp_path / "utm", tmp_path / "utm blocks"), "fprf-lite", quiet=True)
     assert done.stat().st_mtime_ns == stamp, "a finished block stays"
 
 

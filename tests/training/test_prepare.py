@@ -2,32 +2,25 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny_world import World
+from tiny_world import World, prepared_for
 
 from fprf.errors import PluginError, UsageError
 from fprf.methods import fprf, fprf_lite
+from fprf.training.driver import Forecast, Report, schedule_of
+from fprf.training.learner import outcome
 from fprf.training.model import build_model
-from fprf.training.prepare import (
-    Forecast,
-    Outcome,
-    device_of,
-    exposure_of,
-    find_downscale,
-    outcome,
-    prepare,
-    scene_of,
-    with_downscale,
-)
-from fprf.training.trainer import Report
+from fprf.training.prepare import device_of, exposure_of, read_scene, with_downscale
+from fprf.training.run import Run
 
 
 def test_without_semantics(world: World) -> None:
-    found = prepare(replace(world.config, semantic=replace(world.config.semantic, encoder=None)))
+    found = prepared_for(replace(world.config, semantic=replace(world.config.semantic, encoder=None)))
     assert found.facts.dim == 0 and found.facts.semantic_encoder == "" and found.basis is None
     assert found.manager.batch(0).semantic is None
 
@@ -59,7 +52,9 @@ def test_the_start_is_a_function_of_the_seed(world: World) -> None:
 
 
 def factor(width: int, height: int, views: int, minutes: float | None = None, device: str = "cpu") -> int:
-    return find_downscale(replace(fprf_lite(), minutes=minutes), torch.tensor([[width, height]] * views), device)
+    size = torch.tensor([[width, height]] * views)
+    scene = SimpleNamespace(cameras=SimpleNamespace(size=size), train=torch.arange(views))
+    return replace(fprf_lite(), minutes=minutes).find_downscale(scene, device)  # type: ignore[arg-type]
 
 
 def test_photographs_are_reduced_as_far_as_docs_say() -> None:
@@ -88,23 +83,24 @@ def test_more_time_and_fewer_images_never_reduce_further(side: int, views: int, 
 def test_a_config_gets_the_size_of_its_scene(world: World) -> None:
     config = with_downscale(replace(world.config, downscale=None))
     assert config == world.config and with_downscale(config) is config
-    half = scene_of(replace(config, downscale=2))
+    half = read_scene(replace(config, downscale=2))
     assert half.cameras.size[0].tolist() == [16, 12]
     with pytest.raises(UsageError, match="--data FOLDER, or --data garden"):
-        scene_of(replace(config, data=None))
+        read_scene(replace(config, data=None))
 
 
 def test_what_training_came_to(world: World, tmp_path: Path) -> None:
     config, scene = world.config, world.prepared.scene
-    found = outcome(world.run, config, scene)
-    assert found is not None and found.steps == 15 and found.passes == pytest.approx(15 * 256 / (8 * 32 * 24))
-    told = found.told(world.run, config)
-    assert found.too_short and told.startswith("warning: ") and f"fprf train {world.run}/config.json --steps 600" in told
-    long = Outcome(4000, 24.5, 9.0)
-    timed, reduced = (long.told(world.run, replace(fprf_lite(), **field)) for field in ({"minutes": 8.0}, {"downscale": 5}))
-    assert not long.too_short and "--minutes 16" in timed and "--downscale" not in timed
+    told = outcome(Run(world.run), config, scene)
+    assert told.startswith(f"warning: too few steps to judge the scene by: 15 steps, {15 * 256 / (8 * 32 * 24):.2g} rays")
+    assert f"fprf train {world.run}/config.json --steps 600" in told
+    assert outcome(Run(tmp_path), config, scene) == "no step was made"
+    Run(tmp_path).log({"step": 4000, "seconds": 9.0, "psnr": 24.5})
+    timed, reduced = (
+        outcome(Run(tmp_path), replace(fprf_lite(), **field), scene) for field in ({"minutes": 8.0}, {"downscale": 5})
+    )
+    assert "--minutes 16" in timed and "--downscale" not in timed
     assert "--steps 24000" in reduced and "--downscale 4" in reduced
-    assert outcome(tmp_path, config, scene) is None
 
 
 def event(step: int, seconds: float) -> Report:
@@ -112,11 +108,11 @@ def event(step: int, seconds: float) -> Report:
 
 
 def test_hours_are_told_once_from_the_first_steps() -> None:
-    slow = Forecast(fprf(), "fprf", "cpu")
+    slow = Forecast(schedule_of(fprf(), 8), "fprf", "cpu")
     assert slow(event(1, 100.0)) == "" and slow(event(2, 103.0)) == "", "the first step compiles"
     assert "30,000 steps at 3 s a step take 25 hours" in slow(event(3, 106.0)) and slow(event(9, 124.0)) == ""
     for config, device, pace in ((fprf_lite(), "cpu", 0.1), (replace(fprf(), minutes=9), "cpu", 3.0), (fprf(), "cuda", 3.0)):
-        quick = Forecast(config, "fprf", device)
+        quick = Forecast(schedule_of(config, 8), "fprf", device)
         assert not any(quick(event(step, 5 + pace * step)) for step in range(1, 200))
 
 

@@ -18,10 +18,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import World
 
-from fprf.cli.train import train_scene
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import CheckpointError, DataError, UsageError
 from fprf.training import checkpoint
+from fprf.training.driver import train
 from fprf.training.run import IMAGES, LOCK, Run, check_images, held, image_hashes, read_history, save_image_hashes, view_names
 
 
@@ -96,13 +96,13 @@ def test_training_goes_on_with_the_same_images_and_with_others_when_asked(world:
     image.write_bytes(sorted((town / "images").iterdir())[4].read_bytes())
     before = json.loads((run / IMAGES).read_text())
     with pytest.raises(UsageError, match=f"{image.name} is another"):
-        train_scene(config, "fprf-lite", quiet=True)
+        train(config, "fprf-lite", quiet=True)
     assert json.loads((run / IMAGES).read_text()) == before and checkpoint.steps(run / "checkpoints")[-1] == 15
-    train_scene(config, "fprf-lite", quiet=True, others=True)
+    train(config, "fprf-lite", quiet=True, changed_images=True)
     after = json.loads((run / IMAGES).read_text())
     assert [name for name in before["images"] if before["images"][name] != after["images"][name]] == [image.stem]
     assert checkpoint.steps(run / "checkpoints")[-1] == 16
-    train_scene(replace(config, steps=17), "fprf-lite", quiet=True)
+    train(replace(config, steps=17), "fprf-lite", quiet=True)
     assert checkpoint.steps(run / "checkpoints")[-1] == 17
 
 

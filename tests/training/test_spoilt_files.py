@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.town.write import write_town
-from fprf.blocks.plan import boxes_to
+from fprf.blocks.partition import write_cells
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import Scene
 from fprf.errors import CheckpointError, FprfError
@@ -20,16 +20,16 @@ from fprf.io.atomic import write_json
 from fprf.methods import fprf_lite
 from fprf.plugins.codec import save_config
 from fprf.rendering.space import Space
-from fprf.splats import cell_training
-from fprf.splats.cell_training import OVERVIEW, read_cells, write_cells
+from fprf.splats import cells
+from fprf.splats.cells import Cells, load_cells, read_views
 from fprf.splats.config import GaussiansConfig
 from fprf.training import blocks, checkpoint, tensorfiles
-from fprf.training.block_plan import trained_tasks
-from fprf.training.blocks import load_boxes, load_finished, read_done
+from fprf.training.blocks import load_blocks, load_finished
+from fprf.training.learner import outcome
 from fprf.training.model import Facts
-from fprf.training.prepare import outcome
-from fprf.training.run import Run, begin, check_images, image_hashes, read_history, save_image_hashes, task_of
-from fprf.types import Boxes
+from fprf.training.run import Run, check_images, image_hashes, read_history, save_image_hashes
+from fprf.training.tasks import WHOLE, begin, read_done, renumber, task_of
+from fprf.types import Cell
 
 LARGE = "1" + "0" * 400
 JUNK = ("null", "true", "-1", "0.5", "1e300", "1e999", "NaN", "9" * 30, LARGE, "9" * 5000, '"x"', r'"\ud800"', "[]", "{}")
@@ -49,7 +49,12 @@ class Example:
     @property
     def parts(self) -> tuple[Path, ...]:
         """Folders of a block, of the whole scene and of a cell."""
-        return blocks.folder_of(self.root, 0), self.root / OVERVIEW, cell_training.folder_of(self.root, 1)
+        return blocks.folder_of(self.root, 0), cells.folder_of(self.root, WHOLE), cells.folder_of(self.root, 1)
+
+    def cells(self) -> Cells:
+        """Its scene, ready to be cut into cells."""
+        config = GaussiansConfig(data=self.root.parent / "town", cells=2)
+        return Cells(config, self.scene, Run(self.root).load_known().facts)
 
     def documents(self) -> list[Path]:
         return [path for path in self.content if path.suffix in (".json", ".jsonl")]
@@ -65,15 +70,15 @@ class Example:
         yield Run(root).load_known
         yield lambda: check_images(root, self.scene, image_hashes(self.scene))
         yield lambda: read_history(root)
-        yield lambda: outcome(root, fprf_lite(), self.scene)
-        yield lambda: load_boxes(root)
+        yield lambda: outcome(Run(root), fprf_lite(), self.scene)
+        yield lambda: load_blocks(root)
         yield lambda: load_finished(self.parts[0])
-        yield lambda: trained_tasks(root)
-        yield lambda: read_cells(root)
-        yield lambda: cell_training._read_views(root, GaussiansConfig(), data)
-        yield lambda: [cell_training._read_done(folder) for folder in self.parts[1:]]
+        yield lambda: renumber(root / "blocks", {1: "other"})
+        yield lambda: load_cells(root)
+        yield lambda: read_views(root, GaussiansConfig(), data)
+        yield lambda: [read_done(folder) for folder in self.parts]
         yield lambda: [checkpoint.load_latest(folder / "checkpoints") for folder in self.parts]
-        yield lambda: [begin(folder, task_of(folder)) for folder in self.parts]
+        yield lambda: [begin(folder, task_of(folder) or "other") for folder in self.parts]
 
 
 @pytest.fixture(scope="module")
@@ -90,11 +95,11 @@ def example(tmp_path_factory: pytest.TempPathFactory) -> Example:
     save_config(root / "config.json", fprf_lite(), "fprf-lite")
     run.save_known(scene, town, facts)
     save_image_hashes(root, image_hashes(scene))
-    corner = torch.ones(1, 3, dtype=torch.float64)
-    write_json(root / "blocks.json", {"format": 1, "boxes": boxes_to(Boxes(-corner, corner, torch.eye(3)[None], 0.5))})
-    write_cells(root, scene, town, 2)
+    corner = torch.ones(3, dtype=torch.float64)
+    write_cells(root / "blocks.json", [Cell(low=-corner, high=corner, border=corner / 2)])
     made = Example(root, scene, {})
-    for part, task in zip(made.parts, ({"task": "a"}, "b", "c"), strict=True):
+    made.cells().write(run)
+    for part, task in zip(made.parts, ("a", "b", "c"), strict=True):
         begin(part, task)
         manifest = tensorfiles.save(part / "block.safetensors", TENSORS)
         done = {"format": 1, "asked": {"task": "a"}, "step": 3, "seconds": 1.5, "tensors": manifest}
@@ -165,7 +170,7 @@ def test_a_part_whose_task_is_damaged_is_begun_anew(example: Example) -> None:
 def test_a_spoilt_cut_is_named_and_its_cells_stay(example: Example) -> None:
     (example.root / "cells.json").write_text('{"format')
     with pytest.raises(CheckpointError, match=r"cells\.json"):
-        write_cells(example.root, example.scene, example.root.parent / "town", 2)
+        example.cells().write(Run(example.root))
     assert (example.parts[2] / "done.json").exists()
     example.restore()
 
@@ -189,7 +194,7 @@ def test_a_line_of_events_with_a_number_too_large_is_passed_over(example: Exampl
 
 @pytest.mark.parametrize("name", ["scene.json", "blocks.json", "cells.json"])
 def test_a_number_too_large_is_refused(example: Example, name: str) -> None:
-    readers = {"scene.json": Run(example.root).load_known, "blocks.json": load_boxes, "cells.json": read_cells}
+    readers = {"scene.json": Run(example.root).load_known, "blocks.json": load_blocks, "cells.json": load_cells}
     file, read = example.root / name, readers[name]
     whole = json.loads(file.read_text())
     for container, key in places(whole):

@@ -10,16 +10,16 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny_world import Altered, Change, World, events, parameters, same, spoilt, stopping, trained_for
+from tiny_world import Altered, Change, World, events, parameters, same, spoilt, stopping, taught, trained_for
 from torch import nn
 
 from fprf.config import TrainConfig
 from fprf.errors import CheckpointError, NumericsError
 from fprf.training import checkpoint
-from fprf.training.loop import CLEAR_EVERY, SMOOTHING, StepStatistics, clear_denormals, progress, unfit_gradients
+from fprf.training.driver import Report, Schedule
+from fprf.training.learner import CLEAR_EVERY, SMOOTHING, StepStatistics, clear_denormals, unfit_gradients
 from fprf.training.model import build_model
 from fprf.training.run import Run
-from fprf.training.trainer import Report, train
 from fprf.types import Batch
 
 NAN, INF = float("nan"), float("inf")
@@ -111,7 +111,7 @@ def bad_gradients(world: World, folder: Path, config: TrainConfig, value: float,
     model.learned()[1].register_hook(spoil)
     folder.mkdir(exist_ok=True)
     prepared = world.prepared._replace(manager=Altered(world.prepared.manager, watch))
-    train(config, prepared, Run(folder), lambda event: None, model=model)
+    taught(config, prepared, Run(folder), model=model)
     return Run(folder)
 
 
@@ -262,5 +262,4 @@ def test_the_first_signal_lets_the_step_end_and_the_second_saves_nothing_doubtfu
     ],
 )
 def test_whichever_comes_first_ends(steps: int, minutes: float | None, step: int, seconds: float, share: float) -> None:
-    config = replace(TrainConfig(), steps=steps, minutes=minutes)
-    assert progress(config, step, seconds) == pytest.approx(share, abs=1e-12)
+    assert Schedule(steps, minutes).share(step, seconds) == pytest.approx(share, abs=1e-12)

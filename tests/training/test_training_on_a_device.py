@@ -11,21 +11,20 @@ import pytest
 import torch
 from block_world import BlockWorld, tensors_of, unfinish
 from pretend_cuda import CUDA, pretend_cuda
-from tiny_world import Altered, Change, World, events, parameters, spoilt, stopping
+from task_world import world_of_blocks
+from tiny_world import Altered, Change, World, events, parameters, prepared_for, spoilt, stopping, taught
 
 from fprf.config import TrainConfig
 from fprf.errors import NumericsError
 from fprf.interfaces import DataManager
 from fprf.methods import fprf
-from fprf.plugins.decoders.config import ResidualDecoderConfig
 from fprf.plugins.samplers.config import UniformConfig
-from fprf.training import checkpoint, trainer
-from fprf.training.blocks import BlockTask, train_block
+from fprf.training import checkpoint, driver, learner
+from fprf.training.driver import Report
 from fprf.training.model import build_model
-from fprf.training.prepare import device_of, prepare
+from fprf.training.prepare import device_of
 from fprf.training.run import Run
 from fprf.training.style_pass import measure_style
-from fprf.training.trainer import Report, train
 from fprf.types import Batch
 
 STEPS = 4
@@ -45,28 +44,28 @@ class Steps:
         self.waits: list[int] = []
         self.uploads: list[int] = []
         self.seen: Any = None
-        plain = trainer.Loop.step
+        plain = learner.FieldLearner.step
 
-        def counted(loop: trainer.Loop, step: int, share: float) -> Any:
+        def counted(loop: learner.FieldLearner, step: int, share: float) -> Any:
             before = self.seen.syncs.total(), self.seen.uploads.total()
             result = plain(loop, step, share)
             self.waits.append(self.seen.syncs.total() - before[0])
             self.uploads.append(self.seen.uploads.total() - before[1])
             return result
 
-        monkeypatch.setattr(trainer.Loop, "step", counted)
-        monkeypatch.setattr(trainer, "REPORT_SECONDS", 1e9)
+        monkeypatch.setattr(learner.FieldLearner, "step", counted)
+        monkeypatch.setattr(driver, "REPORT_SECONDS", 1e9)
 
 
 def trained(
     config: TrainConfig, folder: Path, change: Change | None = None, wrap: Callable[..., DataManager] = Altered
 ) -> tuple[Run, list[Report]]:
     """Prepare and train; the reports."""
-    prepared, reports = prepare(config), []
+    prepared, reports = prepared_for(config), []
     if change is not None:
         prepared = prepared._replace(manager=wrap(prepared.manager, change))
     folder.mkdir(exist_ok=True)
-    train(config, prepared, Run(folder), reports.append)
+    taught(config, prepared, Run(folder), reports.append)
     return Run(folder), reports
 
 
@@ -99,8 +98,8 @@ def agrees(
 def variant(name: str, config: TrainConfig) -> TrainConfig:
     config, content = replace(config, steps=STEPS), config.content
     match name:
-        case "marked, poses, tones, residual":
-            return replace(config, poses=0.02, tones=True, content=replace(content, decoder=ResidualDecoderConfig()))
+        case "marked, poses, tones":
+            return replace(config, poses=0.02, tones=True)
         case "uniform, no semantics":
             semantic = replace(config.semantic, encoder=None)
             return replace(config, sampler=UniformConfig(samples=12), semantic=semantic)
@@ -121,7 +120,7 @@ def variant(name: str, config: TrainConfig) -> TrainConfig:
     return config
 
 
-@pytest.mark.parametrize("name", ["lite", "marked, poses, tones, residual", "uniform, no semantics", "paper"])
+@pytest.mark.parametrize("name", ["lite", "marked, poses, tones", "uniform, no semantics", "paper"])
 def test_training_is_that_of_the_cpu_without_waits_or_copies(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
@@ -135,7 +134,7 @@ def test_training_is_that_of_the_cpu_without_waits_or_copies(
 
 def test_a_step_that_is_not_finite_changes_nothing(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As on the CPU, but told at a report."""
-    monkeypatch.setattr(trainer, "REPORT_SECONDS", 1e9)
+    monkeypatch.setattr(driver, "REPORT_SECONDS", 1e9)
     config = replace(world.config, steps=STEPS)
     run, reports = on_device(config, tmp_path / "device", change=spoilt(NAN, 1, 2))
     expected = agrees(run, config, tmp_path, change=spoilt(NAN, 1, 2))
@@ -161,9 +160,9 @@ def test_apple_s_device_needs_no_float64(world: World, tmp_path: Path) -> None:
     config = replace(world.config, steps=2, poses=0.02, tones=True)
     with pretend_cuda(mps=True):
         run, reports = trained(replace(config, device="mps:0"), tmp_path / "mps")
-        prepared = prepare(config)
+        prepared = prepared_for(config)
         scene, model = prepared.scene, build_model(config, prepared.facts)
-        checkpoint.restore(checkpoint.load(run.checkpoints, 2), model, None)
+        checkpoint.restore(checkpoint.load(run.checkpoints, 2).state, model, None)
         found = measure_style(config, model.to("mps:0"), scene.cameras, scene.train)
     _, expected = trained(config, tmp_path / "cpu")
     assert reports[-1].losses == pytest.approx(expected[-1].losses, rel=1e-5, abs=1e-9)
@@ -217,7 +216,7 @@ def test_a_thread_draws_again_after_going_back() -> None:
         def image(self, view: int) -> torch.Tensor:
             raise NotImplementedError
 
-    batches = trainer.Batches(Numbers(), torch.device("meta"))
+    batches = learner.Batches(Numbers(), torch.device("meta"))
     assert [int(batches(step).view) for step in (0, 1, 2, 0, 1, 4)] == [0, 1, 2, 0, 1, 4]
     with pytest.raises(ValueError, match="no such step"):
         batches(5)
@@ -228,7 +227,7 @@ def test_features_are_made_on_the_device(world: World, tmp_path: Path, monkeypat
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     with pretend_cuda() as seen:
         assert device_of("auto") == CUDA
-        there = prepare(replace(world.config, device="auto"))
+        there = prepared_for(replace(world.config, device="auto"))
     assert seen.uploads["aten._to_copy.default"] > 2 * len(there.scene.train), "each image, to each encoder"
     here, batch = world.prepared.manager.batch(0), there.manager.batch(0)
     for kind, scale in (("content", there.facts.content_scale), ("semantic", there.facts.semantic_scale)):
@@ -243,8 +242,7 @@ def test_a_block_is_trained_on_a_device(block_world: BlockWorld, tmp_path: Path,
     Run(root).save_config(replace(config, device="cuda:0"), method)
     unfinish(root, 1)
     with pretend_cuda() as steps.seen:
-        task = BlockTask(root=str(root), data=str(block_world.config.data), block=1, minutes=None, quiet=True)
-        assert train_block(task, lambda event: None)
+        assert world_of_blocks(block_world.config, root).train(root, 1)
     assert set(steps.waits) == {0} and set(steps.uploads[2:]) == {0}
     found, expected = tensors_of(root, "01"), tensors_of(block_world.root, "01")
     assert found.keys() == expected.keys()

@@ -17,7 +17,7 @@ from browser import Front, front, served
 from tiny_world import World, flags
 
 from fprf.splats.files import read_capture
-from fprf.splats.training import gaussians_of
+from fprf.splats.gaussians import from_tensors
 from fprf.training import checkpoint
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
@@ -152,7 +152,7 @@ def test_photographs_become_a_restyled_ply_without_a_terminal(tmp_path: Path) ->
             acts.filter(has_text=".ply").click()
         assert downloaded.value.suggested_filename == "garden-restyled.ply"
         downloaded.value.save_as(tmp_path / "restyled.ply")
-        plain = gaussians_of(checkpoint.load_latest(made / "garden" / "run" / "checkpoints")[0])
+        plain = from_tensors(checkpoint.load_latest(made / "garden" / "run" / "checkpoints")[0].model)
         styled = read_capture(tmp_path / "restyled.ply").gaussians
         assert torch.equal(styled.means, plain.means) and not torch.allclose(styled.harmonics, plain.harmonics, atol=0.1)
         with page.expect_download(timeout=120_000) as downloaded:

@@ -22,7 +22,7 @@ from ...errors import DataError
 from ...interfaces import DataParser
 from ...rendering.splines import rotations
 from ..scene import Scene
-from .config import ColmapConfig
+from .config import ColmapConfig, model_folders
 from .files import NamedFiles, path_inside, read_bytes, read_float, read_npz, read_ply_points
 from .views import View, assemble_scene, index_tensor, lens_of, pixel_size, quaternion_rotation, read_views, rigid_pose
 
@@ -330,13 +330,6 @@ def _undistort(folder: Path, images: str = "IMAGES") -> str:
     """The remedy for lenses that cannot be represented."""
     paths = f"--image_path {shlex.quote(images)} --input_path {shlex.quote(str(folder))} --output_path UNDISTORTED"
     return f"undistort the images with `colmap image_undistorter {paths}` and give the folder UNDISTORTED"
-
-
-def model_folders(data: Path) -> list[Path]:
-    """Folders of sparse models in a scene folder: sparse/0, sparse/1, ... sparse, the folder itself, colmap/sparse/0, ..."""
-    numbered = [sorted(path for path in (data / place).glob("*")) for place in ("sparse", "colmap/sparse")]
-    folders = [*numbered[0], data / "sparse", data, *numbered[1]]
-    return [each for each in folders if (each / "cameras.bin").is_file() or (each / "cameras.txt").is_file()]
 
 
 def largest_model(data: Path) -> tuple[Path | None, list[str]]:

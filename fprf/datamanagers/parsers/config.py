@@ -1,4 +1,4 @@
-"""Parser configs, and the choice among all that are installed. `build` and `recognises` import the implementation.
+"""Parser configs, the files that each format is known by, and the choice among all parsers that are installed.
 
 Confidence of the built-in formats: 0.6 to 0.9 where files were prepared for training, 0.5 for a reconstruction that comes
 with its images, 0.3 for raw recordings. Prepared folders often hold the reconstruction that they were made of.
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from ..scene import Scene
 
 
+ODM_FILES = "opensfm/reconstruction.json", "odm_report/shots.geojson"
+
+
 class Recognised(NamedTuple):
     """A parser's confidence that it reads a folder."""
 
@@ -29,6 +32,41 @@ class Recognised(NamedTuple):
     """In (0, 1]: the parser with the highest one reads the folder; a tie is an error."""
     reason: str
     """The file or folder that it was recognised by, for example `transforms.json`."""
+
+
+def model_folders(data: Path) -> list[Path]:
+    """Folders of COLMAP's models in a scene folder: sparse/0, sparse/1, ... sparse, the folder itself, colmap/sparse/0, ..."""
+    numbered = [sorted(path for path in (data / place).glob("*")) for place in ("sparse", "colmap/sparse")]
+    folders = [*numbered[0], data / "sparse", data, *numbered[1]]
+    return [each for each in folders if (each / "cameras.bin").is_file() or (each / "cameras.txt").is_file()]
+
+
+def is_record(name: str) -> bool:
+    """Return whether a file name is that of a TFRecord file or of one of its shards."""
+    return re.search(r"\.tfrecord(-\d+-of-\d+)?$", name) is not None
+
+
+def keyframes(data: Path) -> list[tuple[Path, Path]]:
+    """Folders of Polycam's images and cameras, corrected ones first; they lie in `keyframes`, which `data` may be."""
+    for root in (data / "keyframes", data):
+        pairs = [(root / f"{kind}images", root / f"{kind}cameras") for kind in ("corrected_", "")]
+        there = [(images, cameras) for images, cameras in pairs if images.is_dir() and next(cameras.glob("*.json"), None)]
+        if there:
+            return there
+    return []
+
+
+def recording(data: Path) -> tuple[Path, Path] | None:
+    """Record3D's metadata and its folder of images, or None."""
+    names = (("metadata.json", "rgb"), ("metadata", "rgbd"), ("metadata", "rgb"), ("metadata.json", "rgbd"))
+    pairs = ((data / file, data / images) for file, images in names)
+    return next(((file, images) for file, images in pairs if file.is_file() and images.is_dir()), None)
+
+
+def project_file(data: Path) -> Path | None:
+    """File with the poses of an OpenDroneMap project, or None."""
+    files = (data / name for name in ODM_FILES)
+    return next((file for file in files if file.is_file()), None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,8 +133,6 @@ class ColmapConfig(DataParserConfig):
     """Image folder. `images_N` holds images reduced by N: the model's cameras are then scaled to their size."""
 
     def recognises(self, data: Path) -> Recognised | None:
-        from .colmap import model_folders
-
         folder = next(iter(model_folders(data)), None)
         return Recognised(0.5, f"a model in {folder}") if folder is not None else None
 
@@ -118,11 +154,6 @@ class GardenConfig(DataParserConfig):
         from .transforms import GardenParser
 
         return GardenParser()
-
-
-def is_record(name: str) -> bool:
-    """Return whether a file name is that of a TFRecord file or of one of its shards."""
-    return re.search(r"\.tfrecord(-\d+-of-\d+)?$", name) is not None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,8 +204,6 @@ class PhotoTourismConfig(DataParserConfig):
 
     def recognises(self, data: Path) -> Recognised | None:
         """By the only *.tsv beside a model, or beside `dense` with a model."""
-        from .colmap import model_folders
-
         tables = [path.name for path in data.glob("*.tsv")]
         modelled = model_folders(data) or model_folders(data / "dense")
         return Recognised(0.6, tables[0]) if len(tables) == 1 and modelled else None
@@ -190,8 +219,6 @@ class PolycamConfig(DataParserConfig):
     """Polycam's raw data: `keyframes` with images and a JSON file for each camera, corrected ones first."""
 
     def recognises(self, data: Path) -> Recognised | None:
-        from .polycam import keyframes
-
         folders = keyframes(data)
         return Recognised(0.3, str(folders[0][1])) if folders else None
 
@@ -212,8 +239,6 @@ class Record3DConfig(DataParserConfig):
         at_least("parser.frames", self.frames, 1)
 
     def recognises(self, data: Path) -> Recognised | None:
-        from .record3d import recording
-
         record = recording(data)
         return Recognised(0.3, record[0].name) if record is not None else None
 
@@ -231,8 +256,6 @@ class OdmConfig(DataParserConfig):
     """Folder of the photographs, of any size."""
 
     def recognises(self, data: Path) -> Recognised | None:
-        from .odm import project_file
-
         record = project_file(data)
         return Recognised(0.3, record.name) if record is not None else None
 

@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from ...errors import DataError
 from ...interfaces import DataParser
 from ..scene import Scene
-from .config import OdmConfig
+from .config import ODM_FILES, OdmConfig, project_file
 from .files import NamedFiles, Record, as_record, path_inside, read_json
 from .views import View, assemble_scene, image_size, lens_of, read_views, rigid_pose
 
-_RECONSTRUCTION, _SHOTS = "opensfm/reconstruction.json", "odm_report/shots.geojson"
 _LENSES = dict.fromkeys(("perspective", "simple_radial", "radial", "brown"), "OPENCV")
 _LENSES |= {"fisheye": "FISHEYE", "fisheye_opencv": "OPENCV_FISHEYE", "spherical": "EQUIRECTANGULAR"}
 """COLMAP's names of OpenSfM's."""
@@ -41,11 +40,6 @@ class _Shot(NamedTuple):
     place: NDArray[np.float64]
 
 
-def project_file(data: Path) -> Path | None:
-    """File with the poses of a project's images, or None."""
-    return next((data / file for file in (_RECONSTRUCTION, _SHOTS) if (data / file).is_file()), None)
-
-
 class OdmParser(DataParser):
     """A project folder."""
 
@@ -56,7 +50,7 @@ class OdmParser(DataParser):
         """The scene at 1/downscale of its photographs, with the reconstruction's points where they are there."""
         file = project_file(data)
         if file is None:
-            raise DataError(f"{data}: neither {_RECONSTRUCTION} nor {_SHOTS}; give the folder of an ODM project")
+            raise DataError(f"{data}: neither {' nor '.join(ODM_FILES)}; give the folder of an ODM project")
         shots, points = _reconstruction(file) if file.name == "reconstruction.json" else (_shots(data, file), None)
         folder = path_inside(data, "parser.images", self.config.images)[1]
         files = NamedFiles(folder)
@@ -98,7 +92,7 @@ def _shots(data: Path, file: Path) -> list[_Shot]:
         if key is None and len(cameras) == 1:
             key = next(iter(cameras))
         if key is None or key not in cameras:
-            raise DataError(f"{record.where}: which of {len(cameras)} cameras took it is not said; keep {_RECONSTRUCTION}")
+            raise DataError(f"{record.where}: which of {len(cameras)} cameras took it is not said; keep {ODM_FILES[0]}")
         shots.append(_Shot(name, cameras[key], _turn(record), record.numbers("translation", 3)))
     return shots
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from ...errors import DataError
 from ...interfaces import DataParser
 from ..scene import Scene
-from .colmap import ColmapParser, model_folders
-from .config import ColmapConfig, PhotoTourismConfig
+from .colmap import ColmapParser
+from .config import ColmapConfig, PhotoTourismConfig, model_folders
 from .files import name_of
 
 

@@ -14,21 +14,9 @@ from ...errors import DataError
 from ...interfaces import DataParser
 from ..images import IMAGE_SUFFIXES
 from ..scene import Scene
-from .config import PolycamConfig
+from .config import PolycamConfig, keyframes
 from .files import as_record, read_json
 from .views import View, assemble_scene, read_views, rigid_pose, stated_size
-
-_PAIRS = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
-
-
-def keyframes(data: Path) -> list[tuple[Path, Path]]:
-    """Folders of images and cameras in a scene folder, corrected ones first: either may be `keyframes` or hold it."""
-    for root in (data / "keyframes", data):
-        pairs = [(root / images, root / cameras) for images, cameras in _PAIRS]
-        there = [(images, cameras) for images, cameras in pairs if images.is_dir() and next(cameras.glob("*.json"), None)]
-        if there:
-            return there
-    return []
 
 
 class PolycamParser(DataParser):

@@ -15,18 +15,11 @@ from ...errors import DataError
 from ...interfaces import DataParser
 from ..images import image_names
 from ..scene import Scene
-from .config import Record3DConfig
+from .config import Record3DConfig, recording
 from .files import Record, as_record, read_json
 from .views import View, assemble_scene, quaternion_rotation, read_views, rigid_pose, stated_size
 
 _NUMBER = re.compile("[0-9]{1,9}")
-_PAIRS = (("metadata.json", "rgb"), ("metadata", "rgbd"), ("metadata", "rgb"), ("metadata.json", "rgbd"))
-
-
-def recording(data: Path) -> tuple[Path, Path] | None:
-    """The metadata and the folder of images in a scene folder, or None."""
-    pairs = ((data / file, data / images) for file, images in _PAIRS)
-    return next(((file, images) for file, images in pairs if file.is_file() and images.is_dir()), None)
 
 
 class Record3DParser(DataParser):

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from ...checks import at_least, positive
 from ..config import Need, PluginConfig, absent_file
 from ..encoders.config import EncoderConfig
 from ..registry import name_of
@@ -56,35 +55,6 @@ class MlpDecoderConfig(DecoderConfig):
         from .decoders import load_decoder
 
         return load_decoder(self.weights, encoder=encoder, channels=channels, objective=self.objective)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ResidualDecoderConfig(DecoderConfig):
-    """The frozen decoder and a small colour head that every scene trains for itself; a style fades the head out."""
-
-    weights: Path | None = None
-    """A decoder made by `fprf pretrain decoder`. By default the one that ships for the chosen encoder."""
-    hidden: int = 32
-    """Hidden units of the head."""
-    fade: float = 0.5
-    """Change of the decoded colour, in logits, at which a full style leaves 1/e of the head's share."""
-
-    def __post_init__(self) -> None:
-        at_least("hidden", self.hidden, 1)
-        positive("fade", self.fade)
-
-    def needs(self) -> tuple[Need, ...]:
-        """The file, where one is named; whether it fits the encoder is found when it is read."""
-        return absent_file(self.weights)
-
-    def build(self, *, encoder: str, channels: int, seed: int = 0) -> Decoder:
-        import torch
-
-        from .decoders import ResidualDecoder, load_decoder
-
-        frozen = load_decoder(self.weights, encoder=encoder, channels=channels)
-        generator = torch.Generator().manual_seed(seed)
-        return ResidualDecoder(frozen, hidden=self.hidden, fade=self.fade, generator=generator)
 
 
 def pretrain_line(encoder: EncoderConfig | Missing, output: Path = Path("decoder.safetensors")) -> str:

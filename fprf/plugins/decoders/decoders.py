@@ -1,10 +1,4 @@
-"""D_VGG of the paper: content features to colour by a two-layer network, point by point.
-
-D_VGG with a colour head of the scene's own, whose share of a colour fades out as a style changes that colour.
-
-In logits: colour = D(content) + head(content), restyled = D(styled) + w head(content). The head learns what the scene-agnostic
-decoder gets wrong about this scene; in another style that no longer holds, and would carry the scene's saturated colours over.
-"""
+"""D_VGG of the paper: content features to colour by a two-layer network, point by point."""
 
 from pathlib import Path
 from typing import Annotated
@@ -35,27 +29,6 @@ class MlpDecoder(Decoder):
         """sRGB in [0, 1]."""
         maps = (self.first, self.second)
         return torch.sigmoid(dense.network(content, [m.weight for m in maps], [m.bias for m in maps]))
-
-    def hidden(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N H"]:
-        """The hidden units: of about unit scale for features like those it was trained on."""
-        return dense.network(content, [self.first.weight], [self.first.bias], last="relu")
-
-    def logit(self, hidden: Annotated[Tensor, "N H"]) -> Annotated[Tensor, "N 3"]:
-        """The colour that hidden units give, before its sigmoid."""
-        return dense.network(hidden, [self.second.weight], [self.second.bias])
-
-    def restyled(
-        self,
-        content: Annotated[Tensor, "N C"],
-        styled: Annotated[Tensor, "N C"],
-        strength: float | Annotated[Tensor, "N 1"],
-    ) -> Annotated[Tensor, "N 3"]:
-        """The decoded style: there is nothing of the scene's own to be kept."""
-        colour: Tensor = self(styled)
-        return colour
-
-    def frozen_colour(self, content: Annotated[Tensor, "N C"]) -> None:
-        """None: it has no parameters of a scene."""
 
 
 def load_decoder(path: Path | None, *, encoder: str, channels: int, objective: Objective = "identity") -> MlpDecoder:
@@ -93,68 +66,3 @@ def _loaded(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str], *,
     decoder.eval()
     decoder.requires_grad_(False)
     return decoder
-
-
-def residual_share(
-    change: Annotated[Tensor, "N 3"], strength: float | Annotated[Tensor, "N 1"], fade: float
-) -> Annotated[Tensor, "N 1"]:
-    """Share of the residual that a restyled colour keeps: 1 - strength (1 - g), with g = exp(-mean(change^2) / fade^2).
-
-    1 without a change or at strength 0, exactly; at full strength 1/e where the decoded logits change by `fade` (root mean
-    square over the channels), and soon nothing.
-    """
-    return 1 + strength * torch.expm1(-change.square().mean(-1, keepdim=True) / fade**2)
-
-
-class ColourHead(nn.Module):
-    """One hidden layer on the decoder's hidden units, which are of unit scale for any encoder. Starts at exactly 0.
-
-    Weights are kept times the root of their fan-in. Adam moves each by the learning rate, whatever its size: at the rate
-    that planes need, plain weights move a logit by half a unit in one step, and on a red flower the head ran off and died
-    (20.4 -> 16.2 dB after 400 steps).
-    """
-
-    def __init__(self, inputs: int, hidden: int, generator: torch.Generator) -> None:
-        super().__init__()
-        bound = 6**0.5
-        self.first = nn.Parameter(torch.empty(hidden, inputs).uniform_(-bound, bound, generator=generator))
-        self.first_bias = nn.Parameter(torch.zeros(hidden))
-        self.second = nn.Parameter(torch.zeros(3, hidden))
-        self.second_bias = nn.Parameter(torch.zeros(3))
-
-    def forward(self, hidden: Annotated[Tensor, "N I"]) -> Annotated[Tensor, "N 3"]:
-        """Logits to be added."""
-        maps = [weight / weight.shape[1] ** 0.5 for weight in (self.first, self.second)]
-        return dense.network(hidden, maps, [self.first_bias, self.second_bias])
-
-
-class ResidualDecoder(Decoder):
-    """A frozen `MlpDecoder` and a `ColourHead` that is trained with the scene."""
-
-    def __init__(self, frozen: MlpDecoder, *, hidden: int, fade: float, generator: torch.Generator) -> None:
-        super().__init__()
-        self.frozen = frozen
-        self.head = ColourHead(frozen.first.out_features, hidden, generator)
-        self._fade = fade
-
-    def forward(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"]:
-        """sigmoid(D + head), in [0, 1]."""
-        hidden = self.frozen.hidden(content)
-        return torch.sigmoid(self.frozen.logit(hidden) + self.head(hidden))
-
-    def restyled(
-        self,
-        content: Annotated[Tensor, "N C"],
-        styled: Annotated[Tensor, "N C"],
-        strength: float | Annotated[Tensor, "N 1"],
-    ) -> Annotated[Tensor, "N 3"]:
-        """sigmoid(D(styled) + w head(content)), w by `residual_share`."""
-        hidden = self.frozen.hidden(content)
-        logit = self.frozen.logit(self.frozen.hidden(styled))
-        share = residual_share(logit - self.frozen.logit(hidden), strength, self._fade)
-        return torch.sigmoid(logit + share * self.head(hidden))
-
-    def frozen_colour(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"]:
-        """sigmoid(D)."""
-        colour: Tensor = self.frozen(content)
-        return colour

@@ -6,6 +6,7 @@ from typing import Annotated
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from ...errors import WeightsError
 from ..weights import read_weights
@@ -131,7 +132,14 @@ def _loaded(name: str, student: nn.Module, tensors: dict[str, Tensor], path: Pat
     except RuntimeError as error:
         first = str(error).splitlines()[-1].strip()
         raise WeightsError(f"{path}: does not fit this version's network ({first}); train it again") from error
-    return NetworkEncoder(name, student, stride=stride)
+    encoder = NetworkEncoder(name, student, stride=stride)
+    # Once its identity is known: normalisation as part of the convolutions before it, and channels last, as they are computed
+    # on the CPU. 1.5 times as fast on two threads, and the same features up to rounding.
+    for module in student.modules():
+        if isinstance(module, _ConvNorm):
+            module.conv, module.norm = fuse_conv_bn_eval(module.conv, module.norm), nn.Identity()
+    student.to(memory_format=torch.channels_last)
+    return encoder
 
 
 class RandomEncoder(FrozenEncoder):

@@ -3,7 +3,7 @@
 M_w = R^S M and Sigma_w = R^S Sigma over the codes' means and deviations, then Sigma_w (F - mu_c) / sigma_c + M_w with the
 statistics of the whole scene. With dot products, not centred, at the absolute temperature 1, R^S is the paper's softmax(R).
 
-Global AdaIN (paper, single reference) is sigma_s (F - mu_c) / sigma_c + mu_s; the identity changes nothing.
+Global AdaIN (paper, single reference) is sigma_s (F - mu_c) / sigma_c + mu_s.
 """
 
 from typing import Annotated
@@ -20,27 +20,6 @@ from ...style.scene import SceneStyle, check_fit
 from ...style.statistics import deviation
 from ...types import Want
 from .config import LocalAdainConfig
-
-
-class IdentityStylizer(Stylizer):
-    """Content goes through bit for bit."""
-
-    odds: Tensor
-
-    def __init__(self, dictionary: StyleDictionary) -> None:
-        super().__init__()
-        self.register_buffer("odds", code_odds(dictionary).float())
-
-    @property
-    def needs(self) -> Want:
-        return Want.CONTENT
-
-    def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
-        return content
-
-    def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
-        """Every point alike: the codes' shares of the references."""
-        return self.odds.expand(len(semantic), -1)
 
 
 class AdainStylizer(Stylizer):

@@ -52,16 +52,6 @@ class StylizerConfig(PluginConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class IdentityConfig(StylizerConfig):
-    """Leaves the scene as it is: shows what the decoder alone does."""
-
-    def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
-        from .adain import IdentityStylizer
-
-        return IdentityStylizer(dictionary)
-
-
-@dataclass(frozen=True, kw_only=True)
 class AdainConfig(StylizerConfig):
     """Global AdaIN (paper, single reference): one mean and deviation of all references. Needs no semantics."""
 
@@ -144,11 +134,6 @@ class _RegionConfig(StylizerConfig):
         plan = plan_regions(dictionary, scene, matching, self.smoothing(scene, dictionary.allowed))
         maps = MatrixMaps if self.transport else ChannelMaps
         return TwoSidedStylizer(plan, scene, maps(plan, scene, self.gain))
-
-
-@dataclass(frozen=True, kw_only=True)
-class RegionAdainConfig(_RegionConfig):
-    """Two-sided AdaIN: points belong to scene regions, regions match style codes, channel by channel."""
 
 
 @dataclass(frozen=True, kw_only=True)

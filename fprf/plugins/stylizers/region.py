@@ -4,8 +4,8 @@
 
 A_k and b_k carry region k's statistics to those of the codes that it matches, through a [K T] table that a user can read.
 The source statistics are mixed over the scene's own regions just as the target's are over the codes: a dictionary that
-equals the scene gives the identity, and a high temperature gives the global style. Region AdaIN and region OT differ in
-nothing but A_k: per channel sigma_s / sigma_c, or the optimal transport of all channels at once.
+equals the scene gives the identity, and a high temperature gives the global style. `region-tone` and `region-ot` differ in
+A_k: per channel sigma_s / sigma_c (AdaIN), or the optimal transport of all channels at once.
 """
 
 from abc import ABC, abstractmethod

@@ -24,7 +24,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ...fields.planes import harmonics as harmonic_functions
+from ...ops.harmonics import spherical_harmonics
 from ...plugins.captures import CaptureFormat
 from ...types import Origin
 from ..gaussians import COUNTS, Gaussians, bulk_of, from_arrays
@@ -237,7 +237,7 @@ def _turn(bands: int) -> Floats:
     there = torch.nn.functional.normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(0)).double(), dim=1)
     before = torch.stack([there[:, 0], -there[:, 2], there[:, 1]], 1)
     degree = math.isqrt(bands)
-    return np.asarray(torch.linalg.lstsq(harmonic_functions(there, degree), harmonic_functions(before, degree)).solution)
+    return np.asarray(torch.linalg.lstsq(spherical_harmonics(there, degree), spherical_harmonics(before, degree)).solution)
 
 
 def _axes(path: Path, number: int, degree: int) -> _Axes:

@@ -3,9 +3,10 @@
 import pytest
 import torch
 from style_cases import points, references, scene_of, setting
+from two_sided import region_adain
 
 from fprf.errors import DataError
-from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionAdainConfig
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig
 from fprf.style.dictionary import Reference, build_dictionary
 from fprf.style.matching import score_spread, share_mean, unit
 from fprf.style.scene import own_style
@@ -59,6 +60,6 @@ def test_the_scenes_own_style_gives_the_scene() -> None:
 def test_other_encoders_references_are_refused() -> None:
     content, semantic = points()
     d = build_dictionary([Reference("a", torch.randn(9, 5), torch.randn(9, 4))])
-    for config in (LocalAdainConfig(), RegionAdainConfig()):
+    for config in (LocalAdainConfig(), region_adain()):
         with pytest.raises(DataError, match="5 content and 4 semantic channels"):
             config.build(dictionary=d, scene=scene_of(content, semantic))

@@ -1,15 +1,17 @@
 """Two-sided stylizers against their definition, written out in float64; identity and limits."""
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from style_cases import points, scene_of, setting
+from two_sided import region_adain
 
 from fprf.plugins.stylizers.config import (
     AdainConfig,
     LocalAdainConfig,
-    RegionAdainConfig,
     RegionOtConfig,
     RegionToneConfig,
     StylizerConfig,
@@ -21,9 +23,9 @@ from fprf.style.scene import Membership, SceneStyle, own_style
 from fprf.style.statistics import deviation, monge
 from fprf.types import Want
 
-BOTH = (RegionAdainConfig, RegionOtConfig)
+BOTH = (region_adain, RegionOtConfig)
 PAPER = LocalAdainConfig(similarity="dot", centred=False, relative=False, temperature=1.0)
-Config = type[RegionAdainConfig] | type[RegionOtConfig]
+Config = Callable[..., StylizerConfig]
 
 
 def plain_table(scene: SceneStyle, d: StyleDictionary, temperature: float, similarity: Similarity = "cosine") -> torch.Tensor:
@@ -113,7 +115,7 @@ def test_a_region_that_no_reference_shows_takes_the_codes_of_one_that_looks_like
     st.integers(1, 12),
     st.sampled_from([0.0, 1e-6, 1.0, 1e4]),
     st.sampled_from([0.0, 1e-6, 1.0, 1e4]),
-    st.sampled_from([AdainConfig(), LocalAdainConfig(), PAPER, RegionAdainConfig(), RegionOtConfig(), RegionToneConfig()]),
+    st.sampled_from([AdainConfig(), LocalAdainConfig(), PAPER, region_adain(), RegionOtConfig(), RegionToneConfig()]),
 )
 def test_never_nan_for_degenerate_scenes_and_styles(
     n: int, regions: int, clusters: int, here: float, there: float, config: StylizerConfig

@@ -1,0 +1,197 @@
+"""The space of a scene of blocks, and which tiles of which views each block learns from.
+
+Pure geometry of cameras and sparse points: made in seconds, before any image is decoded.
+
+The space: Rays, sample spacing and density live here, the same for all blocks, so that densities blend as they are; each
+block maps the points of this space to its own unit cube.
+
+Visibility: Images are looked at in tiles. Where a ray ends is known from the sparse points around: a tile's rays reach BEYOND
+times as far as the farthest point that is seen in it or its neighbours, and without end where nothing is (the sky).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ..datamanagers.bounds import FAR, NEAR, ROUNDING, axes
+from ..datamanagers.scene import TILES, Scene, Sightings, find_sightings, tile_of
+from ..errors import ConfigError, DataError
+from ..rendering.cameras import Cameras, rays_through
+from ..rendering.space import Space
+from ..types import Cell, Site
+from .config import LayoutConfig
+from .routing import chart_of
+
+FLAT = 0.3
+"""Cameras spread over a plane if their third extent is below this share of their second ..."""
+WIDE = 0.2
+"""... and that one above this share of the first."""
+NEAREST = 0.001
+"""Share of the sightings that may lie closer than twice the nearest distance that is looked at."""
+SPACINGS = 10.0
+"""Without points views are taken to see this many times the distance to the next camera ..."""
+SOME = 512
+"""... which is measured for about so many of them."""
+BEYOND = 1.25
+"""Rays end at most so many times farther than what is seen around them."""
+VIEWS = 256
+"""Views whose tiles are looked at together: bounds memory, changes nothing."""
+
+
+def level_axes(cameras: Cameras) -> Annotated[Tensor, "3 3"]:
+    """Rows: along the capture, across, up. Over a plane (drones) its normal is up; along a line (streets) the cameras' own."""
+    offset = cameras.pose[:, :, 3] - cameras.pose[:, :, 3].mean(0)
+    _, extent, rows = torch.linalg.svd(offset, full_matrices=True)
+    if len(extent) < 3 or extent[2] > FLAT * extent[1] or extent[1] < WIDE * extent[0]:
+        return axes(cameras)
+    up, along = rows[2], rows[0]
+    upright, ahead = cameras.pose[:, :, 1].mean(0), -cameras.pose[:, :, 2].mean(0)
+    # Cameras stand upright, or look down: one of the two tells which side of the plane the sky is on.
+    if (upright @ up - ahead @ up) < 0:
+        up = -up
+    if offset[-1] @ along < offset[0] @ along:
+        along = -along
+    return torch.stack([along, torch.linalg.cross(up, along), up])
+
+
+def open_space(scene: Scene, sightings: Sightings | None) -> Space:
+    """The space of kind `open`. Raises DataError where all cameras stand in one place and nothing says how far they see."""
+    position = scene.cameras.pose[:, :, 3]
+    centre, turn = position.mean(0), level_axes(scene.cameras)
+    nearest = None
+    if sightings is not None:
+        unit = float(sightings.distance.median())
+        nearest = float(sightings.distance.sort().values[int(NEAREST * len(sightings.distance))])
+    elif scene.depths is not None:
+        unit, nearest = float(scene.depths.prod(-1).sqrt().median()), float(scene.depths[:, 0].amin())
+    else:
+        apart = torch.cdist(position[:: max(1, len(position) // SOME)], position)
+        unit = SPACINGS * float(apart.topk(2, largest=False).values[:, 1].median()) if len(position) > 1 else 0.0
+    if unit <= ROUNDING * max(1.0, float(position.abs().amax())):
+        raise DataError(f"{scene.name}: all cameras stand in one place and there are no points; capture from several places")
+    near = NEAR if nearest is None else min(NEAR, max(1e-3, 0.5 * nearest / unit))
+    first, second, third = ((float(row[0]), float(row[1]), float(row[2])) for row in turn)
+    middle = (float(centre[0]), float(centre[1]), float(centre[2]))
+    return Space("open", middle, (first, second, third), 1 / unit, near, FAR)
+
+
+def site_of(scene: Scene, space: Space) -> Site:
+    """Training cameras and sparse points in the space."""
+    turn = torch.tensor(space.rotation, dtype=torch.float64)
+    centre = torch.tensor(space.centre, dtype=torch.float64)
+    cameras = scene.cameras.select(scene.train)
+    points = scene.points if scene.points is not None else centre.new_zeros(0, 3)
+    return Site(
+        ((cameras.pose[:, :, 3] - centre) @ turn.T) * space.scale,
+        cameras.size.prod(-1),
+        ((points - centre) @ turn.T) * space.scale,
+        1 / space.scale,
+    )
+
+
+class Tiles(NamedTuple):
+    """The rays through the middles of the tiles of M views, in the space; float32 is enough here."""
+
+    origin: Annotated[Tensor, "M 3"]
+    direction: Annotated[Tensor, "M TILES TILES 3"]
+    reach: Annotated[Tensor, "M TILES TILES"]
+    """Upper bounds of the lengths of rays, space units; inf where nothing is known."""
+    pixels: Annotated[Tensor, "M TILES TILES"]
+    """int64 pixels of each tile; 0 outside of the image."""
+
+
+def tile_rays(scene: Scene, space: Space, views: Annotated[Tensor, "M"], sightings: Sightings | None) -> Tiles:
+    """Tiles [row, column] of some views."""
+    cameras = scene.cameras
+    size = cameras.size[views].double()
+    side = size.amax(1) / TILES
+    low = side[:, None] * torch.arange(TILES, dtype=torch.float64)
+    # Pixel centres (+0.5) in each column and row of tiles, as `tile_of` puts them there.
+    ends = [torch.minimum(low + side[:, None], extent[:, None]) for extent in size.T]
+    columns, rows = (((end - 0.5).ceil() - (low - 0.5).ceil()).clamp_min(0).long() for end in ends)
+    # The ray through the middle of each tile.
+    middle = low + side[:, None] / 2
+    x, y = (torch.minimum(middle, extent[:, None] - 0.5) for extent in size.T)
+    pixel = torch.stack([x[:, None, :].expand(-1, TILES, -1), y[:, :, None].expand(-1, -1, TILES)], -1)
+    which = views[:, None, None].expand(-1, TILES, TILES).reshape(-1)
+    rays = space.rays(*rays_through(cameras, which, pixel.reshape(-1, 2)))
+    # The farthest point that is seen in each tile, then in it or its neighbours; the sky has none.
+    reach = torch.full((len(views), TILES, TILES), torch.inf)
+    if sightings is not None:
+        slot = torch.full((len(cameras),), -1, dtype=torch.int64)
+        slot[views] = torch.arange(len(views))
+        mine = slot[sightings.view] >= 0
+        view, pixels = sightings.view[mine], sightings.pixel[mine]
+        column, row = tile_of(cameras, view, pixels).unbind(1)
+        at = (slot[view] * TILES + row) * TILES + column
+        far = torch.zeros(len(views), TILES, TILES)
+        far.view(-1).scatter_reduce_(0, at, (sightings.distance[mine] * space.scale).float(), "amax")
+        around = F.max_pool2d(far[:, None], 3, stride=1, padding=1)[:, 0]
+        reach = torch.where(around > 0, BEYOND * around, reach)
+    return Tiles(
+        rays.origin.view(-1, TILES, TILES, 3)[:, 0, 0],
+        rays.direction.view(-1, TILES, TILES, 3),
+        reach,
+        rows[:, :, None] * columns[:, None, :],
+    )
+
+
+def meets(tiles: Tiles, cell: Cell) -> Annotated[Tensor, "M TILES TILES"]:
+    """True where the rays of a tile meet a block, border included, before they end: the slab test."""
+    chart, origin = chart_of(cell), tiles.origin[:, None, None]
+    safe = torch.where(tiles.direction.abs() < 1e-9, torch.full_like(tiles.direction, 1e-9), tiles.direction)
+    a, b = (chart.low.to(origin) - origin) / safe, (chart.high.to(origin) - origin) / safe
+    enter, leave = torch.minimum(a, b).amax(-1).clamp_min(0), torch.maximum(a, b).amin(-1)
+    return (enter <= leave) & (enter <= tiles.reach) & (tiles.pixels > 0)
+
+
+def pixel_mask(seen: Annotated[Tensor, "TILES TILES"], size: tuple[int, int]) -> Annotated[Tensor, "H W"]:
+    """The pixels of the tiles that are set, for an image of (width, height)."""
+    width, height = size
+    side = max(size) / TILES
+    column = ((torch.arange(width, dtype=torch.float64) + 0.5) / side).long().clamp(max=TILES - 1)
+    row = ((torch.arange(height, dtype=torch.float64) + 0.5) / side).long().clamp(max=TILES - 1)
+    return seen[row][:, column]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """Z blocks of a scene, T training views."""
+
+    space: Space
+    cells: Sequence[Cell]
+    views: Annotated[Tensor, "T"]
+    """int64 training views of the scene."""
+    seen: Annotated[Tensor, "T Z TILES TILES"]
+    """Tiles of each view that each block learns from."""
+    pixels: Annotated[Tensor, "T TILES TILES"]
+    """int64 pixels of each tile."""
+
+    @property
+    def rays(self) -> Annotated[Tensor, "Z"]:
+        """int64 training pixels of each block."""
+        return torch.stack([(self.seen[:, z] * self.pixels).sum() for z in range(len(self.cells))])
+
+    def views_of(self, block: int) -> Annotated[Tensor, "M"]:
+        """int64 training views that a block learns from."""
+        return self.views[(self.seen[:, block] & (self.pixels > 0)).flatten(1).any(1)]
+
+
+def make_plan(scene: Scene, layout: LayoutConfig) -> Plan:
+    """Cut the scene and find out who sees what. Raises ConfigError where a block would have nothing to learn from."""
+    sightings = find_sightings(scene)
+    space = open_space(scene, sightings)
+    cells = layout.build().cut(site_of(scene, space))
+    parts: list[tuple[Tensor, Tensor]] = []
+    for views in torch.split(scene.train, VIEWS):
+        tiles = tile_rays(scene, space, views, sightings)
+        parts.append((torch.stack([meets(tiles, cell) for cell in cells], 1), tiles.pixels))
+    seen, pixels = (torch.cat(column) for column in zip(*parts, strict=True))
+    used = [block for block in range(len(cells)) if int((seen[:, block] * pixels).sum())]
+    if not used:
+        raise ConfigError(f"{scene.name}: no training view sees any block of this layout; choose another --blocks")
+    return Plan(space=space, cells=[cells[block] for block in used], views=scene.train, seen=seen[:, used], pixels=pixels)

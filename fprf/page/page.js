@@ -1,0 +1,177 @@
+// The stage of a page: a scene in 3D with its styles, or pictures of it where there is no WebGL 2 or no Gaussians.
+"use strict";
+
+const make = (tag, props = {}, ...inside) => {
+  const node = Object.assign(document.createElement(tag), props);
+  node.append(...inside);
+  return node;
+};
+const at = (id) => document.getElementById(id);
+const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+
+// Pictures in the place of a scene: views by styles, one over the other.
+class Pictures {
+  constructor(stage, stills) {
+    Object.assign(this, { stills, at: 0, first: null, second: null, blend: 1, wipe: -1, listeners: {} });
+    this.images = ["one", "two"].map((name) => stage.querySelector(`.still.${name}`));
+    this.images.forEach((image) => { image.hidden = false; });
+  }
+
+  show(changes) {
+    Object.assign(this, changes);
+    const first = this.first ?? this.second, second = this.second ?? first;
+    [first, second].forEach((name, i) => {
+      const rows = this.stills[name] ?? Object.values(this.stills)[0];
+      this.images[i].src = rows[this.at % rows.length];
+    });
+    const [one, two] = this.images;
+    two.style.opacity = this.wipe >= 0 ? 1 : this.blend;
+    two.style.clipPath = this.wipe >= 0 ? `inset(0 0 0 ${100 * this.wipe}%)` : "none";
+    one.alt = `${first}, ${second}`;
+  }
+
+  step(by) {
+    const count = Math.max(...Object.values(this.stills).map((rows) => rows.length));
+    this.at = (this.at + by + count) % count;
+    this.show({});
+  }
+}
+
+// The controls of a stage: which style, from which other one, how far, or a line between both.
+class Stage {
+  constructor(place, styles) {
+    this.place = place;
+    this.styles = [];
+    this.from = this.to = null;
+    this.wiping = false;
+    this.amount = 1;
+    this.line = 0.5;
+    this.root = at("place");
+    this.listeners = { chosen: null };
+    at("mix").oninput = () => this.set({ amount: at("mix").value / 100 });
+    at("from").onchange = () => this.set({ from: at("from").value });
+    at("wiping").onclick = () => this.set({ wiping: !this.wiping, ...(this.wiping ? {} : { line: 0.5 }) });
+    at("back").onclick = () => this.place.step(-1);
+    at("next").onclick = () => this.place.step(1);
+    at("full").onclick = () => (document.fullscreenElement ? document.exitFullscreen() : this.root.requestFullscreen?.());
+    at("full").hidden = !this.root.requestFullscreen;
+    at("how").onclick = () => { at("help").hidden = !at("help").hidden; };
+    const handle = at("line");
+    const drag = (event) => {
+      const box = this.root.querySelector(".view").getBoundingClientRect();
+      this.set({ line: Math.min(1, Math.max(0, (event.clientX - box.left) / box.width)) });
+    };
+    handle.onpointerdown = (event) => { handle.setPointerCapture(event.pointerId); event.preventDefault(); handle.focus(); };
+    handle.onpointermove = (event) => { if (handle.hasPointerCapture(event.pointerId)) drag(event); };
+    handle.onkeydown = (event) => {
+      const by = { ArrowLeft: -0.02, ArrowRight: 0.02, Home: -1, End: 1 }[event.key];
+      if (by) { event.preventDefault(); event.stopPropagation(); this.set({ line: Math.min(1, Math.max(0, this.line + by)) }); }
+    };
+    addEventListener("keydown", (event) => this.key(event));
+    styles.forEach((style) => this.add(style));
+  }
+
+  // `style` has a name and, where there is one, a small picture.
+  add(style) {
+    if (this.styles.some((each) => each.name === style.name)) return;
+    const card = make("button", { type: "button", className: "look", title: style.name, onclick: () => this.choose(style.name) },
+      style.thumb ? make("img", { src: style.thumb, alt: "", draggable: false }) : make("i"), make("span", { textContent: style.name }));
+    card.style.setProperty("--hue", String((47 * this.styles.length) % 360));
+    this.styles.push({ ...style, card });
+    at("looks").insertBefore(card, at("add"));
+    at("from").append(make("option", { value: style.name, textContent: style.name }));
+    this.set(this.from === null ? { from: style.name, to: style.name } : {});
+  }
+
+  // From the captured colours to a style, without a jump.
+  choose(name) {
+    const before = this.to;
+    this.set({ to: name, amount: 1 });
+    this.listeners.chosen?.(name);
+    if (this.wiping || before === name || !(this.place instanceof Place) || matchMedia("(prefers-reduced-motion: reduce)").matches) return;
+    const start = performance.now();
+    const step = (now) => {
+      const t = Math.min(1, (now - start) / 450);
+      if (this.to !== name || this.amount !== 1 || this.wiping) return;
+      this.place.show(t < 1 ? { first: before, second: name, blend: t * t * (3 - 2 * t), wipe: -1 } : {});
+      if (t < 1) requestAnimationFrame(step);
+      else this.set({});
+    };
+    requestAnimationFrame(step);
+  }
+
+  set(changes) {
+    Object.assign(this, changes);
+    const { from, to, amount, wiping, line } = this, alone = this.styles.length < 2;
+    this.place.show({ first: from, second: to, blend: amount, wipe: wiping ? line : -1 });
+    this.styles.forEach(({ name, card }) => card.setAttribute("aria-pressed", String(name === to)));
+    at("mix").value = 100 * amount;
+    at("mix").setAttribute("aria-valuetext", `${Math.round(100 * amount)} % ${to}`);
+    at("from").value = from;
+    at("towards").textContent = to;
+    at("blending").hidden = alone || this.root.classList.contains("live");
+    at("mix").disabled = wiping || from === to;
+    at("wiping").setAttribute("aria-pressed", String(wiping));
+    const handle = at("line");
+    handle.hidden = !wiping;
+    handle.style.left = `${100 * line}%`;
+    handle.setAttribute("aria-valuenow", String(Math.round(100 * line)));
+    handle.dataset.left = from;
+    handle.dataset.right = to;
+  }
+
+  key(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey || /^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName)) return;
+    const digit = /^Digit(\d)$/.exec(event.code);
+    const style = digit && this.styles[Number(digit[1])];
+    if (style) this.choose(style.name);
+    else if (event.key === "[" || event.key === "]") this.set({ amount: Math.min(1, Math.max(0, this.amount + (event.key === "]" ? 0.1 : -0.1))) });
+    else if (event.code === "KeyC") this.set({ wiping: !this.wiping });
+    else if (event.code === "KeyV") this.place.step(event.shiftKey ? -1 : 1);
+    else if (event.code === "KeyR") this.place.step(0);
+    else if (event.key === "?" || event.code === "KeyH") at("help").hidden = !at("help").hidden;
+    else if (event.key === "Escape") at("help").hidden = true;
+    else return;
+    event.preventDefault();
+  }
+}
+
+// A page of one file: everything lies in it.
+const open = async (data) => {
+  const styles = data.styles.map(({ name, thumb }) => ({ name, thumb })), root = at("place");
+  const fall = (why) => {
+    root.classList.add("pictures");
+    root.dataset.why = why;
+    at("canvas").hidden = true;
+    const count = Math.max(1, ...Object.values(data.stills).map((rows) => rows.length));
+    for (const id of ["back", "next"]) at(id).hidden = count < 2;
+    return new Pictures(root, data.stills);
+  };
+  const section = (name) => bytes(at(`data-${name}`).textContent.trim());
+  let place = null;
+  if (data.scene) {
+    try {
+      const splats = await Splats.make(at("canvas"), data.scene, Object.fromEntries(["shape", "chunks", "palette"].map((name) => [name, section(name)])));
+      await splats.add(styles[0].name, data.styles[0], section("style-0"));
+      place = new Place(at("canvas"), data.scene, splats);
+      place.listeners.drawn = () => { root.classList.add("drawn"); };
+    } catch (error) {
+      place = fall(error.message);
+    }
+  } else place = fall("");
+  const stage = new Stage(place, styles.slice(0, 1));
+  window.fprf = { place, stage };
+  for (const [k, style] of data.styles.entries()) {
+    if (!k) continue;
+    if (place.splats) {
+      await place.splats.add(style.name, style, section(`style-${k}`));
+      await new Promise((done) => setTimeout(done, 0)); // a picture between two styles
+    }
+    stage.add(styles[k]);
+  }
+  root.classList.add("ready");
+  const film = document.querySelector("video.flight");
+  if (film && !matchMedia("(prefers-reduced-motion: reduce)").matches) {
+    new IntersectionObserver(([entry]) => (entry.isIntersecting ? film.play().catch(() => {}) : film.pause()), { threshold: 0.3 }).observe(film);
+  }
+};

@@ -1,0 +1,276 @@
+// A canvas that one walks through: camera, controls, and which styles are shown. Frames are drawn when something has changed,
+// coarsely while it moves, as fast as the machine is, and exactly at rest.
+"use strict";
+
+const FRAME = 90; // milliseconds that a frame of a moving camera may take
+const REST = 220; // milliseconds without a move, after which the exact picture is drawn
+const SHARES = [1, 0.75, 0.5, 0.35, 0.25];
+const EDGE = 4096; // pixels a side of the canvas, at most
+
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+const plus = (a, b, by = 1) => [a[0] + by * b[0], a[1] + by * b[1], a[2] + by * b[2]];
+const unit = (a) => { const n = Math.hypot(...a) || 1; return a.map((x) => x / n); };
+const turned = (v, axis, angle) => { // Rodrigues
+  const c = Math.cos(angle), s = Math.sin(angle), k = dot(axis, v) * (1 - c), x = cross(axis, v);
+  return [0, 1, 2].map((i) => v[i] * c + x[i] * s + axis[i] * k);
+};
+
+// Where one stands: place, axes of the camera (right, down, forward), distance of what is turned about, lens of a photograph.
+class Camera {
+  constructor(data) {
+    const v = data.view;
+    this.axes = [0, 1, 2].map((r) => [v[r], v[4 + r], v[8 + r]]);
+    this.place = [0, 1, 2].map((i) => -(this.axes[0][i] * v[12] + this.axes[1][i] * v[13] + this.axes[2][i] * v[14]));
+    Object.assign(this, { distance: data.depth || 1, lens: data.lens, size: data.size });
+  }
+
+  get view() {
+    const [r, d, f] = this.axes, p = this.place;
+    return new Float32Array([r[0], d[0], f[0], 0, r[1], d[1], f[1], 0, r[2], d[2], f[2], 0, -dot(r, p), -dot(d, p), -dot(f, p), 1]);
+  }
+
+  // fx fy cx cy for a canvas on which all of the photograph is to be seen.
+  fitted(width, height) {
+    const [w, h] = this.size, by = Math.min(width / w, height / h), [fx, fy, cx, cy] = this.lens;
+    return [fx * by, fy * by, width / 2 + (cx - w / 2) * by, height / 2 + (cy - h / 2) * by];
+  }
+
+  copy() { return Object.assign(Object.create(Camera.prototype), this, { axes: this.axes.map((a) => [...a]), place: [...this.place] }); }
+
+  turn(axis, angle) { this.axes = this.axes.map((a) => turned(a, axis, angle)); }
+
+  // About the point in front, or about itself where `distance` is 0; never over the top.
+  orbit(up, yaw, pitch, distance = this.distance) {
+    const centre = plus(this.place, this.axes[2], distance), tilt = Math.asin(Math.max(-1, Math.min(1, dot(this.axes[2], up))));
+    this.turn(up, yaw);
+    this.turn(this.axes[0], Math.max(-1.45 - tilt, Math.min(1.45 - tilt, pitch)));
+    this.axes = this.axes.map(unit);
+    this.place = plus(centre, this.axes[2], -distance);
+  }
+
+  move(right, down, forward) {
+    this.place = [right, down, forward].reduce((p, by, i) => plus(p, this.axes[i], by), this.place);
+  }
+
+  // On the way to another camera.
+  towards(other, t) {
+    const mid = this.copy(), mixed = [2, 1].map((k) => plus(this.axes[k].map((x) => x * (1 - t)), other.axes[k], t));
+    const f = unit(mixed[0]), r = unit(cross(mixed[1], f));
+    mid.axes = [r, cross(f, r), f];
+    mid.place = plus(this.place.map((x) => x * (1 - t)), other.place, t);
+    mid.distance = this.distance * (1 - t) + other.distance * t;
+    mid.lens = this.lens.map((x, i) => (x / this.size[i % 2]) * (1 - t) * other.size[i % 2] + other.lens[i] * t);
+    mid.size = other.size;
+    return mid;
+  }
+}
+
+class Place {
+  // `scene`: head of pack.py with cameras, up, near, background and reach; `draw` shows a camera in the place of WebGL where
+  // pictures come from elsewhere.
+  constructor(canvas, scene, splats, painter = null) {
+    Object.assign(this, { canvas, scene, splats, painter, first: null, second: null, blend: 1, wipe: -1, at: 0 });
+    this.camera = new Camera(scene.cameras[0]);
+    this.full = 0; // milliseconds of a frame at full resolution, as far as is known
+    this.moved = this.changed = true;
+    this.keys = new Set();
+    this.still = 0;
+    this.flight = null;
+    this.listeners = { pick: null, moved: null, drawn: null };
+    this.controls();
+    new ResizeObserver(() => this.resize()).observe(canvas);
+    if (splats) {
+      canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); this.lost = true; });
+      canvas.addEventListener("webglcontextrestored", () => { this.lost = false; splats.start(); this.touch(); });
+    }
+    this.resize();
+    requestAnimationFrame((now) => this.frame(now));
+  }
+
+  resize() {
+    const box = this.canvas.getBoundingClientRect(), by = Math.min(window.devicePixelRatio || 1, 2, EDGE / Math.max(box.width, box.height, 1));
+    const size = [box.width, box.height].map((side) => Math.max(1, Math.round(side * by)));
+    if (size[0] === this.canvas.width && size[1] === this.canvas.height) return;
+    [this.canvas.width, this.canvas.height] = size;
+    this.touch();
+  }
+
+  get lens() { return this.camera.fitted(this.canvas.width, this.canvas.height); }
+  get look() { return { first: this.first ?? this.second, second: this.second ?? this.first, blend: this.blend, wipe: this.wipe }; }
+
+  // Something else is to be seen: `moved` where the camera is another one.
+  touch(moved = true) {
+    this.changed = true;
+    this.moved ||= moved;
+    this.still = performance.now();
+    if (moved) this.listeners.moved?.();
+  }
+
+  show(changes) {
+    Object.assign(this, changes);
+    this.touch(false);
+  }
+
+  go(camera, seconds = 0.7) {
+    const from = this.camera.copy(), start = performance.now();
+    if (matchMedia("(prefers-reduced-motion: reduce)").matches) seconds = 0;
+    this.flight = (now) => {
+      const t = seconds ? Math.min(1, (now - start) / 1000 / seconds) : 1;
+      this.camera = t < 1 ? from.towards(camera, t * t * (3 - 2 * t)) : camera.copy();
+      if (t >= 1) this.flight = null;
+      this.touch();
+    };
+  }
+
+  // The captured camera `by` further on.
+  step(by) {
+    const count = this.scene.cameras.length;
+    this.at = (this.at + by + count) % count;
+    this.go(new Camera(this.scene.cameras[this.at]));
+  }
+
+  frame(now) {
+    requestAnimationFrame((next) => this.frame(next));
+    this.fly(now);
+    this.flight?.(now);
+    if (this.painter) { this.painter(this); return; }
+    if (this.lost || !this.look.first || !this.splats.styles.has(this.look.first) || this.waiting) return;
+    if (this.moved && !this.sorting) {
+      this.moved = false;
+      this.sorting = true;
+      this.splats.sort(this.camera.view, this.scene.near).then(() => { this.sorting = false; this.changed = true; });
+    }
+    const rest = now - this.still > REST && !this.sorting && !this.moved;
+    if (!this.splats.kept || !(this.changed || (rest && !this.exact))) return;
+    const share = rest || !this.full ? 1 : SHARES.find((each) => each * each * this.full <= FRAME) ?? SHARES.at(-1);
+    this.changed = false;
+    this.exact = rest;
+    const start = performance.now();
+    this.splats.draw(this.camera.view, this.lens, this.look, { near: this.scene.near, background: this.scene.background, share, exact: rest });
+    this.wait(() => {
+      if (!rest) this.full = 0.5 * (this.full || (performance.now() - start) / share ** 2) + 0.5 * (performance.now() - start) / share ** 2;
+      this.milliseconds = performance.now() - start;
+      this.listeners.drawn?.(rest);
+    });
+  }
+
+  // Until the graphics card has drawn: frames never queue.
+  wait(done) {
+    const gl = this.splats.gl, sync = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    this.waiting = true;
+    const ask = () => {
+      if (!gl.isContextLost() && gl.getSyncParameter(sync, gl.SYNC_STATUS) !== gl.SIGNALED) { setTimeout(ask, 4); return; }
+      gl.deleteSync(sync);
+      this.waiting = false;
+      done();
+    };
+    setTimeout(ask, 0);
+  }
+
+  // World point under a pixel of the page; null where there is nothing.
+  point(x, y) {
+    const box = this.canvas.getBoundingClientRect(), by = this.canvas.width / box.width, lens = this.lens;
+    const at = [(x - box.left) * by, (y - box.top) * by];
+    const depth = this.splats?.pick(this.camera.view, lens, this.look, ...at, this.scene.near);
+    this.changed = true;
+    if (!depth) return null;
+    const local = [(at[0] - lens[2]) / lens[0], (at[1] - lens[3]) / lens[1], 1];
+    return local.reduce((p, v, i) => plus(p, this.camera.axes[i], v * depth), this.camera.place);
+  }
+
+  // Turn about what is under a pixel, and come a little nearer.
+  focus(x, y) {
+    const point = this.point(x, y);
+    if (!point) return;
+    const camera = this.camera.copy(), to = plus(point, camera.place, -1), forward = unit(to);
+    camera.axes[2] = forward;
+    camera.axes[0] = unit(cross(camera.axes[1], forward));
+    camera.axes[1] = cross(forward, camera.axes[0]);
+    camera.distance = Math.hypot(...to);
+    camera.move(0, 0, 0.25 * camera.distance);
+    camera.distance *= 0.75;
+    this.go(camera);
+  }
+
+  // Nobody leaves what was captured by more than its own size.
+  keep() {
+    const { centre, radius } = this.scene.reach, away = plus(this.camera.place, centre, -1), far = Math.hypot(...away);
+    if (far > radius) this.camera.place = plus(centre, away, radius / far);
+    this.touch();
+  }
+
+  controls() {
+    const { canvas } = this, pointers = new Map();
+    let pressed = null, gap = 0;
+    const turn = (dx, dy) => this.camera.orbit(this.scene.up, -3 * dx / canvas.clientHeight, 2 * dy / canvas.clientHeight, this.scene.within ? 0 : this.camera.distance);
+    const pan = (dx, dy) => { const by = this.camera.distance * this.canvas.width / canvas.clientWidth / this.lens[0]; this.camera.move(-dx * by, -dy * by, 0); };
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    canvas.addEventListener("pointerdown", (event) => {
+      canvas.focus({ preventScroll: true });
+      canvas.setPointerCapture(event.pointerId);
+      pointers.set(event.pointerId, [event.clientX, event.clientY]);
+      pressed = pointers.size === 1 ? { x: event.clientX, y: event.clientY, far: 0 } : null;
+      gap = 0;
+      this.flight = null;
+    });
+    canvas.addEventListener("pointermove", (event) => {
+      const before = pointers.get(event.pointerId);
+      if (!before) return;
+      const dx = event.clientX - before[0], dy = event.clientY - before[1];
+      pointers.set(event.pointerId, [event.clientX, event.clientY]);
+      if (pressed) pressed.far += Math.hypot(dx, dy);
+      if (pointers.size === 2) { // two fingers: pan and pinch
+        const [[ax, ay], [bx, by]] = [...pointers.values()], now = Math.hypot(ax - bx, ay - by);
+        if (gap) this.camera.move(0, 0, this.camera.distance * (1 - gap / now));
+        gap = now;
+        pan(dx / 2, dy / 2);
+      } else if (event.shiftKey || event.buttons & 6) pan(dx, dy);
+      else turn(dx, dy);
+      this.keep();
+    });
+    const up = (event) => {
+      pointers.delete(event.pointerId);
+      if (event.type === "pointerup" && pressed && pressed.far < 5) this.listeners.pick?.(event.clientX, event.clientY);
+      pressed = null;
+    };
+    canvas.addEventListener("pointerup", up);
+    canvas.addEventListener("pointercancel", up);
+    canvas.addEventListener("dblclick", (event) => this.focus(event.clientX, event.clientY));
+    canvas.addEventListener("wheel", (event) => {
+      if (!this.scene.alone && document.activeElement !== canvas) return; // a page is scrolled past it
+      event.preventDefault();
+      this.camera.move(0, 0, this.camera.distance * (1 - Math.exp(event.deltaY * (event.deltaMode ? 0.03 : 0.0012))));
+      this.keep();
+    }, { passive: false });
+    canvas.addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.metaKey || event.altKey || !KEYS[event.code]) return;
+      event.preventDefault();
+      this.flight = null;
+      this.keys.add(event.code);
+    });
+    canvas.addEventListener("keyup", (event) => this.keys.delete(event.code));
+    canvas.addEventListener("blur", () => this.keys.clear());
+  }
+
+  // Keys that are held.
+  fly(now) {
+    const seconds = Math.min(0.1, (now - (this.last ?? now)) / 1000);
+    this.last = now;
+    if (!this.keys.size) return;
+    const by = seconds * this.camera.distance * 0.6;
+    for (const code of this.keys) {
+      const [kind, a, b, c] = KEYS[code];
+      if (kind === "turn") this.camera.orbit(this.scene.up, a * seconds, b * seconds, this.scene.within ? 0 : this.camera.distance);
+      else this.camera.move(a * by, b * by, c * by);
+    }
+    this.keep();
+  }
+}
+
+const KEYS = {
+  KeyW: ["move", 0, 0, 1], KeyS: ["move", 0, 0, -1], KeyA: ["move", -1, 0, 0], KeyD: ["move", 1, 0, 0], KeyQ: ["move", 0, 1, 0], KeyE: ["move", 0, -1, 0],
+  ArrowLeft: ["turn", 0.9, 0], ArrowRight: ["turn", -0.9, 0], ArrowUp: ["turn", 0, 0.6], ArrowDown: ["turn", 0, -0.6],
+  PageUp: ["move", 0, 0, 1], PageDown: ["move", 0, 0, -1],
+};

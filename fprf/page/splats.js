@@ -1,0 +1,419 @@
+// Draw packed 3D Gaussians (fprf/page/pack.py) in WebGL 2 as fprf's rasteriser does, in colours that blend between two styles.
+//
+// Two passes: each Gaussian is projected and coloured once (transform feedback), then drawn as a quad that just holds it, the
+// nearest first, under what is there: colour += (1 - a) alpha c, a += (1 - a) alpha. Eight bits a channel lose what faint ones
+// add (37 dB on the garden against 42 with half floats, at two thirds of the time), so they are for cameras that move.
+"use strict";
+
+const WIDTH = 2048; // texels a row
+const COMMON = `#version 300 es
+precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
+`;
+const VERTEX = `${COMMON}
+uniform usampler2D shape;               // a texel a Gaussian, see pack.py
+uniform sampler2D chunks, palette;
+uniform sampler2D first, second;        // a texel a Gaussian: mean colour, number of the map
+uniform sampler2D maps0, maps1;         // three texels a map
+uniform mat4 range0, range1;            // columns 0 and 1: least colour and width
+uniform mat4 view; uniform vec4 lens; uniform vec2 size; uniform float near, blend, wipe, largest; uniform vec3 eye;
+uniform int bands; uniform bool depth; uniform bool sharp;
+layout(location = 0) in uint index;
+out vec4 place;  // of the centre in the picture, and the longer half axis, at one standard deviation
+out vec4 look;   // colour, opacity
+out vec2 wide;   // the shorter half axis over the longer, and how many deviations the quad reaches
+ivec2 texel(int i) { return ivec2(i % ${WIDTH}, i / ${WIDTH}); }
+vec3 shaded(vec4 texel4, mat4 range, sampler2D maps, vec3 rest) {
+  vec3 mean = range[0].xyz + texel4.rgb * range[1].xyz;
+  if (bands > 1) {
+    int m = int(texel4.a * 255. + .5) * 3;
+    mean += rest.x * texelFetch(maps, ivec2(m, 0), 0).rgb + rest.y * texelFetch(maps, ivec2(m + 1, 0), 0).rgb
+      + rest.z * texelFetch(maps, ivec2(m + 2, 0), 0).rgb;
+  }
+  return max(mean, 0.);
+}
+vec3 entry(int i) { vec3 v = texelFetch(palette, texel(i), 0).rgb; return largest * v * abs(v); }
+void main() {
+  place = vec4(0.); look = vec4(0.); wide = vec2(0.); // a quad without size is not drawn
+  uvec4 w = texelFetch(shape, texel(int(index)), 0);
+  int chunk = int(index >> 8u) * 3;
+  vec4 a = texelFetch(chunks, texel(chunk), 0), b = texelFetch(chunks, texel(chunk + 1), 0), c = texelFetch(chunks, texel(chunk + 2), 0);
+  vec3 mean = mix(a.xyz, vec3(a.w, b.xy), vec3(w.x & 65535u, w.x >> 16u, w.y & 65535u) / 65535.);
+  vec3 p = (view * vec4(mean, 1.)).xyz; // x right, y down, z forward
+  if (p.z <= near) return;
+  vec3 scale = exp(mix(vec3(b.zw, c.x), c.yzw, vec3(w.w & 255u, (w.w >> 8u) & 255u, (w.w >> 16u) & 255u) / 255.));
+  vec3 three = (vec3(w.z & 1023u, (w.z >> 10u) & 1023u, (w.z >> 20u) & 1023u) / 1023. * 2. - 1.) * .70710678;
+  float four = sqrt(max(0., 1. - dot(three, three)));
+  uint out4 = w.z >> 30u; // component left out: w x y z
+  vec4 q = out4 == 0u ? vec4(four, three) : out4 == 1u ? vec4(three.x, four, three.yz) : out4 == 2u ? vec4(three.xy, four, three.z) : vec4(three, four);
+  float r = q.x, x = q.y, y = q.z, z = q.w;
+  mat3 turn = mat3(1. - 2. * (y * y + z * z), 2. * (x * y + r * z), 2. * (x * z - r * y),
+    2. * (x * y - r * z), 1. - 2. * (x * x + z * z), 2. * (y * z + r * x),
+    2. * (x * z + r * y), 2. * (y * z - r * x), 1. - 2. * (x * x + y * y));
+  mat3 axes = mat3(view) * turn; // columns: own axes in the camera
+  vec2 t = p.xy / p.z, beyond = .15 * size / lens.xy;
+  vec2 n = clamp(t, -lens.zw / lens.xy - beyond, (size - lens.zw) / lens.xy + beyond);
+  vec3 across = lens.x / p.z * scale * vec3(axes[0].x - n.x * axes[0].z, axes[1].x - n.x * axes[1].z, axes[2].x - n.x * axes[2].z);
+  vec3 down = lens.y / p.z * scale * vec3(axes[0].y - n.y * axes[0].z, axes[1].y - n.y * axes[1].z, axes[2].y - n.y * axes[2].z);
+  float xx = dot(across, across), yy = dot(down, down), xy = dot(across, down);
+  vec3 normal = cross(across, down);
+  float thin = dot(normal, normal), whole = thin + .3 * (xx + yy) + .09;
+  float alpha = float(w.w >> 24u) / 255.;
+  if (sharp) alpha *= sqrt(thin / whole + 1e-8);
+  if (!(alpha > 1. / 255.) || xx + yy > 1e16) return;
+  xx += .3; yy += .3;
+  float mid = .5 * (xx + yy), gap = length(vec2(.5 * (xx - yy), xy));
+  float l1 = mid + gap, l2 = max(whole / l1, 1e-3);
+  vec2 axis = gap < 1e-6 * mid ? vec2(1., 0.) : xx > yy ? normalize(vec2(l1 - yy, xy)) : normalize(vec2(xy, l1 - xx));
+  float reach = 2. * log(255. * alpha);
+  vec2 centre = lens.zw + lens.xy * t, half_ = sqrt(reach * vec2(xx, yy));
+  if (any(lessThan(centre + half_, vec2(0.))) || any(greaterThan(centre - half_, size))) return;
+  place = vec4(centre, sqrt(l1) * axis);
+  wide = vec2(sqrt(l2 / l1), sqrt(reach));
+  if (depth) { look = vec4(p.z, p.z, p.z, alpha); return; }
+  vec3 rest = vec3(0.);
+  if (bands > 1) {
+    vec3 d = normalize(mean - eye);
+    int e = int(w.y >> 16u) * (bands * bands - 1);
+    rest = .48860251 * (-d.y * entry(e) + d.z * entry(e + 1) - d.x * entry(e + 2));
+    if (bands > 2) {
+      vec3 s = d * d;
+      rest += 1.09254843 * (d.x * d.y * entry(e + 3) - d.y * d.z * entry(e + 4) - d.x * d.z * entry(e + 6))
+        + .31539157 * (2. * s.z - s.x - s.y) * entry(e + 5) + .54627422 * (s.x - s.y) * entry(e + 7);
+    }
+  }
+  float m = wipe >= 0. ? step(wipe * size.x, centre.x) : blend;
+  vec3 shown = m < 1. ? shaded(texelFetch(first, texel(int(index)), 0), range0, maps0, rest) : vec3(0.);
+  if (m > 0.) shown = mix(shown, shaded(texelFetch(second, texel(int(index)), 0), range1, maps1, rest), m);
+  look = vec4(shown, alpha);
+}`;
+const NOTHING = `${COMMON}
+void main() {}`;
+const QUAD = `${COMMON}
+uniform vec2 size;
+layout(location = 0) in vec2 corner; layout(location = 1) in vec4 place; layout(location = 2) in vec4 look; layout(location = 3) in vec2 wide;
+out vec2 at; flat out vec4 colour;
+void main() {
+  at = corner * wide.y;
+  vec2 px = place.xy + at.x * place.zw + at.y * wide.x * vec2(-place.w, place.z);
+  gl_Position = vec4(2. * px / size - 1., 0., 1.);
+  colour = look;
+}`;
+const FRAGMENT = `${COMMON}
+in vec2 at; flat in vec4 colour; out vec4 o;
+void main() {
+  float a = min(.99, colour.a * exp(-.5 * dot(at, at)));
+  if (a < 1. / 255.) discard;
+  o = vec4(colour.rgb * a, a);
+}`;
+const FULL = `${COMMON}
+void main() { gl_Position = vec4(float(gl_VertexID & 1) * 4. - 1., float(gl_VertexID >> 1) * 4. - 1., -1., 1.); }`;
+const SHOW = `${COMMON}
+uniform sampler2D picture; uniform vec2 scale; uniform float height; uniform vec3 background; out vec4 o;
+void main() {
+  vec2 at = vec2(gl_FragCoord.x, height - gl_FragCoord.y) * scale;
+  vec4 c = texture(picture, at / vec2(textureSize(picture, 0)));
+  o = vec4(c.rgb + (1. - c.a) * background, 1.);
+}`;
+
+// Runs in a worker: a 16-bit counting sort by depth, nearest first, of what lies before the camera. Bits of a positive float
+// grow with it, about as its logarithm does: near things are told apart however far the sky is.
+function sorter() {
+  let means, depth, bits, key, order;
+  onmessage = ({ data }) => {
+    if (data.means) {
+      means = data.means;
+      const count = means.length / 3;
+      depth = new Float32Array(count); bits = new Int32Array(depth.buffer); key = new Uint16Array(count);
+      return;
+    }
+    const [a, b, c, d] = data.row, count = depth.length, near = data.near, start = performance.now();
+    let least = 0x7fffffff, most = 0, kept = 0;
+    for (let i = 0, j = 0; i < count; i++, j += 3) {
+      const z = a * means[j] + b * means[j + 1] + c * means[j + 2] + d;
+      depth[i] = z;
+      if (z > near) {
+        const v = bits[i];
+        if (v < least) least = v;
+        if (v > most) most = v;
+        kept++;
+      }
+    }
+    const scale = 65535 / Math.max(1, most - least), starts = new Uint32Array(65537);
+    for (let i = 0; i < count; i++) {
+      if (!(depth[i] > near)) continue;
+      const k = (bits[i] - least) * scale | 0;
+      key[i] = k;
+      starts[k + 1]++;
+    }
+    for (let k = 0; k < 65536; k++) starts[k + 1] += starts[k];
+    order = data.spare && data.spare.length >= kept ? data.spare : new Uint32Array(count);
+    for (let i = 0; i < count; i++) if (depth[i] > near) order[starts[key[i]]++] = i;
+    postMessage({ order, kept, milliseconds: performance.now() - start }, [order.buffer]);
+  };
+}
+
+const inflate = async (bytes) => new Uint8Array(await new Response(
+  new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer());
+
+// Planes of bytes to rows of so many bytes.
+const woven = (planes, count, width) => {
+  const rows = new Uint8Array(count * width);
+  for (let k = 0; k < width; k++) for (let i = 0, j = k, from = k * count; i < count; i++, j += width) rows[j] = planes[from + i];
+  return rows;
+};
+
+class Splats {
+  // `head` is that of pack.py; `parts` are its deflated sections. Throws where WebGL 2 is missing.
+  static async make(canvas, head, parts) {
+    const [shape, chunks, palette] = await Promise.all([parts.shape, parts.chunks, parts.palette].map(inflate));
+    return new Splats(canvas, head, new Uint32Array(woven(shape, head.count, 16).buffer), new Float32Array(chunks.buffer), palette);
+  }
+
+  constructor(canvas, head, shape, chunks, palette) {
+    Object.assign(this, { canvas, head, count: head.count, styles: new Map(), order: null, kept: 0, sortMilliseconds: 0 });
+    this.kept_ = { shape, chunks, palette }; // to come back from a lost context
+    this.colours = new Map();
+    this.worker = new Worker(URL.createObjectURL(new Blob([`"use strict";(${sorter})()`], { type: "text/javascript" })));
+    const means = decodedMeans(shape, chunks, head.count);
+    this.worker.postMessage({ means }, [means.buffer]);
+    this.start();
+  }
+
+  start() {
+    const gl = this.gl = this.canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
+    if (!gl) throw new Error("this browser has no WebGL 2");
+    this.floats = Boolean(gl.getExtension("EXT_color_buffer_float"));
+    this.programs = { project: this.link(VERTEX, NOTHING, ["place", "look", "wide"]), splat: this.link(QUAD, FRAGMENT), show: this.link(FULL, SHOW) };
+    const { shape, chunks, palette } = this.kept_;
+    this.textures = {
+      shape: this.texture(shape, gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT),
+      chunks: this.texture(chunks, gl.RGBA32F, gl.RGBA, gl.FLOAT),
+      palette: this.texture(palette.length ? new Int8Array(palette.buffer) : new Int8Array(4), gl.RGBA8_SNORM, gl.RGBA, gl.BYTE),
+    };
+    const order = this.buffer = gl.createBuffer(), corners = gl.createBuffer();
+    this.projected = gl.createBuffer();
+    const arrays = (...rows) => { // place, size, type, bytes between, bytes before, an instance each
+      const vertices = gl.createVertexArray();
+      gl.bindVertexArray(vertices);
+      for (const [buffer, place, size, stride, offset, each] of rows) {
+        gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+        gl.enableVertexAttribArray(place);
+        if (buffer === order) gl.vertexAttribIPointer(place, size, gl.UNSIGNED_INT, 0, 0);
+        else gl.vertexAttribPointer(place, size, gl.FLOAT, false, stride, offset);
+        gl.vertexAttribDivisor(place, each);
+      }
+      gl.bindVertexArray(null);
+      return vertices;
+    };
+    gl.bindBuffer(gl.ARRAY_BUFFER, order);
+    gl.bufferData(gl.ARRAY_BUFFER, 4 * this.count, gl.DYNAMIC_DRAW);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.projected);
+    gl.bufferData(gl.ARRAY_BUFFER, 40 * this.count, gl.DYNAMIC_COPY);
+    gl.bindBuffer(gl.ARRAY_BUFFER, corners);
+    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]), gl.STATIC_DRAW);
+    this.ordered = arrays([order, 0, 1, 0, 0, 0]);
+    this.quads = arrays([corners, 0, 2, 0, 0, 0], [this.projected, 1, 4, 40, 0, 1], [this.projected, 2, 4, 40, 16, 1], [this.projected, 3, 2, 40, 32, 1]);
+    this.feedback = gl.createTransformFeedback();
+    this.empty = gl.createVertexArray();
+    this.exact = this.coarse = null;
+    this.styles.clear();
+    for (const [name, style] of this.colours) this.upload(name, style);
+    if (this.order) this.put();
+  }
+
+  link(vertex, fragment, varyings = null) {
+    const gl = this.gl, program = gl.createProgram();
+    for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, text);
+      gl.compileShader(shader);
+      gl.attachShader(program, shader);
+    }
+    if (varyings) gl.transformFeedbackVaryings(program, varyings, gl.INTERLEAVED_ATTRIBS);
+    gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
+      throw new Error(gl.getAttachedShaders(program).map((each) => gl.getShaderInfoLog(each)).join(" ") + gl.getProgramInfoLog(program));
+    }
+    const places = {};
+    for (let i = 0; i < gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS); i++) {
+      const { name } = gl.getActiveUniform(program, i);
+      places[name] = gl.getUniformLocation(program, name);
+    }
+    return { program, places };
+  }
+
+  texture(data, inner, format, type, width = WIDTH) {
+    const gl = this.gl, texels = data.length / 4, rows = Math.max(1, Math.ceil(texels / width)), full = Math.floor(texels / width);
+    const texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, inner, width, rows);
+    // Whole rows as they lie, then what is left: no padded copy of all.
+    if (full) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, full, format, type, data.subarray(0, 4 * width * full));
+    if (full < rows) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, full, texels - width * full, 1, format, type, data.subarray(4 * width * full));
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
+    return texture;
+  }
+
+  // A style: `head` with low, high and the number of maps, `part` its deflated section.
+  async add(name, head, part) {
+    const data = await inflate(part), rows = woven(data, this.count, 4);
+    const style = { head, rows, maps: new Float32Array(data.slice(4 * this.count).buffer) };
+    this.colours.set(name, style);
+    this.upload(name, style);
+  }
+
+  upload(name, { head, rows, maps }) {
+    const gl = this.gl, padded = new Float32Array(maps.length / 3 * 4), before = this.styles.get(name);
+    for (let i = 0; i < maps.length / 3; i++) padded.set(maps.subarray(3 * i, 3 * i + 3), 4 * i);
+    if (before) { gl.deleteTexture(before.rows); gl.deleteTexture(before.maps); }
+    const range = new Float32Array(16);
+    head.low.forEach((low, i) => { range[i] = low; range[4 + i] = head.high[i] - low; });
+    this.styles.set(name, {
+      range, rows: this.texture(rows, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE),
+      maps: this.texture(padded, gl.RGBA32F, gl.RGBA, gl.FLOAT, padded.length / 4),
+    });
+  }
+
+  remove(name) {
+    const style = this.styles.get(name);
+    if (style) { this.gl.deleteTexture(style.rows); this.gl.deleteTexture(style.maps); }
+    this.styles.delete(name);
+    this.colours.delete(name);
+  }
+
+  // Order the Gaussians for a camera; `view` is world to camera by columns. One at a time.
+  sort(view, near) {
+    return new Promise((done) => {
+      this.worker.onmessage = ({ data }) => {
+        this.order = data.order;
+        this.kept = data.kept;
+        this.sortMilliseconds = data.milliseconds;
+        this.put();
+        done();
+      };
+      const spare = this.order;
+      this.order = null;
+      this.worker.postMessage({ row: [view[2], view[6], view[10], view[14]], near, spare }, spare ? [spare.buffer] : []);
+    });
+  }
+
+  put() {
+    const gl = this.gl;
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.buffer);
+    gl.bufferSubData(gl.ARRAY_BUFFER, 0, this.order, 0, this.kept);
+  }
+
+  // A picture to draw into; `exact` ones hold half floats.
+  frame(width, height, exact) {
+    const gl = this.gl, kind = exact && this.floats ? "exact" : "coarse";
+    if (this[kind]?.width === width && this[kind].height === height) return this[kind];
+    if (this[kind]) { gl.deleteTexture(this[kind].picture); gl.deleteFramebuffer(this[kind].buffer); }
+    const picture = gl.createTexture(), buffer = gl.createFramebuffer();
+    gl.bindTexture(gl.TEXTURE_2D, picture);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, kind === "exact" ? gl.RGBA16F : gl.RGBA8, width, height);
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
+    for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, picture, 0);
+    return this[kind] = { width, height, picture, buffer };
+  }
+
+  // Draw into the canvas at a share of its resolution. `look`: first and second style, blend in [0, 1], wipe in [0, 1] or -1.
+  draw(view, lens, look, { near = 0.01, background = [0, 0, 0], share = 1, exact = true } = {}) {
+    const gl = this.gl, { width, height } = this.canvas;
+    const small = [Math.max(1, Math.round(share * width)), Math.max(1, Math.round(share * height))];
+    const scale = [small[0] / width, small[1] / height];
+    const target = this.frame(...small, exact);
+    this.splat(target, view, [lens[0] * scale[0], lens[1] * scale[1], lens[2] * scale[0], lens[3] * scale[1]], look, near, null);
+    const { program, places } = this.programs.show;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, width, height);
+    gl.disable(gl.BLEND);
+    gl.useProgram(program);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, target.picture);
+    gl.uniform1i(places.picture, 0);
+    gl.uniform2f(places.scale, ...scale);
+    gl.uniform1f(places.height, height);
+    gl.uniform3f(places.background, ...background);
+    gl.bindVertexArray(this.empty);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  // Draw into a target, or, into one pixel of it, depths in the place of colours.
+  splat(target, view, lens, look, near, pixel) {
+    const gl = this.gl, { program, places } = this.programs.project;
+    const one = this.styles.get(look.first), two = this.styles.get(look.second) ?? one;
+    const all = { ...this.textures, first: one.rows, second: two.rows, maps0: one.maps, maps1: two.maps };
+    gl.useProgram(program);
+    Object.entries(all).forEach(([name, texture], i) => {
+      gl.activeTexture(gl.TEXTURE0 + i);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+      gl.uniform1i(places[name], i);
+    });
+    gl.uniformMatrix4fv(places.range0, false, one.range);
+    gl.uniformMatrix4fv(places.range1, false, two.range);
+    gl.uniformMatrix4fv(places.view, false, view);
+    gl.uniform4f(places.lens, ...lens);
+    gl.uniform2f(places.size, target.width, target.height);
+    gl.uniform1f(places.near, near);
+    gl.uniform1f(places.blend, look.blend ?? 0);
+    gl.uniform1f(places.wipe, look.wipe ?? -1);
+    gl.uniform1f(places.largest, this.head.largest);
+    gl.uniform1i(places.bands, Math.round(Math.sqrt(this.head.harmonics)));
+    gl.uniform1i(places.depth, pixel ? 1 : 0);
+    gl.uniform1i(places.sharp, this.head.antialiased ? 1 : 0);
+    // The camera's place: -R^T t.
+    gl.uniform3f(places.eye, ...[0, 1, 2].map((i) => -(view[4 * i] * view[12] + view[4 * i + 1] * view[13] + view[4 * i + 2] * view[14])));
+    gl.bindVertexArray(this.ordered);
+    gl.enable(gl.RASTERIZER_DISCARD);
+    gl.bindTransformFeedback(gl.TRANSFORM_FEEDBACK, this.feedback);
+    gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, this.projected);
+    gl.beginTransformFeedback(gl.POINTS);
+    gl.drawArrays(gl.POINTS, 0, this.kept);
+    gl.endTransformFeedback();
+    gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, null);
+    gl.bindTransformFeedback(gl.TRANSFORM_FEEDBACK, null);
+    gl.disable(gl.RASTERIZER_DISCARD);
+
+    const drawn = this.programs.splat;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);
+    gl.viewport(0, 0, target.width, target.height);
+    if (pixel) { gl.enable(gl.SCISSOR_TEST); gl.scissor(...pixel, 1, 1); }
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.useProgram(drawn.program);
+    gl.uniform2f(drawn.places.size, target.width, target.height);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE_MINUS_DST_ALPHA, gl.ONE);
+    gl.bindVertexArray(this.quads);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.kept);
+    gl.bindVertexArray(null);
+    gl.disable(gl.SCISSOR_TEST);
+  }
+
+  // Depth along the camera's axis at a pixel of the canvas, the mean by weight; null where there is nothing to see.
+  pick(view, lens, look, x, y, near = 0.01) {
+    const gl = this.gl, target = this.frame(this.canvas.width, this.canvas.height, true), pixel = [Math.floor(x), Math.floor(y)];
+    this.splat(target, view, lens, look, near, pixel);
+    const found = new Float32Array(4);
+    gl.readPixels(...pixel, 1, 1, gl.RGBA, gl.FLOAT, found);
+    return found[3] > 0.3 ? found[0] / found[3] : null;
+  }
+
+  free() {
+    this.worker.terminate();
+    this.gl.getExtension("WEBGL_lose_context")?.loseContext();
+  }
+}
+
+const decodedMeans = (shape, chunks, count) => {
+  const means = new Float32Array(3 * count);
+  for (let i = 0; i < count; i++) {
+    const c = 12 * (i >> 8), x = shape[4 * i], z = shape[4 * i + 1] & 65535;
+    means[3 * i] = chunks[c] + (chunks[c + 3] - chunks[c]) * (x & 65535) / 65535;
+    means[3 * i + 1] = chunks[c + 1] + (chunks[c + 4] - chunks[c + 1]) * (x >>> 16) / 65535;
+    means[3 * i + 2] = chunks[c + 2] + (chunks[c + 5] - chunks[c + 2]) * z / 65535;
+  }
+  return means;
+};

@@ -1,0 +1,101 @@
+"""Progress of a long command: a live line on a terminal, one JSON line every few seconds elsewhere."""
+
+import json
+import sys
+import time
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+
+if TYPE_CHECKING:
+    from .training.driver import Report
+
+LINE_SECONDS = 5.0
+"""Time between JSON lines where standard error is no terminal, and in events.jsonl."""
+
+
+class Display:
+    """A context manager; `quiet` shows nothing."""
+
+    def __init__(self, *, quiet: bool = False) -> None:
+        self.console = Console(stderr=True, highlight=False)
+        self.quiet = quiet
+        self.live = self.console.is_terminal and not quiet
+        self.progress = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=None),
+            TextColumn("{task.percentage:>3.0f} %"),
+            TextColumn("{task.fields[detail]}", style="cyan"),
+            TimeElapsedColumn(),
+            console=self.console,
+            disable=not self.live,
+        )
+        self.task: TaskID | None = None
+        self.what = ""
+        self.last = 0.0
+
+    def __enter__(self) -> Self:
+        self.progress.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.progress.stop()
+
+    def say(self, text: str) -> None:
+        """One line that stays."""
+        if self.live:
+            self.progress.console.print(text, markup=False)
+        elif not self.quiet:
+            self._line({"event": text})
+
+    def count(self, done: int, total: int, what: str, *, seconds_left: float | None = None) -> None:
+        """`done` of `total` of something."""
+        left = "" if seconds_left is None else f"  {_clock(seconds_left)} left"
+        self._bar(what, done / max(1, total), f"{done}/{total}{left}")
+        if not self.live and self._due(done == total):
+            ahead = {} if seconds_left is None else {"seconds_left": round(seconds_left)}
+            self._line({"event": what, "done": done, "total": total, **ahead})
+
+    def training(self, report: "Report", what: str = "training") -> None:
+        """Progress of training."""
+        left = report.seconds * (1 - report.share) / max(report.share, 1e-3)
+        detail = f"step {report.step}  {report.psnr:.2f} dB  {report.rays_per_second:,.0f} rays/s  {_clock(left)} left"
+        self._bar(what, report.share, detail)
+        if not self.live and self._due(report.share >= 1):
+            self._line(
+                {
+                    "event": what,
+                    "step": report.step,
+                    "share": round(report.share, 4),
+                    "seconds": round(report.seconds, 1),
+                    "psnr": round(report.psnr, 2),
+                    "rays_per_second": round(report.rays_per_second),
+                    "seconds_left": round(left),
+                }
+            )
+
+    def _bar(self, what: str, share: float, detail: str) -> None:
+        if what != self.what or self.task is None:
+            self.what = what
+            self.task = self.progress.add_task(what, total=1.0, detail=detail)
+        self.progress.update(self.task, completed=min(1.0, share), detail=detail)
+
+    def _due(self, last: bool) -> bool:
+        if self.quiet:
+            return False
+        now = time.perf_counter()
+        if now - self.last < LINE_SECONDS and not last:
+            return False
+        self.last = now
+        return True
+
+    def _line(self, event: dict[str, object]) -> None:
+        print(json.dumps(event), file=sys.stderr, flush=True)
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}:{rest:02d}"

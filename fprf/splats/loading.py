@@ -1,0 +1,140 @@
+"""Runs of 3D Gaussians, opened from their folder alone: semantics, levels of detail, exposures, poses of held-out views."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from ..config import RunConfig
+from ..datamanagers.scene import Scene
+from ..errors import CheckpointError, UsageError
+from ..rendering.cameras import Cameras
+from ..training import checkpoint
+from ..training.camera_optimizers import Poses, Tones, moved_cameras
+from ..training.driver import Schedule, learn
+from ..training.loading import LoadedRun
+from ..training.model import Facts, tones_of
+from ..training.prepare import reach_of
+from ..training.quality import PRESETS, QualityConfig, mixed_tone
+from ..training.run import Run
+from .config import GaussiansConfig
+from .gaussians import Gaussians, from_tensors
+from .learner import MOVES, GaussianLearner, run_scene
+from .levels import Levels, make_levels_of_detail, open_levels, write_levels
+from .photographs import load_photographs, make_levels
+from .scene import Semantics, SplatScene, load_semantics, semantics_tensors
+
+_FIT_RATE, _FIT_STEPS = 2e-3, 120
+"""Of the poses of views that the scene is not learnt from: `GaussiansConfig.poses`, and steps of each view."""
+_LEVELS, _MANY = "levels", 400_000
+"""Folder of a run; Gaussians from which on levels of detail are kept there and mapped, not made in memory."""
+
+
+def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityConfig) -> LoadedRun[SplatScene]:
+    """A run of Gaussians; they are drawn on the CPU, whatever the device.
+
+    Raises CheckpointError with what is missing, UsageError for qualities other than a resolution.
+    """
+    assert isinstance(config, GaussiansConfig)  # by its kind
+    for name in ("samples", "budget", "chunk", "max_memory"):
+        if getattr(quality, name):
+            raise UsageError(f"--{name.replace('_', '-')}: is for runs of fields; leave it out")
+    root, preset = run.root, None if quality.quality is None else PRESETS[quality.quality]
+    merged = None if preset is None else preset.merged
+    # Levels of detail were written from what was verified.
+    key = "" if merged is None else checkpoint.digest(run.checkpoints)
+    saved, _ = checkpoint.load_latest(run.checkpoints, verify=not key or open_levels(root / _LEVELS, key) is None)
+    if saved is None:
+        raise CheckpointError(f"{root}: no checkpoint yet; go on with `fprf train {root / 'config.json'} --output {root}`")
+    captured, gaussians = run.load_known(), from_tensors(saved.model)
+    known = replace(captured, cameras=refined(captured.cameras, saved))
+    tones = tones_in(saved, known.facts)
+    whole = run_scene(config, known, gaussians, float(saved.model.get("near", torch.tensor(0.01))))
+    resolution = preset.resolution if preset is not None else 1.0
+
+    def fit(scene: Scene, views: Sequence[int]) -> Annotated[Tensor, "V 6"]:
+        return fit_poses(config, replace(scene, cameras=known.cameras), known.facts, whole, tones, views)
+
+    shown = replace(
+        whole,
+        found=cache(lambda: _semantics(run, saved.step, whole, config)),
+        resolution=resolution if quality.resolution is None else quality.resolution,
+        tone=mixed_tone(tones, known, quality.tone) if quality.tone else (1.0, 1.0, 1.0),
+        tones=tones,
+        poses=fit,
+        merged=merged,
+        levels=cache(lambda: _levels(root / _LEVELS, gaussians, key)),
+    )
+    return LoadedRun(run, run.load_config()[1], known, saved.step, saved.seconds, shown)
+
+
+def refined(cameras: Cameras, saved: checkpoint.Saved) -> Cameras:
+    """The cameras of all views where training put them."""
+    moves = saved.optimizer.get(MOVES)
+    return cameras if moves is None else moved_cameras(cameras, moves)
+
+
+def fit_poses(
+    config: GaussiansConfig, scene: Scene, facts: Facts, shown: SplatScene, tones: Tones | None, views: Sequence[int]
+) -> Annotated[Tensor, "V 6"]:
+    """Turns (radians) and shifts (world units), float64, that bring renders of some views nearest to their photographs.
+
+    Gaussians stay as they are; the other views' moves are 0.
+    """
+    scene = replace(scene, train=torch.tensor(views))
+    images, masks = load_photographs(config, scene, list(views))
+    others = tuple(sorted(set(range(len(scene.paths))) - set(views)))
+    poses = Poses(scene.cameras.pose[:, :, 3], others, reach=reach_of(scene, facts.space), pace=1.0, still=True)
+    levels = make_levels(scene, images, masks, shown.near)
+    config = replace(config, poses=_FIT_RATE, degree=shown.gaussians.degree)
+    learner = GaussianLearner(config, levels, 1.0, len(shown.gaussians), tones=tones, poses=poses, only="poses")
+    learner.start_from(shown.gaussians)
+    learn(learner, None, Schedule(_FIT_STEPS * len(views)), lambda report: None)
+    return poses.moved_by()
+
+
+def load_tones(run: Run) -> Tones | None:
+    """The exposure of each view of a run; None where that was not learnt."""
+    saved, _ = checkpoint.load_latest(run.checkpoints)
+    return None if saved is None else tones_in(saved, run.load_known().facts)
+
+
+def tones_in(saved: checkpoint.Saved, facts: Facts) -> Tones | None:
+    """The exposures that a checkpoint holds; None where they were not learnt."""
+    tones = tones_of(facts)
+    if tones is not None:
+        tones.load_state_dict(
+            {name: saved.optimizer[f"tones.{name}.value"] for name, _ in tones.named_parameters()}, strict=False
+        )
+        tones.requires_grad_(False)
+    return tones
+
+
+def _semantics(run: Run, step: int, scene: SplatScene, config: GaussiansConfig) -> Semantics:
+    """Semantics from the run folder; found anew and kept where those are of another step, encoder or setting."""
+    wanted = {"step": step, "regions": config.regions, "semantic_size": config.semantic_size}
+    if (run.root / "style.safetensors").is_file():
+        tensors = run.load_tensors("style")
+        if {name: int(tensors.pop(name, torch.tensor(-1))) for name in wanted} == wanted:
+            kept = load_semantics(tensors, len(scene.gaussians))
+            if kept.encoder == scene.encoder().identity:
+                return kept
+    semantics = scene.found()
+    run.save_tensors("style", {**semantics_tensors(semantics), **{name: torch.tensor(of) for name, of in wanted.items()}})
+    return semantics
+
+
+def _levels(folder: Path, gaussians: Gaussians, key: str) -> Levels:
+    """Levels of detail of a run; those of many Gaussians lie in a file, written where there is none of its checkpoint."""
+    if len(gaussians) < _MANY:
+        return make_levels_of_detail(gaussians)
+    levels = open_levels(folder, key)
+    if levels is None:
+        write_levels(folder, gaussians, key)
+        levels = open_levels(folder, key)
+    assert levels is not None  # it was just written
+    return levels

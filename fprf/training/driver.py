@@ -1,0 +1,448 @@
+"""Training of any kind of scene, from a config to a run folder.
+
+`train` owns the folder: its lock, config, hashes of the images, facts, and what is resumed. `learn` owns the loop: schedule,
+checkpoints, reports, interrupts, steps that are not finite, memory. What is learnt, and how, belongs to the learner
+(`interfaces.Learner`) that the config builds.
+
+The run folder is the only channel to whoever watches: they read its newest checkpoint and the end of events.jsonl. `watch` asks
+for checkpoints more often while somebody looks; nothing else that they do reaches training.
+"""
+
+import math
+import shlex
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from types import FrameType
+from typing import NamedTuple
+
+from ..config import RunConfig
+from ..datamanagers.images import useless_masks
+from ..errors import CheckpointError, NumericsError, UsageError
+from ..interfaces import Figures, Learner, Partition
+from ..io.atomic import remove_unfinished
+from ..memory import out_of_memory, shortage
+from ..plugins.typed_json import leaves
+from ..progress import LINE_SECONDS, Display
+from . import checkpoint
+from .prepare import device_of, read_scene, scene_needs, with_downscale
+from .run import Run, check_images, held, image_hashes, save_image_hashes
+
+REPORT_SECONDS = 0.5
+"""Time between reports."""
+PATIENCE = 3
+"""Steps in a row that are not finite after which a run goes back to its last checkpoint: it will not recover by itself."""
+WATCHED = ".watched"
+"""File of a run folder that whoever looks at a training touches every second."""
+_WATCH_SECONDS, _SAVING_SHARE, _MIN_PAUSE = 5.0, 0.05, 2.0
+"""Age up to which that file says that somebody looks; the share of the time that checkpoints may then take, and the least
+seconds between them."""
+_TIMED_VIEWS = 2
+"""Views after which the time of all features is estimated."""
+_SMALL = 96
+"""Pixels of an image's shorter side below which a `--downscale` that was asked for is probably a mistake."""
+_SHOWN = 4
+"""Differences of a run's config that a message names."""
+_LONG_HOURS, _TIMED_SECONDS = 1.0, 5.0
+"""Trainings without a time limit that take longer say so; the time over which their first steps are measured."""
+
+
+class Schedule(NamedTuple):
+    """How long to train, and how often to save."""
+
+    steps: int | None
+    """None = until the minutes are over."""
+    minutes: float | None = None
+    """None = until all steps are made."""
+    checkpoint_minutes: float = 5.0
+
+    def share(self, step: int, seconds: float) -> float:
+        """Share of the way, 0 to 1: by steps or by minutes, whichever is further."""
+        share = 0.0 if self.steps is None else step / self.steps if self.steps else 1.0
+        if self.minutes is not None:
+            share = max(share, seconds / (60 * self.minutes))
+        return min(1.0, share)
+
+
+def schedule_of(config: RunConfig, views: int) -> Schedule:
+    """The schedule of a config on so many training views."""
+    return Schedule(config.limited(views), config.minutes, config.checkpoint_minutes)
+
+
+class Report(NamedTuple):
+    """Progress of training."""
+
+    step: int
+    share: float
+    """Share of the way, 0 to 1."""
+    seconds: float
+    """Training time, that of earlier starts included."""
+    psnr: float
+    """Of the training rays in dB, smoothed."""
+    rays_per_second: float
+    kept: float
+    """Share of the samples that met the content network."""
+    losses: dict[str, float]
+    skipped: int
+    """Steps skipped because their loss or a gradient was not finite."""
+
+
+class Reached(NamedTuple):
+    """Where a training has ended."""
+
+    step: int
+    seconds: float
+
+
+def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images: bool = False) -> Path:
+    """Train a scene to the end and return its run folder; an existing run there is resumed if its config and images fit.
+
+    With `changed_images` they may be others than those that the run was begun with. Raises UsageError where packages,
+    weights or the scene are missing, DataError where another process is training there.
+    """
+    start = time.perf_counter()
+    output = config.output or default_output(config, method)
+    config, run = replace(config, output=output), Run(output)
+    with Display(quiet=quiet) as display:
+        _check_needs(config, method, display)  # before there is a folder
+    with held(output), Display(quiet=quiet) as display:
+        display.say(f"{method} on {config.data}, run folder {output}")
+        config = _sized(run, config, display)
+        _check_same(run, config)
+        for folder in (output, *output.glob("blocks/*"), *output.glob("cells/*")):
+            remove_unfinished(folder)
+        # What the run found out when it was begun stays: its origin, and exposures that were measured then.
+        saved = run.saved_facts()
+        scene = read_scene(config, saved)
+        for note in scene.notes:
+            display.say(f"note: {note}")
+        if config.masked and (said := useless_masks(scene)):
+            display.say(said)
+        hashes = image_hashes(scene)
+        if run.exists and not changed_images:
+            check_images(output, scene, hashes)
+        # Photographs are read, features extracted: minutes, so that nothing is written before it has worked.
+        device = device_of(config.trained_on)
+        learner = config.build(scene, device, saved=saved, progress=_told(config, display))
+        run.root.mkdir(parents=True, exist_ok=True)
+        run.save_config(replace(config, output=None), method)  # the folder may be moved
+        save_image_hashes(output, hashes)
+        run.save_known(scene, config.data, learner.facts)
+        spent = time.perf_counter() - start
+        run.log({"part": "preparing", "seconds": round(spent, 3)})
+        width, height = scene.cameras.size[0].tolist()
+        shown = f"{scene.name}: {len(scene.train)} + {len(scene.test)} views of {width}x{height}"
+        if isinstance(learner, Partition):
+            display.say(shown)
+            learner.train(run, display, spent=spent)
+        else:
+            display.say(shown + learner.begin(run))
+            schedule = schedule_of(config, len(scene.train))
+            forecast = Forecast(schedule, method, learner.device.type)
+            log = reporter(display, run)
+
+            def report(event: Report) -> None:
+                log(event)
+                if line := forecast(event):
+                    display.say(line)
+
+            learn(learner, run, schedule, report, spent=spent)
+            trained = time.perf_counter()
+            run.log({"part": "training", "seconds": round(trained - start - spent, 3)})
+            learner.finish(run, display)
+            run.log({"part": "own style", "seconds": round(time.perf_counter() - trained, 3)})
+        quoted = shlex.quote(str(output))
+        seconds = time.perf_counter() - start
+        display.say(f"done after {seconds:.0f} s: fprf stylize {quoted} --references PHOTO.jpg, fprf eval {quoted}")
+    return output
+
+
+def default_output(config: RunConfig, method: str) -> Path:
+    """runs/SCENE-METHOD."""
+    name = "" if config.data is None else config.data.resolve().name
+    return Path("runs") / f"{name or 'scene'}-{method}"
+
+
+def learn(
+    learner: Learner, run: Run | None, schedule: Schedule, report: Callable[[Report], None], *, spent: float = 0.0
+) -> Reached:
+    """Take steps, going on from the newest checkpoint of the run, until the schedule is over; `spent` seconds count as used.
+
+    Without a `run` nothing is saved. An interrupt saves first, then goes on upwards. Steps that are not finite change nothing
+    and are logged; PATIENCE of them in a row lead back to the last checkpoint: on CUDA with the next report. Raises
+    NumericsError where there is none, or where that was of no use, OutOfMemoryError where a step finds too little memory.
+    """
+    saved = None if run is None else _resume(learner, run)
+    step, before = (saved.step, saved.seconds) if saved is not None else (0, spent)
+    first, clock, went_back = step, before, -1
+    begun = last_report = last_saved = time.perf_counter()
+    pause = longest = 60 * schedule.checkpoint_minutes
+    cost = _SAVING_SHARE
+    figures: Figures | None = None
+
+    def save() -> None:
+        nonlocal last_saved, cost
+        if run is not None:
+            start = time.perf_counter()
+            model, optimizer = learner.state()
+            checkpoint.write(run.checkpoints, model, optimizer, step=step, seconds=clock)
+            last_saved = time.perf_counter()
+            cost = last_saved - start
+
+    def measured(figures: Figures, share: float) -> Report:
+        psnr = -10 * math.log10(max(figures.means.get("rgb", 1.0), 1e-10))
+        speed = figures.rays / max(time.perf_counter() - begun, 1e-9)
+        return Report(step, share, clock, psnr, speed, figures.kept, dict(figures.means), figures.skipped)
+
+    with _signals_held_back() as stop:
+        try:
+            while (share := schedule.share(step, clock)) < 1:
+                stop.obey()
+                learner.step(step, share)
+                now = time.perf_counter()
+                due = now - last_report > REPORT_SECONDS
+                # An accelerator works ahead of the host, which waits for it only twice a second and at the end.
+                if due or learner.device.type == "cpu" or schedule.share(step + 1, before + now - begun) >= 1:
+                    figures = learner.figures()
+                    if figures.fault and run is not None:
+                        run.log({"step": step, "skipped": figures.fault})
+                    if figures.failed >= PATIENCE:
+                        went_back = step = _go_back(learner, run, figures, step, went_back)
+                        continue
+                step, clock = step + 1, before + now - begun
+                if due and figures is not None:
+                    last_report = now
+                    report(measured(figures, schedule.share(step, clock)))
+                    # Who looks gets checkpoints as often as a twentieth of the time allows.
+                    often = run is not None and is_watched(run.root)
+                    pause = min(longest, max(_MIN_PAUSE, cost / _SAVING_SHARE)) if often else longest
+                if now - last_saved > pause:
+                    save()
+            stop.obey()
+        except KeyboardInterrupt:
+            if not stop.hurried:
+                save()
+            raise
+        except Exception as error:
+            if not out_of_memory(error):
+                raise
+            raise shortage(f"training step {step}", error, _less_memory(run)) from error
+    if saved is None or step > saved.step:
+        save()
+    if step > first and figures is not None:
+        report(measured(figures, 1.0))
+    return Reached(step, clock)
+
+
+def _resume(learner: Learner, run: Run) -> checkpoint.Saved | None:
+    """Load the newest intact checkpoint into the learner; None where the run has none yet."""
+    checkpoint.tidy(run.checkpoints)
+    saved, damaged = checkpoint.load_latest(run.checkpoints)
+    for line in damaged:
+        run.log({"damaged": line})
+    if saved is not None:
+        try:
+            learner.load(saved.state)
+        except CheckpointError as error:
+            raise CheckpointError(f"checkpoint of step {saved.step}: {error}") from error
+    return saved
+
+
+def _go_back(learner: Learner, run: Run | None, figures: Figures, step: int, before: int) -> int:
+    """Load the newest checkpoint and return its step; a second time to the same one (`before`) would change nothing."""
+    why = f"step {step}: {figures.fault or 'the loss'} is not finite for {PATIENCE} steps in a row"
+    remedy = "lower the learning rate, or check the images"
+    saved = None if run is None else checkpoint.load_latest(run.checkpoints)[0]
+    if run is None or saved is None:
+        raise NumericsError(f"{why}; {remedy}")
+    if saved.step == before:
+        raise NumericsError(f"{why}, again after going back to step {before}; {remedy}")
+    learner.load(saved.state)
+    run.log({"step": step, "gone_back_to": saved.step, "because": why})
+    return saved.step
+
+
+def _less_memory(run: Run | None) -> str:
+    """Advice where there is not enough memory for a step."""
+    steps = [] if run is None else checkpoint.steps(run.checkpoints)
+    kept = f"the checkpoint of step {steps[-1]} is kept" if steps else "there is no checkpoint yet"
+    return f"lower --datamanager.rays (of fields), or begin anew with a larger --downscale ({kept})"
+
+
+def watch(root: Path) -> None:
+    """Tell the training in a run folder, if there is one, that somebody looks: to be called every second while they do."""
+    with suppress(OSError):  # a run on a read-only disk is not being trained
+        (root / WATCHED).touch()
+
+
+def is_watched(root: Path) -> bool:
+    """True where somebody has looked at a run within the last seconds."""
+    try:
+        return time.time() - (root / WATCHED).stat().st_mtime < _WATCH_SECONDS
+    except OSError:
+        return False
+
+
+class _Stop:
+    """Requests to stop."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        """Once: end when the step is done."""
+        self.hurried = False
+        """Twice: ended within a step, so that what is in memory is of no use."""
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Take note of a signal; the second raises KeyboardInterrupt wherever the program is."""
+        self.hurried = self.asked
+        self.asked = True
+        if self.hurried:
+            raise KeyboardInterrupt
+
+    def obey(self) -> None:
+        """Raise KeyboardInterrupt if it was asked for."""
+        if self.asked:
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def _signals_held_back() -> Iterator[_Stop]:
+    """Hold signals back inside the block, and as before after it. Other threads than the first cannot, and don't."""
+    stop = _Stop()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def reporter(display: Display, run: Run, name: str = "training") -> Callable[[Report], None]:
+    """Progress of what is trained in a folder: for the display, and every few seconds a line of its events.jsonl."""
+    last = -LINE_SECONDS
+
+    def report(event: Report) -> None:
+        nonlocal last
+        display.training(event, name)
+        now = time.perf_counter()
+        if now - last < LINE_SECONDS and event.share < 1:
+            return
+        last = now
+        run.log(
+            {
+                "step": event.step,
+                "seconds": round(event.seconds, 2),
+                "psnr": round(event.psnr, 3),
+                "rays_per_second": round(event.rays_per_second),
+                "kept": round(event.kept, 4),
+                "skipped_steps": event.skipped,
+                "losses": {name: float(f"{value:.4g}") for name, value in event.losses.items()},
+            }
+        )
+
+    return report
+
+
+class Forecast:
+    """Tells from the first steps of a training, once, that all of them will take hours on a CPU."""
+
+    def __init__(self, schedule: Schedule, method: str, device: str) -> None:
+        self.steps, self.method = schedule.steps or 0, method
+        self.first: Report | None = None
+        self.told = device != "cpu" or schedule.minutes is not None
+
+    def __call__(self, event: Report) -> str:
+        """A line to show, or nothing."""
+        if self.told:
+            return ""
+        first = self.first = self.first or event  # whose time holds the compilation of kernels
+        steps, seconds = event.step - first.step, event.seconds - first.seconds
+        if steps < 1 or seconds < _TIMED_SECONDS:
+            return ""
+        self.told = True
+        hours = (self.steps - event.step) * seconds / steps / 3600
+        if hours < _LONG_HOURS:
+            return ""
+        other = "; the method fprf-lite is made for a CPU and needs 8" if self.method == "fprf" else ""
+        return (
+            f"{self.steps:,} steps at {seconds / steps:.2g} s a step take {hours:,.0f} hours on this CPU; "
+            f"--minutes N fits steps and learning rate into N minutes{other}"
+        )
+
+
+def _check_needs(config: RunConfig, method: str, display: Display) -> None:
+    """Raise UsageError where something is missing that nothing downloads, after showing all that is missing."""
+    missing = config.needs()
+    if config.data is not None and all(need.downloaded for need in missing):
+        return  # where the scene cannot be read its parser says so
+    needs = [*scene_needs(config), *missing]
+    if len(needs) > 1:
+        for need in needs:
+            display.say(f"missing: {need.what}: {need.remedy}")
+        raise UsageError(f"fprf train {method}: {len(needs)} things are missing; `fprf doctor {method}` looks again")
+    raise UsageError(f"fprf train {method}: {needs[0].what}: {needs[0].remedy}")
+
+
+def _sized(run: Run, config: RunConfig, display: Display) -> RunConfig:
+    """The config with the size of its images, which an existing run has decided already."""
+    if config.downscale is not None:
+        if config.downscale > 1 and not run.exists:
+            width, height = read_scene(config).cameras.size[0].tolist()
+            if min(width, height) < _SMALL:
+                display.say(
+                    f"warning: {width}x{height} pixels are few: --downscale {config.downscale} counts from the images as they "
+                    "are delivered, also in a folder images_N; leave it out"
+                )
+        return config
+    old = run.load_config()[0].downscale if run.exists else None
+    if old is not None:
+        return replace(config, downscale=old)
+    config = with_downscale(config)
+    if config.downscale != 1:
+        width, height = read_scene(config).cameras.size[0].tolist()
+        display.say(
+            f"images are reduced to 1/{config.downscale}, {width}x{height}, for this device and time: --downscale 1 keeps them"
+        )
+    return config
+
+
+def _check_same(run: Run, config: RunConfig) -> None:
+    """Raise UsageError where a folder holds a run with another config; only what `changeable` names may differ."""
+    if not run.exists:
+        return
+    old, _ = run.load_config()
+    free = config.changeable(old)
+    mine, theirs = leaves(config), leaves(old)
+    changed = [path for path in theirs | mine if path.partition(".")[0] not in free and mine.get(path) != theirs.get(path)]
+    if changed:
+        shown = [f"{name} {theirs.get(name, '-')} ({mine.get(name, '-')} is asked)" for name in changed[:_SHOWN]]
+        more = f" and {len(changed) - _SHOWN} others" if len(changed) > _SHOWN else ""
+        other = next(path for k in range(2, 1000) if not (path := run.root.with_name(f"{run.root.name}-{k}")).exists())
+        raise UsageError(
+            f"{run.root}: holds a run with {', '.join(shown)}{more}; go on with it by its own values, or begin another with "
+            f"--output {shlex.quote(str(other))}"
+        )
+
+
+def _told(config: RunConfig, display: Display) -> Callable[[int, int, str], None]:
+    """Progress of the preparation, with a line where features will take most of a time limit."""
+    begun: dict[str, float] = {}
+
+    def progress(done: int, total: int, what: str) -> None:
+        display.count(done, total, what)
+        now = time.perf_counter()
+        seconds = (now - begun.setdefault(what, now)) / max(done, 1) * total
+        if done == _TIMED_VIEWS and config.minutes is not None and seconds > 30 * config.minutes:
+            display.say(
+                f"warning: {what} will take {seconds:.0f} s of the {60 * config.minutes:.0f} s of --minutes; "
+                f"--downscale {2 * (config.downscale or 1)} and another --output take a quarter"
+            )
+
+    return progress

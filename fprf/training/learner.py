@@ -1,0 +1,398 @@
+"""Fields in training: one batch of rays a step, Adam, and the paper's losses.
+
+Batches and draws are functions of (seed, step), so a resumed run goes on as if never stopped. On CUDA the host waits for the
+device only where figures are asked for: losses and faults stay on the device until then. Batches are drawn there where their
+data fit, otherwise copied one step ahead.
+
+Letters: R rays of a batch, S samples of a ray.
+"""
+
+import math
+import shlex
+from collections.abc import Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.profiler import record_function
+
+from ..config import PASSES, OptimizerConfig, TrainConfig
+from ..datamanagers.basis import Basis
+from ..datamanagers.batches import generator_of
+from ..datamanagers.scene import Scene as ParsedScene
+from ..errors import CheckpointError
+from ..interfaces import DataManager, Figures, Learner, State
+from ..memory import free_memory
+from ..ops.precision import tf32
+from ..progress import Display
+from ..rendering.cameras import PixelRays
+from ..rendering.renderer import render_rays
+from ..style.scene import SceneStyle, to_tensors
+from ..types import Batch, Rays
+from . import checkpoint
+from .camera_optimizers import moving, toned
+from .loading import Trained
+from .losses import check_penalties, extra_term, terms, total, wanted
+from .model import Facts, Model, background_of, build_model
+from .prepare import Prepared
+from .run import Run, known_of, read_history
+from .style_pass import measure_style
+
+SMOOTHING = 0.95
+"""Decay of running means."""
+CLEAR_EVERY = 100
+"""Steps between looks for denormals. A first moment falls by 0.9^100 = 3e-5 until then."""
+FAINT_FIRST = 1e-33
+"""First moments below are cleared: after CLEAR_EVERY more steps they would be denormal (below 1.2e-38)."""
+FAINT_SECOND = 1e-36
+"""The same for second moments. Their root, 1e-18, is far below any useful eps."""
+LARGEST = 1.8e19
+"""Norm of a gradient that Adam can square in float32 (3.4e38)."""
+_NAMED = 3
+_FEW_STEPS = 600
+"""Fewer are too few to judge by: a garden of ten views shows streaks on held-out ones after 350, at 19.8 dB on the training
+views; flower and fox are at 22.9 and 27.1 dB on held-out views after 754 and 775."""
+
+
+def optimizer_of(config: TrainConfig, model: Model) -> torch.optim.Optimizer:
+    """Adam on all that the model learns."""
+    knobs = config.optimizer
+    return torch.optim.Adam(model.learned(), lr=knobs.rate, betas=(0.9, knobs.beta2), eps=knobs.eps, fused=True)
+
+
+class FieldLearner(Learner):
+    """Fields in training: their model, its optimiser, and what lives between steps but is not saved: running means.
+
+    `model` is one at its start, where it is not simply that of the config: a block in its surroundings, whose sampler was
+    trained for `lead` steps before. The parts of a step carry names (`fprf.batch` ...) that a profiler sees; without one they
+    cost microseconds.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        prepared: Prepared,
+        device: torch.device,
+        model: Model | None = None,
+        *,
+        lead: int = 0,
+    ) -> None:
+        self.config, self.prepared, self._device, self.lead = config, prepared, device, lead
+        self.model = (build_model(config, prepared.facts) if model is None else model).to(device)
+        self.optimizer = optimizer_of(config, self.model)
+        self.deferred = device.type == "cuda"
+        """True where the host reads faults only with the figures."""
+        self.tf32 = config.precision == "tf32" and device.type == "cuda"
+        self.half = config.precision == "bfloat16" and device.type != "cpu"
+        check_penalties(config.loss, self.model)
+        self.extra = extra_term(config.loss)
+        self.manager = prepared.manager
+        if device.type != "cpu":
+            free = free_memory(device) if device.type == "cuda" else None
+            self.manager = prepared.manager.to(device, room=int(config.device_memory * (free or 0)))
+        self.batches = Batches(self.manager, device)
+        self.through = PixelRays(prepared.scene.cameras)
+        if device.type != "mps" and not self.through.waits:  # MPS has no float64: rays are made on the CPU, as those that wait
+            self.through.to(device)
+        self.background = background_of(prepared.facts, device)
+        self.statistics = StepStatistics(device)
+        self.rays = self.skipped = self.failed = 0
+        self.fault = ""
+
+    @property
+    def device(self) -> torch.device:
+        return self._device
+
+    @property
+    def facts(self) -> Facts:
+        return self.prepared.facts
+
+    def step(self, index: int, share: float) -> None:
+        """Render a batch of rays, compare it with its pixels and features (paper, Eq. 3 and 4), and step."""
+        with tf32(self.tf32):
+            self._step(index, share)
+
+    def _step(self, step: int, share: float) -> None:
+        # The pixels of the step, and the rays through them: where poses are refined, of the cameras as they are now.
+        with record_function("fprf.batch"):
+            drawn = self.batches(step)
+            batch = _moved(drawn, self.device)
+            rays, ends = self._rays(drawn if self.through.device.type == "cpu" else batch)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate(self.config.optimizer, step, share)
+        draws = generator_of(self.config.seed, step, self.device, purpose="draws")
+        # Colour, content and semantics along each ray; outputs that no loss needs are not computed.
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.half):
+            rendered = render_rays(
+                rays,
+                self.model.parts,
+                want=wanted(self.config.loss, batch, self.extra),
+                budget=self.config.render.train_budget,
+                background=self.background,
+                step=step + self.lead,
+                generator=draws,
+                semantic_rays=len(batch.semantic) if batch.semantic is not None else None,
+                semantic_samples=self.config.semantic.samples,
+                content_moves_density=self.config.content.moves_density,
+            )
+        # Photographs differ in exposure: what is compared is the render as the view would have taken it.
+        rendered = toned(rendered, self.model.tones, batch.view)
+        with record_function("fprf.losses"):
+            parts = terms(
+                self.config.loss,
+                self.facts,
+                rendered,
+                batch,
+                self.model,
+                step=step,
+                ends=ends,
+                extra=self.extra,
+                generator=draws,
+            )
+            loss = total(self.config.loss, parts, share)
+        self.optimizer.zero_grad(set_to_none=True)
+        if self.deferred:
+            self._step_deferred(loss)
+        else:
+            self._step_checked(loss, parts, step)
+        kept = rendered.counts["kept"] / max(1, rendered.counts["samples"])
+        self.statistics.add(parts | {"kept": torch.full((), kept, device=loss.device)})
+        self.rays += len(batch.rgb)
+
+    def _step_checked(self, loss: Tensor, parts: dict[str, Tensor], step: int) -> None:
+        """Check the loss and the gradients, then step."""
+        fault = unfit_terms(loss, parts)
+        if fault is None:
+            with record_function("fprf.backward"):
+                loss.backward()  # type: ignore[no-untyped-call]
+            fault = unfit_gradients(self.model.named_parameters())
+        if fault is not None:
+            self.fault, self.skipped, self.failed = fault, self.skipped + 1, self.failed + 1
+            return
+        with record_function("fprf.optimizer"):
+            self.optimizer.step()
+        if (step + 1) % CLEAR_EVERY == 0:
+            clear_denormals(self.optimizer)
+        self.failed = 0
+
+    def _step_deferred(self, loss: Tensor) -> None:
+        """Step, unless the device finds a loss or gradient that is not finite."""
+        with record_function("fprf.backward"):
+            loss.backward()  # type: ignore[no-untyped-call]
+        flag = unfit_step(loss, self.model.parameters())
+        with record_function("fprf.optimizer"):
+            # As torch's GradScaler does: the optimiser then changes neither parameters, moments nor its count of steps.
+            self.optimizer.found_inf = flag  # type: ignore[attr-defined]
+            self.optimizer.step()
+        self.statistics.count_skipped(flag)
+
+    def figures(self) -> Figures:
+        """Running means, corrected for their start; a term that comes every few steps counts when it comes."""
+        if self.deferred:
+            skipped, self.failed, names = self.statistics.faults()
+            self.fault = (names or "a gradient") if skipped > self.skipped else ""
+            self.skipped = skipped
+        means = self.statistics.means()
+        kept, fault = means.pop("kept", 0.0), self.fault
+        self.fault = ""
+        return Figures(means, self.rays, self.skipped, self.failed, fault, kept)
+
+    def state(self) -> State:
+        return State(self.model.state_dict(), checkpoint.moments_of(self.optimizer))
+
+    def load(self, state: State) -> None:
+        checkpoint.restore(state, self.model, self.optimizer)
+        self.failed = 0
+        self.statistics.failed.zero_()
+
+    def scene(self) -> Trained:
+        """The model as it is, which goes on learning with this learner."""
+        scene, basis = self.prepared.scene, self.prepared.basis
+        known = known_of(scene, self.config.data, self.facts)
+        if self.model.poses is not None:
+            known = replace(known, cameras=self.model.poses.refined(known.cameras))
+
+        def measured() -> tuple[SceneStyle, Basis | None]:
+            return measure_style(self.config, self.model, scene.cameras, scene.train), basis
+
+        return Trained(Run(self.config.output or Path()), self.config, "", known, self.model, 0, 0.0, style=measured)
+
+    def begin(self, run: Run) -> str:
+        """Write the basis of the semantics."""
+        if self.prepared.basis is not None:
+            run.save_tensors("basis", self.prepared.basis.tensors())
+        facts = self.facts
+        semantics = f", {facts.dim} semantic" if facts.dim else ", no semantic"
+        return f", space {facts.space.kind}, {facts.channels} content{semantics} channels{', tones' * bool(facts.exposure)}"
+
+    def finish(self, run: Run, display: Display) -> None:
+        """Measure the scene's own style, and say what quality training reached."""
+        display.say("measuring the scene's own style")
+        style = measure_style(self.config, self.model, self.prepared.scene.cameras, self.prepared.scene.train)
+        run.save_tensors("style", to_tensors(style))
+        display.say(outcome(run, self.config, self.prepared.scene))
+
+    def _rays(self, batch: Batch) -> tuple[Rays, Tensor | None]:
+        """The rays of a batch, and their parameters at its known distances."""
+        there, space = self.through.device, self.model.space
+        origin, direction = self.through(batch.view.to(there), batch.pixel.to(there))
+        ends = None
+        if batch.distance is not None:
+            ends = space.parameter(origin, direction, batch.distance.to(there)).to(self.device)
+        if self.model.poses is not None:
+            rays = moving(space.rays(*self.model.poses(batch.view, origin, direction)))
+        else:
+            rays = space.rays(origin, direction)
+        return Rays(*(x.to(self.device) for x in rays)), ends
+
+
+class Batches:
+    """Batches of a data manager. For an accelerator those in host memory are drawn one step ahead by a thread."""
+
+    def __init__(self, manager: DataManager, device: torch.device) -> None:
+        self.manager, self.device = manager, device
+        self._thread: ThreadPoolExecutor | None = None
+        self._next: tuple[int, Future[Batch]] | None = None
+
+    def __call__(self, step: int) -> Batch:
+        """The batch of a step, as the manager draws it, or in pinned memory."""
+        if self._next is None:
+            batch = self.manager.batch(step)
+            if batch.rgb.device.type != "cpu" or self.device.type == "cpu":
+                return batch
+        elif self._next[0] == step:
+            batch = self._next[1].result()
+        else:  # after going back
+            batch = self._later(step).result()
+        self._next = (step + 1, self._later(step + 1))
+        return batch
+
+    def _later(self, step: int) -> "Future[Batch]":
+        if self._thread is None:
+            self._thread = ThreadPoolExecutor(1, thread_name_prefix="fprf-batches")
+        return self._thread.submit(self._pinned, step)
+
+    def _pinned(self, step: int) -> Batch:
+        batch = self.manager.batch(step)
+        return Batch._make(x if x is None or self.device.type != "cuda" else x.pin_memory() for x in batch)
+
+
+def _moved(batch: Batch, device: torch.device) -> Batch:
+    if device.type == "mps":  # which has no float64
+        batch = batch._replace(pixel=batch.pixel.float())
+    return Batch._make(x if x is None else x.to(device, non_blocking=device.type == "cuda") for x in batch)
+
+
+def rate(config: OptimizerConfig, step: int, share: float) -> float:
+    """Linear warm-up, then a cosine from `rate` to `final * rate`, and 1 / sqrt(step) from `hold` on."""
+    late = 1.0 if config.hold is None else math.sqrt(config.hold / max(config.hold, step))
+    warm = min(1.0, (step + 1) / max(1, config.warm_up))
+    cosine = 0.5 * (1 + math.cos(math.pi * share))
+    return config.rate * warm * late * (config.final + (1 - config.final) * cosine)
+
+
+def unfit_terms(loss: Tensor, parts: Mapping[str, Tensor]) -> str | None:
+    """Names of the loss terms that are not finite; None where the loss is."""
+    if bool(torch.isfinite(loss)):
+        return None
+    bad = [name for name, value in parts.items() if not bool(torch.isfinite(value))]
+    return ", ".join(bad) or "the sum of the loss terms"
+
+
+def unfit_gradients(parameters: Iterable[tuple[str, nn.Parameter]]) -> str | None:
+    """Names of the parameters whose gradient is not finite, or too large to be squared; None where all are well."""
+    gradients = [(name, p.grad) for name, p in parameters if p.grad is not None]
+    if not gradients or bool(torch.nn.utils.get_total_norm([grad for _, grad in gradients]) < LARGEST):
+        return None
+    bad = [name for name, grad in gradients if not bool(grad.norm() < LARGEST)]
+    more = f" and {len(bad) - _NAMED} more" if len(bad) > _NAMED else ""
+    return f"the gradient of {', '.join(bad[:_NAMED]) or 'all parameters together'}{more}"
+
+
+@torch.no_grad()
+def unfit_step(loss: Tensor, parameters: Iterable[nn.Parameter]) -> Tensor:
+    """1 where the loss or a gradient is not finite, or too large to be squared, else 0: float32, on the loss's device."""
+    norm = torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
+    return (~(torch.isfinite(loss) & (norm < LARGEST))).float()
+
+
+class StepStatistics:
+    """Running means of named scalars, and counts of those that were not finite, kept on their device until they are read."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.names: list[str] = []
+        # A row each: sums of values, sums of weights, how often not finite. MPS has no float64.
+        self.rows = torch.zeros(3, 0, dtype=torch.float32 if device.type == "mps" else torch.float64, device=device)
+        self.none = torch.full((), torch.nan, device=device)
+        self.skipped, self.failed = torch.zeros((), device=device), torch.zeros((), device=device)
+        self._present: dict[tuple[str, ...], Tensor] = {}
+
+    @torch.no_grad()
+    def add(self, values: Mapping[str, Tensor]) -> None:
+        """One step's scalars. A name that is absent, or not finite, leaves its mean as it is."""
+        new = [name for name in values if name not in self.names]
+        if new:
+            self.names += new
+            self.rows = torch.nn.functional.pad(self.rows, (0, len(new)))
+            self._present.clear()
+        given = tuple(values)
+        if given not in self._present:
+            # Filled on the device: a term that comes every few steps must not have the host wait for a copy.
+            marks = [torch.full_like(self.none, float(name in values)) for name in self.names]
+            self._present[given] = torch.stack(marks).to(self.rows.dtype)
+        row = torch.stack([values.get(name, self.none) for name in self.names]).to(self.rows.dtype)
+        fit = torch.isfinite(row)
+        means = SMOOTHING * self.rows[:2] + (1 - SMOOTHING) * torch.stack([row, self._present[given]])
+        bad = self.rows[2] + self._present[given] * ~fit
+        self.rows = torch.cat([torch.where(fit, means, self.rows[:2]), bad[None]])
+
+    def count_skipped(self, unfit: Tensor) -> None:
+        """Count a step: `unfit` is 1 where it was skipped, else 0."""
+        self.skipped, self.failed = self.skipped + unfit, (self.failed + 1) * unfit
+
+    def means(self) -> dict[str, float]:
+        """The means, corrected for their start; names that never had a finite number are left out. The host waits."""
+        value, weight, _ = self.rows.tolist()
+        return {name: v / w for name, v, w in zip(self.names, value, weight, strict=True) if w > 0}
+
+    def faults(self) -> tuple[int, int, str]:
+        """Steps skipped so far, the last ones in a row, and the names of terms that were not finite since the last call."""
+        skipped, failed, *bad = torch.cat([torch.stack([self.skipped, self.failed]), self.rows[2]]).tolist()
+        self.rows[2].zero_()
+        return int(skipped), int(failed), ", ".join(name for name, b in zip(self.names, bad, strict=True) if b > 0)
+
+
+@torch.no_grad()
+def clear_denormals(optimizer: torch.optim.Optimizer) -> None:
+    """Set moments of Adam that are, or would soon be, denormal to zero; the parameters' next step is the same without them."""
+    for state in optimizer.state.values():
+        first, second = state.get("exp_avg"), state.get("exp_avg_sq")
+        if first is not None and second is not None:
+            torch.hardshrink(first, FAINT_FIRST, out=first)
+            torch.threshold_(second, FAINT_SECOND, 0.0)
+
+
+def outcome(run: Run, config: TrainConfig, scene: ParsedScene) -> str:
+    """One line on what a training reached, by its events.jsonl or those of its blocks, and the command that raises it."""
+    try:
+        trained = [history for history in read_history(run.root) if history.values.get("psnr", [None])[-1] is not None]
+    except CheckpointError:
+        trained = []
+    if not trained:
+        return "no step was made"
+    blocks = [history for history in trained if history.name] or trained
+    steps = min(history.step[-1] for history in blocks)
+    psnr = sum(history.values["psnr"][-1] or 0.0 for history in blocks) / len(blocks)
+    rays = sum(history.step[-1] for history in trained) * config.datamanager.batch_rays()
+    passes = rays / int(scene.cameras.size[scene.train].prod(1).sum())
+    reached = f"{steps:,} steps, {passes:.2g} rays for each pixel, {psnr:.1f} dB on the training views"
+    timed = config.minutes is not None and steps < config.steps
+    again = f"fprf train {shlex.quote(str(run.root / 'config.json'))}"
+    longer = f"--minutes {2 * (config.minutes or 0):g}" if timed else f"--steps {max(2 * config.steps, _FEW_STEPS)}"
+    if steps < _FEW_STEPS:
+        return f"warning: too few steps to judge the scene by: {reached}; go on: {again} {longer}"
+    size = config.downscale or 1
+    finer = f"; for more detail: --downscale {size - 1} and another --output" if size > 1 and passes > PASSES else ""
+    return f"{reached}; to raise it: {again} {longer}{finer}"

@@ -1,0 +1,203 @@
+"""The page's file in a headless Chromium. Skipped where playwright or Chromium are not there."""
+
+import base64
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from chromium import chromium
+from pages import recoloured, seen, street, written
+from splat_ball import ball
+
+from fprf.rendering.paths import look_at, pinhole
+from fprf.splats.photographs import camera_of
+from fprf.splats.scene import SplatScene
+from fprf.splats.views import draw
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+DRAW = """async ([view, lens, width, height, look]) => {
+  const { splats, scene, canvas } = fprf.place;
+  fprf.place.lost = true; // it shall not draw meanwhile
+  await splats.sort(new Float32Array(view), scene.near);
+  [canvas.width, canvas.height] = [width, height];
+  splats.draw(new Float32Array(view), lens, look, { near: scene.near, background: scene.background });
+  const picture = canvas.toDataURL("image/png");
+  fprf.place.lost = false;
+  fprf.place.resize();
+  return picture;
+}"""
+POSE = "() => [...fprf.place.camera.view]"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as found:
+        yield found
+
+
+def opened(browser: Any, path: Path, width: int = 640, height: int = 480, script: str = "") -> Any:
+    page = browser.new_page(viewport={"width": width, "height": height})
+    page.errors = []
+    page.on("pageerror", lambda error: page.errors.append(str(error)))
+    page.on("console", lambda line: page.errors.append(line.text) if line.type == "error" else None)
+    page.add_init_script(script)
+    page.goto(path.as_uri())
+    page.wait_for_selector(".place.ready", timeout=120_000)
+    return page
+
+
+def drawn(page: Any, scene: SplatScene, view: int, look: dict[str, Any]) -> np.ndarray:
+    camera = camera_of(scene.cameras, view, scene.near)
+    lens = [float(camera.intrinsics[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2))]
+    uri = page.evaluate(DRAW, [camera.world_to_camera.T.flatten().tolist(), lens, camera.width, camera.height, look])
+    return cv2.imdecode(np.frombuffer(base64.b64decode(uri.split(",")[1]), np.uint8), 1)[..., ::-1] / 255
+
+
+def psnr(one: np.ndarray, other: np.ndarray) -> float:
+    return float(-10 * np.log10(((one - other) ** 2).mean() + 1e-10))
+
+
+def rasterised(scene: SplatScene, view: int, harmonics: torch.Tensor) -> np.ndarray:
+    camera = camera_of(scene.cameras, view, scene.near)
+    gaussians = scene.gaussians.recoloured(harmonics)
+    found = draw(gaussians, camera, antialiased=scene.antialiased, background=scene.background)
+    return found.image.clamp(0, 1).numpy()
+
+
+def inside(scene: SplatScene) -> SplatScene:
+    """Cameras in the middle of a scene."""
+    ahead = torch.tensor([[0.0, 0, 1], [1, 0, 0], [-1, 0.2, 0.3], [0, 0.3, -1]], dtype=torch.float64)
+    pose = look_at(0.05 * ahead, ahead, torch.tensor([0.0, -1, 0], dtype=torch.float64))
+    return replace(scene, views=pinhole(pose, width=160, height=120, fov=70.0))
+
+
+@pytest.mark.parametrize("kind", ["ball", "plain ball", "street"])
+def test_it_draws_what_the_rasteriser_draws(browser: Any, tmp_path: Path, kind: str) -> None:
+    made = {"ball": ball(4000, 2), "plain ball": ball(3000, 0), "street": street()}[kind]
+    scene = seen(made, antialiased=kind != "plain ball")
+    scene = inside(scene) if kind == "street" else scene
+    page = opened(browser, written(tmp_path / "page.html", scene))
+    styled = recoloured(scene.gaussians)
+    for view in (0, 2):
+        plain, dusk = (rasterised(scene, view, each) for each in (scene.gaussians.harmonics, styled))
+        assert psnr(drawn(page, scene, view, {"first": "Captured", "blend": 0}), plain) > 38
+        assert psnr(drawn(page, scene, view, {"first": "Captured", "second": "dusk", "blend": 1}), dusk) > 38
+        half = rasterised(scene, view, (scene.gaussians.harmonics + styled) / 2)
+        assert psnr(drawn(page, scene, view, {"first": "Captured", "second": "dusk", "blend": 0.5}), half) > 36
+        wiped = drawn(page, scene, view, {"first": "Captured", "second": "dusk", "wipe": 0.5})
+        third = wiped.shape[1] // 3
+        assert psnr(wiped[:, :third], plain[:, :third]) > 33 and psnr(wiped[:, -third:], dusk[:, -third:]) > 33
+    assert page.errors == []
+
+
+@pytest.fixture
+def page(browser: Any, tmp_path: Path) -> Iterator[Any]:
+    found = opened(browser, written(tmp_path / "page.html", seen(ball(2000, 1))))
+    yield found
+    assert found.errors == []
+    found.close()
+
+
+def pixels(page: Any) -> np.ndarray:
+    """What is seen of the scene once it rests."""
+    page.wait_for_function("() => fprf.place.exact && !fprf.place.waiting && !fprf.place.changed", timeout=60_000)
+    page.wait_for_timeout(400)
+    return cv2.imdecode(np.frombuffer(page.locator("#canvas").screenshot(), np.uint8), 1).astype(float) / 255
+
+
+def test_drags_and_keys_move_the_camera_and_styles_change(page: Any) -> None:
+    start, plain = page.evaluate(POSE), pixels(page)
+    box = page.locator("#canvas").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 60, y + 10, steps=4)
+    page.mouse.up()
+    turned = page.evaluate(POSE)
+    assert not np.allclose(start, turned, atol=0.05) and np.abs(pixels(page) - plain).mean() > 0.01
+    page.keyboard.down("w")
+    page.wait_for_timeout(300)
+    page.keyboard.up("w")
+    assert not np.allclose(turned, page.evaluate(POSE), atol=0.01)
+    page.keyboard.press("r")
+    page.wait_for_function("() => !fprf.place.flight")
+    assert np.allclose(start, page.evaluate(POSE), atol=1e-3)
+    page.keyboard.press("1")
+    assert page.locator(".look[aria-pressed=true]").inner_text() == "dusk"
+    page.wait_for_function("() => fprf.place.blend === 1 && fprf.place.second === 'dusk'")
+    dusk = pixels(page)
+    assert np.abs(dusk - plain).mean() > 0.02
+    page.locator("#mix").fill("50")
+    middle = pixels(page)
+    assert np.abs(middle - (dusk + plain) / 2).mean() < 0.02
+    page.keyboard.press("Escape")
+    page.locator("#wiping").click()
+    wiped = pixels(page)
+    third = wiped.shape[1] // 3
+    # Labels and the line lie over the picture.
+    assert (
+        np.abs(wiped[80:, :third] - plain[80:, :third]).mean() < 0.02
+        and np.abs(wiped[80:, -third:] - dusk[80:, -third:]).mean() < 0.02
+    )
+
+
+def test_the_whole_page_works_by_keyboard(page: Any) -> None:
+    page.keyboard.press("1")
+    reached = []
+    for _ in range(14):
+        page.keyboard.press("Tab")
+        reached.append(page.evaluate("() => document.activeElement.id || document.activeElement.className"))
+    assert {"canvas", "next", "how", "look", "from", "mix", "wiping"} <= set(reached)
+    page.locator("#canvas").focus()
+    before = page.evaluate(POSE)
+    page.keyboard.press("ArrowLeft", delay=250)
+    assert not np.allclose(before, page.evaluate(POSE), atol=1e-3)
+    page.keyboard.press("c")
+    page.locator("#line").focus()
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate("() => fprf.place.wipe") == pytest.approx(0.52)
+
+
+def test_a_pixel_has_a_point_in_space(page: Any) -> None:
+    box = page.locator("#canvas").bounding_box()
+    middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    found = page.evaluate("([x, y]) => fprf.place.point(x, y)", middle)
+    assert 0.7 < np.linalg.norm(found) < 1.2, "the ball's surface"
+    assert page.evaluate("([x, y]) => fprf.place.point(x, y)", (box["x"] + 2, box["y"] + 2)) is None
+    page.mouse.dblclick(*middle)
+    page.wait_for_function("() => !fprf.place.flight")
+
+
+def test_a_lost_context_comes_back(page: Any) -> None:
+    before = pixels(page)
+    page.evaluate("() => { window.lose = fprf.place.splats.gl.getExtension('WEBGL_lose_context'); lose.loseContext(); }")
+    page.wait_for_function("() => fprf.place.lost")
+    page.evaluate("() => lose.restoreContext()")
+    page.wait_for_function("() => !fprf.place.lost")
+    assert np.abs(pixels(page) - before).mean() < 0.01
+
+
+@pytest.mark.parametrize("width", [400, 1280])
+def test_it_fits_any_width(browser: Any, tmp_path: Path, width: int) -> None:
+    page = opened(browser, written(tmp_path / "page.html", seen(ball(500))), width, 720)
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= width
+    box = page.locator("#canvas").bounding_box()
+    page.set_viewport_size({"width": width * 3 // 4, "height": 500})
+    page.wait_for_function(f"() => fprf.place.canvas.clientHeight < {box['height']}")
+    page.wait_for_function("() => Math.abs(fprf.place.canvas.width - fprf.place.canvas.clientWidth) < 2")
+    assert page.errors == []
+
+
+def test_without_webgl_there_are_pictures(browser: Any, tmp_path: Path) -> None:
+    path = written(tmp_path / "page.html", seen(ball(500)))
+    page = opened(browser, path, script="HTMLCanvasElement.prototype.getContext = () => null")
+    page.locator(".look", has_text="dusk").click()
+    assert page.locator(".still.two").is_visible() and not page.locator("#canvas").is_visible()
+    page.locator("#wiping").click()
+    assert page.evaluate("() => document.querySelector('.still.two').style.clipPath") == "inset(0px 0px 0px 50%)"
+    assert page.errors == []

@@ -1,0 +1,162 @@
+import base64
+import hashlib
+import json
+import re
+import zlib
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from pages import page_of, seen, written
+from splat_ball import ball
+
+from fprf.errors import DataError
+from fprf.io.video import write_video
+from fprf.page.writer import PageView, Style, write_page
+
+VOID = {"meta", "link", "img", "input", "br"}
+EVIL = """<script>alert(1)</script>"'&<b>${x}$title"""
+
+
+class Read(HTMLParser):
+    """Reads a page strictly: every tag that opens also closes, in order."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str]]] = []
+        self.text: list[str] = []
+        self.scripts: dict[str, str] = {}
+        self.whole = path.read_text("utf-8")
+        self.feed(self.whole)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, {name: value or "" for name, value in attrs}))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] == "script":
+            self.scripts[self.tags[-1][1].get("id", "")] = data
+        elif self.open and self.open[-1] != "style":
+            self.text.append(data)
+
+    @property
+    def data(self) -> Any:
+        return json.loads(self.scripts["data"])
+
+    def all(self, tag: str, **wanted: str) -> list[dict[str, str]]:
+        return [attrs for name, attrs in self.tags if name == tag and wanted.items() <= attrs.items()]
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Read:
+    return Read(written(tmp_path_factory.mktemp("page") / "page.html", seen(ball(500, 2))))
+
+
+def test_nothing_is_loaded_from_anywhere(page: Read) -> None:
+    assert not re.search(r"(?i)https?:|//[a-z0-9-]+\.[a-z]|@import|[^e]url\(", page.whole)
+    for tag, attrs in page.tags:
+        assert attrs.get("src", "data:").startswith("data:"), tag
+        assert attrs.get("href", "#").startswith(("#", "data:,")), tag
+        assert not [name for name in attrs if name.startswith("on")], tag
+    (policy,) = page.all("meta", **{"http-equiv": "Content-Security-Policy"})
+    digest = base64.b64encode(hashlib.sha256(page.scripts[""].encode()).digest()).decode()
+    assert "default-src 'none'" in policy["content"] and f"script-src 'sha256-{digest}'" in policy["content"]
+
+
+def test_it_holds_shapes_once_and_four_bytes_a_style(page: Read) -> None:
+    parts = {name: zlib.decompress(base64.b64decode(text)) for name, text in page.scripts.items() if name.startswith("data-")}
+    assert len(parts["data-shape"]) == 16 * 500
+    rows = [len(parts[f"data-style-{k}"]) - 36 * page.data["styles"][k]["maps"] for k in range(3)]
+    assert rows == [4 * 500] * 3
+    assert [style["name"] for style in page.data["styles"]] == ["Captured", "dusk", "plain"]
+    assert parts["data-style-0"] == parts["data-style-2"] != parts["data-style-1"]
+
+
+def test_embedded_pictures_decode_and_are_of_the_size_they_claim(page: Read) -> None:
+    for image in page.all("img", loading="lazy"):
+        pixels = cv2.imdecode(np.frombuffer(base64.b64decode(image["src"].split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
+        assert pixels.shape[:2] == (int(image["height"]), int(image["width"])) and image["alt"]
+
+
+def test_names_are_text_whatever_they_hold(tmp_path: Path) -> None:
+    scene = seen(ball(200))
+    plain = page_of(scene)
+    evil = replace(
+        plain,
+        title=EVIL,
+        lead=EVIL,
+        facts={EVIL: EVIL},
+        views=[PageView(EVIL, view.original, view.photograph) for view in plain.views],
+        styles=[style._replace(name=EVIL + str(k), references=[EVIL]) for k, style in enumerate(plain.styles)],
+        references=[plain.references[0]._replace(name=EVIL)],
+        metrics={EVIL: EVIL},
+        credits=[EVIL],
+    )
+    write_page(tmp_path / "evil.html", evil)
+    read = Read(tmp_path / "evil.html")
+    assert "<b>" not in read.whole.replace("Object", "") and EVIL in "".join(read.text)
+    assert read.data["styles"][1]["name"] == f"{EVIL}0"
+    assert len(read.all("script")) == len(Read(written(tmp_path / "plain.html", scene)).all("script"))
+
+
+def test_a_budget_drops_what_shows_least(tmp_path: Path) -> None:
+    scene = seen(ball(20_000))
+    small = page_of(scene)
+    count = write_page(tmp_path / "all.html", small)
+    whole = (tmp_path / "all.html").stat().st_size
+    kept = write_page(tmp_path / "some.html", small, megabytes=0.6 * whole / 2**20)
+    size = (tmp_path / "some.html").stat().st_size
+    assert count == 20_000 > kept > 1000 and 0.45 * whole < size <= 0.6 * whole
+    with pytest.raises(DataError, match="without any Gaussian"):
+        write_page(tmp_path / "none.html", small, megabytes=0.01)
+    assert not (tmp_path / "none.html").exists()
+
+
+def test_without_gaussians_there_are_pictures(tmp_path: Path) -> None:
+    views = [PageView(str(k), np.full((20, 30, 3), 40 * k, np.uint8)) for k in range(3)]
+    page = replace(page_of(seen(ball(50))), scene=None, views=views, styles=[Style("dusk", [view.original for view in views])])
+    assert write_page(tmp_path / "field.html", page) == 0
+    data = Read(tmp_path / "field.html").data
+    assert data["scene"] is None and {name: len(rows) for name, rows in data["stills"].items()} == {"Captured": 3, "dusk": 3}
+
+
+def test_films_are_embedded_linked_or_named(tmp_path: Path) -> None:
+    frames = [np.full((32, 32, 3), 20 * k, np.uint8) for k in range(4)]
+    film = tmp_path / "a film.mp4"
+    write_video(film, iter(frames), 12)
+    scene = seen(ball(50))
+    (video,) = Read(written(tmp_path / "a.html", scene, film=film)).all("video")
+    assert base64.b64decode(video["src"].split(",")[1]) == film.read_bytes()
+    film.write_bytes(film.read_bytes() + bytes(2 << 20))
+    (video,) = Read(written(tmp_path / "b.html", scene, film=film)).all("video")
+    assert video["src"] == "a%20film.mp4"
+    film.write_bytes(b"mp4v")
+    read = Read(written(tmp_path / "c.html", scene, film=film))
+    assert not read.all("video") and read.all("a", href="a%20film.mp4")
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"views": []}, "no views"),
+        ({"references": []}, "names reference city"),
+        ({"scene": None}, "not both"),
+        ({"styles": [Style("x", [], torch.zeros(50, 1, 3))]}, "0 pictures"),
+    ],
+)
+def test_what_does_not_belong_together_is_refused(tmp_path: Path, change: dict[str, Any], told: str) -> None:
+    with pytest.raises(DataError, match=told):
+        write_page(tmp_path / "x.html", replace(page_of(seen(ball(50))), **change))
+    assert not (tmp_path / "x.html").exists()

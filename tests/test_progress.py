@@ -1,0 +1,46 @@
+import io
+import json
+
+import pytest
+from rich.console import Console
+
+from fprf import progress
+from fprf.progress import Display
+from fprf.training.driver import Report
+
+
+def report(step: int, share: float) -> Report:
+    return Report(step, share, 12.34, 20.123, 1000.4, 0.5, {"rgb": 0.01}, 0)
+
+
+def test_off_a_terminal_lines_come_every_few_seconds_and_at_the_end(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr(progress.time, "perf_counter", lambda: now[0])
+    with Display() as display:
+        display.say("begin [bold]")
+        for step in range(1, 21):
+            now[0] += 1.0
+            display.training(report(step, step / 20))
+    out, err = capsys.readouterr()
+    assert out == "" and "\x1b" not in err
+    found = [json.loads(line) for line in err.splitlines()]
+    assert found[0] == {"event": "begin [bold]"}
+    assert [e["step"] for e in found[1:]] == [1, 6, 11, 16, 20]
+    rounded = {"share": 1.0, "seconds": 12.3, "psnr": 20.12, "rays_per_second": 1000, "seconds_left": 0}
+    assert found[-1] == {"event": "training", "step": 20, **rounded}
+    assert found[1]["seconds_left"] == round(12.34 * 0.95 / 0.05)
+
+
+def test_a_terminal_sees_a_bar_and_no_json(monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = io.StringIO()
+    made = Console(file=screen, force_terminal=True, width=120, highlight=False)
+    monkeypatch.setattr(progress, "Console", lambda **named: made)
+    with Display() as display:
+        display.say("a town [of] 3")
+        display.training(report(5, 0.0))
+        display.training(report(7, 0.5))
+        display.count(1, 2, "rendering")
+    text = screen.getvalue()
+    assert "a town [of] 3" in text and "step 7" in text and "20.12 dB" in text and "rendering" in text and "{" not in text

@@ -1,0 +1,78 @@
+"""Small runs in parts, of both kinds: three blocks of fields, two cells of Gaussians."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fprf.config import RunConfig
+from fprf.splats import cells
+from fprf.splats.config import GaussiansConfig
+from fprf.training import block_training, blocks, checkpoint
+from fprf.training.tasks import Part, Task, train_part
+
+REPORT = Callable[[Any], None]
+
+
+@dataclass(frozen=True)
+class TaskWorld:
+    """Read it, never write to it."""
+
+    config: RunConfig
+    method: str
+    root: Path
+    parts: int
+    """How many there are beside the whole scene."""
+    folder_of: Callable[[Path, int], Path]
+    open: Callable[[Task], Part]
+
+    @property
+    def data(self) -> Path:
+        assert self.config.data is not None
+        return self.config.data
+
+    def copy(self, folder: Path) -> Path:
+        shutil.copytree(self.root, folder / "run")
+        return folder / "run"
+
+    def unfinish(self, root: Path, part: int) -> Path:
+        """The folder of a part as it was before its first step."""
+        folder = self.folder_of(root, part)
+        shutil.rmtree(folder / "checkpoints")
+        (folder / "done.json").unlink()
+        return folder
+
+    def train(
+        self, root: Path, part: int, report: REPORT = lambda event: None, data: Path | None = None, **change: Any
+    ) -> bool:
+        """Train a part as a worker does; False where it is finished already."""
+        words = {"root": str(root), "data": str(data or self.data), "part": part, "minutes": None, "quiet": True}
+        return train_part(self.open(Task(**words | change)), report)
+
+    def tensors(self, root: Path, part: int) -> dict[str, torch.Tensor]:
+        """All that the newest checkpoint of a part holds."""
+        saved, _ = checkpoint.load_latest(self.folder_of(root, part) / "checkpoints")
+        assert saved is not None
+        return {k: t.clone() for k, t in (*saved.model.items(), *((f"optimizer.{k}", t) for k, t in saved.optimizer.items()))}
+
+    def done(self, root: Path, part: int) -> dict[str, Any]:
+        document: dict[str, Any] = json.loads((self.folder_of(root, part) / "done.json").read_text())
+        return document
+
+
+def world_of_blocks(config: RunConfig, root: Path) -> TaskWorld:
+    return TaskWorld(config, "fprf-lite", root, 3, blocks.folder_of, block_training.open_block)
+
+
+def small_cells(data: Path, output: Path, **change: Any) -> GaussiansConfig:
+    """Two cells of a few hundred Gaussians."""
+    words = {"downscale": 1, "steps": 150, "cells": 2, "initial": 300, "cap": 600, "output": output}
+    return GaussiansConfig(data=data, **words | change)
+
+
+def world_of_cells(config: RunConfig, root: Path) -> TaskWorld:
+    return TaskWorld(config, "fprf-splats", root, 2, cells.folder_of, cells.open_cell)
