@@ -1,7 +1,7 @@
 """A style as 3D lookup tables (.cube) for video editors: one for the whole scene, and one for each of its regions.
 
-A table knows a pixel's colour alone: what depends on its place is averaged within a region. D [3 n n n] is how far colours at
-nodes, h = 1 / (n - 1) apart, are moved (axes blue, green, red); trilinear, it minimises over pairs x -> y of weight w (sum 1)
+What depends on a pixel's place is averaged within a region. D [3 n n n] is how far colours at nodes, h = 1 / (n - 1) apart, are
+moved (axes blue, green, red); trilinear, it minimises over pairs x -> y of weight w (sum 1)
 
     sum_i w_i |x_i + D(x_i) - y_i|^2  +  s ( integral |grad D|^2  +  integral |D|^2 / r^2 )
 """
@@ -22,19 +22,17 @@ from ..style.scene import Membership
 
 SMOOTH, REACH = 1e-3, 0.25
 """s: pairs in a fourteenth of the cube outweigh the bending of a twentieth of its side. r: away from pairs D fades over it."""
-_PIXELS = 16384
-"""Pixels that a table is fitted to, about."""
+_PIXELS, _STEPS = 16384, 80
+"""Pixels that a table is fitted to, about; steps, after which the energy falls by less than 1e-6 of it."""
 
 
 def colour_pairs(
     scene: Scene, looks: Sequence[Restyle | None], views: Sequence[int]
 ) -> tuple[list[Annotated[Tensor, "R 3"]], Annotated[Tensor, "R K"]]:
     """Colours of R solid pixels of views in each look, and the share of each of the scene's regions in them."""
-    weight = Membership(scene.measured()[0])
-    chosen = scene.cameras.select(torch.tensor(list(views)))
+    weight, chosen = Membership(scene.measured()[0]), scene.cameras.select(torch.tensor(list(views)))
     small = chosen.scaled(max(1.0, float(chosen.size.double().prod(1).sum() / _PIXELS) ** 0.5))
-    shown: list[list[Tensor]] = [[] for _ in looks]
-    shares = []
+    shown, shares = [list[Tensor]() for _ in looks], []
     for view in range(len(small)):
         share, opacity = scene.paint(small, view, pixel_grid(small, view), lambda semantic, _: weight(semantic))
         solid = opacity > 0.5
@@ -56,27 +54,29 @@ def fit_table(
     """D of a colour map; 0 where no pair has weight. Float64, by L-BFGS."""
     x, y, h = source.double(), target.double(), 1 / (size - 1)
     w = weight.double()[:, None] / weight.double().sum().clamp_min(1e-12)
-    table = torch.zeros(3, size, size, size, dtype=torch.float64, requires_grad=True)
-    solver = torch.optim.LBFGS([table], max_iter=1000, tolerance_grad=1e-10, tolerance_change=1e-14, history_size=20,
-                               line_search_fn="strong_wolfe")  # fmt: skip
+
+    unknown = torch.zeros(3, size, size, size, dtype=torch.float64, requires_grad=True)
+    # Nodes near pairs are held firmly, others loosely: in units of the one or the other they are found alike fast.
+    (near,) = torch.autograd.grad((w * moved(unknown, x)).sum(), unknown)
+    unit = (near + 6 * SMOOTH * h + SMOOTH * h**3 / REACH**2).rsqrt()
+    solver = torch.optim.LBFGS([unknown], max_iter=_STEPS, line_search_fn="strong_wolfe", tolerance_change=1e-12)
 
     def energy() -> Tensor:
         solver.zero_grad()
+        table = unknown * unit
         bend = torch.stack([table.diff(dim=axis).square().sum() for axis in (1, 2, 3)]).sum()
         total = (w * (moved(table, x) - y).square()).sum() + SMOOTH * (h * bend + h**3 / REACH**2 * table.square().sum())
         total.backward()  # type: ignore[no-untyped-call]
         return total
 
-    with torch.enable_grad():
-        solver.step(energy)  # type: ignore[no-untyped-call]
-    return table.detach()
+    solver.step(energy)  # type: ignore[no-untyped-call]
+    return (unknown * unit).detach()
 
 
 def write_cube(path: Path, table: Annotated[Tensor, "3 n n n"], title: str) -> None:
     """A .cube file, red changing fastest."""
     size, name = table.shape[1], "".join(c for c in title if c.isascii() and c.isprintable() and c != '"')
-    axis = torch.linspace(0, 1, size, dtype=torch.float64)
-    nodes = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")[::-1])
+    nodes = torch.stack(torch.meshgrid(*(torch.linspace(0, 1, size, dtype=torch.float64),) * 3, indexing="ij")[::-1])
     rows = (nodes + table).clamp(0, 1).flatten(1).T.tolist()
-    lines = [f'TITLE "{name}"', f"LUT_3D_SIZE {size}", "DOMAIN_MIN 0.0 0.0 0.0", "DOMAIN_MAX 1.0 1.0 1.0"]
-    write_text(path, "\n".join([*lines, *(f"{r:.6f} {g:.6f} {b:.6f}" for r, g, b in rows), ""]))
+    head = [f'TITLE "{name}"', f"LUT_3D_SIZE {size}", "DOMAIN_MIN 0.0 0.0 0.0", "DOMAIN_MAX 1.0 1.0 1.0"]
+    write_text(path, "\n".join([*head, *(f"{r:.6f} {g:.6f} {b:.6f}" for r, g, b in rows), ""]))
