@@ -5,6 +5,8 @@ import importlib.util
 import shlex
 import sys
 import tempfile
+from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 from fprf.errors import FprfError, UsageError
@@ -20,7 +22,7 @@ class Benchmark(NamedTuple):
     quick: str
     """Flags that `--quick` stands for: the whole way, in about a minute, with figures that mean nothing.
 
-    {town} is the folder of a small town, {folder} one that is thrown away.
+    {town} is the folder of a small town, {run} a short training of a tiny model on it, {folder} one that is thrown away.
     """
     needs: str = "nothing but fprf"
     """Data, extras and time; said before it starts."""
@@ -28,16 +30,16 @@ class Benchmark(NamedTuple):
     """Modules that must be there."""
 
 
-_RUN = "--data {town} --steps 5 --repeats 1 --rays 256 --device cpu"
+_RUN = "{run} --repeats 1 --rays 256 --device cpu"
 _TRAINED = "a run of fields; without one it trains fprf-lite on the town first"
 BENCHMARKS = {
-    "exports": Benchmark("exported files drawn again, against the scene's own renders", "--steps 30 --views 1", _TRAINED),
+    "exports": Benchmark("exported files drawn again, against the scene's own renders", "{run} --views 1", _TRAINED),
     "fuzz": Benchmark("every reader on a million mutated files", "--rounds 40", "hours for the million; Linux"),
     "fuzz_guided": Benchmark(
         "every reader under libFuzzer", "--minutes 0.2 --only png", "the package atheris; Linux", ("atheris",)
     ),
     "gaussians": Benchmark("the rasteriser of 3D Gaussians: time and error", "--count 500 --times 2"),
-    "kernels": Benchmark("what each compiled kernel brings end to end", "--data {town} --steps 5 --repeats 1", _TRAINED),
+    "kernels": Benchmark("what each compiled kernel brings end to end", "{run} --repeats 1", _TRAINED),
     "kills": Benchmark("training that is killed a hundred times", "--kills 3 --steps 25", "ten minutes; Linux"),
     "large_scene": Benchmark(
         "a district of towns in cells: seconds, memory, fidelity, workers of Ray",
@@ -64,7 +66,7 @@ BENCHMARKS = {
     "profiling": Benchmark("where the time of a training step and of a view goes", f"{_RUN} --operators 3", _TRAINED),
     "restyle": Benchmark(
         "every stylizer against the truth: a town in the light of other towns",
-        "--minutes 0.05 --views 1 --longest 48 --palettes night --missing sky --clusters 4 --device cpu",
+        "{run} --views 1 --longest 48 --palettes night --missing sky --clusters 4 --device cpu",
         "a run of a town; without one it trains fprf-lite on one first",
     ),
     "scenes": Benchmark(
@@ -86,14 +88,15 @@ BENCHMARKS = {
     ),
     "styles": Benchmark(
         "every stylizer on painted photographs and on runs",
-        "--triplets 0 --steps 20 --views 2 --longest 64",
+        "{run} --triplets 0 --views 2 --longest 64",
         "triplets, photographs and VGG-19's weights in --shared; without them a run of the town",
     ),
     "town": Benchmark(
         "write a town as a scene folder", "{folder}/town --views 2 --width 24 --height 18", "a folder to write into"
     ),
+    "tables": Benchmark("tables of the documents, made from the results", "--check", "a clone"),
     "viewer_speed": Benchmark(
-        "response times and memory of the viewer", "--parts start --steps 20", "the extra viewer, playwright and a Chromium"
+        "response times and memory of the viewer", "{run} --parts start", "the extra viewer, playwright and a Chromium"
     ),
 }
 """`benchmarks/gpu.sh` measures a machine with a GPU."""
@@ -120,8 +123,14 @@ def main(args: list[str]) -> int:
         with tempfile.TemporaryDirectory(prefix="fprf-quick-") as folder:
             if "--quick" in flags:
                 flags.remove("--quick")
-                town = cached_town(views=8, width=48, height=36)
-                flags = [*shlex.split(chosen.quick.format(town=town, folder=folder)), *flags]
+                town, run = cached_town(views=8, width=48, height=36), f"{folder}/run"
+                if "{run}" in chosen.quick:
+                    from fprf.training.driver import train
+
+                    from .kills import tiny
+
+                    train(replace(tiny(town, steps=20), output=Path(run), checkpoint_minutes=5.0), "fprf-lite")
+                flags = [*shlex.split(chosen.quick.format(town=town, run=run, folder=folder)), *flags]
             return importlib.import_module(f".{name}", __package__).main(flags) or 0
     except FprfError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -41,12 +41,13 @@ def never(*tensors: object) -> bool:
     return False
 
 
-def plain_lookups(store: FeatureStore, *given: Tensor) -> None:
+KERNEL_LOOKUPS = FeatureStore.at
+
+
+def plain_lookups(store: FeatureStore, view: Tensor, pixel: Tensor, rgb: Tensor) -> Tensor:
     """Guided features by `guided.apply_packed`."""
-    *asked, out = given
     there = packed.setdefault(id(store), store.to(torch.device("cpu")))
-    slots = torch.tensor(list(store._slots))
-    out.copy_(there.at(slots[asked[0]], asked[1], asked[2]))
+    return KERNEL_LOOKUPS(there, view, pixel, rgb)
 
 
 packed: dict[int, FeatureStore] = {}
@@ -54,14 +55,14 @@ no_march = SimpleNamespace(usable=never)
 SWITCHES: dict[str, Patches] = {
     "tri-planes": [(triplane, "usable", never)],
     "tri-planes: total variation": [(triplane, "variation", triplane.variation_reference)],
-    "networks": [(dense, "network", dense.network_reference)],
+    "networks": [(dense, "usable", never)],
     "marching": [(march, "usable", never)],
     "marching: proposals": [(planes, "march", no_march)],
     "marching: weights and sums": [(renderer, "compiled", no_march), (space, "march", no_march)],
     "styles at points": [(mixture, "usable", never), (matching, "usable", never)],
     "styles at points: matching": [(matching, "usable", never)],
     "styles at points: maps": [(mixture, "usable", never)],
-    "guided features": [(FeatureStore, "_compiled", plain_lookups)],
+    "guided features": [(FeatureStore, "at", plain_lookups)],
 }
 """What is replaced where a kernel is off."""
 

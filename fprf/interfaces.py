@@ -41,7 +41,7 @@ OPAQUE = 0.005
 
 
 class Encoder(nn.Module, ABC):
-    """Images to features. Frozen; deterministic; normalises its input itself."""
+    """Images to features. Frozen; deterministic; normalises its input itself; may be called by several threads at once."""
 
     @property
     @abstractmethod
@@ -333,7 +333,7 @@ class Figures(NamedTuple):
 
 
 class Learner(ABC):
-    """A scene that is being learnt, built by `RunConfig.build`; `training.driver` does everything else.
+    """Anything that is learnt step by step; `training.driver.learn` does the rest.
 
     Every draw is a function of (seed, index), so that `state` and the number of steps are all that a resumed training needs.
     """
@@ -343,11 +343,6 @@ class Learner(ABC):
     def device(self) -> torch.device:
         """Device of its parameters. On the CPU figures are read after each step; elsewhere twice a second, since the host
         waits for the device."""
-
-    @property
-    @abstractmethod
-    def facts(self) -> "Facts":
-        """What was found out about the scene before the first step, for scene.json."""
 
     @abstractmethod
     def step(self, index: int, share: float) -> None:
@@ -367,6 +362,15 @@ class Learner(ABC):
     @abstractmethod
     def load(self, state: State) -> None:
         """Go on from a `state`. Raises CheckpointError where it is that of another config."""
+
+
+class SceneLearner(Learner):
+    """A scene that is being learnt, built by `RunConfig.build`; `training.driver.train` owns its run folder."""
+
+    @property
+    @abstractmethod
+    def facts(self) -> "Facts":
+        """What was found out about the scene before the first step, for scene.json."""
 
     @abstractmethod
     def scene(self) -> Scene:

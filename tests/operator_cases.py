@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
+from ops.plain_forms import plainly
 from torch import Tensor
 
 from fprf.ops import dense, guided, march, mixture, triplane
@@ -139,7 +140,7 @@ def _code(t: int) -> Made:
 
 CASES = [
     Case("dense.network", _layers, _network, slopes=(0, 1, 2, 3, 4)),
-    Case("dense.network_reference", _layers, lambda x, *p: dense.network_reference(x, p[0::2], p[1::2]), slopes=(0, 1, 2, 3)),
+    Case("dense.network, plain", _layers, plainly(lambda x, *p: dense.network(x, p[0::2], p[1::2])), slopes=(0, 1, 2, 3)),
     Case("dense.runs", lambda n: ((_unit(n, 2) * 2).floor(),), _spelt_out),
     Case("guided.coefficients", lambda n: (_draw(5, max(1, n // 3), n), _unit(n, n, 3)),
          lambda f, g: guided.coefficients(f, g, radius=2, eps=1e-3, stride=2), sizes=(1, 37, 96), tolerance=1e-4),
@@ -151,12 +152,12 @@ CASES = [
     Case("march.weigh", lambda n: (4 * _unit(n, 20), 3 * _edges(n, 20)), _weighed),
     Case("mixture.affine", lambda n: (_draw(n, 16), _shares(n, 3), _draw(3, 16, 16), _draw(3, 16), _draw(16)),
          lambda x, s, m, b, c: mixture.affine(x, s, m, b, centre=c)),
-    Case("mixture.affine_reference", lambda n: (_draw(n, 16), _shares(n, 3), _draw(3, 16, 16), _draw(3, 16), _draw(16)),
-         lambda x, s, m, b, c: mixture.affine_reference(x, s, m, b, centre=c), slopes=(0, 2, 3)),
+    Case("mixture.affine, plain", lambda n: (_draw(n, 16), _shares(n, 3), _draw(3, 16, 16), _draw(3, 16), _draw(16)),
+         plainly(lambda x, s, m, b, c: mixture.affine(x, s, m, b, centre=c)), slopes=(0, 2, 3)),
     Case("mixture.scaled", lambda n: (_draw(n, 16), _shares(n, 3), _draw(3, 16), _draw(3, 16), _draw(16)),
          lambda x, s, g, b, c: mixture.scaled(x, s, g, b, centre=c)),
-    Case("mixture.scaled_reference", lambda n: (_draw(n, 16), _shares(n, 3), _draw(3, 16), _draw(3, 16), _draw(16)),
-         lambda x, s, g, b, c: mixture.scaled_reference(x, s, g, b, centre=c), slopes=(0, 1, 2, 3)),
+    Case("mixture.scaled, plain", lambda n: (_draw(n, 16), _shares(n, 3), _draw(3, 16), _draw(3, 16), _draw(16)),
+         plainly(lambda x, s, g, b, c: mixture.scaled(x, s, g, b, centre=c)), slopes=(0, 1, 2, 3)),
     Case("triplane.lookup", _planes, lambda p, t, w: triplane.lookup(p, t, (8, 16)), slopes=(1,)),
     Case("triplane.lookup_reference", _planes, lambda p, t, w: triplane.lookup_reference(p, t, (8, 16)), slopes=(1,)),
     Case("triplane.variation", lambda n: (_draw(triplane.rows((n,)), 8),), lambda t: triplane.variation(t, (_side(t),)),

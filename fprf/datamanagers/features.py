@@ -21,7 +21,7 @@ import zlib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import Annotated, NamedTuple
 
 import safetensors
 import safetensors.torch
@@ -36,10 +36,6 @@ from ..io.atomic import atomic_path
 from ..ops import guided
 from .basis import Basis, fit_basis
 from .config import GuidedConfig
-
-if TYPE_CHECKING:
-    from ..ops.guided_kernels import ViewTable
-
 
 GREY = 0.5
 LANES = 8
@@ -174,45 +170,45 @@ class FeatureStore:
     """Targets of some views of a scene; see `extract`."""
 
     def __init__(self, entries: Mapping[int, Entry], basis: Basis | None = None) -> None:
+        from ..ops.guided_kernels import ViewTable
+
         if not entries:
             raise DataError("feature store: no views; a scene needs at least one training view")
         self.basis = basis
         """Basis that the encoder's features were projected on; None = kept raw."""
-        self._entries = list(entries.values())
+        self._coefs = [entry.coefs for entry in entries.values()]
+        parts = zip(*((e.size, e.scale, e.centre, e.moments) for e in entries.values()), strict=True)
+        self._size, self._scale, self._centre, moments = (torch.stack(part) for part in parts)
         self._slots = torch.tensor(list(entries))
         """The view of each entry."""
         self._numbers = torch.zeros(int(self._slots.max()) + 1, dtype=torch.int64)
         """The entry of each view; 0 as well for those that have none."""
         self._numbers[self._slots] = torch.arange(len(entries))
-        self.channels = len(self._entries[0].scale)
-        self.bytes = sum(entry.coefs.numel() * 2 for entry in self._entries)
+        self.channels = self._scale.shape[1]
+        self.bytes = sum(coefs.numel() * 2 for coefs in self._coefs)
         """Size of the coefficients."""
         # Mean and variance of each channel over all views, each counted by its pixels.
-        weight = torch.stack([entry.size.prod() for entry in self._entries]).double()[:, None]
-        means, variances = torch.stack([entry.moments for entry in self._entries]).unbind(1)
+        weight = self._size.prod(1).double()[:, None]
+        means, variances = moments.unbind(1)
         mean = (weight * means).sum(0) / weight.sum()
         variance = (weight * (variances + (means - mean).square())).sum(0) / weight.sum()
         self.std = float(variance.mean().sqrt())
         """Root mean square over the channels' standard deviations, over all pixels."""
-        self._magnitude = max(float(entry.centre.abs().max()) for entry in self._entries)
-        self._table = _table(self._entries)
-        self._packed: tuple[guided.Packed, Tensor] | None = None
-
-    @property
-    def scale(self) -> float:
+        self.scale = self.std if self.std > 1e-6 * float(self._centre.abs().max()) else 1.0
         """The unit of losses: `std`, or 1 where the features do not change but for rounding."""
-        return self.std if self.std > 1e-6 * self._magnitude else 1.0
+        bits = [coefs.view(torch.uint16).numpy() for coefs in self._coefs]
+        self._table = ViewTable(bits, self._size.numpy(), self._scale.numpy(), self._centre.numpy())
+        self._packed: tuple[guided.Packed, Tensor] | None = None
 
     def to(self, device: torch.device) -> "FeatureStore":
         """The same targets, with the coefficients on a device as well: `at` of tensors there computes there."""
-        coefs = [entry.coefs.flatten(0, 1) for entry in self._entries]
-        ends = torch.tensor([len(part) for part in coefs]).cumsum(0)
-        packed = torch.empty(int(ends[-1]), *coefs[0].shape[1:], dtype=torch.float16, device=device)
-        for part, end in zip(coefs, ends.tolist(), strict=True):
-            packed[end - len(part) : end].copy_(part)
-        shapes = torch.tensor([entry.coefs.shape[:2] for entry in self._entries])
-        columns = zip(*((entry.size, entry.scale, entry.centre) for entry in self._entries), strict=True)
-        small = (ends - shapes.prod(1), shapes, *(torch.stack(column) for column in columns))
+        shapes = torch.tensor([coefs.shape[:2] for coefs in self._coefs])
+        ends = shapes.prod(1).cumsum(0)
+        packed = torch.empty(int(ends[-1]), *self._coefs[0].shape[2:], dtype=torch.float16, device=device)
+        # One after the other: together they would be in memory twice.
+        for coefs, end in zip(self._coefs, ends.tolist(), strict=True):
+            packed[end - coefs[..., 0, 0].numel() : end].copy_(coefs.flatten(0, 1))
+        small = ends - shapes.prod(1), shapes, self._size, self._scale, self._centre
         there = copy.copy(self)
         there._packed = guided.Packed(packed, *(part.to(device) for part in small)), self._numbers.to(device)
         return there
@@ -231,18 +227,11 @@ class FeatureStore:
         slot = self._numbers[asked.clamp(0, len(self._numbers) - 1)]
         missing = asked[self._slots[slot] != asked]
         if len(missing):
-            raise DataError(
-                f"feature store: view {int(missing.min())} has no features; {len(self._entries)} training views have"
-            )
-        positions, colours = pixel.detach().cpu().float().contiguous(), rgb.detach().cpu().float().contiguous()
+            raise DataError(f"feature store: view {int(missing.min())} has no features; {len(self._coefs)} training views have")
+        positions, colours = (x.detach().cpu().float().contiguous() for x in (pixel, rgb))
         out = torch.empty(len(view), self.channels)
-        self._compiled(slot, positions, colours, out)
+        self._table.gather(slot.numpy(), positions.numpy(), (colours - GREY).numpy(), out.numpy())
         return out.to(view.device)
-
-    def _compiled(self, slot: Tensor, pixel: Tensor, rgb: Tensor, out: Tensor) -> None:
-        from ..ops.guided_kernels import gather_views
-
-        gather_views(self._table, slot.numpy(), pixel.numpy(), (rgb - GREY).numpy(), out.numpy())
 
 
 def extract(
@@ -359,16 +348,3 @@ def _basis(
     basis = fit_basis(torch.cat(samples), dim)
     write_tensors(folder, key, basis.tensors())
     return basis
-
-
-def _table(entries: Sequence[Entry]) -> "ViewTable":
-    """The views as the kernel takes them."""
-    from ..ops.guided_kernels import ViewArrays, ViewTable
-
-    views = []
-    for entry in entries:
-        rows, columns, _, run = entry.coefs.shape
-        height, width = entry.size.tolist()
-        bits = entry.coefs.view(torch.uint16).numpy().reshape(rows * columns, 4 * run)
-        views.append(ViewArrays(bits, rows, columns, height, width, entry.scale.numpy(), entry.centre.numpy()))
-    return ViewTable(views)

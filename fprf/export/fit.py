@@ -4,9 +4,9 @@ Geometry is learnt once, from the first look; a further look learns colours alon
 Gaussians in the same order.
 """
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,7 @@ from ..splats.learner import GaussianLearner
 from ..splats.photographs import make_levels
 from ..splats.training import find_near, reach_of
 from ..style.look import Restyle
+from ..training.driver import Report, Schedule, learn
 from .mesh import Maps
 
 _ALIKE = 0.7
@@ -66,6 +67,7 @@ def fit_gaussians(
     What is rendered are `views` and as many between them. Gaussians begin where `maps` of the views have surfaces; there are at
     most `cap` in the end.
     """
+    # The scene is photographed from the views and between them, and learnt like any other.
     cameras = _with_midpoints(views)
     every = torch.arange(len(cameras))
     paths = (Path("scene"),) * len(cameras)
@@ -78,6 +80,7 @@ def fit_gaussians(
     for number, look in enumerate(looks):
         images = _renders(scene, cameras, look, report)
         levels = make_levels(parsed, images, {}, near)
+        # The first look decides the geometry; in further ones the same Gaussians learn their colours at full size.
         if learner is None:
             learner = GaussianLearner(config, levels, reach, cap)
             learner.begin_at(points, draw)
@@ -87,13 +90,13 @@ def fit_gaussians(
             learner = GaussianLearner(replace(config, coarse=0.0), levels, reach, cap, only="colours")
             learner.start_from(before.gaussians())
             seconds = 60 * minutes * _COLOURS
-        start, step, share = time.perf_counter(), 0, 0.0
-        while share < 1:
-            learner.step(step, share)
-            step, share = step + 1, (time.perf_counter() - start) / seconds
-            if step % 50 == 0:
-                report(round(100 * min(share, 1)), 100, "fitting Gaussians" if number == 0 else "fitting colours")
+        what = "fitting Gaussians" if number == 0 else "fitting colours"
+        learn(learner, None, Schedule(None, seconds / 60), partial(_tell, report, what))
         yield learner.gaussians()
+
+
+def _tell(report: Callable[[int, int, str], None], what: str, event: Report) -> None:
+    report(round(100 * event.share), 100, what)
 
 
 def _renders(scene: Scene, cameras: Cameras, look: Restyle | None, report: Callable[[int, int, str], None]) -> dict[int, Image]:

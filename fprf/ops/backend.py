@@ -14,11 +14,6 @@ def compiled() -> bool:
     return _AVAILABLE and not _PLAIN.get()
 
 
-def asked_plain() -> bool:
-    """True within `plain()`."""
-    return _PLAIN.get()
-
-
 @contextmanager
 def plain() -> Iterator[None]:
     """The plain forms alone, in this thread and within this block: what kernels are measured and tested against."""

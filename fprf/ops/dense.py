@@ -11,7 +11,7 @@ Part of the inputs may be shared by several points, as the direction of a ray is
 # mypy: disable-error-code="call-arg"
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -40,7 +40,7 @@ def array(x: Tensor) -> Floats:
     return numbers
 
 
-def network_reference(
+def network(
     x: Annotated[Tensor, "N I"],
     weights: Sequence[Tensor],
     biases: Sequence[Tensor | None],
@@ -51,35 +51,33 @@ def network_reference(
 ) -> Annotated[Tensor, "N O"]:
     """ReLU(x W^T + b) layer after layer; `last` is the activation of the last one.
 
-    Weights are [outputs, inputs]. Point n has the inputs x[n] and behind them shared[row[n]].
-    """
-    if shared is not None and row is not None:
-        x = torch.cat([x, shared.index_select(0, row)], -1)
-    for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
-        x = torch.nn.functional.linear(x.relu_() if layer > 0 else x, weight, bias)
-    return x.relu_() if last == "relu" else x
-
-
-def network(
-    x: Annotated[Tensor, "N I"],
-    weights: Sequence[Tensor],
-    biases: Sequence[Tensor | None],
-    *,
-    shared: Annotated[Tensor, "P J"] | None = None,
-    row: Annotated[Tensor, "N"] | None = None,
-    last: Last = "linear",
-) -> Annotated[Tensor, "N O"]:
-    """`network_reference` by the fastest form that applies.
-
-    Each layer of the kernel errs by at most (I + 3) u (|x| |W|^T + |b|), u = 2^-24.
+    Weights are [outputs, inputs]. Point n has the inputs x[n] and behind them shared[row[n]]. Each layer of the kernel errs by
+    at most (I + 3) u (|x| |W|^T + |b|), u = 2^-24.
     """
     if not usable(x, *weights, *(bias for bias in biases if bias is not None)):
-        return network_reference(x, weights, biases, shared=shared, row=row, last=last)
+        if shared is not None and row is not None:
+            x = torch.cat([x, shared.index_select(0, row)], -1)
+        for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+            x = torch.nn.functional.linear(x.relu_() if layer > 0 else x, weight, bias)
+        return x.relu_() if last == "relu" else x
     from . import dense_kernels as kernels
+    from .simd import WIDE
 
-    out = torch.empty(len(x), len(weights[-1]))
-    layers = _packed(x.shape[1], weights, biases, shared, row)
-    kernels.network(array(x), x.shape[1], *layers, int(last == "relu"), out.view(-1).numpy(), out.shape[1])
+    # Outputs are padded to whole vectors, which the next layer meets with zeros.
+    packed, shifts, widths, side, inputs = [], [], [], weights[0].new_empty(0), x.shape[1]
+    for k, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+        width = -(-len(weight) // WIDE) * WIDE
+        if k == 0 and shared is not None:
+            side = _fitted(shared @ weight[:, inputs:].T, len(shared), width)
+        packed.append(_fitted(weight[:, :inputs].T if k == 0 else weight.T, inputs, width).reshape(-1))
+        shifts.append(_fitted((weight.new_zeros(len(weight)) if bias is None else bias)[None], 1, width)[0])
+        widths.append(width)
+        inputs = width
+    rows, out = torch.empty(0, dtype=torch.int64) if row is None else row.contiguous(), torch.empty(len(x), len(weights[-1]))
+    kernels.network(
+        array(x), x.shape[1], array(torch.cat(packed)), array(torch.cat(shifts)), np.asarray(widths), array(side),
+        rows.numpy(), int(last == "relu"), out.view(-1).numpy(), out.shape[1],
+    )  # fmt: skip
     return out
 
 
@@ -95,25 +93,6 @@ def runs(x: Annotated[Tensor, "N C"]) -> tuple[Annotated[Tensor, "P"], Annotated
         return first[: kernels.runs(x.detach().contiguous().numpy(), first.numpy(), run.numpy())], run
     every = torch.arange(len(x), device=x.device)
     return every, every
-
-
-def _packed(
-    inputs: int, weights: Sequence[Tensor], biases: Sequence[Tensor | None], shared: Tensor | None, row: Tensor | None
-) -> tuple[Any, ...]:
-    """Layers as the kernel takes them: outputs padded to whole vectors, which the next layer meets with zeros."""
-    from .simd import WIDE
-
-    packed, shifts, widths, side = [], [], [], weights[0].new_empty(0)
-    for k, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
-        width = -(-len(weight) // WIDE) * WIDE
-        if k == 0 and shared is not None:
-            side = _fitted(shared @ weight[:, inputs:].T, len(shared), width)
-        packed.append(_fitted(weight[:, :inputs].T if k == 0 else weight.T, inputs, width).reshape(-1))
-        shifts.append(_fitted((weight.new_zeros(len(weight)) if bias is None else bias)[None], 1, width)[0])
-        widths.append(width)
-        inputs = width
-    rows = torch.empty(0, dtype=torch.int64) if row is None else row.contiguous()
-    return array(torch.cat(packed)), array(torch.cat(shifts)), np.asarray(widths), array(side), rows.numpy()
 
 
 def _fitted(x: Tensor, rows: int, columns: int) -> Tensor:

@@ -99,21 +99,29 @@ def apply(
     coefs: Annotated[Tensor, "s t C 4"], pixel: Annotated[Tensor, "R 2"], rgb: Annotated[Tensor, "R 3"], size: tuple[int, int]
 ) -> Annotated[Tensor, "R C"]:
     """Features at pixel positions (x, y; centres at +0.5) of an image of `size` (height, width), float32."""
-    rows, columns, channels, _ = coefs.shape
-    index, weight = [], []
-    for position, cells, pixels in ((pixel[:, 1], rows, size[0]), (pixel[:, 0], columns, size[1])):
-        at = (position.float() * (cells / pixels) - 0.5).clamp(0, cells - 1)
-        low = at.floor().clamp(max=max(cells - 2, 0))
-        index.append(torch.stack([low.long(), (low.long() + 1).clamp(max=cells - 1)], 1))
-        weight.append(torch.stack([1 - (at - low), at - low], 1))
-    flat = (index[0][:, :, None] * columns + index[1][:, None, :]).flatten(1)
-    share = (weight[0][:, :, None] * weight[1][:, None, :]).flatten(1)
+    cells = torch.tensor(coefs.shape[:2], device=pixel.device)
+    row, column, share = _corners(pixel, cells, torch.tensor(size, device=pixel.device))
+    flat = (row[:, :, None] * coefs.shape[1] + column[:, None, :]).flatten(1)
     colour = torch.cat([rgb.float(), torch.ones_like(rgb[:, :1], dtype=torch.float32)], 1)
     # Sixteen rows of channels a pixel, four of each corner, summed without R x 16 x C numbers on the way.
-    table = coefs.float().movedim(3, 2).reshape(-1, channels)
-    row = (4 * flat[:, :, None] + torch.arange(4, device=flat.device)).flatten(1)
+    table = coefs.float().movedim(3, 2).reshape(-1, coefs.shape[2])
+    index = (4 * flat[:, :, None] + torch.arange(4, device=flat.device)).flatten(1)
     part = (share[:, :, None] * colour[:, None]).flatten(1)
-    return F.embedding_bag(row, table, mode="sum", per_sample_weights=part)
+    return F.embedding_bag(index, table, mode="sum", per_sample_weights=part)
+
+
+def _corners(pixel: Annotated[Tensor, "R 2"], cells: Tensor, size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows [R 2] and columns [R 2] of the four cells around each pixel, and their shares [R 4] in bilinear interpolation.
+
+    `cells` are rows and columns, `size` height and width: [2], or [R 2] where they differ from pixel to pixel.
+    """
+    at = (pixel.float().flip(1) * (cells.float() / size.float()) - 0.5).clamp_min(0)
+    at = torch.minimum(at, (cells - 1).float())
+    low = torch.minimum(at.floor().long(), (cells - 2).clamp_min(0))
+    high, part = torch.minimum(low + 1, cells - 1), at - low
+    row, column = (torch.stack([low[:, axis], high[:, axis]], 1) for axis in (0, 1))
+    y, x = (torch.stack([1 - part[:, axis], part[:, axis]], 1) for axis in (0, 1))
+    return row, column, (y[:, :, None] * x[:, None, :]).flatten(1)
 
 
 class Packed(NamedTuple):
@@ -143,20 +151,12 @@ def apply_packed(
 
     Makes R x 16 x P numbers on the way. Sums are of float32 numbers whatever autocast or TF32 say.
     """
-    cells, size = packed.cells[view], packed.size[view]
-    at = (pixel.float().flip(1) * (cells.float() / size.float()) - 0.5).clamp_min(0)
-    at = torch.minimum(at, (cells - 1).float())
-    low = torch.minimum(at.floor().long(), (cells - 2).clamp_min(0))
-    high = torch.minimum(low + 1, cells - 1)
-    part = at - low
-    rows, columns = (torch.stack([low[:, axis], high[:, axis]], 1) for axis in (0, 1))
-    y, x = (torch.stack([1 - part[:, axis], part[:, axis]], 1) for axis in (0, 1))
-    index = (rows[:, :, None] * cells[:, 1, None, None] + columns[:, None, :]).flatten(1) + packed.start[view, None]
-    share = (y[:, :, None] * x[:, None, :]).flatten(1)
+    cells = packed.cells[view]
+    row, column, share = _corners(pixel, cells, packed.size[view])
+    index = (row[:, :, None] * cells[:, 1, None, None] + column[:, None, :]).flatten(1) + packed.start[view, None]
     colour = torch.cat([rgb.float() - grey, torch.ones_like(rgb[:, :1], dtype=torch.float32)], 1)
     mixed = (packed.coefs[index].float() * (share[:, :, None] * colour[:, None, :])[..., None]).sum((1, 2))
-    channels = packed.scale.shape[1]
-    return mixed[:, :channels] * packed.scale[view] + packed.centre[view]
+    return mixed[:, : packed.scale.shape[1]] * packed.scale[view] + packed.centre[view]
 
 
 def upsample(

@@ -8,7 +8,7 @@ rounded up to whole vectors of NARROW.
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg"
 
 from collections.abc import Sequence
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numba
 import numpy as np
@@ -19,31 +19,23 @@ PIXELS = 64
 """Pixels of a task."""
 
 Floats: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
-
-
-class ViewArrays(NamedTuple):
-    """One view as the kernel takes it: F = scale (A I + b) + centre."""
-
-    bits: np.ndarray[tuple[int, ...], np.dtype[np.uint16]]
-    """[rows * columns, 4 P], contiguous."""
-    rows: int
-    columns: int
-    height: int
-    width: int
-    scale: Floats
-    centre: Floats
+Halves: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.uint16]]
+Integers: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 
 class ViewTable:
-    """Views side by side: where each one's coefficients lie, and what else is known of it."""
+    """Views side by side, F = scale (A I + b) + centre: where each one's coefficients lie, and what else is known of it."""
 
-    def __init__(self, views: Sequence[ViewArrays]) -> None:
-        self._kept = [view.bits for view in views]  # the addresses below must stay good
-        self.address = np.array([bits.ctypes.data for bits in self._kept], dtype=np.int64)
-        self.shape = np.array([(v.rows, v.columns, v.height, v.width) for v in views], dtype=np.int64)
-        self.scale = np.stack([view.scale for view in views]).astype(np.float32)
-        self.centre = np.stack([view.centre for view in views]).astype(np.float32)
-        self.run = self._kept[0].shape[1] // 4
+    def __init__(self, bits: Sequence[Halves], size: Integers, scale: Floats, centre: Floats) -> None:
+        """Bits [rows columns 4 P], contiguous, height and width [V 2], scale and centre [V C]."""
+        self._kept = bits  # the addresses below must stay good
+        self._address = np.array([each.ctypes.data for each in bits], dtype=np.int64)
+        self._shape = np.concatenate([np.array([each.shape[:2] for each in bits], dtype=np.int64), size], 1)
+        self._scale, self._centre, self._run = scale, centre, bits[0].shape[3]
+
+    def gather(self, slot: Integers, pixel: Floats, rgb: Floats, out: Floats) -> None:
+        """out[i] = F at pixel[i] [R 2] with colour rgb[i] [R 3] of the view slot[i]."""
+        _gather(slot, self._address, self._shape, self._scale, self._centre, self._run, pixel, rgb, out)
 
 
 @traced
@@ -59,11 +51,6 @@ def _corner(position, cells):
     at = min(at, np.float32(cells - 1)) if at > np.float32(0) else np.float32(0)
     low = int(at)
     return low, min(low + 1, cells - 1), at - np.float32(low)
-
-
-def gather_views(table: ViewTable, slot: np.ndarray, pixel: Floats, rgb: Floats, out: Floats) -> None:
-    """out[i] = F at pixel[i] [R 2] with colour rgb[i] [R 3] of the table's view slot[i]."""
-    _gather(slot, table.address, table.shape, table.scale, table.centre, table.run, pixel, rgb, out)
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, fastmath={"contract"})

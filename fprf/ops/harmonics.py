@@ -24,7 +24,7 @@ HARMONIC = 0.28209479177387814
 _TINY = 1e-5
 """Colours below this may be rounded to less than 0."""
 MAX_COLOUR = 1.5
-"""Mean colours are mapped no higher; with 1 pictures lose contrast (docs/train-gaussians.md)."""
+"""Mean colours are mapped no higher; with 1 pictures lose contrast (docs/gaussians.md)."""
 
 
 class Directions(NamedTuple):
@@ -87,7 +87,7 @@ def as_drawn(harmonics: Annotated[Tensor, "N K 3"], directions: Directions) -> A
     return out
 
 
-def recoloured_reference(
+def recoloured(
     harmonics: Annotated[Tensor, "N K 3"],
     change: Annotated[Tensor, "N 4 3"],
     weight: Annotated[Tensor, "N"],
@@ -95,8 +95,16 @@ def recoloured_reference(
 ) -> Annotated[Tensor, "N K 3"]:
     """Harmonics as drawn, mapped by A = 1 + change[:, :3] and b = change[:, 3]; those of no weight stay, bit for bit.
 
-    Mean colours stay below `MAX_COLOUR`, but for those that were above it.
+    Mean colours stay below `MAX_COLOUR`, but for those that were above it. Both forms agree within 60 u of the largest harmonic
+    and change, u = 2^-24; the compiled one has no gradients.
     """
+    if usable(harmonics):
+        from . import harmonics_kernels as kernels
+
+        out = torch.empty_like(harmonics, memory_format=torch.contiguous_format)
+        flat = [array(x.float()) for x in (harmonics, change, weight, directions.values, directions.fit)]
+        kernels.recolour(*flat, len(directions.values), np.float32(MAX_COLOUR), out.view(-1).numpy())
+        return out
     drawn = as_drawn(harmonics, directions)
     matrix = torch.eye(3).to(change) + change[:, :3]
     colour = 0.5 + HARMONIC * drawn[:, 0]
@@ -105,21 +113,3 @@ def recoloured_reference(
     new = torch.einsum("nkc,ncd->nkd", drawn, matrix)
     new[:, 0] = (moved - 0.5) / HARMONIC
     return torch.where((weight > 0)[:, None, None], new, harmonics)
-
-
-def recoloured(
-    harmonics: Annotated[Tensor, "N K 3"],
-    change: Annotated[Tensor, "N 4 3"],
-    weight: Annotated[Tensor, "N"],
-    directions: Directions,
-) -> Annotated[Tensor, "N K 3"]:
-    """`recoloured_reference`, within 60 u of the largest harmonic and change, u = 2^-24; without gradients."""
-    if not usable(harmonics):
-        return recoloured_reference(harmonics, change, weight, directions)
-    from . import harmonics_kernels as kernels
-
-    out = torch.empty_like(harmonics, memory_format=torch.contiguous_format)
-    parts = (harmonics, change, weight, directions.values, directions.fit)
-    flat = [array(part.float()) for part in parts]
-    kernels.recolour(*flat, len(directions.values), np.float32(MAX_COLOUR), out.view(-1).numpy())
-    return out

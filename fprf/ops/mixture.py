@@ -1,6 +1,7 @@
 """Styles at points without gradients: which of several each takes, and what the mixture makes of its features.
 
-Each has a plain form, the reference for every device and dtype, and one compiled for float32 on the CPU.
+Each has a plain form, the reference for every device and dtype (within `backend.plain`, for all), and one compiled for float32
+on the CPU.
 """
 
 # The checker takes compiled functions to have one argument.
@@ -16,26 +17,6 @@ from .dense import array, usable
 from .precision import full_precision
 
 
-def affine_reference(
-    x: Annotated[Tensor, "N C"],
-    share: Annotated[Tensor, "N K"],
-    matrix: Annotated[Tensor, "K C C"],
-    bias: Annotated[Tensor, "K C"],
-    *,
-    centre: Annotated[Tensor, "C"],
-) -> Annotated[Tensor, "N C"]:
-    """sum_k share_k ((x - centre) matrix_k + bias_k); maps that a point has no share in are not computed."""
-    with full_precision(x):
-        x = x - centre
-        if len(matrix) == 1:
-            return x @ matrix[0] + bias[0]
-        out = share @ bias
-        for k in range(len(matrix)):
-            inside = share[:, k].nonzero().squeeze(1)
-            out.index_add_(0, inside, (x[inside] * share[inside, k, None]) @ matrix[k])
-        return out
-
-
 def affine(
     x: Annotated[Tensor, "N C"],
     share: Annotated[Tensor, "N K"],
@@ -44,29 +25,26 @@ def affine(
     *,
     centre: Annotated[Tensor, "C"],
 ) -> Annotated[Tensor, "N C"]:
-    """`affine_reference`, within (C + K + 3) u sum_k share_k (|x - centre| |matrix_k| + |bias_k|), u = 2^-24."""
+    """sum_k share_k ((x - centre) matrix_k + bias_k); maps that a point has no share in are not computed.
+
+    Within (C + K + 3) u sum_k share_k (|x - centre| |matrix_k| + |bias_k|), u = 2^-24.
+    """
     if not usable(x):
-        return affine_reference(x, share, matrix, bias, centre=centre)
+        with full_precision(x):
+            x = x - centre
+            if len(matrix) == 1:
+                return x @ matrix[0] + bias[0]
+            mixed = share @ bias
+            for k in range(len(matrix)):
+                inside = share[:, k].nonzero().squeeze(1)
+                mixed.index_add_(0, inside, (x[inside] * share[inside, k, None]) @ matrix[k])
+            return mixed
     from . import mixture_kernels as kernels
 
-    channels = x.shape[1]
-    out = torch.empty(len(x), channels)
+    out = torch.empty(len(x), x.shape[1])
     padded = [_whole(part) for part in (matrix, bias)]
-    kernels.affine(*(array(part) for part in (x, centre, share, *padded)), channels, padded[1].shape[1], out.view(-1).numpy())
+    kernels.affine(*(array(part) for part in (x, centre, share, *padded)), x.shape[1], padded[1].shape[1], out.view(-1).numpy())
     return out
-
-
-def scaled_reference(
-    x: Annotated[Tensor, "N C"],
-    share: Annotated[Tensor, "N K"],
-    gain: Annotated[Tensor, "K C"],
-    bias: Annotated[Tensor, "K C"],
-    *,
-    centre: Annotated[Tensor, "C"],
-) -> Annotated[Tensor, "N C"]:
-    """(x - centre) (share gain) + share bias, channel by channel: the mixture's gains and biases."""
-    with full_precision(x):
-        return (x - centre) * (share @ gain) + share @ bias
 
 
 def scaled(
@@ -77,22 +55,20 @@ def scaled(
     *,
     centre: Annotated[Tensor, "C"],
 ) -> Annotated[Tensor, "N C"]:
-    """`scaled_reference`, within (K + 2) u (|x - centre| share |gain| + share |bias|)."""
+    """(x - centre) (share gain) + share bias, channel by channel: the mixture's gains and biases.
+
+    Within (K + 2) u (|x - centre| share |gain| + share |bias|), u = 2^-24.
+    """
     if not usable(x):
-        return scaled_reference(x, share, gain, bias, centre=centre)
+        with full_precision(x):
+            return (x - centre) * (share @ gain) + share @ bias
     from . import mixture_kernels as kernels
 
-    channels = x.shape[1]
-    out = torch.empty(len(x), channels)
+    out = torch.empty(len(x), x.shape[1])
     padded = [_whole(part) for part in (gain, bias)]
     width = padded[0].shape[1]
-    kernels.scaled(
-        *(array(part) for part in (x, centre, share, *padded)),
-        channels,
-        width,
-        np.zeros(width, np.float32),
-        out.view(-1).numpy(),
-    )
+    given = [array(part) for part in (x, centre, share, *padded)]
+    kernels.scaled(*given, x.shape[1], width, np.zeros(width, np.float32), out.view(-1).numpy())
     return out
 
 
@@ -114,18 +90,12 @@ def attention(
 
     out, columns = torch.empty(len(x), len(keys)), _whole(keys.T)
     odds = torch.zeros(len(keys)) if prior is None else prior.log()
+    middle, least = (torch.zeros(x.shape[1]), -1.0) if centre is None else (centre, flat)
+    sharpness = 1 / max(temperature, torch.finfo(torch.float32).tiny)
     kernels.attention(
-        array(x),
-        array(torch.zeros(x.shape[1]) if centre is None else centre),
-        np.float32(-1.0 if centre is None else flat),
-        array(columns),
-        columns.shape[1],
-        np.float32(1 / max(temperature, torch.finfo(torch.float32).tiny)),
-        array(odds),
-        np.float32(faint),
-        np.zeros(columns.shape[1], np.float32),
-        out.view(-1).numpy(),
-    )
+        array(x), array(middle), np.float32(least), array(columns), columns.shape[1], np.float32(sharpness), array(odds),
+        np.float32(faint), np.zeros(columns.shape[1], np.float32), out.view(-1).numpy(),
+    )  # fmt: skip
     return out
 
 

@@ -129,11 +129,6 @@ def _difference(image, target, at, width, x, slope, grad):
     return absolute(d) * inside
 
 
-@traced
-def _zero(array, at):
-    store(array, at, 0)
-
-
 @_jit
 def _loss(counters, image, target, target_blurred, width, height, share, rooms, grad, sums):
     padded = (width + LANES - 1) // LANES * LANES
@@ -161,7 +156,7 @@ def _loss(counters, image, target, target_blurred, width, height, share, rooms, 
                 if y < 0 or y >= down:
                     for x in range(0, room, LANES):
                         for layers in range(3):
-                            _zero(moves, layers * layer + d + x)
+                            store(moves, layers * layer + d + x, 0)
                     continue
                 for x in range(0, width, LANES):
                     _down_both(image, target, at + x, padded, line, x, room)

@@ -213,11 +213,6 @@ def lift_values(
 
 
 @traced
-def _clear(memory, at):
-    store(memory, at, 0)
-
-
-@traced
 def _add(memory, at, found, slot):
     store(memory, at, load(memory, at) + load(found, slot))
 
@@ -378,17 +373,11 @@ def _write_gradient(blocks, at, bands, view, memory, out):
         store(out, at + row * LANES, g)
 
 
-@traced
-def _write_zeros(out, at, bands):
-    for row in range(FIXED + 3 * bands):
-        store(out, at + row * LANES, 0)
-
-
 @jit
 def _add_block(found, first_slot, first, memory):
     """The sums of LANES Gaussians, a vector each."""
     for lane in range(LANES):
-        _clear(memory, lane * LANES)
+        store(memory, lane * LANES, 0)
         for slot in range(first_slot[first + lane], first_slot[first + lane + 1]):
             _add(memory, lane * LANES, found, slot * SUMS)
 
@@ -404,7 +393,8 @@ def _gradients(bands):
             for first in range(begin, min(count, begin + BLOCKS * LANES), LANES):
                 at = first * (FIXED + 3 * bands)
                 if first_slot[first + LANES] == first_slot[first]:
-                    _write_zeros(out, at, bands)
+                    for row in range(FIXED + 3 * bands):
+                        store(out, at + row * LANES, 0)
                 else:
                     _add_block(found, first_slot, first, memory)
                     _write_gradient(blocks, at, bands, view, memory, out)

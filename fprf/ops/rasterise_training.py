@@ -240,7 +240,7 @@ class TrainableGaussians:
         pixels[:area], pixels[2 * area : 3 * area] = apart.reshape(3, area).sum(0), 1
         if target.sky is not None:
             pixels[area : 2 * area] = target.sky
-        backward.lift_values(tiles, backward.lift(tiles, pixels), sums.reshape(-1), 8, 0, 8)
+        backward.lift_values(tiles, backward.lift(tiles, 8, pixels), sums.reshape(-1), 8, 0, 8, skipped=0)
         return sums[:, :3]
 
     def _render(self, target: Target, background: tuple[float, float, float]) -> tuple[forward.Tiles, Floats, Floats]:

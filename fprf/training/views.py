@@ -96,6 +96,7 @@ def _rendered(
         depth.append(out.depth)
         opacity.append(out.opacity)
         kept, samples = kept + out.counts["kept"], samples + out.counts["samples"]
+    # As the camera took it, and depths along the world's ray, whatever space the field lives in.
     width, height = (int(v) for v in cameras.size[view])
     colour = torch.cat(rgb)
     colour = (colour if factor is None else colour * factor.to(colour.device)).clamp(0, 1)

@@ -9,12 +9,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plain_forms import plainly
 from torch import Tensor
 
 from fprf.ops import dense
-from fprf.ops.dense import Last, network, network_reference, runs
-from fprf.ops.lanes import exp_lanes, opaque_lanes
-from fprf.ops.simd import WIDE
+from fprf.ops.dense import Last, network, runs
+from fprf.ops.simd import WIDE, exp, load, opaque, store
 
 QUICK = settings(max_examples=25, deadline=None)
 U = 2.0**-24
@@ -66,7 +66,7 @@ def test_both_forms_stay_within_the_bound(sizes: tuple[int, ...], last: Last) ->
     weights, biases = layers_of(sizes)
     x = draw(101, sizes[0], seed=9)
     value, bound = oracle(x, weights, biases, last=last)
-    for form in (network, network_reference):
+    for form in (network, plainly(network)):
         check(form(x, weights, biases, last=last), value, bound)
 
 
@@ -87,7 +87,7 @@ def test_some_inputs_are_shared_by_several_points(last: Last, hidden: int) -> No
     x, shared = draw(130, 12), draw(9, 3, seed=3)
     row = torch.randint(9, (130,), generator=torch.Generator().manual_seed(1))
     value, bound = oracle(x, weights, biases, shared, row, last)
-    for form in (network, network_reference):
+    for form in (network, plainly(network)):
         check(form(x, weights, biases, shared=shared, row=row, last=last), value, bound)
 
 
@@ -133,9 +133,9 @@ NAN, INF = float("nan"), float("inf")
 def _run(kind: int, x: np.ndarray, out: np.ndarray) -> None:
     for i in range(0, len(x), WIDE):
         if kind == 0:
-            exp_lanes(x, i, out, i)
+            store(out, i, exp(load(x, i, WIDE)))
         else:
-            opaque_lanes(x, i, out, i)
+            store(out, i, opaque(load(x, i, WIDE)))
 
 
 def run(kind: int, x: np.ndarray) -> np.ndarray:

@@ -2,9 +2,10 @@
 
 import pytest
 import torch
+from plain_forms import plainly
 from torch import Tensor
 
-from fprf.ops.harmonics import HARMONIC, MAX_COLOUR, Directions, as_drawn, recoloured, recoloured_reference
+from fprf.ops.harmonics import HARMONIC, MAX_COLOUR, Directions, as_drawn, recoloured
 from fprf.ops.harmonics import spherical_harmonics as functions
 from fprf.splats.restyle import all_around
 
@@ -33,9 +34,9 @@ def test_the_compiled_form_stays_within_the_bound(bands: int, count: int) -> Non
     """Each number is a sum of 48 products (fitted again) and one of 4, of numbers that the largest input bounds."""
     harmonics, change, weight = inputs(count, bands)
     directions = all_around(bands)
-    exact = recoloured_reference(harmonics.double(), change.double(), weight.double(), double(directions))
+    exact = recoloured(harmonics.double(), change.double(), weight.double(), double(directions))
     bound = 60 * U * float(harmonics.abs().max()) * (1 + float(change.abs().max()))
-    for form in (recoloured, recoloured_reference):
+    for form in (recoloured, plainly(recoloured)):
         found = form(harmonics, change, weight, directions)
         assert ((found.double() - exact).abs() <= bound).all() and found.shape == harmonics.shape
         assert torch.equal(found[weight == 0], harmonics[weight == 0])
@@ -45,7 +46,7 @@ def test_other_types_and_nothing_take_the_plain_form() -> None:
     harmonics, change, weight = (part.double() for part in inputs(9, 4))
     directions = double(all_around(4))
     found = recoloured(harmonics, change, weight, directions)
-    assert found.dtype == torch.float64 and torch.equal(found, recoloured_reference(harmonics, change, weight, directions))
+    assert found.dtype == torch.float64 and torch.equal(found, plainly(recoloured)(harmonics, change, weight, directions))
     assert recoloured(harmonics[:0].float(), change[:0].float(), weight[:0].float(), all_around(4)).shape == (0, 4, 3)
 
 

@@ -3,10 +3,11 @@
 import numba
 import pytest
 import torch
+from plain_forms import plainly
 from torch import Tensor
 
-from fprf.ops.lanes import BLOCK
-from fprf.ops.mixture import affine, affine_reference, attention, scaled, scaled_reference
+from fprf.ops.mixture import affine, attention, scaled
+from fprf.ops.simd import BLOCK
 
 U = 2.0**-24
 """Unit round-off of float32."""
@@ -38,7 +39,7 @@ def test_affine_maps_stay_within_the_bound(channels: int, regions: int, count: i
     x, centre = draw(count, channels) + 3, draw(channels, seed=1) + 3
     matrix, bias, share = draw(regions, channels, channels, seed=2), draw(regions, channels, seed=3), shares(count, regions)
     value, bound = affine_oracle(x, share, matrix, bias, centre)
-    for form in (affine, affine_reference):
+    for form in (affine, plainly(affine)):
         found = form(x, share, matrix, bias, centre=centre)
         assert found.shape == x.shape and ((found.double() - value).abs() <= bound).all()
 
@@ -47,7 +48,7 @@ def test_affine_maps_stay_within_the_bound(channels: int, regions: int, count: i
 def test_other_types_and_no_points_take_the_plain_form() -> None:
     x, share, centre = draw(7, 16).double(), shares(7, 3).double(), draw(16).double()
     matrix, bias = draw(3, 16, 16).double(), draw(3, 16).double()
-    plain = affine_reference(x, share, matrix, bias, centre=centre), scaled_reference(x, share, bias, bias, centre=centre)
+    plain = plainly(affine)(x, share, matrix, bias, centre=centre), plainly(scaled)(x, share, bias, bias, centre=centre)
     fast = affine(x, share, matrix, bias, centre=centre), scaled(x, share, bias, bias, centre=centre)
     assert all(torch.equal(a, b) and a.dtype == torch.float64 for a, b in zip(plain, fast, strict=True))
     x, share, centre, matrix, bias = (each.float() for each in (x[:0], share[:0], centre, matrix, bias))
@@ -64,7 +65,7 @@ def test_gains_and_biases_stay_within_the_bound(channels: int, regions: int, cou
     away, a = x.double() - centre.double(), share.double()
     value = away * (a @ gain.double()) + a @ bias.double()
     bound = (regions + 4) * U * (away.abs() * (a @ gain.double().abs()) + a @ bias.double().abs())
-    for form in (scaled, scaled_reference):
+    for form in (scaled, plainly(scaled)):
         found = form(x, share, gain, bias, centre=centre)
         assert found.shape == x.shape and ((found.double() - value).abs() <= bound).all()
 

@@ -72,7 +72,7 @@ def test_gradients_are_those_of_float64(case: Case, n: int) -> None:
         assert abs(float(apart.mean())) <= 1e-4 * float(b.abs().mean())
 
 
-NETWORKS = ("dense.network", "dense.network_reference")
+NETWORKS = ("dense.network", "dense.network, plain")
 """What somebody who asks for autocast wants to be lowered."""
 
 

@@ -66,7 +66,7 @@ class _ConvNorm(nn.Module):
         super().__init__()
         padding = dilation * (size // 2)
         self.conv = nn.Conv2d(inputs, outputs, size, stride, padding, dilation, groups, bias=False)
-        self.norm = nn.BatchNorm2d(outputs)
+        self.norm: nn.BatchNorm2d | nn.Identity = nn.BatchNorm2d(outputs)
 
     def forward(self, x: Tensor) -> Tensor:
         return F.relu(self.norm(self.conv(x)))
@@ -136,9 +136,11 @@ def _loaded(name: str, student: nn.Module, tensors: dict[str, Tensor], path: Pat
     # Once its identity is known: normalisation as part of the convolutions before it, and channels last, as they are computed
     # on the CPU. 1.5 times as fast on two threads, and the same features up to rounding.
     for module in student.modules():
-        if isinstance(module, _ConvNorm):
+        if isinstance(module, _ConvNorm) and isinstance(module.norm, nn.BatchNorm2d):
             module.conv, module.norm = fuse_conv_bn_eval(module.conv, module.norm), nn.Identity()
-    student.to(memory_format=torch.channels_last)
+    for parameter in student.parameters():
+        if parameter.ndim == 4:
+            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
     return encoder
 
 
