@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from .rendering.cameras import Cameras
     from .rendering.renderer import Parts
     from .rendering.space import Space
+    from .splats.gaussians import GaussianRows
     from .style.colours import ColourMaps
     from .style.dictionary import StyleDictionary
     from .style.look import Restyle
@@ -254,6 +255,10 @@ class Scene(ABC):
     @abstractmethod
     def semantic_encoder(self) -> str:
         """Identity of the encoder of its semantics; empty where it has none."""
+
+    def gaussian_rows(self) -> "GaussianRows | None":
+        """The Gaussians that it is made of, in its look, for files of them; None where it is made of something else."""
+        return None
 
     @abstractmethod
     def render(self, cameras: "Cameras", view: int, *, resolution: float | None = None) -> View:

@@ -44,7 +44,7 @@ from ..style.scene import to_tensors as style_tensors
 from ..training.camera_optimizers import Tones
 from ..types import Origin, View
 from .config import LookConfig
-from .gaussians import Gaussians, bulk_of
+from .gaussians import GaussianRows, Gaussians, bulk_of
 from .levels import Levels, StyledLevels, seen_by
 from .photographs import camera_of, cover, distorted
 from .restyle import Colours, region_maps, restyled_harmonics
@@ -155,6 +155,10 @@ class SplatScene(Scene):
             return gaussians
         features = self.found().features[rows]
         return gaussians.recoloured(restyled_harmonics(gaussians.harmonics, gaussians.means, features, self.look))
+
+    def gaussian_rows(self) -> GaussianRows:
+        """All of them, in the scene's look."""
+        return GaussianRows(len(self.gaussians), self.part, self.antialiased)
 
     @cached_property
     def _detail(self) -> Levels | StyledLevels:

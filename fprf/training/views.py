@@ -13,7 +13,7 @@ from ..interfaces import Decoder, SceneView, Values
 from ..memory import chunk_size, in_parts
 from ..ops.precision import float64_device
 from ..rendering.cameras import Cameras, PixelRays, grid_rays, rays_through
-from ..rendering.renderer import Kept, composite, composite_mean, enlarged, march, march_features, render_rays, shade
+from ..rendering.renderer import PackedSamples, composite, composite_mean, enlarged, march, march_features, render_rays, shade
 from ..style.look import Restyle
 from ..types import Rays, Rendered, View, Want
 from .camera_optimizers import moving, rotated
@@ -139,7 +139,7 @@ def paint_pixels(
 class Part:
     """A chunk of rays, row after row of a view; it knows no style."""
 
-    kept: Kept
+    kept: PackedSamples
     content: Annotated[Tensor, "M C"]
     semantic: Annotated[Tensor, "M D"] | None
     behind: Annotated[Tensor, "R 3"] | float
