@@ -52,6 +52,11 @@ BENCHMARKS = {
         "the extra test; hours for all modules; Linux",
         ("pytest", "hypothesis"),
     ),
+    "page": Benchmark(
+        "the page: pictures against the rasteriser, frames, sorting, memory, and a dropped photograph",
+        "--parts million --few",
+        "playwright and a Chromium; runs of Gaussians but for the part million",
+    ),
     "paper": Benchmark(
         "the paper's ablations on the town, or on another scene by photographs",
         "--method {run}/config.json --data {town} --steps 5 --views 1 --palettes night --device cpu",
@@ -94,9 +99,7 @@ BENCHMARKS = {
     "town": Benchmark(
         "write a town as a scene folder", "{folder}/town --views 2 --width 24 --height 18", "a folder to write into"
     ),
-    "viewer_speed": Benchmark(
-        "response times and memory of the viewer", "{run} --parts start", "the extra viewer, playwright and a Chromium"
-    ),
+    "tables": Benchmark("tables of the documents, made from the results", "--check", "a clone"),
 }
 """`benchmarks/gpu.sh` measures a machine with a GPU."""
 

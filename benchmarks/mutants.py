@@ -195,7 +195,6 @@ MODULES: dict[str, tuple[str, ...]] = {
     "fprf/ops/guided_kernels.py": ("datamanagers/test_features.py",),
     "fprf/ops/mixture_kernels.py": ("ops/test_mixture.py",),
     "fprf/ops/triplane_kernels.py": ("ops/test_triplane.py",),
-    "fprf/ops/lanes.py": ("ops/test_dense.py", "ops/test_mixture.py", "ops/test_march.py"),
     "fprf/ops/simd.py": ("ops/test_dense.py", "ops/test_triplane.py", "ops/test_rasterise.py"),
     "fprf/style/clusters.py": ("style/test_clusters.py",),
     "fprf/style/colours.py": ("style/test_colours.py",),
@@ -211,7 +210,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "fprf/rendering/splines.py": ("rendering/test_splines.py",),
 }
 """Each numerics module and its tests."""
-COMPILED = ("_kernels.py", "lanes.py", "simd.py")
+COMPILED = ("_kernels.py", "simd.py")
 THIRD_PARTY = (
     "torch", "torch.distributed.tensor", "hypothesis.extra.pytestplugin", "hypothesis.internal.conjecture.engine", "numpy",
     "cv2", "numba", "llvmlite", "safetensors", "pytest", "hypothesis", "kornia.color",

@@ -22,7 +22,7 @@ from fprf.checks import at_least, between
 from fprf.cli.parsing import load_field_method, parse
 from fprf.config import TrainConfig
 from fprf.datamanagers.images import load_image
-from fprf.evaluation.metrics import image_metrics, matched_regions, mean_metrics, structure
+from fprf.evaluation.metrics import image_metrics, mean_metrics
 from fprf.interfaces import Decoder
 from fprf.io.atomic import write_json
 from fprf.io.images import shrink, to_uint8, write_image
@@ -46,6 +46,7 @@ from fprf.training.views import cache_view, render_view
 from .common import Progress, console, origin
 from .report import Column, printed
 from .restyle import PLAIN, dictionary_of, in_scene
+from .style_metrics import matched_regions, structure
 from .styles import Exhibit, judge_exhibit
 from .town.truth import (
     Row,

@@ -14,8 +14,7 @@ from fprf.datamanagers.images import IMAGE_SUFFIXES, load_image
 from fprf.datamanagers.parsers.files import Record, as_record, read_bytes, read_json, read_npy, read_npz
 from fprf.datamanagers.parsers.views import rigid_pose
 from fprf.errors import DataError
-from fprf.evaluation.consistency import published, steadiness
-from fprf.evaluation.metrics import matched_regions, mean_scores, structure, style_distances
+from fprf.evaluation.consistency import published
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig
 from fprf.progress import Display
 from fprf.rendering.cameras import Cameras, grid_rays
@@ -24,6 +23,8 @@ from fprf.training.views import render_view
 
 from .common import ReportConfig, write_report
 from .report import provenance, words
+from .steadiness import steadiness
+from .style_metrics import matched_regions, mean_scores, structure, style_distances
 
 Frames = Mapping[str, Annotated[Tensor, "H W 3"]]
 """Pictures by the stems of their files, in the order of these."""

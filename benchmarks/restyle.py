@@ -15,7 +15,7 @@ from torch import Tensor
 from fprf.checks import at_least, between, positive
 from fprf.cli.parsing import as_flag, parse
 from fprf.errors import ConfigError, UsageError
-from fprf.evaluation.consistency import published, steadiness
+from fprf.evaluation.consistency import published
 from fprf.interfaces import Scene, SceneView
 from fprf.io.images import Picture, to_uint8, write_image
 from fprf.methods import fprf_lite
@@ -40,6 +40,7 @@ from fprf.types import Want
 from .common import ReportConfig, console, write_report
 from .report import Column, contact_sheet, markdown, printed, provenance, words
 from .single_image import encoded, flat_look, flat_scene, histogram_matching, reinhard, render_flat
+from .steadiness import steadiness
 from .town.truth import (
     CUT,
     Matched,

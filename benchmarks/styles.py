@@ -32,7 +32,7 @@ from fprf.datamanagers.config import GuidedConfig
 from fprf.datamanagers.images import load_image
 from fprf.errors import DataError
 from fprf.evaluation.consistency import consistency
-from fprf.evaluation.metrics import contrast_kept, matched_regions, region_contrasts, ssim, structure, style_distances
+from fprf.evaluation.metrics import ssim
 from fprf.interfaces import Decoder, Encoder
 from fprf.io.images import shrink, to_uint8, write_image
 from fprf.plugins.decoders.config import MlpDecoderConfig
@@ -52,6 +52,7 @@ from .report import Column, contact_sheet, printed
 from .restyle import PLAIN, STYLIZERS, transfers
 from .semantic_matching import COLOURS, Triplet, read_triplets, triplet_names
 from .single_image import encoded, flat_look, flat_scene, render_flat
+from .style_metrics import contrast_kept, matched_regions, region_contrasts, structure, style_distances
 from .town.render import walk
 from .town.truth import Place, Row, mean_rows, photograph
 from .town.write import is_town, read_truth

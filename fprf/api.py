@@ -173,6 +173,15 @@ class TrainedScene:
             raise UsageError("save_style: a mix has no file of its own; save both styles, and give one `between` and `at`")
         write_style(Path(path), styled.controls.saved)
 
+    def _repr_html_(self) -> str:
+        """The scene in a notebook: a page to walk through, of Gaussians; a picture of a field."""
+        from .page.writer import notebook_html
+
+        known, styled = self.trained.known, self.styled
+        views = known.test or known.train
+        look = None if styled is None else (" + ".join(Path(name).stem for name in self.references) or "style", styled.restyle)
+        return notebook_html(self.trained.scene, known.name, views[len(views) // 2], look)
+
     def render(self, camera: Cameras | int | str) -> Shot:
         """One view: of a camera, or of a captured one by number or name. Raises UsageError for several cameras."""
         return next(self.film(self._single("render", camera)))

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import torch
 
     from .datamanagers.scene import Scene as ParsedScene
-    from .interfaces import Learner, Partition
+    from .interfaces import Partition, SceneLearner
     from .training.model import Facts
 
 
@@ -232,7 +232,7 @@ class RunConfig:
         *,
         saved: "Facts | None" = None,
         progress: Callable[[int, int, str], None] | None = None,
-    ) -> "Learner | Partition":
+    ) -> "SceneLearner | Partition":
         """Build what learns a scene, with its images read; imports its implementation.
 
         `saved` are the facts of a run that goes on: nothing that was measured for them is measured again. `progress` is told
@@ -317,7 +317,7 @@ class TrainConfig(RunConfig):
     memory, and each batch is copied one step ahead."""
     precision: Literal["float32", "tf32", "bfloat16"] = "float32"
     """Of matrix products on a GPU in training: tf32 rounds their factors to 11 bits (CUDA), bfloat16 those of the networks to 8
-    bits; geometry and sums stay in float32. docs/speed.md has the errors."""
+    bits; geometry and sums stay in float32. docs/measurements.md has the errors."""
     datamanager: DataManagerConfig = RayBatchesConfig()
     """Feeds training."""
     sampler: SamplerConfig = ProposalConfig()
@@ -357,7 +357,7 @@ class TrainConfig(RunConfig):
         *,
         saved: "Facts | None" = None,
         progress: Callable[[int, int, str], None] | None = None,
-    ) -> "Learner | Partition":
+    ) -> "SceneLearner | Partition":
         """Extract the features and build the model; blocks where the scene is cut."""
         from .training.learner import FieldLearner
         from .training.prepare import prepare

@@ -1,7 +1,24 @@
 """The abstract base of every plug-in kind, with shapes: the one file that a plug-in author reads.
 
-Each is built by its config's `build(...)`; the configs live in the `config.py` next to the built-ins and import no torch.
-Shapes use the letters of `fprf.types`.
+Each is built by its config's `build(...)`; the configs live in the `config.py` next to the built-ins and import no torch. A
+contract in `fprf.testing` says what an implementation must hold, and fails with one sentence where it doesn't:
+
+    images      Encoder          [B 3 H W] -> [B C h w]                      check_encoder
+    fields      ContentField     [N 3] -> density [N], content [M C]         check_content_field
+                SemanticField    [N 3] -> [N D]                              check_semantic_field
+                Sampler          rays -> edges [R E]                         check_sampler
+                Decoder          content [N C] -> colours [N 3]              check_decoder
+                LossTerm         render, batch -> scalar                     check_loss_term
+    styles      Stylizer         content [N C], semantic [N D] -> [N C]      check_stylizer
+    captures    DataParser       folder -> scene                             check_parser
+                DataManager      step -> batch of R pixels                   check_data_manager
+    scale       BlockLayout      site -> cells                               check_layout
+                Executor         tasks -> results                            check_executor
+    scenes      Scene, SceneView, SceneLearner, Partition: a kind of scene of its own, built by `RunConfig.build`
+
+Letters (all of them in `fprf.types`): B images · N M points · R rays · E edges · C content channels · D semantic channels ·
+L latent channels · T style codes · K scene regions · H W pixels. Tensors are float32 unless their inputs are of another type;
+device and type of results follow the inputs. Functions of points treat each alone: the same in any batch, and of none none.
 """
 
 from abc import ABC, abstractmethod
@@ -24,6 +41,7 @@ if TYPE_CHECKING:
     from .rendering.cameras import Cameras
     from .rendering.renderer import Parts
     from .rendering.space import Space
+    from .splats.gaussians import GaussianRows
     from .style.colours import ColourMaps
     from .style.dictionary import StyleDictionary
     from .style.look import Restyle
@@ -40,7 +58,10 @@ OPAQUE = 0.005
 
 
 class Encoder(nn.Module, ABC):
-    """Images to features. Frozen; deterministic; normalises its input itself."""
+    """Images to features. Frozen; deterministic; normalises its input itself; may be called by several threads at once.
+
+    Takes images of any size from one pixel on, and keeps their aspect; features of an image do not depend on its batch.
+    """
 
     @property
     @abstractmethod
@@ -71,11 +92,14 @@ class Encoder(nn.Module, ABC):
 
 
 class ContentField(nn.Module, ABC):
-    """Points to density and content features (paper, scene content field). Stateless between calls."""
+    """Points to density and content features (paper, scene content field). Stateless between calls.
+
+    Every parameter has a gradient, through the density or the content, and is drawn from the seed of `build` alone.
+    """
 
     @abstractmethod
     def density(self, points: Annotated[Tensor, "N 3"]) -> FieldSample:
-        """Density per space unit and a latent for `content`, at points of the unit cube [-1, 1]^3."""
+        """Density per space unit, at least 0, and a latent [N L] for `content`, at points of the unit cube [-1, 1]^3."""
 
     @abstractmethod
     def content(self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "M C"]:
@@ -123,7 +147,10 @@ class Sampler(nn.Module, ABC):
         step: int | None,
         generator: torch.Generator | None,
     ) -> Sampled:
-        """Edges along each ray, spaced by `space.distance(s, near, far)`; generator None = deterministic."""
+        """Edges `s` in [0, 1] and `t` in [near, far] along each ray, [R E] with E >= 2, sorted, t = space.distance(s, near, far).
+
+        `step` is that of the training, None in a view. A function of rays, step and generator; None = deterministic.
+        """
 
     @abstractmethod
     def penalties(self) -> dict[str, Tensor]:
@@ -142,7 +169,13 @@ class Decoder(nn.Module, ABC):
 
 
 class Stylizer(nn.Module, ABC):
-    """Content features to stylised content features, point by point. Knows nothing of rays."""
+    """Content features to stylised content features, point by point. Knows nothing of rays.
+
+    On Gaussians the content is the colour, C = 3, and a style is one affine map of colours for each of them, which acts on
+    their harmonics. It is found from what becomes of black and of each channel alone, so either `forward` is affine in content
+    where semantics are given, f(a x + (1 - a) y) = a f(x) + (1 - a) f(y), or the config has `colours` above 0, which carries
+    the colours of each region over in the place of it (`splats.restyle`).
+    """
 
     @property
     @abstractmethod
@@ -151,7 +184,7 @@ class Stylizer(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
-        """The features in the new style, at full strength."""
+        """The features in the new style, at full strength. `semantic` is None unless `needs` asks for it."""
 
     def shared(
         self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
@@ -164,7 +197,7 @@ class Stylizer(nn.Module, ABC):
 
     @abstractmethod
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
-        """Attention of each point to each style code; rows sum to 1."""
+        """Attention of each point to each style code, at least 0; rows sum to 1."""
 
     def region_match(self, keys: Annotated[Tensor, "K D"]) -> Annotated[Tensor, "K T"]:
         """Share of each style code in each of the scene's regions, whose mean semantics are `keys`; rows sum to 1.
@@ -222,6 +255,10 @@ class Scene(ABC):
     @abstractmethod
     def semantic_encoder(self) -> str:
         """Identity of the encoder of its semantics; empty where it has none."""
+
+    def gaussian_rows(self) -> "GaussianRows | None":
+        """The Gaussians that it is made of, in its look, for files of them; None where it is made of something else."""
+        return None
 
     @abstractmethod
     def render(self, cameras: "Cameras", view: int, *, resolution: float | None = None) -> View:
@@ -328,7 +365,7 @@ class Figures(NamedTuple):
 
 
 class Learner(ABC):
-    """A scene that is being learnt, built by `RunConfig.build`; `training.driver` does everything else.
+    """Anything that is learnt step by step; `training.driver.learn` does the rest.
 
     Every draw is a function of (seed, index), so that `state` and the number of steps are all that a resumed training needs.
     """
@@ -338,11 +375,6 @@ class Learner(ABC):
     def device(self) -> torch.device:
         """Device of its parameters. On the CPU figures are read after each step; elsewhere twice a second, since the host
         waits for the device."""
-
-    @property
-    @abstractmethod
-    def facts(self) -> "Facts":
-        """What was found out about the scene before the first step, for scene.json."""
 
     @abstractmethod
     def step(self, index: int, share: float) -> None:
@@ -362,6 +394,15 @@ class Learner(ABC):
     @abstractmethod
     def load(self, state: State) -> None:
         """Go on from a `state`. Raises CheckpointError where it is that of another config."""
+
+
+class SceneLearner(Learner):
+    """A scene that is being learnt, built by `RunConfig.build`; `training.driver.train` owns its run folder."""
+
+    @property
+    @abstractmethod
+    def facts(self) -> "Facts":
+        """What was found out about the scene before the first step, for scene.json."""
 
     @abstractmethod
     def scene(self) -> Scene:

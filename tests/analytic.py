@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from fprf.export.depth_maps import DepthMaps
+from fprf.export.mesh import Maps
 from fprf.rendering.cameras import Cameras, grid_rays, ideal_cameras
 from fprf.rendering.paths import look_at
 
@@ -38,7 +38,13 @@ def sphere_depth(cameras: Cameras, view: int) -> Tensor:
     return torch.where(inside > 0, -along - inside.clamp_min(0).sqrt(), torch.inf).view(height, width)
 
 
-def globe(count: int = 8) -> DepthMaps:
-    """The sphere."""
+def globe(count: int = 8) -> Maps:
+    """The sphere, whose colours are its places, from [-1, 1] to [0, 1]."""
     cameras = ring(count)
-    return DepthMaps(cameras, tuple(sphere_depth(cameras, view).float() for view in range(count)))
+    depths = [sphere_depth(cameras, view).float() for view in range(count)]
+    places = []
+    for view, depth in enumerate(depths):
+        origin, direction = grid_rays(cameras, view)
+        place = origin + direction * depth.view(-1, 1)
+        places.append((0.5 + 0.5 * place).nan_to_num(0.0, 0.0, 0.0).float().view(*depth.shape, 3))
+    return Maps(cameras, depths, places)

@@ -1,3 +1,4 @@
+import html
 import json
 import shutil
 from collections.abc import Callable
@@ -119,3 +120,12 @@ def test_mistakes_are_told(scene: TrainedScene, world: World, tmp_path: Path) ->
     for kind, mistake in mistakes:
         with pytest.raises(kind):
             mistake()
+
+
+def test_a_notebook_shows_the_scene_as_a_page(scene: TrainedScene, world: World) -> None:
+    for shown, names in ((scene, ["Captured"]), (scene.stylize([world.references[0]]), ["Captured", "dusk"])):
+        frame = shown._repr_html_()
+        assert frame.startswith('<iframe srcdoc="') and 'sandbox="allow-scripts"' in frame
+        page = html.unescape(frame.partition('srcdoc="')[2].partition('" sandbox')[0])
+        data = json.loads(page.partition('id="data">')[2].partition("</script>")[0])
+        assert [style["name"] for style in data["styles"]] == names

@@ -22,7 +22,7 @@ import torch.nn.functional as F
 from fprf.config import RunConfig
 from fprf.datamanagers.basis import Basis
 from fprf.datamanagers.images import load_images
-from fprf.interfaces import Figures, Learner, Scene, SceneView, State
+from fprf.interfaces import Figures, Scene, SceneLearner, SceneView, State
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.rendering.cameras import grid_rays
 from fprf.splats.restyle import Colours, region_maps
@@ -53,7 +53,7 @@ def plane() -> PlaneConfig:
     return PlaneConfig()
 
 
-class PlaneLearner(Learner):
+class PlaneLearner(SceneLearner):
     def __init__(self, config, scene, device, saved):
         self.config, self._device = config, device
         self._facts = saved or facts_of(scene)

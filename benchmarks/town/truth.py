@@ -26,7 +26,6 @@ from torch import Tensor
 from fprf.config import RunConfig
 from fprf.datamanagers.config import GuidedConfig
 from fprf.errors import DataError, UsageError
-from fprf.evaluation.metrics import mean_scores
 from fprf.interfaces import Scene, SceneView
 from fprf.rendering.cameras import Cameras
 from fprf.style.dictionary import StyleDictionary
@@ -36,6 +35,7 @@ from fprf.training.prepare import read_scene
 from fprf.training.run import Known
 
 from ..single_image import encoded
+from ..style_metrics import mean_scores
 from .layout import Town, build_town
 from .palettes import palette
 from .render import View, geometry, render, walk

@@ -35,9 +35,9 @@ class SingleConfig(LayoutConfig):
     cuts: ClassVar[bool] = False
 
     def build(self) -> BlockLayout:
-        from .partition import SingleLayout
+        from .partition import GridLayout
 
-        return SingleLayout()
+        return GridLayout(GridConfig(cells=(1, 1)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -35,11 +35,6 @@ class Member(nn.Module):
         self.field = field
         self.semantic = semantic
 
-    def proposal(self, level: int, points: Annotated[Tensor, "n 3"]) -> Annotated[Tensor, "n"]:
-        """Density of a level of the sampler's own fields."""
-        density: Tensor = self.sampler.fields[level](self.chart.locate(points))
-        return density
-
 
 class Members(ABC):
     """Members by number: in memory, or fetched when they are asked for."""
@@ -95,10 +90,12 @@ class BlockedField(ContentField):
         points, own = latent[:, :3].detach(), latent[:, 3:]
         groups, contents = self.router(points), []
         for group in groups:
+            # One member alone decodes what its density was found with.
             if group.weight is None:
                 at = slice(None) if len(groups) == 1 else group.at
                 contents.append(self.members.member(group.members[0]).field.content(own[at], view[at]))
                 continue
+            # Several are looked up again: the latent holds one of them.
             samples, features = [], []
             for number in group.members:
                 member = self.members.member(number)
@@ -183,8 +180,9 @@ class _Routed(nn.Module):
     def forward(self, points: Tensor) -> Tensor:
         groups, outputs = self.router(points), []
         for group in groups:
-            here = points[group.at]
-            outputs.append(_blended([self.members.member(m).proposal(self.level, here) for m in group.members], group))
+            members = [self.members.member(number) for number in group.members]
+            densities = [each.sampler.fields[self.level](each.chart.locate(points[group.at])) for each in members]
+            outputs.append(_blended(densities, group))
         return _joined([group.at for group in groups], outputs)
 
 
@@ -227,6 +225,7 @@ def inherit(member: Member, around: Member) -> None:
         planes = any(isinstance(module, Planes) for module in modules)
         if not planes or not all(id(parameter) in known or parameter.ndim == 1 for parameter in own.parameters()):
             continue
+        # Networks are copied, planes are resampled where the block lies.
         own.load_state_dict(other.state_dict())
         for mine, theirs in zip(own.modules(), other.modules(), strict=True):
             if isinstance(mine, Planes) and isinstance(theirs, Planes):

@@ -84,13 +84,6 @@ def _blocks(boxes: Sequence[Box], margin: float) -> list[Cell]:
     return [Cell(low=low, high=high, border=border) for low, high in boxes]
 
 
-class SingleLayout(BlockLayout):
-    """The default."""
-
-    def cut(self, site: Site) -> list[Cell]:
-        return _blocks([bounds(site)], 0.0)
-
-
 class GridLayout(BlockLayout):
     """Cells along axes 0 and 1, as high as the region."""
 
@@ -170,6 +163,7 @@ def bisect_sightings(scene: Scene, count: int) -> list[Cell]:
         raise ConfigError(
             f"cells: {scene.name} has too few points of a reconstruction for {count} cells; train it in one piece"
         )
+    # Sightings [O] come view by view; `ends` says where each view begins. `local` are their points along principal axes.
     ends = torch.searchsorted(sightings.view, torch.arange(len(scene.cameras) + 1))
     centred = sightings.point - sightings.point.mean(0)
     frame = torch.linalg.eigh(centred.T @ centred).eigenvectors.T.flip(0).contiguous()
@@ -187,6 +181,7 @@ def bisect_sightings(scene: Scene, count: int) -> list[Cell]:
     endless = torch.full((3,), math.inf, dtype=torch.float64)
     cells = []
     for low, high in bisect((-endless, endless), count, halved):
+        # The cell learns what lies within a border around it as well, so that nothing is missing at its faces.
         inside = ((local >= low) & (local < high)).all(1)
         first, last = _extent(local[inside])
         border = BORDER * (last - first)

@@ -60,6 +60,7 @@ def level_axes(cameras: Cameras) -> Annotated[Tensor, "3 3"]:
 
 def open_space(scene: Scene, sightings: Sightings | None) -> Space:
     """The space of kind `open`. Raises DataError where all cameras stand in one place and nothing says how far they see."""
+    # A unit is the distance that views commonly see: of points, else as the capture says, else of the cameras' spacing.
     position = scene.cameras.pose[:, :, 3]
     centre, turn = position.mean(0), level_axes(scene.cameras)
     nearest = None

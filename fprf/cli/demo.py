@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -17,10 +17,12 @@ from ..progress import Display
 from ..style.config import StyleConfig
 from ..style.files import StyleFile
 from .parsing import parse
-from .showcase import frames_of, photographs_of, restyled, write_shown
+from .showcase import photographs_of, restyled, write_shown
 
 if TYPE_CHECKING:
-    from ..style.look import Restyle
+    from ..interfaces import Scene
+    from ..io.images import Picture
+    from ..rendering.cameras import Cameras
 
 TITLE = "One garden, photographed once"
 LEAD = (
@@ -92,26 +94,21 @@ def run(args: list[str]) -> int:
         scene.measured()
         looked = time.perf_counter() - begun
         styles = restyled(scene, [(n, StyleFile(StyleConfig(references=p))) for n, p in chosen], views, display)
-        for style in styles:
-            write_gaussians(
-                config.output / f"{style.name.replace(' ', '-')}.ply",
-                scene.restyled(style.styled.restyle).shown,
-                antialiased=True,
-                views=scene.views,
-                origin=scene.origin,
-                plain=True,
-            )
-        looks = [styles[0].styled.restyle.faded, *(style.styled.restyle for style in styles[: len(references)])]
+        looks = [scene.restyled(style.styled.restyle) for style in styles]
+        for style, look in zip(styles, looks, strict=True):
+            # For viewers that do not compensate opacities; these depend on no colour, so that the views are looked at once.
+            plain = scene.seen.plain(look.shown)
+            write_gaussians(config.output / f"{style.name.replace(' ', '-')}.ply", plain, origin=scene.origin)
         # From one held-out view to the next, where other views surround the camera.
         tour = make_path(opened.known.cameras, views, "interpolate", config.frames, scene.origin)
-        frames = list(frames_of(scene, tour, fading(looks, len(tour)), display))
+        frames = list(fading([scene, *looks[: len(references)]], tour, display))
     film = config.output / "film.mp4"
     if write_video(film, frames, fps=12) == "mp4v":  # browsers do not play that
         film = film.with_suffix(".webp")
         write_video(film, frames, fps=12)
     metrics |= {
         "looked_seconds": looked,
-        "new_style_seconds": fmean(style.metrics["new_style_seconds"] for style in styles),
+        "new_style_seconds": fmean(style.metrics["new_style_seconds"] for style in styles[: len(references)]),
         "restyled_seconds_per_view": fmean(style.metrics["each_view_seconds"] for style in styles),
         "total_seconds": time.perf_counter() - start,
     }
@@ -178,17 +175,23 @@ def _compile() -> None:
         scaled(point, torch.ones(1, 1), point, point, centre=point[0])
 
 
-def fading(looks: "Sequence[Restyle]", frames: int) -> "Callable[[int], Restyle]":
-    """Return the look of each frame: every look for an equal share of the frames, each fading into the next."""
+def fading(looks: "Sequence[Scene]", cameras: "Cameras", display: Display) -> "Iterator[Picture]":
+    """Frames of a flight: every look for an equal share of them, each fading into the next.
 
-    share = frames / len(looks)
+    Pictures fade, as their colours would: what is drawn is linear in these.
+    """
+    from ..io.images import to_uint8
 
-    def look(frame: int) -> "Restyle":
+    share = len(cameras) / len(looks)
+    for frame in range(len(cameras)):
+        display.count(frame, len(cameras), "rendering")
         place = min(int(frame / share), len(looks) - 1)
         into = (frame - (place + 1) * share) / FADE + 1
-        return looks[place].mixed(looks[place + 1], into) if into > 0 and place + 1 < len(looks) else looks[place]
-
-    return look
+        rgb = looks[place].render(cameras, frame).rgb
+        if into > 0 and place + 1 < len(looks):
+            rgb = rgb.lerp(looks[place + 1].render(cameras, frame).rgb, into)
+        yield to_uint8(rgb)
+    display.count(len(cameras), len(cameras), "rendering")
 
 
 if __name__ == "__main__":

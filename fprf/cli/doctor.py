@@ -13,32 +13,18 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
-
-from rich.console import Console
-from rich.markup import escape
 
 from .. import __version__
 from ..errors import CheckpointError, ConfigError
 from ..plugins import registry
 from ..plugins.codec import Missing
 from ..plugins.slots import slots
+from .findings import Finding, show
 from .parsing import as_flag, parse
 
 _MIB = 1 << 20
 _LEAST_DISK = 1 << 30
 """Bytes below which a training may fail for want of room."""
-
-
-class Finding(NamedTuple):
-    """One line of the report."""
-
-    what: str
-    found: str
-    remedy: str = ""
-    """The one command or act that mends it; empty where nothing is wrong."""
-    optional: bool = False
-    """Everything else works without it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,16 +64,10 @@ def run(args: list[str]) -> int:
     elif str(target) in registry.installed("fprf.methods"):
         findings = method_needs(str(target))
     else:
+        from .doctor_scene import scene_folder
+
         findings = scene_folder(target)
-    console = Console(highlight=False)
-    bad = False
-    for finding in findings:
-        mark = "[green]ok[/]      " if not finding.remedy else "[yellow]optional[/]" if finding.optional else "[red]problem[/] "
-        bad |= bool(finding.remedy) and not finding.optional
-        console.print(f"{mark}  [bold]{escape(finding.what):<14}[/] {escape(finding.found)}", soft_wrap=True)
-        if finding.remedy:
-            console.print(f"{'':<26} → {escape(finding.remedy)}", soft_wrap=True)
-    return int(bad)
+    return int(show(findings))
 
 
 def machine() -> Iterator[Finding]:
@@ -203,25 +183,6 @@ def _version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return ""
-
-
-def scene_folder(data: Path) -> Iterator[Finding]:
-    """Format, views, sizes, splits and content of a scene. Raises DataError where it cannot be parsed."""
-    from ..datamanagers.parsers.config import DataParserConfig, parse_scene, recognise
-    from .doctor_scene import inspect_scene
-
-    parser = recognise(data)
-    yield Finding("format", registry.name_of(DataParserConfig.group, type(parser)))
-    scene = parse_scene(data, 1, parser)
-    sizes = sorted({(int(w), int(h)) for w, h in scene.cameras.size.tolist()})
-    shown = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (f" and {len(sizes) - 3} more" if len(sizes) > 3 else "")
-    lenses = sorted({("pinhole", "OpenCV", "fisheye")[lens] for lens in scene.cameras.lens.tolist()})
-    yield Finding("views", f"{len(scene.paths)} of {shown} pixels, {' and '.join(lenses)} lens")
-    yield Finding("split", f"{len(scene.train)} to train, {len(scene.test)} held out")
-    for note in scene.notes:
-        yield Finding("note", note)
-    yield from inspect_scene(data, scene)
-    yield Finding("next", f"fprf train --data {shlex.quote(str(data))}")
 
 
 def run_folder(folder: Path) -> Iterator[Finding]:

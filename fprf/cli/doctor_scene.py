@@ -1,11 +1,11 @@
-"""Findings of `fprf doctor` in a parsed scene that training would not say, each with what is decided.
+"""Findings of `fprf doctor` in a scene folder that training would not say, each with what is decided.
 
 At most LOOKED views, evenly through the scene, have their files opened and their pixels looked at.
 """
 
 import hashlib
 import io
-import warnings
+import shlex
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,13 +14,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image as Pillow
 from PIL import ImageCms
 
-from ..datamanagers.images import Image, load_images, load_mask
+from ..datamanagers.images import Image, exif_orientation, load_images, load_mask, open_image, opened, uniform_colour
+from ..datamanagers.parsers.config import DataParserConfig, parse_scene, recognise
 from ..datamanagers.scene import Scene, exposures_differ, find_sightings, sparser, with_exposure
 from ..errors import DataError
-from .doctor import Finding
+from ..plugins import registry
+from .findings import Finding
 
 LOOKED = 48
 """Views whose files are opened."""
@@ -34,7 +35,22 @@ _FEW_POINTS = 100
 """Points below which the first Gaussians are not placed at them."""
 _TAIL = 1 << 16
 """Bytes by which files of equal size are compared first."""
-_ORIENTATION = 0x0112
+
+
+def scene_folder(data: Path) -> Iterator[Finding]:
+    """Format, views, sizes, splits and content of a scene. Raises DataError where it cannot be parsed."""
+    parser = recognise(data)
+    yield Finding("format", registry.name_of(DataParserConfig.group, type(parser)))
+    scene = parse_scene(data, 1, parser)
+    sizes = sorted({(int(w), int(h)) for w, h in scene.cameras.size.tolist()})
+    shown = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (f" and {len(sizes) - 3} more" if len(sizes) > 3 else "")
+    lenses = sorted({("pinhole", "OpenCV", "fisheye")[lens] for lens in scene.cameras.lens.tolist()})
+    yield Finding("views", f"{len(scene.paths)} of {shown} pixels, {' and '.join(lenses)} lens")
+    yield Finding("split", f"{len(scene.train)} to train, {len(scene.test)} held out")
+    for note in scene.notes:
+        yield Finding("note", note)
+    yield from inspect_scene(data, scene)
+    yield Finding("next", f"fprf train --data {shlex.quote(str(data))}")
 
 
 def inspect_scene(data: Path, scene: Scene) -> Iterator[Finding]:
@@ -98,17 +114,16 @@ def _masks(name: str, masks: Sequence[tuple[Path | None, list[int]]]) -> Iterato
             return
     if not shares:
         return
-    sky = name != "masks"
+    sky, colour = name != "masks", uniform_colour(shares)
     found = f"white is {100 * np.mean(shares):.0f} % of the pixels of {len(shares)} views"
-    black, white = sum(share == 0 for share in shares), sum(share == 1 for share in shares)
-    if black == len(shares) and not sky:
+    if colour == "black" and not sky:
         yield Finding(name, f"{found}: nothing is left to learn from", "invert them: white is used, black is left out")
-    elif white == len(shares) or black == len(shares):
-        what = "all is sky" if white else "no sky" if sky else "they leave nothing out"
-        yield Finding(
-            name, f"{found}: {what}", "remove them, or write them again: do their pixels hold what was meant?", optional=True
-        )
+    elif colour:
+        what = "all is sky" if sky and colour == "white" else "no sky" if sky else "they leave nothing out"
+        remedy = "remove them, or write them again: do their pixels hold what was meant?"
+        yield Finding(name, f"{found}: {what}", remedy, optional=True)
     else:
+        black = shares.count(0.0)
         empty = f"; {black} leave nothing of their view" if black and not sky else ""
         yield Finding(name, f"{found}, which is {'sky' if sky else 'used'}{empty}")
 
@@ -119,11 +134,12 @@ def _metadata(paths: Sequence[Path]) -> Iterator[Finding]:
     turned = 0
     for path in paths:
         try:
-            with warnings.catch_warnings(action="ignore"), Pillow.open(path) as image:
-                icc, orientation = image.info.get("icc_profile"), image.getexif().get(_ORIENTATION, 1)
-        except (OSError, ValueError, SyntaxError, Pillow.DecompressionBombError):
+            with opened(path) as file:
+                image = open_image(file, path)[1]
+                icc, orientation = image.info.get("icc_profile"), exif_orientation(image)
+        except DataError:
             continue  # what cannot be read is said where its pixels are
-        turned += orientation not in (0, 1)
+        turned += orientation != 1
         if icc and "srgb" not in (profile := _profile(icc)).lower():
             profiles[profile] += 1
     if profiles:

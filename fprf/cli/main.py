@@ -118,7 +118,8 @@ def run_verb(verb: str, args: list[str]) -> int:
 
 
 def _help() -> str:
-    bold, dim, plain = ("\x1b[1m", "\x1b[2m", "\x1b[0m") if _colour() else ("", "", "")
+    colour = sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+    bold, dim, plain = ("\x1b[1m", "\x1b[2m", "\x1b[0m") if colour else ("", "", "")
     others = packaged()
     width = max(map(len, [*VERBS, *others]))
     broad = max(len(verb.usage) for verb in VERBS.values())
@@ -134,10 +135,6 @@ def _help() -> str:
         "`fprf VERB --help` shows every flag of a verb, `fprf train` lists the methods. Start with `fprf demo`.",
     ]
     return "\n".join(lines)
-
-
-def _colour() -> bool:
-    return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 
 
 def _our_fault(error: Exception) -> str:

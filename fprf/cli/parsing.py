@@ -206,6 +206,7 @@ def parse(default: C, args: Sequence[str], *, prog: str, description: str, posit
     if DESCRIBE in args:
         print(describe(default, prog=prog, description=description, positional=positional))
         raise SystemExit(0)
+    # Slots first: what fills them decides which flags there are.
     config, rest = resolve(default, args)
     for slot in slots(config):
         if isinstance(slot.value, Missing):
@@ -214,6 +215,7 @@ def parse(default: C, args: Sequence[str], *, prog: str, description: str, posit
     if positional:
         flags = {text: flag for text, flag in flags.items() if flag.path not in positional}
     rest = spell(rest, flags)
+    # What tyro says of a mistake is a box of many lines; ours is one.
     heard = io.StringIO()
     try:
         with contextlib.redirect_stderr(heard), _page_width():

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from ..errors import UsageError
+from ..io.atomic import write_json
 from ..pretraining.config import PretrainConfig, PretrainDecoderConfig
 from .parsing import parse
 from .style_flags import say
@@ -47,8 +48,8 @@ def pretrain(
     begun = time.monotonic()
     measured = train(config, config.output, say)
     report = {"weights": str(config.output), **measured, "seed": config.seed, "seconds": round(time.monotonic() - begun, 1)}
-    from ..pretraining.loop import write_report
-
-    write_report(config.output, prog.split()[-1], report)
+    # The weights by their bare name, since both may be moved.
+    told = {"kind": prog.split()[-1], **report, "weights": config.output.name}
+    write_json(config.output.with_name(config.output.stem + ".report.json"), told)
     print(json.dumps(report, indent=2))
     return 0

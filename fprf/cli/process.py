@@ -21,7 +21,7 @@ MINUTES = 3
 
 _DESCRIPTION = """Find poses for a folder of images or for a video, and make a scene folder that `fprf train` reads.
 
-Needs the extra `sfm` (pip install 'fprf[sfm]') and no other program. Run again, it goes on where it stopped."""
+Needs no other program. Run again, it goes on where it stopped."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,7 @@ def run(args: list[str]) -> int:
     """Choose, match, reconstruct; report what was dropped; check that the scene can be read."""
     config = parse(ProcessConfig(), args, prog="fprf process", description=_DESCRIPTION, positional=("source",))
     if find_spec("pycolmap") is None:
-        raise UsageError("fprf process: pycolmap is not installed; install it with: pip install 'fprf[sfm]'")
+        raise UsageError("fprf process: pycolmap is not installed; install it with: pip install 'pycolmap>=4'")
     from ..io.atomic import write_json
     from ..reconstruction.colmap import find_features, find_matches, find_poses
     from ..reconstruction.images import gather_images, lost_files

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from ..checks import at_least, positive
+from ..checks import at_least
 from ..errors import ConfigError, UsageError
 from ..progress import Display
 from ..style.config import StyleConfig
 from ..style.keyframes import keyed_looks, read_keyframes
 from ..training.quality import QualityConfig
-from .style_flags import read_flags, say
+from .style_flags import named_styles, read_flags, say
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
@@ -51,16 +51,12 @@ class RenderVerbConfig(StyleConfig, QualityConfig):
     """Further looks beside it: NAME=PHOTO,PHOTO, NAME=STYLE.json, or the word plain for the scene as it is."""
     show: tuple[Literal["colour", "depth", "normals", "match"], ...] = ("colour",)
     """Layers of each frame, from left to right."""
-    layout: Literal["beside", "wipe"] = "beside"
-    """Several pictures of a frame lie beside each other, or share one in strips whose seams swing to and fro."""
-    format: Literal["png", "jpg", "exr"] = "png"
-    """Of frames in a folder; exr holds linear light, coverage, depth and normals as numbers, whatever is shown."""
-    lens: Literal["own", "panorama", "stereo"] = "own"
-    """own: as the path has it. panorama: all round (equirectangular). stereo: the same for two eyes, the left one above."""
+    format: Literal["png", "jpg"] = "png"
+    """Format of frames in a folder."""
+    lens: Literal["own", "panorama"] = "own"
+    """own: as the path has it. panorama: all round (equirectangular)."""
     across: int = 2048
     """Width of a panorama in pixels; it is half as high."""
-    eyes: float = 0.065
-    """Distance of the eyes of a stereo panorama in the capture's units, above 0."""
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
 
@@ -70,11 +66,8 @@ class RenderVerbConfig(StyleConfig, QualityConfig):
         at_least("frames", self.frames, 1)
         at_least("fps", self.fps, 1)
         at_least("across", self.across, 2)
-        positive("eyes", self.eyes)
         if not self.show:
             raise ConfigError("show: name at least one of colour, depth, normals, match")
-        if self.lens == "stereo" and {"normals", "match"} & {*self.show}:
-            raise ConfigError("show: a stereo panorama shows colour and depth only")
         if self.keyframes is not None and (self.references or self.style):
             raise ConfigError("keyframes: names styles of its own; leave out --references and --style, or --keyframes")
 
@@ -131,22 +124,16 @@ def _render(
     display: Display,
 ) -> None:
     """Render the frames that are missing, each written as soon as it is done."""
-    from ..io.images import write_exr, write_image
-    from ..io.sheet import side_by_side, wipe
-    from ..training.film import limits_of, panels, planes
+    from ..io.images import write_image
+    from ..io.sheet import side_by_side
+    from ..training.film import limits_of, panels
 
-    eyes = config.eyes if config.lens == "stereo" else None
     limits = limits_of(scene, cameras) if "depth" in config.show and todo else None
     start = time.perf_counter()
     for done, path in enumerate(todo):
         left = (time.perf_counter() - start) / done * (len(todo) - done) if done else None
         display.count(done, len(todo), "rendering", seconds_left=left)
-        frame = numbers[path]
-        if path.suffix == ".exr":
-            write_exr(path, planes(cameras, frame, takes, eyes))
-            continue
-        shown = panels(scene, cameras, frame, takes, config.show, limits, eyes)
-        write_image(path, wipe(shown, frame / len(cameras)) if config.layout == "wipe" else side_by_side(shown))
+        write_image(path, side_by_side(panels(scene, cameras, numbers[path], takes, config.show, limits)))
     display.count(len(todo), len(todo), "rendering")
 
 
@@ -179,7 +166,6 @@ def _key(opened: "LoadedRun[Scene]", config: RenderVerbConfig, cameras: "Cameras
 
 def _takes(scene: "Scene", config: RenderVerbConfig, file: "StyleFile") -> "list[Take]":
     """The looks of a film, at least one. Raises UsageError for a match map without a style to match."""
-    from ..export.config import named_styles
     from ..training.film import Take
 
     takes = []

@@ -13,11 +13,16 @@ if TYPE_CHECKING:
     from ..interfaces import Scene
     from ..io.images import Picture
     from ..rendering.cameras import Cameras
+    from ..style.dictionary import Reference
     from ..style.files import StyleFile
     from ..style.look import Restyle
     from ..style.restyle import Styled
     from ..training.run import Known, Run
     from ..types import View
+
+
+_REDUCED = 4.0
+"""Views by which matches are judged that nobody sees are smaller by this."""
 
 
 class Shown(NamedTuple):
@@ -37,32 +42,41 @@ class Shown(NamedTuple):
 
 
 def restyled(scene: "Scene", chosen: "Sequence[tuple[str, StyleFile]]", views: Sequence[int], display: Display) -> list[Shown]:
-    """Each style on the views, with match maps and how well the views agree with each other."""
+    """Each style on the views, with match maps and how well the views agree with each other.
+
+    A photograph that is in several styles is encoded once, which counts as time of the first of them.
+    """
     from ..style.config import labels
     from ..style.match_maps import match_map, match_picture, summarize
     from ..style.restyle import apply_style
 
     encoders, shown = scene.encoders(), []
+    encoded: dict[tuple[Path, Path], Reference] = {}
+    reduced = scene.cameras.scaled(_REDUCED)
     for i, (name, file) in enumerate(chosen):
         display.count(i, len(chosen), "restyling")
         start = time.perf_counter()
-        styled = apply_style(scene, file, encoders)
+        styled = apply_style(scene, file, encoders, encoded=encoded)
         built = time.perf_counter()
         look = scene.restyled(styled.restyle)
         pictures = [look.render(scene.cameras, view) for view in views]
         done = time.perf_counter()
-        maps = [match_map(scene, styled, view) for view in views]
-        summaries = [summarize(each, styled.codes) for each in maps]
         called = dict(zip(labels(file.style.references), file.style.references, strict=True))
         names = styled.codes.names
         several = len(names) > 1
+        summaries, maps = [], []
+        for view in views:
+            # Where there is one photograph nobody sees the map, and the figures need few pixels.
+            matched = match_map(scene, styled, view, scene.cameras if several else reduced)
+            summaries.append(summarize(matched, styled.codes))
+            maps += [match_picture(matched, styled.codes)] if several else []
         shown.append(
             Shown(
                 name,
                 styled,
                 pictures,
                 [called[label] for label in names],
-                [match_picture(each, styled.codes) for each in maps] if several else [],
+                maps,
                 [fmean(row["references"][k]["share"] for row in summaries) for k in range(len(names))] if several else [],
                 {
                     "match_score": fmean(row["score"] for row in summaries),

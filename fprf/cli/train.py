@@ -11,10 +11,9 @@ from typing import NamedTuple
 
 from ..errors import UsageError
 from .parsing import load_method, methods, parse
-from .view import check_viewer
 
 DEFAULT_METHOD = "fprf-splats"
-"""Where none is named: the best quality for the time on every capture that was measured (docs/photographs.md)."""
+"""Where none is named: the best quality for the time on every capture that was measured (docs/measurements.md)."""
 VIEW, CHANGED = "--view", "--changed-images"
 
 
@@ -26,6 +25,7 @@ def run(args: list[str]) -> int:
     if args[0].startswith("-"):
         args = [DEFAULT_METHOD, *args]
     config, method = load_method(args[0])
+    # A saved config goes on with its run, wherever that lies now.
     source = Path(args[0])
     if source.suffix == ".json" and config.output is None:
         config = replace(config, output=source.parent)
@@ -44,7 +44,6 @@ def run(args: list[str]) -> int:
     if address is None:
         train(config, method, changed_images=changed)
         return 0
-    check_viewer(VIEW, f", or train without {VIEW}")
     with viewed(config.output or default_output(config, method), address):
         train(config, method, changed_images=changed)
     return 0
@@ -67,6 +66,7 @@ def take_view(args: Sequence[str]) -> tuple[list[str], ViewAddress | None]:
         if name != VIEW:
             rest.append(args[i])
             continue
+        # A bare word behind the flag is its value.
         if not equals and i + 1 < len(args) and not args[i + 1].startswith("-"):
             value = args[next(words)]
         address = ViewAddress()

@@ -1,7 +1,6 @@
 """`fprf view [RUN|CAPTURE.ply]`: a scene in the browser, or the page that makes one; a photograph dropped on it restyles it."""
 
 import contextlib
-import importlib.util
 import os
 import threading
 from collections.abc import Callable, Sequence
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..checks import at_least, between
-from ..errors import CheckpointError, UsageError
+from ..errors import CheckpointError
 from ..splats.config import GaussianSemanticsConfig
 from ..training.quality import QualityConfig
 from .parsing import parse
@@ -19,7 +18,7 @@ from .style_flags import say
 if TYPE_CHECKING:
     from ..viewer.server import ViewerServer
     from ..viewer.session import Viewed
-    from ..viewer.start_page import StartPage
+    from ..viewer.start import Start
 
 _EXIT_TIMEOUT = 15.0
 """Seconds after an interrupt within which all must have ended."""
@@ -68,13 +67,11 @@ def run(args: list[str]) -> int:
     """Serve until interrupted."""
     description = "Look at a run in the browser; without one, make a scene there of photographs, a video or a capture."
     config = parse(ViewConfig(), args, prog="fprf view", description=description, positional=("run",))
-    check_viewer("fprf view")
     from ..viewer.server import ViewerServer, make_access
 
     access = make_access(config.host, config.token)
     with contextlib.ExitStack() as stack:
         server = stack.enter_context(ViewerServer(access, config.port))
-        from ..viewer.live import TrainingFollower
         from ..viewer.scene_files import is_capture
 
         path = config.run
@@ -91,6 +88,8 @@ def run(args: list[str]) -> int:
 
             session = None if config.follow else server.open(load, references, config.pixels)
             if not is_capture(path):
+                from ..viewer.live import TrainingFollower
+
                 stack.enter_context(TrainingFollower(server, path, load, session, config.pixels))
         try:
             threading.Event().wait()
@@ -103,13 +102,6 @@ def run(args: list[str]) -> int:
     return 0
 
 
-def check_viewer(asked: str, otherwise: str = "") -> None:
-    """Raise UsageError where packages of the extra `viewer` are missing."""
-    missing = [name for name in ("viser", "uvicorn", "websockets") if importlib.util.find_spec(name) is None]
-    if missing:
-        raise UsageError(f"{asked}: needs {', '.join(missing)}; install with pip install 'fprf[viewer]'{otherwise}")
-
-
 def _photographs(references: Sequence[Path]) -> Sequence[Path]:
     """The images of folders in the folders' place. Raises DataError where there are none."""
     if not any(path.is_dir() for path in references):  # decoding needs a library that the page does not wait for
@@ -119,18 +111,18 @@ def _photographs(references: Sequence[Path]) -> Sequence[Path]:
     return photographs(references, say)
 
 
-def _start(server: "ViewerServer", config: ViewConfig, references: Sequence[Path]) -> "StartPage":
-    from ..viewer.start_page import StartPage
+def _start(server: "ViewerServer", config: ViewConfig, references: Sequence[Path]) -> "Start":
+    from ..viewer.start import Start
 
     def show(path: Path, name: str) -> None:
         server.open(lambda: _load(config, path, name, server.notify), references, config.pixels)
 
     def leave() -> None:
-        server.show_start(page.routes)
+        server.show_start(start)
 
-    page = StartPage(config.output, show, leave)
+    start = Start(config.output, show, leave, server.post)
     leave()
-    return page
+    return start
 
 
 def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[str], None]) -> "Viewed":
@@ -142,7 +134,7 @@ def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[st
         from ..training.loading import open_run
 
         run = open_run(path, config.device, config)
-        viewed = view_of_run(run.scene, run.run, run.known)
+        viewed = view_of_run(run.scene, run.run, run.known, run.step)
         return viewed if name is None else replace(viewed, name=name)
     from ..plugins.stylizers.config import RegionToneConfig
     from ..splats.config import LookConfig

@@ -15,13 +15,13 @@ import os
 import re
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import IO, TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
@@ -108,7 +108,7 @@ def header_of(file: IO[bytes], name: object) -> ImageHeader:
     width, height = image.size
     if isinstance(image, TiffImageFile):  # Pillow gives the size that they have upright
         width, height = image.tag_v2[Tag.ImageWidth], image.tag_v2[Tag.ImageLength]
-    elif kind == "AVIF" and _orientation(image) > 4:
+    elif kind == "AVIF" and exif_orientation(image) > 4:
         width, height = height, width
     return ImageHeader(width, height, image.has_transparency_data, kind)
 
@@ -188,19 +188,22 @@ def load_mask(path: Path, size: tuple[int, int] | None = None, *, upright: bool 
 
 
 def useless_masks(scene: "Scene") -> str:
-    """Describe masks that leave no pixel of any view, or every pixel of all; empty for others and without masks.
-
-    Reads masks only until one, or two of them, tell that they are of use.
-    """
-    used: set[bool] = set()
-    for path in scene.masks:
-        used |= {True} if path is None else set(np.unique(load_mask(path)).tolist())
-        if len(used) == 2:
-            return ""
-    count = f"the masks of all {len(scene.masks)} views"
-    if used == {False}:
+    """Describe masks that leave no pixel of any view, or every pixel of all; empty for others and without masks."""
+    shares = (1.0 if path is None else float(load_mask(path).mean()) for path in scene.masks)
+    colour, count = uniform_colour(shares), f"the masks of all {len(scene.masks)} views"
+    if colour == "black":
         return f"{count} are black: no pixel is used; paint white, or opaque, what is to be used"
-    return f"{count} are white: every pixel is used; paint black, or transparent, what is to be left out" if used else ""
+    return f"{count} are white: every pixel is used; paint black, or transparent, what is to be left out" if colour else ""
+
+
+def uniform_colour(shares: Iterable[float]) -> Literal["", "black", "white"]:
+    """`black` or `white` where the white shares of masks are all 0, or all 1; empty for others, which end the reading early."""
+    first = None
+    for share in shares:
+        first = share if first is None else first
+        if share not in (0, 1) or share != first:
+            return ""
+    return "" if first is None else "white" if first else "black"
 
 
 def load_images(scene: "Scene", background: Sequence[float] | None = None, views: Sequence[int] | None = None) -> list[Image]:
@@ -317,14 +320,14 @@ def _load(kind: str, image: ImageFile, upright: bool) -> int:
     """Decode an image; the EXIF orientation by which its pixels are still to be turned."""
     if kind == "TIFF":
         # Pillow turns TIFFs while it loads them: they are turned back. 6 and 8 are each other's inverse, the rest their own.
-        stored = _orientation(image)
+        stored = exif_orientation(image)
         image.load()
         return 1 if upright else {6: 8, 8: 6}.get(stored, stored)
     image.load()
-    return _orientation(image) if kind == "AVIF" or (upright and kind != "HEIC") else 1
+    return exif_orientation(image) if kind == "AVIF" or (upright and kind != "HEIC") else 1
 
 
-def _orientation(image: ImageFile) -> int:
+def exif_orientation(image: ImageFile) -> int:
     """The EXIF orientation, 1 to 8; 1 where the file says none, or nothing that can be understood."""
     try:
         with silent():
@@ -385,7 +388,7 @@ def _decoding(kind: str, name: object, room: int = 0) -> Iterator[None]:
         raise
     except ImportError as error:
         raise DataError(
-            f"{name}: is HEIC, which needs the package pillow-heif: pip install 'fprf[heic]', or convert the image to JPEG"
+            f"{name}: is HEIC, which needs the package pillow-heif: pip install pillow-heif, or convert the image to JPEG"
         ) from error
     except Exception as error:
         np.empty(room, np.uint8)  # raises MemoryError where that is what the decoder lacked: few of them say so

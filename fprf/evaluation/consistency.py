@@ -8,14 +8,6 @@ nothing): 0 = perfect agreement, sqrt(2) = unrelated colours.
 
     RMSE = sqrt( Σ_pairs Σ_valid |I_a(p) - I_b(p')|² / (3 Σ_pairs #valid) ),  pairs (t, t + 1) short, (t, t + 7) long
 
-`steadiness` is what a style adds to the inconsistency of the unstylised render, plus the sharpness that it loses:
-
-    score = mean over short and long of max(0, error(stylised) - error(plain))  +  max(0, 1 - sharpness)
-
-Only places that the unstylised render itself shows alike count. Colours are compared as means over windows, since a texture
-finer than a pixel differs in every frame. Sharpness is the steepest change of colour in a neighbourhood
-over the range of colours there.
-
 `published` is consistency as other papers report it. A blurred or dull film scores well there.
 
     rmse   = mean over t of sqrt( mean over valid pixels and channels of (I_t - W(I_{t-k}))² )     Stylos, AnyStyle, StyleRF
@@ -28,12 +20,10 @@ from collections.abc import Sequence
 from typing import Annotated, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from ..errors import DataError, NumericsError
-from ..rendering.cameras import Cameras, grid_rays, project
+from ..rendering.cameras import Cameras, grid_rays, look_up, project
 from .lpips import lpips
 
 SHORT, LONG = 1, 7
@@ -75,12 +65,12 @@ def warp(
     size = cameras.size[b].to(there)
     # Half a pixel from the border there is no neighbour to interpolate with. The slack is rounding.
     inside = ((there >= 0.5 - 1e-6) & (there <= size - 0.5 + 1e-6)).all(dim=-1) & (ahead > 0)
-    place = torch.where(inside[:, None], 2 * there / size - 1, torch.zeros_like(there))
+    pixel = torch.where(inside[:, None], there, size / 2)
     distance = (points - cameras.pose[b, :, 3]).norm(dim=-1)
-    met = _at(torch.where(torch.isfinite(depth_b), depth_b, 0.0).to(place)[..., None], place)[:, 0]
+    met = look_up(torch.where(torch.isfinite(depth_b), depth_b, 0.0)[..., None], pixel)[:, 0]
     same = (met - distance).abs() <= _TOLERANCE * distance
     valid = (solid & inside & same).reshape(depth_a.shape)
-    colour = _at(image_b.to(place), place).reshape(*depth_a.shape, 3).to(image_b)
+    colour = look_up(image_b, pixel).reshape(*depth_a.shape, 3).to(image_b)
     return Warped(torch.where(valid[..., None], colour, torch.zeros_like(colour)), valid)
 
 
@@ -141,125 +131,11 @@ class WarpError:
         }
 
 
-def _at(image: Annotated[Tensor, "H W C"], place: Annotated[Tensor, "N 2"]) -> Annotated[Tensor, "N C"]:
-    """Bilinear values; `place` runs from -1 to 1 between the outer edges of the image."""
-    sampled = grid_sample(
-        image.permute(2, 0, 1)[None], place[None, None], mode="bilinear", padding_mode="border", align_corners=False
-    )
-    return sampled[0, :, 0].T
-
-
 def _sized(shape: Sequence[int], cameras: Cameras, view: int, what: str) -> None:
     width, height = (int(side) for side in cameras.size[view])
     if tuple(shape) != (height, width):
         size = "x".join(str(side) for side in reversed(shape))
         raise DataError(f"view {view}: the {what} is {size}, its camera {width}x{height}; render at the camera's size")
-
-
-_ALIKE = 0.1
-"""Distance of sRGB colours up to which the unstylised render shows a place alike in two frames."""
-_WINDOW = 7
-"""Pixels of a side, at least half of which must count."""
-_EDGE = 0.5
-"""Of a frame's contrast: neighbourhoods with a smaller range of colours show no edge."""
-
-Frames = Sequence[Annotated[Tensor, "H W 3"]]
-
-
-class Steadiness(NamedTuple):
-    """Errors are relative to contrast; None where nothing could be compared."""
-
-    score: float | None
-    short: float | None
-    """Error of the stylised frames between neighbours."""
-    long: float | None
-    """Seven frames apart."""
-    plain_short: float | None
-    plain_long: float | None
-    sharpness: float | None
-    """Relative to the unstylised frames; 1 = as sharp."""
-    valid_share: float
-    """Share of the pixels that counted, between neighbours."""
-
-
-def steadiness(plain: Frames, styled: Frames, depths: Sequence[Annotated[Tensor, "H W"]], cameras: Cameras) -> Steadiness:
-    """Of a path. Depths are world distances along the unit ray (0 or infinite = nothing there).
-
-    Raises DataError where the numbers of frames differ, NumericsError for colours that are not finite.
-    """
-    if not len(plain) == len(styled) == len(depths) == len(cameras):
-        raise DataError(
-            f"steadiness: {len(plain)} plain and {len(styled)} stylised frames, {len(depths)} depths, {len(cameras)} cameras; "
-            "one of each per frame is needed"
-        )
-    for frame in (*plain, *styled):
-        if not bool(frame.isfinite().all()):
-            raise NumericsError("steadiness: a frame holds colours that are not finite; nothing can be judged by it")
-    near, far = (_errors(plain, styled, depths, cameras, gap) for gap in (SHORT, LONG))
-    added = [max(0.0, each.styled - each.plain) for each in (near, far) if each.styled is not None and each.plain is not None]
-    sharp = sharpness(plain, styled)
-    lost = 0.0 if sharp is None else max(0.0, 1 - sharp)
-    score = math.fsum(added) / len(added) + lost if added else None
-    return Steadiness(score, near.styled, far.styled, near.plain, far.plain, sharp, near.share)
-
-
-def sharpness(plain: Frames, styled: Frames) -> float | None:
-    """Steepness of the stylised frames' edges over that of the plain ones' (the median over places where both have an edge)."""
-    ratios = []
-    for before, after in zip(plain, styled, strict=True):
-        (steep, edge), (steep_after, edge_after) = _steepness(before), _steepness(after)
-        both = edge & edge_after
-        ratios.append((steep_after[both] / steep[both]).double())
-    all_ratios = torch.cat(ratios) if ratios else torch.empty(0)
-    return float(all_ratios.median()) if len(all_ratios) else None
-
-
-class _Errors(NamedTuple):
-    plain: float | None
-    styled: float | None
-    share: float
-
-
-def _errors(plain: Frames, styled: Frames, depths: Sequence[Tensor], cameras: Cameras, gap: int) -> _Errors:
-    squared, spread = [0.0, 0.0], [0.0, 0.0]
-    counted = pixels = 0
-    for a, b in zip(range(len(plain)), range(gap, len(plain)), strict=False):
-        there, valid = warp(plain[b], depths[a], depths[b], cameras, a, b)
-        valid = valid & ((plain[a] - there).norm(dim=-1) <= _ALIKE)
-        # Share of the window around each pixel that counts; beyond the frame nothing does.
-        within = F.avg_pool2d(valid[None, None].double(), _WINDOW, 1, _WINDOW // 2)[0, 0]
-        full = valid & (within >= 0.5)
-        counted, pixels = counted + int(full.sum()), pixels + full.numel()
-        moved = warp(styled[b], depths[a], depths[b], cameras, a, b).image
-        for i, (here, warped) in enumerate(((plain[a], there), (styled[a], moved))):
-            first, second = (_window_mean(x, valid, within)[full].double() for x in (here, warped))
-            squared[i] += float((first - second).square().sum())
-            spread[i] += float((first - first.mean(0)).square().sum()) if len(first) else 0.0
-    errors = [math.sqrt(s / v) if v > 0 else None for s, v in zip(squared, spread, strict=True)]
-    return _Errors(errors[0], errors[1], counted / pixels if pixels else 0.0)
-
-
-def _window_mean(
-    image: Annotated[Tensor, "H W 3"], valid: Annotated[Tensor, "H W"], within: Annotated[Tensor, "H W"]
-) -> Annotated[Tensor, "H W 3"]:
-    kept = torch.where(valid[..., None], image.double(), 0.0).permute(2, 0, 1)[None]
-    return F.avg_pool2d(kept, _WINDOW, 1, _WINDOW // 2)[0].permute(1, 2, 0) / within[..., None].clamp_min(1e-9)
-
-
-def _steepness(image: Annotated[Tensor, "H W 3"]) -> tuple[Annotated[Tensor, "H W"], Annotated[Tensor, "H W"]]:
-    """Steepest change between neighbours over the range of colours, in the window of each pixel; and where there is an edge."""
-    rows = image.double().permute(2, 0, 1)[None]
-    reach = (_highest(rows) + _highest(-rows)).norm(dim=1)[0]
-    across = F.pad((rows[..., 1:] - rows[..., :-1]).norm(dim=1), (0, 1))
-    down = F.pad((rows[..., 1:, :] - rows[..., :-1, :]).norm(dim=1), (0, 0, 0, 1))
-    steep = _highest(torch.maximum(across, down)[None])[0, 0]
-    contrast = (image.double() - image.double().mean((0, 1))).square().sum(-1).mean().sqrt()
-    edge = reach > _EDGE * contrast.clamp_min(1e-6)
-    return steep / reach.clamp_min(1e-9), edge
-
-
-def _highest(maps: Annotated[Tensor, "1 C H W"]) -> Annotated[Tensor, "1 C H W"]:
-    return F.max_pool2d(maps, _WINDOW, 1, _WINDOW // 2)
 
 
 def published(

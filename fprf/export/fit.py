@@ -1,21 +1,22 @@
-"""3D Gaussians fitted to a field: trained against the field's own renders, from points on its surfaces.
+"""3D Gaussians fitted to a scene of any kind: trained against its own renders, from points on its surfaces.
 
 Geometry is learnt once, from the first look; a further look learns colours alone, so that all of its files hold the same
 Gaussians in the same order.
 """
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from ..datamanagers.images import Image
-from ..datamanagers.scene import Scene
+from ..datamanagers.scene import Scene as ParsedScene
+from ..interfaces import Scene
 from ..io.images import to_uint8
-from ..rendering.cameras import Cameras
+from ..rendering.cameras import Cameras, grid_rays
 from ..splats.config import GaussiansConfig
 from ..splats.gaussians import Gaussians
 from ..splats.initial import Points
@@ -23,43 +24,63 @@ from ..splats.learner import GaussianLearner
 from ..splats.photographs import make_levels
 from ..splats.training import find_near, reach_of
 from ..style.look import Restyle
-from ..training.loading import Trained
+from ..training.driver import Report, Schedule, learn
+from .mesh import Maps
 
 _ALIKE = 0.7
 """Cosine between the axes of views that have a view between them."""
 _COLOURS = 0.3
 """Time for the colours of a further look, as a share of that for the geometry."""
+_BEGIN = 0.7
+"""Gaussians that are there at the start, as a share of the most."""
+_SKY = 3.0
+"""Distance of points in the sky, in distances of the outermost of all others from the middle of the views."""
+
+
+def seen_points(maps: Maps, most: int) -> Points:
+    """Places and colours of random pixels of views, at most so many; where a view sees nothing, of a dome of sky."""
+    place, colour, middle = [], [], maps.cameras.pose[:, :, 3].mean(0)
+    for view, depth in enumerate(maps.depth):
+        origin, direction = grid_rays(maps.cameras, view)
+        place.append(torch.cat([origin + direction * depth.view(-1, 1), direction], 1))
+        colour.append(maps.rgb[view].view(-1, 3))
+    every = torch.randperm(sum(map(len, place)), generator=torch.Generator().manual_seed(0))[:most]
+    (at, direction), shade = torch.split(torch.cat(place)[every], 3, 1), torch.cat(colour)[every]
+    solid = at.isfinite().all(1)
+    far = _SKY * float((at[solid] - middle).norm(dim=1).max()) if bool(solid.any()) else 1.0
+    return Points(torch.where(solid[:, None], at, middle + far * direction).numpy(), shade.float().numpy())
 
 
 def fit_gaussians(
-    trained: Trained,
-    points: Points,
-    views: Sequence[int],
+    scene: Scene,
+    views: Cameras,
+    maps: Maps,
     looks: Sequence[Restyle | None],
     *,
     minutes: float,
     cap: int,
+    background: tuple[float, float, float] | None = None,
     report: Callable[[int, int, str], None] = lambda done, total, what: None,
 ) -> Iterator[Gaussians]:
     """Gaussians of each look, trained for `minutes` after rendering.
 
-    What is rendered are `views` and as many between them. `points` are where Gaussians begin; at most 0.7 `cap` of them are
-    taken, and there are at most `cap` Gaussians in the end.
+    What is rendered are `views` and as many between them. Gaussians begin where `maps` of the views have surfaces; there are at
+    most `cap` in the end.
     """
-    cameras, facts = _with_midpoints(trained.known.cameras.select(torch.tensor(views))), trained.known.facts
-    count, every = len(cameras), torch.arange(len(cameras))
-    paths = (Path("field"),) * count
-    scene = Scene(name="field", paths=paths, cameras=cameras, train=every, test=every[:0])
-    draw = np.random.default_rng(trained.config.seed)
-    some = np.sort(draw.permutation(len(points.position))[: max(1, round(0.7 * cap))])
-    points = Points(points.position[some], points.colour[some])
-    near = find_near(scene, points)
-    config = GaussiansConfig(cap=cap, seed=trained.config.seed, background=facts.background or (0.0, 0.0, 0.0))
-    reach = reach_of(scene)
+    # The scene is photographed from the views and between them, and learnt like any other.
+    cameras = _with_midpoints(views)
+    every = torch.arange(len(cameras))
+    paths = (Path("scene"),) * len(cameras)
+    parsed = ParsedScene(name="scene", paths=paths, cameras=cameras, train=every, test=every[:0])
+    draw, points = np.random.default_rng(0), seen_points(maps, max(1, round(_BEGIN * cap)))
+    near = find_near(parsed, points)
+    config = GaussiansConfig(cap=cap, background=background or (0.0, 0.0, 0.0))
+    reach = reach_of(parsed)
     learner = None
     for number, look in enumerate(looks):
-        images = _renders(trained, cameras, look, report)
-        levels = make_levels(scene, images, {}, near)
+        images = _renders(scene, cameras, look, report)
+        levels = make_levels(parsed, images, {}, near)
+        # The first look decides the geometry; in further ones the same Gaussians learn their colours at full size.
         if learner is None:
             learner = GaussianLearner(config, levels, reach, cap)
             learner.begin_at(points, draw)
@@ -69,19 +90,17 @@ def fit_gaussians(
             learner = GaussianLearner(replace(config, coarse=0.0), levels, reach, cap, only="colours")
             learner.start_from(before.gaussians())
             seconds = 60 * minutes * _COLOURS
-        start, step, share = time.perf_counter(), 0, 0.0
-        while share < 1:
-            learner.step(step, share)
-            step, share = step + 1, (time.perf_counter() - start) / seconds
-            if step % 50 == 0:
-                report(round(100 * min(share, 1)), 100, "fitting Gaussians" if number == 0 else "fitting colours")
+        what = "fitting Gaussians" if number == 0 else "fitting colours"
+        learn(learner, None, Schedule(None, seconds / 60), partial(_tell, report, what))
         yield learner.gaussians()
 
 
-def _renders(
-    trained: Trained, cameras: Cameras, look: Restyle | None, report: Callable[[int, int, str], None]
-) -> dict[int, Image]:
-    shown, images = trained.restyled(look), {}
+def _tell(report: Callable[[int, int, str], None], what: str, event: Report) -> None:
+    report(round(100 * event.share), 100, what)
+
+
+def _renders(scene: Scene, cameras: Cameras, look: Restyle | None, report: Callable[[int, int, str], None]) -> dict[int, Image]:
+    shown, images = scene.restyled(look), {}
     for view in range(len(cameras)):
         report(view, len(cameras), "rendering views")
         images[view] = to_uint8(shown.render(cameras, view).rgb)

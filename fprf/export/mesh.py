@@ -1,194 +1,80 @@
-"""Triangles of a scene's near surfaces: depth maps to a truncated signed distance, to surface nets, without small loose pieces.
+"""Triangles of a scene's near surfaces: renders of its views, fused to a truncated signed distance, whose zero is meshed.
 
-Signed distance (Curless and Levoy 1996), on a sparse lattice, positive towards the cameras: a lattice point's gap along the
-ray times the cosine at which the ray meets the surface, averaged over views. Only the surroundings of points that views
-agree on have lattice points.
+Signed distance (Curless and Levoy 1996), on a sparse lattice, positive towards the cameras: of a lattice point the depth that a
+view has at its pixel, less its distance, times the cosine at which the ray meets the surface; averaged over views.
 
-Surface nets (Gibson 1998), letters: M lattice points with a value. A cell is the cube of 8 neighbouring lattice points; one
-whose corners have both signs gets a vertex, the mean of the places where its edges cross zero. Each lattice edge that crosses
-zero gives a quad of the 4 cells round it, if all of them are there.
+Surface nets (Gibson 1998): a cell is the cube of 8 neighbouring lattice points; one whose corners have both signs has a vertex,
+the mean of the places where its edges cross zero. Each lattice edge that crosses zero gives a quad of the 4 cells round it, if
+all of them are there.
+
+Letters: M lattice points, P points, N vertices, F triangles. World axes and units about the run's origin, float64. Depths are
+distances along the unit ray through a pixel's centre.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import DataError
+from ..interfaces import Scene
 from ..io.atomic import write_bytes
 from ..io.images import srgb_to_linear
+from ..rendering.cameras import Cameras, grid_rays, look_up, normals, project
 from ..rendering.local_frame import added_and_beside, write_offset
-from ..splats.files.ply import ply_file
+from ..rendering.space import Space
+from ..splats.files.ply import in_world, ply_file
 from ..types import Origin
-from .depth_maps import DepthMaps, at_nearest, cosine_map, depth_gaps
-from .point_cloud import SPAN, Cloud, cells, keys, vertex_table
 
+Report = Callable[[int, int], None]
+
+_SOLID = 0.5
+"""Pixels of a smaller opacity see nothing."""
+_TORN = 1.25
+"""Neighbouring pixels whose depths differ by more than this factor lie on different surfaces: far ground falls away fast."""
+_NEAR = 6.0
+"""Pixels more than so many times as wide as the median one stay out: far surfaces are known too coarsely for a mesh."""
+_FINE = 2.0
+"""Edge of the lattice in widths of the median pixel on the surface, unless the user says otherwise."""
+_BLOCK = 4
+"""Lattice points come in cubes of so many a side."""
+_AROUND = 1.5
+"""Edges about what is seen in which there are lattice points."""
+_AGREE = 2
+"""Views that must see something in a block, and say something of a lattice point."""
+_MOST = 8_000_000
+"""Lattice points, at most."""
+_SPAN = 1 << 18
+"""Lattice points to either side of the origin that keys tell apart."""
 _TRUNCATION = 3.0
 """Distances are cut at so many edges."""
-_BLOCK = 4
-"""Lattice points come in cubes of so many a side: those that hold a point of the cloud, and their neighbours."""
 _STEEP = 0.1
 """Smallest cosine that distances are multiplied with: below, a depth map knows little of the surface's place."""
 _CLEAR = 0.3
 """Weight of a view that looks past a lattice point, against one that sees a surface there head-on."""
+_LOOSE = 2e-3
+"""Pieces with a smaller share of all triangles are dropped."""
 _CHUNK = 1 << 18
 
 
-class SignedDistance(NamedTuple):
-    """M points of a lattice, and how far they are outside of the surface."""
+class Maps(NamedTuple):
+    """Depth maps and colours of V views."""
 
-    cell: Annotated[Tensor, "M 3"]
-    """int64; the place in the world is origin + edge * cell."""
-    value: Annotated[Tensor, "M"]
-    """In truncation distances, [-1, 1], float32."""
-    origin: Annotated[Tensor, "3"]
-    """float64, local."""
-    edge: float
-
-
-def lattice_near(cloud: Cloud, edge: float, most: int) -> tuple[Annotated[Tensor, "M 3"], Annotated[Tensor, "3"], float]:
-    """Lattice points near a cloud, the lattice's origin, and its edge: doubled until there are at most `most` points."""
-    origin = cloud.point.mean(0)
-    while True:
-        block = torch.unique(cells(cloud.point - origin, edge * _BLOCK), dim=0)
-        shifts = torch.cartesian_prod(*(torch.arange(-1, 2),) * 3)
-        block = torch.unique((block[:, None] + shifts).view(-1, 3), dim=0)
-        if len(block) * _BLOCK**3 <= most:
-            break
-        edge *= 2
-    inner = torch.cartesian_prod(*(torch.arange(_BLOCK),) * 3)
-    cell = (block[:, None] * _BLOCK + inner).view(-1, 3)
-    return cell[cell.abs().amax(1) < SPAN - 2], origin, edge
-
-
-def integrate(
-    maps: DepthMaps,
-    cell: Annotated[Tensor, "M 3"],
-    origin: Annotated[Tensor, "3"],
-    edge: float,
-    report: Callable[[int, int], None] = lambda done, total: None,
-) -> SignedDistance:
-    """The signed distance at lattice points that two views or more say something of."""
-    far = _TRUNCATION * edge
-    total, weight = torch.zeros(len(cell)), torch.zeros(len(cell))
-    count = torch.zeros(len(cell), dtype=torch.int16)
-    for view in range(len(maps.depth)):
-        report(view, len(maps.depth))
-        cosine = cosine_map(maps, view)
-        for part in torch.split(torch.arange(len(cell)), _CHUNK):
-            point = origin + edge * cell[part].double()
-            gap, distance = depth_gaps(maps, view, point)
-            close = gap.abs() < far / _STEEP
-            slope = torch.full_like(gap, _CLEAR)
-            slope[close] = at_nearest(maps, view, cosine, point[close]).clamp_min(_STEEP)
-            value = (gap * slope / far).clamp(max=1)
-            # Far in front nobody asks how the surface behind lies.
-            value = torch.where(close, value, torch.where(gap > 0, 1.0, torch.nan))
-            seen = value >= -1
-            here, one = part[seen], (slope / distance.square())[seen].float()
-            total[here] += one * value[seen].float()
-            weight[here] += one
-            count[here] += 1
-    report(len(maps.depth), len(maps.depth))
-    known = count >= 2
-    return SignedDistance(cell[known], total[known] / weight[known], origin, edge)
-
-
-_CORNERS = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
-_EDGES = [(a, b) for a in range(8) for b in range(a) if bin(a ^ b).count("1") == 1]
-
-
-def surface_nets(
-    cell: Annotated[Tensor, "M 3"], value: Annotated[Tensor, "M"]
-) -> tuple[Annotated[Tensor, "N 3"], Annotated[Tensor, "F 3"]]:
-    """Vertices in lattice coordinates (float64) and triangles (int64), counter-clockwise seen from outside.
-
-    Lattice points are integers within `voxels.SPAN`, each at most once. What borders on a point without a value is open.
-    """
-    key, order = keys(cell).sort()
-    cell, value = cell[order], value[order].double()
-    inside = value < 0
-    mixed = torch.cat([_mixed(key, inside, part) for part in torch.split(cell, _CHUNK)])
-    vertex = torch.full((len(cell),), -1, dtype=torch.int64)
-    vertex[mixed] = torch.arange(int(mixed.sum()))
-    at = cell[mixed].double() + _crossings(value[_corners(key, cell[mixed])])
-    faces = [_quads(cell, key, inside, vertex, at, axis) for axis in range(3)]
-    return at, torch.cat(faces)
-
-
-def _corners(key: Annotated[Tensor, "M"], cell: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 8"]:
-    """Index in the sorted keys of the 8 lattice points of each cell; -1 = absent."""
-    return torch.stack([_find(key, keys(cell + torch.tensor(shift))) for shift in _CORNERS], 1)
-
-
-def _mixed(
-    key: Annotated[Tensor, "M"], inside: Annotated[Tensor, "M"], cell: Annotated[Tensor, "N 3"]
-) -> Annotated[Tensor, "N"]:
-    """Mask of the cells with all corners, and both signs among them."""
-    corner = _corners(key, cell)
-    signs = inside[corner.clamp_min(0)]
-    return (corner >= 0).all(1) & signs.any(1) & ~signs.all(1)
-
-
-def _find(key: Annotated[Tensor, "M"], wanted: Annotated[Tensor, "N"]) -> Annotated[Tensor, "N"]:
-    """Index in the sorted keys of the wanted ones; -1 = absent."""
-    if len(key) == 0:
-        return torch.full_like(wanted, -1)
-    index = torch.searchsorted(key, wanted).clamp(max=len(key) - 1)
-    return torch.where(key[index] == wanted, index, -1)
-
-
-def _crossings(value: Annotated[Tensor, "N 8"]) -> Annotated[Tensor, "N 3"]:
-    """Mean of the zero crossings on a cell's 12 edges, from its lowest corner."""
-    place = torch.tensor(_CORNERS, dtype=value.dtype)
-    total, count = value.new_zeros(len(value), 3), value.new_zeros(len(value), 1)
-    for a, b in _EDGES:
-        crosses = ((value[:, a] < 0) != (value[:, b] < 0))[:, None]
-        part = (value[:, a] / torch.where(crosses[:, 0], value[:, a] - value[:, b], 1.0))[:, None]
-        total += torch.where(crosses, place[a] + part * (place[b] - place[a]), 0.0)
-        count += crosses
-    return total / count.clamp_min(1)
-
-
-def _quads(cell: Tensor, key: Tensor, inside: Tensor, vertex: Tensor, at: Tensor, axis: int) -> Annotated[Tensor, "F 3"]:
-    """Two triangles for each lattice edge along an axis that crosses zero, split along the shorter diagonal."""
-    step = torch.zeros(3, dtype=torch.int64)
-    step[axis] = 1
-    b, c = step.roll(1), step.roll(2)
-    ahead = _find(key, keys(cell + step))
-    crosses = (ahead >= 0) & (inside != inside[ahead.clamp_min(0)])
-    here = cell[crosses]
-    round_it = torch.stack([_find(key, keys(here - shift)) for shift in (b + c, c, torch.zeros_like(b), b)], 1)
-    corner = torch.where(round_it >= 0, vertex[round_it.clamp_min(0)], -1)
-    whole = (corner >= 0).all(1)
-    corner, outwards = corner[whole], inside[crosses][whole]
-    # Round the edge the four cells run counter-clockwise seen from its far end, which is outside if its start is inside.
-    corner = torch.where(outwards[:, None], corner, corner.flip(1))
-    place = at[corner]
-    first = torch.linalg.vector_norm(place[:, 0] - place[:, 2], dim=-1)
-    second = torch.linalg.vector_norm(place[:, 1] - place[:, 3], dim=-1)
-    corner = torch.where((first <= second)[:, None], corner, corner.roll(-1, 1))
-    return torch.cat([corner[:, [0, 1, 2]], corner[:, [0, 2, 3]]])
-
-
-_NEAR = 4.0
-"""Points of voxels more than so many times the finest stay out: far surfaces are known too coarsely for a mesh."""
-_FINE = 2.0
-"""Edge of the lattice, in edges of the finest voxel, unless the user says otherwise."""
-_MOST = 8_000_000
-"""Lattice points, at most."""
-_LOOSE = 2e-3
-"""Pieces with a smaller share of all triangles are dropped."""
+    cameras: Cameras
+    depth: list[Annotated[Tensor, "H W"]]
+    """float32; infinite where nothing solid is within reach."""
+    rgb: list[Annotated[Tensor, "H W 3"]]
 
 
 class Mesh(NamedTuple):
     """N vertices and F triangles, counter-clockwise seen from outside."""
 
     point: Annotated[Tensor, "N 3"]
-    """float64, local."""
     face: Annotated[Tensor, "F 3"]
     """int64."""
     normal: Annotated[Tensor, "N 3"]
@@ -197,29 +83,206 @@ class Mesh(NamedTuple):
     """Of the lattice, world units."""
 
 
-def build_mesh(
-    maps: DepthMaps, cloud: Cloud, *, edge: float | None = None, report: Callable[[int, int], None] = lambda done, total: None
-) -> Mesh:
-    """The mesh of a cloud's near surfaces. Raises DataError where no surface comes out."""
-    finest = float(cloud.edge.amin())
-    near = Cloud(*(column[cloud.edge <= _NEAR * finest] for column in cloud))
-    cell, origin, width = lattice_near(near, _FINE * finest if edge is None else edge, _MOST)
-    lattice = integrate(maps, cell, origin, width, report)
-    at, face = surface_nets(lattice.cell, lattice.value)
-    piece = components(len(at), face)
+def default_reach(space: Space) -> float:
+    """Distance up to which surfaces are looked for, in world units: a bounded box is looked at as a whole."""
+    return math.inf if space.kind == "box" else 50 * space.near if space.kind == "ndc" else 20 / space.scale
+
+
+def render_maps(scene: Scene, cameras: Cameras, *, side: int, reach: float, report: Report) -> Maps:
+    """Render views, reduced to `side` pixels on the longest; what is farther than `reach` is sky."""
+    size = cameras.size.double()
+    small = cameras.resized((size / (size.amax(1, keepdim=True) / side).clamp_min(1)).round().clamp_min(1).to(cameras.size))
+    maps = Maps(small, [], [])
+    for view in range(len(small)):
+        report(view, len(small))
+        shown = scene.render(small, view, resolution=1.0)
+        seen = (shown.opacity > _SOLID) & (shown.depth > 0) & (shown.depth < reach)
+        maps.depth.append(torch.where(seen, shown.depth, torch.inf))
+        maps.rgb.append(shown.rgb)
+    report(len(small), len(small))
+    return maps
+
+
+def build_mesh(maps: Maps, *, edge: float | None = None, report: Report = lambda done, total: None) -> Mesh:
+    """The mesh of near surfaces. Raises DataError where no surface comes out."""
+    cell, origin, width = _lattice(maps, edge)
+    known, value = _signed_distance(maps, cell, origin, width, report)
+    at, face = surface_nets(cell[known], value)
+    # Small pieces float in the air, or stand for nothing that anyone looks at.
+    piece = _components(len(at), face)
     size = torch.bincount(piece[face[:, 0]], minlength=len(at))
     face = face[size[piece[face[:, 0]]] >= max(8, _LOOSE * len(face))]
-    if len(face) == 0:
-        raise DataError("export: no surface for a mesh; raise --mesh-edge, or export ply or splat instead")
+    if not len(face):
+        raise DataError("export: no surface for a mesh; train longer, raise --mesh-edge, or export ply or splat instead")
     used, corner = torch.unique(face, return_inverse=True)
     point, face = origin + width * at[used], corner.view(-1, 3)
-    return Mesh(point, face, vertex_normals(point - origin, face), width)
+    # Normals are sums of the triangles', which the cross product weighs by area.
+    a, b, c = (point[face[:, k]] - origin for k in range(3))
+    normal = torch.zeros_like(point)
+    for k in range(3):
+        normal.index_add_(0, face[:, k], torch.linalg.cross(b - a, c - a))
+    return Mesh(point, face, F.normalize(normal, dim=-1).float(), width)
 
 
-def components(count: int, face: Annotated[Tensor, "F 3"]) -> Annotated[Tensor, "count"]:
+def vertex_colours(maps: Maps, mesh: Mesh) -> Annotated[Tensor, "N 3"]:
+    """sRGB in [0, 1]: means over the views that see a vertex, those most that have the most pixels on it.
+
+    One view alone would give neighbours the exposures of different pictures. Where no view sees a vertex, those count that miss
+    it least.
+    """
+    total, share = torch.zeros(len(mesh.point), 3, dtype=torch.float64), torch.zeros(len(mesh.point), 1, dtype=torch.float64)
+    for view, rgb in enumerate(maps.rgb):
+        gap, distance, pixel = _gaps(maps, view, mesh.point)
+        towards = (maps.cameras.pose[view, :, 3] - mesh.point) / distance[:, None]
+        pixels = (towards * mesh.normal).sum(-1).clamp_min(1e-3) / distance.square()
+        missed = (gap.abs() / (2 * mesh.edge)).clamp_min(1).nan_to_num(1e6, 1e6)
+        weight = (pixels / missed**6).square()[:, None]
+        total += weight * look_up(rgb, pixel.nan_to_num(0.0))
+        share += weight
+    return (total / share.clamp_min(1e-300)).float().clamp(0, 1)
+
+
+def _gaps(maps: Maps, view: int, point: Annotated[Tensor, "P 3"]) -> tuple[Tensor, Tensor, Annotated[Tensor, "P 2"]]:
+    """How far points lie before the surface that a view sees there [P], their distance [P], and their pixels.
+
+    Infinite where the view sees nothing, NaN outside of it; negative where something hides the point.
+    """
+    pixel, _ = project(maps.cameras, torch.full((len(point),), view), point)
+    distance = torch.linalg.vector_norm(point - maps.cameras.pose[view, :, 3], dim=-1)
+    inside = ((pixel >= 0) & (pixel < maps.cameras.size[view])).all(-1)
+    x, y = pixel[inside].long().unbind(-1)
+    nearest = maps.depth[view].double()[y, x]
+    # 1 / depth of a plane is linear in pixels; where the surface is torn the nearest pixel's depth counts.
+    between = 1 / look_up(1 / maps.depth[view].double()[..., None], pixel[inside])[:, 0]
+    whole = (between < _TORN * nearest) & (nearest < _TORN * between)
+    gap = torch.full_like(distance, torch.nan)
+    gap[inside] = torch.where(whole, between, nearest) - distance[inside]
+    return gap, distance, pixel
+
+
+def _lattice(maps: Maps, edge: float | None) -> tuple[Annotated[Tensor, "M 3"], Annotated[Tensor, "3"], float]:
+    """Lattice points near what is seen, the place of (0, 0, 0), and the edge: doubled until they are few enough."""
+    origin, seen = maps.cameras.pose[:, :, 3].mean(0), []
+    width = torch.cat([(depth / maps.cameras.focal[view].mean())[depth.isfinite()] for view, depth in enumerate(maps.depth)])
+    if not len(width):
+        raise DataError("export: no view sees a surface within reach; raise --reach, or train longer (see `fprf eval`)")
+    finest = float(width.median())
+    for view, depth in enumerate(maps.depth):
+        centre, direction = grid_rays(maps.cameras, view)
+        near = (depth / maps.cameras.focal[view].mean() <= _NEAR * finest).view(-1)
+        seen.append((centre + direction * depth.view(-1, 1))[near] - origin)
+    edge = _FINE * finest if edge is None else edge
+    while True:
+        # A block counts where several views see something in or beside it: what one alone sees is the air before an edge.
+        around = _AROUND * edge * torch.cartesian_prod(*(torch.tensor([-1.0, 1.0], dtype=torch.float64),) * 3)
+        each = [((points[:, None] + around).view(-1, 3) / (edge * _BLOCK)).floor().long() for points in seen]
+        block, views = torch.unique(torch.cat([torch.unique(b, dim=0) for b in each]), dim=0, return_counts=True)
+        block = block[views >= _AGREE]
+        if len(block) * _BLOCK**3 <= _MOST:
+            break
+        edge *= 2
+    inner = torch.cartesian_prod(*(torch.arange(_BLOCK),) * 3)
+    cell = (block[:, None] * _BLOCK + inner).view(-1, 3)
+    return cell[cell.abs().amax(1) < _SPAN - 2], origin, edge
+
+
+def _signed_distance(
+    maps: Maps, cell: Annotated[Tensor, "M 3"], origin: Tensor, edge: float, report: Report
+) -> tuple[Annotated[Tensor, "M"], Tensor]:
+    """Mask of the lattice points that enough views say something of, and their distances, in truncations: [-1, 1], float32."""
+    far = _TRUNCATION * edge
+    total, weight, count = torch.zeros(len(cell)), torch.zeros(len(cell)), torch.zeros(len(cell), dtype=torch.int16)
+    for view, depth in enumerate(maps.depth):
+        report(view, len(maps.depth))
+        facing = -(normals(maps.cameras, view, depth).view(-1, 3) * grid_rays(maps.cameras, view)[1]).sum(-1).view(depth.shape)
+        for part in torch.split(torch.arange(len(cell)), _CHUNK):
+            gap, distance, pixel = _gaps(maps, view, origin + edge * cell[part].double())
+            close = gap.abs() < far / _STEEP
+            slope = torch.full_like(gap, _CLEAR)
+            x, y = pixel[close].long().unbind(-1)
+            slope[close] = facing[y, x].clamp_min(_STEEP)
+            # Far in front of a surface nobody asks how it lies; behind it the view knows nothing.
+            value = torch.where(close, (gap * slope / far).clamp(max=1), torch.where(gap > 0, 1.0, torch.nan))
+            seen = value >= -1
+            here, share = part[seen], (slope / distance.square())[seen].float()
+            total[here] += share * value[seen].float()
+            weight[here] += share
+            count[here] += 1
+    report(len(maps.depth), len(maps.depth))
+    known = count >= _AGREE
+    return known, total[known] / weight[known]
+
+
+_CORNERS = torch.cartesian_prod(*(torch.arange(2),) * 3)
+_EDGES = [(a, b) for a in range(8) for b in range(a) if bin(a ^ b).count("1") == 1]
+
+
+def surface_nets(
+    cell: Annotated[Tensor, "M 3"], value: Annotated[Tensor, "M"]
+) -> tuple[Annotated[Tensor, "N 3"], Annotated[Tensor, "F 3"]]:
+    """Vertices in lattice coordinates (float64) and triangles (int64), counter-clockwise seen from outside.
+
+    Lattice points are integers within `_SPAN`, each at most once. What borders on a point without a value is open.
+    """
+    if not len(cell):
+        return torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.int64)
+    key, order = _keys(cell).sort()
+    cell, value = cell[order], value[order].double()
+    inside = value < 0
+
+    def find(wanted: Annotated[Tensor, "... 3"]) -> Annotated[Tensor, "..."]:
+        """Index of lattice points; -1 = absent."""
+        index = torch.searchsorted(key, _keys(wanted)).clamp(max=len(key) - 1)
+        return torch.where(key[index] == _keys(wanted), index, -1)
+
+    def mixed(part: Annotated[Tensor, "P 3"]) -> Annotated[Tensor, "P"]:
+        """Cells with all corners, and both signs among them."""
+        corner = find(part[:, None] + _CORNERS)
+        signs = inside[corner.clamp_min(0)]
+        return (corner >= 0).all(1) & signs.any(1) & ~signs.all(1)
+
+    # A vertex for each such cell: the mean of the zero crossings on its edges, from its lowest corner.
+    crossed = torch.cat([mixed(part) for part in torch.split(cell, _CHUNK)])
+    vertex = torch.full((len(cell),), -1)
+    vertex[crossed] = torch.arange(int(crossed.sum()))
+    corner = value[find(cell[crossed][:, None] + _CORNERS)]
+    (first, second), place = torch.tensor(_EDGES).T, _CORNERS.double()
+    crosses = (corner[:, first] < 0) != (corner[:, second] < 0)
+    part = corner[:, first] / torch.where(crosses, corner[:, first] - corner[:, second], 1.0)
+    along = place[first] + part[..., None] * (place[second] - place[first])
+    mean = (along * crosses[..., None]).sum(1) / crosses.sum(1, keepdim=True)
+    at = cell[crossed].double() + mean
+    return at, torch.cat([*_quads(cell, inside, vertex, at, find)])
+
+
+def _quads(
+    cell: Tensor, inside: Tensor, vertex: Tensor, at: Tensor, find: Callable[[Tensor], Tensor]
+) -> Iterator[Annotated[Tensor, "F 3"]]:
+    """Two triangles for each lattice edge that crosses zero, split along the shorter diagonal; one axis after the other."""
+    for step in torch.eye(3, dtype=torch.int64):
+        b, c = step.roll(1), step.roll(2)
+        ahead = find(cell + step)
+        crosses = (ahead >= 0) & (inside != inside[ahead.clamp_min(0)])
+        around = find(cell[crosses][:, None] - torch.stack([b + c, c, torch.zeros_like(b), b]))
+        corner = torch.where(around >= 0, vertex[around.clamp_min(0)], -1)
+        whole = (corner >= 0).all(1)
+        corner, outwards = corner[whole], inside[crosses][whole]
+        # Round the edge the four cells run counter-clockwise seen from its far end, which is outside if its start is inside.
+        corner = torch.where(outwards[:, None], corner, corner.flip(1))
+        one, other = ((at[corner[:, k]] - at[corner[:, k + 2]]).norm(dim=-1) for k in (0, 1))
+        corner = torch.where((one <= other)[:, None], corner, corner.roll(-1, 1))
+        yield from (corner[:, [0, 1, 2]], corner[:, [0, 2, 3]])
+
+
+def _keys(cell: Annotated[Tensor, "... 3"]) -> Annotated[Tensor, "..."]:
+    """One integer a lattice point; coordinates must lie within `_SPAN`."""
+    x, y, z = (cell + _SPAN).unbind(-1)
+    return (x * 2 * _SPAN + y) * 2 * _SPAN + z
+
+
+def _components(count: int, face: Annotated[Tensor, "F 3"]) -> Annotated[Tensor, "count"]:
     """For each vertex the smallest index of those that it is connected with."""
-    label = torch.arange(count)
-    pair = torch.cat([face[:, [0, 1]], face[:, [1, 2]], face[:, [2, 0]]])
+    label, pair = torch.arange(count), torch.cat([face[:, [0, 1]], face[:, [1, 2]], face[:, [2, 0]]])
     while True:
         least = torch.minimum(label[pair[:, 0]], label[pair[:, 1]])
         new = label.clone()
@@ -233,29 +296,26 @@ def components(count: int, face: Annotated[Tensor, "F 3"]) -> Annotated[Tensor, 
         label = new
 
 
-def vertex_normals(point: Annotated[Tensor, "N 3"], face: Annotated[Tensor, "F 3"]) -> Annotated[Tensor, "N 3"]:
-    """Sums of the triangles' normals, weighted by area; float32, unit."""
-    a, b, c = (point[face[:, k]] for k in range(3))
-    normal = torch.linalg.cross(b - a, c - a)
-    total = torch.zeros_like(point)
-    for k in range(3):
-        total.index_add_(0, face[:, k], normal)
-    return torch.nn.functional.normalize(total, dim=-1).float()
-
-
-def write_mesh_ply(path: Path, mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin: Origin, *, local: bool = False) -> None:
-    """Write the mesh as PLY, in the world or `local`, with 8-bit sRGB colours."""
-    faces = np.empty(len(mesh.face), [("vertex_indices", [("count", "u1"), ("corners", "<i4", 3)])])
-    faces["vertex_indices"]["count"], faces["vertex_indices"]["corners"] = 3, mesh.face.numpy()
+def write_mesh(path: Path, mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin: Origin, *, local: bool = False) -> None:
+    """Write a .ply, in the world or `local`, with 8-bit sRGB colours, or a .glb (see `_glb`)."""
     added, beside = added_and_beside(origin, local)
-    write_bytes(path, ply_file({"vertex": vertex_table(mesh.point, mesh.normal, colour, added), "face": faces}))
+    if path.suffix.lower() == ".glb":
+        write_bytes(path, _glb(mesh, colour, added))
+    else:
+        faces = np.empty(len(mesh.face), [("vertex_indices", [("count", "u1"), ("corners", "<i4", 3)])])
+        faces["vertex_indices"]["count"], faces["vertex_indices"]["corners"] = 3, mesh.face.numpy()
+        rows = np.empty(len(mesh.point), [("real", "<f4", 6), ("shade", "u1", 3)])
+        rows["real"] = torch.cat([mesh.point, mesh.normal.double()], 1).float().numpy()
+        rows["shade"] = (colour.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
+        named = [*((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")), *((c, "u1") for c in ("red", "green", "blue"))]
+        write_bytes(path, ply_file({"vertex": in_world(rows.view(named), mesh.point.numpy(), added), "face": faces}))
     write_offset(path, beside)
 
 
-def write_mesh_glb(path: Path, mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin: Origin, *, local: bool = False) -> None:
-    """Write the mesh as binary glTF, shown as it is: unlit, with 16-bit linear colours, which glTF asks for.
+def _glb(mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin: Origin) -> bytes:
+    """Binary glTF, shown as it is: unlit, with 16-bit linear colours, which glTF asks for.
 
-    Vertices are local, since glTF has float32; its node's translation, or where `local` a file beside, is the origin.
+    Vertices are local, since glTF has float32; the node's translation is the origin.
     """
     import trimesh
 
@@ -269,25 +329,19 @@ def write_mesh_glb(path: Path, mesh: Mesh, colour: Annotated[Tensor, "N 3"], ori
         vertex_attributes={"_COLOR_0": np.rint(shade * 65535).astype("<u2")},
         process=False,
     )
-    added, beside = added_and_beside(origin, local)
 
     def processed(tree: dict[str, Any]) -> None:
-        _unlit(tree)
+        """Make the attribute the vertices' colours and the material unlit, and move the mesh to its origin."""
+        [primitive] = tree["meshes"][0]["primitives"]
+        primitive["attributes"]["COLOR_0"] = colours = primitive["attributes"].pop("_COLOR_0")
+        tree["accessors"][colours]["normalized"] = True
+        primitive["material"], rough = 0, {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+        material = {"doubleSided": True, "pbrMetallicRoughness": rough, "extensions": {"KHR_materials_unlit": {}}}
+        tree["materials"], tree["extensionsUsed"] = [material], ["KHR_materials_unlit"]
         for node in tree["nodes"]:
-            if "mesh" in node and any(added):
-                node["translation"] = list(added)
+            if "mesh" in node and any(origin):
+                node["translation"] = list(origin)
 
     data = body.export(file_type="glb", include_normals=True, unitize_normals=False, tree_postprocessor=processed)
     assert isinstance(data, bytes)
-    write_bytes(path, data)
-    write_offset(path, beside)
-
-
-def _unlit(tree: dict[str, Any]) -> None:
-    """Make the attribute of colours the vertices' colours, and the material unlit, in a glTF document."""
-    [primitive] = tree["meshes"][0]["primitives"]
-    primitive["attributes"]["COLOR_0"] = colours = primitive["attributes"].pop("_COLOR_0")
-    tree["accessors"][colours]["normalized"] = True
-    primitive["material"], rough = 0, {"metallicFactor": 0.0, "roughnessFactor": 1.0}
-    material = {"doubleSided": True, "pbrMetallicRoughness": rough, "extensions": {"KHR_materials_unlit": {}}}
-    tree["materials"], tree["extensionsUsed"] = [material], ["KHR_materials_unlit"]
+    return data

@@ -1,55 +1,35 @@
 """Cameras as Nerfstudio's `transforms.json`: camera to world in OpenGL axes, in the capture's own frame."""
 
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import Any
 
 import torch
 
 from ..rendering.cameras import Cameras
 from ..rendering.lens import FISHEYE, OPENCV
 
-Json: TypeAlias = "dict[str, Json] | list[Json] | str | int | float"
-
-_LAST: list[Json] = [0.0, 0.0, 0.0, 1.0]
+_MODELS = {FISHEYE: "OPENCV_FISHEYE", OPENCV: "OPENCV"}
 
 
-def transforms(
-    cameras: Cameras, files: Sequence[str], *, train: Sequence[int], test: Sequence[int], cloud: str | None = None
-) -> dict[str, Json]:
-    """The document of V views whose images are `files`, relative to it.
-
-    Intrinsics stand once if all views share them. `cloud` names a PLY of points to start other methods from.
-    """
+def transforms(cameras: Cameras, files: Sequence[str], *, train: Sequence[int], test: Sequence[int]) -> dict[str, Any]:
+    """The document of V views whose images are `files`, relative to it. Intrinsics stand once if all views share them."""
     lenses = [_lens(cameras, view) for view in range(len(cameras))]
     shared = all(lens == lenses[0] for lens in lenses)
-    frames: list[Json] = []
+    frames = []
     for view, file in enumerate(files):
-        rows: list[Json] = [*cameras.pose[view].tolist(), _LAST]
+        rows = [*cameras.pose[view].tolist(), [0.0, 0.0, 0.0, 1.0]]
         frames.append({"file_path": file, **({} if shared else lenses[view]), "transform_matrix": rows})
-    document: dict[str, Json] = dict(lenses[0]) if shared else {}
-    if cloud is not None:
-        document["ply_file_path"] = cloud
-    document["frames"] = frames
-    document["train_filenames"] = [files[view] for view in train]
-    document["test_filenames"] = [files[view] for view in test]
-    document["val_filenames"] = [files[view] for view in test]
-    return document
-
-
-def _lens(cameras: Cameras, view: int) -> dict[str, Json]:
-    kind = int(cameras.lens[view])
-    width, height = (int(side) for side in cameras.size[view])
-    fx, fy = cameras.focal[view].tolist()
-    cx, cy = cameras.centre[view].tolist()
-    lens: dict[str, Json] = {
-        "camera_model": "OPENCV_FISHEYE" if kind == FISHEYE else "OPENCV" if kind == OPENCV else "PINHOLE",
-        "w": width,
-        "h": height,
-        "fl_x": fx,
-        "fl_y": fy,
-        "cx": cx,
-        "cy": cy,
+    named = {
+        f"{name}_filenames": [files[view] for view in of] for name, of in (("train", train), ("test", test), ("val", test))
     }
+    return {**(lenses[0] if shared else {}), "frames": frames, **named}
+
+
+def _lens(cameras: Cameras, view: int) -> dict[str, Any]:
+    width, height = cameras.size[view].tolist()
+    (fx, fy), (cx, cy) = cameras.focal[view].tolist(), cameras.centre[view].tolist()
+    lens = {"camera_model": _MODELS.get(int(cameras.lens[view]), "PINHOLE"), "w": width, "h": height}
+    lens |= {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
     if bool(torch.any(cameras.distortion[view] != 0)):
         lens |= dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), cameras.distortion[view].tolist(), strict=True))
     return lens

@@ -1,4 +1,12 @@
-"""Fields on tri-planes (`ops.triplane`): content and density, semantics (paper), and the proposals of the sampler."""
+"""Fields on tri-planes (`ops.triplane`): content and density, semantics (paper), and the proposals of the sampler.
+
+A point x of the cube [-1, 1]^3 has at each scale the product over three planes, P_xy(x, y) P_xz(x, z) P_yz(y, z), of their
+bilinear samples there (K-Planes, Fridovich-Keil et al. 2023, Section 3.1); the features of all scales side by side are its
+latent. Density is exp of a linear map of the latent; content and semantics are networks on it.
+
+N points · M samples of rays that are kept · L = scales x channels of the latent · C content channels · D semantic channels.
+Inputs are float32 on any device; density is per unit of the scene's space.
+"""
 
 import math
 from collections.abc import Sequence
@@ -18,6 +26,8 @@ LIMIT = 15.0
 
 
 class _Exp(torch.autograd.Function):
+    """exp whose gradient is bounded on both sides, so that what is opaque or empty can still change."""
+
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
         ctx.save_for_backward(x)
@@ -64,7 +74,7 @@ def weights(network: nn.Sequential) -> list[Tensor]:
 
 
 class Planes(nn.Module):
-    """Points of the unit cube to `out` = scales x channels features."""
+    """Planes at several scales: points [N 3] to their latents [N L]; `out` is L."""
 
     def __init__(self, resolutions: Sequence[int], channels: int, *, generator: torch.Generator) -> None:
         super().__init__()
@@ -109,7 +119,8 @@ class PlanesField(ContentField):
         return FieldSample(*self.planes.density(points, self.to_density.weight[0]))
 
     def content(self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "M C"]:
-        """Content features seen from a direction; what samples of one ray have in common is computed once."""
+        """Content features seen from a direction, f(latent, harmonics(view)) + offset."""
+        # Samples of one ray follow each other and share the direction: what it adds is computed once a ray.
         first, run = dense.runs(view)
         maps, shared = weights(self.to_content), spherical_harmonics(view.index_select(0, first), self.degree)
         biases = [None] * (len(maps) - 1) + [self.offset]

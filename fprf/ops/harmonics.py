@@ -24,7 +24,7 @@ HARMONIC = 0.28209479177387814
 _TINY = 1e-5
 """Colours below this may be rounded to less than 0."""
 MAX_COLOUR = 1.5
-"""Mean colours are mapped no higher; with 1 pictures lose contrast (docs/train-gaussians.md)."""
+"""Mean colours are mapped no higher; with 1 pictures lose contrast (docs/gaussians.md)."""
 
 
 class Directions(NamedTuple):

@@ -7,8 +7,7 @@ import math
 import numba
 import numpy as np
 
-from .lanes import dot, scaled
-from .simd import NARROW
+from .simd import NARROW, dot, scaled
 
 _C0, _HALF, _TINY = np.float32(0.28209479177387814), np.float32(0.5), np.float32(1e-5)
 _0 = np.float32(0)

@@ -49,18 +49,24 @@ def explained(
     whole, share, guide, solid = share.float().clone(), share[box], guide[box], solid[box]
     present = (share.mean((0, 1)) > _PRESENT).nonzero()[:, 0]
     before, radius = share[..., present].permute(2, 0, 1).float().contiguous(), max(1.0, radius)
-    # Squares of what lies far from 0 would round.
-    centred = torch.where(solid[..., None], guide - guide[solid].mean(0), 0.0)
-    monomials = _monomials(centred.float()).permute(2, 0, 1).contiguous()
-    masked, size, after = monomials * solid, (share.shape[0], share.shape[1]), before
+    # 1, every channel, and every product of two; about their mean, as squares of what lies far from 0 would round.
+    x = torch.where(solid[..., None], guide - guide[solid].mean(0), 0.0).float()
+    i, j = torch.triu_indices(x.shape[-1], x.shape[-1])
+    monomials = torch.cat([torch.ones_like(x[..., :1]), x, x[..., i] * x[..., j]], -1).permute(2, 0, 1).contiguous()
+    masked, after = monomials * solid, before
     for _ in range(steps):
         prior, logarithm = _local_gaussians(after, masked, radius, noise)
-        # Bilinear interpolation as two small matrices, which takes less time than F.interpolate.
-        rows, columns = (_interpolation(n, m).to(prior) for n, m in zip(prior.shape[1:], size, strict=True))
+        # Bilinear weights of each cell at each pixel, as two small matrices, which take less time than F.interpolate.
+        operators = []
+        for cells, pixels in zip(prior.shape[1:], solid.shape, strict=True):
+            at = ((torch.arange(pixels) + 0.5) * cells / pixels - 0.5).clamp(0, cells - 1)
+            operators.append((1 - (at[:, None] - torch.arange(cells)).abs()).clamp_min(0).to(prior))
+        rows, columns = operators
         prior = rows @ prior @ columns.T
         likelihood = torch.empty_like(prior)
         for k, coefficients in enumerate(logarithm):  # one region at a time: it stays in the cache
             likelihood[k] = ((rows @ coefficients @ columns.T) * monomials).sum(0)
+        # The posterior, of all that these regions had together.
         odds = (own * before + (1 - own) * prior).clamp_min(1e-9).log() + likelihood
         after = torch.where(solid, torch.softmax(odds, 0) * before.sum(0), before)
     whole[box] = share.float().index_copy(2, present, after.permute(1, 2, 0))
@@ -71,9 +77,17 @@ def _local_gaussians(
     share: Annotated[Tensor, "K H W"], monomials: Annotated[Tensor, "M H W"], radius: float, noise: Annotated[Tensor, "C"]
 ) -> tuple[Annotated[Tensor, "K h w"], Annotated[Tensor, "K M h w"]]:
     """Share of each region in the windows, and the coefficients of the logarithm of its density, up to a constant."""
-    channels, (rows, columns) = len(noise), monomials.shape[1:]
+    channels = len(noise)
     i, j = torch.triu_indices(channels, channels)
-    windows = [_windows(n, radius).to(share) for n in (rows, columns)]
+    # Part of each pixel that lies in the window around each cell's centre.
+    windows = []
+    for pixels in monomials.shape[1:]:
+        cells = math.ceil(_CELLS * pixels / radius)
+        centre = (torch.arange(cells).double() + 0.5)[:, None] * pixels / cells
+        edge = torch.arange(pixels + 1).double()
+        overlap = torch.minimum(centre + radius, edge[1:]) - torch.maximum(centre - radius, edge[:-1])
+        windows.append(overlap.clamp_min(0).to(share))
+    # Moments of each region in each window.
     sums = torch.stack([windows[0] @ (part * monomials) @ windows[1].T for part in share])
     sums = sums.double().permute(0, 2, 3, 1)
     mass = sums[..., :1]
@@ -83,6 +97,7 @@ def _local_gaussians(
     covariance[..., i, j] = covariance[..., j, i] = square - mean[..., i] * mean[..., j]
     # Rounding may leave a variance slightly below 0.
     covariance.diagonal(dim1=-2, dim2=-1).clamp_min_(0).add_(noise.double().square())
+    # ln N = -(x - m)^T S^-1 (x - m) / 2 - ln |S| / 2, as coefficients of the monomials.
     root = torch.linalg.cholesky(covariance)
     inverse = torch.cholesky_inverse(root)
     slope = (inverse @ mean[..., None])[..., 0]
@@ -91,23 +106,3 @@ def _local_gaussians(
     logarithm = torch.cat([constant[..., None], slope, curvature], -1).permute(0, 3, 1, 2)
     prior = (mass / mass.sum(0).clamp_min(_MASS))[..., 0]
     return prior.float(), logarithm.float()
-
-
-def _monomials(x: Annotated[Tensor, "H W C"]) -> Annotated[Tensor, "H W M"]:
-    """1, every channel, and every product of two."""
-    i, j = torch.triu_indices(x.shape[-1], x.shape[-1])
-    return torch.cat([torch.ones_like(x[..., :1]), x, x[..., i] * x[..., j]], -1)
-
-
-def _interpolation(cells: int, pixels: int) -> Annotated[Tensor, "pixels cells"]:
-    """Bilinear weight of each cell at each pixel."""
-    at = ((torch.arange(pixels) + 0.5) * cells / pixels - 0.5).clamp(0, cells - 1)
-    return (1 - (at[:, None] - torch.arange(cells)).abs()).clamp_min(0)
-
-
-def _windows(pixels: int, radius: float) -> Annotated[Tensor, "cells pixels"]:
-    """Part of each pixel that lies in the window around each cell's centre."""
-    cells = math.ceil(_CELLS * pixels / radius)
-    centre = (torch.arange(cells).double() + 0.5)[:, None] * pixels / cells
-    edge = torch.arange(pixels + 1).double()
-    return (torch.minimum(centre + radius, edge[1:]) - torch.maximum(centre - radius, edge[:-1])).clamp_min(0)

@@ -9,8 +9,7 @@ distances of a contraction with points as they are, then what a box subtracts an
 import numba
 import numpy as np
 
-from .lanes import BLOCK, copy_lanes, dot, exp_lanes, opaque_lanes
-from .simd import NARROW, WIDE
+from .simd import BLOCK, NARROW, WIDE, dot, exp, load, opaque, store
 from .triplane_kernels import cells, product_forward
 
 _jit = numba.njit(parallel=True, cache=True, nogil=True)
@@ -78,8 +77,8 @@ def _weights(tau, before, w, samples):
     for k in range(samples, len(before)):
         before[k], tau[k] = _0, _0
     for k in range(0, len(before), WIDE):
-        exp_lanes(before, k, before, k)
-        opaque_lanes(tau, k, w, k)
+        store(before, k, exp(load(before, k, WIDE)))
+        store(w, k, opaque(load(tau, k, WIDE)))
     for k in range(samples):
         w[k] *= before[k]
     return np.float32(total)
@@ -136,7 +135,7 @@ def propose(origin, direction, near, far, s, warp, table, size, channels, weight
                         product_forward(table, feature, a + g, b + g, c + g, g, channels, size * channels, u, v, x, NARROW)
                     tau[first + k] = min(dot(feature, 0, weight, 0, channels) - _1, limit)
                 for k in range(first, min(room, first + STRETCH), WIDE):
-                    exp_lanes(tau, k, tau, k)
+                    store(tau, k, exp(load(tau, k, WIDE)))
                 for k in range(first, first + some):
                     tau[k] *= t[k + 1] - t[k]
                     depth += tau[k]
@@ -215,11 +214,11 @@ def weigh(density, t, budget, weights, depth, opacity, transmittance, keep, kept
             kept[ray] = _heaviest(w, samples, budget, order, keep, ray * samples)
         clear, solid = np.empty(len(optical), np.float32), np.empty(len(optical), np.float32)
         for k in range(0, len(optical), WIDE):
-            opaque_lanes(optical, k, solid, k)
+            store(solid, k, opaque(load(optical, k, WIDE)))
         for k in range(len(optical)):
             optical[k] = -optical[k]
         for k in range(0, len(optical), WIDE):
-            exp_lanes(optical, k, clear, k)
+            store(clear, k, exp(load(optical, k, WIDE)))
         for ray in range(first, last):
             opacity[ray], transmittance[ray] = solid[ray - first], clear[ray - first]
 
@@ -241,7 +240,7 @@ def gather(keep, start, weights, point, latent, view, kept_ray, kept_weight, kep
                     kept_view[3 * at + axis] = view[3 * ray + axis]
                 if width % WIDE == 0:
                     for c in range(0, width, WIDE):
-                        copy_lanes(latent, width * k + c, kept_latent, width * at + c)
+                        store(kept_latent, width * at + c, load(latent, width * k + c, WIDE))
                 else:
                     for c in range(width):
                         kept_latent[width * at + c] = latent[width * k + c]

@@ -8,10 +8,9 @@ Arrays are flat, contiguous float32; `width` is a number of outputs rounded up t
 import numba
 import numpy as np
 
-from .dense_kernels import product
-from .lanes import BLOCK, ROWS, accumulate, copy_lanes, dot, exp_lanes
-from .lanes import scaled as scaled_lanes
-from .simd import NARROW, WIDE
+from .dense_kernels import ROWS, accumulate, product
+from .simd import BLOCK, NARROW, WIDE, dot, exp, load, store
+from .simd import scaled as scaled_lanes
 
 _jit = numba.njit(parallel=True, cache=True, nogil=True)
 _0, _1, _LEAST = np.float32(0), np.float32(1), np.float32(-np.inf)
@@ -56,7 +55,7 @@ def _softmax(score, count, factor, sharpness, odds, faint, best, total):
             score[k, r] -= total[r]
     flat = score.reshape(-1)
     for i in range(0, count * block, WIDE):
-        exp_lanes(flat, i, flat, i)
+        store(flat, i, exp(load(flat, i, WIDE)))
     for r in range(block):
         total[r] = _0
     for k in range(count):
@@ -150,7 +149,7 @@ def affine(x, centre, share, matrix, bias, channels, width, out):
             _add_scaled(away, 0, channels, BLOCK, matrix, k * channels * width, width, bias, k * width, sums, belongs, k, count)
         if width == channels:
             for i in range(0, rows * channels, WIDE):
-                copy_lanes(sums, i, out, first * channels + i)
+                store(out, first * channels + i, load(sums, i, WIDE))
         else:
             for r in range(rows):
                 for c in range(channels):

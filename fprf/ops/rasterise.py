@@ -157,7 +157,7 @@ class _Rasterise(torch.autograd.Function):
         (tiles, blocks, bands, camera, _), (features, passing) = ctx.view, ctx.saved_tensors
         # Of the first group the sums of the shape, with the gradient of the transmittance, which is to be counted once.
         of_left = _planes(tiles, grad_passing[..., None], 1)[0]
-        of_features = np.empty((tiles.count, features.shape[1] + -features.shape[1] % _WIDE), np.float32)
+        of_features = np.empty((tiles.total, features.shape[1] + -features.shape[1] % _WIDE), np.float32)
         total, begin = None, 0
         for (channels, values, stride, first), (out, left) in zip(_groups(ctx.view, features), ctx.made, strict=True):
             slope = _planes(tiles, grad[..., begin : begin + channels], channels)
@@ -176,7 +176,7 @@ class _Rasterise(torch.autograd.Function):
         assert total is not None
         slopes = np.empty_like(blocks)
         kernels.gradients(tiles, blocks, bands, camera, total, slopes)
-        rows = torch.from_numpy(slopes).view(-1, 11 + 3 * bands, 16).transpose(1, 2).reshape(-1, 11 + 3 * bands)[: tiles.count]
+        rows = torch.from_numpy(slopes).view(-1, 11 + 3 * bands, 16).transpose(1, 2).reshape(-1, 11 + 3 * bands)[: tiles.total]
         shape = rows[:, :3], rows[:, 6:10], rows[:, 3:6], rows[:, 10], rows[:, 11:].reshape(-1, bands, 3)
         of_background = (grad[..., :3] * passing[..., None]).sum((0, 1))
         return *shape, torch.from_numpy(of_features)[:, : features.shape[1]], of_background, None, None

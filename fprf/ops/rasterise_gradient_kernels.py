@@ -209,7 +209,7 @@ def lift_values(
     tiles: Tiles, found: Floats, out: Floats, stride: int, offset: int, channels: int, *, skipped: int = GEOMETRY
 ) -> None:
     """out[stride * i + offset ...] = the sums of the channels of each Gaussian, which follow on `skipped` others."""
-    on_threads(_lift_values, found, tiles.first_slot, tiles.count, out, stride, offset, channels, skipped)
+    on_threads(_lift_values, found, tiles.first_slot, tiles.total, out, stride, offset, channels, skipped)
 
 
 @traced
@@ -424,7 +424,7 @@ _ADAM = {bands: _adam(bands) for bands in (1, 4, 9, 16)}
 
 def gradients(tiles: Tiles, blocks: Floats, bands: int, view: Floats, found: Floats, out: Floats) -> None:
     """The gradients of all Gaussians, in blocks, from the sums of their slots: shape, colour and depth."""
-    on_threads(_GRADIENTS[bands], blocks, tiles.count, view, found, tiles.first_slot, out)
+    on_threads(_GRADIENTS[bands], blocks, tiles.total, view, found, tiles.first_slot, out)
 
 
 def adam(
@@ -444,8 +444,8 @@ def adam(
     of the weights in the second of a Gaussian, 1 - 0.99^k after k steps: what is seen for the first time moves as it would have
     in the first step. The first moment is not corrected, so the rates rise over a Gaussian's first ten steps.
     """
-    of_camera = np.zeros((-(-tiles.count // LANES), CAMERA, LANES), np.float32)
-    on_threads(_ADAM[bands], blocks, *moments, tiles.count, view, found, tiles.first_slot, rates, of_camera.reshape(-1))
+    of_camera = np.zeros((-(-tiles.total // LANES), CAMERA, LANES), np.float32)
+    on_threads(_ADAM[bands], blocks, *moments, tiles.total, view, found, tiles.first_slot, rates, of_camera.reshape(-1))
     gradient: np.ndarray[Any, np.dtype[np.float64]] = of_camera.sum((0, 2), dtype=np.float64)
     return gradient
 

@@ -259,7 +259,8 @@ class Tiles(NamedTuple):
     """
 
     splats: Floats
-    count: int
+    total: int
+    """Gaussians, seen or not."""
     width: int
     height: int
     start: Annotated[_Ints, "tiles+1"]

@@ -41,6 +41,9 @@ try:
 except RuntimeError:  # the features of some machines cannot be read
     WIDE = 8
 
+BLOCK = 48
+"""Points or rows that kernels take at a time: whole tiles of every shape, small enough for the first-level cache."""
+
 _LINE = 64
 _FLOAT, _INT, _LONG = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 _FUSE = ("contract", "arcp", "nsz")
@@ -183,7 +186,7 @@ def _dry(kind):
 
 def traced(function):
     """Let kernels call a function that runs while they are compiled. It stays what it is for other traced functions."""
-    results = {}  # the kind of the result, by those of the arguments
+    results: dict[Any, Any] = {}  # the kind of the result, by those of the arguments
 
     class Template(AbstractTemplate):
         key = function
@@ -395,6 +398,22 @@ def greater_bits(x, y):
     return _Index(x.build, x.build.zext(x.build.bitcast(bits, ir.IntType(LANES)), _LONG))
 
 
+@traced
+def scaled(x, x_at, factor, y, y_at, out, to):
+    """out[to : to + NARROW] = y[y_at :] + factor * x[x_at :]."""
+    store(out, to, load(y, y_at, NARROW) + load(x, x_at, NARROW) * narrow(factor, NARROW))
+
+
+@traced
+def dot(x, x_at, y, y_at, count):
+    """Sum of x[x_at + i] * y[y_at + i] over i < count, a multiple of NARROW: lanes first, then halves of them."""
+
+    def step(i, sums):
+        return [sums[0] + load(x, x_at + i, NARROW) * load(y, y_at + i, NARROW)]
+
+    return total(*repeat(count, [splat(x, 0, NARROW)], step, NARROW))
+
+
 def _picked(x, y, mask):
     y = _undefined(x.lanes) if y is None else y.value
     return Vector(x.build, x.build.shuffle_vector(x.value, y, ir.Constant(_ints(len(mask)), mask)))
@@ -522,12 +541,14 @@ def _exp_parts(x):
     return r * r * _polynomial(_SERIES, r) + r, Vector(build, build.bitcast(exponent, _floats(lanes)))
 
 
+@traced
 def exp(x):
     """e^x within 3u; 0 below -87.33 and infinite above 88.3, where 2^n would leave float32's normal range. NaN stays NaN."""
     p, power = _exp_parts(minimum(_HIGHEST, maximum(_LOWEST, x)))
     return where_greater(x, _HIGHEST, math.inf, where_greater(_LOWEST, x, 0, power * p + power))
 
 
+@traced
 def opaque(x):
     """1 - exp(-x) for x >= 0, within 3u; NaN stays NaN."""
     p, power = _exp_parts(minimum(0, maximum(-18, -x)))  # below 2^-25 of 1 nothing is left of exp(-x)

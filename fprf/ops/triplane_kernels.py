@@ -6,8 +6,7 @@
 import numba
 import numpy as np
 
-from .lanes import BLOCK
-from .simd import NARROW, WIDE, load, narrow, store, traced
+from .simd import BLOCK, NARROW, WIDE, load, narrow, store, traced
 
 AXES = ((0, 1), (0, 2), (1, 2))
 """Those of `triplane`, which imports this module."""
@@ -40,25 +39,6 @@ def cells(points, first, count, apart, across, size, start, channels, corner, pa
         corner[n] = (start + j * size + i) * channels
         corner[BLOCK + n] = (start + plane + k * size + i) * channels
         corner[2 * BLOCK + n] = (start + 2 * plane + k * size + j) * channels
-
-
-@numba.njit(inline="always", cache=True)
-def features(points, first, count, table, channels, sizes, starts, corner, part, out, to):
-    """For `count` <= BLOCK points [3] the products of their samples, scales side by side, to out[to :]."""
-    scales = len(sizes)
-    for scale in range(scales):
-        size = sizes[scale]
-        cells(points, first, count, 3, 1, size, starts[scale], channels, corner, part)
-        for n in range(count):
-            a, b, c = corner[n], corner[BLOCK + n], corner[2 * BLOCK + n]
-            u, v, w = part[n], part[BLOCK + n], part[2 * BLOCK + n]
-            o = to + (n * scales + scale) * channels
-            if channels % WIDE == 0:
-                for s in range(0, channels, WIDE):
-                    product_forward(table, out, a + s, b + s, c + s, o + s, channels, size * channels, u, v, w, WIDE)
-            else:
-                for s in range(0, channels, NARROW):
-                    product_forward(table, out, a + s, b + s, c + s, o + s, channels, size * channels, u, v, w, NARROW)
 
 
 # The inner steps take several channels at a time: left to the compiler they are 3 times slower on 196 608 points, forward and
@@ -112,6 +92,26 @@ def product_slopes(table, grad, sums, a, b, c, o, step, stride, u, v, w):
         store(sums, at, load(sums, at, NARROW) + g * (first + second))
 
 
+@numba.njit(inline="always", cache=True)
+def _features(points, first, count, table, channels, sizes, starts, corner, part, out, to):
+    """For `count` <= BLOCK points [3] the products of their samples, scales side by side, to out[to :]."""
+    scales = len(sizes)
+    for scale in range(scales):
+        size = sizes[scale]
+        cells(points, first, count, 3, 1, size, starts[scale], channels, corner, part)
+        for n in range(count):
+            a, b, c = corner[n], corner[BLOCK + n], corner[2 * BLOCK + n]
+            u, v, w = part[n], part[BLOCK + n], part[2 * BLOCK + n]
+            o = to + (n * scales + scale) * channels
+            # The number of channels at a time is a constant of the compiled code.
+            if channels % WIDE == 0:
+                for s in range(0, channels, WIDE):
+                    product_forward(table, out, a + s, b + s, c + s, o + s, channels, size * channels, u, v, w, WIDE)
+            else:
+                for s in range(0, channels, NARROW):
+                    product_forward(table, out, a + s, b + s, c + s, o + s, channels, size * channels, u, v, w, NARROW)
+
+
 @_jit
 def forward(points, table, channels, sizes, starts, out):
     """out[n, scale, c] = product over the planes of the bilinear sample at point n."""
@@ -120,7 +120,8 @@ def forward(points, table, channels, sizes, starts, out):
         first = task * BLOCK
         corner, part = np.empty(3 * BLOCK, np.int64), np.empty(3 * BLOCK, np.float32)
         count = min(BLOCK, total - first)
-        features(points, first, count, table, channels, sizes, starts, corner, part, out, first * len(sizes) * channels)
+        # In a function of its own: with these loops here the compiled ones are a tenth slower.
+        _features(points, first, count, table, channels, sizes, starts, corner, part, out, first * len(sizes) * channels)
 
 
 @_jit

@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..ops.harmonics import HARMONIC
+from ..ops.rasterise import lift
 from ..rendering.cameras import Cameras
 from ..splats.files.base import smallest_three, spatial_order, steps
 from ..splats.gaussians import Gaussians
 from ..splats.photographs import camera_of
-from ..splats.views import lift
 
 CHUNK = 256
 """Gaussians of a chunk; the last one is filled up with its last Gaussian."""
@@ -68,16 +68,21 @@ class Packed:
     largest: float
     """Magnitude of the palette's largest harmonic."""
 
-    def colours(self, harmonics: Annotated[Tensor, "n K' 3"]) -> Colours:
-        """A style by the harmonics of all Gaussians that were given, in their order."""
+    def colours(self, harmonics: Annotated[Tensor, "n K' 3"], rounds: int = 6) -> Colours:
+        """A style by the harmonics of all Gaussians that were given, in their order; harmonics that it lacks are 0.
+
+        `rounds` of fitting its maps: fewer for one that is shown at once, and soon replaced.
+        """
         styled = harmonics[self.order, :_HARMONICS]
         mean = (0.5 + HARMONIC * styled[:, 0]).clamp(-1, 2).numpy()
         low, high = mean.min(0), mean.max(0)
         rows = np.zeros((len(mean), 4), np.uint8)
         rows[:, :3] = steps((mean - low) / np.maximum(high - low, 1e-6), 255)
         maps = np.eye(3, dtype=np.float32).reshape(1, 9)
-        if self.harmonics.shape[1] > 1 and not torch.equal(styled[:, 1:], self.harmonics[:, 1:]):
-            rows[:, 3], maps = fit_maps(self.harmonics[:, 1:], styled[:, 1:])
+        if styled.shape[1] < self.harmonics.shape[1]:
+            maps = np.zeros((1, 9), np.float32)
+        elif self.harmonics.shape[1] > 1 and not torch.equal(styled[:, 1:], self.harmonics[:, 1:]):
+            rows[:, 3], maps = fit_maps(self.harmonics[:, 1:], styled[:, 1:], rounds)
         return Colours(rows, low, high, maps)
 
 
@@ -122,7 +127,8 @@ def _palette(
     else:
         # Two levels: each row is compared with 2 sqrt(E) entries and not with E.
         side = math.isqrt(entries)
-        groups, books = _clustered(rows, side)[1], []
+        groups = _clustered(rows, side)[1]
+        books: list[Tensor] = []
         label = torch.zeros(count, dtype=torch.int64)
         for group in range(side):
             inside = (groups == group).nonzero()[:, 0]
@@ -154,11 +160,11 @@ def _clustered(rows: Annotated[Tensor, "N D"], count: int) -> tuple[Annotated[Te
 def _nearest(rows: Annotated[Tensor, "N D"], book: Annotated[Tensor, "E D"]) -> Annotated[Tensor, "N"]:
     """The nearest entry of each row."""
     half = book.square().sum(1) / 2
-    return torch.cat([(half - part @ book.T).argmin(1) for part in rows.split(_BLOCK)])
+    return torch.cat([(half - part @ book.T).argmin(1) for part in torch.split(rows, _BLOCK)])
 
 
 def fit_maps(
-    before: Annotated[Tensor, "N K-1 3"], after: Annotated[Tensor, "N K-1 3"], count: int = MAPS
+    before: Annotated[Tensor, "N K-1 3"], after: Annotated[Tensor, "N K-1 3"], rounds: int = 6, count: int = MAPS
 ) -> tuple[NDArray[np.uint8], Annotated[NDArray[np.float32], "M 9"]]:
     """At most 256 matrices A, and for each row the one by which before A comes nearest to after, in least squares.
 
@@ -174,10 +180,10 @@ def fit_maps(
     ridge = 1e-2 * weight[some, None, None].clamp_min(1e-8) * torch.eye(3)
     maps = torch.linalg.solve(grams[some].view(-1, 3, 3) + ridge, crosses[some].view(-1, 3, 3) + ridge)
     maps = torch.cat([torch.eye(3)[None], maps])
-    for step in range(_LLOYD + 1):
+    for step in range(rounds + 1):
         book = torch.cat([(maps @ maps.transpose(1, 2)).flatten(1), maps.flatten(1)], 1)
-        label = torch.cat([(part @ book.T).argmin(1) for part in rows.split(_BLOCK)])
-        if step == _LLOYD:
+        label = torch.cat([(part @ book.T).argmin(1) for part in torch.split(rows, _BLOCK)])
+        if step == rounds:
             break
         gram = torch.zeros(len(maps), 9).index_add_(0, label, grams).view(-1, 3, 3)
         cross = torch.zeros(len(maps), 9).index_add_(0, label, crosses).view(-1, 3, 3)
@@ -193,21 +199,21 @@ def importance(
     """Weight of each Gaussian in the pixels of at most so many views: those of the least weight show least."""
     shape = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)
     weight = torch.zeros(len(gaussians))
-    for view in torch.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().long().unique().tolist():
+    for view in sorted({*torch.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().long().tolist()}):
         camera = camera_of(cameras, view, near)
         weight += lift(*shape, camera, torch.ones(camera.height, camera.width, 1), antialiased=antialiased)[:, 0]
     return weight
 
 
-def sections(packed: Packed) -> dict[str, bytes]:
+def sections(packed: Packed, level: int = 9) -> dict[str, bytes]:
     """The parts of the geometry by name, deflated; bytes of the shapes lie plane by plane."""
     parts = {"shape": packed.shape.T, "chunks": packed.chunks, "palette": packed.palette}
-    return {name: zlib.compress(np.ascontiguousarray(part).tobytes(), 9) for name, part in parts.items()}
+    return {name: zlib.compress(np.ascontiguousarray(part).tobytes(), level) for name, part in parts.items()}
 
 
-def colour_section(colours: Colours) -> bytes:
+def colour_section(colours: Colours, level: int = 9) -> bytes:
     """A style, deflated: planes of bytes, then the maps."""
-    return zlib.compress(np.ascontiguousarray(colours.rows.T).tobytes() + colours.maps.tobytes(), 9)
+    return zlib.compress(np.ascontiguousarray(colours.rows.T).tobytes() + colours.maps.tobytes(), level)
 
 
 def header(packed: Packed, **more: Any) -> dict[str, Any]:

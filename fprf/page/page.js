@@ -109,7 +109,7 @@ class Stage {
     at("mix").setAttribute("aria-valuetext", `${Math.round(100 * amount)} % ${to}`);
     at("from").value = from;
     at("towards").textContent = to;
-    at("blending").hidden = alone || this.root.classList.contains("live");
+    at("blending").hidden = alone && !this.root.classList.contains("field");
     at("mix").disabled = wiping || from === to;
     at("wiping").setAttribute("aria-pressed", String(wiping));
     const handle = at("line");

@@ -170,9 +170,22 @@ class Splats {
   }
 
   constructor(canvas, head, shape, chunks, palette) {
-    Object.assign(this, { canvas, head, count: head.count, styles: new Map(), order: null, kept: 0, sortMilliseconds: 0 });
-    this.kept_ = { shape, chunks, palette }; // to come back from a lost context
-    this.colours = new Map();
+    Object.assign(this, { canvas, styles: new Map(), colours: new Map(), textures: {} });
+    this.load(head, shape, chunks, palette);
+  }
+
+  // Other Gaussians in the place of these; styles have to be added again.
+  async replace(head, parts) {
+    const [shape, chunks, palette] = await Promise.all([parts.shape, parts.chunks, parts.palette].map(inflate));
+    this.worker.terminate();
+    [...this.styles.keys()].forEach((name) => this.remove(name));
+    Object.values(this.textures).forEach((texture) => this.gl.deleteTexture(texture));
+    this.load(head, new Uint32Array(woven(shape, head.count, 16).buffer), new Float32Array(chunks.buffer), palette);
+  }
+
+  load(head, shape, chunks, palette) {
+    Object.assign(this, { head, count: head.count, order: null, kept: 0, sortMilliseconds: 0 });
+    this.source = { shape, chunks, palette }; // to come back from a lost context
     this.worker = new Worker(URL.createObjectURL(new Blob([`"use strict";(${sorter})()`], { type: "text/javascript" })));
     const means = decodedMeans(shape, chunks, head.count);
     this.worker.postMessage({ means }, [means.buffer]);
@@ -184,7 +197,7 @@ class Splats {
     if (!gl) throw new Error("this browser has no WebGL 2");
     this.floats = Boolean(gl.getExtension("EXT_color_buffer_float"));
     this.programs = { project: this.link(VERTEX, NOTHING, ["place", "look", "wide"]), splat: this.link(QUAD, FRAGMENT), show: this.link(FULL, SHOW) };
-    const { shape, chunks, palette } = this.kept_;
+    const { shape, chunks, palette } = this.source;
     this.textures = {
       shape: this.texture(shape, gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT),
       chunks: this.texture(chunks, gl.RGBA32F, gl.RGBA, gl.FLOAT),

@@ -7,10 +7,9 @@ import base64
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
-from importlib.resources import files
 from itertools import groupby
 from pathlib import Path
 from string import Template
@@ -22,6 +21,7 @@ import torch
 from torch import Tensor
 
 from ..errors import DataError
+from ..interfaces import Scene
 from ..io.atomic import write_text
 from ..io.figures import Metrics, figures, number
 from ..io.images import Picture, data_uri, shrink, to_uint8
@@ -30,6 +30,8 @@ from ..rendering.cameras import Cameras
 from ..rendering.paths import upwards
 from ..splats.photographs import camera_of
 from ..splats.scene import SplatScene
+from ..style.look import Restyle
+from .live import read, script
 from .pack import colour_header, colour_section, header, importance, pack, sections
 
 CAPTURED = "Captured"
@@ -105,34 +107,49 @@ def write_page(path: Path, page: Page, *, megabytes: float | None = None) -> int
     With `megabytes` (2^20 bytes), Gaussians that show least are left out until the file is no larger. Raises DataError where
     pictures do not belong together, or where the page without any Gaussian is larger.
     """
+    text, count = page_html(page, megabytes=megabytes, path=path)
+    write_text(path, text)
+    return count
+
+
+def page_html(page: Page, *, megabytes: float | None = None, path: Path = Path("page.html")) -> tuple[str, int]:
+    """The text of a page that lies at `path`, and how many Gaussians it shows. Raises as `write_page`."""
     _check(page)
     room = None if megabytes is None else int(megabytes * 2**20)
     film = "" if page.film is None else _film(page.film, path, _SMALL_FILM if room is None else min(_SMALL_FILM, room / 3))
     fixed = _text(page, film, None, {})
-    if page.scene is None:
-        write_text(path, fixed)
-        return 0
-    count, kept = len(page.scene.gaussians), None
-    weight: Tensor | None = None
+    if (scene := page.scene) is None:
+        return fixed, 0
+    harmonics = [scene.shown.harmonics, *(style.harmonics for style in page.styles if style.harmonics is not None)]
+    empty, kept, weight = len(fixed.encode()), None, None
     for _ in range(4):
-        head, parts = packed_scene(page.scene, [page.scene.shown.harmonics, *_harmonics(page)], kept, page.start)
+        head, parts = packed_scene(scene, harmonics, kept, page.start)
         text = _text(page, film, head, parts)
-        size = len(text.encode())
+        size, count = len(text.encode()), int(head["count"])
         if room is None or size <= room:
-            write_text(path, text)
-            return int(head["count"])
-        share = (room - len(fixed.encode())) / max(1, size - len(fixed.encode()))
+            return text, count
+        share = (room - empty) / max(1, size - empty)
         if share <= 0.02:
-            raise DataError(
-                f"{path}: {len(fixed.encode()) / 2**20:.1f} MiB without any Gaussian; allow more than {megabytes} MiB"
-            )
+            break
         if weight is None:
-            scene = page.scene
             weight = importance(scene.gaussians, scene.views, antialiased=scene.antialiased, near=scene.near)
         # A little less than would fit by the mean: what shows most compresses least.
-        now = count if kept is None else len(kept)
-        kept = weight.topk(max(1, int(0.98 * share * now))).indices.sort().values
-    raise DataError(f"{path}: no fit into {megabytes} MiB; allow more")
+        kept = weight.topk(max(1, int(0.98 * share * count))).indices.sort().values
+    raise DataError(f"{path}: {empty / 2**20:.1f} MiB without any Gaussian; allow more than {megabytes:g} MiB")
+
+
+def notebook_html(scene: Scene, name: str, view: int, styled: tuple[str, Restyle] | None) -> str:
+    """A page of a scene, as captured or in a style with its name, in an iframe; its stage is all of it."""
+    gaussians = scene if isinstance(scene, SplatScene) else None
+    styles = []
+    if styled is not None:
+        shown = scene.restyled(styled[1])
+        harmonics = shown.shown.harmonics if isinstance(shown, SplatScene) else None
+        styles = [Style(styled[0], [to_uint8(shown.render(scene.cameras, view).rgb)], harmonics)]
+    views = [PageView(scene.names[view], to_uint8(scene.render(scene.cameras, view).rgb))]
+    text, _ = page_html(Page(title=name, facts={}, views=views, styles=styles, scene=gaussians, start=view))
+    # Scripts without this page's origin: they reach nothing of the notebook.
+    return f'<iframe srcdoc="{escape(text)}" sandbox="allow-scripts" width="100%" height="620" style="border:0"></iframe>'
 
 
 def packed_scene(
@@ -151,26 +168,32 @@ def packed_scene(
         colours = packed.colours(each)
         styles.append(colour_header(colours))
         parts[f"style-{k}"] = colour_section(colours)
-    return {**header(packed), **about(scene, start), "styles": styles}, parts
+    return {**header(packed), **about_gaussians(scene, start), "styles": styles}, parts
 
 
-def about(scene: SplatScene, start: int) -> dict[str, Any]:
-    """Cameras of a scene and what drawing it needs, for the page's script."""
-    cameras = scene.views
-    others = torch.linspace(0, len(cameras) - 1, min(_CAMERAS, len(cameras))).round().long().unique().tolist()
+def about(cameras: Cameras, start: int, depth: Callable[[int], float]) -> dict[str, Any]:
+    """Cameras of a scene, that at `start` first, and where one may go; `depth` is the distance that a camera turns about."""
+    others = sorted({*torch.linspace(0, len(cameras) - 1, min(_CAMERAS, len(cameras))).round().long().tolist()})
     chosen = [start, *(view for view in others if view > start), *(view for view in others if view < start)]
-    depths = [_depth(scene, view) for view in chosen]
+    depths = [depth(view) for view in chosen]
     up = torch.nn.functional.normalize(upwards(cameras).double(), dim=0)
     place = cameras.pose[:, :, 3].double()
     centre = place.mean(0)
     radius = _ROOM * float((place - centre).norm(dim=1).max()) + 0.5 * sorted(depths)[len(depths) // 2]
     return {
+        "up": up.tolist(),
+        "reach": {"centre": centre.tolist(), "radius": radius},
+        "cameras": [_camera(cameras, view, far) for view, far in zip(chosen, depths, strict=True)],
+    }
+
+
+def about_gaussians(scene: SplatScene, start: int) -> dict[str, Any]:
+    """What drawing a scene's Gaussians needs beside them."""
+    return {
         "antialiased": scene.antialiased,
         "near": scene.near,
         "background": list(scene.background),
-        "up": up.tolist(),
-        "reach": {"centre": centre.tolist(), "radius": radius},
-        "cameras": [_camera(cameras, view, depth) for view, depth in zip(chosen, depths, strict=True)],
+        **about(scene.views, start, lambda view: _depth(scene, view)),
     }
 
 
@@ -197,10 +220,6 @@ def _depth(scene: SplatScene, view: int) -> float:
     return float(depth[inside].median()) if bool(inside.any()) else 1.0
 
 
-def _harmonics(page: Page) -> list[Tensor]:
-    return [style.harmonics for style in page.styles if style.harmonics is not None]
-
-
 def _check(page: Page) -> None:
     known = {reference.name for reference in page.references}
     if not page.views:
@@ -217,15 +236,8 @@ def _check(page: Page) -> None:
                 raise DataError(f"page: style {style.name} names reference {name}; known are {', '.join(sorted(known))}")
 
 
-def script(*names: str) -> str:
-    """The page's scripts, one after the other."""
-    here = files(__package__)
-    return "\n".join((here / name).read_text("utf-8") for name in ("splats.js", "place.js", "page.js", *names))
-
-
 def _text(page: Page, film: str, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]) -> str:
     """The page; `head` None = without Gaussians."""
-    here = files(__package__)
     names = [CAPTURED, *(style.name for style in page.styles)]
     # With Gaussians one picture a style is enough: it stands in until the first frame, and where there is no WebGL 2.
     most = 1 if page.scene is not None else len(page.views)
@@ -253,14 +265,14 @@ def _text(page: Page, film: str, head: Mapping[str, Any] | None, parts: Mapping[
     ]
     present = [(name, part) for name, part in below if part]
     code = f"{script()}\nopen(JSON.parse(at('data').textContent));\n"
-    return Template((here / "page.html").read_text("utf-8")).substitute(
+    return Template(read("page.html")).substitute(
         title=escape(page.title),
         lead=f'<p class="lead">{escape(page.lead)}</p>' if page.lead else "",
-        css=(here / "page.css").read_text("utf-8"),
+        css=read("page.css"),
         hash=f"'sha256-{base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()}'",
         nav="\n".join(f'<a href="#{name.lower()}">{name}</a>' for name, _ in present),
-        stage=Template((here / "stage.html").read_text("utf-8")).substitute(
-            still=f'src="{stills[0][0]}"', ratio=f"{width / height:.4f}", facts=_facts(page.facts)
+        stage=Template(read("stage.html")).substitute(
+            still=f'src="{stills[0][0]}"', ratio=f'style="--ratio:{width / height:.4f}"', facts=_facts(page.facts)
         ),
         body="\n".join(f'<section id="{name.lower()}"><h2>{name}</h2>\n{part}\n</section>' for name, part in present),
         credits="\n".join(f"<p>{escape(line)}</p>" for line in page.credits),

@@ -143,6 +143,7 @@ def prepare_crops(
 
     `measure` sets the network's units from these crops. Encoder and network must be on `device`; None = the CPU.
     """
+    # Crops of one size, small enough for every photograph.
     loaded = [load_photo(path, longest).to(device) for path in photos]
     side = min(side, *(min(photo.shape[:2]) for photo in loaded))
     made = [filtered_crop(encoder, photo, side, generator_of(seed, i)) for i, photo in enumerate(loaded)]
@@ -150,6 +151,10 @@ def prepare_crops(
     if measure:
         network.measure(images)
     seen = [network(image[None]) for image in images]
+    structure = []
+    for each in seen:
+        mean, std = (half[:, :, None, None] for half in style_statistics([each[CONTENT]])[0].chunk(2, 1))
+        structure.append(((each[CONTENT] - mean) / std).half())
     statistics = [style_statistics(each) for each in seen]
     wide = [double(features) for features, _ in made]
     own = [(each.mean(0), each.var(0, correction=0)) for each in wide]
@@ -158,7 +163,7 @@ def prepare_crops(
         torch.stack([features.half() for features, _ in made]),
         torch.stack([mean for mean, _ in own]).to(made[0][0]),
         torch.stack([deviation(mean, variance) for mean, variance in own]).to(made[0][0]),
-        torch.cat([_whitened(each[CONTENT]).half() for each in seen]),
+        torch.cat(structure),
         tuple(torch.cat(layer) for layer in zip(*statistics, strict=True)),
     )
 
@@ -182,11 +187,6 @@ def restyling_losses(
     return structure, style_distance(style_statistics(activations), wanted)
 
 
-def _whitened(activation: Annotated[Tensor, "1 K h w"]) -> Annotated[Tensor, "1 K h w"]:
-    mean, std = (half[:, :, None, None] for half in style_statistics([activation])[0].chunk(2, 1))
-    return (activation - mean) / std
-
-
 REPORT_PHOTOS = 20
 LONGEST = 384
 SAMPLE_PHOTOS, SAMPLE_LONGEST = 3, 192
@@ -198,22 +198,24 @@ def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[
     encoder = config.encoder.build().to(device)
     measured = config.style_weights is not None or config.content > 0 or config.style > 0
     network = load_style_network(config.style_weights).to(device) if measured else None
-
-    def prepared(chosen: Sequence[Path], seed: int, *, measure: bool) -> Crops | None:
-        if network is None:
-            return None
-        return prepare_crops(
-            encoder, network, chosen, side=config.size, longest=LONGEST, seed=seed, measure=measure, device=device
-        )
-
     photos, held = split(find_photos(config.images)[: config.photos])
     say(f"{len(photos)} photographs to learn from, {len(held)} held out")
-    features, colours = _samples(encoder, photos, config, device)
+    # Pixels of all photographs, on the CPU: they may be more than an accelerator holds.
+    parts = []
+    for index, path in enumerate(photos):
+        photo = load_photo(path, LONGEST).to(device)
+        pixels = random_pixels(photo, config.pixels, generator_of(config.seed + 1, index))
+        parts.append([each.cpu() for each in filtered_at(encoder, photo, pixels)])
+    features, colours = (torch.cat(column) for column in zip(*parts, strict=True))
     mean = features.mean(0).to(device)
     std = features.std(0, correction=0).clamp_min(1e-3 * float(features.std())).to(device)  # dead channels are not blown up
     say(f"{len(features)} pixels prepared")
-    crops = prepared(photos[: config.crops], config.seed + 2, measure=True)
-
+    crops = None
+    if network is not None:
+        chosen, seed = photos[: config.crops], config.seed + 2
+        crops = prepare_crops(
+            encoder, network, chosen, side=config.size, longest=LONGEST, seed=seed, measure=True, device=device
+        )
     torch.manual_seed(config.seed)
     decoder = MlpDecoder(encoder.channels, config.hidden).to(device)
 
@@ -222,20 +224,29 @@ def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[
         return colour
 
     def loss(generator: torch.Generator) -> Tensor:
+        # Identity: the colour of a pixel from its features; noise on these makes the decoder smooth.
         index = torch.randint(0, len(features), (config.batch,), generator=generator)
         content = (features[index].to(device) - mean) / std
         noise = torch.randn(content.shape, generator=generator).to(device)
         identity = F.mse_loss(decoder(content + config.noise * noise), colours[index].to(device))
-        if network is None or crops is None or config.content == config.style == 0:
+        if crops is None or network is None or config.content == config.style == 0:
             return identity
+        # lambda_c L_c + lambda_s L_s (paper), in one step of so many, where it weighs as many times more.
         if int(torch.randint(0, config.every, (), generator=generator)) != 0:
             return identity
-        pairs = (each.to(device) for each in _pairs(len(crops.mean), config.pairs, generator))
-        structure, style = restyling_losses(crops, network, decode, *pairs)
+        # Two different crops, where there are two.
+        one = torch.randint(0, len(crops.mean), (config.pairs,), generator=generator)
+        further = torch.randint(1, max(2, len(crops.mean)), (config.pairs,), generator=generator)
+        pair = one.to(device), ((one + further) % len(crops.mean)).to(device)
+        structure, style = restyling_losses(crops, network, decode, *pair)
         return identity + config.every * (config.content * structure + config.style * style)
 
     steps = train(decoder, loss, config, output, say, _picture(encoder, held, decode, device))
-    _fold(decoder.first, mean, std)
+    # W (f - mean) / std + b as one linear layer of f, in float64.
+    with torch.no_grad():
+        weight = double(decoder.first.weight) / double(std)
+        decoder.first.bias.copy_(double(decoder.first.bias) - weight @ double(mean))
+        decoder.first.weight.copy_(weight)
     metadata = {
         "kind": DECODER_KIND,
         "encoder": encoder.identity,
@@ -244,11 +255,17 @@ def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[
         "licence": "Apache-2.0; trained by this project",
     }
     write_weights(output, decoder.state_dict(), metadata)
+    # What is measured is the file.
     trained = load_decoder(output, encoder=encoder.identity, channels=encoder.channels).to(device)
     report: Report = {"encoder": encoder.identity, "steps": steps, "learned_photos": len(photos)}
     report |= decoder_report(encoder, trained, held[:REPORT_PHOTOS], device)
-    others = prepared(held[:REPORT_PHOTOS], config.seed + 3, measure=False)
-    return report | (restyling_report(others, network, trained) if others is not None and network is not None else {})
+    if network is not None:
+        chosen, seed = held[:REPORT_PHOTOS], config.seed + 3
+        others = prepare_crops(
+            encoder, network, chosen, side=config.size, longest=LONGEST, seed=seed, measure=False, device=device
+        )
+        report |= restyling_report(others, network, trained)
+    return report
 
 
 @torch.no_grad()
@@ -277,13 +294,6 @@ def restyling_report(crops: Crops, network: StyleNetwork, decode: Decode) -> Rep
     return {"content_loss": round(content, 4), "style_loss": round(style, 4)}
 
 
-def _pairs(count: int, size: int, generator: torch.Generator) -> tuple[Annotated[Tensor, "B"], Annotated[Tensor, "B"]]:
-    """Content and style of each pair: two different crops, where there are two."""
-    content = torch.randint(0, count, (size,), generator=generator)
-    further = torch.randint(1, max(2, count), (size,), generator=generator)
-    return content, (content + further) % count
-
-
 def _picture(
     encoder: Encoder, held: Sequence[Path], decode: Decode, device: torch.device
 ) -> Callable[[], Annotated[Tensor, "H W 3"]]:
@@ -303,25 +313,3 @@ def _picture(
         return sheet(rows)
 
     return picture
-
-
-def _samples(
-    encoder: Encoder, photos: Sequence[Path], config: PretrainDecoderConfig, device: torch.device
-) -> tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N 3"]]:
-    """On the CPU: they may be more than an accelerator holds."""
-    features, colours = [], []
-    for index, path in enumerate(photos):
-        photo = load_photo(path, LONGEST).to(device)
-        pixels = random_pixels(photo, config.pixels, generator_of(config.seed + 1, index))
-        content, rgb = filtered_at(encoder, photo, pixels)
-        features.append(content.cpu())
-        colours.append(rgb.cpu())
-    return torch.cat(features), torch.cat(colours)
-
-
-@torch.no_grad()
-def _fold(layer: nn.Linear, mean: Annotated[Tensor, "C"], std: Annotated[Tensor, "C"]) -> None:
-    """W (f - mean) / std + b as one linear layer of f, in float64."""
-    weight = double(layer.weight) / double(std)
-    layer.bias.copy_(double(layer.bias) - weight @ double(mean))
-    layer.weight.copy_(weight)

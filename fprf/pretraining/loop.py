@@ -1,32 +1,43 @@
-"""The training loop of every pretraining: Adam, one cosine to zero by time or steps, checkpoints, report and sample pictures.
+"""Training of a network by any loss: Adam, one cosine to zero by time or steps, checkpoints, sample pictures.
 
-A batch is a function of (seed, step), so that a resumed run goes on as the interrupted one would have. Prepared crops and
-targets are kept beside the output until the run is finished.
+A batch is a function of (seed, step). The checkpoints lie in a folder beside the output until the training is finished.
 """
 
-import json
 import math
+import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import torch
 from torch import Tensor, nn
 
-from ..io.atomic import write_json
+from ..interfaces import Figures, Learner, State
 from ..io.images import to_uint8, write_image
-from ..plugins.weights import read_weights, write_weights
+from ..training import checkpoint
+from ..training.driver import Report, Schedule, learn
+from ..training.run import Run, held
+from ..training.tasks import begin
 from .config import PretrainConfig
 
 GAP = 4
 """Pixels between the pictures of a sheet."""
+WARM_UP = 0.02
+"""Share of the run in which the rate rises."""
+_SAVED, _SPOKEN = 60.0, 15.0
+"""Seconds between checkpoints, and between lines of progress."""
 
 
-def report_path(output: Path) -> Path:
-    """Path of the report of these weights."""
-    return output.with_name(output.stem + ".report.json")
+def generator_of(seed: int, step: int) -> torch.Generator:
+    """The generator of one step. Only 32 bits of a seed count, so seeds are spread over them."""
+    return torch.Generator().manual_seed((seed * 0x9E3779B1 + step) % (1 << 32))
+
+
+def training_folder(output: Path) -> Path:
+    """Folder of an unfinished training of these weights."""
+    return output.with_name(output.name + ".training")
 
 
 def samples_folder(output: Path) -> Path:
@@ -34,11 +45,86 @@ def samples_folder(output: Path) -> Path:
     return output.with_name(output.stem + ".samples")
 
 
-def write_report(output: Path, kind: str, report: Mapping[str, float | int | str]) -> Path:
-    """Write the report, whole or not at all; the weights by their bare name, since both may be moved."""
-    path = report_path(output)
-    write_json(path, {"kind": kind, **report, "weights": output.name})
-    return path
+class NetworkLearner(Learner):
+    """A network in training. `loss` draws its batch from the generator of a step."""
+
+    def __init__(self, network: nn.Module, loss: Callable[[torch.Generator], Tensor], config: PretrainConfig) -> None:
+        self.network, self.loss, self.config = network, loss, config
+        self.optimizer = torch.optim.Adam(network.parameters(), config.rate)
+        self.value = torch.zeros(())
+        self.skipped = self.failed = self.seen = 0
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.network.parameters()).device
+
+    def step(self, index: int, share: float) -> None:
+        warm = min(1.0, share / WARM_UP + 0.01)
+        self.optimizer.param_groups[0]["lr"] = self.config.rate * warm * 0.5 * (1 + math.cos(math.pi * share))
+        value = self.loss(generator_of(self.config.seed, index))
+        self.optimizer.zero_grad(set_to_none=True)
+        value.backward()  # type: ignore[no-untyped-call]
+        self.value, self.seen = value.detach(), self.seen + self.config.batch
+        finite = bool(torch.isfinite(self.value))
+        self.skipped, self.failed = self.skipped + (not finite), 0 if finite else self.failed + 1
+        if finite:
+            self.optimizer.step()
+
+    def figures(self) -> Figures:
+        fault = "the loss" if self.failed else ""
+        return Figures({"loss": float(self.value)}, self.seen, self.skipped, self.failed, fault)
+
+    def state(self) -> State:
+        return State(self.network.state_dict(), checkpoint.moments_of(self.optimizer))
+
+    def load(self, state: State) -> None:
+        checkpoint.restore(state, self.network, self.optimizer)
+        self.failed = 0
+
+
+def train(
+    network: nn.Module,
+    loss: Callable[[torch.Generator], Tensor],
+    config: PretrainConfig,
+    output: Path,
+    say: Callable[[str], None],
+    picture: Callable[[], Annotated[Tensor, "H W 3"]] | None = None,
+) -> int:
+    """Train in place until the budget is spent; the number of steps. A training of the same config goes on, another is dropped.
+
+    `picture` shows what the network can do, in [0, 1]: it is written to `samples_folder` every `config.samples` seconds and
+    at the end. Raises as `training.driver.learn`.
+    """
+    spoken = shown = time.monotonic()
+
+    @torch.no_grad()
+    def show(step: int) -> None:
+        if picture is not None and config.samples > 0:
+            write_image(samples_folder(output) / f"step-{step:07d}.png", to_uint8(picture()))
+
+    def report(event: Report) -> None:
+        nonlocal spoken, shown
+        now = time.monotonic()
+        if now - spoken > _SPOKEN:
+            say(f"step {event.step}  {100 * event.share:.0f} %  loss {event.losses['loss']:.5f}")
+            spoken = now
+        if now - shown > config.samples and event.share < 1:
+            show(event.step)
+            shown = now
+
+    # The folder is a run's, as far as the driver needs one; it goes when the weights are there.
+    run = Run(training_folder(output))
+    schedule = Schedule(config.steps, None if config.steps is not None else config.minutes, _SAVED / 60)
+    with held(run.root):
+        begin(run.root, repr(replace(config, samples=0.0, device="auto")))
+        if steps := checkpoint.steps(run.checkpoints):
+            say(f"resumed at step {steps[-1]}")
+        network.train()
+        reached = learn(NetworkLearner(network, loss, config), run, schedule, report)
+        network.eval()
+        show(reached.step)
+        shutil.rmtree(run.root)
+    return reached.step
 
 
 def sheet(rows: Sequence[Sequence[Annotated[Tensor, "H W 3"]]]) -> Annotated[Tensor, "H W 3"]:
@@ -52,112 +138,3 @@ def sheet(rows: Sequence[Sequence[Annotated[Tensor, "H W 3"]]]) -> Annotated[Ten
             left = sum(width[:x]) + GAP * x
             whole[top : top + picture.shape[0], left : left + picture.shape[1]] = picture.detach().to(whole)
     return whole
-
-
-WARM_UP = 0.02
-"""Share of the run in which the rate rises."""
-EVERY_SECONDS = 60.0
-Say = Callable[[str], None]
-
-
-@dataclass
-class _Progress:
-    step: int = 0
-    seconds: float = 0.0
-
-    def done(self, config: PretrainConfig) -> float:
-        """Finished share of the run, 0 to 1."""
-        if config.steps is not None:
-            return min(1.0, self.step / config.steps)
-        return min(1.0, self.seconds / (60 * config.minutes))
-
-
-def generator_of(seed: int, step: int) -> torch.Generator:
-    """The generator of one step. Only 32 bits of a seed count, so seeds are spread over them."""
-    return torch.Generator().manual_seed((seed * 0x9E3779B1 + step) % (1 << 32))
-
-
-def checkpoint_path(output: Path) -> Path:
-    """Path of the state of an unfinished run."""
-    return output.with_name(output.name + ".checkpoint")
-
-
-def train(
-    network: nn.Module,
-    loss: Callable[[torch.Generator], Tensor],
-    config: PretrainConfig,
-    output: Path,
-    say: Say,
-    picture: Callable[[], Annotated[Tensor, "H W 3"]] | None = None,
-) -> int:
-    """Train in place until the budget is spent; the number of steps. `loss` draws its batch from the generator.
-
-    `picture` shows what the network can do, in [0, 1]: it is written to `samples_folder` every `config.samples` seconds and
-    at the end.
-    """
-    optimizer = torch.optim.Adam(network.parameters(), config.rate)
-    progress = _resume(network, optimizer, config, output)
-    if progress.step:
-        say(f"resumed at step {progress.step}")
-    network.train()
-    started, saved, spoken = time.monotonic() - progress.seconds, time.monotonic(), 0.0
-    shown = saved
-    while (done := progress.done(config)) < 1:
-        optimizer.param_groups[0]["lr"] = config.rate * min(1.0, done / WARM_UP + 0.01) * 0.5 * (1 + math.cos(math.pi * done))
-        value = loss(generator_of(config.seed, progress.step))
-        optimizer.zero_grad(set_to_none=True)
-        value.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-        progress.step += 1
-        now = time.monotonic()
-        progress.seconds = now - started
-        if now - spoken > EVERY_SECONDS / 4:
-            say(f"step {progress.step}  {100 * done:.0f} %  loss {value.item():.5f}")
-            spoken = now
-        if now - saved > EVERY_SECONDS:
-            _save(network, optimizer, config, output, progress)
-            saved = now
-        if picture is not None and config.samples > 0 and now - shown > config.samples and progress.done(config) < 1:
-            _show(picture, output, progress.step)
-            shown = now
-    network.eval()
-    if picture is not None and config.samples > 0:
-        _show(picture, output, progress.step)
-    checkpoint_path(output).unlink(missing_ok=True)
-    return progress.step
-
-
-@torch.no_grad()
-def _show(picture: Callable[[], Tensor], output: Path, step: int) -> None:
-    write_image(samples_folder(output) / f"step-{step:07d}.png", to_uint8(picture()))
-
-
-def _key(config: PretrainConfig) -> str:
-    return repr(replace(config, samples=0.0, device="auto"))
-
-
-def _save(network: nn.Module, optimizer: torch.optim.Adam, config: PretrainConfig, output: Path, progress: _Progress) -> None:
-    tensors = {f"network.{name}": value for name, value in network.state_dict().items()}
-    for index, moments in optimizer.state_dict()["state"].items():
-        tensors |= {f"optimizer.{index}.{name}": value for name, value in moments.items()}
-    metadata = {"config": _key(config), "progress": json.dumps([progress.step, progress.seconds])}
-    write_weights(checkpoint_path(output), tensors, metadata)
-
-
-def _resume(network: nn.Module, optimizer: torch.optim.Adam, config: PretrainConfig, output: Path) -> _Progress:
-    """Continue the run of the same config; any other checkpoint is left alone and overwritten in time."""
-    path = checkpoint_path(output)
-    if not path.is_file():
-        return _Progress()
-    tensors, metadata = read_weights(path)
-    if metadata.get("config") != _key(config):
-        return _Progress()
-    network.load_state_dict({name[8:]: value for name, value in tensors.items() if name.startswith("network.")})
-    state: dict[int, dict[str, Tensor]] = {}
-    for name, value in tensors.items():
-        if name.startswith("optimizer."):
-            _, index, moment = name.split(".")
-            state.setdefault(int(index), {})[moment] = value
-    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
-    step, seconds = json.loads(metadata["progress"])
-    return _Progress(step=step, seconds=seconds)

@@ -248,7 +248,7 @@ def _run(
                 process.wait()
     code = process.returncode
     if code == NO_PYCOLMAP:
-        raise UsageError("fprf process: pycolmap 4 or newer is needed; install it with: pip install 'fprf[sfm]'")
+        raise UsageError("fprf process: pycolmap 4 or newer is needed; install it with: pip install 'pycolmap>=4'")
     if code == NO_MODEL:
         # What the decoders lost comes first: it may be all that is wrong.
         unread = sorted(set(state.images) - set(MatchTables(place.database).ids))

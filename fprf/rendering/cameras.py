@@ -13,6 +13,7 @@ from functools import cached_property, lru_cache
 from typing import Annotated
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from .lens import PINHOLE, bend, lens_reach, unbend
@@ -128,6 +129,18 @@ def project(
     turned = torch.stack([local[:, 0], -local[:, 1], -local[:, 2]], -1)
     plane = bend(cameras.distortion[view], cameras.lens[view], cameras.reach[view], turned)
     return plane * cameras.focal[view] + cameras.centre[view], turned[:, 2]
+
+
+def look_up(image: Annotated[Tensor, "H W C"], pixel: Annotated[Tensor, "N 2"]) -> Annotated[Tensor, "N C"]:
+    """Bilinear values at pixels, whose centres lie at +0.5, in their dtype; beside the image those of its border."""
+    place = 2 * pixel / pixel.new_tensor([image.shape[1], image.shape[0]]) - 1
+    return F.grid_sample(
+        image.to(place).permute(2, 0, 1)[None],
+        place[None, None],
+        mode="bilinear",
+        padding_mode="border",
+        align_corners=False,
+    )[0, :, 0].T
 
 
 LIMIT = 256 * 2**20

@@ -3,10 +3,6 @@
 World units and OpenGL axes as in `rendering.cameras`; float64. Every path stays where the training cameras were: a
 radiance field knows nothing of places that no camera has seen.
 
-A stereo panorama has no single centre: each eye moves on a circle as the head turns, and every column of the picture is
-seen from where the eye is when it looks there (omnidirectional stereo: Peleg, Ben-Ezra and Pritch, 2001). It is rendered as
-strips of columns, each a camera of its own.
-
 A captured view is worth showing where several training cameras have seen the same from about the same direction (coverage).
 """
 
@@ -246,10 +242,6 @@ def upwards(cameras: Cameras) -> Annotated[Tensor, "3"]:
     return cameras.pose[:, :, 2].mean(dim=0) if float(up.norm()) < 0.3 else up
 
 
-STRIP = 4
-"""Columns that share an eye's place."""
-
-
 def panoramas(cameras: Cameras, width: int, up: Annotated[Tensor, "3"]) -> Cameras:
     """Level panoramas at the cameras' places, `width` x `width` / 2 pixels, the middle where each camera looks."""
     ahead = -cameras.pose[:, :, 2]
@@ -260,20 +252,6 @@ def panoramas(cameras: Cameras, width: int, up: Annotated[Tensor, "3"]) -> Camer
     place = cameras.pose[:, :, 3]
     pose = look_at(place, place + level, upright)
     return ideal_cameras(pose, width / (2 * math.pi), (width, max(1, width // 2)), PANORAMA)
-
-
-def eye_strips(panorama: Cameras, offset: float) -> Cameras:
-    """The strips of one eye of one panorama, left to right; `offset` from the middle to the right, in world units."""
-    width, height = (int(side) for side in panorama.size[0])
-    starts = torch.arange(0, width, STRIP)
-    widths = (width - starts).clamp(max=STRIP)
-    many = panorama.select(torch.zeros(len(starts), dtype=torch.int64))
-    angle = (starts + widths / 2 - float(panorama.centre[0, 0])) / float(panorama.focal[0, 0])
-    right, back = panorama.pose[0, :, 0], panorama.pose[0, :, 2]
-    across = angle.cos()[:, None] * right + angle.sin()[:, None] * back
-    pose = torch.cat([many.pose[:, :, :3], (many.pose[:, :, 3] + offset * across)[:, :, None]], -1)
-    centre = torch.stack([many.centre[:, 0] - starts, many.centre[:, 1]], -1)
-    return replace(many, pose=pose, centre=centre, size=torch.stack([widths, torch.full_like(widths, height)], -1))
 
 
 _GRID = (4, 3)

@@ -1,13 +1,16 @@
-"""Rays to colour, features and depth. Every stage that nobody asks for, or whose weight is too small to be seen, is skipped.
+"""Volume rendering: rays to colour, features and depth. Stages that nobody asks for are skipped.
 
-    sampler -> edges -> density everywhere -> weights -> the heaviest samples of each ray
+    sampler -> edges t -> density everywhere -> weights -> the heaviest samples of each ray
             -> content -> (stylizer) -> decoder -> composite
 
-Only the kept samples meet the content network, the semantic field, the stylizer and the decoder; what is left out weighs at
-most `budget` a ray, which bounds the colour error (colours lie in [0, 1]).
+Letters: R rays, S samples of a ray between E = S + 1 edges t, M samples that are kept of all R rays (packed, ray after ray),
+L latent, C content and D semantic channels. With densities s_i and steps d_i = t_i+1 - t_i (paper, Eq. 2; NeRF, Eq. 3)
 
-In training on an accelerator every sample is kept and what is left out has weight 0: the host would have to wait for the
-number of samples in each step. Geometry stays in full precision under autocast: a density is an exponential.
+    w_i = T_i (1 - exp(-s_i d_i)),    T_i = exp(-sum_j<i s_j d_j),    value of a ray = sum_i w_i value_i + T_S background
+
+Only kept samples meet the content network, the semantic field, the stylizer and the decoder; what is left out weighs at most
+`budget` a ray, which bounds the error of colours in [0, 1]. In training on an accelerator every sample is kept and what is left
+out has weight 0: the host would have to wait for their number in each step.
 """
 
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -41,8 +44,8 @@ class Parts(NamedTuple):
     decoder: Decoder
 
 
-class Kept(NamedTuple):
-    """The samples of R rays that matter, flattened: M of them, ray after ray."""
+class PackedSamples(NamedTuple):
+    """The samples of R rays that are kept, packed: M of them, ray after ray."""
 
     ray: Annotated[Tensor, "M"]
     """int64 index of the ray of each."""
@@ -68,26 +71,35 @@ class March(NamedTuple):
     opacity: Annotated[Tensor, "R"]
     transmittance: Annotated[Tensor, "R"]
     """Of the whole ray: the share of the background that is seen. Density learns from it."""
-    kept: Kept
+    kept: PackedSamples
 
 
 def march(
     rays: Rays, parts: Parts, *, budget: float, step: int | None = None, generator: torch.Generator | None = None
 ) -> March:
-    """Sample, weigh, and keep what matters."""
+    """Sample rays, weigh the samples, and keep the heaviest. `step` is given in training alone.
+
+    In full precision under autocast too: a density is an exponential.
+    """
     with full_precision(rays.origin):
         return _march(rays, parts, budget, step, generator)
 
 
 def _march(rays: Rays, parts: Parts, budget: float, step: int | None, generator: torch.Generator | None) -> March:
     space = parts.space
-    sampled = parts.sampler(_fixed(rays), space=space, step=step, generator=generator)
+    sampled = parts.sampler(_detached(rays), space=space, step=step, generator=generator)
     # A camera samples what is near it far more densely than any other camera does, and could explain its own image by a
     # veil there. Scaling gradients by the square of the distance makes every piece of space count alike (Philip and
     # Deschaintre 2023); beyond a few times the nearest distance that is no longer needed.
     scaled = step is not None and space.kind in ("contraction", "open")
     if not scaled and compiled.usable(rays.origin, sampled.t):
-        return _march_compiled(rays, parts, sampled, budget)
+        # The same without gradients, compiled, ray by ray.
+        place = compiled.place(rays, sampled.t, space.warp)
+        sample = parts.field.density(place.view(-1, 3))
+        weighed = compiled.weigh(sample.density.view(place.shape[:2]), sampled.t, budget)
+        kept = PackedSamples(*compiled.gather(weighed, place, sample.latent, rays.view), start=weighed.start)
+        return March(sampled, weighed.weights, weighed.depth, weighed.opacity, weighed.transmittance, kept)
+    # Densities at the middle of each step, in the unit cube, where the fields live.
     middle = midpoints(sampled.t)
     points = rays.origin[:, None] + rays.direction[:, None] * middle[..., None]
     located = space.locate(points.view(-1, 3))
@@ -96,23 +108,25 @@ def _march(rays: Rays, parts: Parts, budget: float, step: int | None, generator:
     scale = (middle / (_NEAR_CAMERA * rays.near[:, None])).square().clamp(max=1) if scaled else None
     if scale is not None:
         density = scale_gradient(density, scale)
+    # Weights and transmittance of Eq. 2; what is only shown needs no gradient.
     weights = transmittance_weights(density, sampled.t)
     optical = (density * (sampled.t[:, 1:] - sampled.t[:, :-1])).sum(-1)
-    # 1 - sum of weights would cancel where the ray is opaque.
-    transmittance = torch.exp(-optical)
+    transmittance = torch.exp(-optical)  # 1 - sum of weights would cancel where the ray is opaque
     with torch.no_grad():
         opacity = -torch.expm1(-optical)
         depth = (weights * middle).sum(-1) / weights.sum(-1).clamp_min(1e-10)
         keep = keep_heaviest(weights, budget)
     if step is not None and rays.origin.device.type != "cpu":
+        # All samples, the light ones with weight 0: shapes that the host knows without waiting.
         ray = torch.arange(len(weights), device=weights.device)[:, None].expand(weights.shape).reshape(-1)
         heavy = torch.where(keep, weights, 0.0).view(-1)
         flat = None if scale is None else scale.view(-1)
-        kept = Kept(ray, heavy, located, sample.latent, rays.view.index_select(0, ray), flat, whole=True)
+        kept = PackedSamples(ray, heavy, located, sample.latent, rays.view.index_select(0, ray), flat, whole=True)
         return March(sampled, weights, depth, opacity, transmittance, kept)
+    # Elsewhere the kept ones alone, gathered.
     index = keep.view(-1).nonzero()[:, 0]
     ray = index // max(1, middle.shape[1])
-    kept = Kept(
+    kept = PackedSamples(
         ray,
         weights.view(-1).index_select(0, index),
         located.index_select(0, index),
@@ -123,17 +137,8 @@ def _march(rays: Rays, parts: Parts, budget: float, step: int | None, generator:
     return March(sampled, weights, depth, opacity, transmittance, kept)
 
 
-def _march_compiled(rays: Rays, parts: Parts, sampled: Sampled, budget: float) -> March:
-    """The same without gradients, ray by ray."""
-    point = compiled.place(rays, sampled.t, parts.space.warp)
-    sample = parts.field.density(point.view(-1, 3))
-    weighed = compiled.weigh(sample.density.view(point.shape[:2]), sampled.t, budget)
-    kept = Kept(*compiled.gather(weighed, point, sample.latent, rays.view), start=weighed.start)
-    return March(sampled, weighed.weights, weighed.depth, weighed.opacity, weighed.transmittance, kept)
-
-
-def _fixed(rays: Rays) -> Rays:
-    """The rays without gradients: neither where samples lie nor what things are moves a pose."""
+def _detached(rays: Rays) -> Rays:
+    """Rays without gradients: neither the places of samples nor semantics shall move a camera's pose."""
     return Rays(*(x.detach() for x in rays))
 
 
@@ -157,7 +162,7 @@ def shade(
     return restyle.colour(decoder, content, semantic if Want.SEMANTIC in restyle.needs else None)
 
 
-def composite(kept: Kept, values: Annotated[Tensor, "M C"], rays: int) -> Annotated[Tensor, "rays C"]:
+def composite(kept: PackedSamples, values: Annotated[Tensor, "M C"], rays: int) -> Annotated[Tensor, "rays C"]:
     """Weighted sum over the kept samples of each ray (paper, Eq. 2)."""
     values = values.to(kept.weight.dtype)  # under autocast networks answer in half precision
     if kept.start is not None and compiled.usable(kept.weight, values):
@@ -167,7 +172,7 @@ def composite(kept: Kept, values: Annotated[Tensor, "M C"], rays: int) -> Annota
     return values.new_zeros(rays, values.shape[1]).index_add(0, kept.ray, values * kept.weight[:, None])
 
 
-def composite_mean(kept: Kept, values: Annotated[Tensor, "M C"], rays: int) -> Annotated[Tensor, "rays C"]:
+def composite_mean(kept: PackedSamples, values: Annotated[Tensor, "M C"], rays: int) -> Annotated[Tensor, "rays C"]:
     """Mean over the kept samples of each ray, by their weights; 0 where a ray meets nothing."""
     mass = composite(kept, torch.ones_like(kept.weight)[:, None], rays)
     return composite(kept, values, rays) / mass.clamp_min(1e-10)
@@ -193,10 +198,12 @@ def render_rays(
     from their `semantic_samples` heaviest samples, whose weights are scaled up to the ray's opacity. Content features are
     composited with detached weights too unless they may move density.
     """
+    # Geometry, which no style touches.
     marched = march(rays, parts, budget=budget, step=step, generator=generator)
     kept, count = marched.kept, len(rays.near)
     rgb = content = semantic = None
     if want & (Want.COLOUR | Want.CONTENT):
+        # Content features of the kept samples: rendered as they are, or as colours, which a style may change before.
         features = parts.field.content(kept.latent, kept.view)
         if kept.gradient_scale is not None:
             features = scale_gradient(features, kept.gradient_scale[:, None])
@@ -204,17 +211,21 @@ def render_rays(
             still = kept if content_moves_density else kept._replace(weight=kept.weight.detach())
             content = composite(still, features, count)
         if Want.COLOUR in want:
+            # Semantics are evaluated only where the style tells places apart by them.
             backdrop = 0.0 if background is None else marched.transmittance[:, None] * background
             styled = restyle is not None and not restyle.idle and Want.SEMANTIC in restyle.needs
             semantics = parts.semantic(kept.point) if styled and parts.semantic is not None else None
             rgb = composite(kept, shade(parts.decoder, features, semantics, restyle), count) + backdrop
     if Want.SEMANTIC in want and parts.semantic is not None:
-        semantic = _semantics(marched, _fixed(rays), parts, count if semantic_rays is None else semantic_rays, semantic_samples)
+        semantic = _semantics(
+            marched, _detached(rays), parts, count if semantic_rays is None else semantic_rays, semantic_samples
+        )
     counts = {"rays": count, "samples": marched.weights.numel(), "kept": len(kept.ray)}
     return Rendered(marched.depth, marched.opacity, rgb, content, semantic, marched.weights, marched.sampled, counts)
 
 
-def _semantics(marched: March, rays: Rays, parts: Parts, count: int, samples: int | None) -> Tensor:
+def _semantics(marched: March, rays: Rays, parts: Parts, count: int, samples: int | None) -> Annotated[Tensor, "count D"]:
+    """Semantics of the first `count` rays, from their heaviest samples: most light comes from a few of them."""
     assert parts.semantic is not None
     weights = marched.weights[:count].detach()
     s = min(samples or weights.shape[1], weights.shape[1])

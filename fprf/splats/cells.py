@@ -43,8 +43,7 @@ from ..types import Cell
 from .config import GaussiansConfig
 from .gaussians import Gaussians, from_tensors, tensors_of
 from .initial import spatial_order
-from .learner import MOVES, GaussianLearner
-from .learner import Part as Share
+from .learner import MOVES, GaussianLearner, Stage
 from .levels import in_view
 from .loading import refined
 from .photographs import cover, load_photographs, load_skies, make_levels
@@ -171,7 +170,7 @@ class Overview(Part):
         held = other_views(scene, scene.train.tolist()) if facts.exposure or facts.centres else ()
         return build(self.config, scene, replace(facts, held=held))
 
-    def whole(self) -> bool:
+    def is_intact(self) -> bool:
         """Verify the checkpoint, once for all cells. Raises CheckpointError where it is damaged."""
         kept = checkpoint.steps(self.folder / "checkpoints")
         try:
@@ -193,18 +192,19 @@ class CellPart(Part):
     def build(self) -> GaussianLearner:
         """Go on from the whole scene, at lower rates."""
         config, cell, start = self.config, self.cell, self.start
+        # Photographs, from where the whole scene found its views, as far as the cell's windows reach.
         scene = replace(self.scene, cameras=refined(self.scene.cameras, start))
         images, masks = load_photographs(config, scene, list(cell.windows))
         skies = load_skies(config, scene, images)
         images, masks, skies = crop(cell, images), crop(cell, masks), crop(cell, skies)
+        # Gaussians of the whole scene that these show.
         near, whole = float(start.model["near"]), from_tensors(start.model)
         shown = shown_in_windows(scene, cell, whole, near)
-        gaussians = whole.select(shown)
-        own = scene_in_windows(scene, cell)
+        gaussians, own = whole.select(shown), scene_in_windows(scene, cell)
         # Only what lies inside and in the border becomes more: its share of all that may be added.
         around = int(cell.around(gaussians.means).sum())
         cap = len(gaussians) + round(max(config.cap - len(whole), 0) * around / len(whole))
-        tones = tones_in(self.facts, start)
+        tones = overview_tones(self.facts, start)
         learner = GaussianLearner(
             replace(config, cap=cap, rate=_RATE * config.rate),
             make_levels(own, images, masks, near, skies),
@@ -215,11 +215,11 @@ class CellPart(Part):
             limit_widths(scene, near, cells=True),
             near=near,
             tones=tones and tones.going_on(other_views(scene, cell.windows)),
-            part=Share(start.step, config.overview, 1.0),
+            stage=Stage(start.step, config.overview, 1.0),
             known=known_of(own, config.data, self.facts),
             origin="the whole scene",
         )
-        # As if the number had grown from the beginning of the schedule.
+        # Their moments go on, and their number grows as if it had from the beginning of the schedule.
         passed = min(config.overview / config.grow, 0.99)
         begun = max(1, round((len(gaussians) / cap**passed) ** (1 / (1 - passed))))
         moments = {name: start.optimizer[name][shown] for name in _MOMENTS}
@@ -352,7 +352,7 @@ def shown_in_windows(scene: Scene, cell: Cell, gaussians: Gaussians, near: float
     return visible
 
 
-def tones_in(facts: Facts, start: checkpoint.Saved) -> Tones | None:
+def overview_tones(facts: Facts, start: checkpoint.Saved) -> Tones | None:
     """The exposures that cells go on from; None where none are learnt."""
     if "tones.gain.value" not in start.optimizer:
         return None
@@ -369,7 +369,8 @@ def unite(root: Path, cells: Sequence[Cell]) -> int:
     Each view has the mean exposure of the cells that have a window of it. Raises CheckpointError where one is not finished.
     """
     start = load_overview(root)
-    tones = tones_in(Run(root).load_known().facts, start)
+    # Exposures are averaged over cells as factors: of each view, those of the cells that have a window of it.
+    tones = overview_tones(Run(root).load_known().facts, start)
     parts: list[tuple[Tensor, ...]] = []
     step, seconds = start.step, start.seconds
     gain, count = torch.zeros(0), torch.zeros(0)
@@ -380,6 +381,7 @@ def unite(root: Path, cells: Sequence[Cell]) -> int:
         saved, _ = checkpoint.load_latest(folder / "checkpoints")
         if saved is None or read_done(folder) is None:
             raise CheckpointError(f"{folder}: this cell is not finished; go on with `fprf train {root / 'config.json'}`")
+        # What lies outside of the cell only explained what its windows show: its own cells know it better.
         gaussians = from_tensors(saved.model)
         parts.append(tuple(vars(gaussians.select(cell.holds(gaussians.means))).values()))
         step, seconds = max(step, start.step + saved.step), seconds + saved.seconds
@@ -389,6 +391,7 @@ def unite(root: Path, cells: Sequence[Cell]) -> int:
             own.load_state_dict({name: saved.optimizer[f"tones.{name}.value"].clone() for name in ("gain", "exponent")})
             gain[used] += own.gains().detach()[used]
             count[used] += 1
+    # Poses were refined in the whole scene alone.
     gaussians = Gaussians(*(torch.cat(column) for column in zip(*parts, strict=True)))
     corrections = {name: each for name, each in start.optimizer.items() if name == MOVES}
     if tones is not None:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import torch
 
     from ..datamanagers.scene import Scene
-    from ..interfaces import Learner, Partition
+    from ..interfaces import Partition, SceneLearner
     from ..training.model import Facts
 
 
@@ -107,7 +107,7 @@ class GaussiansConfig(RunConfig):
     """Semantic regions of the scene (with 16, 24, 32 of them 89, 91, 91 % of the town's pixels take from the right class)."""
     semantic_size: int = 240
     """Longest side in pixels, at most, of the views that semantics are found in and of references as they are encoded: at 240
-    the bundled encoder tells things apart best (docs/train-gaussians.md)."""
+    the bundled encoder tells things apart best (docs/gaussians.md)."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Colour behind everything, also where images have transparency."""
 
@@ -134,7 +134,7 @@ class GaussiansConfig(RunConfig):
         *,
         saved: "Facts | None" = None,
         progress: Callable[[int, int, str], None] | None = None,
-    ) -> "Learner | Partition":
+    ) -> "SceneLearner | Partition":
         """Read the photographs and find the first points; cells where there are to be some."""
         if self.cells > 1:
             from .cells import Cells

@@ -5,7 +5,7 @@ the real spherical harmonics Y of `fields.harmonics`.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, NamedTuple
 
@@ -103,6 +103,16 @@ class Gaussians:
     def select(self, index: Annotated[Tensor, "M"] | slice) -> "Gaussians":
         """Some of the Gaussians, in the order of `index` (int64, or a mask of all); without a copy those of a slice."""
         return Gaussians(*(part[index] for part in vars(self).values()))
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianRows:
+    """Gaussians of which some rows at a time are in memory."""
+
+    count: int
+    part: Callable[[slice], Gaussians]
+    antialiased: bool
+    """Their opacities are compensated for the width that drawing adds (Mip-Splatting)."""
 
 
 def from_arrays(

@@ -67,11 +67,12 @@ def surroundings(scene: Scene, images: Mapping[int, Image], points: Points, coun
     centre = centres.mean(0)
     away = np.linalg.norm(points.position - centre, axis=1)
     radius = max(np.linalg.norm(centres - centre, axis=1).max(), np.quantile(away, 0.95), _TINY)
-    # Fibonacci's spiral.
+    # Fibonacci's spiral: directions as evenly apart as can be.
     height = 1 - (2 * np.arange(count) + 1) / count
     turn, level = np.arange(count) * math.pi * (3 - math.sqrt(5)), np.sqrt(1 - height**2)
     direction = np.stack([level * np.cos(turn), level * np.sin(turn), height], 1)
     position = centre + _FAR * float(radius) * direction
+    # Blurred, since what is far is drawn by few Gaussians, and a sharp pixel would become a blot.
     small: dict[int, Image] = {}
     for view in scene.train.tolist():
         tall, wide = images[view].shape[:2]
@@ -134,6 +135,7 @@ def _mean_colours(
 
 def _matched(scene: Scene, images: Mapping[int, Image]) -> Points:
     """Points triangulated from SIFT matches between neighbouring training views."""
+    # Pictures without their lenses: triangulation is that of pinholes.
     views = scene.train.tolist()
     detector = cv2.SIFT.create(nfeatures=_FEATURES, contrastThreshold=0.01)
     cameras = {view: cover(scene.cameras, view, 1e-6)[0] for view in views}
@@ -146,6 +148,7 @@ def _matched(scene: Scene, images: Mapping[int, Image]) -> Points:
             continue
         places[view] = np.array([each.pt for each in keypoints], np.float64) + 0.5
         features[view] = np.sqrt(described / np.maximum(described.sum(1, keepdims=True), 1e-9)).astype(np.float32)  # RootSIFT
+    # Each view is matched with the few that stand near and look the same way.
     centre = {v: scene.cameras.pose[v][:, 3].numpy() for v in views}
     axis = {v: -scene.cameras.pose[v][:, 2].numpy() for v in views}
     middle = np.mean([*centre.values()], axis=0)
@@ -160,6 +163,7 @@ def _matched(scene: Scene, images: Mapping[int, Image]) -> Points:
             p, q = _pairs(features[i], features[j])
             if not len(p):
                 continue
+            # Points of both, in the colours of the first.
             rays = [(cameras[v].intrinsics @ cameras[v].world_to_camera[:3]).numpy() for v in (i, j)]
             a, b = places[i][p], places[j][q]
             position = _triangulated(rays, (a, b), (centre[i], centre[j]))

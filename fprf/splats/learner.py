@@ -1,7 +1,15 @@
-"""Training 3D Gaussians step by step, on the CPU: one view a step, Adam, splits where views err.
+"""3D Gaussians in training, on the CPU (Kerbl et al. 2023): one view a step, Adam, splits where views err.
 
-Parameters and Adam's moments are those of `ops.rasterise_training.TrainableGaussians`, a row a Gaussian. Every draw is a
-function of (seed, step), so parameters, moments and the step are all the state there is.
+A step renders a training view and moves what it shows against the gradient of
+
+    L = (1 - ssim) mean |f * render - photograph| + ssim (1 - SSIM(f * render, photograph))        (Kerbl et al., Eq. 7)
+
+where f are the factors of the view's own exposure (`tones`), 1 where none are learnt. Where views err, Gaussians are split
+(`_relocate`), in the place of those that became transparent, and until there are as many as the config allows.
+
+N Gaussians, V views, R = 11 + 3 K parameters of a Gaussian with K = (degree + 1)^2 harmonics, in the columns that
+`ops.rasterise_training` names: means, logarithms of the standard deviations, quaternion, logit of the opacity, harmonics.
+Every draw is a function of (seed, step), so parameters, moments and the step are all the state there is.
 """
 
 import math
@@ -12,11 +20,12 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from ..interfaces import Figures, Learner, State
+from ..interfaces import Figures, SceneLearner, State
 from ..ops.harmonics import HARMONIC
-from ..ops.rasterise_training import HARMONICS, LOG_SCALES, LOGIT, MEANS, QUATERNION, Target, TrainableGaussians
+from ..ops.rasterise_training import HARMONICS, LOG_SCALES, LOGIT, MEANS, QUATERNION, Learnt, Target, TrainableGaussians
 from ..rendering.splines import rotations
 from ..training.camera_optimizers import Poses, Tones
 from ..training.model import Facts
@@ -27,31 +36,39 @@ from .initial import Points, spacing, spatial_order
 from .photographs import Floats, Level, moved
 from .scene import Semantics, SplatScene, find_semantics
 
-_DEAD = 0.005
-"""Opacity below which a Gaussian is moved elsewhere."""
-_SETTLE, _SORT_EVERY, _LAST = 200, 5, 0.85
-"""Steps before the first relocation; relocations between sorts; share of training after which nothing is moved any more."""
-_SKY, _SEEN = 0.7, 1.0
-"""Share of a Gaussian's weight in sky, and its least weight in pixels of the views that judge, from which on it is moved."""
-_JUDGES = 8
-"""Views whose errors say where Gaussians are split."""
-_SPLIT_SIZE, _SPLIT_DISTANCE, _SPLIT_OPACITY = 0.6, 0.5, 0.85
-"""Of both halves: size and distance from the middle along the longest axis, as shares of its size, and share of the opacity."""
 _START_OPACITY, _START_SCALE, _FAR_OPACITY = 0.3, 0.7, 0.9
+"""Of the first Gaussians: opacity, standard deviation as a share of the distance to their neighbours, opacity far away."""
+_RATES = {"means": 2.5e-3, "scales": 0.08, "turns": 0.016, "opacity": 0.1, "colour": 0.07, "harmonics": 0.01}
+"""Learning rates at the beginning, the means' in units of `reach`. They fall to a fifth, the means' to a twentieth."""
 _DECAY, _DECAY_EVERY = 3e-3, 20
 """Weight decay of the harmonics above degree 0, a step, and the steps between its uses; it falls as the rates do. From where no
 photograph looks they would become any colour, which a style that refits cut colours brings into view as specks."""
-_SMOOTHING = 0.95
-"""Decay of running means."""
 _GAIN, _EXPONENT = 0.005, 2e-3
 """Learning rates of the logarithms of a view's factors, whenever it is seen, and of the exponent. They fall to a tenth."""
-
+_SETTLE, _SORT_EVERY, _LAST = 200, 5, 0.85
+"""Steps before the first relocation; relocations between sorts; share of training after which nothing is moved any more."""
+_JUDGES = 8
+"""Views whose errors say where Gaussians are split."""
+_DEAD = 0.005
+"""Opacity below which a Gaussian is moved elsewhere."""
+_SKY, _SEEN = 0.7, 1.0
+"""Share of a Gaussian's weight in sky, and its least weight in pixels of the views that judge, from which on it is moved."""
+_SPLIT_SIZE, _SPLIT_DISTANCE, _SPLIT_OPACITY = 0.6, 0.5, 0.85
+"""Of both halves: size and distance from the middle along the longest axis, as shares of its size, and share of the opacity."""
+_SMOOTHING = 0.95
+"""Decay of running means."""
+_VIEWS = 32
+"""Training views that semantics are found in, at most."""
+MOVES = "poses.moves"
+"""Name in checkpoints of where views were moved: `Poses.moved_by`."""
+_KEPT = "value", "first", "second", "steps"
+"""Names in checkpoints of the parameter of a correction, its moments, and the steps of each view."""
 
 Narrow = Callable[[TrainableGaussians, int], None]
 """Cuts standard deviations in place after a step."""
 
 
-class Part(NamedTuple):
+class Stage(NamedTuple):
     """The part of a whole schedule that a learner is given to train."""
 
     before: int = 0
@@ -61,11 +78,11 @@ class Part(NamedTuple):
     """Shares of the schedule where its training begins and ends."""
 
 
-class GaussianLearner(Learner):
+class GaussianLearner(SceneLearner):
     """Gaussians in training. `reach` is the radius of the cameras' positions in world units: the unit of the means' rate.
 
-    Only Gaussians whose means are `inside` are split or moved; None = all. After each step `narrow` may cut the standard
-    deviations; None = none is limited. Nothing nearer to a camera than `near` is drawn.
+    There is room for `room` of them. Only those whose means are `inside` are split or moved; None = all. After each step
+    `narrow` may cut the standard deviations; None = none is limited. Nothing nearer to a camera than `near` is drawn.
     With `tones` each view's factors are learnt as well, with `poses` where each view was taken. `only` colours learns harmonics
     alone, `only` poses neither Gaussians nor factors. `known` is what scene.json will hold, for learners of a run; `origin`
     says where the first Gaussians come from.
@@ -84,23 +101,23 @@ class GaussianLearner(Learner):
         tones: Tones | None = None,
         poses: Poses | None = None,
         only: Literal["colours", "poses"] | None = None,
-        part: Part | None = None,
+        stage: Stage | None = None,
         known: Known | None = None,
         origin: str = "",
     ) -> None:
         self.inside, self.narrow, self.near, self.known, self.origin = inside, narrow, near, known, origin
-        self.config, self.levels, self.reach, self.part = config, levels, reach, part or Part()
+        self.config, self.levels, self.reach, self.stage = config, levels, reach, stage or Stage()
         self.bands = (config.degree + 1) ** 2
+        self.model = TrainableGaussians(room, self.bands)
         self.begun = self.pixels = self.skipped = self.failed = 0
         self.means: dict[str, float] = {}
-        self.model = TrainableGaussians(room, self.bands)
         self.tones, self.poses, self.only = tones, poses, only
         self.corrections = {
             f"{kind}.{name}": (each.detach(), torch.zeros_like(each), torch.zeros_like(each), torch.zeros(each.shape[:1]))
             for kind, module in (("tones", tones), ("poses", poses))
             for name, each in (module.named_parameters() if module is not None else ())
         }
-        """Corrections of views by name: the parameter, its moments and the steps of each view."""
+        """Corrections of views by name: the parameter, its moments and the steps of each view (`_KEPT`)."""
 
     @property
     def device(self) -> torch.device:
@@ -119,6 +136,7 @@ class GaussianLearner(Learner):
 
     def begin_at(self, points: Points, rng: np.random.Generator, surroundings: Points | None = None) -> None:
         """Put a Gaussian at each point: as wide as the points lie apart, in any direction; those of surroundings are opaque."""
+        # Neighbours in space follow each other, so that tiles find what they show close together.
         order = spatial_order(points.position)
         position, colour = points.position[order], points.colour[order]
         size = spacing(position) * _START_SCALE
@@ -128,38 +146,44 @@ class GaussianLearner(Learner):
             position, colour = np.concatenate([position, far]), np.concatenate([colour, surroundings.colour])
             size = np.concatenate([size, spacing(far) * _START_SCALE])
             logit = np.concatenate([logit, np.full(len(far), math.log(_FAR_OPACITY / (1 - _FAR_OPACITY)))])
+        # The same colour from everywhere: c = 0.5 + Y_0 h_0.
         harmonics = np.zeros((len(position), self.bands, 3), np.float32)
         harmonics[:, 0] = (colour - 0.5) / HARMONIC
         turns, sizes = rng.normal(size=(4, len(position))).T, np.repeat(np.log(size)[:, None], 3, 1)
         self.start_from(from_arrays(position, turns, sizes, logit, harmonics))
 
+    def start_from(self, gaussians: Gaussians) -> None:
+        """Begin with Gaussians, of the config's degree, as they are."""
+        self.begun = len(gaussians)
+        self.model.start(_rows(gaussians))
+
     def step(self, index: int, share: float) -> None:
         """Learn from one view."""
-        step, share = self.part.before + index, self.part.first + (self.part.last - self.part.first) * share
-        # Half the size until `coarse`, a quarter until a third of that, and so on.
-        reduced = sum(share < self.config.coarse / 3**k for k in range(len(self.levels) - 1))
-        level = self.levels[reduced]
+        config = self.config
+        step, share = self.stage.before + index, self.stage.first + (self.stage.last - self.stage.first) * share
+        # Coarse photographs first: half the size until `coarse`, a quarter until a third of that, and so on.
+        level = self.levels[sum(share < config.coarse / 3**k for k in range(len(self.levels) - 1))]
         # Each epoch sees every view once, in an order of its own.
         views = list(level)
         epoch, turn = divmod(step, len(views))
-        view = views[np.random.default_rng((self.config.seed, epoch)).permutation(len(views))[turn]]
+        view = views[np.random.default_rng((config.seed, epoch)).permutation(len(views))[turn]]
         target = self._target(level, view)
-        # Render, compare, and move every Gaussian that the view sees; nothing moves where the loss is not finite.
-        background, ssim, rates, factors = self.config.background, self.config.ssim, self._rates(share), self._factors(view)
-        measured = self.model.learn(target, background=background, ssim=ssim, rates=rates, factors=factors)
+        # Render, compare, and move every Gaussian that the view shows; nothing moves where the loss is not finite.
+        rates, factors = self._rates(share), self._factors(view)
+        measured = self.model.learn(target, background=config.background, ssim=config.ssim, rates=rates, factors=factors)
         if not math.isfinite(measured.l1 + measured.ssim):
             self.skipped, self.failed = self.skipped + 1, self.failed + 1
             return
         self.failed = 0
+        # Colours that no view shows fall back to their mean, and what grew too wide is cut.
         if step % _DECAY_EVERY == 0 and self.only is None:
             self.model.multiply(slice(HARMONICS.start + 3, None), 1 - _DECAY_EVERY * _DECAY * 0.2**share)
         if self.narrow is not None:
             self.narrow(self.model, step)
-        # Exposure and pose of the view, which learn more slowly towards the end.
-        self._learn_tones(view, torch.from_numpy(measured.pull), self.config.rate * 0.1**share)
-        self._learn_pose(view, target, torch.from_numpy(measured.of_camera), self.config.poses * 0.1**share)
-        moved = (step + 1) % self.config.relocate_every == 0 and self.only is None
-        if moved and step >= _SETTLE and share < max(self.config.grow, _LAST):
+        self._correct(view, target, measured, share)
+        # Gaussians move to where views err, but not while the first ones settle, nor so late that nothing learns them.
+        due = (step + 1) % config.relocate_every == 0 and self.only is None
+        if due and step >= _SETTLE and share < max(config.grow, _LAST):
             self._relocate(step, level, share)
         self.pixels += target.width * target.height
         for name, value in (("rgb", measured.squared), ("l1", measured.l1), ("ssim", measured.ssim)):
@@ -169,94 +193,76 @@ class GaussianLearner(Learner):
         means = self.means | {"gaussians": float(self.count)}
         return Figures(means, self.pixels, self.skipped, self.failed, "the loss" if self.failed else "")
 
-    def _rates(self, share: float) -> Floats:
-        """Learning rates of the columns of the parameters. They fall to a fifth, those of the means to a twentieth."""
-        rest = np.full(3 * (self.bands - 1), 0.01)
-        rates = np.concatenate(
-            [np.full(3, 2.5e-3 * self.reach), np.full(3, 0.08), np.full(4, 0.016), [0.1], np.full(3, 0.07), rest]
-        )
-        falls = np.where(np.arange(len(rates)) < 3, 0.05**share, 0.2**share)
+    def _rates(self, share: float) -> Annotated[Floats, "R"]:
+        """Learning rates of the columns, when a share of the training is over."""
+        sizes = {"means": 3, "scales": 3, "turns": 4, "opacity": 1, "colour": 3, "harmonics": 3 * (self.bands - 1)}
+        rates = np.concatenate([np.full(size, _RATES[name]) for name, size in sizes.items()])
+        rates[MEANS] *= self.reach
+        falls = np.full(len(rates), 0.2**share)
+        falls[MEANS] = 0.05**share
         if self.only is not None:
             rates[: HARMONICS.start if self.only == "colours" else None] = 0
         scaled: Floats = (self.config.rate * rates * falls).astype(np.float32)
         return scaled
 
-    @torch.no_grad()
-    def _learn_tones(self, view: int, pull: Annotated[Tensor, "3"], rate: float) -> None:
-        """Move the exposure of a view by a step of Adam. Each view counts its own steps: with moments of all views together,
-        one that is seen every thousandth step moved by the root of a thousand times the rate, and far scenes got worse.
-        """
-        if self.tones is None or self.only == "poses":
-            return
-        _adam([each[view] for each in self.corrections["tones.gain"]], pull, _GAIN * rate)
-        if self.tones.exponent.requires_grad:
-            slope = pull.sum() * self.tones.exposure[view]
-            _adam(self.corrections["tones.exponent"], slope, _EXPONENT * rate)
-
-    @torch.no_grad()
-    def _learn_pose(self, view: int, target: Target, gradient: Annotated[Tensor, "6"], rate: float) -> None:
-        """Move the pose of a view by a step of Adam, as `_learn_tones` does; `rate` is in radians and distances commonly seen.
-
-        The gradient of a rotation vector is taken for that of a further turn: exact to first order in how far views turn.
-        """
-        if self.poses is None:
-            return
-        slope = torch.cat([torch.from_numpy(target.axes).T @ gradient[:3], self.poses.reach * gradient[3:]]).float()
-        _adam([each[view] for each in self.corrections["poses.offset"]], slope, rate)
-
     def _target(self, level: Level, view: int) -> Target:
         """A photograph, taken from where its pose is now."""
-        target = level[view]
         if self.poses is None:
-            return target
+            return level[view]
         move = self.poses.moved_by()[view]
-        return moved(target, move[:3], move[3:])
+        return moved(level[view], move[:3], move[3:])
 
-    def _factors(self, view: int) -> Floats | None:
-        """Return the factors of renders of a view."""
-        if self.tones is None:
-            return None
-        factors: Floats = self.tones(torch.tensor([view]))[0].detach().numpy()
-        return factors
+    def _factors(self, view: int) -> Annotated[Floats, "3"] | None:
+        """Factors of renders of a view; None = 1."""
+        return None if self.tones is None else self.tones(torch.tensor([view]))[0].detach().numpy()
+
+    @torch.no_grad()
+    def _correct(self, view: int, target: Target, measured: Learnt, share: float) -> None:
+        """Move the exposure and the pose of a view by a step of Adam; their rates fall to a tenth.
+
+        Each view counts its own steps: with moments of all views together, one that is seen every thousandth step moved by the
+        root of a thousand times the rate, and far scenes got worse.
+        """
+        if self.tones is not None and self.only != "poses":
+            pull, rate = torch.from_numpy(measured.pull), self.config.rate * 0.1**share
+            _adam([each[view] for each in self.corrections["tones.gain"]], pull, _GAIN * rate)
+            if self.tones.exponent.requires_grad:
+                slope = pull.sum() * self.tones.exposure[view]
+                _adam(self.corrections["tones.exponent"], slope, _EXPONENT * rate)
+        if self.poses is not None:
+            # The gradient of a rotation vector is taken for that of a further turn: exact to first order in how far views turn.
+            gradient = torch.from_numpy(measured.of_camera)
+            slope = torch.cat([torch.from_numpy(target.axes).T @ gradient[:3], self.poses.reach * gradient[3:]]).float()
+            _adam([each[view] for each in self.corrections["poses.offset"]], slope, self.config.poses * 0.1**share)
 
     def _relocate(self, step: int, level: Level, share: float) -> None:
-        """Split Gaussians where views err: as many as became transparent, which move there, and as the number grows by.
-
-        They are drawn by opacity times what they have to do with the errors of some views. Each becomes two along its
-        longest axis.
-        """
+        """Split Gaussians where views err: as many as became transparent, which move there, and as the number grows by."""
         draw = np.random.default_rng((self.config.seed, step, 1))
-        views = draw.permutation(list(level))[:_JUDGES]
+        # What each Gaussian has to do with the errors of some views, with their sky, and with all that they show.
         shown = np.zeros((self.count, 3))
-        for view in views:
+        for view in draw.permutation(list(level))[:_JUDGES]:
             shown += self.model.errors(self._target(level, view), self.config.background, self._factors(view))
+        # The chance of a split: opacity times error, so that neither haze nor what is right already becomes more.
         opacity = 1 / (1 + np.exp(-self.model.read(LOGIT)[:, 0].astype(np.float64)))
         chance = np.nan_to_num(shown[:, 0] * opacity)
-        # What shows almost only in the sky floats before it.
-        transparent = (opacity < _DEAD) | (shown[:, 1] > _SKY * np.maximum(shown[:, 2], _SEEN))
+        # What is transparent, or shows almost only in the sky and so floats before it, can be had.
+        spare = (opacity < _DEAD) | (shown[:, 1] > _SKY * np.maximum(shown[:, 2], _SEEN))
         if self.inside is not None:
             inside = self.inside(torch.from_numpy(self.model.read(MEANS))).numpy()
-            chance, transparent = chance * inside, transparent & inside
-        dead = np.flatnonzero(transparent)
+            chance, spare = chance * inside, spare & inside
+        dead = np.flatnonzero(spare)
         chance[dead] = 0
+        # The number grows evenly on a logarithmic scale: begun (cap / begun)^(share / grow).
         cap = max(self.config.cap, self.begun)
         wanted = int(self.begun * (cap / self.begun) ** min(1.0, share / self.config.grow))
         more = max(wanted - self.count, 0)
         many = min(len(dead) + more, int(np.count_nonzero(chance)))
         if many > 0:
+            # One half stays in its place, the other takes that of a dead one, or a new one at the end.
             picked = draw.choice(self.count, many, replace=False, p=chance / chance.sum())
             to = np.concatenate([dead, np.arange(self.count, self.count + more)])[:many]
-            halves = self.model.read(index=picked)
-            longest = np.arange(many), LOG_SCALES.start + halves[:, LOG_SCALES].argmax(1)
-            turns: Floats = rotations(torch.from_numpy(halves[:, QUATERNION])).numpy()
-            across = turns[longest[0], :, longest[1] - LOG_SCALES.start] * np.exp(halves[longest])[:, None]
-            halves[longest] += math.log(_SPLIT_SIZE)
-            each = np.clip(_SPLIT_OPACITY * opacity[picked], _DEAD, 0.995)
-            halves[:, LOGIT] = np.log(each / (1 - each))[:, None]
-            others = halves.copy()
-            halves[:, MEANS] += _SPLIT_DISTANCE * across
-            others[:, MEANS] -= _SPLIT_DISTANCE * across
-            self.model.split(picked, to, halves, others)
+            self.model.split(picked, to, *halves(self.model.read(index=picked), opacity[picked]))
+        # Neighbours in space drift apart in memory, and tiles slow down.
         if (step + 1) % (_SORT_EVERY * self.config.relocate_every) == 0 or more > 0.3 * self.count:
             self.model.reorder(spatial_order(self.model.read(MEANS)))
 
@@ -276,11 +282,6 @@ class GaussianLearner(Learner):
         if self.poses is not None:
             tensors[MOVES] = self.poses.moved_by()
         return State(tensors_of(self.gaussians(), self.near), tensors)
-
-    def start_from(self, gaussians: Gaussians) -> None:
-        """Begin with Gaussians, of the config's degree, as they are."""
-        self.begun = len(gaussians)
-        self.model.start(_rows(gaussians))
 
     def load(self, state: State) -> None:
         """Go on from a checkpoint; without their moments, tones and poses go on as they are.
@@ -309,35 +310,46 @@ class GaussianLearner(Learner):
         return f", {self.count} Gaussians at {self.origin}{light}{passes if most < self.config.steps else ''}"
 
 
-_VIEWS = 32
-"""Training views that semantics are found in, at most."""
+def halves(
+    rows: Annotated[Floats, "M R"], opacity: Annotated[NDArray[np.float64], "M"]
+) -> tuple[Annotated[Floats, "M R"], Annotated[Floats, "M R"]]:
+    """Split Gaussians in two along their longest axes: both are smaller, fainter and beside the middle."""
+    first = rows.copy()
+    which = np.arange(len(rows))
+    longest = first[:, LOG_SCALES].argmax(1)
+    size = first[which, LOG_SCALES.start + longest]
+    # The longest axis in the world is a column of the rotation.
+    turns: Floats = rotations(torch.from_numpy(first[:, QUATERNION])).numpy()
+    across = turns[which, :, longest] * np.exp(size)[:, None]
+    first[which, LOG_SCALES.start + longest] += math.log(_SPLIT_SIZE)
+    each = np.clip(_SPLIT_OPACITY * opacity, _DEAD, 0.995)
+    first[:, LOGIT] = np.log(each / (1 - each))[:, None]
+    second = first.copy()
+    first[:, MEANS] += _SPLIT_DISTANCE * across
+    second[:, MEANS] -= _SPLIT_DISTANCE * across
+    return first, second
 
 
-def run_scene(config: GaussiansConfig, known: Known, gaussians: Gaussians, near: float) -> SplatScene:
-    """The scene of a run; its semantics are found when they are first asked for."""
+def run_scene(config: GaussiansConfig, known: Known, gaussians: Gaussians, near: float, *, quick: bool = False) -> SplatScene:
+    """The scene of a run; its semantics are found when they are first asked for, `quick` in few, small views."""
     encoder = cache(config.semantic.encoder.build)
+    count, side = (_VIEWS // 4, config.semantic_size // 2) if quick else (_VIEWS, config.semantic_size)
 
     def found() -> Semantics:
         every = torch.tensor(known.train)
-        views = known.cameras.select(every[torch.linspace(0, len(every) - 1, min(_VIEWS, len(every))).round().long()])
-        views = views.scaled(max(1.0, float(views.size.amax()) / config.semantic_size))
+        views = known.cameras.select(every[torch.linspace(0, len(every) - 1, min(count, len(every))).round().long()])
+        views = views.scaled(max(1.0, float(views.size.amax()) / side))
         return find_semantics(gaussians, True, encoder(), views, config.regions, near=near)
 
-    longest = min(config.semantic_size, int(known.cameras.size.amax()))
+    longest = min(side, int(known.cameras.size.amax()))
     return SplatScene(
         gaussians, True, known.cameras, known.names, cache(found), encoder, longest, near, config.background,
         origin=known.facts.origin,
     )  # fmt: skip
 
 
-MOVES = "poses.moves"
-"""Name in checkpoints of where views were moved: `Poses.moved_by`."""
-_KEPT = "value", "first", "second", "steps"
-"""Names in checkpoints of what `Learner.corrections` holds."""
-
-
 def _adam(kept: Sequence[Tensor], gradient: Tensor, rate: float) -> None:
-    """One step of Adam, in place, on a value, its two moments and the number of steps."""
+    """One step of Adam (Kingma and Ba 2015, Algorithm 1), in place, on a value, its two moments and the number of steps."""
     value, first, second, steps = kept
     steps += 1
     first.lerp_(gradient, 1 - 0.9)
@@ -346,6 +358,7 @@ def _adam(kept: Sequence[Tensor], gradient: Tensor, rate: float) -> None:
 
 
 def _rows(gaussians: Gaussians) -> Annotated[Floats, "N R"]:
+    """Gaussians in the columns of the rasteriser."""
     parts = (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logits[:, None])
     rows: Floats = torch.cat([*parts, gaussians.harmonics.flatten(1)], 1).numpy()
     return rows

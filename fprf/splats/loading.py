@@ -20,7 +20,7 @@ from ..training.loading import LoadedRun
 from ..training.model import Facts, tones_of
 from ..training.prepare import reach_of
 from ..training.quality import PRESETS, QualityConfig, mixed_tone
-from ..training.run import Run
+from ..training.run import Run, in_training
 from .config import GaussiansConfig
 from .gaussians import Gaussians, from_tensors
 from .learner import MOVES, GaussianLearner, run_scene
@@ -53,7 +53,8 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
     captured, gaussians = run.load_known(), from_tensors(saved.model)
     known = replace(captured, cameras=refined(captured.cameras, saved))
     tones = tones_in(saved, known.facts)
-    whole = run_scene(config, known, gaussians, float(saved.model.get("near", torch.tensor(0.01))))
+    near, training = float(saved.model.get("near", torch.tensor(0.01))), in_training(root)
+    whole = run_scene(config, known, gaussians, near, quick=training)
     resolution = preset.resolution if preset is not None else 1.0
 
     def fit(scene: Scene, views: Sequence[int]) -> Annotated[Tensor, "V 6"]:
@@ -61,7 +62,8 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
 
     shown = replace(
         whole,
-        found=cache(lambda: _semantics(run, saved.step, whole, config)),
+        # What a training has learnt so far is looked at quickly, and not kept.
+        found=whole.found if training else cache(lambda: _semantics(run, saved.step, whole, config)),
         resolution=resolution if quality.resolution is None else quality.resolution,
         tone=mixed_tone(tones, known, quality.tone) if quality.tone else (1.0, 1.0, 1.0),
         tones=tones,
@@ -95,12 +97,6 @@ def fit_poses(
     learner.start_from(shown.gaussians)
     learn(learner, None, Schedule(_FIT_STEPS * len(views)), lambda report: None)
     return poses.moved_by()
-
-
-def load_tones(run: Run) -> Tones | None:
-    """The exposure of each view of a run; None where that was not learnt."""
-    saved, _ = checkpoint.load_latest(run.checkpoints)
-    return None if saved is None else tones_in(saved, run.load_known().facts)
 
 
 def tones_in(saved: checkpoint.Saved, facts: Facts) -> Tones | None:

@@ -7,12 +7,16 @@ colours, which acts on harmonics exactly. Statistics are those of pixels: Gaussi
 0.13 against 0.17 on a plant), since what is seen is a mix of many.
 """
 
+import contextvars
 import hashlib
+import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -22,6 +26,7 @@ from ..datamanagers.config import GuidedConfig
 from ..datamanagers.scene import Scene as ParsedScene
 from ..errors import CheckpointError, DataError
 from ..interfaces import Encoder, Scene, SceneView, Stylizer, Values
+from ..ops.backend import compiled
 from ..ops.guided import upsample
 from ..ops.local_mixture import explained
 from ..ops.rasterise import Pinhole, lift
@@ -39,7 +44,7 @@ from ..style.scene import to_tensors as style_tensors
 from ..training.camera_optimizers import Tones
 from ..types import Origin, View
 from .config import LookConfig
-from .gaussians import Gaussians, bulk_of
+from .gaussians import GaussianRows, Gaussians, bulk_of
 from .levels import Levels, StyledLevels, seen_by
 from .photographs import camera_of, cover, distorted
 from .restyle import Colours, region_maps, restyled_harmonics
@@ -66,6 +71,10 @@ _UP = (0.0, -1.0, 0.0)
 _NEIGHBOURS, _LEVELS, _REACH = 1.0, 8, 0.02
 """Pixels that the nearest neighbourhood counts for, half of it for each that is twice as wide; how many; the edge of the
 nearest one, as a share of the spread of the positions."""
+
+_VIEWS_AT_ONCE = 4
+"""Views that are looked at at the same time, at most: each takes the memory of what it draws."""
+_Found = TypeVar("_Found")
 
 
 class Semantics(NamedTuple):
@@ -146,6 +155,10 @@ class SplatScene(Scene):
             return gaussians
         features = self.found().features[rows]
         return gaussians.recoloured(restyled_harmonics(gaussians.harmonics, gaussians.means, features, self.look))
+
+    def gaussian_rows(self) -> GaussianRows:
+        """All of them, in the scene's look."""
+        return GaussianRows(len(self.gaussians), self.part, self.antialiased)
 
     @cached_property
     def _detail(self) -> Levels | StyledLevels:
@@ -335,15 +348,19 @@ def find_semantics(
 
     Raises DataError where nothing is opaque enough to be seen.
     """
-    total = 3 * len(cameras)
-    pictures, cells, solid = [], [], []
-    for view in range(len(cameras)):
-        progress(view, total)
+    total, numbers = 3 * len(cameras), [(view,) for view in range(len(cameras))]
+
+    def encoded(view: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         camera = camera_of(cameras, view, near)
         drawn = draw(gaussians.select(seen_by(gaussians, camera)), camera, antialiased=antialiased)
-        pictures.append((drawn.image, drawn.opacity, drawn.depth))
         maps = encoder.cutout(drawn.image.permute(2, 0, 1)[None], drawn.opacity[None])[0].float()
-        cover = torch.nn.functional.interpolate(drawn.opacity[None, None], maps.shape[1:], mode="area")[0, 0]
+        return drawn.image, drawn.opacity, drawn.depth, maps
+
+    pictures, cells, solid = [], [], []
+    for view, (image, opacity, depth, maps) in enumerate(_at_once(encoded, numbers)):
+        progress(view, total)
+        pictures.append((image, opacity, depth))
+        cover = torch.nn.functional.interpolate(opacity[None, None], maps.shape[1:], mode="area")[0, 0]
         cells.append(maps)
         solid.append(maps[:, cover > _SOLID].T)
     if not any(len(each) for each in solid):
@@ -355,11 +372,16 @@ def find_semantics(
     pairs: list[Tensor] = []
     pixels: list[tuple[Tensor, Tensor]] = []
     reduced = cameras.scaled(_COARSER)
-    for view, (maps, (image, opacity, depth)) in enumerate(zip(cells, pictures, strict=True)):
-        progress(len(cameras) + view, total)
+
+    def filtered(view: int) -> tuple[Tensor, Tensor]:
+        image, opacity, depth = pictures[view]
         layers = torch.cat([image, opacity[..., None], (depth * opacity)[..., None]], 2)
         coarse = _reduced(layers, reduced.select(torch.tensor([view])))
-        fine = _pixel_features(basis, maps, coarse[..., :3], coarse[..., 3])
+        return coarse, _pixel_features(basis, cells[view], coarse[..., :3], coarse[..., 3])
+
+    for view, (coarse, fine) in enumerate(_at_once(filtered, numbers)):
+        progress(len(cameras) + view, total)
+        image, opacity, _ = pictures[view]
         pixels.append((coarse, fine))
         # Colours are those of single pixels of the whole picture: averages would have less contrast.
         height, width = fine.shape[:2]
@@ -371,20 +393,33 @@ def find_semantics(
         pair = (solid_here[:, :-1] & solid_here[:, 1:]).flatten().nonzero()[::every, 0]
         shown = torch.cat([_colours(coarse), fine], 2)
         pairs.append(torch.stack([shown[:, :-1].flatten(0, 1)[pair], shown[:, 1:].flatten(0, 1)[pair]], 1))
+    # The pictures are seen; what follows takes as much memory.
+    pictures.clear()
+    cells.clear()
     colour, semantic, seen = (torch.cat(each) for each in zip(*samples, strict=True))
     style = scene_style(colour, semantic, seen, None, regions, seed=0)
     ends = torch.cat(pairs)
     if len(style.share) > 1:
         style = style._replace(contacts=region_contacts(style, ends[..., 3:], ends[..., :3]))
-    sums, weights = torch.zeros(len(gaussians), dim), torch.zeros(len(gaussians))
-    for view, (coarse, fine) in enumerate(pixels):
-        progress(2 * len(cameras) + view, total)
-        fine = _sharpened(style, fine, coarse)
-        trust = coarse[..., 3:4] ** _TRUST
+
+    units = region_units(style.keys, style.semantic_mean)
+
+    def member(view: int) -> Tensor:
+        fine = pixels[view][1]
+        return membership(fine.flatten(0, 1), style.semantic_mean, *units).view(*fine.shape[:2], -1)
+
+    def carried(view: int, share: Tensor) -> tuple[Tensor, Tensor]:
+        coarse, fine = pixels[view]
+        fine, trust = _sharpened(style, share, fine, coarse), coarse[..., 3:4] ** _TRUST
         camera = camera_of(reduced, view, near)
         index = seen_by(gaussians, camera)
         shape = (gaussians.means[index], gaussians.quaternions[index], gaussians.log_scales[index], gaussians.logits[index])
-        lifted = lift(*shape, camera, torch.cat([fine * trust, trust], 2), antialiased=antialiased)
+        return index, lift(*shape, camera, torch.cat([fine * trust, trust], 2), antialiased=antialiased)
+
+    sums, weights = torch.zeros(len(gaussians), dim), torch.zeros(len(gaussians))
+    # Memberships are computed here, not on the threads: some of numba's own layers bear one caller at a time.
+    for view, (index, lifted) in enumerate(_at_once(carried, ((view, member(view)) for view in range(len(cameras))))):
+        progress(2 * len(cameras) + view, total)
         sums.index_add_(0, index, lifted[:, :dim])
         weights.index_add_(0, index, lifted[:, dim])
     progress(total, total)
@@ -392,6 +427,42 @@ def find_semantics(
     weights *= _COARSER**2
     features = _spread(gaussians.means, sums, weights, style.semantic_mean)
     return Semantics(style, basis, features, encoder.identity)
+
+
+def _at_once(function: Callable[..., _Found], given: Iterable[tuple[Any, ...]]) -> Iterator[_Found]:
+    """function(*arguments) for each of what is given, in order: several at a time, each on one thread.
+
+    For views. The operations on one are too short to be shared between threads, which would wait for each other most of the
+    time. What is given is asked for by this thread, a little ahead.
+    """
+    before = torch.get_num_threads()
+    threads = min(before, _VIEWS_AT_ONCE)
+    if threads == 1:
+        yield from itertools.starmap(function, given)
+        return
+
+    def begin() -> None:
+        torch.set_num_threads(1)
+        if compiled():
+            import numba
+
+            numba.set_num_threads(1)
+
+    left, waiting = iter(given), deque[Future[_Found]]()
+    with ThreadPoolExecutor(threads, "fprf-views", begin) as pool:
+        try:
+            while True:
+                for arguments in itertools.islice(left, threads + 1 - len(waiting)):
+                    # Modes of this thread that hold in others only if they are carried over.
+                    run = contextvars.copy_context().run
+                    waiting.append(pool.submit(run, torch.inference_mode()(function), *arguments))
+                if not waiting:
+                    break
+                yield waiting.popleft().result()
+        finally:
+            for each in waiting:
+                each.cancel()
+            torch.set_num_threads(before)  # which threads that begin later take over
 
 
 def semantics_tensors(found: Semantics) -> dict[str, Tensor]:
@@ -459,14 +530,16 @@ def _pixel_features(
 
 
 def _sharpened(
-    style: SceneStyle, fine: Annotated[Tensor, "H W D"], coarse: Annotated[Tensor, "H W 5"]
+    style: SceneStyle,
+    share: Annotated[Tensor, "H W K"],
+    fine: Annotated[Tensor, "H W D"],
+    coarse: Annotated[Tensor, "H W 5"],
 ) -> Annotated[Tensor, "H W D"]:
     """Features moved to the regions that explain what pixels look like, by their colour and depth.
 
-    `coarse` holds colours times opacity, opacity, and depth times opacity.
+    `share` are the pixels' memberships in the regions; `coarse` holds colours times opacity, opacity, depth times opacity.
     """
-    share = membership(fine.flatten(0, 1), style.semantic_mean, *region_units(style.keys, style.semantic_mean))
-    share, opacity = share.view(*fine.shape[:2], -1), coarse[..., 3]
+    opacity = coarse[..., 3]
     depth = (coarse[..., 4] / opacity.clamp_min(_SOLID)).clamp_min(1e-30).log()
     guide, noise = torch.cat([_colours(coarse), depth[..., None]], 2), torch.tensor([*3 * (_GRAIN,), _ROUGH])
     after = explained(share, guide, opacity > _SOLID, radius=_MEETING * math.sqrt(opacity.numel()), noise=noise)

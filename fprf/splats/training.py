@@ -12,8 +12,7 @@ from torch import Tensor
 from ..datamanagers.images import Image
 from ..datamanagers.scene import Scene, find_sightings, sparser
 from ..ops.rasterise_training import LOG_SCALES, MEANS, TrainableGaussians, compile_beside
-from ..training.camera_optimizers import Poses
-from ..training.model import Facts, tones_of
+from ..training.model import Facts, poses_of, tones_of
 from ..training.prepare import exposure_of, facts_of
 from ..training.run import known_of
 from .config import GaussiansConfig
@@ -36,15 +35,6 @@ _NEAR_UNSEEN, _DEPTHS = 1e-3, 10_000_000
 """The same where no view has any point, in the radius of the cameras; depths that are looked at, at most."""
 
 
-def _bounded(config: GaussiansConfig, scene: Scene) -> GaussiansConfig:
-    """The config with few surroundings; in one piece with no more Gaussians than there are photographed pixels for."""
-    if config.cells == 1:
-        pixels = int(scene.cameras.size[scene.train].prod(1).sum())
-        cap = max(1, min(config.cap, pixels // config.pixels_per_gaussian))
-        config = replace(config, cap=cap, initial=max(1, config.initial * cap // config.cap))
-    return replace(config, surroundings=min(config.surroundings, config.cap // _SURROUNDINGS))
-
-
 def build(
     config: GaussiansConfig,
     scene: Scene,
@@ -53,26 +43,33 @@ def build(
 ) -> GaussianLearner:
     """Load photographs, find the first points, and put a Gaussian at each; arguments as of `RunConfig.build`."""
     compiling = compile_beside((config.degree + 1) ** 2)  # while images are read
-    config = _bounded(config, scene)
+    # Few photographs get few Gaussians, which they would else learn by heart; cells bound theirs by the whole scene.
+    if config.cells == 1:
+        pixels = int(scene.cameras.size[scene.train].prod(1).sum())
+        cap = max(1, min(config.cap, pixels // config.pixels_per_gaussian))
+        config = replace(config, cap=cap, initial=max(1, config.initial * cap // config.cap))
+    config = replace(config, surroundings=min(config.surroundings, config.cap // _SURROUNDINGS))
     images, masks = load_photographs(config, scene, scene.train.tolist())
     facts = saved or lit_facts(config, scene, lambda view: images[view])
+    # Gaussians begin at points of the reconstruction, or at matches between views, and on a sphere around everything.
     draw = np.random.default_rng((config.seed, 0))
     points, origin = initial_points(scene, images, config.initial, draw)
+    far, sphere = None, None
+    if config.surroundings:
+        far = surroundings(scene, images, points, config.surroundings)
+        centre = torch.from_numpy(far.position.mean(0)).float()
+        sphere = _Sphere(centre, float((torch.from_numpy(far.position).float() - centre).norm(dim=1).min()))
     near = find_near(scene, points)
-    far = surroundings(scene, images, points, config.surroundings) if config.surroundings else None
-    room = max(config.cap, len(points.position) + config.surroundings)
-    sphere = _Sphere.around(far) if far is not None else None
-    levels = make_levels(scene, images, masks, near, load_skies(config, scene, images))
     learner = GaussianLearner(
         config,
-        levels,
+        make_levels(scene, images, masks, near, load_skies(config, scene, images)),
         reach_of(scene),
-        room,
+        max(config.cap, len(points.position) + config.surroundings),
         None if sphere is None else sphere.encloses,
         limit_widths(scene, near, cells=config.cells > 1, sphere=sphere),
         near=near,
         tones=tones_of(facts),
-        poses=poses_of(facts),
+        poses=poses_of(facts, 1.0),
         known=known_of(scene, config.data, facts),
         origin=origin,
     )
@@ -95,12 +92,6 @@ class _Sphere(NamedTuple):
 
     centre: Annotated[Tensor, "3"]
     radius: float
-
-    @staticmethod
-    def around(far: Points) -> "_Sphere":
-        """The sphere of points."""
-        centre = torch.from_numpy(far.position.mean(0)).float()
-        return _Sphere(centre, float((torch.from_numpy(far.position).float() - centre).norm(dim=1).min()))
 
     def encloses(self, means: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
         """Whether means lie well within."""
@@ -130,10 +121,12 @@ def limit_widths(scene: Scene, near: float, *, cells: bool, sphere: _Sphere | No
         return torch.cdist(points, some, compute_mode="donot_use_mm_for_euclid_dist").amin(1)
 
     def narrow(gaussians: TrainableGaussians, step: int) -> None:
+        # The surroundings stay thin: seen from beside, a wide one would be drawn before the scene.
         if sphere is not None and step % 10 == 0:
             gaussians.limit_scales(sphere.widest(gaussians.read(MEANS)))
         if step % every:
             return
+        # Only what is wider than the share of `near` can be too wide anywhere.
         wide = np.flatnonzero(gaussians.read(LOG_SCALES).max(1) > math.log(share * near))
         if len(wide):
             points = torch.from_numpy(gaussians.read(MEANS, wide))
@@ -155,15 +148,8 @@ def reach_of(scene: Scene) -> float:
     return reach if sightings is None else min(reach, float(sightings.distance.median()))
 
 
-def poses_of(facts: Facts) -> Poses | None:
-    """Poses as the capture says; None where they are not refined."""
-    if not facts.centres:
-        return None
-    return Poses(torch.tensor(facts.centres, dtype=torch.float64), facts.held, reach=facts.reach, pace=1.0)
-
-
 def find_near(scene: Scene, points: Points) -> float:
-    """Distance from cameras, along z, from which on things are drawn."""
+    """Distance from cameras, along z, from which on things are drawn: below that at which all but 1 % of the points lie."""
     some = torch.from_numpy(points.position[:: -(-len(points.position) // _SOME)])
     seen = torch.cat([depth[inside] for _, _, depth, inside in projected(scene, some)])
     if not len(seen):

@@ -7,17 +7,21 @@ Colours are sRGB in [0, 1], rows: c' = c A + b. A region k with mean m_k takes
 with its exposure e_k and contrast q_k, and the saturation s and white balance g of the references; L takes colours to the grey
 of their luma. A gain of light is a product, in linear light and, but for the black end, in sRGB.
 
-- Exposure: what all regions agree on, and a quarter of what the region's own match says: a night is dark for what it does not
-  show. The sky is a source of light and no thing; it changes more than what it lights, so smooth regions follow their match.
-- White balance: the cast that all codes of the references share (`shared`), less that of the scene. A sunset is warm in sky,
-  road and tree: that is light. A meadow with a blue sky and a red barn shares nothing: that is material.
+- Exposure: the median change of log luma over the things of the scene, each counted as far as it is sure of its match, drawn
+  to no change. A night is dark for what it does not show, too; how dark is known within limits.
+  The sky is a source of light and no thing; it changes more than what it lights, so smooth regions follow their match.
+- White balance: the cast that all codes of the references share (`shared`), less that of the scene, drawn to none likewise. A
+  sunset is warm in sky, road and tree: that is light. A meadow with a blue sky and a red barn shares nothing: that is material.
 
 A point of confidence p takes p paint(c) + (1 - p) light(c) + 4 p (1 - p) u_k. On the way from blue to yellow lies green: u_k
 takes it out of the middle where both are opposite along red and blue.
 
-Confidence is the rate at which matches of that score are right where a right one is as likely as none, on painted pairs of
-photographs (`benchmarks/semantic_matching.py`). Scores count in spreads of the cosines between the scene's own
-regions: encoders differ in these as they do in the scores of unlike things.
+Confidence has two factors. One is a ramp over the likeness of a point and its region to the codes that they take, in spreads
+of the cosines between the scene's own regions: encoders differ in these as they do in the scores of unlike things. The other
+asks the scene itself, where both sides come from the same pictures (`unrivalled`): a code that another, unlike region of the
+scene resembles more belongs to that region's kind. Where the references lack trees, trees take the road's code, which the road
+claims. Both are set on painted pairs of photographs (`benchmarks/semantic_matching.py`): confidence is about the rate at which
+matches are right where a right one is as likely as none.
 """
 
 from collections.abc import Callable
@@ -32,12 +36,17 @@ from .dictionary import StyleDictionary, choose, code_odds
 from .matching import score_spread, share_mean, unit
 from .scene import Membership, SceneStyle
 
-UNSURE, SURE = 0.0, 1.3
-"""Scores, in spreads of the scene's own regions, up to which a match counts nothing and from which on it counts wholly."""
+SURE = 0.9
+"""Likeness, in spreads of the scene's own regions, from which on a match counts wholly; at 0 it counts nothing."""
+UNRIVALLED = 0.9
+"""Lowe's ratio from which on a claim has no rival: below lies the noise between regions of one kind."""
+_RIVALLED = 0.8
+"""What a rival takes from confidence at most."""
 _NEAREST = 0.05
 """Share of a reference's pixels that a score is the mean of: less may be the rim of something else."""
-_MATCHED = 0.25
-"""Share of a thing's exposure that its own match decides."""
+KNOWN = 0.6
+"""Share of the estimated exposure of things and of the cast that is applied: both are drawn to no change, since a few matches
+know the light of another place within limits."""
 _SMOOTH, _ROUGH = 0.12, 0.25
 """Deviations of luma, relative to it, up to which a region is a source of light, and from which on it is a thing."""
 _BLACK = 0.02
@@ -46,6 +55,8 @@ _EXPOSURE = (0.05, 2.5)
 """Least and largest gain of light."""
 _SATURATION = (0.35, 1.1)
 """Least and largest gain of saturation: black and white takes colour away, a neon street adds little to a wall."""
+_SKY_SATURATION = 0.7
+"""Gain of saturation of sources of light besides: what they show is light, no material, and an overcast sky is never wrong."""
 _CAST = 0.36
 """Largest cast along an axis, in logarithms of sRGB."""
 _BRIGHT = 0.15
@@ -77,7 +88,8 @@ class Light(nn.Module):
     share: Annotated[Tensor, "T"]
     reference: Annotated[Tensor, "T"]
     forbidden: Annotated[Tensor, "K references"]
-    regions: Annotated[Tensor, "K 1"]
+    region_likeness: Annotated[Tensor, "K 1"]
+    claim: Annotated[Tensor, "K 1"]
 
     def __init__(
         self,
@@ -85,7 +97,8 @@ class Light(nn.Module):
         dictionary: StyleDictionary,
         maps: LightMaps,
         bold: float,
-        regions: Annotated[Tensor, "K"],
+        likeness: Annotated[Tensor, "K"],
+        claim: Annotated[Tensor, "K"],
         allowed: Annotated[Tensor, "K references"],
     ) -> None:
         super().__init__()
@@ -101,18 +114,16 @@ class Light(nn.Module):
         self.register_buffer("share", dictionary.share.float())
         self.register_buffer("reference", dictionary.reference)
         self.register_buffer("forbidden", (~allowed).float())
-        self.register_buffer("regions", regions.float()[:, None])
+        self.register_buffer("region_likeness", likeness.float()[:, None])
+        self.register_buffer("claim", claim.float()[:, None])
 
     def confidence(
         self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
     ) -> Annotated[Tensor, "N 1"]:
-        """How sure points are of their match, in [0, 1]."""
-        return certainty(self.score(semantic, belongs))
+        """How sure points are of their match, in [0, 1].
 
-    def score(
-        self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
-    ) -> Annotated[Tensor, "N 1"]:
-        """Likeness of points to their nearest codes and of their regions to those that they take, half each, in spreads."""
+        Likeness is that of a point to its nearest codes and that of its regions to those that they take, half each.
+        """
         belongs, points = self._belongs(semantic, belongs), semantic.to(self.keys)
         own = points.new_full((len(points),), -1.0)
         for i, middle in enumerate(self.middles):
@@ -121,7 +132,8 @@ class Light(nn.Module):
             if self._restricted:  # of references that are forbidden to their regions, points know nothing
                 near = near - 2 * (belongs @ self.forbidden[:, i, None])
             own = torch.maximum(own, nearest_mean(near, self.share[codes]))
-        return (own[:, None] / self._spread + belongs @ self.regions) / 2
+        likeness = (own[:, None] / self._spread + belongs @ self.region_likeness) / 2
+        return ramp(likeness) * (belongs @ self.claim)
 
     def paint(
         self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
@@ -178,18 +190,18 @@ def light_of(
     count = len(scene.share)
     every = torch.ones(count, len(dictionary.names), dtype=torch.bool) if allowed is None else allowed.cpu()
     mean, covariance = (double(part).cpu() for part in colours)
-    scores = mean.new_zeros(count)
+    likeness, claim = mean.new_zeros(count), mean.new_zeros(count)
     maps = LightMaps(mean.new_zeros(count, 3, 3), torch.zeros_like(mean), torch.zeros_like(mean))
     for row in sorted({tuple(row) for row in every.tolist()}):
         chosen = torch.tensor(row)
         part, rows = choose(dictionary, chosen)[0], (every == chosen).all(1)
         table = double(match(part)).cpu()
-        found = region_scores(scene, part, table)
-        scores[rows] = found[rows]
-        made = light_maps(mean, covariance, double(scene.share), table, part, certainty(found))
+        alike, alone = region_likeness(scene, part, table), unrivalled(scene, part, table)
+        likeness[rows], claim[rows] = alike[rows], alone[rows]
+        made = light_maps(mean, covariance, double(scene.share), table, part, ramp(alike) * alone)
         for whole, own in zip(maps, made, strict=True):
             whole[rows] = own[rows]
-    return Light(scene, dictionary, maps, bold, scores, every)
+    return Light(scene, dictionary, maps, bold, likeness, claim, every)
 
 
 def cosines(
@@ -221,7 +233,7 @@ def nearest_mean(cosine: Annotated[Tensor, "N T"], share: Annotated[Tensor, "T"]
     return (taken * near).sum(1) / taken.sum(1)
 
 
-def region_scores(scene: SceneStyle, dictionary: StyleDictionary, table: Annotated[Tensor, "K T"]) -> Annotated[Tensor, "K"]:
+def region_likeness(scene: SceneStyle, dictionary: StyleDictionary, table: Annotated[Tensor, "K T"]) -> Annotated[Tensor, "K"]:
     """Mean cosine of each region with the codes that it takes, float64, in spreads of the scene's own regions."""
     own, keys, centre = double(scene.keys), double(dictionary.keys), double(scene.semantic_mean)
     beyond = double(_beyond(dictionary))
@@ -245,9 +257,30 @@ def _middles(scene: SceneStyle, dictionary: StyleDictionary) -> Annotated[Tensor
     return torch.stack(rows)
 
 
-def certainty(score: Annotated[Tensor, "..."]) -> Annotated[Tensor, "..."]:
-    """Confidence in [0, 1] of scores in spreads."""
-    return ((score - UNSURE) / (SURE - UNSURE)).clamp(0, 1)
+def ramp(likeness: Annotated[Tensor, "..."]) -> Annotated[Tensor, "..."]:
+    """Confidence in [0, 1] that likeness alone gives."""
+    return (likeness / SURE).clamp(0, 1)
+
+
+def unrivalled(scene: SceneStyle, dictionary: StyleDictionary, table: Annotated[Tensor, "K T"]) -> Annotated[Tensor, "K"]:
+    """How little other, unlike regions claim the codes that each region takes, in [0, 1], float64.
+
+    With the squared distance d of directions from the scene's mean, a region k takes code t against its strongest rival l by
+
+        min over l of   r + (1 - r) max(0, cos(k, l))^4,      r = min(1, d(l, t) / d(k, t))
+
+    r is Lowe's ratio of distances (IJCV 2004, section 7.1), with rivals of the scene in the place of rival codes; a rival that
+    is like the region takes nothing from it, since what it claims is of its kind. Cosines between regions know no gap between
+    two sets of pictures: codes come back to the scene (cycle consistency).
+    """
+    units = unit(double(scene.keys), double(scene.semantic_mean))
+    cosine = units @ unit(double(dictionary.keys), double(scene.semantic_mean)).T
+    distance = (1 - cosine).clamp_min(1e-6)  # no ratio of two roundings
+    ratio = (distance[None] / distance[:, None]).clamp_max(1)
+    like = (units @ units.T).clamp_min(0).pow(4)[..., None]
+    share = (table * (ratio + (1 - ratio) * like).amin(1)).sum(1)
+    # Steep where a rival appears, flat where it is much the nearer: that much a wrong match still tells.
+    return 1 - _RIVALLED * (1 - (share / UNRIVALLED).clamp(0, 1)).pow(0.4)
 
 
 def light_maps(
@@ -268,7 +301,7 @@ def light_maps(
     vote = share if float(vote.sum()) < 1e-3 * float(share.sum()) else vote  # of a scene of nothing but sky, all
     # Exposure, from the logarithms of luma.
     change = (luma(wanted)[:, 0] + _BLACK).log() - (own + _BLACK).log()
-    thing = torch.lerp(change.new_tensor(agreed(change, vote * (sure + _LEAST_VOTE))), change, _MATCHED)
+    thing = torch.full_like(change, KNOWN * _quantile(change, vote * (sure + _LEAST_VOTE), 0.5))
     gain = torch.lerp(thing, change, source).exp().clamp(*_EXPOSURE)
     # White balance, from the logarithms of colours.
     axes = torch.tensor(_AXES, dtype=torch.float64)
@@ -279,21 +312,15 @@ def light_maps(
         lit = shared(there[:, a], bright)
         # Where the references share nothing, what the scene shares may be its material: a plant is yellowish throughout.
         cast.append(lit - shared(here[:, a], share) if lit else 0.0)
-    balance = (torch.tensor(cast, dtype=torch.float64).clamp(-_CAST, _CAST) @ axes).exp()
+    balance = (KNOWN * torch.tensor(cast, dtype=torch.float64).clamp(-_CAST, _CAST) @ axes).exp()
     saturation = (_saturation(codes, odds) / _saturation(mean, share)).clamp(*_SATURATION)
+    saturation = (saturation * torch.lerp(torch.ones_like(source), source.new_tensor(_SKY_SATURATION), source))[:, None, None]
     towards = (saturation * torch.eye(3).to(grey) + (1 - saturation) * grey.expand(3, 3)) * balance
     # Two deviations above the mean stay below white, with at least a third of the contrast.
     contrast = gain.minimum(((1 - gain * own) / (2 * deviation).clamp_min(_BLACK)).clamp_min(gain.clamp_max(1) / 3))
-    bias = ((gain - contrast)[:, None] * mean) @ towards
-    lit_mean = gain[:, None] * mean @ towards
+    bias = torch.einsum("kc,kcd->kd", (gain - contrast)[:, None] * mean, towards)
+    lit_mean = torch.einsum("kc,kcd->kd", gain[:, None] * mean, towards)
     return LightMaps(contrast[:, None, None] * towards, bias, _ungreened(lit_mean, wanted, axes))
-
-
-def agreed(value: Annotated[Tensor, "N"], weight: Annotated[Tensor, "N"]) -> float:
-    """The weighted median, as far as more than three fifths (wholly: nine tenths) of the weight have its sign."""
-    median = _quantile(value, weight, 0.5)
-    same = float(weight[value.sign() == (median > 0) - (median < 0)].sum() / weight.sum())
-    return median * min(1.0, max(0.0, (same - 0.6) / 0.3))
 
 
 def shared(value: Annotated[Tensor, "N"], weight: Annotated[Tensor, "N"]) -> float:

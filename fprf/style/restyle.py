@@ -15,7 +15,7 @@ from ..testing.outputs import check_stylizer
 from .colours import own_colours
 from .config import NO_MASK, Place, StyleConfig, find_reference, labels, parse_place, parse_region_value, parse_strength
 from .controls import allowed_references
-from .dictionary import BLEND, CLUSTERS, StyleDictionary, build_dictionary
+from .dictionary import BLEND, CLUSTERS, Reference, StyleDictionary, build_dictionary
 from .files import StyleFile, check_photographs, read_style
 from .light import light_of
 from .look import Restyle
@@ -46,17 +46,24 @@ class Styled(NamedTuple):
 
 
 @torch.inference_mode()
-def apply_style(here: Scene, file: StyleFile, encoders: Encoders | None = None, trail: tuple[Path, ...] = ()) -> Styled:
+def apply_style(
+    here: Scene,
+    file: StyleFile,
+    encoders: Encoders | None = None,
+    trail: tuple[Path, ...] = (),
+    encoded: dict[tuple[Path, Path], Reference] | None = None,
+) -> Styled:
     """Build the dictionary of a style's references and its stylizer on the scene; mix in the style that it goes towards.
 
-    `trail` are the style files that led here. Raises UsageError for no references and wishes that the scene does not know,
-    DataError for unreadable photographs, WeightsError where the encoders are not the scene's.
+    `trail` are the style files that led here. `encoded` keeps photographs with their masks for further styles. Raises
+    UsageError for no references and wishes that the scene does not know, DataError for unreadable photographs, WeightsError
+    where the encoders are not the scene's.
     """
     style = file.style
     if not style.references:
         raise UsageError("--references: at least one photograph is needed, for example --references autumn.jpg night.jpg")
     encoders = here.encoders() if encoders is None else encoders
-    styled = dress(here, file, encoders, _dictionary(style, encoders))
+    styled = dress(here, file, encoders, _dictionary(style, encoders, {} if encoded is None else encoded))
     if style.between is None or style.at == 0:
         return styled
     path = style.between.resolve()
@@ -128,17 +135,13 @@ def restyle(
     return apply_style(here, StyleFile(style))
 
 
-def _dictionary(style: StyleConfig, encoders: Encoders) -> StyleDictionary:
-    references = [
-        encode_photograph(
-            path,
-            encoders,
-            name=name,
-            weight=style.weights[i] if style.weights else 1.0,
-            mask=style.masks[i] if style.masks and style.masks[i] != NO_MASK else None,
-        )
-        for i, (path, name) in enumerate(zip(style.references, labels(style.references), strict=True))
-    ]
+def _dictionary(style: StyleConfig, encoders: Encoders, encoded: dict[tuple[Path, Path], Reference]) -> StyleDictionary:
+    references = []
+    for i, (path, name) in enumerate(zip(style.references, labels(style.references), strict=True)):
+        mask, weight = style.masks[i] if style.masks else NO_MASK, style.weights[i] if style.weights else 1.0
+        if (path, mask) not in encoded:
+            encoded[path, mask] = encode_photograph(path, encoders, name=name, mask=None if mask == NO_MASK else mask)
+        references.append(encoded[path, mask]._replace(name=name, weight=weight))
     return build_dictionary(references, clusters=style.clusters, blend=style.blend, seed=encoders.seed)
 
 

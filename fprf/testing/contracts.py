@@ -79,9 +79,10 @@ def _built(config: PluginConfig, kind: type[Kind], build: Callable[[], object], 
     made, name = build(), type(config).__name__
     require(isinstance(made, kind), f"{name}: build() gives {type(made).__name__}, not an fprf.interfaces.{kind.__name__}")
     assert isinstance(made, kind)
-    other = build() if again and isinstance(made, nn.Module) else None
-    if isinstance(made, nn.Module) and isinstance(other, nn.Module):
-        mine, theirs = made.state_dict(), other.state_dict()
+    module: object = made
+    other = build() if again and isinstance(module, nn.Module) else None
+    if isinstance(module, nn.Module) and isinstance(other, nn.Module):
+        mine, theirs = module.state_dict(), other.state_dict()
         equal = mine.keys() == theirs.keys() and all(torch.equal(mine[key], theirs[key]) for key in mine)
         require(equal, f"{name}: its parameters must be drawn from the seed alone")
     return made, name

@@ -59,6 +59,7 @@ def cut(
     plan = make_plan(scene, config.blocks)
     if len(plan.cells) == 1:
         return None
+    # Features of all training views, into the cache that all blocks read.
     content, semantic = build_encoders(config)
     build_decoder(config, encoder=content.identity, channels=content.channels)  # refused now, not after all the features
     background, cache, views = behind(config, scene), cache_folder() / "features", scene.train.tolist()
@@ -107,6 +108,7 @@ class Blocks(Partition):
         plan = self.plan
         if self.basis is not None:
             run.save_tensors("basis", self.basis.tensors())
+        # The views that see a block, and the tiles of them whose rays meet it; the surroundings learn from everything.
         rays = {}
         for block in (WHOLE, *range(len(plan.cells))):
             views = plan.views if block == WHOLE else plan.views_of(block)
@@ -168,6 +170,7 @@ class Block(Part):
             # Its sampler goes on where that of the surroundings stopped.
             lead = done.step
             config = replace(config, optimizer=replace(config.optimizer, warm_up=min(config.optimizer.warm_up, WARM_UP)))
+        # Its pixels are those of the tiles that meet it; the basis of the semantics is the whole scene's.
         slots = {view: slot for slot, view in enumerate(self.rays["views"].tolist())}
 
         def seen(view: int) -> Tensor:

@@ -84,7 +84,7 @@ def surroundings(config: TrainConfig, facts: Facts, cells: Sequence[Cell]) -> Bu
     """The coarse scene that everything starts from. Raises PluginError where a part breaks its contract at once."""
     decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
     member = Member(surroundings_of(cells), *build_fields(config, facts))
-    model = assemble(config, facts, Held([member]), Everywhere(), decoder, tones_of(facts), poses_of(config, facts))
+    model = assemble(config, facts, Held([member]), Everywhere(), decoder, tones_of(facts), poses_of(facts, config.poses))
     check_parts(config, model.parts, facts.channels, facts.dim)
     return Built(model, member)
 
@@ -97,6 +97,7 @@ def inset(config: TrainConfig, facts: Facts, cell: Cell, around: Built, views: A
     chart = chart_of(cell)
     member = Member(chart, *build_fields(config, facts))
     inherit(member, around.member)
+    # Decoder and tones stay as they are, so that all blocks mean the same by a colour; the surroundings go on learning.
     decoder = copy.deepcopy(around.model.decoder).requires_grad_(False)
     tones, poses = copy.deepcopy(around.model.tones), around.model.poses
     if tones is not None:
@@ -172,10 +173,12 @@ def load_blocked(
 
     Blocks are fetched as they are met; at most `max_memory` MiB of them stay. Raises CheckpointError where one is missing.
     """
+    # The surroundings stay in memory, with the decoder, tones and poses that all blocks have in common.
     cells = load_blocks(root)
     around = surroundings(config, facts, cells)
     whole, tensors = load_finished(folder_of(root, WHOLE))
     around.restore(tensors)
+    # Blocks are fetched when a ray meets them.
     limit = None if max_memory is None else int(max_memory * _MIB)
     shelf = Shelf(root, cells, around.member.to(device), device=device, limit=limit)
     model = assemble(config, facts, shelf, Blend(cells), around.model.decoder, around.model.tones, around.model.poses)

@@ -65,11 +65,13 @@ def write(root: Path, model: Mapping[str, Tensor], optimizer: Mapping[str, Tenso
             "model": tensorfiles.save(folder / "model.safetensors", model),
             "optimizer": tensorfiles.save(folder / "optimizer.safetensors", optimizer),
         }
+        # Last of all, so that a folder with a manifest is whole.
         manifest = {"format": 1, "step": step, "seconds": seconds, "files": files}
         write_json(folder / "manifest.json", manifest | {"crc32": _checksum(manifest)})
     except DataError:
         tidy(root)
         raise
+    # The manifest goes first: without it a folder does not count, also where this is cut short.
     written = steps(root)
     for old in [s for s in written if s <= step][:-KEEP] + [s for s in written if s > step]:
         (_folder(root, old) / "manifest.json").unlink()

@@ -107,10 +107,12 @@ def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images
     start = time.perf_counter()
     output = config.output or default_output(config, method)
     config, run = replace(config, output=output), Run(output)
+    # What is missing is said before there is a folder.
     with Display(quiet=quiet) as display:
-        _check_needs(config, method, display)  # before there is a folder
+        _check_needs(config, method, display)
     with held(output), Display(quiet=quiet) as display:
         display.say(f"{method} on {config.data}, run folder {output}")
+        # An existing run goes on with its own config and images; what was cut short there is removed.
         config = _sized(run, config, display)
         _check_same(run, config)
         for folder in (output, *output.glob("blocks/*"), *output.glob("cells/*")):
@@ -125,15 +127,13 @@ def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images
         hashes = image_hashes(scene)
         if run.exists and not changed_images:
             check_images(output, scene, hashes)
-        # Photographs are read, features extracted: minutes, so that nothing is written before it has worked.
-        device = device_of(config.trained_on)
-        learner = config.build(scene, device, saved=saved, progress=_told(config, display))
-        run.root.mkdir(parents=True, exist_ok=True)
+        # Reading photographs and extracting features takes minutes: nothing is written before it has worked.
+        learner = config.build(scene, device_of(config.trained_on), saved=saved, progress=_told(config, display))
+        output.mkdir(parents=True, exist_ok=True)
         run.save_config(replace(config, output=None), method)  # the folder may be moved
         save_image_hashes(output, hashes)
         run.save_known(scene, config.data, learner.facts)
         spent = time.perf_counter() - start
-        run.log({"part": "preparing", "seconds": round(spent, 3)})
         width, height = scene.cameras.size[0].tolist()
         shown = f"{scene.name}: {len(scene.train)} + {len(scene.test)} views of {width}x{height}"
         if isinstance(learner, Partition):
@@ -141,8 +141,7 @@ def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images
             learner.train(run, display, spent=spent)
         else:
             display.say(shown + learner.begin(run))
-            schedule = schedule_of(config, len(scene.train))
-            forecast = Forecast(schedule, method, learner.device.type)
+            forecast = Forecast(schedule := schedule_of(config, len(scene.train)), method, learner.device.type)
             log = reporter(display, run)
 
             def report(event: Report) -> None:
@@ -151,12 +150,8 @@ def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images
                     display.say(line)
 
             learn(learner, run, schedule, report, spent=spent)
-            trained = time.perf_counter()
-            run.log({"part": "training", "seconds": round(trained - start - spent, 3)})
             learner.finish(run, display)
-            run.log({"part": "own style", "seconds": round(time.perf_counter() - trained, 3)})
-        quoted = shlex.quote(str(output))
-        seconds = time.perf_counter() - start
+        quoted, seconds = shlex.quote(str(output)), time.perf_counter() - start
         display.say(f"done after {seconds:.0f} s: fprf stylize {quoted} --references PHOTO.jpg, fprf eval {quoted}")
     return output
 
@@ -176,12 +171,13 @@ def learn(
     and are logged; PATIENCE of them in a row lead back to the last checkpoint: on CUDA with the next report. Raises
     NumericsError where there is none, or where that was of no use, OutOfMemoryError where a step finds too little memory.
     """
+    # All draws are functions of (seed, step): a resumed training is bit for bit the one that never stopped.
     saved = None if run is None else _resume(learner, run)
     step, before = (saved.step, saved.seconds) if saved is not None else (0, spent)
     first, clock, went_back = step, before, -1
     begun = last_report = last_saved = time.perf_counter()
     pause = longest = 60 * schedule.checkpoint_minutes
-    cost = _SAVING_SHARE
+    cost = 0.1  # seconds of a checkpoint, until one is measured
     figures: Figures | None = None
 
     def save() -> None:
@@ -224,13 +220,16 @@ def learn(
                     save()
             stop.obey()
         except KeyboardInterrupt:
-            if not stop.hurried:
+            if not stop.hurried:  # else a step was cut in half
                 save()
             raise
         except Exception as error:
             if not out_of_memory(error):
                 raise
-            raise shortage(f"training step {step}", error, _less_memory(run)) from error
+            steps = [] if run is None else checkpoint.steps(run.checkpoints)
+            kept = f"the checkpoint of step {steps[-1]} is kept" if steps else "there is no checkpoint yet"
+            remedy = f"lower --datamanager.rays (of fields), or begin anew with a larger --downscale ({kept})"
+            raise shortage(f"training step {step}", error, remedy) from error
     if saved is None or step > saved.step:
         save()
     if step > first and figures is not None:
@@ -264,13 +263,6 @@ def _go_back(learner: Learner, run: Run | None, figures: Figures, step: int, bef
     learner.load(saved.state)
     run.log({"step": step, "gone_back_to": saved.step, "because": why})
     return saved.step
-
-
-def _less_memory(run: Run | None) -> str:
-    """Advice where there is not enough memory for a step."""
-    steps = [] if run is None else checkpoint.steps(run.checkpoints)
-    kept = f"the checkpoint of step {steps[-1]} is kept" if steps else "there is no checkpoint yet"
-    return f"lower --datamanager.rays (of fields), or begin anew with a larger --downscale ({kept})"
 
 
 def watch(root: Path) -> None:
@@ -401,6 +393,7 @@ def _sized(run: Run, config: RunConfig, display: Display) -> RunConfig:
                     "are delivered, also in a folder images_N; leave it out"
                 )
         return config
+    # Else a run would change its size with the machine or the minutes.
     old = run.load_config()[0].downscale if run.exists else None
     if old is not None:
         return replace(config, downscale=old)

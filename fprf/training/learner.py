@@ -23,7 +23,7 @@ from ..datamanagers.basis import Basis
 from ..datamanagers.batches import generator_of
 from ..datamanagers.scene import Scene as ParsedScene
 from ..errors import CheckpointError
-from ..interfaces import DataManager, Figures, Learner, State
+from ..interfaces import DataManager, Figures, SceneLearner, State
 from ..memory import free_memory
 from ..ops.precision import tf32
 from ..progress import Display
@@ -62,7 +62,7 @@ def optimizer_of(config: TrainConfig, model: Model) -> torch.optim.Optimizer:
     return torch.optim.Adam(model.learned(), lr=knobs.rate, betas=(0.9, knobs.beta2), eps=knobs.eps, fused=True)
 
 
-class FieldLearner(Learner):
+class FieldLearner(SceneLearner):
     """Fields in training: their model, its optimiser, and what lives between steps but is not saved: running means.
 
     `model` is one at its start, where it is not simply that of the config: a block in its surroundings, whose sampler was
@@ -118,7 +118,8 @@ class FieldLearner(Learner):
         # The pixels of the step, and the rays through them: where poses are refined, of the cameras as they are now.
         with record_function("fprf.batch"):
             drawn = self.batches(step)
-            batch = _moved(drawn, self.device)
+            here = drawn._replace(pixel=drawn.pixel.float()) if self.device.type == "mps" else drawn  # which has no float64
+            batch = Batch._make(x if x is None else x.to(self.device, non_blocking=self.deferred) for x in here)
             rays, ends = self._rays(drawn if self.through.device.type == "cpu" else batch)
         for group in self.optimizer.param_groups:
             group["lr"] = rate(self.config.optimizer, step, share)
@@ -270,19 +271,15 @@ class Batches:
         return batch
 
     def _later(self, step: int) -> "Future[Batch]":
+        """Have the thread draw the batch of a step; for CUDA into pinned memory, from where copies need not be waited for."""
+
+        def draw() -> Batch:
+            batch = self.manager.batch(step)
+            return Batch._make(x if x is None or self.device.type != "cuda" else x.pin_memory() for x in batch)
+
         if self._thread is None:
             self._thread = ThreadPoolExecutor(1, thread_name_prefix="fprf-batches")
-        return self._thread.submit(self._pinned, step)
-
-    def _pinned(self, step: int) -> Batch:
-        batch = self.manager.batch(step)
-        return Batch._make(x if x is None or self.device.type != "cuda" else x.pin_memory() for x in batch)
-
-
-def _moved(batch: Batch, device: torch.device) -> Batch:
-    if device.type == "mps":  # which has no float64
-        batch = batch._replace(pixel=batch.pixel.float())
-    return Batch._make(x if x is None else x.to(device, non_blocking=device.type == "cuda") for x in batch)
+        return self._thread.submit(draw)
 
 
 def rate(config: OptimizerConfig, step: int, share: float) -> float:

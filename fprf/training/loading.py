@@ -29,7 +29,7 @@ from .blocks import load_blocked
 from .model import Model, build_model
 from .prepare import device_of, reach_of
 from .quality import QualityConfig, at_quality
-from .run import Known, Run
+from .run import Known, Run, in_training
 from .style_pass import measure_style
 from .views import CachedView, cache_view, fit_pose, paint_pixels, render_view
 
@@ -144,7 +144,7 @@ class Trained(Scene):
         """Statistics as training has written them; while it goes on those of now, from few rays."""
         if self.style is not None:
             return self.style()
-        if not (self.run.root / "style.safetensors").is_file():
+        if in_training(self.run.root) or not (self.run.root / "style.safetensors").is_file():
             few = replace(self.config.statistics, rays=min(_FEW_RAYS, self.config.statistics.rays))
             style = measure_style(
                 replace(self.config, statistics=few), self.model, self.known.cameras, torch.tensor(self.known.train)
@@ -221,6 +221,7 @@ def load_run(root: Path, device: str = "auto", max_memory: float | None = None) 
     if isinstance(config, IncompleteConfig) and not known.facts.channels:
         package = json.loads(config.packages)["method"]
         raise PluginError(f"{root}: {config.reason}; to open a scene of its kind install {package}")
+    # The space of blocks has no cube of its own: each block brings one.
     if known.facts.space.kind == "open":
         blended, step, seconds = load_blocked(root, config, known.facts, device_of(device), max_memory)
         return Trained(run, config, method, _where_refined(known, blended), blended, step, seconds)

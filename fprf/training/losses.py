@@ -77,12 +77,14 @@ def terms(
     generator.
     """
     result: dict[str, Tensor] = {}
+    # Reconstruction (paper, Eq. 3 and 4): what was rendered against pixels and their features.
     if rendered.rgb is not None and config.rgb > 0:
         result["rgb"] = F.mse_loss(rendered.rgb, batch.rgb)
     if config.content > 0 and rendered.content is not None and batch.content is not None:
         result["content"] = F.mse_loss(rendered.content, batch.content) / facts.content_scale**2
     if config.semantic > 0 and rendered.semantic is not None and batch.semantic is not None:
         result["semantic"] = F.l1_loss(rendered.semantic, batch.semantic) / facts.semantic_scale
+    # Geometry: proposals bound the weights, weights gather (Mip-NeRF 360, Eq. 13 and 15), end at known points, leave the sky.
     sampled, weights = rendered.sampled, rendered.weights
     assert sampled is not None and weights is not None
     if config.interlevel > 0 and sampled.levels:
@@ -101,6 +103,7 @@ def terms(
     if config.extra is not None and extra is not None:
         result["extra"] = extra(rendered, batch, model.parts, step=step, generator=generator)
         check_term(config.extra, result["extra"], rendered.opacity)
+    # Regularisers of all parameters cost as much as a batch, and need not follow every one.
     if step % config.penalty_every == 0 and any(_penalty_weight(config, name) > 0 for name in model.penalty_names):
         result |= {name: value for name, value in model.penalties().items() if _penalty_weight(config, name) > 0}
     return result

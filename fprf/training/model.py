@@ -41,19 +41,19 @@ class Facts:
     """Facts of a trained scene: enough to rebuild its model without images or encoders."""
 
     space: Space
-    channels: int = 0
+    channels: int
     """Content channels; 0 = the scene is not of fields."""
-    dim: int = 0
+    dim: int
     """Semantic channels of the field; 0 = no semantics."""
-    content_encoder: str = ""
+    content_encoder: str
     """Identity of the content encoder, to which the decoder belongs."""
-    semantic_encoder: str = ""
+    semantic_encoder: str
     """Identity of the semantic encoder; empty without one."""
-    content_scale: float = 1.0
+    content_scale: float
     """RMS standard deviation of the content targets: the unit of the content loss."""
-    semantic_scale: float = 1.0
+    semantic_scale: float
     """The same for semantics."""
-    background: tuple[float, float, float] | None = None
+    background: tuple[float, float, float] | None
     """Colour behind everything, if anything can be seen through."""
     exposure: tuple[float, ...] = ()
     """Logarithm of each view's exposure over their mean (see `tones.relative`); empty where tones are not learnt."""
@@ -122,11 +122,11 @@ def tones_of(facts: Facts) -> Tones | None:
     return Tones(torch.tensor(facts.exposure), facts.held) if facts.exposure else None
 
 
-def poses_of(config: TrainConfig, facts: Facts) -> Poses | None:
-    """Poses as the capture says; None where they are not refined."""
+def poses_of(facts: Facts, pace: float) -> Poses | None:
+    """Poses as the capture says, to be learnt at a `pace`; None where they are not refined."""
     if not facts.centres:
         return None
-    return Poses(torch.tensor(facts.centres, dtype=torch.float64), facts.held, reach=facts.reach, pace=config.poses)
+    return Poses(torch.tensor(facts.centres, dtype=torch.float64), facts.held, reach=facts.reach, pace=pace)
 
 
 def build_fields(config: TrainConfig, facts: Facts) -> tuple[Sampler, ContentField, SemanticField | None]:
@@ -146,4 +146,4 @@ def build_model(config: TrainConfig, facts: Facts) -> Model:
     decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
     parts = Parts(facts.space, *build_fields(config, facts), decoder)
     check_parts(config, parts, facts.channels, facts.dim)
-    return Model(parts, tones_of(facts), poses_of(config, facts))
+    return Model(parts, tones_of(facts), poses_of(facts, config.poses))

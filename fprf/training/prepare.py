@@ -148,11 +148,17 @@ def facts_of(
     exposure: tuple[float, ...] = (),
     poses: bool = False,
 ) -> Facts:
-    """Facts of any scene; `space` is found where none is given, `poses` says whether cameras are refined."""
+    """Facts of a scene without fields; `space` is found where none is given, `poses` says whether cameras are refined."""
     space = find_space(scene) if space is None else space
     others = tuple(sorted(set(range(len(scene.paths))) - set(scene.train.tolist())))
     return Facts(
         space=space,
+        channels=0,
+        dim=0,
+        content_encoder="",
+        semantic_encoder="",
+        content_scale=1.0,
+        semantic_scale=1.0,
         background=background,
         exposure=exposure,
         held=others if exposure or poses else (),

@@ -101,6 +101,7 @@ def mixed_tone(tones: "Tones | None", known: "Known", texts: tuple[str, ...]) ->
         raise UsageError("tone: this run has learnt no tones; train it with --tones true, or leave --tone out")
     views, weights = [], []
     for text in texts:
+        # A name may hold an equals sign itself.
         name, _, share = text.rpartition("=") if text not in known.names else (text, "", "1")
         name, share = (text, "1") if not name else (name, share)
         try:

@@ -121,16 +121,9 @@ class Run:
 
     def save_known(self, scene: Scene, data: Path | None, facts: Facts) -> None:
         """Write scene.json."""
-        document = {
-            "format": FORMAT,
-            "name": scene.name,
-            "data": str(data or ""),
-            "names": view_names(scene.paths),
-            "cameras": {key: getattr(scene.cameras, key).tolist() for key in _CAMERA},
-            "train": scene.train.tolist(),
-            "test": scene.test.tolist(),
-            "facts": dataclasses.asdict(facts),
-        }
+        known = known_of(scene, data, facts)
+        cameras = {key: getattr(scene.cameras, key).tolist() for key in _CAMERA}
+        document = {"format": FORMAT, **vars(known), "cameras": cameras, "facts": dataclasses.asdict(facts)}
         write_json(self.root / "scene.json", document)
 
     def load_known(self) -> Known:
@@ -140,6 +133,7 @@ class Run:
                 raise ValueError(f"format {document['format']!r}, this fprf reads {FORMAT}")
             names = from_json(document["names"], tuple[str, ...], path="names")
             train, test = (from_json(document[key], tuple[int, ...], path=key) for key in ("train", "test"))
+            # A file that somebody sent may hold anything.
             if not all(0 <= view < len(names) for view in (*train, *test)):
                 raise ValueError(f"train or test numbers a view beyond its {len(names)}")
             cameras = {}
@@ -206,7 +200,6 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 LOCK = ".lock"
-_BUSY = (errno.EAGAIN, errno.EACCES)
 _NOTE = 200
 """Bytes of the holder's note that are repeated to others."""
 
@@ -217,54 +210,66 @@ def held(folder: Path) -> Iterator[None]:
 
     Raises DataError where another process holds it, naming that, and where nothing can be written: before any work is done.
     """
-    handle = _open(folder)
+    while (handle := _locked(folder)) is None:
+        pass
     try:
         yield
     finally:
-        with suppress(OSError):  # while it is held: who opened it before finds out in `_open`
+        with suppress(OSError):  # while it is held: who opened it before finds out in `_locked`
             (folder / LOCK).unlink()
         os.close(handle)
         with suppress(OSError):
             folder.rmdir()
 
 
-def _open(folder: Path) -> int:
-    while True:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            handle = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        except FileExistsError as error:
-            raise DataError(f"{folder}: is a file, not a folder; choose another --output") from error
-        except OSError as error:
-            raise unwritable(folder, error) from error
-        try:
-            _take(folder, handle)
-            if os.fstat(handle).st_ino == os.stat(folder / LOCK).st_ino:
-                return handle
-        except FileNotFoundError:  # removed by its holder, who ended in between
-            pass
-        except BaseException:
-            os.close(handle)
-            raise
-        os.close(handle)
-
-
-def _take(folder: Path, handle: int) -> None:
-    if fcntl is None:
-        return
+def _locked(folder: Path) -> int | None:
+    """Take the lock of a folder; None where its holder removed the file in between."""
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        if error.errno not in _BUSY:
-            return
-        note = os.pread(handle, _NOTE, 0).decode(errors="replace").strip()
-        who = note if note.isprintable() and note else "another process"
-        raise DataError(f"{folder}: {who} is training here; wait for it, end it, or choose another --output") from error
-    try:
-        os.ftruncate(handle, 0)
-        os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    except FileExistsError as error:
+        raise DataError(f"{folder}: is a file, not a folder; choose another --output") from error
     except OSError as error:
         raise unwritable(folder, error) from error
+    try:
+        # The kernel releases the lock of a process that dies; file systems without locks hold nothing.
+        if fcntl is not None:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                if error.errno in (errno.EAGAIN, errno.EACCES):
+                    note = os.pread(handle, _NOTE, 0).decode(errors="replace").strip()
+                    who = note if note.isprintable() and note else "another process"
+                    line = f"{folder}: {who} is training here; wait for it, end it, or choose another --output"
+                    raise DataError(line) from error
+            else:
+                os.ftruncate(handle, 0)
+                os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+        # Somebody may hold a file of this name that is not this one any more.
+        if os.fstat(handle).st_ino == os.stat(folder / LOCK).st_ino:
+            return handle
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        os.close(handle)
+        raise unwritable(folder, error) from error
+    except BaseException:
+        os.close(handle)
+        raise
+    os.close(handle)
+    return None
+
+
+def in_training(folder: Path) -> bool:
+    """True while a process holds a folder: what it has learnt so far will change soon."""
+    if fcntl is None or not (folder / LOCK).is_file():
+        return False
+    try:
+        with (folder / LOCK).open() as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError as error:
+        return error.errno in (errno.EAGAIN, errno.EACCES)
+    return False
 
 
 IMAGES = "images.json"
@@ -324,8 +329,6 @@ class History(NamedTuple):
     """Training time at each step, over all resumes."""
     values: dict[str, list[float | None]]
     """psnr, rays_per_second, kept and each loss by its name, at each step; None where a line does not say."""
-    parts: dict[str, float]
-    """Seconds of each part of training by its name, all resumes together."""
     notes: list[str]
     """Faults of the training: skipped steps, damaged checkpoints, returns to an earlier one."""
 
@@ -338,21 +341,27 @@ def read_history(run: Path) -> list[History]:
     """
     files = [run / "events.jsonl", *sorted((run / "blocks").glob("*/events.jsonl"))]
     histories = [_history("" if file.parent == run else file.parent.name, file) for file in files if file.is_file()]
-    histories = [history for history in histories if history.step or history.parts]
+    histories = [history for history in histories if history.step]
     if not histories:
         raise CheckpointError(f"{run}: no events.jsonl with a line of training; `fprf train` writes it as it goes")
     return histories
 
 
 def _history(name: str, file: Path) -> History:
+    """The lines of a file, which a killed process may have cut short, and which may come from anywhere."""
     lines: list[dict[str, Any]] = []
-    parts: dict[str, float] = {}
     notes: list[str] = []
-    for event in _events(file):
-        if "part" in event and _number(event.get("seconds")) is not None:
-            parts[str(event["part"])] = parts.get(str(event["part"]), 0.0) + float(event["seconds"])
-        elif type(step := event.get("step")) is int and abs(step) < _LAST and _number(event.get("seconds")) is not None:
-            while lines and lines[-1]["step"] >= event["step"]:
+    for text in file.read_text("utf-8", errors="replace").splitlines():
+        try:
+            event = parse_json(text, nan=True)
+        except ValueError:
+            continue
+        if not isinstance(event, dict) or "part" in event:  # seconds of a part, of runs of before
+            continue
+        step = event.get("step")
+        if type(step) is int and abs(step) < _LAST and _number(event.get("seconds")) is not None:
+            # After a resume the steps come again.
+            while lines and lines[-1]["step"] >= step:
                 lines.pop()
             lines.append(event)
         else:
@@ -360,17 +369,7 @@ def _history(name: str, file: Path) -> History:
     flat = [{**event, **(event["losses"] if isinstance(event.get("losses"), dict) else {})} for event in lines]
     known = dict.fromkeys(key for event in flat for key in event if key not in ("step", "seconds", "losses"))
     values = {key: [_number(event.get(key)) for event in flat] for key in known}
-    return History(name, [e["step"] for e in lines], [float(e["seconds"]) for e in lines], values, parts, notes)
-
-
-def _events(file: Path) -> Iterator[dict[str, Any]]:
-    for line in file.read_text("utf-8", errors="replace").splitlines():
-        try:
-            event = parse_json(line, nan=True)
-        except ValueError:
-            continue
-        if isinstance(event, dict):
-            yield event
+    return History(name, [e["step"] for e in lines], [float(e["seconds"]) for e in lines], values, notes)
 
 
 _LARGEST, _LAST = 3.4e38, 2**63

@@ -59,6 +59,7 @@ def measure_style(config: TrainConfig, model: Model, cameras: Cameras, views: An
 
     `cameras` are the capture's; the model's own poses, if it has any, are taken into account here.
     """
+    # Rays on a lattice over all training views, chunk by chunk; moments are merged, so that chunks do not matter.
     cameras = refined(model.poses, cameras)
     device = model.device
     view, pixel = lattice(cameras, views, config.statistics.rays)
@@ -90,6 +91,7 @@ def measure_style(config: TrainConfig, model: Model, cameras: Cameras, views: An
         config.statistics.regions,
         config.seed,
     )
+    # One region has no neighbours.
     if len(scene.share) == 1:
         return scene
     return scene._replace(contacts=_contacts(config, model, cameras, views, scene))

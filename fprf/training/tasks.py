@@ -88,7 +88,7 @@ class Part(ABC):
         """Write what is kept of a finished part beside its checkpoints; its manifest."""
         return {}
 
-    def whole(self) -> bool:
+    def is_intact(self) -> bool:
         """Return whether all files of a finished part are still there."""
         return True
 
@@ -100,7 +100,7 @@ def train_part(part: Part, report: Callable[[Report], None]) -> bool:
     """
     with held(part.folder):
         done = read_done(part.folder)
-        if done is not None and done.asked == part.asked and part.whole():
+        if done is not None and done.asked == part.asked and part.is_intact():
             return False
         begin(part.folder, part.asked["task"])
         learner = part.build()
@@ -134,9 +134,11 @@ def train_all(
     The whole scene may take a share of the minutes that are left of a limit when `spent` seconds are over, each part as much
     of the rest as the others.
     """
+    # Tasks name folders absolutely: a worker may run elsewhere, on a disk that both see.
     begun, folder = time.perf_counter() - spent, config.data or Path()
     root, data = str(run.root.resolve()), str(folder.resolve() if folder.exists() else folder)  # `town` is no folder
     for parts, share in (([WHOLE], whole_share), (order, 1 / len(order))):
+        # What is left is looked at again after the whole scene: where that ended early the parts have its time, too.
         minutes = None
         if config.minutes is not None:
             left = config.minutes - (time.perf_counter() - begun) / 60
@@ -206,6 +208,7 @@ def renumber(folder: Path, asked: Mapping[int, str]) -> None:
     tasks = {mark.parent: task_of(mark.parent) for mark in sorted(folder.glob(f"*/{_TASK}"))}
     known = {part: task for part, task in tasks.items() if task is not None}
     targets = {number: folder / f"{number:02d}" for number in asked}
+    # Those that are where they belong stay; of the others each number takes the first that was begun as what it is asked for.
     moves: dict[int, Path] = {}
     for number, task in asked.items():
         if known.get(targets[number]) == task:

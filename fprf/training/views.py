@@ -13,7 +13,7 @@ from ..interfaces import Decoder, SceneView, Values
 from ..memory import chunk_size, in_parts
 from ..ops.precision import float64_device
 from ..rendering.cameras import Cameras, PixelRays, grid_rays, rays_through
-from ..rendering.renderer import Kept, composite, composite_mean, enlarged, march, march_features, render_rays, shade
+from ..rendering.renderer import PackedSamples, composite, composite_mean, enlarged, march, march_features, render_rays, shade
 from ..style.look import Restyle
 from ..types import Rays, Rendered, View, Want
 from .camera_optimizers import moving, rotated
@@ -96,6 +96,7 @@ def _rendered(
         depth.append(out.depth)
         opacity.append(out.opacity)
         kept, samples = kept + out.counts["kept"], samples + out.counts["samples"]
+    # As the camera took it, and depths along the world's ray, whatever space the field lives in.
     width, height = (int(v) for v in cameras.size[view])
     colour = torch.cat(rgb)
     colour = (colour if factor is None else colour * factor.to(colour.device)).clamp(0, 1)
@@ -138,7 +139,7 @@ def paint_pixels(
 class Part:
     """A chunk of rays, row after row of a view; it knows no style."""
 
-    kept: Kept
+    kept: PackedSamples
     content: Annotated[Tensor, "M C"]
     semantic: Annotated[Tensor, "M D"] | None
     behind: Annotated[Tensor, "R 3"] | float

@@ -1,1 +1,1 @@
-"""A scene in the browser: `fprf view`. Everything but `frontend` works, and is tested, without viser."""
+"""A scene in the browser: `fprf view`."""

@@ -4,10 +4,9 @@ A photograph is encoded when it comes and clustered once for each number of clus
 """
 
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Annotated, TypeAlias, TypeVar
+from typing import Annotated, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -25,12 +24,10 @@ from ..style.look import Restyle
 from ..style.matching import unit
 from ..style.references import Encoders, encode_photograph
 from ..style.regions import memberships
-from ..style.restyle import Styled, dress, mixed
+from ..style.restyle import Styled, dress
 from ..style.scene import SceneStyle
-from .state import Look, Photograph, RegionInfo, simplified, style_config
+from .look import Look, Photograph, style_config
 
-OpenEncoders: TypeAlias = Callable[[Encoders | None], Encoders]
-"""Opens the encoders of a scene with its style, given those that were opened before."""
 Key = TypeVar("Key")
 Value = TypeVar("Value")
 
@@ -42,14 +39,21 @@ _SOLID = 0.01
 """Opacity below which there is nothing to point at."""
 
 
+class RegionInfo(NamedTuple):
+    """A region that was picked."""
+
+    region: int
+    share: float
+    """Of the scene."""
+    taken: tuple[tuple[str, float], ...]
+    """Share that it takes from each photograph, the largest first; empty without a style."""
+
+
 class Restyler:
     """Looks as styles on one scene; encoders are opened when they are first needed."""
 
-    def __init__(
-        self, scene: Scene, open_encoders: OpenEncoders | None = None, stylizer: RegionToneConfig | None = None
-    ) -> None:
+    def __init__(self, scene: Scene, stylizer: RegionToneConfig | None = None) -> None:
         self.scene = scene
-        self._open: OpenEncoders = open_encoders or (lambda before: scene.encoders())
         self._stylizer = stylizer
         self._encoders: Encoders | None = None
         self._stale = False
@@ -61,14 +65,13 @@ class Restyler:
     def encoders(self) -> Encoders:
         """Encoders of the scene. Raises WeightsError where those at hand are others."""
         if self._encoders is None or self._stale:
-            self._encoders = self._open(self._encoders)
+            self._encoders = self.scene.encoders()
             self._stale = False
         return self._encoders
 
-    def reload(self, scene: Scene, open_encoders: OpenEncoders | None = None) -> SceneStyle | None:
+    def reload(self, scene: Scene) -> SceneStyle | None:
         """Replace the scene, and with it its style; return the style from before, if there was one."""
-        self.scene, self._open = scene, open_encoders or self._open
-        self._stale = True
+        self.scene, self._stale = scene, True
         self._styles.clear()
         return None if self._encoders is None else self._encoders.scene
 
@@ -85,13 +88,14 @@ class Restyler:
 
     def styled(self, look: Look) -> Styled | None:
         """The look on the scene; None for the scene as it is. Raises UsageError for rules that contradict each other."""
-        look = simplified(look)
-        here = self._single(look)
-        if here is None or look.towards is None:
-            return here
-        there = self._single(look.towards)
-        assert there is not None  # else the look would have been simplified
-        return mixed(here, there, look.at)
+        if look.plain:
+            return None
+        if look not in self._styles:
+            parts = [self._dictionary(photograph, look.clusters, look.blend) for photograph, _ in look.mix]
+            style = style_config(look, self._stylizer)
+            dictionary = concatenate(parts, labels(style.references), [weight for _, weight in look.mix])
+            self._styles[look] = dress(self.scene, StyleFile(style), self.encoders, dictionary)
+        return _use(self._styles, look)
 
     def retain(self, photographs: Collection[Photograph]) -> None:
         """Drop what is kept for any other photograph."""
@@ -117,24 +121,11 @@ class Restyler:
         scene, styled = self.encoders.scene, self.styled(look)
         taken: list[tuple[str, float]] = []
         if styled is not None:
-            look = simplified(look)
-            names = [photograph.name for photograph, _ in (*look.mix, *(look.towards.mix if look.towards else ()))]
             attention = styled.restyle.match(scene.keys[region : region + 1].to(self.scene.device))[0].cpu()
             shares = torch.zeros(len(styled.codes.names)).index_add_(0, styled.codes.reference, attention.float())
+            names = [photograph.name for photograph, _ in look.mix]
             taken = sorted(zip(names, shares.tolist(), strict=True), key=lambda row: -row[1])
         return RegionInfo(region, float(scene.share[region]), tuple(taken))
-
-    def _single(self, look: Look) -> Styled | None:
-        """The look without what it goes towards."""
-        look = replace(look, towards=None, at=0.0)
-        if look.plain:
-            return None
-        if look not in self._styles:
-            parts = [self._dictionary(photograph, look.clusters, look.blend) for photograph, _ in look.mix]
-            style = style_config(look, self._stylizer)
-            dictionary = concatenate(parts, labels(style.references), [weight for _, weight in look.mix])
-            self._styles[look] = dress(self.scene, StyleFile(style), self.encoders, dictionary)
-        return _use(self._styles, look)
 
     def _dictionary(self, photograph: Photograph, clusters: int, blend: float) -> StyleDictionary:
         key = (photograph, clusters, blend)

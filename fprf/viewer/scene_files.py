@@ -55,6 +55,12 @@ def is_capture(path: Path) -> bool:
     return format_name(path) is not None or (path / "meta.json").is_file()
 
 
+def newest_step(run: Path) -> int:
+    """Step of the newest whole checkpoint; -1 where there is none."""
+    steps = (path.parent.name.removeprefix("step-") for path in run.glob("checkpoints/step-*/manifest.json"))
+    return max((int(step) for step in steps if step.isdigit()), default=-1)
+
+
 def find_source(path: Path) -> Source:
     """Return the kind of a file or folder, by names alone. Raises DataError where no scene can be made of it."""
     if (path / "config.json").is_file():

@@ -1,43 +1,54 @@
-"""The scene that is viewed: its state, its clients' cameras, and everything that changes either. Knows no page.
+"""The scene that is viewed: its looks, its clients' wishes, and everything that changes either. Knows no network.
 
-Calls come from any thread. What touches the model runs on the render worker; the `Frontend` learns of the results.
+Calls come from any thread. What touches the model runs on the render worker; clients learn of the results by messages, of which
+a newer one of the same kind takes the place of one that was not sent yet.
 """
 
 import threading
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Generator, Hashable, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
-from typing import TypeVar
+from queue import Queue
+from typing import Any, TypeAlias, TypeVar
 
+import msgspec
 import numpy as np
 
 from ..errors import FprfError, UsageError
 from ..interfaces import Scene
-from ..io.images import Picture, encode, shrink, write_image
+from ..io.images import Picture, encode, write_image
+from ..io.maps import palette
+from ..io.video import write_video
+from ..page.pack import colour_header, colour_section, container, header, pack, sections
+from ..page.writer import about, about_gaussians
 from ..plugins.stylizers.config import RegionToneConfig
-from ..rendering.space import Space
+from ..rendering.cameras import Cameras
 from ..splats.files import Capture, write_capture, write_gaussians
 from ..splats.scene import SplatScene
+from ..style.look import Restyle
 from ..training.loading import Trained
 from ..training.run import Known, Run
-from .cameras import CameraState, PageTransform, page_transform
-from .film import FilmRecorder
-from .gaussian_renderer import Colours, GaussianRenderer
+from . import messages
+from .drawing import FieldPainter, Map, Request, Shown, gaussian_colours, gaussian_frame
+from .film import FilmPlan, Frames, Key, film_frames, new_folder, queued_frames, write_film_files
+from .look import Look, Photograph, apply_preset, only, renumbered, set_rule, set_weight
 from .render_worker import RenderWorker, Steps
-from .renderer import ProgressiveRenderer, RenderedFrame, RenderRequest, SceneRenderer, first_speeds
-from .restyler import OpenEncoders, Restyler, matching_regions
-from .state import Look, Photograph, State, Thumbnail, ViewSettings, add_photograph, only, renumber_regions
+from .restyler import RegionInfo, Restyler, matching_regions
 from .uploads import Uploads, shown_name
 
 T = TypeVar("T")
-
+Post: TypeAlias = Callable[[Hashable | None, str, "Mapping[str, Any] | bytes"], None]
+"""Sends a client, or all (None), a message under the name of its kind."""
+SHELF = 12
+"""Photographs on the shelf; the oldest that no look needs makes room."""
 _POLL = 0.5
 """Seconds between looks whether the worker is closed."""
-_THUMBNAIL = 192
-"""Longest side of a key's picture."""
+_MAX_KEYS = 64
+_QUALITY = {False: 72, True: 90}
+NOW = "Now"
+"""Name of the colours of the present look, beside those of looks that are kept."""
 
 
 @dataclass(frozen=True)
@@ -48,69 +59,77 @@ class Viewed:
     name: str
     home: int
     """View at which clients begin."""
-    captured: tuple[int, ...] = ()
-    """Views from which it was trained."""
     root: Path | None = None
     """Folder for films and pictures: that of a run; None = there is none."""
     capture: Capture | None = None
     """The file of Gaussians that it was read from; None = it is a run."""
-    space: Space | None = None
-    """Of fields, in which blocks lie."""
     stylizer: RegionToneConfig | None = None
     """Style that a look starts from; None = the default."""
+    step: int = 0
+    """Step of the checkpoint that it was read from."""
 
 
-def view_of_run(scene: Scene, run: Run, known: Known) -> Viewed:
+def view_of_run(scene: Scene, run: Run, known: Known, step: int) -> Viewed:
     """A run, beginning at the middle one of the views that training did not see."""
     views = known.test or known.train
-    return Viewed(scene, known.name, views[len(views) // 2], tuple(known.train), run.root, space=known.facts.space)
+    return Viewed(scene, known.name, views[len(views) // 2], run.root, step=step)
 
 
-class Frontend(ABC):
-    """The page, as a session talks to it. Called from several threads; a call that fails harms nothing."""
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """What the page shows, for all clients alike but for their cameras."""
 
-    @abstractmethod
-    def show(self, client: Hashable, frame: RenderedFrame) -> None:
-        """Show a picture to a client."""
+    shelf: tuple[Photograph, ...] = ()
+    look: Look = field(default_factory=Look)
+    together: bool = False
+    """A photograph that is dropped joins the others; else it becomes the style alone."""
+    map: Map = "none"
+    picked: RegionInfo | None = None
+    kept: tuple[tuple[str, Look], ...] = ()
+    """Looks that were kept, by name."""
+    keys: tuple[Key, ...] = ()
+    film: tuple[int, int, Path | None] = (0, 0, None)
+    """Frames done, of how many, and the film that is finished."""
+    pictures: tuple[Path, ...] = ()
+    """Pictures that were saved."""
 
-    @abstractmethod
-    def reload(self, scene: Scene) -> None:
-        """Show another state of the scene to all clients, where their browsers draw it."""
+    @property
+    def shown(self) -> Shown:
+        """What is shown of the scene."""
+        return Shown(self.look, self.map, None if self.picked is None else self.picked.region)
 
-    @abstractmethod
-    def recolour(self, colours: Colours) -> None:
-        """Show Gaussians in other colours to all clients."""
+    @property
+    def in_use(self) -> frozenset[Photograph]:
+        """Photographs that some look needs."""
+        looks = [self.look, *(look for _, look in self.kept), *(key.look for key in self.keys)]
+        return frozenset(photograph for look in looks for photograph, _ in look.mix)
 
-    @abstractmethod
-    def changed(self, before: State, now: State) -> None:
-        """Follow a change of the state."""
-
-    @abstractmethod
-    def notify(self, text: str) -> None:
-        """Show a line of text to all clients: one's mistake is nothing to hide."""
+    def photograph(self, number: int | None) -> Photograph:
+        """A photograph of the shelf. Raises UsageError where it is not there."""
+        for each in self.shelf:
+            if each.number == number:
+                return each
+        raise UsageError(f"card {number}: none of the shelf")
 
 
 class Session:
     """Use as a context manager, which ends its threads and processes."""
 
-    def __init__(self, viewed: Viewed, state: State, open_encoders: OpenEncoders | None = None) -> None:
-        self.viewed = viewed
-        self.transform: PageTransform = page_transform(viewed.scene.cameras)
-        self.restyler = Restyler(viewed.scene, open_encoders, viewed.stylizer)
-        self.state = state
-        self._frontend: Frontend | None = None
-        self._cameras: dict[Hashable, CameraState] = {}
-        self._photographs: frozenset[Photograph] = frozenset()
-        self._lock = threading.RLock()
-        self._speeds = first_speeds()
-        self.renderer = self._make_renderer()
-        self._worker: RenderWorker[RenderRequest] = RenderWorker(
-            lambda client, request: self.renderer.render(client, request), self._on_error
-        )
-        self.films = FilmRecorder(self, self._worker)
-        self._pictures: dict[Hashable, Picture] = {}
-        self._thumbnails = count(1)
+    def __init__(self, viewed: Viewed, post: Post, *, longest: int = 640, together: bool = False) -> None:
+        self.viewed, self._post, self._longest = viewed, post, longest
+        self.restyler = Restyler(viewed.scene, viewed.stylizer)
+        self.state = State(together=together)
         self.uploads = Uploads()
+        self._lock = threading.RLock()
+        self._requests: dict[Hashable, Request] = {}
+        self._photographs: frozenset[Photograph] = frozenset()
+        self._painter: FieldPainter | None = None
+        self._worker: RenderWorker[Request] = RenderWorker(self._draw, self._on_error)
+        self._version = count(1)
+        self._colours: dict[str, tuple[int, bytes]] = {}
+        self._coloured: Shown | None = None
+        self._progress: dict[str, Any] | None = None
+        self._load()
 
     def __enter__(self) -> "Session":
         self._worker.start()
@@ -120,9 +139,103 @@ class Session:
         self._worker.close()  # a film that is being made is left unfinished
         self.uploads.close()
 
-    def attach(self, frontend: Frontend) -> None:
-        """Set who is told of pictures, changes and messages."""
-        self._frontend = frontend
+    def _load(self) -> None:
+        """Prepare what browsers are sent of the scene, or the painter of a field."""
+        scene, home = self.viewed.scene, self.viewed.home
+        if isinstance(scene, SplatScene):
+            self.packed = pack(scene.gaussians)
+            captured = self.packed.colours(scene.gaussians.harmonics)
+            head = {**header(self.packed), **about_gaussians(scene, home), "styles": [colour_header(captured)]}
+            parts = {**sections(self.packed, 1), "style-0": colour_section(captured, 1)}
+            self.geometry, self._coloured = container(head, parts), None
+        elif isinstance(scene, Trained):
+            self._painter = FieldPainter(scene, self.restyler, self._show)
+            place = scene.cameras.pose[:, :, 3]
+            spread = float((place - place.median(dim=0).values).norm(dim=1).quantile(0.9)) or 1.0
+            self.geometry = container(about(scene.cameras, home, lambda view: 1.5 * spread), {})
+        else:
+            raise UsageError(f"{self.viewed.name}: the viewer shows runs of fields and Gaussians, not {type(scene).__name__}")
+
+    @property
+    def drawn_there(self) -> bool:
+        """True where browsers draw the scene."""
+        return isinstance(self.viewed.scene, SplatScene)
+
+    def hello(self) -> list[tuple[str, dict[str, Any]]]:
+        """What a new client has to know."""
+        scene = {"type": "scene", "name": self.viewed.name, "gaussians": self.drawn_there, "step": self.viewed.step}
+        ready = [("colours " + name, self._colours_message(name)) for name in self._colours]
+        training = [] if self._progress is None else [("training", self._progress)]
+        return [("scene", scene), ("state", self._described()), *ready, *training]
+
+    def handle(self, client: Hashable, message: messages.AnyMessage) -> None:
+        """Do what a client asks for. Raises FprfError with what is wrong with it."""
+        match message:
+            case messages.View():
+                self._move(client, Request(message.camera, self.state.shown, self._longest, message.captured))
+            case messages.Set():
+                value: Any = int(message.value) if message.name == "clusters" else round(message.value, 4)
+                self.apply(lambda state: replace(state, look=replace(state.look, **{message.name: value})))
+            case messages.Preset():
+                self.apply(lambda state: replace(state, look=apply_preset(state.look, message.name)))
+            case messages.Card():
+                self.apply(lambda state: _carded(state, message))
+            case messages.Pick():
+                self._pick(message)
+            case messages.Region():
+                self.apply(lambda state: _ruled(state, message))
+            case messages.Map():
+                self.apply(lambda state: replace(state, map=message.map))
+            case messages.Keep():
+                self.apply(lambda state: _kept(state, message))
+                if message.action == "keep" and self.drawn_there:
+                    self._worker.run(("kept", message.name), lambda: self._colour(message.name, Shown(self.state.look)))
+            case messages.Key():
+                self.apply(lambda state: _keyed(state, message))
+            case messages.Film():
+                self._record(FilmPlan(self.state.keys, message.seconds, message.fps, message.side))
+            case messages.Picture():
+                self._save_picture(message.camera)
+
+    def disconnect(self, client: Hashable) -> None:
+        """Drop everything of a client."""
+        with self._lock:
+            self._requests.pop(client, None)
+        self._worker.forget(client)
+        if (painter := self._painter) is not None:
+            self._worker.run(("forget", client), lambda: painter.forget(client))
+
+    def notify(self, text: str, *, bad: bool = False) -> None:
+        """Show a line of text to all clients."""
+        self._post(None, f"said {next(self._version)}", {"type": "said", "text": text[:400], "bad": bad})
+
+    def apply(self, change: Callable[[State], State]) -> None:
+        """Replace the state for all clients. Raises what `change` raises."""
+        with self._lock:
+            before, self.state = self.state, change(self.state)
+            now = self.state
+        if now.picked is not None and now.look != before.look:
+            region = now.picked.region  # what it takes has changed
+            self._worker.run("select", lambda: self._select(region))
+        if now.shown != before.shown:
+            self._refresh()
+        if now != before:
+            self._post(None, "state", self._described())
+
+    def upload(self, data: bytes, name: str) -> Photograph:
+        """Decode and encode a photograph and restyle the scene with it. Raises DataError for what is none."""
+        path = self.uploads.store(data)
+
+        def add() -> Photograph:
+            taken = {photograph.name for photograph in self.state.shelf}
+            plain = shown_name(name)
+            unused = plain if plain not in taken else next(each for n in count(2) if (each := f"{plain} ({n})") not in taken)
+            photograph = self.restyler.encode(path, unused)
+            self.apply(lambda state: _added(state, photograph))
+            self._delete_unused(photograph)
+            return photograph
+
+        return self._result(("add", path), add)
 
     def warm_up(self) -> None:
         """Prepare what the first photograph needs while nobody waits: decoder, encoders, kernels, a style."""
@@ -132,105 +245,31 @@ class Session:
             self.restyler.encoders  # noqa: B018  they are opened by asking for them
             yield
             path = self.uploads.folder / "warm-up.png"
-            ramp = np.linspace(0, 255, 96 * 128 * 3).reshape(96, 128, 3).astype(np.uint8)
-            path.write_bytes(encode(ramp, "png"))
+            path.write_bytes(encode(np.linspace(0, 255, 96 * 128 * 3).reshape(96, 128, 3).astype(np.uint8), "png"))
             photograph = self.restyler.encode(path, "warm-up")
             yield
-            look = only(State().look, photograph)
-            self.restyler.styled(look)
+            styled = self.restyler.styled(only(Look(), photograph))
             yield
-            camera = self.transform.camera_state(self.viewed.scene.cameras, 0)
-            yield from self.renderer.render(None, RenderRequest(camera, replace(State(), look=look).view, 32))
-            self.renderer.forget(None)
-            self.restyler.retain(self.state.photographs)
+            if styled is not None and isinstance(self.viewed.scene, SplatScene):
+                self.packed.colours(self.viewed.scene.restyled(styled.restyle).shown.harmonics, rounds=1)
+            self.restyler.retain(self._photographs)
 
         self._worker.run_when_idle(work())
 
-    def move_camera(self, client: Hashable, camera: CameraState) -> None:
-        """Render what a client's camera sees now."""
-        with self._lock:
-            if not self.films.playing(client):
-                self._cameras[client] = camera
-                self.refresh(client)
+    def reload(self, viewed: Viewed) -> None:
+        """Show another state of the scene, from the next step of the worker on."""
+        self._worker.run("reload", lambda: self._reload(viewed))
 
-    def disconnect(self, client: Hashable) -> None:
-        """Drop everything of a client."""
-        with self._lock:
-            self._cameras.pop(client, None)
-            self._pictures.pop(client, None)
-        self.films.stop(client)
-        self._worker.forget(client)
-        self._worker.run(("forget", client), lambda: self.renderer.forget(client))
+    def trained(self, progress: Mapping[str, Any]) -> None:
+        """Tell all clients how far the scene's training is."""
+        self._progress = {"type": "training", **progress}
+        self._post(None, "training", self._progress)
 
-    @property
-    def has_clients(self) -> bool:
-        """True while anybody is connected."""
-        return bool(self._cameras)
-
-    @property
-    def in_browser(self) -> bool:
-        """True where the clients' browsers draw the scene, not this machine."""
-        return isinstance(self.viewed.scene, SplatScene)
-
-    @property
-    def idle(self) -> bool:
-        """True when all clients have their sharpest picture."""
-        return self._worker.idle
-
-    def reload(self, load: Callable[[], Viewed], open_encoders: OpenEncoders | None = None) -> None:
-        """Replace the scene by another state of its training, between two steps of the worker."""
-
-        def job() -> None:
-            self.viewed = load()
-            before = self.restyler.reload(self.viewed.scene, open_encoders)
-            self.renderer = self._make_renderer()
-            if self._frontend is not None:
-                self._frontend.reload(self.viewed.scene)
-            if before is not None and self.state.names_regions:
-                regions = matching_regions(before, self.restyler.encoders.scene).tolist()
-                self.update(lambda state: renumber_regions(state, regions))
-            self._request_all()
-            if self.state.picked is not None:
-                self.select_region(self.state.picked.region)
-
-        self._worker.run("reload", job)
-
-    def notify(self, text: str) -> None:
-        if self._frontend is not None:
-            self._frontend.notify(text)
-
-    def update(self, change: Callable[[State], State]) -> bool:
-        """Replace the state for all clients; return False and say why where that is not possible."""
-        try:
-            self.apply(change)
-        except FprfError as error:
-            self.notify(str(error))
-            return False
-        return True
-
-    def apply(self, change: Callable[[State], State]) -> None:
-        """Replace the state for all clients. Raises what `change` raises."""
-        with self._lock:
-            before, self.state = self.state, change(self.state)
-            now = self.state
-            if (before.view, before.pixels) != (now.view, now.pixels):
-                self._request_all()
-        if now.picked is not None and now.look != before.look:
-            self.select_region(now.picked.region)  # what it takes has changed
-        if now != before and self._frontend is not None:
-            self._frontend.changed(before, now)
-
-    def upload(self, data: bytes, name: str) -> Photograph:
-        """Decode and encode a photograph and restyle the scene with it. Raises DataError for what is none."""
-        path = self.uploads.store(data)
-
-        def add() -> Photograph:
-            photograph = self.restyler.encode(path, _unused_name(shown_name(name), self.state))
-            self.update(lambda state: add_photograph(state, photograph))
-            self._delete_unused(photograph)
-            return photograph
-
-        return self._result(("add", path), add)
+    def colours(self, name: str) -> bytes:
+        """Colours of the present look or of a kept one, for a browser. Raises UsageError where there are none."""
+        if name not in self._colours:
+            raise UsageError(f"{name}: no such colours")
+        return self._colours[name][1]
 
     def gaussians(self) -> bytes:
         """The Gaussians in the look of now, as a .ply file. Raises UsageError for a scene without any."""
@@ -249,65 +288,131 @@ class Session:
 
         return self._result("gaussians", written)
 
-    def save_picture(self, camera: CameraState, size: tuple[int, int]) -> None:
-        """Render what a camera sees, at a width and height, into the scene's folder while no client waits for a picture."""
-        cameras, root = self.transform.cameras([camera], size), self.viewed.root or self.uploads.folder
+    def _move(self, client: Hashable, request: Request) -> None:
+        if self._painter is not None:
+            messages.cameras_of([request.camera])  # refused where it is none
+            with self._lock:
+                self._requests[client] = request
+            self._worker.request(client, request)
+
+    def _refresh(self) -> None:
+        """Show all clients what is shown now."""
+        with self._lock:
+            shown = self.state.shown
+            for client, request in self._requests.items():
+                self._requests[client] = request._replace(shown=shown)
+                self._worker.request(client, self._requests[client])
+        if self.drawn_there:
+            self._worker.run("colours", lambda: self._colour(NOW, self.state.shown))
+
+    def _draw(self, client: Hashable, request: Request) -> Steps:
+        if self._painter is not None:
+            yield from self._painter.render(client, request)
+
+    def _show(self, client: Hashable, kind: str, picture: Picture, final: bool) -> None:
+        """A picture as one byte for its kind, and a JPEG."""
+        import cv2
+
+        done, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY[final]])
+        assert done
+        self._post(client, kind, (b"\1" if kind == "captured" else b"\0") + data.tobytes())
+
+    def _colour(self, name: str, shown: Shown) -> None:
+        """Make colours for browsers, of what is shown now or of a look that is kept."""
+        scene = self.viewed.scene
+        assert isinstance(scene, SplatScene)
+        if name == NOW and shown == self._coloured:
+            return
+        colours = gaussian_colours(scene, self.packed, self.restyler, shown)
+        if name == NOW:
+            self._coloured = shown
+        self._colours[name] = (next(self._version), container(colour_header(colours), {"rows": colour_section(colours, 1)}))
+        self._post(None, f"colours {name}", self._colours_message(name))
+
+    def _colours_message(self, name: str) -> dict[str, Any]:
+        return {"type": "colours", "name": name, "version": self._colours[name][0]}
+
+    def _reload(self, viewed: Viewed) -> None:
+        """Take another state of the scene, between two steps of the worker."""
+        self.viewed = viewed
+        before = self.restyler.reload(viewed.scene)
+        self._load()
+        self._colours.clear()
+        for key, message in self.hello():
+            self._post(None, key, message)
+        if before is not None and (self.state.look.rules or self.state.picked is not None):
+            regions = matching_regions(before, self.restyler.encoders.scene).tolist()
+            self.apply(lambda state: replace(state, look=renumbered(state.look, regions), picked=None))
+        if not self.state.look.plain:
+            self._refresh()
+
+    def _pick(self, message: messages.Pick) -> None:
+        """Select the region at a place of a picture; none where there is nothing."""
+        cameras = messages.cameras_of([message.camera], longest=1000)
+
+        def job() -> None:
+            width, height = cameras.size[0].tolist()
+            at = (min(message.x * width, width - 1e-3), min(message.y * height, height - 1e-3))
+            self._select(self.restyler.region_at(cameras, at))
+
+        self._worker.run("pick", job)
+
+    def _select(self, region: int | None) -> None:
+        picked = None if region is None else self.restyler.region_info(self.state.look, region)
+        self.apply(lambda state: replace(state, picked=picked))
+
+    def _frame(self, cameras: Cameras, view: int, look: Restyle | None) -> Generator[None, None, Picture]:
+        if self._painter is not None:
+            return (yield from self._painter.frame(cameras, view, look))
+        return (yield from gaussian_frame(self.viewed.scene, cameras, view, look))
+
+    def _save_picture(self, camera: messages.Camera) -> None:
+        """Render what a camera sees, as large as it is there, into the scene's folder while no client waits for a picture."""
+        cameras = messages.cameras_of([camera], longest=min(2048, round(max(camera.size))))
+        folder = (self.viewed.root or self.uploads.folder) / "pictures"
 
         def work() -> Steps:
             try:
-                picture = yield from self.renderer.frame(cameras, 0, self.restyler.restyle(self.state.look))
-                folder = root / "pictures"
+                picture = yield from self._frame(cameras, 0, self.restyler.restyle(self.state.look))
                 path = next(each for n in count(1) if not (each := folder / f"{n:04d}.png").exists())
                 folder.mkdir(parents=True, exist_ok=True)
                 write_image(path, picture)
             except FprfError as error:
-                self.notify(f"picture: {error}")
+                self.notify(f"picture: {error}", bad=True)
             else:
-                self.update(lambda state: replace(state, pictures=(*state.pictures, path)))
+                self.apply(lambda state: replace(state, pictures=(*state.pictures, path)))
 
         self._worker.run_when_idle(work())
 
-    def pick(self, client: Hashable, place: tuple[float, float]) -> None:
-        """Select the region at a click, given as shares of the client's width and height; none where there is nothing."""
+    def _record(self, plan: FilmPlan) -> None:
+        """Make a film in the scene's folder while no client waits for a picture, one at a time."""
+        with self._lock:
+            if self.state.film[1] and self.state.film[2] is None:
+                raise UsageError("film: one is being made; wait for it")
+            if self.viewed.root is None:
+                raise UsageError("this scene has no folder to put a film in")
+            folder, scene = new_folder(self.viewed.root), self.viewed.scene
+            write_film_files(folder, plan, scene.semantic_encoder, self.viewed.stylizer, scene.origin)
+            self.apply(lambda state: replace(state, film=(0, 1, None)))
+        abandoned = threading.Event()
 
-        def job() -> None:
-            camera = self._cameras.get(client)
-            if camera is None:
+        def progress(done: int, total: int) -> None:
+            self.apply(lambda state: replace(state, film=(done, total, None)))
+
+        def work() -> None:
+            frames: Frames = Queue(2)
+            try:
+                self._worker.run_when_idle(film_frames(folder, scene, self._frame, frames, progress, abandoned.is_set))
+                write_video(folder / "film.mp4", queued_frames(frames), plan.fps)
+            except Exception as error:  # whatever it is, the next film can be made
+                abandoned.set()
+                self.apply(lambda state: replace(state, film=(0, 0, None)))
+                self.notify(f"film: {error}", bad=True)
                 return
-            side = 1000
-            cameras = self.transform.cameras([camera], (round(side * camera.aspect), side))
-            width, height = cameras.size[0].tolist()
-            self._select(self.restyler.region_at(cameras, (place[0] * width, place[1] * height)))
+            self.apply(lambda state: replace(state, film=(*state.film[:2], folder / "film.mp4")))
+            self.notify(f"film: {folder / 'film.mp4'}")
 
-        self._worker.run(("pick", client), job)
-
-    def select_region(self, region: int | None) -> None:
-        """Select a region by number, or none."""
-        self._worker.run("select", lambda: self._select(region))
-
-    def preview(self, client: Hashable, camera: CameraState, look: Look) -> None:
-        """Show one client another look than that of all."""
-        with self._lock:
-            if client in self._cameras and not self.in_browser:  # there all clients have one look
-                self._cameras[client] = camera = camera._replace(aspect=self._cameras[client].aspect)
-                self._worker.request(client, RenderRequest(camera, ViewSettings(look), self.state.pixels))
-
-    def refresh(self, client: Hashable) -> None:
-        """Show one client what its camera sees, in the look of all."""
-        with self._lock:
-            if client in self._cameras:
-                self._worker.request(client, RenderRequest(self._cameras[client], self.state.view, self.state.pixels))
-
-    def picture(self, client: Hashable) -> Picture | None:
-        """The last picture that a client was shown."""
-        return self._pictures.get(client)
-
-    def thumbnail(self, client: Hashable) -> Thumbnail | None:
-        """The last picture that a client was shown, small."""
-        picture = self._pictures.get(client)
-        if picture is None:
-            return None
-        return Thumbnail(next(self._thumbnails), shrink(picture, _THUMBNAIL))
+        threading.Thread(target=work, name="fprf-film", daemon=True).start()
 
     def _result(self, name: Hashable, call: Callable[[], T]) -> T:
         """Run a call on the worker and return its result. Raises what it raises."""
@@ -327,50 +432,128 @@ class Session:
                 if self._worker.closed and not done.done():
                     raise UsageError("the viewer is ending") from None
 
-    def _make_renderer(self) -> SceneRenderer:
-        scene = self.viewed.scene
-        if isinstance(scene, SplatScene):
-            return GaussianRenderer(scene, self.restyler, self._recolour)
-        if isinstance(scene, Trained):
-            return ProgressiveRenderer(scene, self.restyler, self.transform, self._show, self._speeds)
-        raise UsageError(f"{self.viewed.name}: the viewer shows runs of fields and Gaussians, not {type(scene).__name__}")
-
     def _delete_unused(self, added: Photograph) -> None:
         """Delete photographs that left the shelf and that no look needs, with what was made of them: some 6 MB each."""
-        used = self.state.photographs
+        used = self.state.in_use | frozenset(self.state.shelf)
         for gone in {*self._photographs, added} - used:
             if gone.path.parent == self.uploads.folder:
                 gone.path.unlink(missing_ok=True)
         self._photographs = used
         self.restyler.retain(used)
 
-    def _select(self, region: int | None) -> None:
-        regions = self.restyler.regions
-        if region is not None and not 0 <= region < regions:
-            raise UsageError(f"region {region}: regions go from 0 to {regions - 1}")
-        picked = None if region is None else self.restyler.region_info(self.state.look, region)
-        self.update(lambda state: replace(state, picked=picked))
-
-    def _request_all(self) -> None:
-        with self._lock:
-            for client in self._cameras:
-                self.refresh(client)
-
-    def _show(self, client: Hashable, frame: RenderedFrame) -> None:
-        if self._frontend is not None and client is not None:  # the warm-up has no client
-            self._pictures[client] = frame.picture
-            self._frontend.show(client, frame)
-
-    def _recolour(self, colours: Colours) -> None:
-        if self._frontend is not None:
-            self._frontend.recolour(colours)
-
     def _on_error(self, error: Exception) -> None:
         expected = isinstance(error, FprfError)
-        self.notify(str(error) if expected else f"this should not have happened: {type(error).__name__}: {error}")
+        text = str(error) if expected else f"this should not have happened: {type(error).__name__}: {error}"
+        self.notify(text, bad=True)
+
+    def _described(self) -> dict[str, Any]:
+        """The state as the page reads it."""
+        state, picked = self.state, self.state.picked
+        weights = dict(state.look.mix)
+        hues = palette(len(weights)).mul(255).round().int().tolist() if state.map == "matches" else []
+        colours = {each: "rgb({}, {}, {})".format(*hue) for each, hue in zip(weights, hues, strict=False)}
+        names = ("strength", "bold", "luminance", "temperature", "clusters", "blend", "smoothness")
+        return {
+            "type": "state",
+            "shelf": [
+                {"card": each.number, "name": each.name, "weight": weights.get(each, 0.0), "colour": colours.get(each)}
+                for each in state.shelf
+            ],
+            "look": {name: getattr(state.look, name) for name in names},
+            "map": state.map,
+            "picked": None
+            if picked is None
+            else {
+                "region": picked.region,
+                "share": picked.share,
+                "taken": [{"name": name, "share": share} for name, share in picked.taken],
+                "rules": [
+                    {"action": rule.action, "card": None if rule.photograph is None else rule.photograph.number}
+                    for rule in state.look.rules
+                    if rule.region == picked.region
+                ],
+            },
+            "kept": [name for name, _ in state.kept],
+            "keys": [msgspec.to_builtins(key.camera) for key in state.keys],
+            "film": {"done": state.film[0], "total": state.film[1], "ready": state.film[2] is not None},
+            "pictures": len(state.pictures),
+        }
 
 
-def _unused_name(name: str, state: State) -> str:
-    """The name, with a number where a photograph on the shelf has it already."""
-    taken = {photograph.name for photograph in state.shelf}
-    return name if name not in taken else next(each for n in count(2) if (each := f"{name} ({n})") not in taken)
+def _added(state: State, photograph: Photograph) -> State:
+    """With a new photograph on the shelf and in the look; the oldest one that no look needs makes room."""
+    shelf = (*state.shelf, photograph)
+    together = state.together and state.look.mix
+    look = set_weight(state.look, photograph, 1.0, shelf) if together else only(state.look, photograph)
+    state = replace(state, shelf=shelf, look=replace(look, strength=look.strength or 1.0), picked=None)
+    while len(state.shelf) > SHELF:
+        spare = [each for each in state.shelf if each not in state.in_use] or [state.shelf[0]]
+        state = _removed(state, spare[0])
+    return state
+
+
+def _removed(state: State, photograph: Photograph) -> State:
+    """Without a photograph on the shelf and in the look; looks that were kept, and keys of the film, keep it."""
+    shelf = tuple(each for each in state.shelf if each is not photograph)
+    return replace(state, shelf=shelf, look=set_weight(state.look, photograph, 0.0, shelf))
+
+
+def _carded(state: State, message: messages.Card) -> State:
+    photograph = state.photograph(message.card)
+    if message.action == "remove":
+        return _removed(state, photograph)
+    if message.action == "alone":
+        return replace(state, look=only(state.look, photograph))
+    return replace(state, look=set_weight(state.look, photograph, message.weight, state.shelf))
+
+
+def _ruled(state: State, message: messages.Region) -> State:
+    if message.action == "close":
+        return replace(state, picked=None)
+    if state.picked is None:
+        raise UsageError("region: none is picked")
+    look, photograph = state.look, None
+    if message.action in ("pin", "forbid"):
+        photograph = state.photograph(message.card)
+        if photograph not in dict(look.mix):
+            look = set_weight(look, photograph, 1.0, state.shelf)
+    action = None if message.action == "free" else message.action
+    return replace(state, look=set_rule(look, state.picked.region, action, photograph))
+
+
+def _kept(state: State, message: messages.Keep) -> State:
+    """With a look kept under a name, or that of a name in use again, or dropped."""
+    name, held = " ".join(message.name.split())[:40], dict(state.kept)
+    if message.action == "restore" and name in held:
+        return replace(state, look=held[name])
+    others = tuple(row for row in state.kept if row[0] != name)
+    if message.action == "drop":
+        return replace(state, kept=others)
+    if not name or name in (NOW, "Captured") or message.action == "restore":
+        raise UsageError("keep look: give it a name of its own")
+    if len(others) >= _MAX_KEYS:
+        raise UsageError(f"keep look: at most {_MAX_KEYS} are kept; remove one first")
+    return replace(state, kept=(*others, (name, state.look)))
+
+
+def _keyed(state: State, message: messages.Key) -> State:
+    """With a keyframe more, less, or in another place."""
+    keys, at = list(state.keys), message.at
+    if message.action == "add":
+        if message.camera is None:
+            raise UsageError("key: a camera is needed")
+        if len(keys) >= _MAX_KEYS:
+            raise UsageError(f"film: at most {_MAX_KEYS} keys; remove one first")
+        messages.cameras_of([message.camera])
+        return replace(state, keys=(*keys, Key(message.camera, state.look)))
+    if not at < len(keys):
+        raise UsageError(f"film: key {at + 1} of {len(keys)}: there is none")
+    if message.action == "replace" and message.camera is not None:
+        messages.cameras_of([message.camera])
+        keys[at] = Key(message.camera, state.look)
+    elif message.action in ("earlier", "later"):
+        to = min(len(keys) - 1, max(0, at + (1 if message.action == "later" else -1)))
+        keys.insert(to, keys.pop(at))
+    elif message.action == "remove":
+        del keys[at]
+    return replace(state, keys=tuple(keys))

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from benchmarks.semantic_matching import Triplet, matching_rate, semantic_matching
+from benchmarks.style_metrics import MIXED, whole_cells
 from fprf.errors import DataError
-from fprf.evaluation.metrics import MIXED, whole_cells
 from fprf.interfaces import Encoder
 
 

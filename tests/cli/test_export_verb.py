@@ -3,6 +3,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 import torch
 import trimesh
 from tiny_world import World
@@ -10,21 +11,15 @@ from tiny_world import World
 from fprf.cli import main as cli
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.evaluation.metrics import psnr
-from fprf.export.depth_maps import render_depth_maps
+from fprf.export.fit import seen_points
+from fprf.export.mesh import render_maps
 from fprf.splats.files import read_capture
 from fprf.splats.photographs import camera_of
 from fprf.splats.views import draw
 
-LOOSE = ["--tolerance", "0.3", "--agree", "1", "--presence", "0"]
-"""The tiny model has barely begun to agree with itself."""
-
 
 def export(world: World, *args: str) -> int:
     return cli.main(["export", str(world.run), *args])
-
-
-def reds(path: Path) -> np.ndarray:
-    return trimesh.load(path).metadata["_ply_raw"]["vertex"]["data"]["f_dc_0"]
 
 
 def test_cameras_with_pictures_are_a_scene_of_its_own(world: World, tmp_path: Path) -> None:
@@ -39,45 +34,47 @@ def test_cameras_with_pictures_are_a_scene_of_its_own(world: World, tmp_path: Pa
         assert np.array_equal(cv2.imread(str(path)), cv2.imread(str(tmp_path / "styled" / f"{name}.png")))
 
 
-def test_bounds_and_options_reach_the_files(world: World, tmp_path: Path) -> None:
-    def count(*args: str) -> dict[str, float]:
-        folder = tmp_path / "x"
-        assert export(world, "splat", *LOOSE, *args, "--output", str(folder)) == 0
-        made: dict[str, float] = json.loads((folder / "export.json").read_text())
-        return made
+def test_bounds_and_options_reach_the_mesh(world: World, tmp_path: Path) -> None:
+    def made(*args: str) -> dict[str, float]:
+        assert export(world, "mesh", *args, "--output", str(tmp_path / "x")) == 0
+        found: dict[str, float] = json.loads((tmp_path / "x" / "export.json").read_text())
+        return found
 
-    every = count()
-    assert count("--points", "200")["points"] <= 200 < every["points"]
-    assert count("--edge", "3")["finest_edge"] >= 3 > every["finest_edge"]
-    assert count("--side", "16")["points"] < every["points"]
-    assert count("--tolerance", "0.1")["points"] < every["points"]
-    several = reds(tmp_path / "x" / "splats.ply")
-    assert every["floating"] == 0
-    count("--tolerance", "0.1", "--witnesses", "1")
-    assert not np.array_equal(several, reds(tmp_path / "x" / "splats.ply")), "other colours, the same points"
-    trained = world.load()
-    known = trained.known
-    [depth] = render_depth_maps(trained.model, known.cameras, known.train[:1], trained.config.render, side=32, reach=1e9).depth
-    reach = ["--reach", str(float(depth.median()))]
-    near = count(*reach)
-    assert near["splats"] > near["points"] < every["points"]
-    bare = count(*reach, "--no-sky")
-    assert bare["splats"] == bare["points"] == near["points"]
+    every = made()
+    assert made("--mesh-edge", "1")["mesh_edge"] == 1 > every["mesh_edge"]
+    assert made("--side", "16")["mesh_edge"] > every["mesh_edge"]
+    assert made("--reach", "8")["vertices"] < every["vertices"]
 
 
-def test_one_table_of_another_size(world: World, tmp_path: Path) -> None:
+def test_one_file_holds_one_look(world: World, tmp_path: Path) -> None:
     style = ["--references", str(world.references[0])]
     assert export(world, "lut", *style, "--lut-size", "5", "--output", str(tmp_path / "dusk.cube")) == 0
     lines = (tmp_path / "dusk.cube").read_text().splitlines()
     assert [path.name for path in tmp_path.iterdir()] == ["dusk.cube"]
     assert len(lines) == 4 + 5**3 and lines[1] == "LUT_3D_SIZE 5"
+    assert export(world, "mesh", *style, "--output", str(tmp_path / "dusk.ply")) == 0
+    assert len(trimesh.load(tmp_path / "dusk.ply").faces) > 100
+    assert export(world, "mesh", *style, "--styles", f"x={world.references[1]}", "--output", str(tmp_path / "a.glb")) == 2
+
+
+@pytest.mark.parametrize("most", [50, 10_000])
+def test_points_of_pixels_lie_where_the_view_sees_them_or_in_the_sky(world: World, most: int) -> None:
+    trained = world.load()
+    cameras = trained.cameras.select(torch.tensor(trained.known.train))
+    maps = render_maps(trained, cameras, side=32, reach=8.0, report=lambda done, total: None)
+    points = seen_points(maps, most)
+    sky = sum(int(depth.isinf().sum()) for depth in maps.depth)
+    assert len(points.position) == len(points.colour) == min(most, sum(depth.numel() for depth in maps.depth)) and sky > 0
+    away = np.linalg.norm(points.position - cameras.pose[:, :, 3].mean(0).numpy(), axis=1)
+    solid = np.linalg.norm(points.position[:, None] - cameras.pose[:, :, 3].numpy(), axis=2).min(1) < 8
+    assert away[~solid].min() > 1.5 * away[solid].max() and (~solid).mean() == pytest.approx(sky / 6144, abs=0.2)
 
 
 def test_splats_are_fitted_to_the_field(world: World, tmp_path: Path) -> None:
-    """Trained ones come nearer to the field's own render than discs do; a style has the same ones in other colours."""
-    more = ["--references", str(world.references[1])]
-    assert export(world, "splat", *LOOSE, "--output", str(tmp_path / "discs")) == 0
-    assert export(world, "splat", *LOOSE, *more, "--fit", "0.08", "--fit-cap", "500", "--output", str(tmp_path)) == 0
+    """The longer they are trained the nearer they come to the field's render; a style has the same ones in other colours."""
+    more = ["--references", str(world.references[1]), "--fit-cap", "500"]
+    assert export(world, "ply", "--fit", "1e-6", "--fit-cap", "500", "--output", str(tmp_path / "begun")) == 0
+    assert export(world, "splats", "spz", *more, "--fit", "0.08", "--output", str(tmp_path)) == 0
     trained = world.load()
     cameras, view = trained.known.cameras, trained.known.test[0]
     shown = trained.render(cameras, view).rgb
@@ -86,8 +83,9 @@ def test_splats_are_fitted_to_the_field(world: World, tmp_path: Path) -> None:
         capture = read_capture(path)
         return psnr(draw(capture.gaussians, camera_of(cameras, view), antialiased=capture.antialiased).image.clamp(0, 1), shown)
 
-    assert quality(tmp_path / "splats.ply") > quality(tmp_path / "discs" / "splats.ply")
+    assert quality(tmp_path / "splats.ply") > quality(tmp_path / "begun" / "splats.ply") + 1
     plain, snow = (read_capture(tmp_path / f"splats{look}.ply").gaussians for look in ("", ".snow"))
     assert len(plain) <= 500 and torch.equal(plain.means, snow.means) and torch.equal(plain.logits, snow.logits)
     assert float((plain.colours - snow.colours).abs().mean()) > 0.02
     assert len(read_capture(tmp_path / "splats.snow.splat").gaussians) == len(snow)
+    assert quality(tmp_path / "splats.spz") > quality(tmp_path / "splats.ply") - 1

@@ -3,7 +3,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from unittest.mock import Mock, call
 
 import pytest
@@ -86,16 +85,3 @@ def test_every_verb_describes_itself_and_every_flag_has_a_meaning(verb: str, cap
     found = json.loads(capsys.readouterr().out)
     assert found["prog"].startswith(f"fprf {verb}") and found["description"]
     assert found["flags"] and [row["flag"] for row in found["flags"] if not row["meaning"]] == []
-
-
-@pytest.mark.parametrize("absent", [["uvicorn"], ["viser", "uvicorn", "websockets"]])
-def test_without_its_packages_view_says_what_to_install(
-    absent: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name in absent else object())
-    train = ["train", "fprf-splats", "--data", "garden", "--output", str(tmp_path / "run"), "--view"]
-    for line in (["view", str(tmp_path)], train):
-        assert cli.main(line) == 2
-        told = capsys.readouterr().err
-        assert f"needs {', '.join(absent)};" in told and "pip install 'fprf[viewer]'" in told
-    assert not (tmp_path / "run").exists()

@@ -139,7 +139,7 @@ def test_without_pycolmap_it_says_what_to_install(
 ) -> None:
     monkeypatch.setattr("fprf.cli.process.find_spec", lambda name: None)
     assert cli.main(["process", str(tmp_path)]) == 2
-    assert "pip install 'fprf[sfm]'" in capsys.readouterr().err
+    assert "pip install 'pycolmap" in capsys.readouterr().err
 
 
 def test_an_old_pycolmap_is_refused(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:

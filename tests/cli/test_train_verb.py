@@ -6,6 +6,7 @@ import pytest
 from tiny_world import World, flags, parameters, same
 
 from fprf.cli import main as cli
+from fprf.config import TrainConfig
 from fprf.datamanagers.batches import RayBatches
 from fprf.errors import UsageError
 from fprf.methods import fprf_lite
@@ -84,7 +85,7 @@ def test_everything_that_is_missing_is_listed_at_once(
 def test_a_size_that_is_found_stays_with_the_run(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a number in config.json; the same command goes on with it, whatever would be found today."""
     found = iter((2, 3))
-    monkeypatch.setattr("fprf.training.prepare.find_downscale", lambda config, sizes, device: next(found))
+    monkeypatch.setattr(TrainConfig, "find_downscale", lambda config, scene, device: next(found))
     for steps in ("2", "3"):
         args = [*flags(world, tmp_path / "run"), "--steps", steps]
         assert cli.main(["train", "fprf-lite", *args[:4], *args[6:]]) == 0

@@ -5,7 +5,6 @@ import pytest
 from tiny_world import World, flags, parameters, same
 
 from fprf.cli import main as cli
-from fprf.cli import train
 from fprf.cli.train import ViewAddress, take_view
 from fprf.errors import UsageError
 from fprf.training import driver
@@ -38,7 +37,6 @@ def test_what_is_trained_is_the_same_to_the_bit_whoever_looks(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With a viewer of its own process that cannot start, too."""
-    monkeypatch.setattr(train, "check_viewer", lambda *words: None)
     monkeypatch.setattr(driver, "REPORT_SECONDS", 0.0)
     monkeypatch.setattr(driver, "_MIN_PAUSE", 0.0)
     monkeypatch.setattr(driver, "is_watched", lambda root: True)

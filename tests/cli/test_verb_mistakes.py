@@ -10,8 +10,7 @@ from tiny_world import World
 
 from fprf.cli import main as cli
 
-LOOSE = "--tolerance 0.3 --agree 1"
-MISTAKES = f"""
+MISTAKES = """
     doctor run --device x | --device
     doctor absent | absent
     doctor empty | empty
@@ -26,19 +25,16 @@ MISTAKES = f"""
     eval other | its images are not those of the run
     eval untested | --split test
     export run plx | 'plx'
-    export run --witnesses 0 | --witnesses
-    export run --presence 1.5 | --presence
-    export run --points 0 | --points
+    export run --fit 0 | --fit
     export run --views 1 | --views
-    export run --edge 0 | --edge
+    export run --mesh-edge 0 | --mesh-edge
     export run --lut-size 1 | --lut-size
     export run --styles A | NAME=
     export run --styles a=absent.png | absent.png
     export run --styles a=x.png b=x.png --output out/one.ply | one file holds one style
     export run cameras --output out/one.splat | holds splat
     export run lut --output out | --references
-    export run ply {LOOSE} --presence 1 --output out | --presence
-    export run ply --tolerance 1e-6 --output out | no surface
+    export run mesh --reach 1e-6 --output out | no view sees a surface
     gallery run | --references
     gallery untested --references A.png --split test | --split test
     gallery run --references empty | no image
@@ -49,7 +45,7 @@ MISTAKES = f"""
     render run --path spirale | --path spirale
     render run --path path.json | path.json
     render run --show match --path orbit | --show match
-    render run --show colour normals --lens stereo | --show
+    render run --format exr | --format
     render run --styles dusk --path orbit | NAME=
     render run --path orbit --frames 2 --output a.mov | .mp4
     render run --path orbit --frames 2 --output path.json | path.json: cannot be written
@@ -115,7 +111,6 @@ def test_a_mistake_is_one_line(
 ) -> None:
     command, _, told = line.partition(" | ")
     if command.startswith("view"):
-        pytest.importorskip("uvicorn", reason="the extra `viewer` is not installed")
         monkeypatch.setattr("importlib.util.find_spec", lambda name: object())
     monkeypatch.chdir(_place)
     before = files(_place)

@@ -16,7 +16,7 @@ from fprf.plugins.weights import read_weights
 
 VIEW = ["--views", "0000"]
 QUICK = ["--clusters", "3"]
-LOOSE = ["--tolerance", "0.3", "--agree", "1", "--presence", "0", "--side", "16", "--views", "3", "--lut-size", "3"]
+SMALL = ["--side", "16", "--views", "3", "--lut-size", "3", "--fit", "1e-6", "--fit-cap", "50"]
 DEVICE = "cuda:0"
 
 
@@ -73,7 +73,7 @@ EVERYTHING = "ply splat glb cameras lut --images --output OUT"
 VERBS: dict[str, Callable[[World, Path], list[str]]] = {
     "stylize": lambda world, folder: [*VIEW, *between(world, folder)],
     "render": lambda *_: SPIRAL.split(),
-    "export": lambda world, _: [*EVERYTHING.split(), *LOOSE, *references(world)],
+    "export": lambda world, _: [*EVERYTHING.split(), *SMALL, *references(world)],
 }
 
 

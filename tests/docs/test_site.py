@@ -2,7 +2,6 @@
 
 import importlib
 import importlib.util
-import json
 import os
 import re
 import subprocess
@@ -12,7 +11,6 @@ from types import ModuleType
 
 import pytest
 
-from fprf.cli import main as cli
 from fprf.cli.main import VERBS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -46,10 +44,10 @@ def test_it_builds_without_a_warning(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("source", "page", "text", "wanted"),
     [
-        ("README.md", "index.md", "[a](docs/speed.md#x)", "[a](speed.md#x)"),
+        ("README.md", "index.md", "[a](docs/method.md#x)", "[a](method.md#x)"),
         ("README.md", "index.md", "[a](CONTRIBUTING.md)", "[a](CONTRIBUTING.md)"),
         ("README.md", "index.md", "![a](docs/images/town.jpg)", "![a](images/town.jpg)"),
-        ("docs/speed.md", "speed.md", "[a](../benchmarks/a.json)", "[a](repository/benchmarks/a.json)"),
+        ("docs/method.md", "method.md", "[a](../benchmarks/a.json)", "[a](repository/benchmarks/a.json)"),
         ("docs/python.md", "python.md", "[a](../examples/plugin)", "[a](repository/examples/plugin/README.md)"),
         ("docs/evidence/x.md", "evidence/x.md", "[a](../../README.md)", "[a](../index.md)"),
         ("README.md", "index.md", "[a](https://example.org/a.md) [b](#c)", "[a](https://example.org/a.md) [b](#c)"),
@@ -58,19 +56,3 @@ def test_it_builds_without_a_warning(tmp_path: Path) -> None:
 )
 def test_links_lead_to_the_same_files(hooks: ModuleType, source: str, page: str, text: str, wanted: str) -> None:
     assert hooks.moved(text, source, page) == wanted
-
-
-DEFAULTS = (ROOT / "docs" / "defaults.md").read_text("utf-8")
-SECTIONS = dict(re.findall(r"^## fprf (.*?)\n(.*?)(?=^## |\Z)", DEFAULTS, re.DOTALL | re.MULTILINE))
-ROW = re.compile(r"^\| `(--[\w.-]+)` \| `([^`]*)` \| (.+) \| .*\|$", re.MULTILINE)
-
-
-@pytest.mark.parametrize("title", SECTIONS)
-def test_it_says_the_values_of_the_configs(title: str, capsys: pytest.CaptureFixture[str]) -> None:
-    rows = ROW.findall(SECTIONS[title])
-    assert len(rows) > 5 and len(rows) == SECTIONS[title].count("\n| `--"), "a row that the pattern does not read"
-    assert cli.main([*title.partition(",")[0].split(), "--describe"]) == 0
-    known = json.loads(capsys.readouterr().out)
-    values = {row["flag"]: row["default"] for row in [*known["flags"], *known["slots"]]}
-    assert {flag: value for flag, value, _ in rows} == {flag: values.get(flag) for flag, _, _ in rows}
-    assert all(why.strip() for _, _, why in rows)

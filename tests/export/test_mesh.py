@@ -1,4 +1,4 @@
-"""Meshes of a sphere of exact depths: closed, in its place, and read again by trimesh."""
+"""Meshes of a sphere of exact depths: closed, in its place, in its colours, and read again by trimesh."""
 
 from pathlib import Path
 
@@ -9,9 +9,7 @@ import trimesh
 from analytic import RADIUS, globe
 
 from fprf.errors import DataError
-from fprf.export.depth_maps import DepthMaps
-from fprf.export.mesh import Mesh, build_mesh, surface_nets, write_mesh_glb, write_mesh_ply
-from fprf.export.point_cloud import Cloud, fuse
+from fprf.export.mesh import Maps, Mesh, build_mesh, surface_nets, vertex_colours, write_mesh
 from fprf.io.images import srgb_to_linear
 from fprf.rendering.local_frame import read_offset
 
@@ -19,14 +17,13 @@ ZERO = (0.0, 0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
-def seen() -> tuple[DepthMaps, Cloud]:
-    maps = globe(10)
-    return maps, fuse(maps, edge=0.1, most=10**6, tolerance=0.02, agree=2)
+def seen() -> Maps:
+    return globe(10)
 
 
 @pytest.fixture(scope="module")
-def mesh(seen: tuple[DepthMaps, Cloud]) -> Mesh:
-    return build_mesh(*seen, edge=0.1)
+def mesh(seen: Maps) -> Mesh:
+    return build_mesh(seen, edge=0.1)
 
 
 @pytest.mark.parametrize("radius", [3.3, 5.0, 9.7])
@@ -49,10 +46,46 @@ def test_the_mesh_lies_on_the_sphere_with_its_normals(mesh: Mesh) -> None:
     assert int(mesh.face.amax()) == len(mesh.point) - 1 and len(torch.unique(mesh.face)) == len(mesh.point)
 
 
+def test_vertices_have_the_colours_of_what_views_see_there(seen: Maps, mesh: Mesh) -> None:
+    around = mesh.point[:, 2].abs() < 0.7  # below nothing looks
+
+    def apart(maps: Maps) -> torch.Tensor:
+        return (vertex_colours(maps, mesh) - (0.5 + 0.5 * mesh.point)).abs()[around]
+
+    assert float(apart(seen).mean()) < 0.01 and float(apart(seen).quantile(0.99)) < 0.05
+    # A view that looks past all of it counts for nothing.
+    dark = [rgb if view != 3 else 0 * rgb for view, rgb in enumerate(seen.rgb)]
+    gone = [depth if view != 3 else torch.full_like(depth, torch.inf) for view, depth in enumerate(seen.depth)]
+    without = apart(seen._replace(depth=gone, rgb=dark))
+    assert float(without.mean()) < 0.015 and float(without.quantile(0.99)) < 0.08
+
+
+def test_what_one_view_alone_claims_is_dropped(seen: Maps) -> None:
+    """A view with a wall right before it: the others look through that wall."""
+    wall = [depth if view != 3 else torch.full_like(depth, 1.5) for view, depth in enumerate(seen.depth)]
+    spoilt = build_mesh(seen._replace(depth=wall), edge=0.1)
+    assert float(spoilt.point.norm(dim=1).amax()) < RADIUS + 0.1
+
+
+def test_it_is_the_same_far_from_the_origin(seen: Maps, mesh: Mesh) -> None:
+    """World coordinates of a survey: 4.5e6 m from the origin."""
+    shift = torch.tensor([4.5e6, 5e5, 200.0], dtype=torch.float64)
+    far = build_mesh(seen._replace(cameras=seen.cameras.shifted(shift.tolist())), edge=0.1)
+    assert abs(len(far.point) - len(mesh.point)) <= 0.02 * len(mesh.point)
+    assert float(((far.point - shift).norm(dim=1) - RADIUS).abs().quantile(0.95)) < 0.03
+
+
+def test_the_edge_follows_the_pixels_and_the_bound(seen: Maps, monkeypatch: pytest.MonkeyPatch) -> None:
+    pixel = torch.cat([depth[depth.isfinite()] for depth in seen.depth]).median() / 50
+    assert build_mesh(seen).edge == pytest.approx(2 * float(pixel), rel=1e-6)
+    monkeypatch.setattr("fprf.export.mesh._MOST", 5_000)
+    assert build_mesh(seen).edge > 3 * float(pixel)
+
+
 def test_both_files_are_read_again_whole(mesh: Mesh, tmp_path: Path) -> None:
     colour = torch.rand(len(mesh.point), 3, generator=torch.Generator().manual_seed(0))
-    write_mesh_ply(tmp_path / "m.ply", mesh, colour, ZERO)
-    write_mesh_glb(tmp_path / "m.glb", mesh, colour, ZERO)
+    write_mesh(tmp_path / "m.ply", mesh, colour, ZERO)
+    write_mesh(tmp_path / "m.glb", mesh, colour, ZERO)
     ply = trimesh.load(tmp_path / "m.ply", process=False)
     [glb] = trimesh.load_scene(tmp_path / "m.glb", process=False).geometry.values()
     for found in (ply, glb):
@@ -70,21 +103,24 @@ def test_both_files_are_read_again_whole(mesh: Mesh, tmp_path: Path) -> None:
 def test_far_from_0_the_mesh_lies_where_the_capture_does(mesh: Mesh, tmp_path: Path) -> None:
     """PLY in float64, glTF by its node, both local where that is asked for."""
     origin, colour = (500_000.0, -16.0, 5_600_000.0), torch.rand(len(mesh.point), 3)
-    write_mesh_ply(tmp_path / "m.ply", mesh, colour, origin)
-    write_mesh_glb(tmp_path / "m.glb", mesh, colour, origin)
+    write_mesh(tmp_path / "m.ply", mesh, colour, origin)
+    write_mesh(tmp_path / "m.glb", mesh, colour, origin)
     glb = trimesh.load_scene(tmp_path / "m.glb", process=False)
     [node] = glb.graph.nodes_geometry
     matrix, name = glb.graph[node]
     assert np.array_equal(matrix[:3, 3], origin) and np.array_equal(glb.geometry[name].vertices, mesh.point.float().numpy())
     assert np.abs(trimesh.load(tmp_path / "m.ply", process=False).vertices - origin - mesh.point.numpy()).max() < 1e-8
-    for write, ending in ((write_mesh_ply, "ply"), (write_mesh_glb, "glb")):
+    for ending in ("ply", "glb"):
         path = tmp_path / f"local.{ending}"
-        write(path, mesh, colour, origin, local=True)
+        write_mesh(path, mesh, colour, origin, local=True)
         whole = trimesh.load_scene(path, process=False)
         assert np.abs(whole.to_geometry().vertices - mesh.point.numpy()).max() < 1e-6
         assert read_offset(path) == origin
 
 
-def test_a_lattice_too_coarse_for_anything_is_a_clear_mistake(seen: tuple[DepthMaps, Cloud]) -> None:
-    with pytest.raises(DataError, match="no surface for a mesh; raise --mesh-edge"):
-        build_mesh(*seen, edge=50.0)
+def test_where_nothing_is_seen_there_is_a_clear_mistake(seen: Maps) -> None:
+    with pytest.raises(DataError, match=r"no surface for a mesh.*--mesh-edge"):
+        build_mesh(seen, edge=50.0)
+    nothing = [torch.full_like(depth, torch.inf) for depth in seen.depth]
+    with pytest.raises(DataError, match="no view sees a surface within reach"):
+        build_mesh(seen._replace(depth=nothing))

@@ -4,12 +4,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from fprf.errors import DataError
 from fprf.io.maps import depth_image, depth_limits, match_image, match_summary, palette
-from fprf.io.sheet import seam_positions, side_by_side, wipe
+from fprf.io.sheet import side_by_side
 from fprf.io.video import missing_frames
 
 
@@ -85,24 +83,6 @@ def test_beside_keeps_every_pixel() -> None:
     assert (whole[:, 40:42] == 255).all() and np.array_equal(side_by_side([flat(7)]), flat(7))
     with pytest.raises(DataError, match="heights"):
         side_by_side([flat(1), flat(2, height=7)])
-
-
-@settings(deadline=None)
-@given(st.integers(1, 6), st.floats(0, 1))
-def test_seams_are_in_order_and_inside(count: int, at: float) -> None:
-    found = seam_positions(count, at)
-    assert len(found) == count - 1 and found == sorted(found)
-    assert all(0 < seam < 1 for seam in found)
-
-
-def test_strips_show_their_pictures() -> None:
-    whole = wipe([flat(10), flat(20)], 0.0)
-    assert whole.shape == (6, 40, 3)
-    assert (whole[:, :19] == 10).all() and (whole[:, 19:21] == 255).all() and (whole[:, 21:] == 20).all()
-    assert (wipe([flat(10), flat(20)], 0.25)[:, :29] == 10).all()
-    assert np.array_equal(wipe([flat(3)], 0.3), flat(3))
-    with pytest.raises(DataError, match="shapes"):
-        wipe([flat(1), flat(2, 41)], 0)
 
 
 def test_missing_frames_are_those_not_there(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import DataError, NumericsError
-from fprf.io.images import encode, shrink, srgb_to_linear, to_uint8, write_exr, write_image
+from fprf.io.images import encode, shrink, srgb_to_linear, to_uint8, write_image
 
 
 def ramp(height: int = 40, width: int = 60) -> np.ndarray:
@@ -43,9 +43,6 @@ def test_other_endings_and_other_arrays_are_refused(tmp_path: Path) -> None:
             encode(wrong, "png")
     with pytest.raises(DataError, match="use png"):
         encode(np.zeros((1, 20000, 3), np.uint8), "webp")
-    for planes in ({}, {"R": np.zeros((2, 3), np.float32), "G": np.zeros((3, 2), np.float32)}):
-        with pytest.raises(DataError):
-            write_exr(tmp_path / "a.exr", planes)
     assert not list(tmp_path.iterdir())
 
 
@@ -58,21 +55,6 @@ def test_shrinking_keeps_the_shape_and_the_mean(height: int, width: int, side: i
     assert small.min() >= picture.min() and small.max() <= picture.max()
     if min(small.shape[:2]) > 8:
         assert np.abs(small.mean((0, 1)) - picture.mean((0, 1))).max() < 3
-
-
-def test_ffmpeg_reads_openexr(tmp_path: Path) -> None:
-    """A reader that is not ours."""
-    av = pytest.importorskip("av")
-    smooth = np.linspace(0, 3, 9 * 14, dtype=np.float32).reshape(9, 14)
-    noise = np.random.default_rng(0).normal(0, 1e9, (9, 14)).astype(np.float32)
-    colours = {"R": smooth, "G": smooth * 0, "B": noise}
-    write_exr(tmp_path / "a.exr", colours)
-    with av.open(str(tmp_path / "a.exr")) as container:
-        frame = next(container.decode(video=0))
-    assert (frame.format.name, frame.width, frame.height) == ("gbrpf32le", 14, 9)
-    for name, plane in zip("GBR", frame.planes, strict=True):
-        read_ = np.frombuffer(plane, np.float32).reshape(plane.height, plane.line_size // 4)[:, : plane.width]
-        assert np.array_equal(read_, colours[name]), name
 
 
 def test_light_is_srgb_to_linear() -> None:

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from fprf.ops import dense
 from fprf.ops.dense import Last, network, runs
-from fprf.ops.lanes import exp_lanes, opaque_lanes
-from fprf.ops.simd import WIDE
+from fprf.ops.simd import WIDE, exp, load, opaque, store
 
 QUICK = settings(max_examples=25, deadline=None)
 U = 2.0**-24
@@ -134,9 +133,9 @@ NAN, INF = float("nan"), float("inf")
 def _run(kind: int, x: np.ndarray, out: np.ndarray) -> None:
     for i in range(0, len(x), WIDE):
         if kind == 0:
-            exp_lanes(x, i, out, i)
+            store(out, i, exp(load(x, i, WIDE)))
         else:
-            opaque_lanes(x, i, out, i)
+            store(out, i, opaque(load(x, i, WIDE)))
 
 
 def run(kind: int, x: np.ndarray) -> np.ndarray:

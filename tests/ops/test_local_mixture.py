@@ -42,6 +42,16 @@ def test_shares_sum_to_what_they_did_and_holes_stay() -> None:
     assert not torch.allclose(after[solid], before[solid], atol=0.1)
 
 
+def test_emptiness_around_decides_nothing() -> None:
+    guide, _ = two_halves()
+    before, solid = blurred_shares(), torch.ones(40, 60, dtype=torch.bool)
+    around = (0, 0, 30, 7, 3, 50)
+    padded = torch.nn.functional.pad(guide, around, value=torch.nan), torch.nn.functional.pad(solid, around[2:])
+    after = explained(torch.nn.functional.pad(before, around, value=0.5), *padded, radius=12.0, noise=NOISE)
+    assert torch.equal(after[3:43, 30:90], explained(before, guide, solid, radius=12.0, noise=NOISE))
+    assert bool((after[:3] == 0.5).all()) and bool((after[:, :30] == 0.5).all())
+
+
 @pytest.mark.parametrize("scale", [0.0, 1.0])
 def test_regions_of_one_look_keep_their_pixels(scale: float) -> None:
     """Where colour tells nothing apart, everything stays near the mean of the pixel's own share and the window's."""

@@ -6,8 +6,8 @@ import torch
 from plain_forms import plainly
 from torch import Tensor
 
-from fprf.ops.lanes import BLOCK
 from fprf.ops.mixture import affine, attention, scaled
+from fprf.ops.simd import BLOCK
 
 U = 2.0**-24
 """Unit round-off of float32."""

@@ -14,6 +14,7 @@ from chromium import chromium
 from pages import recoloured, seen, street, written
 from splat_ball import ball
 
+from fprf.page.writer import notebook_html
 from fprf.rendering.paths import look_at, pinhole
 from fprf.splats.photographs import camera_of
 from fprf.splats.scene import SplatScene
@@ -201,3 +202,12 @@ def test_without_webgl_there_are_pictures(browser: Any, tmp_path: Path) -> None:
     page.locator("#wiping").click()
     assert page.evaluate("() => document.querySelector('.still.two').style.clipPath") == "inset(0px 0px 0px 50%)"
     assert page.errors == []
+
+
+def test_a_notebooks_iframe_draws_it(browser: Any, tmp_path: Path) -> None:
+    scene = seen(ball(500, 2))
+    (tmp_path / "notebook.html").write_text(f"<!doctype html>{notebook_html(scene, 'ball', 1, None)}")
+    page = browser.new_page()
+    page.goto((tmp_path / "notebook.html").as_uri())
+    page.frame_locator("iframe").locator(".place.drawn").wait_for(timeout=60_000)
+    page.close()

@@ -16,7 +16,7 @@ from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, RandomConfig
 from fprf.plugins.weights import read_weights
 from fprf.pretraining.config import PretrainConfig
-from fprf.pretraining.loop import checkpoint_path, train
+from fprf.pretraining.loop import train, training_folder
 from tools.distil.__main__ import main
 
 QUICK = ["--steps", "2", "--batch", "2"]
@@ -96,8 +96,7 @@ def network() -> nn.Linear:
     return nn.Linear(3, 2)
 
 
-def test_a_resumed_run_ends_where_an_unbroken_one_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fprf.pretraining.loop.EVERY_SECONDS", -1.0)
+def test_a_resumed_run_ends_where_an_unbroken_one_does(tmp_path: Path) -> None:
     config, output = PretrainConfig(steps=9), tmp_path / "w.safetensors"
     whole, broken, resumed = network(), network(), network()
     train(whole, quadratic(whole), config, tmp_path / "other.safetensors", lambda _: None)
@@ -108,4 +107,4 @@ def test_a_resumed_run_ends_where_an_unbroken_one_does(tmp_path: Path, monkeypat
     assert train(resumed, quadratic(resumed), seldom, output, said.append) == 9
     assert said[0] == "resumed at step 5"
     assert torch.equal(resumed.weight, whole.weight)
-    assert not checkpoint_path(output).exists()
+    assert not training_folder(output).exists()

@@ -16,7 +16,7 @@ from fprf.methods import fprf_lite
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.plugins.weights import read_weights
-from fprf.pretraining.loop import report_path, samples_folder
+from fprf.pretraining.loop import samples_folder
 from fprf.training.model import build_decoder
 
 ENCODER = ["--encoder", "random", "--encoder.channels", "6", "--encoder.stride", "2"]
@@ -30,7 +30,7 @@ def vgg(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 def made(photos: Path, output: Path, *more: str) -> dict[str, float]:
     assert run(["decoder", "--images", str(photos), "--output", str(output), *ENCODER, *QUICK, *more]) == 0
-    report: dict[str, float] = json.loads(report_path(output).read_text())
+    report: dict[str, float] = json.loads(output.with_name(output.stem + ".report.json").read_text())
     return report
 
 
@@ -52,7 +52,10 @@ def test_without_weights_for_it_no_style_is_measured(photos: Path, vgg: str, tmp
     assert all(torch.equal(first[name], second[name]) for name in first), "measuring is not training"
 
 
-def test_samples_are_pictures_of_photo_decoded_and_restyled(photos: Path, tmp_path: Path) -> None:
+def test_samples_are_pictures_of_photo_decoded_and_restyled(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fprf.training.driver.REPORT_SECONDS", 0.0)
     output = tmp_path / "decoder.safetensors"
     made(photos, output, "--steps", "3", "--samples", "1e-9")
     files = sorted(samples_folder(output).iterdir())

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from fprf.rendering.cameras import LIMIT, Cameras, PixelRays, grid_rays, normals, pixel_grid, project, rays_through
 from fprf.rendering.lens import FISHEYE, OPENCV, PANORAMA, PINHOLE, bend, lens_reach, unbend
-from fprf.rendering.paths import eye_strips, look_at, panoramas, pinhole
+from fprf.rendering.paths import look_at, panoramas, pinhole
 
 K = {
     PINHOLE: (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
@@ -201,21 +201,6 @@ def test_all_directions_come_back_to_their_pixels() -> None:
     # Every part of the sphere is covered alike, per solid angle.
     weight = torch.cos((pixel[:, 1] / 24 - 0.5) * math.pi)
     assert (weight[:, None] * direction).sum(0).norm() / weight.sum() < 1e-9
-
-
-def test_eyes_look_where_the_panorama_does_from_a_circle() -> None:
-    camera = panoramas(looking(1, 0, 0), 30, UP)
-    _, whole = view_rays(camera)
-    for offset in (-0.03, 0.03):
-        strips = eye_strips(camera, offset)
-        columns = [view_rays(strips, k)[1].view(15, -1, 3) for k in range(len(strips))]
-        assert torch.allclose(torch.cat(columns, 1).reshape(-1, 3), whole, atol=1e-12)
-        for place, column in zip(strips.pose[:, :, 3], columns, strict=True):
-            away = place - camera.pose[0, :, 3]
-            ahead = torch.nn.functional.normalize(column[7].mean(0) * torch.tensor([1.0, 1, 0]), dim=0)
-            assert float(away.norm()) == pytest.approx(0.03)
-            right = torch.linalg.cross(ahead, torch.tensor([0.0, 0, 1], dtype=torch.float64))
-            assert torch.allclose(away, offset * right, atol=1e-9), "the eye is beside where it looks"
 
 
 def camera(around: bool) -> Cameras:

@@ -264,7 +264,8 @@ def test_verbs_of_a_run(run: Path, tmp_path: Path) -> None:
     assert main(["eval", str(run), "--fit-poses"]) == 0
     fitted = json.loads((run / "metrics.json").read_text())
     assert len(fitted["fitted_poses"]) == fitted["views"] and fitted["psnr"] > metrics["psnr"]
-    assert main(["export", str(run)]) == 0
+    assert main(["export", str(run), "--side", "64"]) == 0
+    assert {f"mesh.{ending}" for ending in ("ply", "glb")} <= {path.name for path in (run / "exports").iterdir()}
     capture = read_capture(run / "exports" / "splats.ply")
     assert len(capture.gaussians) == metrics["gaussians"] and capture.antialiased
     assert main(["export", str(run), "--output", str(tmp_path / "x.spz")]) == 0
@@ -352,8 +353,7 @@ def test_styles_on_a_run(run: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert np.array_equal(fprf.load(run).stylize([dusk, snow]).render(view).pixels, image)
 
 
-UNKNOWN = """export RUN glb
-export RUN splat --fit 1
+UNKNOWN = """export RUN splat --fit 1
 export RUN cameras --output x.ply
 render RUN --tone 1
 render RUN --lens panorama

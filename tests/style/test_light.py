@@ -12,7 +12,7 @@ from fprf.plugins.stylizers.config import RegionToneConfig
 from fprf.splats.gaussians import HARMONIC
 from fprf.splats.restyle import all_around, region_maps, restyled_harmonics
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
-from fprf.style.light import Light, agreed, light_maps, light_of, shared
+from fprf.style.light import KNOWN, Light, light_maps, light_of, shared, unrivalled
 from fprf.style.look import Restyle
 from fprf.style.scene import SceneStyle, scene_style
 
@@ -138,10 +138,10 @@ def shown_light(colours: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("tint", [(1.15, 1.0, 0.8), (0.8, 1.0, 1.2)])
 def test_the_cast_of_an_evenly_tinted_reference_is_found(tint: tuple[float, float, float]) -> None:
-    """A light is what all share: grey things seen through a tint give grey things that tint."""
+    """A light is what all share: grey things seen through a tint give grey things that tint, as far as it is applied."""
     greys = torch.tensor([0.3, 0.4, 0.5, 0.6])[:, None] * torch.tensor(tint)
     found = shown_light(greys)
-    assert torch.allclose(found[:, 0] / found[:, 2], torch.full((KINDS,), tint[0] / tint[2]), rtol=0.1)
+    assert torch.allclose(found[:, 0] / found[:, 2], torch.full((KINDS,), (tint[0] / tint[2]) ** KNOWN), rtol=0.1)
 
 
 def test_a_meadow_with_a_sky_and_a_barn_has_no_cast() -> None:
@@ -180,10 +180,37 @@ def test_half_way_from_blue_to_yellow_is_not_green() -> None:
         assert float(mixed[1] - mixed[[0, 2]].max()) <= float(plain[1] - plain[[0, 2]].max()) + 1e-9
 
 
-def test_what_all_share_and_what_they_agree_on() -> None:
+def test_what_all_share_is_the_cast() -> None:
     even = torch.ones(5)
     assert shared(torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5]), even) == pytest.approx(0.1)
     assert shared(-torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5]), even) == pytest.approx(-0.1, abs=0.11)
     assert shared(torch.tensor([-0.4, -0.2, 0.3, 0.4, 0.5]), even) == 0
-    assert agreed(torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5]), even) == pytest.approx(0.3)
-    assert agreed(torch.tensor([-0.4, -0.2, 0.3, 0.4, 0.5]), even) == pytest.approx(0, abs=1e-6)
+
+
+def test_references_that_show_everything_paint_as_if_there_were_no_light() -> None:
+    colour, semantic, scene = made_scene()
+    both = look_of(scene, reference(MEADOW)), look_of(scene, reference(MEADOW), bold=1.0)
+    lit, painted = (each.colour(Straight(), colour, semantic) for each in both)
+    assert float((lit - painted).abs().max()) < 0.02 < 0.1 < float((painted - colour).abs().max())
+
+
+def test_a_kind_that_a_reference_lacks_keeps_its_own_chroma() -> None:
+    """Brick beside a reference without a cast stays as red as the references are colourful."""
+    colour, semantic, scene = made_scene()
+    light = lights(look_of(scene, reference(0.6 * OWN, kinds=(0, 1, 2)), bold=0.0))
+    brick = torch.arange(len(colour)) % KINDS == 3
+    moved = colour[brick] + light(colour[brick], semantic[brick], light.paint(semantic[brick]))
+    before, after = (part.mean(0) - part.mean() for part in (colour[brick], moved))
+    assert float(torch.nn.functional.cosine_similarity(before, after, dim=0)) > 0.99
+
+
+def test_a_code_that_another_kind_claims_is_no_match_and_one_that_its_like_claims_is() -> None:
+    """Without brick in the reference, brick takes the ground's code; two regions of one kind do not rob each other."""
+    _, _, scene = made_scene()
+    twin = scene._replace(keys=torch.cat([scene.keys, scene.keys[:1] + 0.05]), share=torch.ones(KINDS + 1) / (KINDS + 1))
+    d = build_dictionary([reference(MEADOW)], clusters=KINDS, blend=0.0)
+    alike = torch.nn.functional.normalize(twin.keys, dim=1) @ torch.nn.functional.normalize(d.keys, dim=1).T
+    right = torch.nn.functional.one_hot(alike.argmax(1), KINDS).double()
+    assert float(unrivalled(twin, d, right).min()) > 0.9
+    wrong = right.roll(1, 1)
+    assert float(unrivalled(twin, d, wrong).max()) < 0.5

@@ -102,7 +102,7 @@ def test_cameras_that_were_turned_come_back(world: World, tmp_path: Path) -> Non
     config = replace(world.config, poses=0.1, steps=80)
     changed = replace(world, prepared=world.prepared._replace(facts=facts, scene=replace(scene, cameras=cameras)))
     found = parameters(trained_for(changed, tmp_path / "run", config), 80)
-    built = poses_of(config, facts)
+    built = poses_of(facts, config.poses)
     assert built is not None
     with torch.no_grad():
         built.offset.copy_(found["model.poses.offset"])

@@ -4,13 +4,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from session_helpers import Listener, viewed
+from session_helpers import Listener
+from splat_ball import ball
 from tiny_world import World
 
+from fprf.plugins.encoders.config import BundledSemanticConfig
+from fprf.splats.config import LookConfig
+from fprf.splats.scene import look_at_capture
 from fprf.training.loading import load_run
+from fprf.viewer.look import Photograph
 from fprf.viewer.restyler import Restyler
-from fprf.viewer.session import Session
-from fprf.viewer.state import Photograph, State
+from fprf.viewer.session import Session, Viewed, view_of_run
 
 
 @pytest.fixture
@@ -31,7 +35,16 @@ def listener() -> Listener:
 
 @pytest.fixture
 def session(run: Path, listener: Listener) -> Iterator[Session]:
-    """A session of a copy of the trained run, with the listener attached."""
-    with Session(viewed(load_run(run, "cpu")), State(pixels=64)) as opened:
-        opened.attach(listener)
+    """A session of a copy of the trained run of fields."""
+    trained = load_run(run, "cpu")
+    with Session(view_of_run(trained, trained.run, trained.known, trained.step), listener.post, longest=64) as opened:
+        yield opened
+
+
+@pytest.fixture
+def splats(listener: Listener, tmp_path: Path) -> Iterator[Session]:
+    """A session of a ball of Gaussians."""
+    config = LookConfig(views=4, size=(64, 48), inside=False)
+    scene = look_at_capture(ball(400, 2), True, BundledSemanticConfig().build(), config)
+    with Session(Viewed(scene, "ball", 1, tmp_path / "ball"), listener.post, longest=64) as opened:
         yield opened

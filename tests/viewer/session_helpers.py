@@ -1,49 +1,34 @@
-"""What tests of the viewer share: views of a scene, films, a page that remembers what it is told, requests, and waiting."""
+"""Sessions without a network: what they post is kept here."""
 
-import asyncio
-import json
 import threading
 import time
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any
 
+import cv2
+import numpy as np
+
 from fprf.interfaces import Scene
-from fprf.training.loading import Trained
-from fprf.viewer.cameras import CameraState, page_transform
-from fprf.viewer.film import FilmPlan
-from fprf.viewer.gaussian_renderer import Colours
-from fprf.viewer.renderer import RenderedFrame
-from fprf.viewer.routes import Request, Response, Routes
-from fprf.viewer.session import Frontend, Viewed, view_of_run
-from fprf.viewer.state import Key, Look, State
+from fprf.splats.photographs import camera_of as pinhole_of
+from fprf.viewer.film import FilmPlan, Key
+from fprf.viewer.look import Look
+from fprf.viewer.messages import Camera
 
 
-def viewed(trained: Trained) -> Viewed:
-    return view_of_run(trained, trained.run, trained.known)
+def camera_of(scene: Scene, view: int) -> Camera:
+    """A captured camera as a client's."""
+    camera = pinhole_of(scene.cameras, view)
+    pose, lens = camera.world_to_camera, camera.intrinsics
+    axes = tuple(tuple(row) for row in pose[:3, :3].tolist())
+    place = tuple((-pose[:3, :3].T @ pose[:3, 3]).tolist())
+    numbers = tuple(float(lens[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return Camera(place=place, axes=axes, lens=numbers, size=(float(camera.width), float(camera.height)))
 
 
-def camera_of(scene: Scene, view: int) -> CameraState:
-    return page_transform(scene.cameras).camera_state(scene.cameras, view)
-
-
-def plan_of(scene: Scene, looks: Sequence[Look], seconds: float = 0.1, fps: float = 30.0) -> FilmPlan:
-    """A film with a key at each of the first views."""
+def plan_of(scene: Scene, looks: Sequence[Look], seconds: float = 0.125, fps: float = 24.0) -> FilmPlan:
+    """A film of 32 x 24 pixels through captured views."""
     keys = tuple(Key(camera_of(scene, view), look) for view, look in enumerate(looks))
-    return FilmPlan(keys, seconds, fps, (32, 24))
-
-
-def ask(routes: Routes, method: str, path: str, body: bytes = b"", /, **query: object) -> Response:
-    """The answer of a page's handler."""
-
-    async def answered() -> Response:
-        fields = {name: str(value) for name, value in query.items()}
-        return await routes[(method, path)](Request(method, path, fields, {}, body))
-
-    return asyncio.run(answered())
-
-
-def post(routes: Routes, path: str, /, **asked: object) -> Any:
-    return json.loads(ask(routes, "POST", path, json.dumps(asked).encode()).body)
+    return FilmPlan(keys, seconds, fps, 32)
 
 
 def until(true: Callable[[], bool], act: Callable[[], object] = lambda: None) -> None:
@@ -55,34 +40,29 @@ def until(true: Callable[[], bool], act: Callable[[], object] = lambda: None) ->
         time.sleep(0.01)
 
 
-class Listener(Frontend):
-    """Remembers what it is told."""
+class Listener:
+    """Remembers what clients are sent."""
 
     def __init__(self) -> None:
-        self.frames: list[tuple[Hashable, RenderedFrame]] = []
-        self.states: list[State] = []
-        self.colours: list[Colours] = []
-        self.scenes: list[Scene] = []
-        self.said: list[str] = []
+        self.sent: list[tuple[Hashable | None, str, Any]] = []
         self.news = threading.Condition()
         self.fails = False
 
-    def show(self, client: Hashable, frame: RenderedFrame) -> None:
-        if self.fails:
+    def post(self, client: Hashable | None, kind: str, message: Mapping[str, Any] | bytes) -> None:
+        if self.fails and isinstance(message, bytes):
             raise RuntimeError("the client has gone")
-        self._add(self.frames, (client, frame))
+        with self.news:
+            self.sent.append((client, kind, message))
+            self.news.notify_all()
 
-    def reload(self, scene: Scene) -> None:
-        self._add(self.scenes, scene)
+    @property
+    def said(self) -> list[str]:
+        return [message["text"] for _, kind, message in self.sent if kind.startswith("said")]
 
-    def recolour(self, colours: Colours) -> None:
-        self._add(self.colours, colours)
-
-    def changed(self, before: State, now: State) -> None:
-        self._add(self.states, now)
-
-    def notify(self, text: str) -> None:
-        self._add(self.said, text)
+    def pictures(self, client: Hashable, kind: str = "look") -> list[np.ndarray]:
+        """Pictures of fields that a client was sent."""
+        mine = [message for who, what, message in self.sent if who == client and what == kind]
+        return [cv2.imdecode(np.frombuffer(each[1:], np.uint8), 1) for each in mine]
 
     def until(self, true: Callable[[], bool]) -> None:
         with self.news:
@@ -90,12 +70,3 @@ class Listener(Frontend):
 
     def until_said(self, part: str) -> None:
         self.until(lambda: any(part in text for text in self.said))
-
-    def final(self) -> dict[Hashable, RenderedFrame]:
-        """The sharpest pictures of the clients that have one."""
-        return {client: frame for client, frame in self.frames if frame.final}
-
-    def _add(self, heard: list[object], what: object) -> None:
-        with self.news:
-            heard.append(what)
-            self.news.notify_all()

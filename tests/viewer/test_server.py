@@ -2,25 +2,21 @@
 
 import json
 import socket
-import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import pytest
-
-from fprf.errors import DataError, UsageError
-
-pytest.importorskip("uvicorn", reason="the extra `viewer` is not installed")
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import BaseRoute, Route
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
-from websockets.sync.server import ServerConnection, serve
-from websockets.typing import Subprotocol
 
+from fprf.errors import UsageError
 from fprf.viewer import server
-from fprf.viewer.routes import Request, Response
-from fprf.viewer.server import COOKIE, Access, HttpServer, ViewerServer, make_access
+from fprf.viewer.server import COOKIE, Access, Client, ViewerServer, make_access
 
 HERE = Access("127.0.0.1", None)
 TOKEN = "a-token-of-sixteen-characters"
@@ -57,39 +53,44 @@ def test_tokens_are_made_where_they_are_needed_and_weak_ones_are_refused() -> No
             make_access("127.0.0.1", token)
 
 
-async def hello(request: Request) -> Response:
-    return Response(200, "text/plain", b"hello")
+class Probe(ViewerServer):
+    """The viewer's server with some more pages."""
 
+    def _routes(self) -> list[BaseRoute]:
+        async def hello(request: Request) -> Response:
+            return Response(b"hello", media_type="text/plain")
 
-async def echo(request: Request) -> Response:
-    return Response(200, "application/json", json.dumps({"size": len(request.body), "query": dict(request.query)}).encode())
+        async def echo(request: Request) -> Response:
+            return JSONResponse({"size": len(await self.body(request)), "query": dict(request.query_params)})
 
+        async def film(request: Request) -> Response:
+            return Response(b"x" * (64 << 20), media_type="video/mp4")
 
-async def film(request: Request) -> Response:
-    return Response(200, "video/mp4", b"x" * (64 << 20))
+        async def refused(request: Request) -> Response:
+            raise UsageError("the scene has no such thing")
 
-
-async def refused(request: Request) -> Response:
-    raise UsageError("the scene has no such thing")
-
-
-ROUTES = {("GET", "/"): hello, ("POST", "/echo"): echo, ("GET", "/refused"): refused, ("GET", "/film"): film}
+        return [
+            Route("/hello", hello),
+            Route("/echo", echo, methods=["POST"]),
+            Route("/film64", film),
+            Route("/refused", refused),
+            *super()._routes(),
+        ]
 
 
 @pytest.fixture
-def http(monkeypatch: pytest.MonkeyPatch) -> Iterator[HttpServer]:
+def http(monkeypatch: pytest.MonkeyPatch) -> Iterator[ViewerServer]:
     monkeypatch.setattr(server, "_MAX_BODY", 100_000)
     monkeypatch.setattr(server, "_TIMEOUT", 0.5)
-    found = HttpServer(HERE, 0, ROUTES)
-    yield found
-    found.close()
+    with Probe(HERE, 0) as found:
+        yield found
 
 
-def connected(http: HttpServer) -> socket.socket:
+def connected(http: ViewerServer) -> socket.socket:
     return socket.create_connection(("127.0.0.1", http.port), timeout=30)
 
 
-def talk(http: HttpServer, data: bytes) -> bytes:
+def talk(http: ViewerServer, data: bytes) -> bytes:
     """The answer to some bytes, as soon as the server hangs up."""
     with connected(http) as wire:
         wire.sendall(data)
@@ -99,22 +100,22 @@ def talk(http: HttpServer, data: bytes) -> bytes:
     return answer
 
 
-def request(http: HttpServer, line: str, *headers: str, body: bytes = b"") -> bytes:
+def request(http: ViewerServer, line: str, *headers: str, body: bytes = b"") -> bytes:
     return talk(http, "\r\n".join([f"{line} HTTP/1.1", f"Host: 127.0.0.1:{http.port}", *headers, "", ""]).encode() + body)
 
 
-def status(http: HttpServer, line: str, *headers: str, body: bytes = b"") -> int:
+def status(http: ViewerServer, line: str, *headers: str, body: bytes = b"") -> int:
     return int(request(http, line, *headers, body=body).split(b" ", 2)[1])
 
 
-def test_a_page_comes_with_headers_that_keep_it_to_itself(http: HttpServer) -> None:
-    answer = request(http, "GET /")
+def test_a_page_comes_with_headers_that_keep_it_to_itself(http: ViewerServer) -> None:
+    answer = request(http, "GET /hello")
     assert answer.startswith(b"HTTP/1.1 200 ") and answer.endswith(b"\r\n\r\nhello")
     for header in (b"x-frame-options: DENY", b"x-content-type-options: nosniff", b"connection: close"):
         assert header in answer
 
 
-def test_bodies_and_queries_arrive(http: HttpServer) -> None:
+def test_bodies_and_queries_arrive(http: ViewerServer) -> None:
     body = b"x" * 100_000
     chunked = f"{len(body):x}\r\n".encode() + body + b"\r\n0\r\n\r\n"
     for header, sent in (("Content-Length: 100000", body), ("Transfer-Encoding: chunked", chunked)):
@@ -140,18 +141,18 @@ def test_bodies_and_queries_arrive(http: HttpServer) -> None:
         ("GET /?" + "a=1&" * 20, (), b"", 400),
     ],
 )
-def test_what_is_wrong_is_refused(http: HttpServer, line: str, headers: tuple[str, ...], body: bytes, expected: int) -> None:
+def test_what_is_wrong_is_refused(http: ViewerServer, line: str, headers: tuple[str, ...], body: bytes, expected: int) -> None:
     assert status(http, line, *headers, body=body) == expected
     assert status(http, "GET /") == 200
 
 
-def test_nonsense_and_half_heads_end_their_own_connection_alone(http: HttpServer) -> None:
+def test_nonsense_and_half_heads_end_their_own_connection_alone(http: ViewerServer) -> None:
     for data in (b"", b"\x16\x03\x01\x02\x00", b"\0" * 100 + b"\r\n\r\n", b"GET / HTTP/1.1\r\nX: " + b"y" * 20_000):
         talk(http, data)
         assert status(http, "GET /") == 200
 
 
-def test_idle_connections_are_closed_and_do_not_shut_others_out(http: HttpServer) -> None:
+def test_idle_connections_are_closed_and_do_not_shut_others_out(http: ViewerServer) -> None:
     wires = [connected(http) for _ in range(80)]
     deadline = time.monotonic() + 30
     while status(http, "GET /") != 200:
@@ -162,9 +163,9 @@ def test_idle_connections_are_closed_and_do_not_shut_others_out(http: HttpServer
         wire.close()
 
 
-def test_a_client_that_does_not_read_is_dropped(http: HttpServer) -> None:
+def test_a_client_that_does_not_read_is_dropped(http: ViewerServer) -> None:
     with connected(http) as wire:
-        wire.sendall(f"GET /film HTTP/1.1\r\nHost: 127.0.0.1:{http.port}\r\n\r\n".encode())
+        wire.sendall(f"GET /film64 HTTP/1.1\r\nHost: 127.0.0.1:{http.port}\r\n\r\n".encode())
         time.sleep(1.5)
         size = 0
         while piece := wire.recv(1 << 20):
@@ -173,8 +174,7 @@ def test_a_client_that_does_not_read_is_dropped(http: HttpServer) -> None:
 
 
 def test_a_token_in_the_address_becomes_a_cookie() -> None:
-    http = HttpServer(Access("127.0.0.1", TOKEN), 0, ROUTES)
-    try:
+    with Probe(Access("127.0.0.1", TOKEN), 0) as http:
         assert status(http, "GET /") == status(http, "GET /?token=wrong") == 403
         answer = request(http, f"GET /?token={TOKEN}")
         assert answer.startswith(b"HTTP/1.1 303 ") and b"location: /\r\n" in answer
@@ -182,104 +182,96 @@ def test_a_token_in_the_address_becomes_a_cookie() -> None:
         assert status(http, "GET /", f"Cookie: {COOKIE}={TOKEN}") == 200
         assert status(http, "POST /echo", f"Cookie: {COOKIE}={TOKEN}", "Content-Length: 0") == 200
         assert status(http, "POST /echo", "Content-Length: 0") == 403
-    finally:
-        http.close()
+        with pytest.raises(InvalidStatus) as told, opened(http):
+            pass
+        assert told.value.response.status_code == 403
 
 
-def check(payload: bytes) -> None:
-    if not payload.startswith(b"good"):
-        raise DataError("message: bad")
+def opened(http: ViewerServer, **more: object) -> ClientConnection:
+    return connect(f"ws://127.0.0.1:{http.port}/live", compression=None, proxy=None, **more)  # type: ignore[arg-type]
 
 
-@pytest.fixture
-def inner(http: HttpServer) -> Iterator[list[bytes]]:
-    """A server in the place of viser, which sends back what it receives; and what it received."""
-    received: list[bytes] = []
-
-    def handle(connection: ServerConnection) -> None:
-        for message in connection:
-            received.append(message)
-            connection.send(message[::-1])
-
-    def choose(connection: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
-        return offered[-1] if offered else None
-
-    with serve(handle, "127.0.0.1", 0, select_subprotocol=choose) as listening:
-        threading.Thread(target=listening.serve_forever, daemon=True).start()
-        http.relay_to(ROUTES, listening.socket.getsockname(), check)
-        yield received
-        listening.shutdown()
+GOOD = '{"type": "set", "name": "strength", "value": 0.5}'
 
 
-def opened(http: HttpServer, **more: object) -> ClientConnection:
-    return connect(f"ws://127.0.0.1:{http.port}/", compression=None, proxy=None, **more)  # type: ignore[arg-type]
-
-
-def test_messages_pass_until_one_is_bad_and_then_that_client_is_out(http: HttpServer, inner: list[bytes]) -> None:
-    with opened(http, subprotocols=["viser-v1"]) as bad, opened(http) as other:
-        assert bad.subprotocol == "viser-v1"
-        for message in (b"good", b"good" + b"x" * 1000, [b"go", b"od in parts"]):
+def test_messages_pass_until_one_is_bad_and_then_that_client_is_out(http: ViewerServer) -> None:
+    with opened(http) as bad, opened(http) as other:
+        assert json.loads(bad.recv()) == json.loads(other.recv()) == {"type": "loading"}
+        for message in (GOOD, [GOOD[:10], GOOD[10:]]):
             bad.send(message)
-            whole = b"".join(message) if isinstance(message, list) else message
-            assert bad.recv() == whole[::-1]
-        bad.send(b"bad")
-        with pytest.raises(ConnectionClosed):
+        http.notify("hello")
+        assert json.loads(bad.recv())["text"] == "hello"
+        bad.send('{"type": "shutdown"}')
+        with pytest.raises(ConnectionClosed) as told:
             bad.recv()
-        other.send(b"good still")
-        assert other.recv() == b"good still"[::-1]
-    assert b"bad" not in inner
+        assert told.value.rcvd is not None and told.value.rcvd.code == 1008
+        other.send(GOOD)
+        http.notify("still there")
+        assert "hello" in other.recv() and "still there" in other.recv()
 
 
-@pytest.mark.parametrize("message", [b"good" + b"x" * (1 << 20), [b"good" + b"x" * 600_000, b"x" * 600_000], "good text"])
-def test_messages_that_are_too_long_or_text_end_the_connection(
-    http: HttpServer, inner: list[bytes], message: bytes | list[bytes] | str
-) -> None:
+@pytest.mark.parametrize(
+    "message", ["x" * (1 << 17), ["x" * 60_000, "x" * 60_000], b"bytes", b"\xff", GOOD + "x", "", "[" * 60_000]
+)
+def test_messages_that_are_no_message_end_the_connection(http: ViewerServer, message: bytes | list[str] | str) -> None:
     with opened(http) as client, pytest.raises(ConnectionClosed):
+        client.recv()
         client.send(message)
         client.recv()
-    assert inner == [] and status(http, "GET /") == 200
-
-
-def test_websockets_of_other_sites_and_before_the_scene_is_there_are_refused(http: HttpServer) -> None:
-    for origin, expected in (("http://evil.example", 403), (f"http://127.0.0.1:{http.port}", 503)):
-        with pytest.raises(InvalidStatus) as told, opened(http, origin=origin):
-            pass
-        assert told.value.response.status_code == expected
-    http.relay_to(ROUTES, ("127.0.0.1", 9), check)
-    with pytest.raises(InvalidStatus), opened(http):  # nobody listens inside
-        pass
     assert status(http, "GET /") == 200
+
+
+def test_websockets_of_other_sites_and_too_many_are_refused(http: ViewerServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InvalidStatus) as told, opened(http, origin="http://evil.example"):
+        pass
+    assert told.value.response.status_code == 403
+    with opened(http, origin=f"http://127.0.0.1:{http.port}") as client:
+        client.recv()
+        monkeypatch.setattr(server, "_PAGES", 1)
+        with pytest.raises(InvalidStatus), opened(http):
+            pass
+    assert status(http, "GET /") == 200
+
+
+def test_a_client_that_is_slow_gets_the_newest_of_each_kind_alone() -> None:
+    client = Client()
+    for number in range(1000):
+        client.put("state", str(number))
+        client.put(f"said {number % 2}", str(number))
+    assert client._waiting == {"said 0": "998", "state": "999", "said 1": "999"}
 
 
 def page_of(address: str) -> bytes:
     with urllib.request.urlopen(address, timeout=60) as answer:
-        return answer.read()
+        found: bytes = answer.read()
+        return found
 
 
-def test_before_the_scene_is_there_a_page_says_so_and_a_visit_is_known() -> None:
+def test_before_the_scene_is_there_a_page_says_so() -> None:
     with ViewerServer(HERE, 0) as found:
         address = found.address
-        assert not found.visited.is_set()
-        assert b"Loading the scene" in page_of(address) and found.visited.is_set()
+        assert b"Loading the scene" in page_of(address) and b"class Splats" in page_of(f"{address}app.js")
         found.notify("nobody hears this")
 
         def load() -> None:
             raise UsageError("no such run")
 
         with pytest.raises(UsageError, match="no such run"):
-            found.open(load, (), 64)  # type: ignore[arg-type]
-        assert b"Loading" in page_of(address)
+            found.open(load)  # type: ignore[arg-type]
+        for path in ("scene", "colours?name=x", "card?card=1", "gaussians", "film", "picture?number=0"):
+            with pytest.raises(urllib.error.HTTPError, match="400"):
+                page_of(f"{address}{path}")
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            page_of(f"{address}start/picture")
         with pytest.raises(UsageError, match="choose another port"):
-            ViewerServer(HERE, int(address.rstrip("/").rpartition(":")[2]), preload=False)
-        found.show_start(ROUTES)
-        assert page_of(address) == b"hello"
+            ViewerServer(HERE, found.port)
     with pytest.raises(OSError):
         page_of(address)
 
 
 def test_the_address_carries_the_token_and_without_it_nothing_opens() -> None:
-    with ViewerServer(make_access("127.0.0.1", "a-token/of-&-characters"), 0, preload=False) as found:
+    with ViewerServer(make_access("127.0.0.1", "a-token/of-&-characters"), 0) as found:
         assert "?token=a-token/of-%26-characters" in found.address
-        with pytest.raises(urllib.error.HTTPError, match="403"):
-            page_of(found.address.partition("?")[0])
-        assert not found.visited.is_set()
+        for path in ("", "app.js", "scene"):
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                page_of(found.address.partition("?")[0] + path)

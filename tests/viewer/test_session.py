@@ -1,57 +1,117 @@
+import json
 import threading
+import zlib
+from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
-from session_helpers import Listener, camera_of, plan_of
+import torch
+from session_helpers import Listener, camera_of, until
 from tiny_world import World
 
-from fprf.errors import UsageError
+from fprf.errors import FprfError, UsageError
+from fprf.splats.files import read_capture
+from fprf.viewer import messages
+from fprf.viewer.messages import cameras_of
 from fprf.viewer.render_worker import Steps
-from fprf.viewer.session import Session
-from fprf.viewer.state import SHELF, Look, State
+from fprf.viewer.session import SHELF, Session, State
 
 
-def test_a_photograph_restyles_what_every_client_sees(session: Session, listener: Listener, world: World) -> None:
+def unpacked(body: bytes) -> tuple[dict[str, object], dict[str, bytes]]:
+    """Head and sections of a body that browsers read."""
+    length = int.from_bytes(body[:4], "little")
+    head, parts, at = json.loads(body[4 : 4 + length]), {}, 4 + length
+    for name, size in head["sizes"].items():
+        parts[name], at = zlib.decompress(body[at : at + size]), at + size
+    return head, parts
+
+
+def test_a_photograph_restyles_what_every_client_of_a_field_sees(session: Session, listener: Listener, world: World) -> None:
     for client in (1, 2):
-        session.move_camera(client, camera_of(session.viewed.scene, client))
-    listener.until(lambda: listener.final().keys() == {1, 2})
-    plain = listener.final()
-    listener.frames.clear()
+        session.handle(client, messages.View(camera=camera_of(session.viewed.scene, client)))
+    sharp = lambda client: [each for each in listener.pictures(client) if max(each.shape) == 64]  # noqa: E731
+    listener.until(lambda: all(sharp(client) for client in (1, 2)))
+    plain = {client: sharp(client)[0] for client in (1, 2)}
     card = session.upload(world.references[0].read_bytes(), "../dusk.png")
     assert card.name == "dusk.png" and session.state.look.mix == ((card, 1.0),)
-    listener.until(lambda: listener.final().keys() == {1, 2})
-    for client, frame in listener.final().items():
-        assert abs(frame.picture.astype(int) - plain[client].picture).mean() > 2
+    listener.until(lambda: all(len(sharp(client)) > 1 for client in (1, 2)))
+    for client in (1, 2):
+        assert abs(sharp(client)[-1].astype(int) - plain[client]).mean() > 2
     again = session.upload(world.references[0].read_bytes(), "dusk.png")
     assert again.name == "dusk.png (2)" and session.state.shelf == (card, again)
+    session.handle(1, messages.View(camera=camera_of(session.viewed.scene, 1), captured=True))
+    listener.until(lambda: bool(listener.pictures(1, "captured")))
 
 
-def test_a_click_picks_a_region_and_its_references_follow_the_look(session: Session, listener: Listener, world: World) -> None:
-    session.pick(9, (0.5, 0.5))  # a client that nobody knows
-    session.move_camera(1, camera_of(session.viewed.scene, 2))
-    session.pick(1, (0.5, 0.8))
+def test_a_photograph_recolours_gaussians_and_they_can_be_saved(splats: Session, listener: Listener, world: World) -> None:
+    head, parts = unpacked(splats.geometry)
+    assert head["count"] == 400 and len(parts["shape"]) == 16 * 400 and len(parts["style-0"]) == 4 * 400 + 36
+    splats.upload(world.references[0].read_bytes(), "dusk.png")
+    listener.until(lambda: any(kind == "colours Now" for _, kind, _ in listener.sent))
+    about, colours = unpacked(splats.colours("Now"))
+    assert len(colours["rows"]) == 4 * 400 + 36 * about["maps"]  # type: ignore[operator]
+    splats.handle(1, messages.Keep(name="dusk", action="keep"))
+    listener.until(lambda: any(kind == "colours dusk" for _, kind, _ in listener.sent))
+    assert unpacked(splats.colours("dusk"))[1]["rows"][: 4 * 400] == colours["rows"][: 4 * 400]
+    for shown in ("matches", "regions", "none"):
+        count = len(listener.sent)
+        splats.handle(1, messages.Map(map=shown))  # type: ignore[arg-type]
+        listener.until(lambda count=count: any(kind == "colours Now" for _, kind, _ in listener.sent[count:]))  # type: ignore[misc]
+    with pytest.raises(UsageError, match="no such colours"):
+        splats.colours("else")
+    path = splats.uploads.folder / "out.ply"
+    path.write_bytes(splats.gaussians())
+    saved, scene = read_capture(path).gaussians, splats.viewed.scene
+    assert torch.equal(saved.means, scene.gaussians.means) and not torch.equal(saved.harmonics, scene.gaussians.harmonics)
+
+
+def test_a_click_picks_a_region_and_its_rules_change_the_look(session: Session, listener: Listener, world: World) -> None:
+    camera = camera_of(session.viewed.scene, 2)
+    session.handle(1, messages.Pick(camera=camera, x=0.5, y=0.8))
     listener.until(lambda: session.state.picked is not None)
     assert session.state.picked is not None and session.state.picked.taken == ()
-    session.upload(world.references[0].read_bytes(), "dusk.png")
-    session.select_region(0)
+    card = session.upload(world.references[0].read_bytes(), "dusk.png")
+    session.handle(1, messages.Pick(camera=camera, x=0.5, y=0.8))
     listener.until(lambda: session.state.picked is not None and session.state.picked.taken != ())
-    session.select_region(99)
-    listener.until_said("region 99")
-    session.pick(1, (7.0, 0.5))
-    listener.until_said("outside")
-    session.select_region(None)
+    assert session.state.picked is not None
+    region = session.state.picked.region
+    session.handle(1, messages.Region(action="keep"))
+    assert {*session.state.look.rules} == {(region, "keep", None)}
+    session.handle(1, messages.Region(action="pin", card=card.number))
+    assert {*session.state.look.rules} == {(region, "pin", card)}
+    session.handle(1, messages.Region(action="free"))
+    session.handle(1, messages.Region(action="close"))
+    assert not session.state.look.rules
     listener.until(lambda: session.state.picked is None)
 
 
-def test_a_film_is_made_while_others_look(session: Session, listener: Listener) -> None:
-    session.films.record(plan_of(session.viewed.scene, [Look()] * 2))
-    session.films.record(plan_of(session.viewed.scene, [Look()] * 2))
-    session.move_camera(1, camera_of(session.viewed.scene, 2))
-    listener.until(lambda: session.state.film.path is not None)
-    path = session.state.film.path
-    assert path is not None and path.stat().st_size > 500 and path.parent.parent == session.viewed.root / "films"
-    assert session.state.film.done == session.state.film.total == 4
-    assert (path.parent / "path.json").is_file() and any("film.mp4" in text for text in listener.said)
-    assert any("one is being made" in text for text in listener.said)
+def test_controls_change_the_look_within_their_ranges(session: Session, world: World) -> None:
+    card = session.upload(world.references[0].read_bytes(), "dusk.png")
+    session.handle(1, messages.Set(name="clusters", value=3.0))
+    session.handle(1, messages.Set(name="strength", value=0.25))
+    session.handle(1, messages.Card(card=card.number, action="weight", weight=0.5))
+    look = session.state.look
+    assert (look.clusters, look.strength, look.mix) == (3, 0.25, ((card, 0.5),))
+    session.handle(1, messages.Preset(name="gentle"))
+    assert session.state.look.strength != 0.25
+    for wrong in (
+        messages.Set(name="strength", value=7.0),
+        messages.Card(card=99, action="alone"),
+        messages.Region(action="keep"),
+        messages.Keep(name="", action="keep"),
+        messages.Film(),
+        messages.Key(action="remove", at=0),
+    ):
+        with pytest.raises(FprfError):
+            session.handle(1, wrong)
+
+
+def test_pictures_are_saved_as_large_as_they_are_seen(session: Session) -> None:
+    camera = camera_of(session.viewed.scene, 2)
+    session.handle(1, messages.Picture(camera=camera))
+    until(lambda: len(session.state.pictures) == 1)
+    assert session.state.pictures[0].parent == session.viewed.root / "pictures"
 
 
 def test_an_upload_ends_with_the_viewer(session: Session, world: World) -> None:
@@ -62,11 +122,11 @@ def test_an_upload_ends_with_the_viewer(session: Session, world: World) -> None:
 
 def test_an_unexpected_error_is_told_and_nothing_stops(session: Session, listener: Listener) -> None:
     listener.fails = True
-    session.move_camera(1, camera_of(session.viewed.scene, 2))
+    session.handle(1, messages.View(camera=camera_of(session.viewed.scene, 2)))
     listener.until_said("should not have happened")
     listener.fails = False
-    session.move_camera(1, camera_of(session.viewed.scene, 3))
-    listener.until(lambda: bool(listener.final()))
+    session.handle(1, messages.View(camera=camera_of(session.viewed.scene, 3)))
+    listener.until(lambda: bool(listener.pictures(1)))
     session.disconnect(1)
     session.disconnect(1)
 
@@ -75,7 +135,6 @@ def test_photographs_that_left_the_shelf_are_deleted(session: Session, world: Wo
     for _ in range(SHELF + 3):
         session.upload(world.references[0].read_bytes(), "x.png")
     assert len(list(session.uploads.folder.glob("*.png"))) == SHELF == len(session.state.shelf)
-    assert {key[0] for key in session.restyler._dictionaries} <= session.state.photographs
 
 
 def test_the_warm_up_leaves_nothing_behind(session: Session, listener: Listener) -> None:
@@ -88,4 +147,24 @@ def test_the_warm_up_leaves_nothing_behind(session: Session, listener: Listener)
 
     session._worker.run_when_idle(last())
     assert done.wait(120)
-    assert session.state == State(pixels=64) and listener.frames == [] and not session.restyler._styles
+    assert session.state == State() and listener.sent == [] and not session.restyler._styles
+
+
+def test_newer_states_of_a_training_are_shown_as_they_come(splats: Session, listener: Listener, world: World) -> None:
+    splats.upload(world.references[0].read_bytes(), "dusk.png")
+    listener.until(lambda: any(kind == "colours Now" for _, kind, _ in listener.sent))
+    before, scene = splats.geometry, splats.viewed.scene
+    moved = replace(scene, gaussians=replace(scene.gaussians, means=scene.gaussians.means + 0.1))  # type: ignore[type-var]
+    count = len(listener.sent)
+    splats.reload(replace(splats.viewed, scene=moved, step=9))
+    listener.until(lambda: any(kind == "colours Now" for _, kind, _ in listener.sent[count:]))
+    scenes = [message for _, kind, message in listener.sent[count:] if kind == "scene"]
+    assert scenes[-1]["step"] == 9 and splats.geometry != before
+    splats.trained({"step": 9, "share": 0.5})
+    assert ("training", {"type": "training", "step": 9, "share": 0.5}) in splats.hello()
+
+
+def test_a_client_is_a_camera_of_the_captured_world(session: Session) -> None:
+    camera = camera_of(session.viewed.scene, 2)
+    assert np.allclose(cameras_of([camera]).pose[0], session.viewed.scene.cameras.pose[2])
+    assert Path(session.viewed.root or "").is_dir()

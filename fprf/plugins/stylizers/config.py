@@ -99,7 +99,7 @@ class _RegionConfig(StylizerConfig):
     """Score of a match: cosine of centred features, or their dot product."""
     whitening: float = 0.5
     """Whitening of both sides' semantics before they are scored as cosines, in [0, 1]; 0 = none."""
-    recentred: int = 5
+    recentred: int = 1
     """Times that the references' centre is taken again from the codes that the scene takes; 0 = the mean of all codes."""
     centred: bool = True
     """Cosines are taken from the mean of each side; False = from the encoder's own origin, without whitening: for single
@@ -153,7 +153,7 @@ class RegionToneConfig(_RegionConfig):
     """Share by which the colours of each region are then carried to the colours of what it matches, in [0, 1]."""
     light: bool = True
     """What the references show nothing like keeps its material and takes their light; False = it is painted like the rest."""
-    temperature: float = 0.2
+    temperature: float = 0.25
     """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
     smoothness: float = 16.0
     """Likeness of the styles of regions that meet without an edge of colour between them, at least 0; 0 = each by

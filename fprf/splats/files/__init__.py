@@ -15,17 +15,17 @@ from torch import Tensor
 
 from ...errors import DataError
 from ...io.atomic import unwritable
-from ...plugins.captures import format_of
+from ...plugins.captures import format_name, format_of
 from ...rendering.cameras import Cameras
 from ...rendering.local_frame import added_and_beside, read_offset, write_offset
 from ...training.run import held
 from ...types import Origin
-from ..gaussians import Gaussians, bulk_of
+from ..gaussians import GaussianRows, Gaussians, bulk_of
 from ..views import seen_means
 from .base import Capture
 from .ply import ply_head, ply_rows
 
-__all__ = ["Capture", "Written", "read_capture", "write_capture", "write_gaussians", "write_ply_parts"]
+__all__ = ["Capture", "Written", "read_capture", "write_capture", "write_gaussians", "write_ply_parts", "write_rows"]
 
 _ROWS = 1 << 17
 """Gaussians that are in memory at a time while a large scene is written."""
@@ -126,6 +126,24 @@ def write_gaussians(
     write_offset(path, beside)
     form.write(path, data)
     return Written(faulty, far, tuple(form.notes(gaussians)))
+
+
+def write_rows(
+    path: Path,
+    rows: GaussianRows,
+    *,
+    key: str = "",
+    views: Cameras | None = None,
+    plain: bool = False,
+    origin: Origin = (0.0, 0.0, 0.0),
+    local: bool = False,
+) -> Written:
+    """`write_gaussians` of rows. A .ply is written in parts where `key` is given, which says what its Gaussians are."""
+    if key and not plain and format_name(path) == "ply":
+        write_ply_parts(path, rows.part, rows.count, key, antialiased=rows.antialiased, origin=origin, local=local)
+        return Written()
+    whole = rows.part(slice(0, rows.count))
+    return write_gaussians(path, whole, antialiased=rows.antialiased, views=views, plain=plain, origin=origin, local=local)
 
 
 def write_ply_parts(

@@ -93,7 +93,7 @@ class Ply(CaptureFormat):
         up, camera = _up(said.get("vertical axis", "")), _camera(elements)
         if up is None and camera is not None:
             up = (float(camera.pose[0, 0, 1]), float(camera.pose[0, 1, 1]), float(camera.pose[0, 2, 1]))
-        return replace(read(path, data, elements), antialiased=mode in ("mip", "1"), up=up, camera=camera)
+        return replace(read(path, data, header, elements), antialiased=mode in ("mip", "1"), up=up, camera=camera)
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> bytes:
         return ply_bytes(gaussians, antialiased, origin)
@@ -199,12 +199,6 @@ def ply_head(tables: Mapping[str, NDArray[np.void]], antialiased: bool, count: i
     return "\n".join([*lines, "end_header", ""]).encode("ascii")
 
 
-class _Element(NamedTuple):
-    table: NDArray[np.void]
-    offset: int
-    """Of its first byte in the file."""
-
-
 class _Header(NamedTuple):
     lines: list[list[str]]
     """Words of each line but the first and the last."""
@@ -217,11 +211,11 @@ class _Header(NamedTuple):
         return any(words[0] == "property" and words[-1] == _PACKED[0] for words in self.lines)
 
 
-def _read_inria(path: Path, data: bytes, elements: Mapping[str, _Element]) -> Capture:
-    vertex = elements.get("vertex")
-    if vertex is None:
+def _read_inria(path: Path, data: bytes, header: _Header, elements: Mapping[str, NDArray[np.void]]) -> Capture:
+    table = elements.get("vertex")
+    if table is None:
         raise DataError(f"{path}: no element `vertex`; not a file of 3D Gaussians")
-    table, known = vertex.table, set(vertex.table.dtype.names or ())
+    known = set(table.dtype.names or ())
     if {"scale_0", "scale_1"} <= known and "scale_2" not in known:
         raise DataError(f"{path}: 2D Gaussians (no scale_2); only 3D Gaussians are read")
     # Properties may stand in any order, among any others.
@@ -254,7 +248,7 @@ def _read_inria(path: Path, data: bytes, elements: Mapping[str, _Element]) -> Ca
 
     def recolour(harmonics: Floats, changed: Bools) -> bytes:
         out = bytearray(data)
-        target = np.frombuffer(out, table.dtype, len(table), vertex.offset)
+        target = _elements(path, out, header)["vertex"]
         for name, column in zip(colours, _flat(harmonics).T, strict=True):
             target[name][changed] = column[changed]
         return bytes(out)
@@ -262,32 +256,32 @@ def _read_inria(path: Path, data: bytes, elements: Mapping[str, _Element]) -> Ca
     return Capture(path, gaussians, False, data, recolour, shift=shift)
 
 
-def _read_compressed(path: Path, data: bytes, elements: Mapping[str, _Element]) -> Capture:
+def _read_compressed(path: Path, data: bytes, header: _Header, elements: Mapping[str, NDArray[np.void]]) -> Capture:
     chunk, vertex, sh = (elements.get(name) for name in ("chunk", "vertex", "sh"))
-    tinted = chunk is not None and _COLOUR[0][0] in (chunk.table.dtype.names or ())
+    tinted = chunk is not None and _COLOUR[0][0] in (chunk.dtype.names or ())
     bounds = [name for pair in (_POSITION, _SCALE, *([_COLOUR] if tinted else [])) for of in pair for name in of]
     for element, names, kind in ((chunk, bounds, "<f4"), (vertex, _PACKED, "<u4")):
         for name in names:
-            if element is None or name not in (element.table.dtype.names or ()) or element.table.dtype[name] != kind:
+            if element is None or name not in (element.dtype.names or ()) or element.dtype[name] != kind:
                 raise DataError(f"{path}: no property {name}; not the compressed layout of SuperSplat")
     assert chunk is not None and vertex is not None
-    count, of = len(vertex.table), np.arange(len(vertex.table)) // _CHUNK
-    rest = [] if sh is None else list(sh.table.dtype.names or ())
+    count, of = len(vertex), np.arange(len(vertex)) // _CHUNK
+    rest = [] if sh is None else list(sh.dtype.names or ())
     wrong = 1 + len(rest) // 3 not in COUNTS or len(rest) % 3 or rest != [f"f_rest_{i}" for i in range(len(rest))]
-    if sh is not None and (wrong or len(sh.table) != count or any(sh.table.dtype[name] != "u1" for name in rest)):
-        raise DataError(f"{path}: element `sh` with {len(rest)} properties and {len(sh.table)} rows; not SuperSplat's layout")
-    if len(chunk.table) != -(-count // _CHUNK):
-        raise DataError(f"{path}: {len(chunk.table)} chunks for {count} Gaussians; there is one for each {_CHUNK}")
+    if sh is not None and (wrong or len(sh) != count or any(sh.dtype[name] != "u1" for name in rest)):
+        raise DataError(f"{path}: element `sh` with {len(rest)} properties and {len(sh)} rows; not SuperSplat's layout")
+    if len(chunk) != -(-count // _CHUNK):
+        raise DataError(f"{path}: {len(chunk)} chunks for {count} Gaussians; there is one for each {_CHUNK}")
 
     def unpacked(share: Floats, pair: tuple[tuple[str, ...], tuple[str, ...]]) -> Floats:
-        low, high = (np.stack([chunk.table[name][of] for name in names], 1).astype(np.float64) for names in pair)
+        low, high = (np.stack([chunk[name][of] for name in names], 1).astype(np.float64) for names in pair)
         return np.asarray(low * (1 - share) + high * share)
 
-    words = {name: vertex.table[name] for name in _PACKED}
+    words = {name: vertex[name] for name in _PACKED}
     rgba = _unpack(words["packed_color"], (8, 8, 8, 8))
     harmonics = constants_of(unpacked(rgba[:, :3], _COLOUR) if tinted else rgba[:, :3])
     if sh is not None:
-        raw = np.stack([sh.table[name] for name in rest], 1)
+        raw = np.stack([sh[name] for name in rest], 1)
         share = np.where(raw == 0, 0.0, np.where(raw == 255, 1.0, (raw + 0.5) / 256))
         harmonics = np.concatenate([harmonics, ((share - 0.5) * _SPAN).reshape(count, 3, -1).transpose(0, 2, 1)], 1)
     turned = words["packed_rotation"]
@@ -302,23 +296,19 @@ def _read_compressed(path: Path, data: bytes, elements: Mapping[str, _Element]) 
 
     def recolour(harmonics: Floats, changed: Bools) -> bytes:
         out = bytearray(data)
-        share = colours_of(finite(harmonics))
+        target, share = _elements(path, out, header), colours_of(finite(harmonics))
         changed_here = changed
         if tinted:  # a chunk in which anything changes gets new bounds, and all of its colours are rounded again
             share, *limits = _in_chunks(share.clip(*_COLOURS))
             there = np.unique(of[changed])
             changed_here = np.isin(of, there)
-            bounds = np.frombuffer(out, chunk.table.dtype, len(chunk.table), chunk.offset)
             for names, values in zip(_COLOUR, limits, strict=True):
                 for name, column in zip(names, values.T, strict=True):
-                    bounds[name][there] = column[there]
+                    target["chunk"][name][there] = column[there]
         colour = _pack(share, (8, 8, 8)).astype(np.uint32) << 8 | (words["packed_color"] & 255)
-        target = np.frombuffer(out, vertex.table.dtype, count, vertex.offset)
-        target["packed_color"][changed_here] = colour[changed_here]
-        if sh is not None:
-            into = np.frombuffer(out, sh.table.dtype, count, sh.offset)
-            for name, column in zip(rest, _rest_bytes(harmonics).T, strict=True):
-                into[name][changed] = column[changed]
+        target["vertex"]["packed_color"][changed_here] = colour[changed_here]
+        for name, column in zip(rest, _rest_bytes(harmonics).T, strict=True):
+            target["sh"][name][changed] = column[changed]
         return bytes(out)
 
     return Capture(path, gaussians, False, data, recolour, shift=shift)
@@ -338,8 +328,8 @@ def _header(data: bytes) -> _Header | None:
     return _Header([each for each in words if each[0]], end.end())
 
 
-def _elements(path: Path, data: bytes, header: _Header) -> dict[str, _Element]:
-    """Elements by name; those with lists are passed over."""
+def _elements(path: Path, data: bytes | bytearray, header: _Header) -> dict[str, NDArray[np.void]]:
+    """Tables of elements by name, in the file's own memory; those with lists are passed over."""
     form = next((words[1:] for words in header.lines if words[0] == "format"), [])
     if form not in (["binary_little_endian", "1.0"], ["binary_big_endian", "1.0"]):
         raise DataError(f"{path}: a PLY of format {' '.join(form) or 'unknown'}; binary ones are read: export it again as such")
@@ -363,7 +353,7 @@ def _elements(path: Path, data: bytes, header: _Header) -> dict[str, _Element]:
         table = np.dtype([(each[-1], kinds[0]) for each, kinds in zip(properties, fields, strict=True)])
         if offset + count * table.itemsize > len(data):
             raise short(path, len(data), offset + count * table.itemsize, what)
-        elements[words[1]] = _Element(np.frombuffer(data, table, count, offset), offset)
+        elements[words[1]] = np.frombuffer(data, table, count, offset)
         offset += count * table.itemsize
     return elements
 
@@ -375,7 +365,7 @@ def _kinds(words: list[str]) -> list[str]:
     return words[1:2] if len(words) == 3 else []
 
 
-def _after_lists(data: bytes, offset: int, count: int, fields: Sequence[Sequence[str]]) -> int | None:
+def _after_lists(data: bytes | bytearray, offset: int, count: int, fields: Sequence[Sequence[str]]) -> int | None:
     """Where rows with lists end; None where that is beyond the end of the file."""
     if count and len(fields) == 1 and offset + np.dtype(fields[0][0]).itemsize <= len(data):
         # Mostly all have as many values as the first.
@@ -412,7 +402,7 @@ def _up(text: str) -> tuple[float, float, float] | None:
     return (x, y, z) if 0 < x * x + y * y + z * z < np.inf else None
 
 
-def _camera(elements: Mapping[str, _Element]) -> Cameras | None:
+def _camera(elements: Mapping[str, NDArray[np.void]]) -> Cameras | None:
     """The camera of `extrinsic` (world to camera, OpenCV axes), `intrinsic` and `image_size`; None where there is no sound one.
 
     Older files have 12 numbers of `extrinsic`, its rotation transposed, and fx, fy, width and height as `intrinsic`.
@@ -420,8 +410,8 @@ def _camera(elements: Mapping[str, _Element]) -> Cameras | None:
     numbers = {}
     for name in ("extrinsic", "intrinsic", "image_size"):
         if name in elements:
-            table = elements[name].table
-            numbers[name] = np.stack([table[each].astype(np.float64) for each in table.dtype.names or ()], 1).ravel()
+            columns = [elements[name][each].astype(np.float64) for each in elements[name].dtype.names or ()]
+            numbers[name] = np.stack(columns, 1).ravel()
     matrix, lens = numbers.get("extrinsic", np.eye(4).ravel()), numbers.get("intrinsic", np.zeros(0))
     size = numbers.get("image_size", lens[2:4] if len(lens) == 4 else np.zeros(0))
     if len(matrix) not in (12, 16) or len(lens) not in (4, 9) or len(size) != 2:

@@ -1,0 +1,281 @@
+// The page of `fprf view`: the same stage with the scene of a server, which hears small messages and answers with colours.
+"use strict";
+
+const post = async (path, body) => {
+  const answer = await fetch(path, { method: "POST", body });
+  if (!answer.ok) throw new Error((await answer.text()).trim() || answer.statusText);
+  return answer.json();
+};
+// What is wrong stays until it is clicked away.
+const say = (text, bad = false) => {
+  const line = make("button", { type: "button", textContent: text, className: bad ? "bad" : "", title: "close", onclick: () => line.remove() });
+  at("said").append(line);
+  while (at("said").children.length > 4) at("said").firstChild.remove();
+  if (!bad) setTimeout(() => line.remove(), 6000);
+  return line;
+};
+// JSON and sections of one body (pack.py).
+const unpacked = async (answer) => {
+  if (!answer.ok) throw new Error((await answer.text()).trim());
+  const data = new Uint8Array(await answer.arrayBuffer()), length = new DataView(data.buffer).getUint32(0, true);
+  const head = JSON.parse(new TextDecoder().decode(data.subarray(4, 4 + length))), parts = {};
+  let from = 4 + length;
+  for (const [name, size] of Object.entries(head.sizes)) { parts[name] = data.subarray(from, from + size); from += size; }
+  return { head, parts };
+};
+
+class Live {
+  constructor() {
+    Object.assign(this, { place: null, stage: null, scene: null, state: null, asked: false, last: {}, cards: new Map() });
+    this.start = new Start(this);
+    this.controls();
+    this.connect();
+  }
+
+  connect() {
+    const socket = this.socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/live`);
+    socket.binaryType = "arraybuffer";
+    socket.onmessage = ({ data }) => { this.queue = (this.queue ?? Promise.resolve()).then(() => this.hear(data)).catch((error) => say(error.message, true)); };
+    socket.onclose = () => setTimeout(() => this.connect(), 1500);
+  }
+
+  tell(type, more = {}) {
+    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify({ type, ...more }));
+  }
+
+  async hear(data) {
+    if (typeof data !== "string") { await this.paint(new Uint8Array(data)); return; }
+    const message = JSON.parse(data);
+    if (message.type === "said") say(message.text, message.bad);
+    else if (message.type === "start" && this.scene) location.reload();
+    else if (message.type === "start") { this.mode("start"); this.start.fill(message); }
+    else if (message.type === "loading") this.mode("loading");
+    else if (message.type === "scene") await this.open(message);
+    else if (message.type === "state") this.fill(message);
+    else if (message.type === "training") this.trained(message);
+    else if (message.type === "colours") await this.recolour(message);
+  }
+
+  mode(name) {
+    for (const each of ["start", "scene", "loading"]) at(each).hidden = each !== name;
+  }
+
+  async open(scene) {
+    const before = this.scene;
+    if (before && (before.name !== scene.name || before.gaussians !== scene.gaussians)) { location.reload(); return; }
+    if (before && before.step === scene.step) return; // it was only away for a moment
+    const { head, parts } = await unpacked(await fetch("/scene"));
+    this.mode("scene");
+    this.scene = scene;
+    document.title = `${scene.name} - fprf`;
+    at("title").textContent = scene.name;
+    at("scenes").hidden = !scene.back;
+    at("place").classList.toggle("field", !scene.gaussians);
+    at("save-ply").hidden = !scene.gaussians;
+    head.alone = true;
+    if (before) { // a newer state of its training
+      if (scene.gaussians) { await this.place.splats.replace(head, parts); await this.place.splats.add("Captured", head.styles[0], parts["style-0"]); }
+      this.place.scene = head;
+      this.place.touch();
+      return;
+    }
+    let splats = null;
+    if (scene.gaussians) {
+      splats = await Splats.make(at("canvas"), head, parts);
+      await splats.add("Captured", head.styles[0], parts["style-0"]);
+    }
+    this.place = new Place(at("canvas"), head, splats, splats ? null : () => this.paintField());
+    this.place.listeners.pick = (x, y) => this.pick(x, y);
+    this.place.listeners.drawn = () => at("place").classList.add("drawn");
+    this.stage = new Stage(this.place, [{ name: "Captured" }]);
+    this.stage.listeners.chosen = (name) => this.chosen(name);
+    window.fprf = { place: this.place, stage: this.stage, live: this };
+  }
+
+  trained({ step, share, psnr, seconds_left: left }) {
+    const clock = `${Math.floor(left / 60)}:${String(left % 60).padStart(2, "0")} left`;
+    at("training").hidden = false;
+    at("training").children[0].value = share;
+    at("training").children[1].textContent = share < 1 ? `training, step ${step} · ${psnr.toFixed(1)} dB · ${clock}` : `trained, ${step} steps`;
+  }
+
+  async recolour({ name, version }) {
+    const { head, parts } = await unpacked(await fetch(`/colours?name=${encodeURIComponent(name)}&version=${version}`));
+    await this.place.splats.add(name, head, parts.rows);
+    this.place.touch(false);
+    const fresh = !this.stage.styles.some((style) => style.name === name);
+    this.stage.add({ name });
+    if (fresh && name === "Now") this.stage.choose(name);
+    at("place").classList.toggle("busy", false);
+  }
+
+  // Where the server draws: the newest pictures, and the line between them.
+  async paint(data) {
+    const kind = data[0] ? "captured" : "look", bitmap = await createImageBitmap(new Blob([data.subarray(1)], { type: "image/jpeg" }));
+    this.last[kind]?.close();
+    this.last[kind] = bitmap;
+    this.drawField();
+  }
+
+  drawField() {
+    const { canvas, wipe } = this.place, context = canvas.getContext("2d"), { look, captured } = this.last;
+    if (!look) return;
+    context.drawImage(look, 0, 0, canvas.width, canvas.height);
+    if (wipe >= 0 && captured) context.drawImage(captured, 0, 0, wipe * captured.width, captured.height, 0, 0, wipe * canvas.width, canvas.height);
+    at("place").classList.add("drawn");
+  }
+
+  paintField() {
+    const place = this.place, now = performance.now(), captured = place?.wipe >= 0;
+    if (!place?.changed && this.captured === captured) return;
+    if ((place.moved || this.captured !== captured) && now - (this.sent ?? 0) > 40) {
+      Object.assign(this, { sent: now, captured });
+      place.moved = false;
+      this.tell("view", { camera: this.camera(), captured });
+    }
+    place.changed = place.moved;
+    this.drawField();
+  }
+
+  camera() {
+    const { camera, canvas, lens } = this.place;
+    return { place: camera.place, axes: camera.axes, lens, size: [canvas.width, canvas.height] };
+  }
+
+  pick(x, y) {
+    const box = at("canvas").getBoundingClientRect();
+    if (this.state?.shelf.length) this.tell("pick", { camera: this.camera(), x: (x - box.left) / box.width, y: (y - box.top) / box.height });
+  }
+
+  chosen(name) {
+    if (this.state?.kept.includes(name)) this.tell("keep", { name, action: "restore" });
+  }
+
+  // The state of the server
+  fill(state) {
+    this.state = state;
+    const now = new Set(state.shelf.map((row) => row.card));
+    for (const [card, node] of this.cards) if (!now.has(card)) { node.remove(); this.cards.delete(card); }
+    for (const row of state.shelf) {
+      if (!this.cards.has(row.card)) { this.cards.set(row.card, this.card(row)); at("shelf").insertBefore(this.cards.get(row.card), at("add-photograph")); }
+      const node = this.cards.get(row.card);
+      node.classList.toggle("on", row.weight > 0);
+      node.style.setProperty("--chip", row.colour ?? "transparent");
+      if (node.weight !== document.activeElement) node.weight.value = row.weight;
+      node.weight.hidden = state.shelf.length < 2;
+    }
+    for (const slider of document.querySelectorAll("[data-look]")) if (slider !== document.activeElement) slider.value = state.look[slider.dataset.look];
+    at("map").value = state.map;
+    at("hint").hidden = !state.shelf.length || Boolean(state.picked);
+    this.fillRegion(state.picked, state.shelf);
+    if (this.scene && !this.scene.gaussians && this.stage) state.kept.forEach((name) => this.stage.add({ name }));
+    at("keys").replaceChildren(...state.keys.map((key, k) => make("span", { className: "key" },
+      make("button", { type: "button", textContent: k + 1, title: "go there", onclick: () => this.place.go(this.keyed(key)) }),
+      make("button", { type: "button", textContent: "‹", title: "earlier", onclick: () => this.tell("key", { action: "earlier", at: k }) }),
+      make("button", { type: "button", textContent: "×", title: "remove", onclick: () => this.tell("key", { action: "remove", at: k }) }))));
+    const busy = state.film.total > 0 && !state.film.ready;
+    at("make-film").textContent = busy ? `${state.film.done} / ${state.film.total}` : "Make film";
+    at("make-film").disabled = busy || !state.keys.length;
+    at("play").disabled = state.keys.length < 2;
+    if (this.before && state.film.ready && !this.before.film.ready) this.offer("/film", "download the film");
+    if (this.before && state.pictures > this.before.pictures) this.offer(`/picture?number=${state.pictures - 1}`, "download the picture", true);
+    this.before = state;
+  }
+
+  offer(href, text, at_once = false) {
+    const link = make("a", { href, textContent: text, download: "" });
+    if (at_once) { document.body.append(link); link.click(); link.remove(); return; }
+    const line = say("", true);
+    line.classList.remove("bad");
+    line.append(link);
+  }
+
+  card(row) {
+    const picture = make("img", { src: `/card?card=${row.card}`, alt: row.name, draggable: false });
+    const alone = make("button", { type: "button", className: "photo", title: `${row.name}: this one alone; with Shift in or out of the mix`, onclick: (event) => (event.shiftKey
+      ? this.tell("card", { card: row.card, action: "weight", weight: node.classList.contains("on") ? 0 : 1 }) : this.tell("card", { card: row.card, action: "alone" })) }, picture);
+    const weight = make("input", { type: "range", min: 0, max: 2, step: 0.05, title: "weight in the mix" });
+    weight.setAttribute("aria-label", `weight of ${row.name}`);
+    weight.oninput = () => this.steady(`card ${row.card}`, () => this.tell("card", { card: row.card, action: "weight", weight: +weight.value }));
+    const node = make("div", { className: "card" }, alone, make("span", { textContent: row.name }), weight,
+      make("button", { type: "button", className: "close", textContent: "×", title: "remove", onclick: () => this.tell("card", { card: row.card, action: "remove" }) }));
+    return Object.assign(node, { weight });
+  }
+
+  // At most one message of a kind in 60 ms, the last one for certain.
+  steady(kind, send) {
+    const timers = this.timers ??= {};
+    if (timers[kind]) { timers[kind].next = send; return; }
+    send();
+    timers[kind] = { next: null };
+    setTimeout(() => { const { next } = timers[kind]; delete timers[kind]; if (next) this.steady(kind, next); }, 60);
+  }
+
+  fillRegion(picked, rows) {
+    at("region").hidden = !picked;
+    if (!picked) return;
+    const is = (action, card) => picked.rules.some((rule) => rule.action === action && rule.card === card);
+    const button = (text, action, card, set) => make("button", { type: "button", className: "pill", textContent: text, ariaPressed: String(set),
+      onclick: () => this.tell("region", { action: set ? "free" : action, card }) });
+    const share = new Map(picked.taken.map((row) => [row.name, row.share]));
+    at("region").replaceChildren(
+      make("p", {}, make("b", { textContent: "This thing" }), ` ${(100 * picked.share).toFixed(1)} % of the scene`,
+        make("button", { type: "button", className: "close", textContent: "×", title: "close", onclick: () => this.tell("region", { action: "close" }) })),
+      ...rows.map((row) => make("div", { className: "row" }, make("span", { textContent: `${row.name} ${share.has(row.name) ? `${Math.round(100 * share.get(row.name))} %` : ""}` }),
+        button("only", "pin", row.card, is("pin", row.card)), button("never", "forbid", row.card, is("forbid", row.card)))),
+      make("div", { className: "row" }, button("keep as it is", "keep", null, is("keep", null)), button("free", "free", null, false)));
+  }
+
+  keyed(key) {
+    const view = Object.create(Camera.prototype);
+    return Object.assign(view, { axes: key.axes, place: key.place, lens: key.lens, size: key.size, distance: this.place.camera.distance });
+  }
+
+  async send(files) {
+    for (const file of [...files].slice(0, 12)) {
+      const line = say(`${file.name} …`, true);
+      line.className = "";
+      try {
+        await post(`/photograph?name=${encodeURIComponent(file.name)}`, file);
+      } catch (error) {
+        say(`${file.name}: ${error.message}`, true);
+      }
+      line.remove();
+    }
+  }
+
+  controls() {
+    const carries = (event) => [...(event.dataTransfer?.types ?? [])].includes("Files");
+    let depth = 0;
+    const on = (name, act) => addEventListener(name, (event) => { if (this.scene && carries(event)) { event.preventDefault(); act(event); at("veil").hidden = depth <= 0; } });
+    on("dragenter", () => { depth += 1; });
+    on("dragover", (event) => { event.dataTransfer.dropEffect = "copy"; });
+    on("dragleave", () => { depth -= 1; });
+    on("drop", (event) => { depth = 0; this.send(event.dataTransfer.files); });
+    addEventListener("paste", (event) => {
+      const files = [...(event.clipboardData?.files ?? [])].filter((file) => file.type.startsWith("image/"));
+      if (this.scene && files.length) this.send(files);
+    });
+    at("add-photograph").onclick = () => at("photographs").click();
+    at("photographs").onchange = () => this.send(at("photographs").files).then(() => { at("photographs").value = ""; });
+    for (const slider of document.querySelectorAll("[data-look]")) {
+      slider.oninput = () => this.steady(slider.dataset.look, () => this.tell("set", { name: slider.dataset.look, value: +slider.value }));
+    }
+    at("map").onchange = () => this.tell("map", { map: at("map").value });
+    at("gentle").onclick = () => this.tell("preset", { name: "gentle" });
+    at("keep").onsubmit = (event) => { event.preventDefault(); this.tell("keep", { name: at("keep-name").value, action: "keep" }); };
+    at("add-key").onclick = () => this.tell("key", { action: "add", camera: this.camera() });
+    at("play").onclick = async () => {
+      for (const key of this.state.keys) {
+        this.place.go(this.keyed(key), +at("seconds").value);
+        while (this.place.flight) await new Promise((done) => setTimeout(done, 30));
+      }
+    };
+    at("make-film").onclick = () => this.tell("film", { seconds: +at("seconds").value });
+    at("save-ply").onclick = () => this.offer("/gaussians", "", true);
+    at("save-picture").onclick = () => this.tell("picture", { camera: this.camera() });
+    at("scenes").onclick = () => post("/start/leave", "{}").catch((error) => say(error.message, true));
+  }
+}
+
+const live = () => new Live();

@@ -1,0 +1,86 @@
+"""What the documents name exists: files, modules, anchors and flags; their tables are those of the results."""
+
+import importlib.util
+import re
+from dataclasses import fields as dataclass_fields
+from dataclasses import is_dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+
+from benchmarks.tables import DOCS, filled
+from fprf.cli import main as cli
+from fprf.cli.main import VERBS
+
+ROOT = DOCS.parent
+PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+FILE = re.compile(r"`((?:fprf|tests|benchmarks|tools|examples)/[\w./+-]+)`")
+BELOW = re.compile(
+    r"`((?:blocks|cli|datamanagers|evaluation|export|fields|io|ops|page|plugins|rendering|splats|style|training|viewer)/[\w/]+\.py)`"
+)
+MODULE = re.compile(r"`(fprf(?:\.\w+)+)`")
+LINK = re.compile(r"\]\((?!https?:)([^)#\s]*)(#[\w-]*)?\)")
+FLAG = re.compile(r"`(--[a-z][\w.-]*)")
+OTHERS = {"--no-compile", "--check", "--strict", "--scene", "--view", "--changed-images", "--clean", "--help", "--gentle"}
+"""Of pip, mkdocs and `benchmarks/gpu.sh`, and words that verbs take before their flags are parsed."""
+
+
+def anchor(title: str) -> str:
+    return "#" + re.sub(r"[^\w -]", "", title.lower()).strip().replace(" ", "-")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_paths_modules_and_anchors_exist(page: Path) -> None:
+    text = page.read_text("utf-8")
+    missing = [name for name in FILE.findall(text) if not (ROOT / name).exists()]
+    missing += [name for name in BELOW.findall(text) if not (ROOT / "fprf" / name).exists()]
+    for name in MODULE.findall(text):
+        parts = name.split(".")
+        found = [n for n in range(1, len(parts) + 1) if _is_module(".".join(parts[:n]))]
+        if max(found) < len(parts) - 2:
+            missing.append(name)
+    for target, fragment in LINK.findall(text):
+        path = page if not target else (page.parent / target).resolve()
+        if not path.exists():
+            missing.append(target)
+        elif fragment and path.suffix == ".md":
+            titles = re.findall(r"^#+ (.*)$", path.read_text("utf-8"), re.MULTILINE)
+            if fragment not in map(anchor, titles):
+                missing.append(target + fragment)
+    assert not missing
+
+
+def _is_module(name: str) -> bool:
+    try:
+        return importlib.util.find_spec(name) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def test_flags_exist(capsys: pytest.CaptureFixture[str]) -> None:
+    for verb in VERBS:
+        for method in ("fprf", "fprf-lite", "fprf-splats") if verb == "train" else ("",):
+            cli.main([word for word in (verb, method, "--describe") if word])
+    known = OTHERS | set(re.findall(r'"(--[\w.-]+)"', capsys.readouterr().out))
+    # Of `--slot.field` the field may be that of any plug-in.
+    fields = {
+        field.name.replace("_", "-")
+        for group in entry_points().groups
+        if group.startswith("fprf.")
+        for point in entry_points(group=group)
+        if is_dataclass(made := point.load())
+        for field in dataclass_fields(made)
+    }
+    absent = [
+        f"{page.name}: {flag}"
+        for page in PAGES
+        for flag in FLAG.findall(page.read_text("utf-8"))
+        if flag not in known and not ("." in flag and flag.rpartition(".")[2] in fields)
+    ]
+    assert not absent
+
+
+@pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=lambda page: page.stem)
+def test_tables_are_those_of_the_results(page: Path) -> None:
+    assert filled(page.read_text("utf-8")) == page.read_text("utf-8"), "python -m benchmarks tables"

@@ -1,0 +1,144 @@
+import itertools
+from collections.abc import Hashable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from pretend_cuda import CUDA, pretend_cuda
+from session_helpers import camera_of
+from tiny_world import World
+
+from fprf.io.images import Picture, to_uint8
+from fprf.io.maps import depth_image, match_image
+from fprf.ops import backend
+from fprf.style.match_maps import match_map
+from fprf.training.loading import load_run
+from fprf.training.views import render_view
+from fprf.viewer import drawing
+from fprf.viewer.drawing import FieldPainter, Request, Shown, Speed, resolutions
+from fprf.viewer.look import Look, Photograph, set_rule
+from fprf.viewer.restyler import Restyler
+
+Pair = tuple[Photograph, Photograph]
+
+
+class Watched(FieldPainter):
+    """A painter, as slow at first, whose pictures are kept, and whose marches are counted."""
+
+    def __init__(self, restyler: Restyler) -> None:
+        super().__init__(restyler.scene, restyler, lambda client, *picture: self.pictures.append(picture))
+        self._speed = Speed(1.0)
+        self.pictures: list[tuple[str, Picture, bool]] = []
+        self.marched = 0
+
+    def _parts(self, *args: Any) -> Any:
+        self.marched += 1
+        return super()._parts(*args)
+
+    def look(self, shown: Shown | None = None, view: int = 2, client: Hashable = 1, captured: bool = False) -> list[Any]:
+        self.pictures.clear()
+        camera = camera_of(self._trained, view)
+        for _ in self.render(client, Request(camera, shown or Shown(Look()), int(max(camera.size)), captured)):
+            pass
+        return list(self.pictures)
+
+
+@pytest.fixture
+def watched(restyler: Restyler) -> Watched:
+    return Watched(restyler)
+
+
+def rendered(restyler: Restyler, look: Look) -> Picture:
+    trained, restyle = restyler.scene, restyler.restyle(look)
+    view = render_view(trained.model, trained.known.facts, trained.known.cameras, 2, trained.config.render, restyle)
+    return to_uint8(view.rgb)
+
+
+def test_pictures_grow_sharper_and_the_last_is_what_is_rendered(watched: Watched, restyler: Restyler) -> None:
+    pictures = watched.look()
+    assert [picture.shape for _, picture, _ in pictures] == [(12, 16, 3), (24, 32, 3)]
+    assert [final for _, _, final in pictures] == [False, True]
+    assert np.abs(pictures[-1][1].astype(int) - rendered(restyler, Look())).max() <= 1
+
+
+def test_another_look_marches_nothing(watched: Watched, restyler: Restyler, encoded: Pair) -> None:
+    watched.look()
+    before, look = watched.marched, Look(mix=((encoded[0], 1.0),), clusters=2)
+    found = watched.look(Shown(look), captured=True)
+    assert [(kind, final) for kind, _, final in found] == [("look", True), ("captured", True)] and watched.marched == before
+    for (_, picture, _), each in zip(found, (look, Look()), strict=True):
+        assert np.abs(picture.astype(int) - rendered(restyler, each)).max() <= 1
+    watched.look(view=3)
+    assert watched.marched > before
+    watched.forget(1)
+    assert not watched._views
+
+
+def test_memory_is_bounded(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drawing, "CACHE_BYTES", 1 << 10)
+    watched.look()
+    assert not any(kept.parts for kept in watched._views.values())
+
+
+def test_maps_are_what_the_command_line_renders(watched: Watched, restyler: Restyler, encoded: Pair) -> None:
+    a, b = encoded
+    look = set_rule(Look(mix=((a, 1.0), (b, 1.0)), clusters=3), 0, "keep")
+    trained, styled = restyler.scene, restyler.styled(look)
+    found = match_map(trained, styled, 2)
+    wanted = match_image(found.attention, styled.codes.reference, styled.codes.names, found.opacity, found.kept)
+    assert np.abs(watched.look(Shown(look, "matches"))[-1][1].astype(int) - wanted).mean() < 0.5
+    assert (watched.look(Shown(Look(), "matches"))[-1][1] == 128).all(), "grey without a style"
+    view = render_view(trained.model, trained.known.facts, trained.known.cameras, 2, trained.config.render)
+    depth = watched.look(Shown(look, "depth"))[-1][1]
+    assert np.abs(depth.astype(int) - depth_image(view.depth, view.opacity)).mean() < 1
+
+
+def test_a_picked_region_stands_out(watched: Watched, restyler: Restyler) -> None:
+    whole = watched.look()[-1][1].astype(int)
+    shown = [watched.look(Shown(Look(), region=region))[-1][1].astype(int) for region in range(restyler.regions)]
+    # Each is grey but for its region's share, and the shares of all regions are the whole.
+    grey = 0.45 * whole.mean(-1, keepdims=True)
+    assert np.abs(sum(each - grey for each in shown) - (whole - grey)).max() <= len(shown)
+    assert len(shown) > 1 and all(np.abs(each - whole).max() > 20 for each in shown)
+
+
+def everything(world: World, device: str) -> dict[str, Any]:
+    """Every picture of a view, and what there is to say of a region in it."""
+    restyler = Restyler(load_run(world.run, device))
+    a, b = (restyler.encode(path, path.name) for path in world.references)
+    look = set_rule(Look(mix=((a, 1.0), (b, 0.5)), clusters=3), 0, "keep")
+    cameras = restyler.scene.known.cameras
+    found: dict[str, Any] = {"picked": restyler.region_info(look, 1), "region": restyler.region_at(cameras, (16.5, 12.5))}
+    for name in ("none", "matches", "regions", "depth"):
+        for kind, picture, _ in Watched(restyler).look(Shown(look, name, 1), captured=True):  # type: ignore[arg-type]
+            found[f"{name} {kind}"] = picture
+    return found
+
+
+def test_every_picture_is_the_same_on_another_device(world: World) -> None:
+    with backend.plain():
+        expected = everything(world, "cpu")
+    with pretend_cuda() as seen:
+        found = everything(world, str(CUDA))
+    assert seen.uploads and found.keys() == expected.keys() and found.pop("picked") == expected.pop("picked")
+    assert [name for name in expected if not np.array_equal(found[name], expected[name])] == []
+    assert torch.is_inference_mode_enabled() is False
+
+
+@given(st.integers(1, 4096), st.integers(1, 4096))
+def test_resolutions_double_up_to_the_very_size(width: int, height: int) -> None:
+    found = resolutions((width, height))
+    assert found[-1] == (width, height)
+    assert found == sorted(found) and all(min(size) >= 1 for size in found)
+    for small, large in itertools.pairwise(found):
+        assert abs(small[0] - large[0] / 2) <= 1 and abs(small[1] - large[1] / 2) <= 1
+    assert max(found[0]) < 33 or len(found) == 1
+
+
+def test_a_slow_machine_begins_coarse_and_a_fast_one_sharp() -> None:
+    sizes = resolutions((640, 480))
+    for seconds, first in ((1e-9, sizes[-1]), (1.0, sizes[0]), (1e-5, (80, 60))):  # 0.1 s are 10 000 pixels
+        assert sizes[Speed(seconds).first(sizes)] == first

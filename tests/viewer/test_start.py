@@ -1,0 +1,139 @@
+"""The start without a browser: the programs that find poses and train are stood in for by a script."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from session_helpers import until
+
+from fprf.errors import DataError, FprfError, UsageError
+from fprf.viewer import start as start_module
+from fprf.viewer.start import Start
+
+PROGRAM = f"""#!{sys.executable}
+import json, pathlib, signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in the background
+verb, args = sys.argv[3], sys.argv[4:]
+output = pathlib.Path(args[args.index("--output") + 1])
+print("hello from", verb, flush=True)
+if verb == "process":
+    print(json.dumps({{"event": "matching", "done": 3, "total": 4}}), file=sys.stderr, flush=True)
+    if (pathlib.Path(args[0]) / "bad.jpg").exists():
+        print("error: 3 photographs show nothing in common", file=sys.stderr)
+        sys.exit(2)
+    output.mkdir(parents=True)
+    (output / "transforms.json").touch()
+    sys.exit(0)
+assert pathlib.Path(args[args.index("--data") + 1], "transforms.json").is_file()
+checkpoint = output / "checkpoints" / "step-0000007"
+checkpoint.mkdir(parents=True)
+(output / "config.json").touch()
+(checkpoint / "manifest.json").touch()
+line = {{"event": "training", "step": 7, "share": 0.5, "psnr": 20.0, "seconds_left": 61}}
+print(json.dumps(line), file=sys.stderr, flush=True)
+if args[args.index("--minutes") + 1] != "1":
+    time.sleep(100)
+"""
+
+
+class Shown(Start):
+    """A start that notes what it would open the viewer on, and what it posts."""
+
+    def __init__(self, output: Path) -> None:
+        self.shown: list[tuple[Path, str]] = []
+        self.posted: list[Any] = []
+        super().__init__(output, self.view, self.shown.clear, lambda client, kind, message: self.posted.append(message))
+
+    def view(self, path: Path, name: str) -> None:
+        if path.suffix == ".ply":
+            raise DataError("of two dimensions")
+        self.shown.append((path, name))
+
+    def reached(self, **wanted: object) -> Any:
+        """The state, as soon as it is so."""
+        until(lambda: wanted.items() <= self.state().items())
+        return self.state()
+
+
+@pytest.fixture
+def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Shown]:
+    program = tmp_path / "python"
+    program.write_text(PROGRAM)
+    program.chmod(0o755)
+    monkeypatch.setattr(start_module.sys, "executable", str(program))
+    monkeypatch.chdir(tmp_path)
+    page = Shown(tmp_path / "made")
+    yield page
+    page.close()
+
+
+@pytest.fixture
+def photographs(tmp_path: Path) -> Path:
+    folder = tmp_path / "yard"
+    folder.mkdir()
+    for i in range(3):
+        (folder / f"{i}.jpg").touch()
+    return folder
+
+
+def test_photographs_are_posed_trained_and_shown(page: Shown, photographs: Path, tmp_path: Path) -> None:
+    page.open({"path": f' "{photographs}" ', "minutes": 1})
+    state = page.reached(stage="open")
+    assert page.shown == [(tmp_path / "made" / "yard" / "run", "yard")] and state["error"] is None
+    assert [each["stage"] for each in page.posted if each["stage"] != "training"][-2:] == ["opening", "open"]
+    assert list(state["lines"]) == ["hello from process", "hello from train"]
+    page.leave({})
+    recent = page.reached(stage="idle")["recent"]
+    assert page.shown == [] and [(row["name"], row["kind"]) for row in recent] == [("yard", "trained")]
+    page.open({"path": recent[0]["path"]})
+    page.reached(stage="open")
+    assert page.shown == [(tmp_path / "made" / "yard" / "run", "yard")]
+
+
+@pytest.mark.parametrize("then", ["show", "leave"])
+def test_training_is_stopped_to_show_what_there_is_or_to_leave_it(page: Shown, photographs: Path, then: str) -> None:
+    page.open({"path": str(photographs), "minutes": 2})
+    state = page.reached(stage="training", share=0.5)
+    assert state["picture"] == 7 and state["detail"] == "step 7 · 20.0 dB · 1:01 left"
+    with pytest.raises(UsageError, match="yard is being made"):
+        page.open({"path": str(photographs)})
+    page.stop({"then": then})
+    page.reached(stage="open" if then == "show" else "idle")
+    assert len(page.shown) == (then == "show")
+
+
+def test_a_failure_is_told_and_nothing_is_lost(page: Shown, photographs: Path, tmp_path: Path) -> None:
+    (photographs / "bad.jpg").touch()
+    page.open({"path": str(photographs)})
+    page.reached(stage="poses", error="3 photographs show nothing in common")
+    page.stop({})
+    page.reached(stage="idle", error=None)
+    scene = page.new({"name": "../../x/My capture.ply"})["scene"]
+    assert scene == "My-capture-ply"
+    page.piece({"scene": scene, "name": "x.ply", "at": "0", "size": "4"}, b"ply\n")
+    page.make({"scene": scene})
+    page.reached(error="of two dimensions")
+    assert (tmp_path / "made" / scene / "files" / "x.ply").read_bytes() == b"ply\n"
+    assert page.new({"name": "My capture.ply"})["scene"] == "My-capture-ply-2"
+
+
+def test_requests_that_make_no_sense_are_refused(page: Shown, photographs: Path) -> None:
+    empty = page.new({"name": ""})["scene"]
+    place = str(photographs)
+    refused: list[tuple[str, dict[str, object]]] = [
+        ("make", {"scene": empty}),
+        ("make", {"scene": "../yard"}),
+        ("open", {}),
+        ("open", {"path": "/no/such"}),
+        ("open", {"path": place, "minutes": "2"}),
+        ("open", {"path": place, "minutes": float("nan")}),
+    ]
+    for path, asked in refused:
+        with pytest.raises(FprfError):
+            getattr(page, path)(asked)
+    with pytest.raises(UsageError):
+        page.piece({"scene": empty, "name": "a.ply", "at": "-1", "size": "4"}, b"x")
+    assert page.picture() == b""
+    assert page.reached(stage="idle")["folder"] == ""
