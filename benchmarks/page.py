@@ -48,6 +48,7 @@ PARTS = ("pictures", "frames", "million", "drop")
 DRAW = """async ([view, lens, width, height, options]) => {
   const { splats, scene, canvas } = fprf.place;
   fprf.place.lost = true;
+  while (fprf.place.sorting) await new Promise((done) => setTimeout(done, 5));
   await splats.sort(new Float32Array(view), scene.near);
   [canvas.width, canvas.height] = [width, height];
   const start = performance.now();

@@ -1,6 +1,4 @@
 // The page of `fprf view`: the same stage with the scene of a server, which hears small messages and answers with colours.
-"use strict";
-
 const post = async (path, body) => {
   const answer = await fetch(path, { method: "POST", body });
   if (!answer.ok) throw new Error((await answer.text()).trim() || answer.statusText);
@@ -106,7 +104,6 @@ class Live {
     const fresh = !this.stage.styles.some((style) => style.name === name);
     this.stage.add({ name });
     if (fresh && name === "Now") this.stage.choose(name);
-    at("place").classList.toggle("busy", false);
   }
 
   // Where the server draws: the newest pictures, and the line between them.

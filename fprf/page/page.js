@@ -1,6 +1,4 @@
 // The stage of a page: a scene in 3D with its styles, or pictures of it where there is no WebGL 2 or no Gaussians.
-"use strict";
-
 const make = (tag, props = {}, ...inside) => {
   const node = Object.assign(document.createElement(tag), props);
   node.append(...inside);

@@ -1,7 +1,5 @@
 // A canvas that one walks through: camera, controls, and which styles are shown. Frames are drawn when something has changed,
 // coarsely while it moves, as fast as the machine is, and exactly at rest.
-"use strict";
-
 const FRAME = 90; // milliseconds that a frame of a moving camera may take
 const REST = 220; // milliseconds without a move, after which the exact picture is drawn
 const SHARES = [1, 0.75, 0.5, 0.35, 0.25];
@@ -37,7 +35,6 @@ class Camera {
   }
 
   copy() { return Object.assign(Object.create(Camera.prototype), this, { axes: this.axes.map((a) => [...a]), place: [...this.place] }); }
-
   turn(axis, angle) { this.axes = this.axes.map((a) => turned(a, axis, angle)); }
 
   // About the point in front, or about itself where `distance` is 0; never over the top.
@@ -272,5 +269,4 @@ class Place {
 const KEYS = {
   KeyW: ["move", 0, 0, 1], KeyS: ["move", 0, 0, -1], KeyA: ["move", -1, 0, 0], KeyD: ["move", 1, 0, 0], KeyQ: ["move", 0, 1, 0], KeyE: ["move", 0, -1, 0],
   ArrowLeft: ["turn", 0.9, 0], ArrowRight: ["turn", -0.9, 0], ArrowUp: ["turn", 0, 0.6], ArrowDown: ["turn", 0, -0.6],
-  PageUp: ["move", 0, 0, 1], PageDown: ["move", 0, 0, -1],
 };

@@ -413,11 +413,6 @@ class Splats {
     gl.readPixels(...pixel, 1, 1, gl.RGBA, gl.FLOAT, found);
     return found[3] > 0.3 ? found[0] / found[3] : null;
   }
-
-  free() {
-    this.worker.terminate();
-    this.gl.getExtension("WEBGL_lose_context")?.loseContext();
-  }
 }
 
 const decodedMeans = (shape, chunks, count) => {

@@ -1,6 +1,4 @@
 // Before a scene is open: files are sent in pieces, then the progress of the scene is shown until it takes this place.
-"use strict";
-
 const PIECE = 8 << 20;
 const ORDER = ["files", "poses", "training", "opening", "open"];
 
@@ -50,13 +48,9 @@ class Start {
   }
 
   get minutes() { return Number(at("minutes").value) || 2; }
-
   fault(text) { at("fault").textContent = text; at("fault").hidden = !text; if (text) scrollTo(0, 0); }
-
   attempt(act) { return act().catch((error) => this.fault(error.message)); }
-
   ask(name, value) { return post(`/start/${name}`, JSON.stringify(value)); }
-
   open(path) { return this.attempt(async () => { this.fault(""); await this.ask("open", { path, minutes: this.minutes }); }); }
 
   stop(then) {
