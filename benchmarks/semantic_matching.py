@@ -4,9 +4,10 @@
 
 One encoder a call; its row replaces the row of the same encoder in the output. Without triplets the town alone is measured.
 
-`confidence` compares that of `fprf.style.light` with how often matches are right: each painted region that both photographs show is asked for twice, with
-the style photograph as it is, and without the region. A pixel of the region has a right match the first time and none the
-second; both times weigh alike. The rate of a bin of confidence is the share of the pixels with a right match in it.
+`confidence` compares that of `fprf.style.light` with how often matches are right: each painted region that both photographs
+show is asked for twice, with the style photograph as it is, and without the region. A pixel of the region has a right match the
+first time and none the second; both times weigh alike. The rate of a bin of confidence is the share of the pixels with a right
+match in it.
 """
 
 import json
@@ -285,7 +286,7 @@ def measured_scores(encoder: Encoder, triplet: Triplet) -> tuple[list[Tensor], l
 
 
 def rates(encoder: Encoder, triplets: Sequence[Triplet]) -> dict[str, object]:
-    """Share of right matches by bins of confidence, all regions alike; and the odds that a right one has more than a wrong one."""
+    """Share of right matches by bins of confidence, all regions alike; `auc`: how often a right one has more than a wrong one."""
     right: list[Tensor] = []
     wrong: list[Tensor] = []
     for triplet in triplets:
