@@ -4,9 +4,9 @@
 
 One encoder a call; its row replaces the row of the same encoder in the output. Without triplets the town alone is measured.
 
-`confidence` says what that of `fprf.style.light` is worth: each painted region that both photographs show is asked for twice,
-with the style photograph as it is, and without the region. A pixel of the region has a right match the first time and none the
-second; both times weigh alike. The rate of a bin of confidence is the share of the pixels with a right match in it.
+`confidence` is what the confidence of `fprf.style.light` says: each painted region that both photographs show is asked for
+twice, with the style photograph as it is, and without the region. A pixel of the region has a right match the first time and
+none the second; both times weigh alike. The rate of a bin of confidences is the share of the pixels with a right match in it.
 """
 
 import json
@@ -27,6 +27,7 @@ from fprf.datamanagers.basis import Basis, fit_basis
 from fprf.datamanagers.config import GuidedConfig
 from fprf.datamanagers.images import load_image
 from fprf.errors import DataError
+from fprf.evaluation.metrics import MIXED, whole_cells
 from fprf.interfaces import Encoder
 from fprf.plugins.encoders.config import SEMANTICS, EncoderConfig
 from fprf.plugins.stylizers.config import RegionToneConfig
@@ -36,7 +37,6 @@ from fprf.style.references import semantic_samples
 from fprf.style.scene import scene_style
 
 from .common import SHARED, report
-from .style_metrics import MIXED, whole_cells
 from .town.layout import build_town
 from .town.palettes import PALETTES, palette
 from .town.render import colours, geometry, walk
@@ -249,7 +249,7 @@ def town_cells(
 
 
 _CHANNELS, _REGIONS, _STEP, _BINS = 31, 16, 5, 10
-"""Principal components and regions, as of a capture; pixels between samples; bins of the confidence."""
+"""Principal components and regions, as of a capture; pixels between samples; bins of confidence."""
 _FEWEST = 50
 """Samples that a style must have left."""
 
@@ -285,7 +285,10 @@ def measured_confidence(encoder: Encoder, triplet: Triplet) -> tuple[list[Tensor
 
 
 def rates(encoder: Encoder, triplets: Sequence[Triplet]) -> dict[str, object]:
-    """Share of right matches by bins of confidence, all regions alike; and that a right one is surer than a wrong one."""
+    """Share of right matches by bins of confidence, all regions alike, and how far both differ (`rms`).
+
+    `auc` is the rate at which a right match is surer than a wrong one; of the same bin half count.
+    """
     right: list[Tensor] = []
     wrong: list[Tensor] = []
     for triplet in triplets:
