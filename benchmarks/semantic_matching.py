@@ -4,10 +4,9 @@
 
 One encoder a call; its row replaces the row of the same encoder in the output. Without triplets the town alone is measured.
 
-`confidence` is what a score of `fprf.style.light` says: each painted region that both photographs show is asked for twice, with
-the style photograph as it is, and without the region. A pixel of the region has a right match the first time and none the
-second; both times weigh alike. The rate of a bin of scores (in spreads of the scene's regions) is the share of the pixels with
-a right match in it.
+`confidence` is what the confidence of `fprf.style.light` says: each painted region that both photographs show is asked for
+twice, with the style photograph as it is, and without the region. A pixel of the region has a right match the first time and
+none the second; both times weigh alike. The rate of a bin of confidences is the share of the pixels with a right match in it.
 """
 
 import json
@@ -33,7 +32,7 @@ from fprf.interfaces import Encoder
 from fprf.plugins.encoders.config import SEMANTICS, EncoderConfig
 from fprf.plugins.stylizers.config import RegionToneConfig
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
-from fprf.style.light import SURE, UNSURE, certainty, light_of
+from fprf.style.light import light_of
 from fprf.style.references import semantic_samples
 from fprf.style.scene import scene_style
 
@@ -249,15 +248,15 @@ def town_cells(
     return {name: (torch.cat(parts), torch.cat(labels)) for name, parts in features.items()}
 
 
-_CHANNELS, _REGIONS, _STEP, _WIDTH = 31, 16, 5, 0.2
-"""Principal components and regions, as of a capture; pixels between samples; of a bin, in spreads."""
+_CHANNELS, _REGIONS, _STEP, _BINS = 31, 16, 5, 10
+"""Principal components and regions, as of a capture; pixels between samples; bins of confidence."""
 _FEWEST = 50
 """Samples that a style must have left."""
 
 
 @torch.inference_mode()
-def measured_scores(encoder: Encoder, triplet: Triplet) -> tuple[list[Tensor], list[Tensor]]:
-    """Scores, in spreads, of pixels with a right match and of those without, one tensor for each region."""
+def measured_confidence(encoder: Encoder, triplet: Triplet) -> tuple[list[Tensor], list[Tensor]]:
+    """Confidence of pixels with a right match and of those without, one tensor for each region."""
     cells = encoder(triplet.content.permute(2, 0, 1)[None])[0].float()
     basis = fit_basis(cells.flatten(1).T, _CHANNELS)
     here, _, _, kinds = _sampled(triplet.content, triplet.content_regions, encoder, basis)
@@ -277,40 +276,40 @@ def measured_scores(encoder: Encoder, triplet: Triplet) -> tuple[list[Tensor], l
         )
         light = light_of(scene, dictionary, match, (scene.region_mean, scene.region_covariance), bold=0.5)
         assert light is not None  # a photograph has several regions
-        score = light.score(here)[:, 0]
+        sure = light.confidence(here)[:, 0]
         if gone is None:
-            right = [score[kinds == region] for region in regions]
+            right = [sure[kinds == region] for region in regions]
         else:
-            wrong.append(score[kinds == gone])
+            wrong.append(sure[kinds == gone])
     return right, wrong
 
 
 def rates(encoder: Encoder, triplets: Sequence[Triplet]) -> dict[str, object]:
-    """Share of right matches by bins of the score, all regions alike; and that a right one scores higher than a wrong one."""
+    """Share of right matches by bins of confidence, all regions alike, and how far both differ (`rms`).
+
+    `auc` is the rate at which a right match is surer than a wrong one; of the same bin half count.
+    """
     right: list[Tensor] = []
     wrong: list[Tensor] = []
     for triplet in triplets:
         if len(shared_regions(triplet)) > 1:
-            found = measured_scores(encoder, triplet)
+            found = measured_confidence(encoder, triplet)
             right, wrong = right + found[0], wrong + found[1]
-    edges = torch.arange(-0.4, 2.4001, _WIDTH)
+    edges = torch.linspace(0, 1, _BINS + 1)
     counts = []
     for side in (right, wrong):
-        shares = [torch.histogram(part.clamp(-0.39, 2.39).cpu(), edges)[0] / len(part) for part in side if len(part)]
+        shares = [torch.histogram(part.cpu(), edges)[0] / len(part) for part in side if len(part)]
         counts.append(torch.stack(shares).double().mean(0))
     rate = counts[0] / (counts[0] + counts[1]).clamp_min(1e-9)
     middle = (edges[:-1] + edges[1:]) / 2
     above = counts[1].cumsum(0) - counts[1] / 2
     return {
-        "score": [round(float(x), 2) for x in middle],
+        "confidence": [round(float(x), 2) for x in middle],
         "rate": [round(float(x), 3) for x in rate],
         "right": [round(float(x), 4) for x in counts[0]],
         "wrong": [round(float(x), 4) for x in counts[1]],
-        "confidence": [round(float(x), 3) for x in certainty(middle)],
         "auc": round(float(counts[0] @ above), 4),
-        "rms": round(math.sqrt(float(((certainty(middle) - rate).square() * (counts[0] + counts[1]) / 2).sum())), 4),
-        "unsure": UNSURE,
-        "sure": SURE,
+        "rms": round(math.sqrt(float(((middle - rate).square() * (counts[0] + counts[1]) / 2).sum())), 4),
     }
 
 
