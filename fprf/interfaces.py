@@ -146,7 +146,9 @@ class Sampler(nn.Module, ABC):
         step: int | None,
         generator: torch.Generator | None,
     ) -> Sampled:
-        """Edges `s` in [0, 1] and `t` in [near, far] along each ray, [R E] with E >= 2, sorted, t = space.distance(s, near, far).
+        """Edges `s` in [0, 1] and `t` in [near, far] along each ray, [R E] with E >= 2, sorted.
+
+        t = space.distance(s, near, far).
 
         `step` is that of the training, None in a view. A function of rays, step and generator; None = deterministic.
         """
