@@ -286,7 +286,7 @@ def measured_scores(encoder: Encoder, triplet: Triplet) -> tuple[list[Tensor], l
 
 
 def rates(encoder: Encoder, triplets: Sequence[Triplet]) -> dict[str, object]:
-    """Share of right matches by bins of confidence, all regions alike; `auc`: how often a right one has more than a wrong one."""
+    """Share of right matches by bins of confidence, all regions alike; `auc`: how often a right one exceeds a wrong one."""
     right: list[Tensor] = []
     wrong: list[Tensor] = []
     for triplet in triplets:
