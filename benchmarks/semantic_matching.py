@@ -27,7 +27,6 @@ from fprf.datamanagers.basis import Basis, fit_basis
 from fprf.datamanagers.config import GuidedConfig
 from fprf.datamanagers.images import load_image
 from fprf.errors import DataError
-from fprf.evaluation.metrics import MIXED, whole_cells
 from fprf.interfaces import Encoder
 from fprf.plugins.encoders.config import SEMANTICS, EncoderConfig
 from fprf.plugins.stylizers.config import RegionToneConfig
@@ -37,6 +36,7 @@ from fprf.style.references import semantic_samples
 from fprf.style.scene import scene_style
 
 from .common import SHARED, report
+from .style_metrics import MIXED, whole_cells
 from .town.layout import build_town
 from .town.palettes import PALETTES, palette
 from .town.render import colours, geometry, walk
