@@ -65,7 +65,6 @@ def labelled(model: Model, stylizer: Stylizer | None = None) -> Iterator[None]:
         (model.field, "content", "content"),
         (model.semantic, "forward", "semantic"),
         (model.decoder, "forward", "decoder"),
-        (model.decoder, "restyled", "decoder"),
         (model, "penalties", "penalties"),
         (stylizer, "shared", "stylizer"),
     ]

@@ -51,4 +51,5 @@ def test_speed(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str])
 def test_a_mistake_is_one_line(line: str, told: str, world: World, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(line.replace("RUN", str(world.run)).split()) == 2
     lines = [each for each in capsys.readouterr().err.splitlines() if not each.startswith("{")]
-    assert len(lines) == 1 and lines[0].startswith("error: ") and told in lines[0]
+    assert len(lines) == 2 and " needs " in lines[0], "needs are said first"
+    assert lines[1].startswith("error: ") and told in lines[1]

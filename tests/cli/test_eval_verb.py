@@ -34,7 +34,7 @@ def test_data_that_has_moved(run: Path, world: World, tmp_path: Path) -> None:
     assert cli.main(["eval", str(run), "--data", str(tmp_path / "there"), "--no-images"]) == 0
 
 
-HISTORY = History("", [10, 20], [1.5, 3.0], {"psnr": [12.0, None], "colour": [0.5, 0.25]}, {}, [])
+HISTORY = History("", [10, 20], [1.5, 3.0], {"psnr": [12.0, None], "colour": [0.5, 0.25]}, [])
 
 
 def read(folder: Path) -> dict[str, list[tuple[int, float, float]]]:

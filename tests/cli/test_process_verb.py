@@ -14,7 +14,8 @@ import pytest
 
 from fprf.cli import main as cli
 from fprf.cli.parsing import load_method, parse
-from fprf.cli.train import DEFAULT_METHOD, default_output
+from fprf.cli.train import DEFAULT_METHOD
+from fprf.training.driver import default_output
 from fprf.datamanagers.parsers.config import parse_scene
 
 FAKE = Path(__file__).parents[1] / "reconstruction" / "fake"

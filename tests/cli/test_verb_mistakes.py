@@ -52,7 +52,6 @@ MISTAKES = """
     render run --path orbit --frames 2 --fps 1e9 --output a.mp4 | --fps 1e+09
     render run --keyframes absent.json | absent.json
     render run --keyframes keys.json --references A.png | --keyframes
-    report absent | no such folder
     stylize run | --references
     stylize run --references A.png --forbid 0=0 | region 0
     stylize run --references A.png --keep 0000:99,1 | 0000:99,1
@@ -60,7 +59,6 @@ MISTAKES = """
     stylize run --references A.png --views 000 | --views 000
     stylize run --references A.png --stylizer region-to | 'region-tone'
     stylize untested --references A.png --split test | --split test
-    stylize unmeasured --references A.png | fprf train
     train --sampler uniform | --sampler
     train fprf-lite --loss.rgb 0 --loss.content 0 --loss.semantic 0 | nothing would be learnt
     train absent/config.json | absent/config.json
@@ -80,7 +78,7 @@ MISTAKES = """
 def _place(_world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folders and files of the names above."""
     folder = tmp_path_factory.mktemp("mistakes")
-    for name in ("run", "moved", "other", "untested", "unmeasured"):
+    for name in ("run", "moved", "other", "untested"):
         shutil.copytree(_world.run, folder / name)
     for name in ("photos", "empty"):
         (folder / name).mkdir()
@@ -95,7 +93,6 @@ def _place(_world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
         config.write_text(config.read_text().replace(str(_world.town), str(data)))
     known = folder / "untested" / "scene.json"
     known.write_text(json.dumps(json.loads(known.read_text()) | {"test": []}))
-    (folder / "unmeasured" / "style.safetensors").unlink()
     (folder / "path.json").write_text("{}")
     (folder / "keys.json").write_text(json.dumps({"format": 1, "keyframes": [{"frame": 0, "style": None}]}))
     return folder

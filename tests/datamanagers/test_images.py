@@ -303,7 +303,7 @@ def test_heic_comes_upright_and_needs_its_package(tmp_path: Path, monkeypatch: p
     (tmp_path / "a.heic").write_bytes(HEIC)
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "pillow_heif", None)
-        with pytest.raises(DataError, match=r"is HEIC.*pip install 'fprf\[heic\]', or convert"):
+        with pytest.raises(DataError, match=r"is HEIC.*pip install pillow-heif, or convert"):
             load_image(tmp_path / "a.heic")
     pytest.importorskip("pillow_heif")
     assert read_header(tmp_path / "a.heic") == (48, 64, False, "HEIC")

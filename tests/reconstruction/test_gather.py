@@ -122,7 +122,7 @@ def test_heic_becomes_jpeg_with_its_lens_or_says_what_is_missing(tmp_path: Path,
         patch.setitem(sys.modules, "pillow_heif", None)
         with pytest.raises(
             DataError,
-            match=r"3 of 3 files could not .*: IMG 0\.HEIC, IMG 1\.HEIC, IMG 2\.HEIC \(is HEIC.*pip install 'fprf\[heic\]'",
+            match=r"3 of 3 files could not .*: IMG 0\.HEIC, IMG 1\.HEIC, IMG 2\.HEIC \(is HEIC.*pip install pillow-heif",
         ):
             gathered(source, SceneFolder(tmp_path / "without"))
     pytest.importorskip("pillow_heif")
