@@ -15,8 +15,8 @@ import pytest
 from fprf.cli import main as cli
 from fprf.cli.parsing import load_method, parse
 from fprf.cli.train import DEFAULT_METHOD
-from fprf.training.driver import default_output
 from fprf.datamanagers.parsers.config import parse_scene
+from fprf.training.driver import default_output
 
 FAKE = Path(__file__).parents[1] / "reconstruction" / "fake"
 
