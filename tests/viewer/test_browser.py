@@ -21,7 +21,7 @@ from splat_ball import ball
 from tiny_world import World, flags
 
 from fprf.splats.files import read_capture, write_gaussians
-from fprf.splats.training import gaussians_of
+from fprf.splats.gaussians import from_tensors
 from fprf.training import checkpoint
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
@@ -165,7 +165,9 @@ def test_photographs_become_a_restyled_ply_without_a_terminal(tmp_path: Path) ->
             page.locator("#save-ply").click()
         assert downloaded.value.suggested_filename == "garden-restyled.ply"
         downloaded.value.save_as(tmp_path / "restyled.ply")
-        plain = gaussians_of(checkpoint.load_latest(made / "garden" / "run" / "checkpoints")[0])
+        saved, _ = checkpoint.load_latest(made / "garden" / "run" / "checkpoints")
+        assert saved is not None
+        plain = from_tensors(saved.model)
         styled = read_capture(tmp_path / "restyled.ply").gaussians
         assert torch.equal(styled.means, plain.means) and not torch.allclose(styled.harmonics, plain.harmonics, atol=0.1)
         with page.expect_download(timeout=120_000) as downloaded:
