@@ -51,6 +51,8 @@ _SMOOTH, _ROUGH = 0.12, 0.25
 """Deviations of luma, relative to it, up to which a region is a source of light, and from which on it is a thing."""
 _BLACK = 0.02
 """Added to colours before ratios are taken: five 8-bit steps, below which no ratio is known."""
+_WHITE = 0.95
+"""Luma that a deviation above the mean may reach by exposure."""
 _EXPOSURE = (0.05, 2.5)
 """Least and largest gain of light."""
 _SATURATION = (0.35, 1.1)
@@ -303,6 +305,8 @@ def light_maps(
     change = (luma(wanted)[:, 0] + _BLACK).log() - (own + _BLACK).log()
     thing = torch.full_like(change, KNOWN * _quantile(change, vote * (sure + _LEAST_VOTE), 0.5))
     gain = torch.lerp(thing, change, source).exp().clamp(*_EXPOSURE)
+    # What is nearly white already, as a marble statue is, cannot become brighter without losing its shape.
+    gain = gain.minimum((_WHITE / (own + deviation)).clamp_min(1.0))
     # White balance, from the logarithms of colours.
     axes = torch.tensor(_AXES, dtype=torch.float64)
     here, there = ((part.clamp_min(0) + _BLACK).log() @ axes.T for part in (mean, codes))
