@@ -402,11 +402,11 @@ class SceneLearner(Learner):
     @property
     @abstractmethod
     def facts(self) -> "Facts":
-        """What was found out about the scene before the first step, for scene.json."""
+        """Facts found before the first step, for scene.json."""
 
     @abstractmethod
     def scene(self) -> Scene:
-        """What is learnt so far, as a scene."""
+        """The scene as learnt so far."""
 
     def begin(self, run: "Run") -> str:
         """Write further files of the run before the first step; return a line about what will be learnt, or nothing."""
