@@ -271,7 +271,7 @@ class Live {
     at("make-film").onclick = () => this.tell("film", { seconds: +at("seconds").value });
     at("save-ply").onclick = () => this.offer("/gaussians", "", true);
     at("save-picture").onclick = () => this.tell("picture", { camera: this.camera() });
-    at("scenes").onclick = () => post("/start/leave", "{}").catch((error) => say(error.message, true));
+    at("scenes").onclick = () => post("/start", JSON.stringify({ type: "leave" })).catch((error) => say(error.message, true));
   }
 }
 

@@ -140,7 +140,7 @@ class Stage {
 
 // A page of one file: everything lies in it.
 const open = async (data) => {
-  const styles = data.styles.map(({ name, thumb }) => ({ name, thumb })), root = at("place");
+  const styles = data.styles.map(({ name }) => ({ name, thumb: data.stills[name][0] })), root = at("place");
   const fall = (why) => {
     root.classList.add("pictures");
     root.dataset.why = why;

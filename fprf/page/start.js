@@ -50,7 +50,7 @@ class Start {
   get minutes() { return Number(at("minutes").value) || 2; }
   fault(text) { at("fault").textContent = text; at("fault").hidden = !text; if (text) scrollTo(0, 0); }
   attempt(act) { return act().catch((error) => this.fault(error.message)); }
-  ask(name, value) { return post(`/start/${name}`, JSON.stringify(value)); }
+  ask(type, more) { return post("/start", JSON.stringify({ type, ...more })); }
   open(path) { return this.attempt(async () => { this.fault(""); await this.ask("open", { path, minutes: this.minutes }); }); }
 
   stop(then) {

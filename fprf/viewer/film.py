@@ -25,8 +25,9 @@ from ..style.files import StyleFile, write_style
 from ..style.keyframes import keyed_looks, read_keyframes
 from ..style.look import Restyle
 from ..types import Origin
+from .drawing import cameras_of
 from .look import Look, style_config
-from .messages import Camera, cameras_of
+from .messages import Camera
 
 Frame: TypeAlias = Callable[[Cameras, int, Restyle | None], Generator[None, None, Picture]]
 """Renders one frame, step by step."""

@@ -4,12 +4,12 @@ into the terms of `style.json`."""
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 from ..checks import at_least, between, positive
 from ..io.images import Picture
 from ..plugins.stylizers.config import RegionToneConfig
-from ..style.config import PRESETS, StyleConfig
+from ..style.config import StyleConfig
 from ..style.dictionary import Reference
 
 RegionAction: TypeAlias = Literal["pin", "forbid", "keep"]
@@ -95,12 +95,6 @@ def set_rule(look: Look, region: int, action: RegionAction | None, photograph: P
         if {rule.photograph for rule in new} >= {each for each, _ in look.mix}:
             return replace(look, rules=rest)
     return replace(look, rules=rest | new)
-
-
-def apply_preset(look: Look, name: str) -> Look:
-    """The look with the values of a preset (`PRESETS`)."""
-    values: dict[str, Any] = {path.rpartition(".")[2]: value for path, value in PRESETS[name].items()}
-    return replace(look, **values)
 
 
 def renumbered(look: Look, regions: Sequence[int]) -> Look:
