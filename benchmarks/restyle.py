@@ -29,9 +29,8 @@ from fprf.plugins.stylizers.config import (
 )
 from fprf.progress import Display
 from fprf.style.config import StyleConfig, labels
-from fprf.style.dictionary import StyleDictionary, build_dictionary
+from fprf.style.dictionary import Encoders, StyleDictionary, build_dictionary, encode_photograph
 from fprf.style.files import StyleFile
-from fprf.style.references import Encoders, encode_photograph
 from fprf.style.restyle import dress
 from fprf.training.driver import train
 from fprf.training.loading import open_run

@@ -30,10 +30,9 @@ from fprf.errors import DataError
 from fprf.interfaces import Encoder
 from fprf.plugins.encoders.config import SEMANTICS, EncoderConfig
 from fprf.plugins.stylizers.config import RegionToneConfig
-from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
+from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary, semantic_samples
 from fprf.style.light import light_of
-from fprf.style.references import semantic_samples
-from fprf.style.scene import scene_style
+from fprf.style.scene_style import scene_style
 
 from .common import SHARED, report
 from .style_metrics import MIXED, whole_cells

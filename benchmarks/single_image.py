@@ -17,12 +17,11 @@ from fprf.interfaces import Decoder, Encoder
 from fprf.ops.guided import upsample
 from fprf.plugins.stylizers.config import StylizerConfig
 from fprf.splats.restyle import region_maps
-from fprf.style.colours import colour_maps, own_colours
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import StyleDictionary
 from fprf.style.light import light_of
-from fprf.style.look import Restyle
-from fprf.style.scene import SceneStyle, scene_style
+from fprf.style.look import Restyle, colour_maps, own_colours
+from fprf.style.scene_style import SceneStyle, scene_style
 from fprf.types import Want
 
 _CELL = 8

@@ -14,7 +14,7 @@ from torch import Tensor
 from fprf.ops import dense, guided, march, mixture, triplane
 from fprf.rendering import cameras, lens, space, splines, stepfun
 from fprf.rendering.lens import lens_reach
-from fprf.style import clusters, controls, dictionary, matching, scene, statistics
+from fprf.style import dictionary, light, look, matching, scene_style, statistics
 
 Made = Sequence[Tensor]
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -167,11 +167,11 @@ CASES = [
                                                  matching.Matching(1.0), torch.ones(5)), sizes=(1, 37, 500)),
     Case("matching.whitener", lambda n: (_draw(n, 6), _unit(n) + 0.1),
          lambda k, s: matching.whitener(matching.Keys(k, s), 0.5), sizes=(1, 37, 500)),
-    Case("clusters.kmeans", lambda n: (_draw(n, 4) + 20 * (_unit(n, 1) * 3).floor(),), lambda x: clusters.kmeans(x, 3, seed=0)),
-    Case("controls.blend_strength", lambda n: (_draw(n, 9), _draw(n, 9, seed=5), _unit(n, 1)), controls.blend_strength,
+    Case("statistics.kmeans", lambda n: (_draw(n, 4) + 20 * (_unit(n, 1) * 3).floor(),), lambda x: statistics.kmeans(x, 3, seed=0)),
+    Case("look.blend_strength", lambda n: (_draw(n, 9), _draw(n, 9, seed=5), _unit(n, 1)), look.blend_strength,
          slopes=(0, 1)),
-    Case("controls.luma", lambda n: (_unit(n, 3),), controls.luma, slopes=(0,)),
-    Case("controls.keep_luminance", lambda n: (_unit(n, 3), _unit(n, 3, seed=5), _unit(n, 1)), controls.keep_luminance),
+    Case("light.luma", lambda n: (_unit(n, 3),), light.luma, slopes=(0,)),
+    Case("look.keep_luminance", lambda n: (_unit(n, 3), _unit(n, 3, seed=5), _unit(n, 1)), look.keep_luminance),
     Case("dictionary.blend_codes", lambda n: (*_code(n), _draw(6), _covariances(1, 6)[0]),
          lambda m, c, b, w, v: dictionary.blend_codes(m, c, w, v, b.clamp(0, 1)), sizes=(0, 1, 37, 500)),
     Case("matching.unit", lambda n: (_draw(n, 8), _draw(8)), matching.unit, slopes=(0,)),
@@ -185,10 +185,10 @@ CASES = [
          lambda q, k, p: matching.attention(q, k, 0.7, p), slopes=(0, 1)),
     Case("matching.point_shares", lambda n: (_draw(n, 8), _draw(7, 8), _draw(8, seed=6)),
          lambda q, k, c: matching.point_shares(q, k, 0.7, centre=c)),
-    Case("scene.region_units", lambda n: (_draw(n, 8), _draw(8)), lambda k, c: scene.region_units(k, c)[0],
+    Case("scene_style.region_units", lambda n: (_draw(n, 8), _draw(8)), lambda k, c: scene_style.region_units(k, c)[0],
          sizes=(0, 1, 37, 500)),
-    Case("scene.membership", lambda n: (_draw(n, 8), _draw(8, seed=6), torch.nn.functional.normalize(_draw(5, 8), dim=-1)),
-         lambda x, c, u: scene.membership(x, c, u, 0.5)),
+    Case("scene_style.membership", lambda n: (_draw(n, 8), _draw(8, seed=6), torch.nn.functional.normalize(_draw(5, 8), dim=-1)),
+         lambda x, c, u: scene_style.membership(x, c, u, 0.5)),
     Case("statistics.moments", lambda n: (_draw(n, 6) + 100, _unit(n)), _moments),
     Case("statistics.group_moments", lambda n: (_draw(n, 6), _shares(n, 3)), statistics.group_moments),
     Case("statistics.mix", _code, statistics.mix, sizes=(1, 37, 500)),

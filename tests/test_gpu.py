@@ -19,7 +19,7 @@ from fprf.config import TrainConfig
 from fprf.ops import triplane
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from fprf.style.restyle import restyle
-from fprf.style.scene import to_tensors
+from fprf.style.scene_style import to_tensors
 from fprf.training import driver, learner
 from fprf.training.driver import Report
 from fprf.training.loading import load_run

@@ -31,10 +31,9 @@ import torch
 from torch import Tensor, nn
 
 from ..ops.precision import double
-from .controls import luma
 from .dictionary import StyleDictionary, choose, code_odds
 from .matching import score_spread, share_mean, unit
-from .scene import Membership, SceneStyle
+from .scene_style import Membership, SceneStyle
 
 SURE = 0.9
 """Likeness, in spreads of the scene's own regions, from which on a match counts wholly; at 0 it counts nothing."""
@@ -67,6 +66,13 @@ _LEAST_VOTE = 0.1
 """Vote of an unsure region on the exposure, beside 1 of a sure one: a scene of nothing but these has an exposure, too."""
 _AXES = ((0.5**0.5, 0.0, -(0.5**0.5)), (-(6**-0.5), (2 / 3) ** 0.5, -(6**-0.5)))
 """Red against blue, green against magenta; of unit length, at right angles to grey and to each other."""
+_LUMA = (0.2126, 0.7152, 0.0722)
+"""Rec. 709."""
+
+
+def luma(rgb: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 1"]:
+    """Luma of sRGB colours, in [0, 1] for colours in [0, 1]."""
+    return (rgb * rgb.new_tensor(_LUMA)).sum(-1, keepdim=True)
 
 
 class LightMaps(NamedTuple):

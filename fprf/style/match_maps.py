@@ -23,7 +23,7 @@ from ..rendering.cameras import Cameras, pixel_grid
 from .matching import unit
 from .regions import Regions, membership_view, shrunk
 from .restyle import Codes, Styled
-from .scene import Membership
+from .scene_style import Membership
 
 _LISTED = 0.005
 """Codes that less than this share of a view takes are not listed."""

@@ -1,6 +1,7 @@
 """Choice of a scene's regions: by number, by name in a style file, by a pixel of a view, by a mask over one."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -14,10 +15,11 @@ from ..datamanagers.images import load_mask
 from ..errors import UsageError
 from ..interfaces import Scene
 from ..rendering.cameras import Cameras, pixel_grid
-from .config import Pixel, pixel_of
-from .files import Key
+from .config import Pixel, Place, StyleConfig, find_reference, labels, parse_place, parse_region_value, parse_strength, pixel_of
+from .dictionary import StyleDictionary
+from .files import RegionKey, StyleFile
 from .matching import scores, unit
-from .scene import Membership, SceneStyle
+from .scene_style import Membership, SceneStyle
 
 ALIKE = 0.5
 """Least cosine of a region with a key from elsewhere: below, the scene has no such region.
@@ -39,7 +41,7 @@ class Regions(NamedTuple):
     views: Scene
     scene: SceneStyle
     basis: Basis | None
-    keys: Mapping[str, Key] = {}
+    keys: Mapping[str, RegionKey] = {}
     """Regions that a style file names."""
     encoder: str = ""
     """Identity of the encoder that the keys are of, if the file tells."""
@@ -55,7 +57,7 @@ class RegionMatch(NamedTuple):
     """Cosine with the key of that name; 1 where the region was pointed at."""
 
 
-def key_of(regions: Regions, number: int) -> Key:
+def key_of(regions: Regions, number: int) -> RegionKey:
     """The semantics of a region in the encoder's own channels, to six digits: what it can be found by on another scene."""
     if regions.basis is None:
         return ()
@@ -152,3 +154,155 @@ def _covered(regions: Regions, view: int, mask: Path) -> list[int]:
         raise UsageError(f"{mask}: the mask selects nothing of view {regions.views.names[view]}; paint white what counts")
     most = inside / total.clamp_min(1e-10)
     return sorted({int(inside.argmax()), *((most > 0.5) & (inside >= 1)).nonzero().flatten().tolist()})
+
+
+class RegionControls(NamedTuple):
+    """Controls of each of K regions."""
+
+    allowed: Annotated[Tensor, "K references"]
+    """References that it may take from, bool, in the order of the dictionary."""
+    strength: Annotated[Tensor, "K"]
+    """Strength of the style; 0 = kept."""
+    score: Annotated[Tensor, "K T"]
+    """Cosine of the region with each style code, both from the scene's mean; 0 without semantics."""
+    saved: StyleFile
+    """The style with every wish in terms that hold on other scenes."""
+    regions: Regions
+    notes: tuple[str, ...]
+    """A line for each thing that the user may not expect."""
+    places: tuple[tuple[Place, Annotated[Tensor, "K references"]], ...]
+    """References that each region may take from in places, each over those before it."""
+
+
+def region_scores(scene: SceneStyle, dictionary: StyleDictionary) -> Annotated[Tensor, "K T"]:
+    """Cosines between regions and style codes, in [-1, 1]: whether the references show such a thing at all.
+
+    Both are seen from the scene's mean. Matching, which only has to choose, centres each side on its own: there a rose's
+    petals are as far from its leaves as the sky from the road, and something would always fit.
+    """
+    return scores(unit(scene.keys, scene.semantic_mean), unit(dictionary.keys, scene.semantic_mean))
+
+
+def allowed_references(
+    regions: int,
+    references: int,
+    *,
+    pin: Mapping[int, Set[int]] | None = None,
+    forbid: Sequence[tuple[int, int]] = (),
+) -> Annotated[Tensor, "regions references"]:
+    """References that each region may take codes from, bool: all, but for what the user excludes.
+
+    `pin` maps a region to the only references that it may take from; `forbid` holds (region, reference) pairs that may not
+    meet. Raises UsageError for numbers out of range or a region that is left with nothing.
+    """
+    pin = pin or {}
+    for k, i in (*((k, i) for k, chosen in pin.items() for i in sorted(chosen)), *forbid):
+        if not (0 <= k < regions and 0 <= i < references):
+            raise UsageError(
+                f"region {k} and reference {i}: regions go from 0 to {regions - 1}, references from 0 to {references - 1}"
+            )
+    allowed = torch.ones(regions, references, dtype=torch.bool)
+    for k, chosen in pin.items():
+        allowed[k] = False
+        allowed[k, sorted(chosen)] = True
+    for k, i in forbid:
+        allowed[k, i] = False
+    for k in (~allowed.any(1)).nonzero().flatten().tolist():
+        raise UsageError(f"region {k}: every reference is forbidden; allow one, or keep the region as it is")
+    return allowed
+
+
+def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleConfig) -> RegionControls:
+    """Find every region and reference that the style names. Raises UsageError for those that are not there, or contradict."""
+    book = _Book(regions, dictionary, style.references)
+    wishes = [parse_region_value("pin", text) for text in style.pin]
+    place_of = {wish.region: place for wish in wishes if (place := parse_place("pin", wish.region))}
+    pins = book.pairs([wish for wish in wishes if wish.region not in place_of])
+    bans = book.pairs([parse_region_value("forbid", text) for text in style.forbid])
+    kept = [match for text in style.keep for match in book.find(text)]
+    parsed = [parse_strength("region_strength", text) for text in style.region_strength]
+    strengths = [(match, value) for text, value in parsed for match in book.find(text)]
+    pinned: dict[int, set[int]] = {}
+    for match, i in pins:
+        pinned.setdefault(match.number, set()).add(book.order[i])
+    allowed = allowed_references(
+        len(regions.scene.share), len(dictionary.names), pin=pinned, forbid=[(f.number, book.order[i]) for f, i in bans]
+    )
+    for match in kept:
+        if match.number in pinned or match.number in {f.number for f, _ in strengths}:
+            raise UsageError(f"region {match.name}: is to be kept, and to be pinned or restyled in part; leave out one of both")
+    strength, score = torch.ones(len(allowed)), region_scores(regions.scene, dictionary)
+    for match, value in strengths:
+        strength[match.number] = value
+    strength[[match.number for match in kept]] = 0.0
+    if style.keep_below is not None:
+        best = score.masked_fill(~allowed[:, dictionary.reference], -torch.inf).amax(1)
+        poor = (best < style.keep_below).nonzero().flatten().tolist()
+        strength[[k for k in poor if k not in pinned]] = 0.0
+    taken: dict[str, set[int]] = {}
+    for wish in wishes:
+        if wish.region in place_of:
+            taken.setdefault(wish.region, set()).add(find_reference(wish.value, style.references))
+    places = []
+    for text, chosen in taken.items():
+        only = torch.zeros(len(dictionary.names), dtype=torch.bool)
+        only[[book.order[i] for i in chosen]] = True
+        # What regions may take of these references; all of them where that is none.
+        both = allowed & only
+        places.append((place_of[text], torch.where(both.any(1, keepdim=True), both, only)))
+    saved = replace(
+        style,
+        pin=(
+            *(f"{book.name(f)}={book.label(i)}" for f, i in pins),
+            *(f"{text}={book.label(i)}" for text, chosen in taken.items() for i in sorted(chosen)),
+        ),
+        forbid=tuple(f"{book.name(f)}={book.label(i)}" for f, i in bans),
+        keep=tuple(book.name(f) for f in kept),
+        region_strength=tuple(f"{book.name(f)}={value:g}" for f, value in strengths),
+    )
+    file = StyleFile(saved, book.keys, regions.views.semantic_encoder)
+    return RegionControls(allowed, strength, score, file, regions, tuple(dict.fromkeys(book.notes)), tuple(places))
+
+
+class _Book:
+    """Looks up names, and remembers which keys and notes belong to them."""
+
+    def __init__(self, regions: Regions, dictionary: StyleDictionary, references: Sequence[Path]) -> None:
+        self.regions, self.references = regions, references
+        self.names = labels(references)
+        self.order = [dictionary.names.index(name) for name in self.names]
+        # All regions, not only those that are wished about: on another scene each must find its like among all of them.
+        every = {f"region{k}": key_of(regions, k) for k in range(len(regions.scene.share)) if regions.basis is not None}
+        self.keys = dict(regions.keys) if regions.keys else every
+        self.notes: list[str] = []
+
+    def find(self, text: str) -> list[RegionMatch]:
+        matches = find_regions(self.regions, text)
+        if not matches:
+            self.notes.append(f"region {text!r} of the style: no region here is most like it, so it is left out")
+        for each in matches:
+            if each.name in self.regions.keys:
+                self.notes.append(f"region {text!r} of the style is region {each.number} here (cosine {each.alike:.2f})")
+        return matches
+
+    def pairs(self, wishes: Sequence[tuple[str, str]]) -> list[tuple[RegionMatch, int]]:
+        """Regions and references of REGION=REFERENCE; a mask may mean several regions."""
+        return [(match, find_reference(value, self.references)) for region, value in wishes for match in self.find(region)]
+
+    def label(self, reference: int) -> str:
+        """A reference as a style file names it, wherever its photographs are moved to."""
+        name = self.references[reference].name
+        return name if self.names[reference] == name else str(reference)
+
+    def name(self, region: RegionMatch) -> str:
+        """Name of the region in a style file, which holds its key under that name."""
+        if region.name in self.regions.keys or not self.keys:
+            return region.name
+        key, name = key_of(self.regions, region.number), f"region{region.number}"
+        known = [other for other, its in self.keys.items() if its == key]
+        if known:
+            return known[0]
+        while name in self.keys:
+            name += "'"
+        self.keys[name] = key
+        return name

@@ -18,14 +18,13 @@ from ..io.images import shrink
 from ..plugins.stylizers.config import RegionToneConfig
 from ..rendering.cameras import Cameras
 from ..style.config import labels
-from ..style.dictionary import StyleDictionary, build_dictionary
+from ..style.dictionary import Encoders, StyleDictionary, build_dictionary, encode_photograph
 from ..style.files import StyleFile
 from ..style.look import Restyle
 from ..style.matching import unit
-from ..style.references import Encoders, encode_photograph
 from ..style.regions import memberships
 from ..style.restyle import Styled, dress
-from ..style.scene import SceneStyle
+from ..style.scene_style import SceneStyle
 from .look import Look, Photograph, style_config
 
 Key = TypeVar("Key")

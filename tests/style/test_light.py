@@ -14,7 +14,7 @@ from fprf.splats.restyle import all_around, region_maps, restyled_harmonics
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
 from fprf.style.light import KNOWN, Light, light_maps, light_of, shared, unrivalled
 from fprf.style.look import Restyle
-from fprf.style.scene import SceneStyle, scene_style
+from fprf.style.scene_style import SceneStyle, scene_style
 
 KINDS, EACH = 4, 150
 CONFIG = RegionToneConfig(smoothness=0.0)

@@ -9,10 +9,8 @@ from torch import Tensor
 
 from fprf.interfaces import Decoder, Stylizer
 from fprf.plugins.stylizers.config import AdainConfig, RegionOtConfig
-from fprf.style.controls import keep_luminance
-from fprf.style.look import Restyle
-from fprf.style.regional import RegionWeight
-from fprf.style.scene import Membership
+from fprf.style.look import Restyle, keep_luminance
+from fprf.style.scene_style import Membership, RegionWeight
 from fprf.types import Want
 
 

@@ -16,8 +16,8 @@ from fprf.plugins.stylizers.config import AdainConfig
 from fprf.style.config import StyleConfig
 from fprf.style.files import Key, StyleFile
 from fprf.style.match_maps import explain, region_row, region_tile
-from fprf.style.regions import RegionMatch, Regions, find_regions, key_of, membership_view
-from fprf.style.restyle import RegionControls, Styled, apply_style, region_controls
+from fprf.style.regions import RegionControls, RegionMatch, Regions, find_regions, key_of, membership_view, region_controls
+from fprf.style.restyle import Styled, apply_style
 from fprf.training.loading import load_style
 
 

@@ -17,7 +17,7 @@ from fprf.plugins.stylizers.config import (
 from fprf.rendering.cameras import pixel_grid
 from fprf.style.look import Restyle
 from fprf.style.restyle import restyle
-from fprf.style.scene import own_style
+from fprf.style.scene_style import own_style
 from fprf.training.loading import Trained, load_style
 from fprf.training.views import view_parts
 

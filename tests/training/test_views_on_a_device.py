@@ -13,10 +13,9 @@ from tiny_world import World
 from fprf.ops import backend
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from fprf.style.config import StyleConfig
-from fprf.style.dictionary import StyleDictionary, build_dictionary
+from fprf.style.dictionary import Encoders, StyleDictionary, build_dictionary, encode_photograph
 from fprf.style.files import StyleFile
 from fprf.style.match_maps import match_map
-from fprf.style.references import Encoders, encode_photograph
 from fprf.style.restyle import dress
 from fprf.training.loading import Trained, load_run
 from fprf.training.views import cache_view, render_view

@@ -16,7 +16,7 @@ from ...ops import mixture
 from ...ops.precision import double, full_precision
 from ...style.dictionary import StyleDictionary, code_odds, whole_style
 from ...style.matching import compared, point_shares, score_spread, share_mean
-from ...style.scene import SceneStyle, check_fit
+from ...style.scene_style import SceneStyle, check_fit
 from ...style.statistics import deviation
 from ...types import Want
 from .config import LocalAdainConfig

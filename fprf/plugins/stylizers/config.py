@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from ...interfaces import Stylizer
     from ...style.dictionary import StyleDictionary
-    from ...style.scene import SceneStyle
+    from ...style.scene_style import SceneStyle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +43,7 @@ class StylizerConfig(PluginConfig):
     def smoothing(
         self, scene: SceneStyle, allowed: Annotated[Tensor, "K references"] | None = None
     ) -> Annotated[Tensor, "K K"] | None:
-        """Matrix that smooths the matches of regions (`style.scene.region_smoothing`); None = not smoothed."""
+        """Matrix that smooths the matches of regions (`style.scene_style.region_smoothing`); None = not smoothed."""
         return None
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
@@ -122,7 +122,7 @@ class _RegionConfig(StylizerConfig):
         self, scene: SceneStyle, allowed: Annotated[Tensor, "K references"] | None = None
     ) -> Annotated[Tensor, "K K"] | None:
         """By `smoothness`."""
-        from ...style.scene import region_smoothing
+        from ...style.scene_style import region_smoothing
 
         return region_smoothing(scene, self.smoothness, allowed)
 

@@ -19,7 +19,7 @@ from ...ops import mixture
 from ...ops.precision import double, full_precision
 from ...style.dictionary import StyleDictionary, choose, code_odds, whole_style
 from ...style.matching import Keys, Matching, match_keys, unit
-from ...style.scene import Membership, SceneStyle, check_fit, own_style
+from ...style.scene_style import Membership, SceneStyle, check_fit, own_style
 from ...style.statistics import deviation, monge
 from ...types import Want
 

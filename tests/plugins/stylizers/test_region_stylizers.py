@@ -19,7 +19,7 @@ from fprf.plugins.stylizers.config import (
 from fprf.plugins.stylizers.region import region_table
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
 from fprf.style.matching import Matching, Similarity, score_spread, share_mean, unit
-from fprf.style.scene import Membership, SceneStyle, own_style
+from fprf.style.scene_style import Membership, SceneStyle, own_style
 from fprf.style.statistics import deviation, monge
 from fprf.types import Want
 

@@ -8,10 +8,9 @@ from torch import Tensor, nn
 
 from ..errors import CheckpointError, DataError
 from ..ops.precision import double
-from .clusters import kmeans
 from .dictionary import BLEND, StyleDictionary, blend_codes
 from .matching import point_shares, score_spread, unit
-from .statistics import Moments, covariance, group_moments
+from .statistics import Moments, covariance, group_moments, kmeans
 from .statistics import moments as moments_of
 
 _SOFTNESS = 0.3
@@ -116,6 +115,24 @@ class Membership(nn.Module):
     def forward(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N K"]:
         """Rows sum to 1."""
         return membership(semantic.to(self.units), self.centre, self.units, self._temperature)
+
+
+class RegionWeight(nn.Module):
+    """One number a region, at points: by how much they belong to each."""
+
+    values: Annotated[Tensor, "K X"]
+
+    def __init__(self, scene: SceneStyle, values: Annotated[Tensor, "K X"]) -> None:
+        super().__init__()
+        self.membership = Membership(scene)
+        self.register_buffer("values", values.float())
+
+    def forward(
+        self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
+    ) -> Annotated[Tensor, "N X"]:
+        """The values, mixed by membership (`belongs`, where it is known): exactly 0 where all of a point's regions have 0."""
+        share: Tensor = self.membership(semantic) if belongs is None else belongs
+        return share.to(self.values) @ self.values
 
 
 def region_contacts(
