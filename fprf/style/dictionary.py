@@ -3,8 +3,8 @@
 Letters: N pixel samples of a photograph, C content channels, D semantic channels in the scene's basis, T style codes of all
 references, K regions of the scene. Colours are sRGB in [0, 1].
 
-Content and semantics of a photograph pass the same guided filter as the scene's training targets, at the photograph's pixels, so
-that a reference's statistics are in kind with the scene's. What moves them is the size that the encoder sees (VGG relu2_1: the
+Content and semantics of a photograph pass the same guided filter as the scene's training targets, at its own pixels, so that
+a reference's statistics are in kind with the scene's. What moves them is the size that the encoder sees (VGG relu2_1: the
 deviations change by 4 to 12 % from 512 to 384 pixels a side), so photographs are encoded at the scene's own. What doesn't is
 how many pixels are looked at: every third and coarser filter cells change them by 0.6 % at most, and cost a fifth.
 """

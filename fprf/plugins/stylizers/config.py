@@ -86,7 +86,7 @@ class LocalAdainConfig(StylizerConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _RegionConfig(StylizerConfig):
+class RegionConfig(StylizerConfig):
     """Common fields of two-sided stylizers: points belong to scene regions, regions match style codes."""
 
     handles_allowed_references: ClassVar[bool] = True
@@ -127,24 +127,22 @@ class _RegionConfig(StylizerConfig):
         return region_smoothing(scene, self.smoothness, allowed)
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
-        from ...style.matching import Matching
         from .region import ChannelMaps, MatrixMaps, TwoSidedStylizer, plan_regions
 
-        matching = Matching(self.temperature, self.similarity, self.whitening, self.recentred, self.centred)
-        plan = plan_regions(dictionary, scene, matching, self.smoothing(scene, dictionary.allowed))
+        plan = plan_regions(dictionary, scene, self, self.smoothing(scene, dictionary.allowed))
         maps = MatrixMaps if self.transport else ChannelMaps
         return TwoSidedStylizer(plan, scene, maps(plan, scene, self.gain))
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegionOtConfig(_RegionConfig):
+class RegionOtConfig(RegionConfig):
     """Two-sided optimal transport: regions match style codes, all channels move together."""
 
     transport: ClassVar[bool] = True
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegionToneConfig(_RegionConfig):
+class RegionToneConfig(RegionConfig):
     """Two-sided (recommended): half of AdaIN's change, then each region's colours as a whole to those of its match."""
 
     features: float = 0.5
