@@ -82,12 +82,8 @@ def flat_look(flat: Flat, dictionary: StyleDictionary, config: StylizerConfig, d
     stylizer = config.build(dictionary=dictionary, scene=flat.style).to(device)
     light = None
     if config.light:
-
-        def match(part: StyleDictionary) -> Annotated[Tensor, "K T"]:
-            return config.build(dictionary=part, scene=flat.style).region_match(flat.style.keys)
-
         own = own_colours(stylizer, flat.style, decoder)
-        light = light_of(flat.style, dictionary, match, own, bold=StyleConfig.bold)
+        light = light_of(flat.style, dictionary, config, own, bold=StyleConfig.bold)
         light = None if light is None else light.to(device)
     if decoder is None:
         maps = region_maps(stylizer, dictionary, flat.style, config)

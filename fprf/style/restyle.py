@@ -96,12 +96,9 @@ def dress(here: Scene, file: StyleFile, encoders: Encoders, dictionary: StyleDic
         light = None
         if chosen.light and style.bold < 1:
             own = own_colours(stylizer, scene, here.decoder)
-            light = light_of(scene, dictionary, match, own, bold=style.bold, allowed=allowed)
+            light = light_of(scene, dictionary, chosen, own, bold=style.bold, allowed=allowed)
             light = None if light is None else light.to(device)
         return Restyle(stylizer, style.strength, weight, chosen.features, moved, style.luminance, light=light)
-
-    def match(part: StyleDictionary) -> Annotated[Tensor, "K T"]:
-        return chosen.build(dictionary=part, scene=scene).region_match(scene.keys)
 
     places = tuple((place.about(here.origin), look(allowed)) for place, allowed in controls.places)
     mine = replace(look(controls.allowed), places=places)
