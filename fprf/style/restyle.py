@@ -10,10 +10,9 @@ from torch import Tensor
 
 from ..errors import ConfigError, UsageError
 from ..interfaces import Scene
-from ..plugins.stylizers.config import StylizerConfig
 from ..testing.outputs import check_stylizer
-from .config import NO_MASK, StyleConfig, labels
-from .dictionary import BLEND, CLUSTERS, Encoders, Reference, StyleDictionary, build_dictionary, encode_photograph
+from .config import NO_MASK, labels
+from .dictionary import Encoders, Reference, StyleDictionary, build_dictionary, encode_photograph
 from .files import Keyframe, StyleFile, check_photographs, fade, read_style
 from .light import light_of
 from .look import Restyle, own_colours, regional
@@ -52,16 +51,25 @@ def apply_style(
     """Build the dictionary of a style's references and its stylizer on the scene; mix in the style that it goes towards.
 
     `trail` are the style files that led here. `encoded` keeps photographs with their masks for further styles. Raises
-    UsageError for no references and wishes that the scene does not know, DataError for unreadable photographs, WeightsError
-    where the encoders are not the scene's.
+    UsageError for no references and for regions that the scene does not have, DataError for unreadable photographs,
+    WeightsError where the encoders are not the scene's.
     """
     style = file.style
     if not style.references:
         raise UsageError("--references: at least one photograph is needed, for example --references autumn.jpg night.jpg")
     encoders = here.encoders() if encoders is None else encoders
-    styled = dress(here, file, encoders, _dictionary(style, encoders, {} if encoded is None else encoded))
+    encoded = {} if encoded is None else encoded
+    references = []
+    for i, (path, name) in enumerate(zip(style.references, labels(style.references), strict=True)):
+        mask, weight = style.masks[i] if style.masks else NO_MASK, style.weights[i] if style.weights else 1.0
+        if (path, mask) not in encoded:
+            encoded[path, mask] = encode_photograph(path, encoders, name=name, mask=None if mask == NO_MASK else mask)
+        references.append(encoded[path, mask]._replace(name=name, weight=weight))
+    dictionary = build_dictionary(references, clusters=style.clusters, blend=style.blend, seed=encoders.seed)
+    styled = apply_dictionary(here, file, encoders, dictionary)
     if style.between is None or style.at == 0:
         return styled
+    # The other style is built alike, and so is the one that it goes towards itself.
     path = style.between.resolve()
     if path in trail:
         raise ConfigError(f"{style.between}: lies between styles that lead back to it; end the circle")
@@ -71,71 +79,44 @@ def apply_style(
 
 
 @torch.inference_mode()
-def dress(here: Scene, file: StyleFile, encoders: Encoders, dictionary: StyleDictionary) -> Styled:
-    """A style whose dictionary is built already, on the scene. `between` is not heeded.
+def apply_dictionary(here: Scene, file: StyleFile, encoders: Encoders, dictionary: StyleDictionary) -> Styled:
+    """Build the look of a style whose dictionary is built already. `between` is not heeded.
 
-    The dictionary's names are the labels of the style's references. Raises UsageError for wishes that the scene does not know.
+    The dictionary's names are the labels of the style's references. Raises UsageError for regions that the scene does not have.
     """
     style, scene, basis = file.style, encoders.scene, encoders.basis
     if basis is not None:
         dictionary = dictionary._replace(origin=basis.origin().to(dictionary.keys))
-    regions = Regions(here, scene, basis, file.regions, file.semantic_encoder)
-    controls = region_controls(regions, dictionary, style)
+    controls = region_controls(Regions(here, scene, basis, file.regions, file.semantic_encoder), dictionary, style)
     if controls.places and here.decoder is not None:
         raise UsageError("--pin: places are for Gaussians; for a run of fields pin regions, such as --pin 3=autumn.jpg")
-    chosen, device = style.stylizer, here.device
+    config, device = style.stylizer, here.device
     partly = bool((controls.strength != 1).any())
     weight = RegionWeight(scene, controls.strength[:, None]).to(device) if partly else None
 
     def look(allowed: Annotated[Tensor, "K references"]) -> Restyle:
-        stylizer = regional(dictionary, scene, allowed, chosen)
-        check_stylizer(chosen, stylizer, dictionary, scene, affine=here.decoder is None and chosen.colours <= 0)
+        """The look of one choice of references: stylizer, colours behind the decoder, and light where matches are not sure."""
+        stylizer = regional(dictionary, scene, allowed, config)
+        check_stylizer(config, stylizer, dictionary, scene, affine=here.decoder is None and config.colours <= 0)
         stylizer = stylizer.to(device)
-        colours = here.colour_maps(stylizer, dictionary, scene, chosen, allowed)
-        moved = None if colours is None else colours.to(device)
+        colours = here.colour_maps(stylizer, dictionary, scene, config, allowed)
         light = None
-        if chosen.light and style.bold < 1:
+        if config.light and style.bold < 1:
             own = own_colours(stylizer, scene, here.decoder)
-            light = light_of(scene, dictionary, chosen, own, bold=style.bold, allowed=allowed)
-            light = None if light is None else light.to(device)
-        return Restyle(stylizer, style.strength, weight, chosen.features, moved, style.luminance, light=light)
+            light = light_of(scene, dictionary, config, own, bold=style.bold, allowed=allowed)
+        return Restyle(
+            stylizer,
+            strength=style.strength,
+            regions=weight,
+            features=config.features,
+            colours=None if colours is None else colours.to(device),
+            luminance=style.luminance,
+            light=None if light is None else light.to(device),
+        )
 
     places = tuple((place.about(here.origin), look(allowed)) for place, allowed in controls.places)
-    mine = replace(look(controls.allowed), places=places)
     codes = Codes(dictionary.reference, dictionary.names, unit(dictionary.keys, scene.semantic_mean))
-    return Styled(mine, dictionary, scene, codes, controls)
-
-
-def restyle(
-    here: Scene,
-    references: Sequence[Path],
-    stylizer: StylizerConfig,
-    *,
-    strength: float = 1.0,
-    weights: Sequence[float] = (),
-    clusters: int = CLUSTERS,
-    blend: float = BLEND,
-) -> Styled:
-    """`apply_style` without wishes about regions."""
-    style = StyleConfig(
-        references=tuple(references),
-        stylizer=stylizer,
-        strength=strength,
-        weights=tuple(weights),
-        clusters=clusters,
-        blend=blend,
-    )
-    return apply_style(here, StyleFile(style))
-
-
-def _dictionary(style: StyleConfig, encoders: Encoders, encoded: dict[tuple[Path, Path], Reference]) -> StyleDictionary:
-    references = []
-    for i, (path, name) in enumerate(zip(style.references, labels(style.references), strict=True)):
-        mask, weight = style.masks[i] if style.masks else NO_MASK, style.weights[i] if style.weights else 1.0
-        if (path, mask) not in encoded:
-            encoded[path, mask] = encode_photograph(path, encoders, name=name, mask=None if mask == NO_MASK else mask)
-        references.append(encoded[path, mask]._replace(name=name, weight=weight))
-    return build_dictionary(references, clusters=style.clusters, blend=style.blend, seed=encoders.seed)
+    return Styled(replace(look(controls.allowed), places=places), dictionary, scene, codes, controls)
 
 
 def mixed(a: Styled, b: Styled, at: float) -> Styled:

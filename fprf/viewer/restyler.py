@@ -23,7 +23,7 @@ from ..style.files import StyleFile
 from ..style.look import Restyle
 from ..style.matching import unit
 from ..style.regions import memberships
-from ..style.restyle import Styled, dress
+from ..style.restyle import Styled, apply_dictionary
 from ..style.scene_style import SceneStyle
 from .look import Look, Photograph, style_config
 
@@ -93,7 +93,7 @@ class Restyler:
             parts = [self._dictionary(photograph, look.clusters, look.blend) for photograph, _ in look.mix]
             style = style_config(look, self._stylizer)
             dictionary = concatenate(parts, labels(style.references), [weight for _, weight in look.mix])
-            self._styles[look] = dress(self.scene, StyleFile(style), self.encoders, dictionary)
+            self._styles[look] = apply_dictionary(self.scene, StyleFile(style), self.encoders, dictionary)
         return _use(self._styles, look)
 
     def retain(self, photographs: Collection[Photograph]) -> None:
