@@ -4,8 +4,8 @@ The whole scene is trained first, on photographs of half the size, for most of t
 the poses that were refined there. It starts from Gaussians of the whole scene: those that its windows show explain what lies
 outside, and are dropped in the end.
 
-    RUN/views.json          where images and masks lie, so that no cell reads the whole scene folder again
-    RUN/checkpoints/        the union of all cells
+    RUN/overview, RUN/cells/NN      the whole scene, and the cells (see `training.tasks`)
+    RUN/checkpoints                 the union of all cells
 """
 
 import math
@@ -26,11 +26,8 @@ from ..datamanagers.images import load_images
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError
 from ..interfaces import Partition, State
-from ..io.atomic import write_json
-from ..io.strict_json import open_json
 from ..ops.rasterise import lift
 from ..ops.rasterise_training import compile_beside
-from ..plugins.codec import from_json
 from ..progress import Display
 from ..training import checkpoint
 from ..training.camera_optimizers import Tones
@@ -46,8 +43,8 @@ from .initial import spatial_order
 from .learner import MOVES, GaussianLearner, Stage
 from .levels import in_view
 from .loading import refined
-from .photographs import cover, load_photographs, load_skies, make_levels
-from .training import build, limit_widths, lit_facts, reach_of
+from .photographs import cover, load_photographs, make_levels
+from .training import build, light_and_poses, limit_widths, scene_scale
 
 Number = TypeVar("Number", bound=np.generic)
 _FORMAT = 6
@@ -82,7 +79,7 @@ class Cells(Partition):
     def __init__(self, config: GaussiansConfig, scene: Scene, saved: Facts | None) -> None:
         self.config, self.scene = config, scene
         self.compiling = compile_beside((config.degree + 1) ** 2)
-        self._facts = saved or lit_facts(config, scene, lambda view: load_images(scene, config.background, [view])[0])
+        self._facts = saved or light_and_poses(config, scene, lambda view: load_images(scene, config.background, [view])[0])
 
     @property
     def facts(self) -> Facts:
@@ -103,44 +100,11 @@ class Cells(Partition):
         display.say(f"{unite(run.root, cells)} Gaussians")
 
     def write(self, run: Run) -> list[Cell]:
-        """Cut the scene and write all that tasks read. Cells of another cut, which could be taken for these, are removed."""
-        scene, data = self.scene, self.config.data or Path()
-        cells = bisect_sightings(scene, self.config.cells)
+        """Cut the scene and write the cells. Those of another cut, which could be taken for these, are removed."""
+        cells = bisect_sightings(self.scene, self.config.cells)
         if write_cells(run.root / "cells.json", cells):
             shutil.rmtree(run.root / "cells", ignore_errors=True)
-        views = run.root / "views.json"
-        views.unlink(missing_ok=True)
-        files = {"paths": scene.paths, "masks": scene.masks, "sky_masks": scene.sky_masks}
-        if all(path is None or path.is_relative_to(data) for paths in files.values() for path in paths):
-            named = {name: [path and path.relative_to(data).as_posix() for path in paths] for name, paths in files.items()}
-            write_json(views, named)
         return cells
-
-
-def read_views(root: Path, config: GaussiansConfig, data: Path) -> Scene:
-    """The views of a run's scene with their images in the folder `data`; parsed where the run does not list them.
-
-    Raises CheckpointError where the list cannot be read.
-    """
-    file, known = root / "views.json", Run(root).load_known()
-    if not file.is_file():
-        return read_scene(replace(config, data=data), known.facts)
-    with open_json(file, "train again to write it") as document:
-        paths = from_json(document["paths"], tuple[str, ...], path="paths")
-        masks = from_json(document["masks"], tuple[str | None, ...], path="masks")
-        skies = from_json(document.get("sky_masks", []), tuple[str | None, ...], path="sky_masks")  # older runs name none
-        if len(paths) != len(known.cameras) or not {len(masks), len(skies)} <= {0, len(paths)}:
-            raise ValueError(f"{len(paths)} images, {len(masks)} and {len(skies)} masks for {len(known.cameras)} cameras")
-    return Scene(
-        name=known.name,
-        paths=tuple(data / name for name in paths),
-        cameras=known.cameras,
-        train=torch.tensor(known.train),
-        test=torch.tensor(known.test, dtype=torch.int64),
-        masks=tuple(None if name is None else data / name for name in masks),
-        sky_masks=tuple(None if name is None else data / name for name in skies),
-        origin=known.facts.origin,
-    )
 
 
 def load_overview(root: Path) -> checkpoint.Saved:
@@ -192,10 +156,10 @@ class CellPart(Part):
     def build(self) -> GaussianLearner:
         """Go on from the whole scene, at lower rates."""
         config, cell, start = self.config, self.cell, self.start
-        # Photographs, from where the whole scene found its views, as far as the cell's windows reach.
-        scene = replace(self.scene, cameras=refined(self.scene.cameras, start))
-        images, masks = load_photographs(config, scene, list(cell.windows))
-        skies = load_skies(config, scene, images)
+        # Photographs, from where the whole scene found its views, as far as the cell's windows reach. Lengths follow from the
+        # cell's own cameras: points of the whole scene say nothing about it.
+        scene = replace(self.scene, cameras=refined(self.scene.cameras, start), points=None, seen=None)
+        images, masks, skies = load_photographs(config, scene, list(cell.windows))
         images, masks, skies = crop(cell, images), crop(cell, masks), crop(cell, skies)
         # Gaussians of the whole scene that these show.
         near, whole = float(start.model["near"]), from_tensors(start.model)
@@ -208,7 +172,7 @@ class CellPart(Part):
         learner = GaussianLearner(
             replace(config, cap=cap, rate=_RATE * config.rate),
             make_levels(own, images, masks, near, skies),
-            reach_of(own),
+            scene_scale(own),
             cap,
             cell.around,
             # Of all cameras: what lies before those of other cells is part of the union.
@@ -234,8 +198,8 @@ def open_cell(task: Task) -> Overview | CellPart:
     """
     root, number = Path(task.root), task.part
     folder, facts, config = folder_of(root, number), Run(root).load_known().facts, Run(root).load_config()[0]
-    assert isinstance(config, GaussiansConfig)
-    scene = read_views(root, config, Path(task.data))
+    assert isinstance(config, GaussiansConfig)  # by its kind
+    scene = read_scene(replace(config, data=Path(task.data)), facts)
     free = (*RESUMABLE, *config.untrained, "cells")
     if number == WHOLE:
         own, every = reduced(replace(config, data=Path(task.data)), scene)

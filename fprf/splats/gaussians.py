@@ -1,7 +1,7 @@
 """3D Gaussians with view-dependent colours (Kerbl et al. 2023), as every part of fprf passes them.
 
 World axes are the capture's own. Colour seen along a unit direction d = max(0, 0.5 + sum_k Y_k(d) harmonics_k), sRGB, with
-the real spherical harmonics Y of `fields.harmonics`.
+the real spherical harmonics Y of `ops.harmonics`.
 """
 
 import math
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ..errors import CheckpointError, DataError
 from ..ops.harmonics import HARMONIC
+from ..ops.rasterise_training import HARMONICS, LOG_SCALES, LOGIT, MEANS, QUATERNION
 
 COUNTS = (1, 4, 9, 16, 25)
 """Harmonics a channel, by degree."""
@@ -65,6 +66,12 @@ class Gaussians:
     def colours(self) -> Annotated[Tensor, "N 3"]:
         """Mean colours over all directions; may leave [0, 1]."""
         return 0.5 + HARMONIC * self.harmonics[:, 0]
+
+    @property
+    def rows(self) -> Annotated[Tensor, "N R"]:
+        """All parameters of a Gaussian in a row of R = 11 + 3 K, in the columns of `ops.rasterise_training`."""
+        parts = (self.means, self.log_scales, self.quaternions, self.logits[:, None])
+        return torch.cat([*parts, self.harmonics.flatten(1)], 1)
 
     @property
     def finite(self) -> Annotated[Tensor, "N"]:
@@ -121,6 +128,13 @@ def from_arrays(
     """Gaussians of arrays of any float type; what is beyond float32 becomes infinite."""
     parts = (means, quaternions, log_scales, logits, harmonics)
     return Gaussians(*(torch.from_numpy(np.array(part, np.float32, order="C")) for part in parts))
+
+
+def from_rows(rows: Annotated[Tensor, "N R"]) -> Gaussians:
+    """The Gaussians of `Gaussians.rows`."""
+    harmonics = rows[:, HARMONICS].reshape(len(rows), (rows.shape[1] - HARMONICS.start) // 3, 3)
+    parts = (rows[:, MEANS], rows[:, QUATERNION], rows[:, LOG_SCALES], rows[:, LOGIT.start], harmonics)
+    return Gaussians(*(part.contiguous() for part in parts))
 
 
 def tensors_of(gaussians: Gaussians, near: float) -> dict[str, Tensor]:

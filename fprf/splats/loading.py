@@ -23,10 +23,11 @@ from ..training.quality import PRESETS, QualityConfig, mixed_tone
 from ..training.run import Run, in_training
 from .config import GaussiansConfig
 from .gaussians import Gaussians, from_tensors
-from .learner import MOVES, GaussianLearner, run_scene
+from .learner import MOVES, GaussianLearner
 from .levels import Levels, make_levels_of_detail, open_levels, write_levels
 from .photographs import load_photographs, make_levels
-from .scene import Semantics, SplatScene, load_semantics, semantics_tensors
+from .scene import SplatScene, run_scene
+from .semantics import Semantics, load_semantics, semantics_tensors
 
 _FIT_RATE, _FIT_STEPS = 2e-3, 120
 """Of the poses of views that the scene is not learnt from: `GaussiansConfig.poses`, and steps of each view."""
@@ -88,7 +89,7 @@ def fit_poses(
     Gaussians stay as they are; the other views' moves are 0.
     """
     scene = replace(scene, train=torch.tensor(views))
-    images, masks = load_photographs(config, scene, list(views))
+    images, masks, _ = load_photographs(config, scene, list(views))
     others = tuple(sorted(set(range(len(scene.paths))) - set(views)))
     poses = Poses(scene.cameras.pose[:, :, 3], others, reach=reach_of(scene, facts.space), pace=1.0, still=True)
     levels = make_levels(scene, images, masks, shown.near)
