@@ -79,22 +79,20 @@ class Gaussians:
 
         Infinite logits are opacities 0 and 1, and ln-scales of -inf those of flat Gaussians: both can be drawn.
         """
-        return self._bounded & ~self._unrotated
+        bounded, turned = self._sound()
+        return bounded & turned
 
-    @property
-    def _bounded(self) -> Annotated[Tensor, "N"]:
+    def _sound(self) -> tuple[Annotated[Tensor, "N"], Annotated[Tensor, "N"]]:
+        """Whether numbers are within bounds, and whether there is a rotation."""
         parts = (self.means, self.quaternions, self.harmonics.flatten(1))
+        small = torch.stack([(part.abs() < _LARGEST).all(1) for part in parts]).all(0)
         sized = (self.log_scales <= _WIDEST).all(1)  # False for NaN
-        return torch.stack([(part.abs() < _LARGEST).all(1) for part in parts]).all(0) & sized & ~self.logits.isnan()
-
-    @property
-    def _unrotated(self) -> Annotated[Tensor, "N"]:
-        return (self.quaternions.abs() < 1e-12).all(1)
+        return small & sized & ~self.logits.isnan(), (self.quaternions.abs() >= 1e-12).any(1)
 
     def faults(self) -> list[str]:
         """How many Gaussians cannot be drawn, for each reason: "3 that are not finite"."""
-        bounded = self._bounded
-        counts = {"that are not finite": ~bounded, "without a rotation": bounded & self._unrotated}
+        bounded, turned = self._sound()
+        counts = {"that are not finite": ~bounded, "without a rotation": bounded & ~turned}
         return [f"{int(each.sum())} {what}" for what, each in counts.items() if bool(each.any())]
 
     def drawable(self) -> "Gaussians":
@@ -171,6 +169,7 @@ def bulk_of(points: Annotated[NDArray[Any], "N 3"]) -> Bulk:
 
 def morton_order(cells: Annotated[NDArray[np.int64], "N 3"]) -> NDArray[np.int64]:
     """Indices along a Morton curve (Z-order) of cells, 0 to 1023 a side: neighbours in space follow each other."""
+    # Bits of the three coordinates interleaved: each coordinate's are spread to every third place by doubling the gaps.
     code = np.zeros(len(cells), np.int64)
     for axis in range(3):
         v = cells[:, axis]
