@@ -66,6 +66,7 @@ def sequential_pairs(count: int, overlap: int) -> list[Pair]:
 
 def similar_pairs(vectors: Annotated[NDArray[np.float32], "V X"], nearest: int) -> list[Pair]:
     """Each with those whose unit vectors are most like its own, by cosine; an image without a vector (all 0) with none."""
+    # Cosines, without those of images with themselves and of images that nothing is known of.
     likeness = vectors @ vectors.T
     empty = ~vectors.any(axis=1)
     likeness[empty] = likeness[:, empty] = -np.inf
@@ -78,6 +79,7 @@ def similar_pairs(vectors: Annotated[NDArray[np.float32], "V X"], nearest: int) 
 
 def build_vocabulary(read: Reader, count: int, number: int, seed: int = 0) -> Words:
     """`number` visual words, or fewer where there are fewer descriptors; `read(i)` gives those of image i of `count`."""
+    # A sample of all descriptors, as many of each image.
     rng = np.random.default_rng(seed)
     each = max(1, _SAMPLE // max(1, count))
     parts = []
@@ -87,10 +89,12 @@ def build_vocabulary(read: Reader, count: int, number: int, seed: int = 0) -> Wo
     sample = np.concatenate(parts).astype(np.float32) if parts else np.zeros((0, 128), np.float32)
     if len(sample) <= number:
         return sample
+    # cv2 draws from a generator of its own.
     stop = (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, _ROUNDS, 1e-3)
     cv2.setRNGSeed(seed)
     start = rng.permutation(len(sample))[:number]
-    labels = np.argmax(-_distances(sample, sample[start]), axis=1).astype(np.int32)[:, None]
+    # k-means begins with some of the descriptors as centres: cv2 takes them as the labels of all.
+    labels = np.argmin(_distances(sample, sample[start]), axis=1).astype(np.int32)[:, None]
     centres = cv2.kmeans(sample, number, labels, stop, 1, cv2.KMEANS_USE_INITIAL_LABELS)[2]
     return np.asarray(centres, dtype=np.float32)
 
@@ -136,6 +140,7 @@ def find_features(place: SceneFolder, state: State, config: SfmConfig, progress:
     key = step_key(settings, hashes)
     if state.done.get("features") == key and place.database.is_file():
         return
+    # From now on the database is of these images: a step that is cut off goes on with them.
     write_json(place.work / "features.json", {"settings": settings, "hashes": hashes})
     # Images of one size and lens share a camera, unless each is to have its own.
     groups: dict[str, list[str]] = {}
@@ -245,6 +250,7 @@ def _run(
             if process.poll() is None:
                 process.terminate()
                 process.wait()
+    # Exit codes of the worker, in sentences.
     code = process.returncode
     if code == NO_PYCOLMAP:
         raise UsageError("fprf process: pycolmap 4 or newer is needed; install it with: pip install 'pycolmap>=4'")

@@ -142,7 +142,7 @@ class Lens(NamedTuple):
     focal: float = 0.0
     """Millimetres; 0 where the file does not say."""
     focal_35: int = 0
-    """The same as on 35 mm film."""
+    """Focal length on 35 mm film of the same angle."""
 
 
 def read_lens(path: Path) -> Lens:

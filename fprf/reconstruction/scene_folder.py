@@ -50,7 +50,7 @@ class State:
     source: str = ""
     """Source of the images."""
     images: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Of each used image by its name: sha256, width, height, lens."""
+    """Used images by name, each with sha256, width, height and lens."""
     dropped: dict[str, str] = field(default_factory=dict)
     """Files or frames that were not used, with the reason."""
     done: dict[str, str] = field(default_factory=dict)

@@ -29,6 +29,7 @@ from ..interfaces import Partition, State
 from ..ops.rasterise import lift
 from ..ops.rasterise_training import compile_beside
 from ..progress import Display
+from ..rendering.cameras import Cameras
 from ..training import checkpoint
 from ..training.camera_optimizers import Tones
 from ..training.driver import Schedule
@@ -48,7 +49,7 @@ from .training import build, light_and_poses, limit_widths, scene_scale
 
 Number = TypeVar("Number", bound=np.generic)
 _FORMAT = 6
-"""Of what a cell is trained as."""
+"""Version of how a cell is trained: another one trains it anew."""
 _MOMENTS = "first", "second", "weight"
 _PIXELS, _SMALLEST = 16_000_000, 4
 """Pixels of all photographs that the whole scene is trained on, at most; how far they are reduced before some are left out."""
@@ -86,7 +87,7 @@ class Cells(Partition):
         return self._facts
 
     def train(self, run: Run, display: Display, *, spent: float) -> None:
-        """The whole scene, all cells, those with the largest windows first, and their union. Finished ones stay."""
+        """Train the whole scene and all cells, those with the largest windows first, and unite them. Finished ones stay."""
         config, size = self.config, self.scene.cameras.size
         for process in self.compiling:
             process.wait()
@@ -163,8 +164,9 @@ class CellPart(Part):
         images, masks, skies = crop(cell, images), crop(cell, masks), crop(cell, skies)
         # Gaussians of the whole scene that these show.
         near, whole = float(start.model["near"]), from_tensors(start.model)
-        shown = shown_in_windows(scene, cell, whole, near)
-        gaussians, own = whole.select(shown), scene_in_windows(scene, cell)
+        own = scene_in_windows(scene, cell)
+        shown = shown_in_windows(own.cameras, cell, whole, near)
+        gaussians = whole.select(shown)
         # Only what lies inside and in the border becomes more: its share of all that may be added.
         around = int(cell.around(gaussians.means).sum())
         cap = len(gaussians) + round(max(config.cap - len(whole), 0) * around / len(whole))
@@ -200,9 +202,10 @@ def open_cell(task: Task) -> Overview | CellPart:
     folder, facts, config = folder_of(root, number), Run(root).load_known().facts, Run(root).load_config()[0]
     assert isinstance(config, GaussiansConfig)  # by its kind
     scene = read_scene(replace(config, data=Path(task.data)), facts)
+    # Fields of the config that may change without training a part anew.
     free = (*RESUMABLE, *config.untrained, "cells")
     if number == WHOLE:
-        own, every = reduced(replace(config, data=Path(task.data)), scene)
+        own, every = overview_config(replace(config, data=Path(task.data)), scene)
         return Overview(
             name="whole scene",
             folder=folder,
@@ -235,11 +238,12 @@ def open_cell(task: Task) -> Overview | CellPart:
     )
 
 
-def reduced(config: GaussiansConfig, scene: Scene) -> tuple[GaussiansConfig, int]:
+def overview_config(config: GaussiansConfig, scene: Scene) -> tuple[GaussiansConfig, int]:
     """How the whole scene is trained before its cells, and which one of so many photographs it learns from.
 
     Of smaller images, then of fewer, where memory would not be bounded.
     """
+    # Memory is in proportion to the pixels: half the size, then a third, a quarter, and then every other photograph ...
     pixels, factor = int(scene.cameras.size[scene.train].prod(1).sum()), 2
     while factor < _SMALLEST and pixels > factor**2 * _PIXELS:
         factor += 1
@@ -285,12 +289,12 @@ def crop(cell: Cell, images: dict[int, NDArray[Number]]) -> dict[int, NDArray[Nu
     return cropped
 
 
-def shown_in_windows(scene: Scene, cell: Cell, gaussians: Gaussians, near: float) -> Annotated[Tensor, "N"]:
+def shown_in_windows(cameras: Cameras, cell: Cell, gaussians: Gaussians, near: float) -> Annotated[Tensor, "N"]:
     """True for Gaussians that a window shows, and for all in the cell and its border.
 
-    What others hide, and what covers next to nothing, is not shown, so their number does not grow with the scene.
+    `cameras` are those of `scene_in_windows`. What others hide, and what covers next to nothing, is not shown, so their number
+    does not grow with the scene.
     """
-    cameras = scene_in_windows(scene, cell).cameras
     visible = cell.around(gaussians.means)
     # Runs [B R] of Gaussians near to each other, the last one repeated, with balls around what they show: most windows
     # show few of them.

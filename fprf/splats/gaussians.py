@@ -59,7 +59,7 @@ class Gaussians:
 
     @property
     def opacities(self) -> Annotated[Tensor, "N"]:
-        """In [0, 1]."""
+        """Opacities in [0, 1]."""
         return torch.sigmoid(self.logits)
 
     @property
@@ -83,7 +83,7 @@ class Gaussians:
         return bounded & turned
 
     def _sound(self) -> tuple[Annotated[Tensor, "N"], Annotated[Tensor, "N"]]:
-        """Whether numbers are within bounds, and whether there is a rotation."""
+        """Masks of the Gaussians whose numbers are within bounds, and of those that have a rotation."""
         parts = (self.means, self.quaternions, self.harmonics.flatten(1))
         small = torch.stack([(part.abs() < _LARGEST).all(1) for part in parts]).all(0)
         sized = (self.log_scales <= _WIDEST).all(1)  # False for NaN
@@ -117,7 +117,7 @@ class GaussianRows:
     count: int
     part: Callable[[slice], Gaussians]
     antialiased: bool
-    """Their opacities are compensated for the width that drawing adds (Mip-Splatting)."""
+    """Opacities are compensated for the width that drawing adds (Mip-Splatting)."""
 
 
 def from_arrays(

@@ -55,7 +55,7 @@ from .photographs import Level
 from .scene import SplatScene, run_scene
 
 _START_OPACITY, _START_SCALE, _FAR_OPACITY = 0.3, 0.7, 0.9
-"""Of the first Gaussians: opacity, standard deviation as a share of the distance to their neighbours, opacity far away."""
+"""First Gaussians: opacity, standard deviation as a share of the distance to their neighbours, opacity far away."""
 _RATES = {"means": 2.5e-3, "scales": 0.08, "quats": 0.016, "opacities": 0.1, "sh0": 0.07, "shN": 0.01}
 """Learning rates at the beginning, the means' in units of the scene scale. They fall to a fifth, the means' to a twentieth."""
 _DECAY, _DECAY_EVERY = 3e-3, 20
@@ -72,7 +72,7 @@ _DEAD = 0.005
 _SKY, _SEEN = 0.7, 1.0
 """Share of a Gaussian's weight in sky, and its least weight in pixels of these views, from which on it is moved."""
 _SPLIT_SIZE, _SPLIT_DISTANCE, _SPLIT_OPACITY = 0.6, 0.5, 0.85
-"""Of both halves: size and distance from the middle along the longest axis, as shares of its size, and share of the opacity."""
+"""Halves: size and distance from the middle along the longest axis, as shares of its size; share of the opacity."""
 _SMOOTHING = 0.95
 """Decay of running means."""
 MOVES = "poses.moves"

@@ -32,7 +32,7 @@ _CHUNK, _GROUP, _LEVELS = 512, 4, 4
 _DEVIATIONS = 3.0
 """How far a Gaussian reaches, in standard deviations."""
 _FARTHEST, _WIDENED = 3.5, 2.0
-"""The same where nothing may be left out, down to opacities of 1/255; pixels by which drawing widens them."""
+"""Reach in standard deviations where nothing may be left out, down to opacities of 1/255; pixels that drawing widens it by."""
 _OPAQUE = 0.995
 _TAIL = 0.02
 """Share of the means at either end that does not say how long a chunk is."""
@@ -62,11 +62,11 @@ class Levels:
     """Distances over which a level merges, in world units; 0 in the finest."""
     centre: Annotated[NDArray[np.float64], "B 3"]
     radius: Annotated[NDArray[np.float64], "B"]
-    """Of a ball around all that a chunk shows."""
+    """Radius of a ball around all that a chunk shows."""
     core: Annotated[NDArray[np.float64], "B"]
-    """Of a ball around nearly all means of a chunk."""
+    """Radius of a ball around nearly all means of a chunk."""
     order: Annotated[NDArray[np.int32], "N"]
-    """Which Gaussian each row of the finest level is, chunk after chunk."""
+    """Number of the Gaussian in each row of the finest level, chunk after chunk."""
     mapped: mmap.mmap | None = None
     """The file that the rows lie in: of its pages none stays in memory."""
 
@@ -264,7 +264,7 @@ def _chunks(position: Annotated[NDArray[np.float64], "N 3"], index: NDArray[np.i
 
 
 def _shares(gaussians: Gaussians) -> tuple[Annotated[Tensor, "M*4"], Annotated[Tensor, "M 4 1"], Annotated[Tensor, "M 4 1"]]:
-    """Which Gaussians are merged, `_GROUP` after `_GROUP`, their shares of what they become, and their weights."""
+    """Numbers of the Gaussians that are merged, `_GROUP` by `_GROUP`, their shares of what they become, and their weights."""
     missing = -len(gaussians) % _GROUP
     index = torch.arange(len(gaussians) + missing).clamp_max(len(gaussians) - 1)
     areas = gaussians.log_scales.double().exp().topk(2, dim=1).values.prod(1)

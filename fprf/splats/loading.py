@@ -29,7 +29,7 @@ from .scene import SplatScene, run_scene
 from .semantics import Semantics, load_semantics, semantics_tensors
 
 _FIT_RATE, _FIT_STEPS = 2e-3, 120
-"""Of the poses of views that the scene is not learnt from: `GaussiansConfig.poses`, and steps of each view."""
+"""Rate of poses (`GaussiansConfig.poses`) and steps of each view, where poses of views are fitted to a finished scene."""
 _LEVELS, _MANY = "levels", 400_000
 """Folder of a run; Gaussians from which on levels of detail are kept there and mapped, not made in memory."""
 

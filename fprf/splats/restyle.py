@@ -34,7 +34,7 @@ class Colours(Encoder):
 
     @property
     def identity(self) -> str:
-        """They have no weights."""
+        """A constant: there are no weights."""
         return "colours"
 
     @property

@@ -48,7 +48,7 @@ class SplatScene(Scene):
     """Gaussians with views of them, all on the CPU."""
 
     gaussians: Gaussians
-    """As they were captured; all finite."""
+    """Gaussians as they were captured; all finite."""
     antialiased: bool
     views: Cameras
     view_names: tuple[str, ...]
@@ -57,14 +57,14 @@ class SplatScene(Scene):
     encoder: Callable[[], Encoder]
     """The encoder of these semantics, for references: built when first needed."""
     longest: int
-    """Longest side in pixels at which that was looked at."""
+    """Longest side in pixels of the views that semantics were found in; references are encoded at that size."""
     near: float = 0.01
     """Nothing is drawn nearer to a camera, along z."""
     background: tuple[float, float, float] = (0.5, 0.5, 0.5)
     resolution: float = 1.0
     """Share of a view's width and height that is rendered."""
     look: Restyle | None = None
-    """None = as captured."""
+    """Look that it is drawn in; None = as captured."""
     tone: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Factors of rendered colours, applied last."""
     merged: float | None = None
@@ -110,7 +110,7 @@ class SplatScene(Scene):
         return gaussians.recoloured(restyled_harmonics(gaussians.harmonics, gaussians.means, features, self.look))
 
     def gaussian_rows(self) -> GaussianRows:
-        """All of them, in the scene's look."""
+        """All Gaussians in the scene's look, to be read in parts."""
         return GaussianRows(len(self.gaussians), self.part, self.antialiased)
 
     @cached_property

@@ -105,7 +105,7 @@ class _Sphere(NamedTuple):
     radius: float
 
     def encloses(self, means: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
-        """Whether means lie well within."""
+        """Mask of the means that lie well within."""
         apart: Tensor = (means - self.centre).norm(dim=1)
         return apart < _INSIDE_SPHERE * self.radius
 

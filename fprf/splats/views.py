@@ -30,7 +30,7 @@ from .photographs import camera_of, cover
 _LIFTS = (-8.0, 12.0, 32.0, 55.0)
 """Heights of the rings, in degrees above the middle."""
 _DISTANCES = (1.2, 1.7)
-"""Of the rings; at 1 the object just fits into the view."""
+"""Distances of the rings; at 1 the object just fits into the view."""
 OUTLYING = 128.0
 """Extents of the bulk from it, beyond which Gaussians are stray."""
 _FOV, _WIDE = 45.0, 70.0
@@ -57,7 +57,7 @@ _GRIDS = ((17, 3.0), (9, 0.375))
 _AROUND = (0.08, 0.2)
 """Distances of the cameras from that place, relative to the median distance of what they see."""
 _BACK = (0.0, 0.25)
-"""And against the mean direction of what is seen."""
+"""Distances behind that place, against the mean direction of what is seen, in the same unit."""
 _TARGETS, _NARROW = 12, 55.0
 """Directions looked in from there, and the vertical angle in degrees."""
 _CLOSE, _BLUR = 0.15, 3.0
@@ -96,7 +96,7 @@ class SeenMeans(NamedTuple):
     no compensation of opacities (Mip-Splatting), as in browsers and .splat files."""
 
     functions: Annotated[Tensor, "N K"]
-    """Of the functions of the harmonics, at most those of degree 3."""
+    """Means of the functions of the harmonics, at most those of degree 3."""
     opacities: Annotated[Tensor, "N"]
 
     def plain(self, gaussians: Gaussians) -> Gaussians:
