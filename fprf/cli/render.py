@@ -13,7 +13,7 @@ from ..progress import Display
 from ..style.config import StyleConfig
 from ..style.keyframes import keyed_looks, read_keyframes
 from ..training.quality import QualityConfig
-from .style_flags import named_styles, read_flags, say
+from .style_flags import named_styles, read_flags
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
@@ -178,7 +178,7 @@ def _takes(scene: "Scene", config: RenderVerbConfig, file: "StyleFile") -> "list
         if text == "plain":
             takes.append(Take("plain", lambda frame: scene))
         else:
-            ((name, named),) = named_styles([text], file, say)
+            ((name, named),) = named_styles([text], file)
             takes.append(_styled_take(scene, name, named))
     takes = takes or [Take("plain", lambda frame: scene)]
     if "match" in config.show and not any(take.styled is not None for take in takes):

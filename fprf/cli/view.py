@@ -139,13 +139,13 @@ def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[st
     from ..plugins.stylizers.config import RegionToneConfig
     from ..splats.config import LookConfig
     from ..splats.files import read_capture
-    from .restyle import seen_capture
+    from ..splats.loading import open_capture
 
     def progress(done: int, total: int) -> None:
         if done == 0:
             notify("looking at the capture, once; a photograph can be dropped already")
 
     capture, look = read_capture(path), LookConfig(up=config.up, inside=config.inside, semantic=config.semantic)
-    scene = seen_capture(capture, look, progress=progress)
+    scene = open_capture(capture, look, progress=progress)
     name = name or path.resolve().name.partition(".")[0]
     return Viewed(scene, name, 0, root=config.output / name, capture=capture, stylizer=RegionToneConfig(centred=False))
