@@ -2,20 +2,18 @@
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..checks import at_least, positive
 from ..errors import FprfError, UsageError
-from ..plugins.stylizers.config import StylizerConfig
 from ..progress import Display
 from ..style.config import StyleConfig
 from ..style.files import StyleFile, check_photographs, read_style
 from ..training.quality import QualityConfig
-from .parsing import parse
-from .style_flags import read_preset, say, with_presets_named
+from .style_flags import read_flags
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
@@ -36,27 +34,15 @@ Each reference is a style of its own; with several of them all together are one 
 
 
 @dataclass(frozen=True, kw_only=True)
-class GalleryConfig(QualityConfig):
+class GalleryConfig(StyleConfig, QualityConfig):
     """Views and styles of the page."""
 
     run: Path = Path()
     """Run folder."""
-    references: tuple[Path, ...] = ()
-    """Photographs, or folders of them."""
     styles: tuple[Path, ...] = ()
     """Style files (style.json), each one more style."""
     together: bool = True
     """Also show all photographs as one style."""
-    strength: float = 1.0
-    """0 leaves the scene as it is, 1 is the full style; of photographs."""
-    luminance: float = 0.0
-    """Share of the scene's own luminance that is kept, in [0, 1]; of photographs."""
-    clusters: int = StyleConfig().clusters
-    """Local styles per photograph, at least 1."""
-    blend: float = StyleConfig().blend
-    """Share of the overall style in each local one, in [0, 1]; of photographs."""
-    stylizer: StylizerConfig = StyleConfig().stylizer
-    """Method that moves the scene's features; of photographs."""
     split: Literal["covered", "test", "train", "all"] = "covered"
     """Views to choose from. covered: at most 8, those that training views surround; test: those held out from training."""
     most: int = 6
@@ -77,34 +63,20 @@ class GalleryConfig(QualityConfig):
     """cpu, cuda, mps, or auto."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        self.style_of()
+        StyleConfig.__post_init__(self)
+        QualityConfig.__post_init__(self)
         at_least("most", self.most, 1)
         at_least("frames", self.frames, 0)
         positive("megabytes", self.megabytes)
 
-    def style_of(self, *references: Path) -> StyleFile:
-        """The style of some photographs. Raises ConfigError for a value out of its range."""
-        return StyleFile(
-            StyleConfig(
-                references=references,
-                strength=self.strength,
-                luminance=self.luminance,
-                clusters=self.clusters,
-                blend=self.blend,
-                stylizer=self.stylizer,
-            )
-        )
-
 
 def run(args: list[str]) -> int:
     """Render the views in every style, film, write the page."""
-    default, args = read_preset(GalleryConfig(), args)
-    config = parse(default, args, prog="fprf gallery", description=with_presets_named(_DESCRIPTION), positional=("run",))
+    config, file = read_flags(GalleryConfig(), args, prog="fprf gallery", description=_DESCRIPTION, positional=("run",))
     output = config.output if config.output is not None else config.run / "gallery.html"
     if output.suffix.lower() != ".html":
         raise UsageError(f"--output {output}: the page is an .html file; give such a name")
-    from ..datamanagers.images import load_image, photographs
+    from ..datamanagers.images import load_image
     from ..io.video import write_video
     from ..page.writer import Page, Reference, write_page
     from ..plugins.codec import read_json
@@ -112,15 +84,14 @@ def run(args: list[str]) -> int:
     from ..splats.scene import SplatScene
     from ..training.loading import open_run
 
-    references = photographs(config.references, say)
     opened = open_run(config.run, config.device, config)
     known, scene = opened.known, opened.scene
     views = known.views(config.split, config.views)
     # Evenly from the split; views that are named are all shown.
     most = len(views) if config.views else min(config.most, len(views))
     views = [views[k * len(views) // most] for k in range(most)]
-    chosen = _chosen(config, references)
-    called = _called([*references, *(path for _, file in chosen for path in file.style.references)])
+    chosen = _chosen(config, file)
+    called = _called([*config.references, *(path for _, each in chosen for path in each.style.references)])
     film = None
     with Display() as display:
         originals = page_views(opened, views, display)
@@ -156,18 +127,19 @@ def run(args: list[str]) -> int:
     return 0
 
 
-def _chosen(config: GalleryConfig, references: list[Path]) -> list[tuple[str, StyleFile]]:
+def _chosen(config: GalleryConfig, together: StyleFile) -> list[tuple[str, StyleFile]]:
     """The styles with their names. Raises UsageError where there are none."""
-    names = _called(references)
-    chosen = [(name, config.style_of(path)) for path, name in names.items()]
+    names = _called(config.references)
+    # What names photographs one by one does not hold where each is alone.
+    alone = replace(together.style, weights=(), masks=(), pin=(), forbid=())
+    chosen = [(name, StyleFile(replace(alone, references=(path,)))) for path, name in names.items()]
     for path in config.styles:
         file = read_style(path)
         check_photographs(path, file)
         own = path.resolve().parent.name if path.name == "style.json" else path.stem
         chosen.append((f"{own} ({len(chosen) + 1})" if own in dict(chosen) else own, file))
-    if config.together and len(references) > 1:
-        joined = " + ".join(names.values()) if len(names) <= 3 else f"all {len(names)}"
-        chosen.append((joined, config.style_of(*references)))
+    if config.together and len(names) > 1:
+        chosen.append((" + ".join(names.values()) if len(names) <= 3 else f"all {len(names)}", together))
     if not chosen:
         raise UsageError("fprf gallery: name photographs with --references, or style files with --styles")
     return chosen

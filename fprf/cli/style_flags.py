@@ -13,7 +13,6 @@ from ..style.files import StyleFile, check_photographs, read_style, with_folders
 from .parsing import parse
 
 C = TypeVar("C", bound=StyleConfig)
-D = TypeVar("D")
 
 _LONGEST = 60
 """Characters of a style's name, which file names carry."""
@@ -33,10 +32,14 @@ def read_flags(
     file = read_style(path) if path is not None else StyleFile(StyleConfig())
     if path is not None:
         default = replace(default, **_styles(file.style))
-    default, args = read_preset(default, args)
-    config = parse(
-        default, _joined(args, default), prog=prog, description=with_presets_named(description), positional=positional
-    )
+    flags = {f"--{name}": name for name in PRESETS}
+    for flag in (arg for arg in args if arg in flags):
+        print(f"{flag}: {preset_flags(flags[flag])}")
+        default = with_preset(default, flags[flag])
+    args = [arg for arg in args if arg not in flags]
+    meanings = [f"{flag} stands for {preset_flags(name)}; other flags come over it." for flag, name in flags.items()]
+    about = "\n\n".join([description, *meanings])
+    config = parse(default, _joined(args, default), prog=prog, description=about, positional=positional)
     config = with_folders(config, say)
     file = file._replace(style=StyleConfig(**_styles(config)))
     given = {arg.partition("=")[0] for arg in args}
@@ -48,22 +51,6 @@ def read_flags(
 def say(text: str) -> None:
     """A line on standard error."""
     print(text, file=sys.stderr)
-
-
-def read_preset(default: D, args: Sequence[str]) -> tuple[D, list[str]]:
-    """The default with the preset whose flag is among the arguments, and the other arguments; says what the preset sets."""
-    flags = [f"--{name}" for name in PRESETS]
-    for flag in (arg for arg in args if arg in flags):
-        print(f"{flag}: {preset_flags(flag[2:])}")
-        default = with_preset(default, flag[2:])
-    return default, [arg for arg in args if arg not in flags]
-
-
-def with_presets_named(description: str) -> str:
-    """A verb's description, with the presets that it takes."""
-    return "\n\n".join(
-        [description, *(f"--{name} stands for {preset_flags(name)}; other flags come over it." for name in PRESETS)]
-    )
 
 
 def _styles(config: StyleConfig) -> dict[str, Any]:
