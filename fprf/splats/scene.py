@@ -34,13 +34,11 @@ from ..ops.rasterise_reference import MIN_ALPHA
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.cameras import Cameras, pixel_grid
 from ..rendering.renderer import enlarged
-from ..style.colours import ColourMaps
-from ..style.dictionary import StyleDictionary
-from ..style.look import Restyle
-from ..style.references import Encoders
-from ..style.scene import SceneStyle, membership, region_contacts, region_units, scene_style
-from ..style.scene import from_tensors as style_from
-from ..style.scene import to_tensors as style_tensors
+from ..style.dictionary import Encoders, StyleDictionary
+from ..style.look import ColourMaps, Restyle
+from ..style.scene_style import SceneStyle, membership, region_contacts, region_units, scene_style
+from ..style.scene_style import from_tensors as style_from
+from ..style.scene_style import to_tensors as style_tensors
 from ..training.camera_optimizers import Tones
 from ..types import Origin, View
 from .config import LookConfig
