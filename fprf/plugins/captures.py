@@ -6,12 +6,14 @@ the longest does (`compressed.ply` before `ply`).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from mmap import mmap
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 from ..errors import DataError
-from ..io.atomic import write_bytes
+from ..io.atomic import atomic_path
 from . import registry
 from .config import PluginConfig
 
@@ -22,6 +24,10 @@ if TYPE_CHECKING:
     from ..splats.files import Capture
     from ..splats.gaussians import Gaussians
     from ..types import Origin
+
+
+Data: TypeAlias = bytes | mmap
+"""The content of a file: large ones are mapped. Both are sliced into bytes, and read by np.frombuffer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,12 +47,12 @@ class CaptureFormat(PluginConfig):
         """False where a file of `size` bytes that begin with `head` is certainly damaged or of another format."""
         raise NotImplementedError
 
-    def read(self, path: Path, data: bytes) -> Capture:
+    def read(self, path: Path, data: Data) -> Capture:
         """The Gaussians of a file, and how to recolour it. Raises DataError for anything else than a sound file."""
         raise NotImplementedError
 
-    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> bytes:
-        """A file of these Gaussians, on the CPU. `origin` is to be added to their positions; it is 0 unless `exact`."""
+    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> Iterable[bytes]:
+        """The file of these Gaussians, on the CPU, in pieces. `origin` is to be added to their positions; 0 unless `exact`."""
         raise NotImplementedError
 
     def keeps(self, gaussians: Gaussians) -> NDArray[np.bool_] | None:
@@ -61,9 +67,10 @@ class CaptureFormat(PluginConfig):
         """Whether a capture's own file, recoloured, is a file of this format."""
         return type(read_as) is type(self)
 
-    def write(self, path: Path, data: bytes) -> None:
+    def write(self, path: Path, pieces: Iterable[bytes]) -> None:
         """Write what `pack` or `Capture.recolour` gave, whole or not at all."""
-        write_bytes(path, data)
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            file.writelines(pieces)
 
 
 def endings() -> tuple[str, ...]:

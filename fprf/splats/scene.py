@@ -31,6 +31,7 @@ from ..ops.guided import upsample
 from ..ops.local_mixture import explained
 from ..ops.rasterise import Pinhole, lift
 from ..ops.rasterise_reference import MIN_ALPHA
+from ..plugins.captures import Data
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.cameras import Cameras, pixel_grid
 from ..rendering.renderer import enlarged
@@ -507,7 +508,7 @@ def _group(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:
     return {key.partition(".")[2]: tensor for key, tensor in tensors.items() if key.startswith(f"{name}.")}
 
 
-def cache_name(data: bytes, encoder: str, config: LookConfig) -> str:
+def cache_name(data: Data, encoder: str, config: LookConfig) -> str:
     """A name for what is found out about a file: by its content, the encoder, and how it is looked at."""
     digest = hashlib.sha256(data)
     digest.update(f"9 {encoder} {config.up} {config.inside} {config.views} {config.size} {config.regions}".encode())
