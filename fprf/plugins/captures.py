@@ -39,6 +39,8 @@ class CaptureFormat(PluginConfig):
     view_dependent: ClassVar[bool] = True
     """It holds harmonics, and whether opacities are compensated for antialiasing. Where it does not, it is given the mean
     colours and opacities that views show."""
+    writes: ClassVar[bool] = True
+    """False = files of it are read alone, and what was read from them is written as another format."""
     exact: ClassVar[bool] = False
     """It holds every number as it is, NaN too, and positions in float64. Where it does not, it is given Gaussians that can be
     drawn, about a local origin that stands in a file beside."""
@@ -53,7 +55,7 @@ class CaptureFormat(PluginConfig):
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> Iterable[bytes]:
         """The file of these Gaussians, on the CPU, in pieces. `origin` is to be added to their positions; 0 unless `exact`."""
-        raise NotImplementedError
+        raise DataError(f"{type(self).__name__}: files of this format are read, not written; name a .ply, .spz, .sog or .glb")
 
     def keeps(self, gaussians: Gaussians) -> NDArray[np.bool_] | None:
         """Gaussians [N] that a file holds: all but outliers that would cost the others their precision; None = all."""
@@ -65,7 +67,7 @@ class CaptureFormat(PluginConfig):
 
     def holds(self, capture: Capture, read_as: CaptureFormat) -> bool:
         """Whether a capture's own file, recoloured, is a file of this format."""
-        return type(read_as) is type(self)
+        return self.writes and type(read_as) is type(self)
 
     def write(self, path: Path, pieces: Iterable[bytes]) -> None:
         """Write what `pack` or `Capture.recolour` gave, whole or not at all."""
@@ -83,7 +85,9 @@ def format_name(path: Path) -> str | None:
     name = path.name.lower()
     if name == "meta.json":
         return "sog"
-    return max((each for each in registry.installed(CaptureFormat.group) if name.endswith(f".{each}")), key=len, default=None)
+    installed = registry.installed(CaptureFormat.group)
+    fits = [each for each in installed if name.endswith(f".{each}") or (name == each and "." in each)]
+    return max(fits, key=len, default=None)
 
 
 def format_of(path: Path) -> CaptureFormat:

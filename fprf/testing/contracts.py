@@ -389,6 +389,12 @@ def check_capture_format(form: CaptureFormat) -> None:
 
     check_config(form)
     name, path = type(form).__name__, Path("capture")
+    if not form.writes:
+        try:
+            form.read(path, b"")
+        except DataError:
+            return
+        require(False, f"{name}: an empty file must raise DataError")
     made = Gaussians(
         cases.normal(50, 3, seed=30),
         torch.nn.functional.normalize(cases.normal(50, 4, seed=31), dim=1),

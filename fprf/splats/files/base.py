@@ -71,19 +71,22 @@ def pieces(count: int) -> Iterator[slice]:
         yield slice(start, min(start + ROWS, count))
 
 
-def decoded(count: int, bands: int, part: Callable[[slice], tuple[Floats, ...]]) -> tuple[Gaussians, Origin]:
+def decoded(bands: int, *sections: tuple[int, Callable[[slice], tuple[Floats, ...]]]) -> tuple[Gaussians, Origin]:
     """Gaussians about their local origin, and that: decoded piece by piece.
 
-    `part` gives means [n 3], quaternions [n 4], ln-scales [n 3], logits [n] and harmonics [n K 3] of some rows, of any type.
+    Each section has a number of rows and a function that gives means [n 3], quaternions [n 4], ln-scales [n 3], logits [n] and
+    harmonics [n K 3] of some of them, of any type.
     """
-    means = np.empty((count, 3))
+    count, start = sum(number for number, _ in sections), 0
     shapes = ((count, 4), (count, 3), (count,), (count, bands, 3))
-    parts: list[Floats] = [means, *(np.empty(shape, np.float32) for shape in shapes)]
-    for rows in pieces(count):
-        for whole, some in zip(parts, part(rows), strict=True):
-            whole[rows] = some
-    shift = local_origin(torch.from_numpy(means))
-    means -= shift
+    parts: list[Floats] = [np.empty((count, 3)), *(np.empty(shape, np.float32) for shape in shapes)]
+    for number, part in sections:
+        for rows in pieces(number):
+            for whole, some in zip(parts, part(rows), strict=True):
+                whole[start + rows.start : start + rows.stop] = some
+        start += number
+    shift = local_origin(torch.from_numpy(parts[0]))
+    parts[0] -= shift
     return from_arrays(parts[0], parts[1], parts[2], parts[3], parts[4]), shift
 
 

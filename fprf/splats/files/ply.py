@@ -283,7 +283,7 @@ def _read_inria(path: Path, data: Data, elements: Mapping[str, _Element]) -> Cap
             yield table.tobytes()
         yield data[vertex.offset + vertex.rows * vertex.kind.itemsize :]
 
-    gaussians, shift = decoded(vertex.rows, count, part)
+    gaussians, shift = decoded(count, (vertex.rows, part))
     return Capture(path, gaussians, False, data, recolour, shift=shift)
 
 
@@ -343,7 +343,7 @@ def _read_compressed(path: Path, data: Data, elements: Mapping[str, _Element]) -
             target["sh"][name][changed] = column[changed]
         return [bytes(out)]
 
-    gaussians, shift = decoded(count, 1 + len(rest) // 3, part)
+    gaussians, shift = decoded(1 + len(rest) // 3, (count, part))
     return Capture(path, gaussians, False, data, recolour, shift=shift)
 
 

@@ -122,7 +122,7 @@ class Sog(CaptureFormat):
             return [bundle(files | {folder + name: content for name, content in new.items()}, like=data)]
 
         antialiased = meta.get("antialias") is True or meta.get("model") == "antialiased"
-        gaussians, shift = decoded(count, 1 + rest.shape[1], part)
+        gaussians, shift = decoded(1 + rest.shape[1], (count, part))
         return Capture(path, gaussians, antialiased, data, recolour, shift=shift)
 
     def keeps(self, gaussians: Gaussians) -> Bools:

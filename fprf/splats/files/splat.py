@@ -46,7 +46,7 @@ class Splat(CaptureFormat):
             out["rgba"][changed, :3] = steps(colours_of(harmonics[changed]), 255)
             return [out.tobytes()]
 
-        gaussians, shift = decoded(len(whole), 1, part)
+        gaussians, shift = decoded(1, (len(whole), part))
         return Capture(path, gaussians, False, data, recolour, shift=shift)
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:

@@ -143,7 +143,7 @@ class Spz(CaptureFormat):
             whole = b"".join([unpacked[: header.size], *parts, extensions])
             return [_zipped(whole), after] if packed else [whole]
 
-        gaussians, shift = decoded(count, bands, part)
+        gaussians, shift = decoded(bands, (count, part))
         return Capture(path, gaussians, bool(header.flags & 1), data, recolour, shift=shift)
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
