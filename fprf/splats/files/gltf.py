@@ -239,8 +239,11 @@ def _parts(path: Path, document: dict[str, Any], data: Data | bytearray, start: 
             if extension.get("extensions"):
                 raise DataError(f"{path}: Gaussians packed by {', '.join(extension['extensions'])}; export them uncompressed")
             columns = {name: _column(document, data, start, at) for name, at in primitive["attributes"].items()}
-            if not {*_SHAPE, _HARMONICS[0]} <= {*columns} or len({len(column) for column in columns.values()}) > 1:
-                raise DataError(f"{path}: Gaussians without one of {', '.join(_SHAPE)}, or of unequal numbers; export it again")
+            widths = {name: columns[name].shape[1] for name in columns if name in _SHAPE or name in _HARMONICS}
+            wanted = dict.fromkeys(_HARMONICS, 3) | dict(zip(_SHAPE, (3, 4, 3, 1), strict=True))
+            sound = {*_SHAPE, _HARMONICS[0]} <= {*columns} and all(wanted[name] == width for name, width in widths.items())
+            if not sound or len({len(column) for column in columns.values()}) > 1:
+                raise DataError(f"{path}: Gaussians without one of {', '.join(_SHAPE)}, or of unequal shapes; export it again")
             linear, scale = matrix[:3, :3], float(np.cbrt(np.linalg.det(matrix[:3, :3])))
             if not scale > 0 or not np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() < 1e-3:
                 raise DataError(f"{path}: a node shears, mirrors or stretches its Gaussians; apply its transform first")

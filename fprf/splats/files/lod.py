@@ -39,7 +39,7 @@ class StreamedSog(CaptureFormat):
             for leaf in _leaves(index["tree"]):
                 level = leaf["lods"][min(leaf["lods"], key=int)]
                 first, count = level["offset"], level["count"]
-                if first < 0 or count < 0 or level["file"] < 0:
+                if not all(isinstance(number, int) and number >= 0 for number in (first, count, level["file"])):
                     raise ValueError(f"a leaf of {count} Gaussians from {first} on")
                 wanted.setdefault(index["filenames"][level["file"]], []).append(slice(first, first + count))
             if index.get("environment"):
