@@ -4,7 +4,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console
 from rich.table import Table
@@ -52,7 +52,7 @@ def run(args: list[str]) -> int:
     return 0
 
 
-def evaluate(config: EvalConfig) -> dict[str, object]:
+def evaluate(config: EvalConfig) -> dict[str, Any]:
     """Judge a run of any kind; write metrics.json and, if they are wanted, the renders, and return what is written.
 
     Raises UsageError where the images at hand are not those of the run, or the split has no views.
