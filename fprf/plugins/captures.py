@@ -98,3 +98,10 @@ def format_of(path: Path) -> CaptureFormat:
             f"{path}: no file of Gaussians by its name; known endings are {', '.join(endings())}, or meta.json of a SOG folder"
         )
     return registry.make(CaptureFormat.group, name, CaptureFormat)
+
+
+def is_scene(path: Path) -> bool:
+    """Whether a path is that of a capture or of a run, and so of no photograph."""
+    if path.is_dir():
+        return any((path / name).is_file() for name in ("meta.json", "lod-meta.json", "config.json"))
+    return format_name(path) is not None

@@ -1,8 +1,9 @@
 """The .ksplat file (mkkellogg's GaussianSplats3D), read alone: a header of 4096 bytes, headers of sections of 1024, sections.
 
-Of each Gaussian: position, standard deviations, quaternion w x y z, RGBA bytes and harmonics up to degree 2, degree by degree, in
-each channel by channel. Compression 0: float32; 1 and 2: positions of 16 bits about the centre of a bucket, float16 for the
-rest, and harmonics of float16 or of 8 bits. A section begins with the sizes of its buckets that are not full, and all centres.
+Of each Gaussian: position, standard deviations, quaternion w x y z, RGBA bytes and harmonics up to degree 2, degree by
+degree, in each channel by channel. Compression 0: float32; 1 and 2: positions of 16 bits about the centre of a bucket, float16
+for the rest, and harmonics of float16 or of 8 bits. A section begins with the sizes of its buckets that are not full, and all
+centres.
 """
 
 import struct
