@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from fprf.checks import at_least, between, positive
-from fprf.cli.parsing import as_flag, parse
+from fprf.cli.parsing import parse
 from fprf.errors import ConfigError, UsageError
 from fprf.evaluation.consistency import published
 from fprf.interfaces import Scene, SceneView
@@ -29,10 +29,9 @@ from fprf.plugins.stylizers.config import (
 )
 from fprf.progress import Display
 from fprf.style.config import StyleConfig, labels
-from fprf.style.dictionary import StyleDictionary, build_dictionary
+from fprf.style.dictionary import Encoders, StyleDictionary, build_dictionary, encode_photograph
 from fprf.style.files import StyleFile
-from fprf.style.references import Encoders, encode_photograph
-from fprf.style.restyle import dress
+from fprf.style.restyle import apply_dictionary
 from fprf.training.driver import train
 from fprf.training.loading import open_run
 from fprf.types import Want
@@ -192,7 +191,7 @@ def in_scene(
     """A stylizer of the scene."""
     start = time.perf_counter()
     style = StyleConfig(references=tuple(paths), stylizer=config, bold=bold)
-    look = dress(scene, StyleFile(style), encoders, dictionary).restyle
+    look = apply_dictionary(scene, StyleFile(style), encoders, dictionary).restyle
     spent = time.perf_counter() - start
     pictures, seconds = _each(views, lambda view: view.restyled(look).rgb)
     matched = Want.SEMANTIC in look.stylizer.needs
@@ -563,7 +562,7 @@ def _by_class(document: Mapping[str, Any]) -> str:
 def main(argv: list[str]) -> int:
     """`python -m benchmarks restyle [RUN]`."""
     about = (RestyleConfig.__doc__ or "").strip()
-    config = parse(RestyleConfig(), as_flag(argv, "--run"), prog="python -m benchmarks restyle [RUN]", description=about)
+    config = parse(RestyleConfig(), argv, prog="python -m benchmarks restyle", description=about, positional=("run",))
     with tempfile.TemporaryDirectory(prefix="fprf-restyle-") as made:
         root = config.run
         if root is None:

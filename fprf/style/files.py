@@ -10,7 +10,7 @@ on another scene by its key, since numbers mean something on one scene alone.
 import hashlib
 import os
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from ..errors import ConfigError, DataError
 from ..io.atomic import write_json
+from ..plugins.captures import is_scene
 from ..plugins.codec import from_json, packages_of, read_json, to_json
 from ..plugins.registry import nearest
 from .config import NO_MASK, StyleConfig
@@ -26,7 +27,7 @@ from .config import NO_MASK, StyleConfig
 _FORMAT = 1
 _KEYS = ("format", "fprf", "plugins", "style", "sha256", "semantic_encoder", "regions", "made")
 
-Key = tuple[float, ...]
+RegionKey = tuple[float, ...]
 S = TypeVar("S", bound=StyleConfig)
 
 
@@ -34,7 +35,7 @@ class StyleFile(NamedTuple):
     """Content of a style file; paths relative to the working directory."""
 
     style: StyleConfig
-    regions: Mapping[str, Key] = {}
+    regions: Mapping[str, RegionKey] = {}
     """Regions of the scene that the style was made on, by their semantics in the encoder's own channels."""
     semantic_encoder: str = ""
     """Identity of the encoder that the keys are of."""
@@ -104,7 +105,8 @@ def with_folders(style: S, report: Callable[[str], None] = warnings.warn) -> S:
     Images of folders that cannot be read are left out, and `report` is given the reason. Raises DataError for a folder
     without a readable image, ConfigError for a mask over a folder.
     """
-    if not any(path.is_dir() for path in style.references):
+    folders = {path for path in style.references if path.is_dir() and not is_scene(path)}
+    if not folders:
         return style
     from ..datamanagers.images import photographs
 
@@ -113,9 +115,10 @@ def with_folders(style: S, report: Callable[[str], None] = warnings.warn) -> S:
     for path, weight, mask in zip(
         style.references, style.weights or (1.0,) * count, style.masks or (NO_MASK,) * count, strict=True
     ):
-        if path.is_dir() and mask != NO_MASK:
+        if path in folders and mask != NO_MASK:
             raise ConfigError(f"masks: {mask} is for one photograph, {path} is a folder; write none, or name the photographs")
-        rows |= {file: (weight, mask) for file in photographs([path], report) if file not in rows}
+        files = photographs([path], report) if path in folders else [path]
+        rows |= {file: (weight, mask) for file in files if file not in rows}
     weights, masks = zip(*rows.values(), strict=True)
     return replace(style, references=tuple(rows), weights=weights if style.weights else (), masks=masks if style.masks else ())
 
@@ -147,3 +150,43 @@ def _hash(path: Path) -> str:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
+
+
+class Keyframe(NamedTuple):
+    """A frame, from 0, and its style file; None = the scene as it is."""
+
+    frame: int
+    style: Path | None
+
+
+def read_keyframes(path: Path) -> tuple[Keyframe, ...]:
+    """The keys of a file, by frame. Raises ConfigError naming the file and the key."""
+    whole = read_json(path, 'a keyframe file: {"format": 1, "keyframes": [{"frame": 0, "style": "style.json"}]}')
+    try:
+        if not isinstance(whole, dict) or whole.keys() != {"format", "keyframes"} or whole["format"] != _FORMAT:
+            raise ConfigError(f'expected an object with "format": {_FORMAT} and "keyframes", and nothing else')
+        rows = from_json(whole["keyframes"], list[dict[str, int | str | None]])
+        keys = [_keyframe(path, number, row) for number, row in enumerate(rows)]
+        frames = [key.frame for key in keys]
+        if not keys or len(set(frames)) < len(frames):
+            raise ConfigError("keyframes: at least one is needed, and no two at one frame")
+    except ConfigError as fault:
+        raise ConfigError(f"{path}: {fault}") from fault
+    return tuple(sorted(keys, key=lambda key: key.frame))
+
+
+def fade(frames: Sequence[int], at: int) -> tuple[int, int, float]:
+    """The keys before and after a frame, as places in `frames` (sorted), and how far it is from one to the other, in [0, 1]."""
+    after = next((i for i, frame in enumerate(frames) if frame > at), len(frames))
+    if after == 0 or after == len(frames):
+        only = min(after, len(frames) - 1)
+        return only, only, 0.0
+    way = (at - frames[after - 1]) / (frames[after] - frames[after - 1])
+    return after - 1, after, way * way * (3 - 2 * way)
+
+
+def _keyframe(path: Path, number: int, row: dict[str, int | str | None]) -> Keyframe:
+    frame, style = row.get("frame"), row.get("style")
+    if row.keys() != {"frame", "style"} or not isinstance(frame, int) or frame < 0 or isinstance(style, int):
+        raise ConfigError(f'keyframes.{number}: expected {{"frame": a number from 0, "style": a file or null}}')
+    return Keyframe(frame, None if style is None else path.parent / style)

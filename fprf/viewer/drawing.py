@@ -22,8 +22,8 @@ from ..page.pack import Colours, Packed
 from ..rendering.cameras import Cameras, ideal_cameras
 from ..splats.scene import SplatScene
 from ..style.look import Restyle
-from ..style.regional import RegionWeight
 from ..style.restyle import Styled
+from ..style.scene_style import RegionWeight
 from ..training.loading import Trained
 from ..training.views import Part, view_parts
 from .look import Look
@@ -193,14 +193,15 @@ class FieldPainter:
         """A chunk as it is shown; of the map of depths, depth and opacity."""
         restyle, semantic = None if styled is None else styled.restyle, part.semantic
         if shown.map == "depth":
-            return torch.stack([part.depth, part.opacity], -1)
+            return torch.stack([part.depth, part.opacity], -1).cpu()
         colours: Tensor = part.colour(self._trained.model.decoder, restyle).cpu()
+        opacity = part.opacity.cpu()
         if shown.map == "matches":
             taken = None if styled is None or semantic is None else part.mean(styled.restyle.match(semantic)).cpu()
-            colours = _match_colours(styled, taken, part.opacity)
+            colours = _match_colours(styled, taken, opacity)
         if shown.map == "regions" or shown.region is not None:
             memberships = part.mean(_memberships(self._restyler, part.content[:, :0] if semantic is None else semantic)).cpu()
-            colours = _mapped(colours, memberships, part.opacity, shown)
+            colours = _mapped(colours, memberships, opacity, shown)
         return colours
 
     def _parts(self, cameras: Cameras, view: int) -> Iterable[Part]:
