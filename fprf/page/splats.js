@@ -171,26 +171,20 @@ const woven = (planes, count, width) => {
 };
 
 class Splats {
-  // `head` is that of pack.py; `parts` are its deflated sections. Throws where WebGL 2 is missing.
-  static async make(canvas, head, parts) {
-    const splats = Object.assign(new Splats(), { canvas, styles: new Map(), colours: new Map(), textures: {} });
-    splats.compile(); // the graphics process does it while this one inflates
-    await splats.load(head, parts);
-    return splats;
+  // Throws where WebGL 2 is missing. Shaders compile in the graphics process while this one inflates what is loaded.
+  constructor(canvas) {
+    Object.assign(this, { canvas, styles: new Map(), colours: new Map(), textures: {} });
+    this.compile();
   }
 
-  // Other Gaussians in the place of these; styles have to be added again.
-  async replace(head, parts) {
-    this.worker.terminate();
-    this.colours.clear();
-    const coloured = [...this.styles.values()].flatMap(({ rows, maps }) => [rows, maps]);
-    [...Object.values(this.textures), ...coloured].forEach((texture) => this.gl.deleteTexture(texture));
-    await this.load(head, parts);
-  }
-
+  // Gaussians, in the place of any from before; styles are added then. `head` is that of pack.py; `parts` are its deflated sections.
   async load(head, parts) {
     const [planes, floats, palette] = await Promise.all([parts.shape, parts.chunks, parts.palette].map(inflate));
     const shape = new Uint32Array(woven(planes, head.count, 16).buffer), chunks = new Float32Array(floats.buffer);
+    const coloured = [...this.styles.values()].flatMap(({ rows, maps }) => [rows, maps]);
+    [...Object.values(this.textures), ...coloured].forEach((texture) => this.gl.deleteTexture(texture));
+    this.colours.clear();
+    this.worker?.terminate();
     Object.assign(this, { head, count: head.count, order: null, kept: 0, sortMilliseconds: 0 });
     this.source = { shape, chunks, palette }; // to come back from a lost context
     this.worker = new Worker(URL.createObjectURL(new Blob([`"use strict";(${sorter})()`], { type: "text/javascript" })));

@@ -26,10 +26,9 @@ from ..style.restyle import Styled
 from ..style.scene_style import RegionWeight
 from ..training.loading import Trained
 from ..training.views import Part, view_parts
-from .look import Look
 from .messages import Camera
 from .render_worker import Steps
-from .restyler import Restyler
+from .restyler import Look, Restyler
 
 Map: TypeAlias = Literal["none", "matches", "regions", "depth"]
 CACHE_BYTES = 128 << 20

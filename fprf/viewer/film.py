@@ -26,8 +26,8 @@ from ..style.look import Restyle
 from ..style.restyle import keyed_looks
 from ..types import Origin
 from .drawing import cameras_of
-from .look import Look, style_config
 from .messages import Camera
+from .restyler import Look, style_config
 
 Frame: TypeAlias = Callable[[Cameras, int, Restyle | None], Generator[None, None, Picture]]
 """Renders one frame, step by step."""

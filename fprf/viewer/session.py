@@ -32,9 +32,8 @@ from ..training.run import Known, Run
 from . import messages
 from .drawing import FieldPainter, Map, Request, Shown, cameras_of, gaussian_colours
 from .film import FilmPlan, Key, film_frames, new_folder, write_film_files
-from .look import Look, Photograph, only, renumbered, set_rule, set_weight
 from .render_worker import RenderWorker, Steps
-from .restyler import RegionInfo, Restyler, matching_regions
+from .restyler import Look, Photograph, RegionInfo, Restyler, matching_regions, only, renumbered, set_rule, set_weight
 from .uploads import Uploads, shown_name
 
 Post: TypeAlias = Callable[[Hashable | None, str, "Mapping[str, Any] | bytes"], None]
@@ -174,7 +173,7 @@ class Session:
                 value: Any = int(message.value) if message.name == "clusters" else round(message.value, 4)
                 self.apply(lambda state: replace(state, look=replace(state.look, **{message.name: value})))
             case messages.Preset():
-                values = {path.rpartition(".")[2]: value for path, value in PRESETS[message.name].items()}
+                values: dict[str, Any] = {path.rpartition(".")[2]: value for path, value in PRESETS[message.name].items()}
                 self.apply(lambda state: replace(state, look=replace(state.look, **values)))
             case messages.Card():
                 self.apply(lambda state: _carded(state, message))

@@ -19,7 +19,7 @@ from typing import Any, Literal, TypeAlias
 
 from ..errors import DataError, FprfError, UsageError
 from .messages import Leave, Make, New, Open, StartRequest, Stop
-from .scene_files import SceneFiles, Source, find_source, is_capture, newest_step
+from .uploads import SceneFiles, Source, find_source, is_capture, newest_step
 
 METHOD = "fprf-splats"
 _FILES, _SCENE, _RUN = "files", "scene", "run"
