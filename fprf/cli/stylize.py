@@ -13,7 +13,7 @@ from .style_flags import read_flags
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
-    from ..style.match_maps import Region
+    from ..style.match_maps import ExplainedRegion
     from ..style.regions import Regions
     from ..style.restyle import Styled
 
@@ -148,7 +148,7 @@ def print_explained(output: Path, regions: "Regions", styled: "Styled | None") -
     print(f"the same with pictures in {output / 'explain.png'} and explain.json")
 
 
-def _cells(region: "Region") -> tuple[str, ...]:
+def _cells(region: "ExplainedRegion") -> tuple[str, ...]:
     """A row of the table."""
     place = (str(region.number), f"{region.share:.1%}", f"{region.view}:{region.pixel[0]},{region.pixel[1]}")
     if not region.taken:

@@ -19,7 +19,7 @@ from ..datamanagers.images import load_mask
 from ..errors import UsageError
 from ..interfaces import Scene
 from ..rendering.cameras import Cameras, pixel_grid
-from .config import Place, StyleConfig, find_reference, labels, parse_place, parse_region_value, parse_strength, pixel_of
+from .config import Place, StyleConfig, find_reference, labels, parse_pixel, parse_place, parse_region_value, parse_strength
 from .dictionary import StyleDictionary
 from .files import RegionKey, StyleFile
 from .matching import scores, unit
@@ -84,7 +84,7 @@ def find_regions(regions: Regions, text: str) -> list[RegionMatch]:
     for view in sorted(range(len(names)), key=lambda v: -len(names[v])):
         if text.startswith(f"{names[view]}:"):
             rest = text[len(names[view]) + 1 :]
-            pixel = pixel_of(rest)
+            pixel = parse_pixel(rest)
             numbers = _covered(regions, view, Path(rest)) if pixel is None else [_at_pixel(regions, view, *pixel)]
             return [RegionMatch(k, str(k)) for k in numbers]
     named = f", a name in the style file ({', '.join(regions.keys)})" if regions.keys else ""
