@@ -1,18 +1,27 @@
-"""Image metrics: PSNR and SSIM, with LPIPS. Pure functions of images [H W 3] in [0, 1], to floats.
+"""Renders against photographs: PSNR, SSIM and LPIPS of images [H W 3] in [0, 1], and the report of `fprf eval` on a run.
 
 PSNR = -10 log10(mean squared error), in decibels. SSIM after Wang et al. 2004: Gaussian window of 11 pixels (σ 1.5),
 K = (0.01, 0.03), dynamic range 1, mean over channels and over the windows that lie wholly inside.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Annotated, Any
 
 import torch
 from kornia.metrics import ssim as _ssim_map
 from torch import Tensor
 
+from ..datamanagers.images import Image
+from ..datamanagers.scene import Scene as ParsedScene
 from ..errors import DataError, NumericsError
+from ..interfaces import Scene
+from ..io.images import to_uint8
+from ..memory import peak
+from ..training.run import Known
+from ..types import View
+from .consistency import WarpError
 from .lpips import lpips
 
 PSNR_CAP = 99.0
@@ -92,3 +101,50 @@ def mean_metrics(views: Iterable[Mapping[str, float]]) -> dict[str, float]:
     if not rows:
         raise DataError("no views to average metrics over; the split is empty")
     return {name: math.fsum(row[name] for row in rows) / len(rows) for name in rows[0]}
+
+
+def judge(
+    scene: Scene,
+    known: Known,
+    captured: ParsedScene,
+    views: Sequence[int],
+    progress: Callable[[int, int, str], None],
+    *,
+    masks: bool = True,
+) -> tuple[dict[str, Any], list[Image]]:
+    """Metrics of views of a scene (means and each by name), and their images, each in the light that it was taken in.
+
+    `captured` has the photographs; pixels that its `masks` leave out do not count. Seconds are those of rendering alone.
+    Consistency warps each view into the next one of the list by the rendered depth.
+    """
+    cameras = known.cameras
+    images: list[Image] = []
+    before: View | None = None
+    rows, seconds, kept, pixels = {}, 0.0, 0.0, 0
+    warped = WarpError(cameras.select(torch.tensor(list(views), dtype=torch.int64)))
+    for i, view in enumerate(views):
+        progress(i, len(views), "rendering")
+        taken, start = scene.as_taken(view), time.perf_counter()
+        render = taken.render(cameras, view)
+        seconds += time.perf_counter() - start
+        images.append(to_uint8(render.rgb))
+        kept += render.kept
+        if before is not None:
+            warped.add(i - 1, i, before.rgb, render.rgb, before.depth, render.depth)
+        before = render
+        truth, where = known.photograph(captured, view, masks=masks)
+        pixels += truth.shape[0] * truth.shape[1]
+        rows[known.names[view]] = image_metrics(render.rgb, truth, where)
+    progress(len(views), len(views), "rendering")
+    means = mean_metrics(rows.values())
+    return {
+        **means,
+        "views": len(views),
+        "render_seconds": seconds,
+        "seconds_per_view": seconds / max(1, len(views)),
+        "rays_per_second": pixels / max(seconds, 1e-9),
+        "kept_samples_share": kept / max(1, len(views)),
+        "peak_rss_mib": (peak() or 0) / 2**20,
+        "consistency": warped.summary(),
+        "per_view": rows,
+    }, images

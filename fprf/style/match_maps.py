@@ -7,6 +7,7 @@ a view, T style codes, K regions.
 import io
 import math
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -235,7 +236,7 @@ def explain(regions: Regions, styled: Styled | None = None) -> list[ExplainedReg
     return rows
 
 
-def _middle(share: Annotated[Tensor, "H W"], size: tuple[int, int]) -> tuple[int, int]:
+def _middle(share: Annotated[Tensor, "H W"], size: Sequence[int]) -> tuple[int, int]:
     """Find the pixel, of the full view, about which most of the region lies."""
     reach = 2 * (max(share.shape) // 12) + 1
     smooth = cv2.blur(share.cpu().numpy(), (reach, reach), borderType=cv2.BORDER_CONSTANT)
