@@ -105,6 +105,7 @@ def render_maps(scene: Scene, cameras: Cameras, *, side: int, reach: float, repo
 
 def build_mesh(maps: Maps, *, edge: float | None = None, report: Report = lambda done, total: None) -> Mesh:
     """The mesh of near surfaces. Raises DataError where no surface comes out."""
+    # Depths of all views become distances on a lattice, and their zero a mesh.
     cell, origin, width = _lattice(maps, edge)
     known, value = _signed_distance(maps, cell, origin, width, report)
     at, face = surface_nets(cell[known], value)
