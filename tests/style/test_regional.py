@@ -47,7 +47,7 @@ def test_each_region_is_styled_by_what_it_may_take_from(config: StylizerConfig) 
         alone = config.build(dictionary=part, scene=scene)
         if isinstance(alone, TwoSidedStylizer):
             only = torch.nn.functional.one_hot(torch.full((300,), k), 3).float()
-            styled, taken = alone.maps(content, only, alone.centre), alone.table[k]
+            styled, taken = alone.mapped(content, only), alone.table[k]
         else:
             styled, taken = alone(content, semantic), alone.match(semantic)
         out += share[:, k, None] * styled

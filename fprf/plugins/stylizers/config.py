@@ -127,11 +127,9 @@ class RegionConfig(StylizerConfig):
         return region_smoothing(scene, self.smoothness, allowed)
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
-        from .region import ChannelMaps, MatrixMaps, TwoSidedStylizer, plan_regions
+        from .region import TwoSidedStylizer
 
-        plan = plan_regions(dictionary, scene, self, self.smoothing(scene, dictionary.allowed))
-        maps = MatrixMaps if self.transport else ChannelMaps
-        return TwoSidedStylizer(plan, scene, maps(plan, scene, self.gain))
+        return TwoSidedStylizer(dictionary, scene, self)
 
 
 @dataclass(frozen=True, kw_only=True)
