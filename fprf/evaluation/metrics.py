@@ -59,12 +59,14 @@ def ssim(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"], where: An
     An image with a side below 11 pixels is judged with the largest odd window that fits. Raises as `psnr`.
     """
     first, second = _pair(a, b)
+    # The window must be odd, and fit.
     shortest = min(first.shape[:2])
     window = min(_WINDOW, shortest - 1 + shortest % 2)
     x, y = first.permute(2, 0, 1)[None], second.permute(2, 0, 1)[None]
     # No eps: K keeps the denominator above 9e-8, and kornia's 1e-12 would cost black images 1e-5.
     windows = _ssim_map(x, y, window, eps=0.0, padding="valid")
     if where is not None:
+        # Windows stand at the pixels in their middle, without a rim.
         edge = window // 2
         about = where[edge : edge + windows.shape[2], edge : edge + windows.shape[3]]
         windows = windows[..., about] if bool(about.any()) else windows
@@ -84,6 +86,7 @@ def image_metrics(
         return {"psnr": psnr(render, truth), "ssim": ssim(render, truth), "lpips": lpips(render, truth)}
     if not bool(where.any()):
         raise DataError("a mask leaves nothing of a view that is to be judged; leave the view out, or its mask")
+    # Pixels that are left out are made equal, so that windows over them see no difference.
     filled = torch.where(where[..., None], render, truth)
     return {
         "psnr": psnr(render[where][None], truth[where][None]),
@@ -124,11 +127,13 @@ def judge(
     warped = WarpError(cameras.select(torch.tensor(list(views), dtype=torch.int64)))
     for i, view in enumerate(views):
         progress(i, len(views), "rendering")
+        # As it was taken: in its exposure and tone. Only rendering is timed.
         taken, start = scene.as_taken(view), time.perf_counter()
         render = taken.render(cameras, view)
         seconds += time.perf_counter() - start
         images.append(to_uint8(render.rgb))
         kept += render.kept
+        # Two renders are held at a time, whatever the number of views.
         if before is not None:
             warped.add(i - 1, i, before.rgb, render.rgb, before.depth, render.depth)
         before = render

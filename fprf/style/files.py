@@ -59,7 +59,7 @@ def read_style(path: Path) -> StyleFile:
         if not isinstance(whole, dict) or whole.get("format") != _FORMAT or not isinstance(whole.get("style"), dict):
             raise ConfigError(f'expected an object with "format": {_FORMAT} and "style", as `fprf stylize` writes it')
         for key in whole:
-            if key not in _KEYS:
+            if key not in _KEYS:  # a typing error would otherwise go unnoticed
                 raise ConfigError(f"unknown key {key!r}{nearest(key, list(_KEYS))} (allowed: {', '.join(_KEYS)})")
         fields = whole["style"]
         if "fprf" in whole and "bold" not in fields:  # saved before there was light: all was painted
@@ -83,6 +83,7 @@ def read_style(path: Path) -> StyleFile:
 
 def write_style(path: Path, file: StyleFile, made: Mapping[str, Any] | None = None) -> None:
     """Write the style with the hashes of its photographs as they are now; `made` is kept beside it for people to read."""
+    # Paths go relative, so that the folder can be moved; hashes tell when a photograph changes.
     style = file.style
     masks = [p for p in style.masks if p != NO_MASK]
     whole = {
@@ -119,6 +120,7 @@ def with_folders(style: S, report: Callable[[str], None] = warnings.warn) -> S:
         return style
     from ..datamanagers.images import photographs
 
+    # Each image once, under the weight and mask of what it came with.
     count = len(style.references)
     rows: dict[Path, tuple[float, Path]] = {}
     for path, weight, mask in zip(

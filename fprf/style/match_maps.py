@@ -74,6 +74,7 @@ def match_map(here: Scene, styled: Styled, view: int, cameras: Cameras | None = 
     centre, units, codes = scene.semantic_mean.to(device), styled.codes.units.to(device), len(styled.codes.reference)
 
     def values(semantic: Tensor, points: Tensor | None) -> Tensor:
+        # The score is weighted by what is taken, so that its composite is the mean over that.
         taken = look.match(semantic, points)
         near = unit(semantic, centre) @ units.T if belongs.divided else taken.new_zeros(taken.shape)
         sure = look.confidence(semantic, points).to(taken)
@@ -82,6 +83,7 @@ def match_map(here: Scene, styled: Styled, view: int, cameras: Cameras | None = 
     # One pass composites all of them: codes, score, confidence, regions.
     pixel = pixel_grid(cameras, view)
     shares, opacity = here.paint(cameras, view, pixel, values, semantic=belongs.divided)
+    # Take them apart again.
     width, height = (int(v) for v in cameras.size[view])
     shares = shares.view(height, width, -1)
     taken = shares[..., :codes]
@@ -108,6 +110,7 @@ def match_pictures(matched: MatchMap, codes: Codes) -> dict[str, Picture]:
 
 def summarize(matched: MatchMap, codes: Codes) -> dict[str, Any]:
     """Use of the references and their codes, and its certainty, over the pixels of a view by their opacity."""
+    # Pixels count by their opacity; certainty is that of what is styled at all.
     each, kept = matched.opacity.double(), matched.kept
     total = float(each.sum()) or 1.0
     weight = each * (1 - kept)
@@ -132,6 +135,7 @@ def write_pixels(path: Path, matched: MatchMap, codes: Codes) -> None:
     """Write an .npz: reference, cluster, region (int16, -1 where nothing is), score, confidence, entropy_bits, kept, opacity,
     names.
     """
+    # The one code that a pixel takes most of; -1 where there is nothing, or where nothing is taken.
     code = matched.taken.argmax(-1)
     some, styled = matched.opacity > 0.5, matched.taken.sum(-1) > 0.5
     arrays = {
@@ -144,6 +148,7 @@ def write_pixels(path: Path, matched: MatchMap, codes: Codes) -> None:
         "kept": matched.kept,
         "opacity": matched.opacity,
     }
+    # As np.savez_compressed writes it, but with arrays that hold no pickles, and whole or absent.
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, values in {"names": np.asarray(codes.names), **arrays}.items():
@@ -238,6 +243,7 @@ def explain(regions: Regions, styled: Styled | None = None) -> list[ExplainedReg
 
 def _middle(share: Annotated[Tensor, "H W"], size: Sequence[int]) -> tuple[int, int]:
     """Find the pixel, of the full view, about which most of the region lies."""
+    # Blurred membership is highest in the middle; a pixel that belongs to the region itself comes before one beside it.
     reach = 2 * (max(share.shape) // 12) + 1
     smooth = cv2.blur(share.cpu().numpy(), (reach, reach), borderType=cv2.BORDER_CONSTANT)
     y, x = np.unravel_index(int(np.argmax(smooth * (share.cpu().numpy() > 0.5) + 1e-3 * smooth)), smooth.shape)

@@ -12,7 +12,7 @@ from fprf.plugins.stylizers.config import RegionToneConfig
 from fprf.splats.gaussians import HARMONIC
 from fprf.splats.restyle import all_around, region_maps, restyled_harmonics
 from fprf.style.dictionary import Reference, build_dictionary
-from fprf.style.light import KNOWN, Light, light_maps, light_of, shared, unrivalled
+from fprf.style.light import APPLIED, Light, light_maps, light_of, shared, unrivalled
 from fprf.style.look import Restyle
 from fprf.style.scene_style import SceneStyle, scene_style
 
@@ -137,7 +137,7 @@ def test_the_cast_of_an_evenly_tinted_reference_is_found(tint: tuple[float, floa
     """A light is what all share: grey things seen through a tint give grey things that tint, as far as it is applied."""
     greys = torch.tensor([0.3, 0.4, 0.5, 0.6])[:, None] * torch.tensor(tint)
     found = shown_light(greys)
-    assert torch.allclose(found[:, 0] / found[:, 2], torch.full((KINDS,), (tint[0] / tint[2]) ** KNOWN), rtol=0.1)
+    assert torch.allclose(found[:, 0] / found[:, 2], torch.full((KINDS,), (tint[0] / tint[2]) ** APPLIED), rtol=0.1)
 
 
 def test_a_meadow_with_a_sky_and_a_barn_has_no_cast() -> None:
