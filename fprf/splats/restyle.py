@@ -17,11 +17,10 @@ from ..interfaces import Encoder, Stylizer
 from ..ops.harmonics import Directions, recoloured, spherical_harmonics
 from ..ops.precision import double
 from ..plugins.stylizers.config import StylizerConfig
-from ..style.colours import ColourMaps, carried_colours
-from ..style.controls import luma, place_weight
 from ..style.dictionary import StyleDictionary
-from ..style.look import Restyle
-from ..style.scene import SceneStyle, own_style
+from ..style.light import luma
+from ..style.look import ColourMaps, Restyle, carried_colours, place_weight
+from ..style.scene_style import SceneStyle, own_style
 
 _DIRECTIONS = 48
 """In which harmonics are evaluated to find where renderers cut their colours."""

@@ -21,11 +21,9 @@ from ..ops.rasterise_reference import MIN_ALPHA
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.cameras import Cameras, pixel_grid
 from ..rendering.renderer import enlarged
-from ..style.colours import ColourMaps
-from ..style.dictionary import StyleDictionary
-from ..style.look import Restyle
-from ..style.references import Encoders
-from ..style.scene import SceneStyle
+from ..style.dictionary import Encoders, StyleDictionary
+from ..style.look import ColourMaps, Restyle
+from ..style.scene_style import SceneStyle
 from ..training.camera_optimizers import Tones
 from ..training.run import Known
 from ..types import Origin, View

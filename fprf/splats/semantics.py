@@ -30,9 +30,9 @@ from ..ops.guided import upsample
 from ..ops.local_mixture import explained
 from ..ops.rasterise import lift
 from ..rendering.cameras import Cameras
-from ..style.scene import SceneStyle, membership, region_contacts, region_units, scene_style
-from ..style.scene import from_tensors as style_from
-from ..style.scene import to_tensors as style_tensors
+from ..style.scene_style import SceneStyle, membership, region_contacts, region_units, scene_style
+from ..style.scene_style import from_tensors as style_from
+from ..style.scene_style import to_tensors as style_tensors
 from .gaussians import Gaussians, bulk_of
 from .levels import seen_by
 from .photographs import camera_of
