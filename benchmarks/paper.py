@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from fprf.checks import at_least, between
-from fprf.cli.parsing import load_field_method, parse
+from fprf.cli.parsing import parse
 from fprf.config import TrainConfig
 from fprf.datamanagers.images import load_image
 from fprf.evaluation.metrics import image_metrics, mean_metrics
@@ -37,13 +37,13 @@ from fprf.style.look import Restyle
 from fprf.style.restyle import apply_style
 from fprf.training.driver import Report, learn, schedule_of
 from fprf.training.learner import FieldLearner
-from fprf.training.loading import Trained, encoders_of
+from fprf.training.loading import Trained
 from fprf.training.prepare import device_of, prepare, read_scene
 from fprf.training.run import Run
 from fprf.training.style_pass import measure_style
 from fprf.training.views import cache_view, render_view
 
-from .common import Progress, console, origin
+from .common import Progress, console, field_method, origin
 from .report import Column, printed
 from .restyle import PLAIN, dictionary_of, in_scene
 from .style_metrics import matched_regions, structure
@@ -197,9 +197,10 @@ def short_training(config: TrainConfig, folder: Path, progress: Progress) -> Sho
     learner = FieldLearner(config, prepared, device_of(config.device))
     learn(learner, run, schedule_of(config, len(prepared.scene.train)), report)
     model = learner.model.requires_grad_(False).eval()
-    trained = Trained(run, config, "", run.load_known(), model, config.steps, time.perf_counter() - start)
-    scene = measure_style(config, model, prepared.scene.cameras, prepared.scene.train)
-    return Short(trained, encoders_of(trained, scene, prepared.basis))
+    seconds = time.perf_counter() - start
+    style = measure_style(config, model, prepared.scene.cameras, prepared.scene.train), prepared.basis
+    trained = Trained(run, config, "", run.load_known(), model, config.steps, seconds, style=lambda: style)
+    return Short(trained, trained.encoders())
 
 
 def held_out(trained: Trained, views: int) -> Row:
@@ -310,7 +311,7 @@ COLUMNS: tuple[Column, ...] = (
 def main(argv: list[str]) -> int:
     """`python -m benchmarks paper --table NAME [flags]`."""
     config = parse(PaperConfig(), argv, prog="python -m benchmarks paper", description=__doc__ or "")
-    method, name = load_field_method(config.method)
+    method, name = field_method(config.method)
     base = replace(method, data=scene_folder(config.data), downscale=config.downscale, device=config.device)
     base = replace(base, steps=config.steps, minutes=None, output=None)
     tables = []
