@@ -31,9 +31,9 @@ from fprf.plugins.encoders.config import Vgg19Config
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionToneConfig, StylizerConfig
 from fprf.progress import Display
 from fprf.style.config import StyleConfig
+from fprf.style.dictionary import Encoders
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
-from fprf.style.references import Encoders
 from fprf.style.restyle import apply_style
 from fprf.training.driver import Report, learn, schedule_of
 from fprf.training.learner import FieldLearner

@@ -38,10 +38,10 @@ from fprf.io.images import shrink, to_uint8, write_image
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import SEMANTICS, BundledContentConfig, EncoderConfig, RandomConfig, Vgg19Config
 from fprf.style.config import StyleConfig
-from fprf.style.controls import luma
 from fprf.style.dictionary import Reference as Samples
 from fprf.style.dictionary import build_dictionary
 from fprf.style.files import StyleFile
+from fprf.style.light import luma
 from fprf.style.look import Restyle
 from fprf.style.restyle import apply_style
 from fprf.training.loading import Trained, load_run

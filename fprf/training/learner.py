@@ -29,7 +29,7 @@ from ..ops.precision import tf32
 from ..progress import Display
 from ..rendering.cameras import PixelRays
 from ..rendering.renderer import render_rays
-from ..style.scene import SceneStyle, to_tensors
+from ..style.scene_style import SceneStyle, to_tensors
 from ..types import Batch, Rays
 from . import checkpoint
 from .camera_optimizers import moving

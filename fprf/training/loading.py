@@ -17,11 +17,9 @@ from ..interfaces import Decoder, Scene, Stylizer, Values
 from ..plugins.registry import entry, load_object
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.cameras import Cameras
-from ..style.colours import ColourMaps, colour_maps
-from ..style.dictionary import StyleDictionary
-from ..style.look import Restyle
-from ..style.references import Encoders
-from ..style.scene import SceneStyle, from_tensors
+from ..style.dictionary import Encoders, StyleDictionary
+from ..style.look import ColourMaps, Restyle, colour_maps
+from ..style.scene_style import SceneStyle, from_tensors
 from ..types import Origin, View
 from . import checkpoint
 from .blocks import load_blocked

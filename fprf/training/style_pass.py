@@ -15,7 +15,7 @@ from ..config import TrainConfig
 from ..memory import in_parts
 from ..rendering.cameras import Cameras, rays_through
 from ..rendering.renderer import composite_mean, march_features
-from ..style.scene import SceneStyle, region_contacts, scene_style
+from ..style.scene_style import SceneStyle, region_contacts, scene_style
 from ..style.statistics import Moments, merge, moments
 from .model import Model
 

@@ -22,8 +22,8 @@ from ..page.pack import Colours, Packed
 from ..rendering.cameras import Cameras
 from ..splats.scene import SplatScene
 from ..style.look import Restyle
-from ..style.regional import RegionWeight
 from ..style.restyle import Styled
+from ..style.scene_style import RegionWeight
 from ..training.loading import Trained
 from ..training.views import Part, view_parts
 from .look import Look

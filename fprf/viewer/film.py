@@ -22,9 +22,9 @@ from ..plugins.stylizers.config import RegionToneConfig
 from ..rendering.camera_path import read_camera_path, write_camera_path
 from ..rendering.cameras import Cameras
 from ..rendering.paths import interpolate
-from ..style.files import StyleFile, write_style
-from ..style.keyframes import keyed_looks, read_keyframes
+from ..style.files import StyleFile, read_keyframes, write_style
 from ..style.look import Restyle
+from ..style.restyle import keyed_looks
 from ..types import Origin
 from .look import Look, style_config
 from .messages import Camera, cameras_of
