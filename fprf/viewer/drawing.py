@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..interfaces import Scene
 from ..io.images import Picture, to_uint8
 from ..io.maps import depth_image, match_image, palette
 from ..ops.harmonics import HARMONIC
@@ -215,12 +214,6 @@ class FieldPainter:
             yield
         width, height = (int(v) for v in cameras.size[view])
         return to_uint8(torch.cat(rows).view(height, width, 3))
-
-
-def gaussian_frame(scene: Scene, cameras: Cameras, view: int, look: Restyle | None) -> Generator[None, None, Picture]:
-    """One frame of a film of Gaussians."""
-    yield
-    return to_uint8(scene.restyled(look).render(cameras, view).rgb)
 
 
 def resolutions(size: tuple[int, int]) -> list[tuple[int, int]]:
