@@ -11,7 +11,8 @@ from typing import Any
 import numba
 import numpy as np
 
-from .simd import LANES, absolute, as_float, lanes, load, on_threads, splat, store, take, total, traced, where_greater
+from .simd import LANES, absolute, as_float, lanes, load, splat, store, total, traced, where_greater
+from .threads import on_threads, take
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 WINDOW = 11

@@ -236,10 +236,11 @@ def _view(
     antialiased: bool,
 ) -> _View:
     from . import rasterise_kernels as kernels
+    from .rasterise_harmonics import FIXED
     from .simd import LANES, aligned
 
     bands, seen, whole = harmonics.shape[1], camera_array(camera, antialiased), -(-len(means) // LANES) * LANES
-    blocks, splats = aligned(whole * (kernels.FIXED + 3 * bands)), aligned(whole * kernels.SLOTS)
+    blocks, splats = aligned(whole * (FIXED + 3 * bands)), aligned(whole * kernels.SLOTS)
     kernels.pack(*(x.detach().contiguous().numpy() for x in (means, quaternions, log_scales, logits, harmonics)), blocks)
     tiles = kernels.see(blocks, len(means), bands, seen, camera.width, camera.height, splats)
     counts = dict(zip(_SKIPPED, tiles.skipped.tolist(), strict=True)) | {"entries": len(tiles.ids), "saturated": 0}

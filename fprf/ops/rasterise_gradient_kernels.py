@@ -12,10 +12,10 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from .rasterise_harmonics import FIXED, basis, colour, direction, direction_slopes
 from .rasterise_kernels import (
     BLOCKS,
     BLUR,
-    FIXED,
     MAX_ALPHA,
     SIDE,
     SLOTS,
@@ -24,10 +24,7 @@ from .rasterise_kernels import (
     Tiles,
     alpha_of,
     axes,
-    basis,
     block_places,
-    colour,
-    direction,
     entry_of,
     footprint,
     inside,
@@ -40,18 +37,17 @@ from .simd import (
     aligned,
     load,
     lowest_bit,
-    on_threads,
     splat,
     square_root,
     stack,
     store,
     sums,
     swapped,
-    take,
     traced,
     transposed,
     where_greater,
 )
+from .threads import on_threads, take
 
 SUMS = LANES
 GEOMETRY = 6
@@ -217,58 +213,6 @@ def _add(memory, at, found, slot):
     store(memory, at, load(memory, at) + load(found, slot))
 
 
-def _direction_slopes(x, y, z, bands, blocks, at, red, green, blue):
-    """The gradient of the colour in a unit direction, from that of its channels; components along the direction are left in."""
-    gx = gy = gz = splat(x, 0)
-    c1 = 0.4886025119029199
-    for k in range(1, bands):
-        o = at + (FIXED + 3 * k) * LANES
-        s = red * load(blocks, o) + green * load(blocks, o + LANES) + blue * load(blocks, o + 2 * LANES)
-        if k == 1:
-            gy = gy - c1 * s
-        elif k == 2:
-            gz = gz + c1 * s
-        elif k == 3:
-            gx = gx - c1 * s
-        elif k == 4:
-            s = s * 1.0925484305920792
-            gx, gy = gx + s * y, gy + s * x
-        elif k == 5:
-            s = s * -1.0925484305920792
-            gy, gz = gy + s * z, gz + s * y
-        elif k == 6:
-            s = s * 0.31539156525252005
-            gx, gy, gz = gx - 2 * s * x, gy - 2 * s * y, gz + 4 * s * z
-        elif k == 7:
-            s = s * -1.0925484305920792
-            gx, gz = gx + s * z, gz + s * x
-        elif k == 8:
-            s = s * 0.5462742152960396
-            gx, gy = gx + 2 * s * x, gy - 2 * s * y
-        elif k == 9:
-            s = s * -0.5900435899266435
-            gx, gy = gx + s * 6 * x * y, gy + s * 3 * (x * x - y * y)
-        elif k == 10:
-            s = s * 2.890611442640554
-            gx, gy, gz = gx + s * y * z, gy + s * x * z, gz + s * x * y
-        elif k == 11:
-            s = s * -0.4570457994644658
-            gx, gy, gz = gx - 2 * s * x * y, gy + s * (4 * z * z - x * x - 3 * y * y), gz + 8 * s * y * z
-        elif k == 12:
-            s = s * 0.3731763325901154
-            gx, gy, gz = gx - 6 * s * x * z, gy - 6 * s * y * z, gz + s * (6 * z * z - 3 * (x * x + y * y))
-        elif k == 13:
-            s = s * -0.4570457994644658
-            gx, gy, gz = gx + s * (4 * z * z - 3 * x * x - y * y), gy - 2 * s * x * y, gz + 8 * s * x * z
-        elif k == 14:
-            s = s * 1.445305721320277
-            gx, gy, gz = gx + 2 * s * x * z, gy - 2 * s * y * z, gz + s * (x * x - y * y)
-        else:
-            s = s * -0.5900435899266435
-            gx, gy = gx + s * 3 * (x * x - y * y), gy - s * 6 * x * y
-    return gx, gy, gz
-
-
 def _block_gradient(blocks, at, bands, view, summed):
     """The gradient of the parameters of a block, a vector a row, from sums: shape (6), colour, depth; and its part of the
     gradient of the camera: the turn about its own centre (rotation vector in camera axes), and the shift in the world.
@@ -334,7 +278,7 @@ def _block_gradient(blocks, at, bands, view, summed):
     colours = [
         where_greater(was, 0, slope, 0) for was, slope in zip(colour(blocks, at, values), (red, green, blue), strict=True)
     ]
-    gx, gy, gz = _direction_slopes(dx, dy, dz, bands, blocks, at, *colours)
+    gx, gy, gz = direction_slopes(dx, dy, dz, bands, blocks, at, *colours)
     along = gx * dx + gy * dy + gz * dz
     of_means = [
         view[r] * g_x + view[3 + r] * g_y + view[6 + r] * g_z + (g - d * along) * shrink

@@ -20,12 +20,12 @@ from typing import Annotated, Any, NamedTuple
 import numba
 import numpy as np
 
+from .rasterise_harmonics import FIXED, basis, colour, direction
 from .simd import (
     LANES,
     added_in_fours,
     as_float,
     exp2,
-    exp2_rough,
     floor,
     greater_bits,
     lanes,
@@ -36,22 +36,21 @@ from .simd import (
     lowest_bit,
     maximum,
     minimum,
-    on_threads,
     splat,
     square_root,
     stack,
     store,
     swapped,
-    take,
     traced,
     transposed,
     where_greater,
 )
+from .threads import on_threads, take
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 _Ints = np.ndarray[Any, np.dtype[np.int32]]
-FIXED, SLOTS, SIDE = 11, 16, 16
-"""Rows of a block of Gaussians before its harmonics; numbers of a splat; pixels of a tile's side."""
+SLOTS, SIDE = 16, 16
+"""Numbers of a splat; pixels of a tile's side."""
 BLUR = 0.3
 """Variance in pixels that every projected Gaussian gets: the footprint of a pixel."""
 MIN_ALPHA, MAX_ALPHA = 1 / 255, 0.99
@@ -110,47 +109,6 @@ def pack(means: Floats, quaternions: Floats, log_scales: Floats, logits: Floats,
     """Put arrays [N 3], [N 4], [N 3], [N], [N K 3] into blocks. Scales and opacities are limited to what float32 can square; a
     Gaussian with NaN, or with another number beyond 1e15, is marked as invalid by its logit."""
     on_threads(_pack, means, quaternions, log_scales, logits, harmonics, blocks)
-
-
-def direction(mean, view):
-    """Unit vectors from the camera to the means, and 1 / distance."""
-    dx, dy, dz = mean[0] - view[16], mean[1] - view[17], mean[2] - view[18]
-    shrink = 1 / square_root(maximum(dx * dx + dy * dy + dz * dz, 1e-24))
-    return dx * shrink, dy * shrink, dz * shrink, shrink
-
-
-def basis(x, y, z, bands):
-    """The first `bands` of the 16 real spherical harmonics at unit vectors."""
-    values = [splat(x, 0.28209479177387814)]
-    if bands > 1:
-        values += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
-    if bands > 4:
-        values += [
-            1.0925484305920792 * x * y,
-            -1.0925484305920792 * y * z,
-            0.31539156525252005 * (2 * z * z - x * x - y * y),
-            -1.0925484305920792 * x * z,
-            0.5462742152960396 * (x * x - y * y),
-        ]
-    if bands > 9:
-        values += [
-            -0.5900435899266435 * y * (3 * x * x - y * y),
-            2.890611442640554 * x * y * z,
-            -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
-            0.3731763325901154 * z * (2 * z * z - 3 * (x * x + y * y)),
-            -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
-            1.445305721320277 * z * (x * x - y * y),
-            -0.5900435899266435 * x * (x * x - 3 * y * y),
-        ]
-    return values
-
-
-def colour(blocks, at, basis):
-    """0.5 + harmonics times the basis: three vectors, before they are cut at 0."""
-    colours = [splat(basis[0], 0.5)] * 3
-    for k, b in enumerate(basis):
-        colours = [each + b * load(blocks, at + (FIXED + 3 * k + c) * LANES) for c, each in enumerate(colours)]
-    return colours
 
 
 def axes(blocks, at, view):
@@ -436,7 +394,7 @@ def open_blocks(memory):
 
 def alpha_of(power):
     """Alpha from its log2, which is at most 0."""
-    return where_greater(power, LOG_MIN, minimum(exp2_rough(power), MAX_ALPHA), 0)
+    return where_greater(power, LOG_MIN, minimum(exp2(power, 3), MAX_ALPHA), 0)
 
 
 @traced

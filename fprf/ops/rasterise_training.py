@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from . import photometric
 from . import rasterise_gradient_kernels as backward
 from . import rasterise_kernels as forward
-from .rasterise_kernels import FIXED, SIDE, SLOTS
+from .rasterise_harmonics import FIXED
+from .rasterise_kernels import SIDE, SLOTS
 from .simd import LANES, aligned
 
 if TYPE_CHECKING:

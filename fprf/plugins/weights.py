@@ -26,8 +26,10 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise WeightsError(f"{path}: no such weights file; name an existing one or make it with `fprf pretrain`")
     try:
         with safe_open(path, framework="pt") as file:
-            tensors = {name: _widened(file.get_tensor(name)) for name in file.keys()}  # noqa: SIM118
-            return tensors, dict(file.metadata() or {})
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            halves = (torch.float16, torch.bfloat16)
+            wide = {name: tensor.float() if tensor.dtype in halves else tensor for name, tensor in tensors.items()}
+            return wide, dict(file.metadata() or {})
     except (SafetensorError, OSError) as error:
         raise WeightsError(f"{path}: not a readable safetensors file ({error}); copy or download it again") from error
 
@@ -45,10 +47,6 @@ def tensors_hash(tensors: Mapping[str, Tensor]) -> str:
         digest.update(f"{name}{tuple(value.shape)}".encode())
         digest.update(value.numpy().tobytes())
     return digest.hexdigest()[:12]
-
-
-def _widened(tensor: Tensor) -> Tensor:
-    return tensor.float() if tensor.dtype in (torch.float16, torch.bfloat16) else tensor
 
 
 Triple = tuple[float, float, float]
@@ -72,27 +70,23 @@ class WeightSource(NamedTuple):
     """The file's name carries its hash, so that it may be downloaded."""
 
 
-def torchvision_file(network: str, file: str, flag: str) -> WeightSource:
-    """One of torchvision's files: their names carry the beginning of their own SHA-256."""
-    return WeightSource(network, file, f"https://download.pytorch.org/models/{file}", flag, pinned=True)
-
-
 def weights_needed(source: WeightSource, path: Path | None) -> tuple[Need, ...]:
     """Weights that `find_weights` would have to download."""
     if path is not None or _cached(source) is not None:
         return absent_file(path)
-    target = _cache_folder() / source.file
+    target = _folders()[0] / source.file
     command = f"curl --create-dirs --output {target} {source.origin}" if source.pinned else f"put it there: {source.origin}"
     named = f"{command}, or name a file with {source.flag} FILE"
     return (Need(f"{source.network}'s weights {target}", named, downloaded=source.pinned),)
 
 
+def _folders() -> tuple[Path, Path]:
+    """fprf's cache, which downloads go to, and torch's."""
+    return Path.home() / ".cache/fprf/weights", Path.home() / ".cache/torch/hub/checkpoints"
+
+
 def _cached(source: WeightSource) -> Path | None:
     return next((folder / source.file for folder in _folders() if (folder / source.file).is_file()), None)
-
-
-def _folders() -> tuple[Path, Path]:
-    return _cache_folder(), Path.home() / ".cache/torch/hub/checkpoints"
 
 
 def find_weights(source: WeightSource, path: Path | None) -> Path:
@@ -137,24 +131,19 @@ def input_statistics(
     metadata: Mapping[str, str], path: Path, mean: Triple = IMAGENET_MEAN, std: Triple = IMAGENET_STD
 ) -> tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]:
     """Mean and deviation of a network's input, as the file's metadata says; those given where it says nothing."""
-    return _stated_triple(metadata, "mean", mean, path), _stated_triple(metadata, "std", std, path)
-
-
-def _stated_triple(metadata: Mapping[str, str], key: str, default: Triple, path: Path) -> Annotated[Tensor, "3"]:
-    if key not in metadata:
-        return torch.tensor(default)
-    try:
-        return torch.tensor(json.loads(metadata[key]), dtype=torch.float32).view(3)
-    except (ValueError, RuntimeError, TypeError) as error:
-        raise WeightsError(f"{path}: metadata {key!r} is {metadata[key]!r}, not three numbers such as [0.5,0.5,0.5]") from error
-
-
-def _cache_folder() -> Path:
-    return Path.home() / ".cache/fprf/weights"
+    stated = []
+    for key, default in (("mean", mean), ("std", std)):
+        try:
+            numbers = json.loads(metadata[key]) if key in metadata else default
+            stated.append(torch.tensor(numbers, dtype=torch.float32).view(3))
+        except (ValueError, RuntimeError, TypeError) as error:
+            found = f"metadata {key!r} is {metadata[key]!r}"
+            raise WeightsError(f"{path}: {found}, not three numbers such as [0.5,0.5,0.5]") from error
+    return stated[0], stated[1]
 
 
 def _download(source: WeightSource) -> Path:
-    target = _cache_folder() / source.file
+    target = _folders()[0] / source.file
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = target.with_name(f"{source.file}.{os.getpid()}.partial")
     try:

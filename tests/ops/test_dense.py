@@ -4,7 +4,6 @@ import itertools
 from collections.abc import Sequence
 
 import numba
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -14,7 +13,6 @@ from torch import Tensor
 
 from fprf.ops import dense
 from fprf.ops.dense import Last, network, runs
-from fprf.ops.simd import WIDE, exp, load, opaque, store
 
 QUICK = settings(max_examples=25, deadline=None)
 U = 2.0**-24
@@ -124,56 +122,3 @@ def test_runs_of_equal_rows(values: list[float]) -> None:
     assert all(torch.equal(each, torch.arange(len(x))) for each in runs(x.double()))
     assert torch.equal(x[first][run].nan_to_num(7.0), x.nan_to_num(7.0))
     assert all(not torch.equal(x[a - 1], x[a]) for a in first.tolist() if a > 0)
-
-
-NAN, INF = float("nan"), float("inf")
-
-
-@numba.njit
-def _run(kind: int, x: np.ndarray, out: np.ndarray) -> None:
-    for i in range(0, len(x), WIDE):
-        if kind == 0:
-            store(out, i, exp(load(x, i, WIDE)))
-        else:
-            store(out, i, opaque(load(x, i, WIDE)))
-
-
-def run(kind: int, x: np.ndarray) -> np.ndarray:
-    padded = np.zeros(-(-len(x) // WIDE) * WIDE, np.float32)
-    padded[: len(x)] = x
-    out = np.empty_like(padded)
-    _run(kind, padded, out)
-    return out[: len(x)].astype(np.float64)
-
-
-def grid(low: float, high: float) -> np.ndarray:
-    """Evenly, and down to where nothing is left of a number."""
-    even = np.linspace(low, high, 300_001)
-    tiny = np.geomspace(1e-38, max(-low, high), 100_001)
-    both = np.concatenate([even, tiny[tiny <= high], -tiny[-tiny >= low]])
-    return both.astype(np.float32)
-
-
-def test_exp_and_opacity_are_within_three_units_however_thin() -> None:
-    for kind, x in enumerate((grid(-87.3, 88.2), np.abs(grid(0.0, 100.0)))):
-        wide = x.astype(np.float64)
-        exact = -np.expm1(-wide) if kind else np.exp(wide)
-        assert (np.abs(run(kind, x) - exact) <= 3 * U * exact).all()
-
-
-@pytest.mark.parametrize(
-    ("kind", "x", "value"),
-    [
-        (0, -88.0, 0.0),
-        (0, -INF, 0.0),
-        (0, 89.0, INF),
-        (0, INF, INF),
-        (0, NAN, NAN),
-        (1, 0.0, 0.0),
-        (1, INF, 1.0),
-        (1, NAN, NAN),
-    ],
-)
-def test_ends_of_the_range(kind: int, x: float, value: float) -> None:
-    (found,) = run(kind, np.array([x], np.float32))
-    assert found == value or (np.isnan(found) and np.isnan(value))

@@ -46,8 +46,9 @@ def test_each_region_is_styled_by_what_it_may_take_from(config: StylizerConfig) 
         part, codes = choose(d, allowed[k])
         alone = config.build(dictionary=part, scene=scene)
         if isinstance(alone, TwoSidedStylizer):
-            only = torch.nn.functional.one_hot(torch.full((300,), k), 3).float()
-            styled, taken = alone.maps(content, only, alone.centre), alone.table[k]
+            away = content - alone.centre
+            styled = (away @ alone.maps[k] if alone.maps.ndim == 3 else away * alone.maps[k]) + alone.bias[k]
+            taken = alone.table[k]
         else:
             styled, taken = alone(content, semantic), alone.match(semantic)
         out += share[:, k, None] * styled

@@ -3,11 +3,10 @@
 import torch
 from torch import Tensor, nn
 
-from ...fields.planes import LIMIT, ProposalField
+from ...fields.planes import ProposalField
 from ...interfaces import Sampler
-from ...ops import march
 from ...rendering.space import Space
-from ...rendering.stepfun import midpoints, resample, shifts, transmittance_weights
+from ...rendering.stepfun import midpoints, resample, transmittance_weights
 from ...types import Level, Rays, Sampled
 from .config import ProposalConfig, UniformConfig
 
@@ -72,15 +71,6 @@ class ProposalSampler(Sampler):
         levels = []
         for field, count in zip(self.levels, counts, strict=True):
             with torch.set_grad_enabled(learns):
-                if sharpness == 1 and isinstance(field, ProposalField) and field.kernels_apply(rays.origin, s):
-                    # Nothing is learnt from these edges: the same, ray by ray.
-                    table, weight = field.planes.table, field.to_density.weight[0]
-                    padding, shift = self.config.padding, shifts(s, generator)
-                    size = field.planes.resolutions[0]
-                    s = march.propose(
-                        rays, s, space.warp, table, size, weight, limit=LIMIT, padding=padding, count=count, shift=shift
-                    )
-                    continue
                 t = space.distance(s, rays.near, rays.far)
                 points = rays.origin[:, None] + rays.direction[:, None] * midpoints(t)[..., None]
                 density = field(space.locate(points.view(-1, 3))).view(points.shape[:2])

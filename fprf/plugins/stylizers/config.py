@@ -128,12 +128,11 @@ class _RegionConfig(StylizerConfig):
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
         from ...style.matching import Matching
-        from .region import ChannelMaps, MatrixMaps, TwoSidedStylizer, plan_regions
+        from .region import TwoSidedStylizer
 
         matching = Matching(self.temperature, self.similarity, self.whitening, self.recentred, self.centred)
-        plan = plan_regions(dictionary, scene, matching, self.smoothing(scene, dictionary.allowed))
-        maps = MatrixMaps if self.transport else ChannelMaps
-        return TwoSidedStylizer(plan, scene, maps(plan, scene, self.gain))
+        smoothing = self.smoothing(scene, dictionary.allowed)
+        return TwoSidedStylizer(dictionary, scene, matching, smoothing, transport=self.transport, gain=self.gain)
 
 
 @dataclass(frozen=True, kw_only=True)

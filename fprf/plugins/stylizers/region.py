@@ -8,11 +8,10 @@ equals the scene gives the identity, and a high temperature gives the global sty
 A_k: per channel sigma_s / sigma_c (AdaIN), or the optimal transport of all channels at once.
 """
 
-from abc import ABC, abstractmethod
 from typing import Annotated, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ...interfaces import Stylizer
 from ...ops import mixture
@@ -51,92 +50,56 @@ class Side(NamedTuple):
     covariance: Annotated[Tensor, "K C C"]
 
 
-class RegionPlan(NamedTuple):
-    """Statistics of each region, its own and its style's."""
-
-    table: Annotated[Tensor, "K T"]
-    scene: Side
-    style: Side
-
-
-def plan_regions(
-    dictionary: StyleDictionary, scene: SceneStyle, matching: Matching, smoothing: Annotated[Tensor, "K K"] | None = None
-) -> RegionPlan:
-    """Match the regions with the codes. The scene's statistics are blended and smoothed as the dictionary's are."""
-    check_fit(dictionary, scene)
-    own = own_style(scene, dictionary.blend)._replace(origin=dictionary.origin)
-    same, table = region_table(scene, own, matching), region_table(scene, dictionary, matching)
-    if smoothing is not None:
-        same, table = smoothing @ same, smoothing @ table
-    before = _mixed(own, same)
-    if len(table) > 1:
-        return RegionPlan(table, before, _mixed(dictionary, table))
-    # An undivided scene gets the global style: codes taken together, with what lies between them.
-    left = dictionary if dictionary.allowed is None else choose(dictionary, dictionary.allowed[0])[0]
-    mean, covariance = (part[None] for part in whole_style(left))
-    return RegionPlan(table, before, Side(mean, deviation(mean, covariance.diagonal(dim1=-2, dim2=-1)), covariance))
-
-
-class RegionMaps(nn.Module, ABC):
-    """The affine map of each region, applied to features less the scene's mean."""
-
-    @abstractmethod
-    def forward(
-        self, content: Annotated[Tensor, "N C"], share: Annotated[Tensor, "N K"], centre: Annotated[Tensor, "C"]
-    ) -> Annotated[Tensor, "N C"]:
-        """Each point by the maps of its regions."""
-
-
-class ChannelMaps(RegionMaps):
-    """AdaIN: one gain a channel, sigma_s / sigma_c, at most `gain`."""
-
-    gain: Annotated[Tensor, "K C"]
-    bias: Annotated[Tensor, "K C"]
-
-    def __init__(self, plan: RegionPlan, scene: SceneStyle, gain: float) -> None:
-        super().__init__()
-        ratio = (plan.style.sigma / plan.scene.sigma).clamp_max(gain)
-        self.register_buffer("gain", ratio.to(scene.mean))
-        self.register_buffer("bias", (plan.style.mean - (plan.scene.mean - double(scene.mean)) * ratio).to(scene.mean))
-
-    def forward(
-        self, content: Annotated[Tensor, "N C"], share: Annotated[Tensor, "N K"], centre: Annotated[Tensor, "C"]
-    ) -> Annotated[Tensor, "N C"]:
-        """Gains and biases are mixed before they are applied."""
-        return mixture.scaled(content, share, self.gain, self.bias, centre=centre)
-
-
-class MatrixMaps(RegionMaps):
-    """Optimal transport: one matrix a region, no direction amplified more than `gain`."""
-
-    matrix: Annotated[Tensor, "K C C"]
-    bias: Annotated[Tensor, "K C"]
-
-    def __init__(self, plan: RegionPlan, scene: SceneStyle, gain: float) -> None:
-        super().__init__()
-        matrix = monge(plan.scene.covariance, plan.style.covariance, gain=gain)
-        moved = torch.einsum("kc,kcd->kd", plan.scene.mean - double(scene.mean), matrix)
-        self.register_buffer("matrix", matrix.to(scene.mean))
-        self.register_buffer("bias", (plan.style.mean - moved).to(scene.mean))
-
-    def forward(
-        self, content: Annotated[Tensor, "N C"], share: Annotated[Tensor, "N K"], centre: Annotated[Tensor, "C"]
-    ) -> Annotated[Tensor, "N C"]:
-        """Regions that a point does not belong to are not computed."""
-        return mixture.affine(content, share, self.matrix, self.bias, centre=centre)
-
-
 class TwoSidedStylizer(Stylizer):
-    """Membership of points, and the map of each region."""
+    """Membership of points, and the affine map of each region, applied to features less the scene's mean.
+
+    `smoothing` [K K] mixes the matches of regions; None = each by itself. With `transport` the maps are matrices of all
+    channels; else gains, channel by channel. None amplifies more than `gain`.
+    """
 
     centre: Annotated[Tensor, "C"]
     table: Annotated[Tensor, "K T"]
+    maps: Annotated[Tensor, "K C"] | Annotated[Tensor, "K C C"]
+    bias: Annotated[Tensor, "K C"]
 
-    def __init__(self, plan: RegionPlan, scene: SceneStyle, maps: RegionMaps) -> None:
+    def __init__(
+        self,
+        dictionary: StyleDictionary,
+        scene: SceneStyle,
+        matching: Matching,
+        smoothing: Annotated[Tensor, "K K"] | None = None,
+        *,
+        transport: bool,
+        gain: float,
+    ) -> None:
         super().__init__()
-        self.maps, self.membership = maps, Membership(scene)
+        check_fit(dictionary, scene)
+        # Regions are matched with codes of the scene itself and with those of the references, both alike blended and smoothed.
+        own = own_style(scene, dictionary.blend)._replace(origin=dictionary.origin)
+        same, table = region_table(scene, own, matching), region_table(scene, dictionary, matching)
+        if smoothing is not None:
+            same, table = smoothing @ same, smoothing @ table
+        here = _mixed(own, same)
+        if len(table) > 1:
+            there = _mixed(dictionary, table)
+        else:
+            # An undivided scene gets the global style: codes taken together, with what lies between them.
+            left = dictionary if dictionary.allowed is None else choose(dictionary, dictionary.allowed[0])[0]
+            mean, covariance = (part[None] for part in whole_style(left))
+            there = Side(mean, deviation(mean, covariance.diagonal(dim1=-2, dim2=-1)), covariance)
+        # f' = (f - centre) A_k + b_k takes the mean of region k to that of its style.
+        away = here.mean - double(scene.mean)
+        if transport:
+            maps = monge(here.covariance, there.covariance, gain=gain)
+            moved = torch.einsum("kc,kcd->kd", away, maps)
+        else:  # AdaIN: A_k = sigma_s / sigma_c
+            maps = (there.sigma / here.sigma).clamp_max(gain)
+            moved = away * maps
+        self.membership = Membership(scene)
         self.register_buffer("centre", scene.mean.float())
-        self.register_buffer("table", plan.table.to(scene.mean))
+        self.register_buffer("table", table.to(scene.mean))
+        self.register_buffer("maps", maps.to(scene.mean))
+        self.register_buffer("bias", (there.mean - moved).to(scene.mean))
 
     @property
     def needs(self) -> Want:
@@ -152,8 +115,9 @@ class TwoSidedStylizer(Stylizer):
         """`forward`, and the regions that points belong to."""
         with full_precision(content):
             share = self.membership(content[:, :0] if semantic is None else semantic)
-            moved: Tensor = self.maps(content.to(self.centre), share, self.centre)
-            return moved.to(content), share
+            # Gains are mixed before they are applied; matrices of regions that a point does not belong to are not computed.
+            mixed = mixture.scaled if self.maps.ndim == 2 else mixture.affine
+            return mixed(content.to(self.centre), share, self.maps, self.bias, centre=self.centre).to(content), share
 
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
         with full_precision(semantic):
@@ -161,7 +125,7 @@ class TwoSidedStylizer(Stylizer):
             return share @ self.table
 
     def region_match(self, keys: Annotated[Tensor, "K D"]) -> Annotated[Tensor, "K T"]:
-        """The table of the plan."""
+        """Share of each code in each region."""
         return self.table
 
 
@@ -172,17 +136,9 @@ def _matched(scene: SceneStyle, dictionary: StyleDictionary, matching: Matching)
     here, there = Keys(scene.keys, scene.share), Keys(dictionary.keys, odds)
     table = match_keys(here, there, matching, dictionary.weight, dictionary.origin)
     score = (unit(scene.keys, scene.semantic_mean) @ unit(dictionary.keys, scene.semantic_mean).T).amax(1)
-    return _replace_unmatched(table, scene, (double(score) - _UNMATCHED) / (_MATCHED - _UNMATCHED))
-
-
-def _replace_unmatched(
-    table: Annotated[Tensor, "K T"], scene: SceneStyle, trust: Annotated[Tensor, "K"]
-) -> Annotated[Tensor, "K T"]:
-    """Rows of regions that are not in the references, by those of matched regions of similar content.
-
-    The softmax gives such a region whichever code is the least unlike: sky between twigs the colour of a lamp.
-    """
-    trust = trust.clamp(0, 1)
+    # The softmax gives a region that is not in the references whichever code is the least unlike: sky between twigs the colour
+    # of a lamp. Its row is replaced by those of matched regions of similar content.
+    trust = ((double(score) - _UNMATCHED) / (_MATCHED - _UNMATCHED)).clamp(0, 1)
     mean = double(scene.region_mean)
     distance = torch.cdist(mean, mean).square() / double(scene.covariance).trace().clamp_min(1e-12)
     weight = torch.exp(-distance / _SIMILAR) * (trust * double(scene.share))
