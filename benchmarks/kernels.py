@@ -20,8 +20,10 @@ from fprf.config import RenderConfig
 from fprf.datamanagers.features import FeatureStore
 from fprf.ops import backend, dense, mixture, triplane
 from fprf.rendering.cameras import Cameras
+from fprf.style.config import StyleConfig
+from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
-from fprf.style.restyle import restyle
+from fprf.style.restyle import apply_style
 from fprf.training.views import render_view
 
 from .common import arguments, report, train_run
@@ -91,7 +93,9 @@ def tasks(subject: Subject, config: SpeedConfig) -> dict[str, Callable[[], objec
 
     calls: dict[str, Callable[[], object]] = {f"{every} training steps": steps}
     looks = {"view": None} | {
-        f"view, {name}": restyle(trained, subject.references, stylizer, clusters=config.clusters).restyle
+        f"view, {name}": apply_style(
+            trained, StyleFile(StyleConfig(references=subject.references, stylizer=stylizer, clusters=config.clusters))
+        ).restyle
         for name, stylizer in STYLES.items()
     }
     for name, look in looks.items():

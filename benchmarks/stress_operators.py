@@ -12,11 +12,10 @@ from fprf.errors import FprfError
 from fprf.ops.guided import upsample
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from fprf.rendering.stepfun import resample, transmittance_weights
-from fprf.style.clusters import kmeans
 from fprf.style.dictionary import whole_style
 from fprf.style.matching import point_shares
-from fprf.style.scene import SceneStyle, own_style
-from fprf.style.statistics import covariance, empty, merge, moments
+from fprf.style.scene_style import SceneStyle, own_style
+from fprf.style.statistics import covariance, empty, kmeans, merge, moments
 from fprf.testing import cases
 from fprf.types import Want
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from fprf.ops import dense, guided, mixture, triplane
 from fprf.rendering import cameras, lens, space, splines, stepfun
 from fprf.rendering.lens import lens_reach
-from fprf.style import clusters, controls, dictionary, matching, scene, statistics
+from fprf.style import dictionary, light, look, matching, scene_style, statistics
 
 Made = Sequence[Tensor]
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -153,21 +153,19 @@ CASES = [
     Case("triplane.variation", lambda n: (_draw(triplane.rows((n,)), 8),), lambda t: triplane.variation(t, (_side(t),)),
          slopes=(0,), sizes=(2, 3, 37, 128)),
     Case("matching.match_keys", lambda n: (_draw(n, 6), _unit(n) + 0.1, _draw(5, 6), _unit(5) + 0.1),
-         lambda k, s, l, r: matching.match_keys(matching.Keys(k, s), matching.Keys(l, r),
-                                                 matching.Matching(1.0), torch.ones(5)), sizes=(1, 37, 500)),
-    Case("matching.whitener", lambda n: (_draw(n, 6), _unit(n) + 0.1),
-         lambda k, s: matching.whitener(matching.Keys(k, s), 0.5), sizes=(1, 37, 500)),
-    Case("clusters.kmeans", lambda n: (_draw(n, 4) + 20 * (_unit(n, 1) * 3).floor(),), lambda x: clusters.kmeans(x, 3, seed=0)),
-    Case("controls.blend_strength", lambda n: (_draw(n, 9), _draw(n, 9, seed=5), _unit(n, 1)), controls.blend_strength,
+         lambda k, s, l, r: matching.match_keys(k, s, l, r, torch.ones(5), temperature=1.0), sizes=(1, 37, 500)),
+    Case("matching.whitener", lambda n: (_draw(n, 6), _unit(n) + 0.1), lambda k, s: matching.whitener(k, s, 0.5),
+         sizes=(1, 37, 500)),
+    Case("statistics.kmeans", lambda n: (_draw(n, 4) + 20 * (_unit(n, 1) * 3).floor(),),
+         lambda x: statistics.kmeans(x, 3, seed=0)),
+    Case("look.blend_strength", lambda n: (_draw(n, 9), _draw(n, 9, seed=5), _unit(n, 1)), look.blend_strength,
          slopes=(0, 1)),
-    Case("controls.luma", lambda n: (_unit(n, 3),), controls.luma, slopes=(0,)),
-    Case("controls.keep_luminance", lambda n: (_unit(n, 3), _unit(n, 3, seed=5), _unit(n, 1)), controls.keep_luminance),
+    Case("light.luma", lambda n: (_unit(n, 3),), light.luma, slopes=(0,)),
+    Case("look.keep_luminance", lambda n: (_unit(n, 3), _unit(n, 3, seed=5), _unit(n, 1)), look.keep_luminance),
     Case("dictionary.blend_codes", lambda n: (*_code(n), _draw(6), _covariances(1, 6)[0]),
          lambda m, c, b, w, v: dictionary.blend_codes(m, c, w, v, b.clamp(0, 1)), sizes=(0, 1, 37, 500)),
     Case("matching.unit", lambda n: (_draw(n, 8), _draw(8)), matching.unit, slopes=(0,)),
     Case("matching.share_mean", lambda n: (_draw(n, 8), _unit(n) + 0.1), matching.share_mean, sizes=(1, 37, 20_000)),
-    Case("matching.compared", lambda n: (_draw(n, 8), _draw(7, 8), _draw(8, seed=5), _draw(8, seed=6)),
-         lambda q, k, a, b: matching.compared(q, k, "cosine", queries_centre=a, keys_centre=b)),
     Case("matching.scores", lambda n: (_draw(n, 8), _draw(7, 8)), matching.scores, slopes=(0, 1)),
     Case("matching.score_spread", lambda n: (_draw(n, 8), _draw(7, 8)),
          lambda q, k: torch.tensor(matching.score_spread(q, k), dtype=torch.float64)),
@@ -175,10 +173,11 @@ CASES = [
          lambda q, k, p: matching.attention(q, k, 0.7, p), slopes=(0, 1)),
     Case("matching.point_shares", lambda n: (_draw(n, 8), _draw(7, 8), _draw(8, seed=6)),
          lambda q, k, c: matching.point_shares(q, k, 0.7, centre=c)),
-    Case("scene.region_units", lambda n: (_draw(n, 8), _draw(8)), lambda k, c: scene.region_units(k, c)[0],
+    Case("scene_style.region_units", lambda n: (_draw(n, 8), _draw(8)), lambda k, c: scene_style.region_units(k, c)[0],
          sizes=(0, 1, 37, 500)),
-    Case("scene.membership", lambda n: (_draw(n, 8), _draw(8, seed=6), torch.nn.functional.normalize(_draw(5, 8), dim=-1)),
-         lambda x, c, u: scene.membership(x, c, u, 0.5)),
+    Case("scene_style.membership",
+         lambda n: (_draw(n, 8), _draw(8, seed=6), torch.nn.functional.normalize(_draw(5, 8), dim=-1)),
+         lambda x, c, u: scene_style.membership(x, c, u, 0.5)),
     Case("statistics.moments", lambda n: (_draw(n, 6) + 100, _unit(n)), _moments),
     Case("statistics.group_moments", lambda n: (_draw(n, 6), _shares(n, 3)), statistics.group_moments),
     Case("statistics.mix", _code, statistics.mix, sizes=(1, 37, 500)),

@@ -21,7 +21,8 @@ from .stylize import print_explained
 if TYPE_CHECKING:
     from ..io.images import Picture
     from ..splats.files import Capture
-    from ..splats.scene import Semantics, SplatScene
+    from ..splats.scene import SplatScene
+    from ..splats.semantics import Semantics
     from ..style.restyle import Styled
 
 _KEPT = 24

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any
 
 import cv2
@@ -16,18 +15,17 @@ from ..datamanagers.scene import Scene
 from ..errors import DataError
 from ..ops.photometric import WINDOW
 from ..ops.rasterise import Pinhole
-from ..ops.rasterise_training import Target, target_of
+from ..ops.rasterise_training import Floats, Target, target_of
 from ..rendering.cameras import Cameras, pixel_grid, project, rays_through
-from ..training.camera_optimizers import rotated
 from .config import GaussiansConfig
 
-Floats = NDArray[np.float32]
+Masks = dict[int, NDArray[np.bool_]]
+"""Masks [H W] by view."""
 _PANORAMA = 3
 _WIDEST = 4.0
 """Tangent of the widest angle that a pinhole shows: 76 degrees."""
 _SHARPEST = cv2.INTER_LANCZOS4
 """Out of its lens and back into it a photograph of 135 x 240 pixels comes with 43 dB; by cubic interpolation with 40."""
-
 
 Level = dict[int, Target]
 """Training views at one scale, by view; their sizes may differ."""
@@ -52,6 +50,7 @@ def undistorted(cameras: Cameras, view: int, image: Image, camera: Pinhole) -> t
     """
     if int(cameras.lens[view]) == 0:
         return image, None
+    # Rays through the pixels of the pinhole, from OpenCV's axes to OpenGL's and into the world.
     width, height = cameras.size[view].tolist()
     x, y = torch.arange(camera.width).double() + 0.5, torch.arange(camera.height).double() + 0.5
     grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).view(-1, 2)
@@ -59,6 +58,7 @@ def undistorted(cameras: Cameras, view: int, image: Image, camera: Pinhole) -> t
     turned = torch.stack([local[:, 0], -local[:, 1], -torch.ones(len(local), dtype=torch.float64)], -1)
     pose = cameras.pose[view]
     points = turned @ pose[:, :3].T + pose[:, 3]
+    # Where the lens maps them; what falls beyond the outermost pixel centres would only repeat the edge.
     pixel, _ = project(cameras, torch.full((len(points),), view), points)
     place = pixel.view(camera.height, camera.width, 2).numpy()
     inside = np.isfinite(place).all(-1) & (place >= 0.5).all(-1) & (place <= np.array([width - 0.5, height - 0.5])).all(-1)
@@ -73,11 +73,13 @@ def cover(cameras: Cameras, view: int, near: float) -> tuple[Pinhole, Annotated[
     plain = camera_of(cameras, view, near)
     if int(cameras.lens[view]) == 0:
         return plain, None
+    # Tangents of all pixels' rays in OpenCV's axes: what lies behind the camera is put at the widest angle.
     width, height = plain.width, plain.height
     _, direction = rays_through(cameras, torch.full((width * height,), view), pixel_grid(cameras, view))
     local = direction @ cameras.pose[view][:, :3]
     ahead = (-local[:, 2]).clamp_min(1e-9)
     tangent = torch.stack([local[:, 0] / ahead, -local[:, 1] / ahead], -1).clamp(-_WIDEST, _WIDEST)
+    # The pinhole keeps the focal length, and is as large as these reach, with a border of two pixels to interpolate in.
     focal = cameras.focal[view]
     low, high = (tangent * focal).amin(0).floor() - 2, (tangent * focal).amax(0).ceil() + 2
     wide, tall = (high - low).int().tolist()
@@ -92,30 +94,43 @@ def distorted(
     return torch.from_numpy(np.atleast_3d(_sampled(image.numpy(), place.numpy(), cv2.INTER_LINEAR if linear else _SHARPEST)))
 
 
+def load_photographs(config: GaussiansConfig, scene: Scene, views: list[int]) -> tuple[dict[int, Image], Masks, Masks]:
+    """Images of views, then the masks that say where they count, and those that say where they show sky, of views with one."""
+    images = dict(zip(views, load_images(scene, config.background, views), strict=True))
+
+    def load_masks(paths: tuple[Path | None, ...]) -> Masks:
+        named = {view: paths[view] for view in views} if paths and config.masks else {}
+        return {view: load_mask(path, images[view].shape[1::-1]) for view, path in named.items() if path is not None}
+
+    # Without surroundings nothing could show the sky but what floats before it.
+    return images, load_masks(scene.masks), load_masks(scene.sky_masks if config.surroundings else ())
+
+
 def make_levels(
-    scene: Scene,
-    images: Mapping[int, Image],
-    masks: Mapping[int, NDArray[np.bool_]],
-    near: float,
-    skies: Mapping[int, NDArray[np.bool_]] = MappingProxyType({}),
+    scene: Scene, images: Mapping[int, Image], masks: Masks, near: float, skies: Masks | None = None
 ) -> list[Level]:
     """The training views at their own size, at half of it and so on, until the longer side has less than 240 pixels.
 
-    A view counts where its mask, if it has one, is true; where `skies` are true it shows sky.
+    A view counts where its mask, if it has one, is true; where that in `skies` is true it shows sky.
     """
-    views = scene.train.tolist()
-    cameras = {view: cover(scene.cameras, view, near)[0] for view in views}
+    cameras = {view: cover(scene.cameras, view, near)[0] for view in scene.train.tolist()}
     longest = max(max(each.width, each.height) for each in cameras.values())
     shortest = min(min(each.width, each.height) for each in cameras.values())
     count = max(2, min((longest // 120).bit_length(), (shortest // WINDOW).bit_length()))  # SSIM needs its window
     levels: list[Level] = [{} for _ in range(count)]
-    for view in views:
-        camera = cameras[view]
+
+    def straightened(masks: Masks, view: int) -> NDArray[np.bool_] | None:
+        if view not in masks:
+            return None
+        grey = masks[view].astype(np.uint8) * 255
+        return np.asarray(undistorted(scene.cameras, view, grey, cameras[view])[0] > 254)
+
+    for view, camera in cameras.items():
+        # The photograph and its masks without their lens: what lies beyond the lens's picture does not count.
         image, valid = undistorted(scene.cameras, view, images[view], camera)
-        if view in masks:
-            seen = _undistorted_mask(scene.cameras, view, masks[view], camera)
-            valid = seen if valid is None else valid & seen
-        sky = _undistorted_mask(scene.cameras, view, skies[view], camera) if view in skies else None
+        mask, sky = straightened(masks, view), straightened(skies or {}, view)
+        valid = mask if valid is None else valid if mask is None else valid & mask
+        # Each size is reduced from the full one, so that errors do not add up; the camera shrinks with the image.
         colours: Floats = np.divide(image, 255, dtype=np.float32)
         for k, level in enumerate(levels):
             size = (max(1, camera.width >> k), max(1, camera.height >> k))
@@ -126,40 +141,11 @@ def make_levels(
     return levels
 
 
-def load_photographs(
-    config: GaussiansConfig, scene: Scene, views: list[int]
-) -> tuple[dict[int, Image], dict[int, NDArray[np.bool_]]]:
-    """Images of views, and the masks of those that have one."""
-    images = dict(zip(views, load_images(scene, config.background, views), strict=True))
-    return images, _load_masks(scene.masks if config.masks else (), images)
-
-
-def load_skies(config: GaussiansConfig, scene: Scene, images: Mapping[int, Image]) -> dict[int, NDArray[np.bool_]]:
-    """The masks of the sky of the views that have one; none without surroundings: nothing else could show the sky."""
-    return _load_masks(scene.sky_masks if config.masks and config.surroundings else (), images)
-
-
-def _load_masks(paths: tuple[Path | None, ...], images: Mapping[int, Image]) -> dict[int, NDArray[np.bool_]]:
-    """The masks of the views that have one, at the size of their images."""
-    named = {view: paths[view] for view in images} if paths else {}
-    return {view: load_mask(path, images[view].shape[1::-1]) for view, path in named.items() if path is not None}
-
-
-def _undistorted_mask(cameras: Cameras, view: int, mask: NDArray[np.bool_], camera: Pinhole) -> NDArray[np.bool_]:
-    return np.asarray(undistorted(cameras, view, mask.astype(np.uint8) * 255, camera)[0] > 254)
-
-
 def _resized(mask: NDArray[np.bool_] | None, size: tuple[int, int]) -> NDArray[np.bool_] | None:
     """A mask at a size (width, height): pixels all of which it holds."""
     if mask is None or mask.shape[::-1] == size:
         return mask
     return np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999)
-
-
-def moved(target: Target, turn: Annotated[Tensor, "3"], shift: Annotated[Tensor, "3"]) -> Target:
-    """A photograph whose camera is turned about its own centre by a rotation vector and shifted, float64, world axes."""
-    axes = rotated(torch.from_numpy(target.axes), turn.expand(3, 3))
-    return target.seen_from(axes.numpy(), target.centre + shift.numpy())
 
 
 def _sampled(image: NDArray[Any], place: NDArray[np.float64], interpolation: int = _SHARPEST) -> NDArray[Any]:

@@ -22,10 +22,9 @@ from ..rendering.cameras import Cameras
 from ..rendering.paths import look_at, pinhole
 from ..rendering.renderer import render_rays
 from ..rendering.space import Space
-from ..style.colours import colour_maps
 from ..style.dictionary import Reference, build_dictionary
-from ..style.look import Restyle
-from ..style.scene import scene_style
+from ..style.look import Restyle, colour_maps
+from ..style.scene_style import scene_style
 from ..types import Want
 from .model import Facts, Model, build_model
 from .views import render_view, view_rays

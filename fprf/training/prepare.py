@@ -20,7 +20,6 @@ from ..errors import DataError, PluginError, UsageError, WeightsError
 from ..interfaces import DataManager, Encoder
 from ..plugins.config import Need
 from ..rendering.space import Space
-from .camera_optimizers import relative
 from .model import Facts, build_decoder
 
 
@@ -171,16 +170,21 @@ def facts_of(
 def exposure_of(
     tones: bool | None, scene: Scene, image: Callable[[int], Annotated[Tensor, "H W 3"]], saved: Facts | None = None
 ) -> tuple[float, ...]:
-    """`relative` exposure of the views; empty where tones are not learnt: None = where exposures differ.
+    """Logarithm of each view's exposure over their geometric mean; empty where tones are not learnt.
 
-    `image(view)` is a training view, in [0, 1].
+    `tones` None = learn them where exposures differ. `image(view)` is a training view, in [0, 1].
     """
     if saved is not None:
         return saved.exposure
     if tones is False:
         return ()
     exposure = with_exposure(scene, image).exposure
-    return relative(exposure, len(scene.paths)) if tones or exposures_differ(exposure) else ()
+    if not tones and not exposures_differ(exposure):
+        return ()
+    if exposure is None:  # learnt from nothing: all are taken as alike
+        return (0.0,) * len(scene.paths)
+    log = exposure.double().log()
+    return tuple((log - log.mean()).tolist())
 
 
 def reach_of(scene: Scene, space: Space) -> float:

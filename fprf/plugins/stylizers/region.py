@@ -17,10 +17,11 @@ from ...interfaces import Stylizer
 from ...ops import mixture
 from ...ops.precision import double, full_precision
 from ...style.dictionary import StyleDictionary, choose, code_odds, whole_style
-from ...style.matching import Keys, Matching, match_keys, unit
-from ...style.scene import Membership, SceneStyle, check_fit, own_style
+from ...style.matching import match_keys, unit
+from ...style.scene_style import Membership, SceneStyle, check_fit, own_style
 from ...style.statistics import deviation, monge
 from ...types import Want
+from .config import RegionConfig
 
 _UNMATCHED, _MATCHED = 0.1, 0.4
 """Cosines with the nearest code, from the scene's mean: up to the first a region is unmatched, from the second on matched."""
@@ -28,17 +29,17 @@ _SIMILAR = 0.2
 """Squared distance of contents, in total variances of the scene, at which the weight of another region falls to 1/e."""
 
 
-def region_table(scene: SceneStyle, dictionary: StyleDictionary, matching: Matching) -> Annotated[Tensor, "K T"]:
+def region_table(scene: SceneStyle, dictionary: StyleDictionary, config: RegionConfig) -> Annotated[Tensor, "K T"]:
     """Share of each style code in each region, float64; rows sum to 1.
 
     A region that may not take from all references is matched with the codes of the others as if there were only these.
     """
     if dictionary.allowed is None:
-        return _matched(scene, dictionary, matching)
+        return _matched(scene, dictionary, config)
     table = torch.zeros(len(scene.share), len(dictionary.share), dtype=torch.float64)
     for k, chosen in enumerate(dictionary.allowed):
         part, codes = choose(dictionary, chosen)
-        table[k, codes] = _matched(scene, part, matching)[k]
+        table[k, codes] = _matched(scene, part, config)[k]
     return table
 
 
@@ -53,8 +54,7 @@ class Side(NamedTuple):
 class TwoSidedStylizer(Stylizer):
     """Membership of points, and the affine map of each region, applied to features less the scene's mean.
 
-    `smoothing` [K K] mixes the matches of regions; None = each by itself. With `transport` the maps are matrices of all
-    channels; else gains, channel by channel. None amplifies more than `gain`.
+    With `transport` the maps are matrices of all channels; else gains, channel by channel. None amplifies more than `gain`.
     """
 
     centre: Annotated[Tensor, "C"]
@@ -62,21 +62,13 @@ class TwoSidedStylizer(Stylizer):
     maps: Annotated[Tensor, "K C"] | Annotated[Tensor, "K C C"]
     bias: Annotated[Tensor, "K C"]
 
-    def __init__(
-        self,
-        dictionary: StyleDictionary,
-        scene: SceneStyle,
-        matching: Matching,
-        smoothing: Annotated[Tensor, "K K"] | None = None,
-        *,
-        transport: bool,
-        gain: float,
-    ) -> None:
+    def __init__(self, dictionary: StyleDictionary, scene: SceneStyle, config: RegionConfig) -> None:
         super().__init__()
         check_fit(dictionary, scene)
         # Regions are matched with codes of the scene itself and with those of the references, both alike blended and smoothed.
         own = own_style(scene, dictionary.blend)._replace(origin=dictionary.origin)
-        same, table = region_table(scene, own, matching), region_table(scene, dictionary, matching)
+        same, table = region_table(scene, own, config), region_table(scene, dictionary, config)
+        smoothing = config.smoothing(scene, dictionary.allowed)
         if smoothing is not None:
             same, table = smoothing @ same, smoothing @ table
         here = _mixed(own, same)
@@ -89,11 +81,11 @@ class TwoSidedStylizer(Stylizer):
             there = Side(mean, deviation(mean, covariance.diagonal(dim1=-2, dim2=-1)), covariance)
         # f' = (f - centre) A_k + b_k takes the mean of region k to that of its style.
         away = here.mean - double(scene.mean)
-        if transport:
-            maps = monge(here.covariance, there.covariance, gain=gain)
+        if config.transport:
+            maps = monge(here.covariance, there.covariance, gain=config.gain)
             moved = torch.einsum("kc,kcd->kd", away, maps)
         else:  # AdaIN: A_k = sigma_s / sigma_c
-            maps = (there.sigma / here.sigma).clamp_max(gain)
+            maps = (there.sigma / here.sigma).clamp_max(config.gain)
             moved = away * maps
         self.membership = Membership(scene)
         self.register_buffer("centre", scene.mean.float())
@@ -129,12 +121,20 @@ class TwoSidedStylizer(Stylizer):
         return self.table
 
 
-def _matched(scene: SceneStyle, dictionary: StyleDictionary, matching: Matching) -> Annotated[Tensor, "K T"]:
+def _matched(scene: SceneStyle, dictionary: StyleDictionary, config: RegionConfig) -> Annotated[Tensor, "K T"]:
     odds = code_odds(dictionary)
     if len(scene.keys) == 1 or scene.keys.shape[1] == 0:
         return odds.expand(len(scene.keys), -1)
-    here, there = Keys(scene.keys, scene.share), Keys(dictionary.keys, odds)
-    table = match_keys(here, there, matching, dictionary.weight, dictionary.origin)
+    table = match_keys(
+        *(scene.keys, scene.share, dictionary.keys, odds, dictionary.weight),
+        temperature=config.temperature,
+        similarity=config.similarity,
+        whitening=config.whitening,
+        recentred=config.recentred,
+        centred=config.centred,
+        origin=dictionary.origin,
+    )
+    # Whether the references show such a thing at all is asked from the scene's mean: centred on its own, each side always fits.
     score = (unit(scene.keys, scene.semantic_mean) @ unit(dictionary.keys, scene.semantic_mean).T).amax(1)
     # The softmax gives a region that is not in the references whichever code is the least unlike: sky between twigs the colour
     # of a lamp. Its row is replaced by those of matched regions of similar content.
