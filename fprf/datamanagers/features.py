@@ -196,6 +196,7 @@ class FeatureStore:
         if self._packed is not None and view.device == self._packed[1].device:
             packed, numbers = self._packed
             return guided.apply_packed(packed, numbers[view], pixel, rgb, grey=GREY)
+        # Entries of the views, and a clear word for those that have none.
         asked = view.detach().cpu()
         slot = self._numbers[asked.clamp(0, len(self._numbers) - 1)]
         missing = asked[self._slots[slot] != asked]
@@ -230,6 +231,7 @@ def extract(
         with contextlib.suppress(OSError):  # another process was first
             if time.time() - path.stat().st_mtime > 3600:
                 path.unlink()
+    # What a view's features depend on begins with its pixels.
     prints = {}
     for view in views:
         pixels = image(view)
@@ -242,6 +244,7 @@ def extract(
     place = () if device.type == "cpu" else (device.type,)  # other devices round otherwise, TF32 by 1e-3
     entries: dict[int, Entry] = {}
     keys = {}
+    # View by view, what is not there yet.
     for done, view in enumerate(views):
         if progress is not None:
             progress(done, len(views), f"features of {encoder.identity}")
