@@ -82,6 +82,7 @@ def add_shift(bias, at, side, s_at, out, to):
 @numba.njit(inline="always", cache=True)
 def _layers(source, at, depth, weights, biases, widths, side, row, last, first, rows, here, there, out, outputs):
     """A block of rows of `source` through all layers, to rows `first` on of `out`; `source` may be `there`."""
+    # Sums start from the biases, or from these and what is shared.
     start, s_row = biases, 0
     if len(row) > 0:
         width, start, s_row = widths[0], here, widths[0]

@@ -58,6 +58,7 @@ def affine(x, centre, share, matrix, bias, channels, width, out):
             mine, goal = x[(first + r) * channels : (first + r + 1) * channels], away[r * channels : (r + 1) * channels]
             for c in range(channels):
                 goal[c] = mine[c] - centre[c]
+        # Region by region, the block of points stays in the cache.
         for k in range(count):
             _add_scaled(away, 0, channels, BLOCK, matrix, k * channels * width, width, bias, k * width, sums, belongs, k, count)
         if width == channels:
@@ -80,6 +81,7 @@ def scaled(x, centre, share, gain, bias, channels, width, none, out):
         shares = np.zeros(BLOCK * count, np.float32)
         gains, shift = np.empty(BLOCK * width, np.float32), np.empty(BLOCK * width, np.float32)
         shares[: rows * count] = share[first * count : (first + rows) * count]
+        # Mixed gains and biases of each point, then their use.
         product(shares, 0, count, 1, rows, gain, 0, width, none, 0, 0, gains, 0, width, count, _LEAST)
         product(shares, 0, count, 1, rows, bias, 0, width, none, 0, 0, shift, 0, width, count, _LEAST)
         for r in range(rows):

@@ -12,15 +12,13 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from .rasterise_harmonics import FIXED, basis, colour, direction, direction_slopes
+from .rasterise_blocks import BLOCKS, FIXED, Floats, basis, colour, direction, direction_slopes, jit
 from .rasterise_kernels import (
-    BLOCKS,
     BLUR,
     MAX_ALPHA,
     SIDE,
     SLOTS,
     TILE,
-    Floats,
     Tiles,
     alpha_of,
     axes,
@@ -28,7 +26,6 @@ from .rasterise_kernels import (
     entry_of,
     footprint,
     inside,
-    jit,
     opacity,
     open_blocks,
 )
@@ -88,6 +85,7 @@ def _nothing(memory, count):
 @traced
 def _composite_block(entry, block, memory, places, found, geometry):
     """Add a block to the sums of an entry: those of the shape, then of channels."""
+    # Alpha as in the forward pass, and what it lets pass.
     dx, dy, a, b, c, d, *value = entry
     dx, dy = dx + memory[block + places], dy + memory[block + places + LANES]
     power = d + dx * (a * dx + b * dy) + c * dy * dy
@@ -101,6 +99,7 @@ def _composite_block(entry, block, memory, places, found, geometry):
     summed = [each + weight * g for each, g in zip(found[len(shape) :], slope, strict=True)]
     if not geometry:
         return summed
+    # dL / d ln alpha = weight <value, gradient> - alpha / (1 - alpha) <what is behind, gradient>.
     gain = splat(memory, 0)
     for each, g in zip(value, slope, strict=True):
         gain = gain + each * g
@@ -141,6 +140,7 @@ def _composite_back(channels, geometry):
                 _begin(
                     row, memory, channels, geometry, bx, by, width, height, out, left, grad, grad_left, d, padded, area
                 )  # fmt: skip
+            # Front to back as in the forward pass, with the same blocks left alone.
             k, end, unsaturated = start[tile], start[tile + 1], 0xFFFF
             while k < end and unsaturated != 0:
                 stop = min(k + 32, end)
@@ -293,6 +293,7 @@ def _block_gradient(blocks, at, bands, view, summed):
 @traced
 def _learn_block(blocks, first, second, weight, start, bands, view, memory, rates, of_camera):
     at = start * (FIXED + 3 * bands)
+    # Adam, whose second moment is weighted by how often a Gaussian was seen.
     w = load(weight, start)
     w = w + (1 - _BETAS[1]) * (1 - w)
     store(weight, start, w)

@@ -34,6 +34,7 @@ def _cells(points, first, count, size, start, channels, corner, part):
             low = min(np.floor(at), top)
             part[axis * BLOCK + n] = at - low
             corner[axis * BLOCK + n] = np.int64(low)
+    # Rows of the table by plane: (0, 1), (0, 2), (1, 2).
     for n in range(count):
         i, j, k = corner[n], corner[BLOCK + n], corner[2 * BLOCK + n]
         corner[n] = (start + j * size + i) * channels

@@ -1,14 +1,71 @@
-"""View-dependent colours in the compiled rasteriser: values of the spherical harmonics at a vector of Gaussians, and slopes.
+"""Blocks of Gaussians in the compiled rasteriser: how their parameters lie, and the colours that they give.
 
-Blocks of parameters are those of `rasterise_kernels`; K = 1, 4, 9 or 16 `bands` are the harmonics of a colour channel.
+Parameters of LANES Gaussians lie together, one row of LANES numbers each: mean 0-2, ln scale 3-5, quaternion wxyz 6-9, logit
+of the opacity 10, then harmonics [K 3], K = 1, 4, 9 or 16 `bands`. A flat array of blocks, so that every load is one vector.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg, var-annotated"
 
-from .simd import LANES, load, maximum, splat, square_root
+from typing import Any
 
+import numba
+import numpy as np
+
+from .simd import LANES, load, maximum, splat, square_root
+from .threads import on_threads, take
+
+Floats = np.ndarray[Any, np.dtype[np.float32]]
 FIXED = 11
-"""Rows of a block of Gaussians before its harmonics."""
+"""Rows of a block before its harmonics."""
+BLOCKS = 64
+"""Blocks that a thread takes at a time."""
+_f = np.float32
+_LARGE, _MOST_LOG, MARK = _f(1e15), _f(30), _f(-70)
+"""Coordinates beyond which a Gaussian is invalid; most of a logarithm; the logit of the invalid."""
+
+jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz"})
+
+
+@jit
+def _pack(counters, means, quaternions, log_scales, logits, harmonics, blocks):
+    count, bands = harmonics.shape[0], harmonics.shape[1]
+    rows = FIXED + 3 * bands
+    while True:
+        begin = take(counters, 0) * BLOCKS * LANES
+        if begin >= count:
+            break
+        for i in range(begin, min(begin + BLOCKS * LANES, (count + LANES - 1) // LANES * LANES)):
+            o = i // LANES * rows * LANES + i % LANES
+            # Rows behind the last Gaussian, NaN and what is too large are marked.
+            fine = i < count
+            if fine:
+                fine = logits[i] == logits[i]
+                for c in range(3):
+                    fine = fine and abs(means[i, c]) < _LARGE and log_scales[i, c] == log_scales[i, c]
+                    for k in range(bands):
+                        fine = fine and abs(harmonics[i, k, c]) < _LARGE
+                for c in range(4):
+                    fine = fine and abs(quaternions[i, c]) < _LARGE
+            if not fine:
+                for row in range(rows):
+                    blocks[o + row * LANES] = _f(0)
+                blocks[o + 10 * LANES] = MARK
+                continue
+            for c in range(3):
+                blocks[o + c * LANES] = means[i, c]
+                blocks[o + (3 + c) * LANES] = min(max(log_scales[i, c], -_MOST_LOG), _MOST_LOG)
+            for c in range(4):
+                blocks[o + (6 + c) * LANES] = quaternions[i, c]
+            blocks[o + 10 * LANES] = min(max(logits[i], -_MOST_LOG), _MOST_LOG)
+            for k in range(bands):
+                for c in range(3):
+                    blocks[o + (FIXED + 3 * k + c) * LANES] = harmonics[i, k, c]
+
+
+def pack(means: Floats, quaternions: Floats, log_scales: Floats, logits: Floats, harmonics: Floats, blocks: Floats) -> None:
+    """Put arrays [N 3], [N 4], [N 3], [N], [N K 3] into blocks. Scales and opacities are limited to what float32 can square; a
+    Gaussian with NaN, or with another number beyond 1e15, is marked as invalid by its logit."""
+    on_threads(_pack, means, quaternions, log_scales, logits, harmonics, blocks)
 
 
 def direction(mean, view):
