@@ -16,7 +16,8 @@ from typing import Any, Literal, NamedTuple, TypeVar
 from rich.console import Console
 
 from fprf.checks import at_least
-from fprf.cli.parsing import as_flag, load_field_method, parse
+from fprf.cli.parsing import load_method, parse
+from fprf.config import TrainConfig, fields_only
 from fprf.errors import FprfError
 from fprf.io.atomic import write_json, write_text
 from fprf.progress import Display
@@ -137,7 +138,7 @@ def bench_run(prog: str, default: C, args: list[str], measure: Callable[[C, Path
     `measure` gets the config, the run folder, a temporary folder and a function that shows progress.
     """
     about = (type(default).__doc__ or "").strip()
-    config = parse(default, as_flag(args, "--run"), prog=f"{prog} [RUN]", description=about)
+    config = parse(default, args, prog=prog, description=about, positional=("run",))
     with tempfile.TemporaryDirectory(prefix="fprf-bench-") as made:
         folder = Path(made)
         root = config.run or train_run(folder / "run", config.method, config.data, steps=config.steps, device=config.device)
@@ -152,9 +153,15 @@ def bench_run(prog: str, default: C, args: list[str], measure: Callable[[C, Path
 
 def train_run(output: Path, method: str, data: Path | None, *, steps: int, device: str = "cpu") -> Path:
     """Train fields for the steps; without data on the method's own, or else on the town. Returns the run folder."""
-    chosen, name = load_field_method(method)
+    chosen, name = field_method(method)
     scene = scene_folder(data or chosen.data or Path("town"))
     return train(replace(chosen, data=scene, output=output, steps=steps, minutes=None, device=device), name)
+
+
+def field_method(method: str) -> tuple[TrainConfig, str]:
+    """Config and name of a method of fields. Raises UsageError for one of another kind."""
+    config, name = load_method(method)
+    return fields_only(config, Path(method)), name
 
 
 def console() -> Console:

@@ -17,7 +17,7 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 
-from fprf.cli.parsing import as_flag, parse
+from fprf.cli.parsing import parse
 from fprf.errors import UsageError
 from fprf.interfaces import Scene
 from fprf.io.images import write_image
@@ -63,7 +63,7 @@ class ExportsConfig:
 def main(argv: list[str]) -> None:
     """`python -m benchmarks exports [RUN] [flags]`."""
     about = __doc__ or ""
-    config = parse(ExportsConfig(), as_flag(argv, "--run"), prog="python -m benchmarks exports [RUN]", description=about)
+    config = parse(ExportsConfig(), argv, prog="python -m benchmarks exports", description=about, positional=("run",))
     with tempfile.TemporaryDirectory(prefix="fprf-exports-") as made:
         folder = Path(made) / "files"
         run = config.run or train_run(Path(made) / "run", "fprf-lite", None, steps=config.steps)

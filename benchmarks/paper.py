@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from fprf.checks import at_least, between
-from fprf.cli.parsing import load_field_method, parse
+from fprf.cli.parsing import parse
 from fprf.config import TrainConfig
 from fprf.datamanagers.images import load_image
 from fprf.evaluation.metrics import image_metrics, mean_metrics
@@ -43,7 +43,7 @@ from fprf.training.run import Run
 from fprf.training.style_pass import measure_style
 from fprf.training.views import cache_view, render_view
 
-from .common import Progress, console, origin
+from .common import Progress, console, field_method, origin
 from .report import Column, printed
 from .restyle import PLAIN, dictionary_of, in_scene
 from .style_metrics import matched_regions, structure
@@ -311,7 +311,7 @@ COLUMNS: tuple[Column, ...] = (
 def main(argv: list[str]) -> int:
     """`python -m benchmarks paper --table NAME [flags]`."""
     config = parse(PaperConfig(), argv, prog="python -m benchmarks paper", description=__doc__ or "")
-    method, name = load_field_method(config.method)
+    method, name = field_method(config.method)
     base = replace(method, data=scene_folder(config.data), downscale=config.downscale, device=config.device)
     base = replace(base, steps=config.steps, minutes=None, output=None)
     tables = []

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from fprf.checks import at_least, between, positive
-from fprf.cli.parsing import as_flag, parse
+from fprf.cli.parsing import parse
 from fprf.errors import ConfigError, UsageError
 from fprf.evaluation.consistency import published
 from fprf.interfaces import Scene, SceneView
@@ -562,7 +562,7 @@ def _by_class(document: Mapping[str, Any]) -> str:
 def main(argv: list[str]) -> int:
     """`python -m benchmarks restyle [RUN]`."""
     about = (RestyleConfig.__doc__ or "").strip()
-    config = parse(RestyleConfig(), as_flag(argv, "--run"), prog="python -m benchmarks restyle [RUN]", description=about)
+    config = parse(RestyleConfig(), argv, prog="python -m benchmarks restyle", description=about, positional=("run",))
     with tempfile.TemporaryDirectory(prefix="fprf-restyle-") as made:
         root = config.run
         if root is None:

@@ -1,8 +1,9 @@
-"""The abstract base of every plug-in kind, with shapes: the one file that a plug-in author reads.
+"""What every plug-in must do: one abstract class a kind, with shapes. The one file that a plug-in author reads.
 
-Each is built by its config's `build(...)`; the configs live in the `config.py` next to the built-ins and import no torch. A
-contract in `fprf.testing` says what an implementation must hold, and fails with one sentence where it doesn't:
+A plug-in is built by its config's `build(...)`; configs live in the `config.py` next to the built-ins and import no torch. A
+contract in `fprf.testing` checks an implementation, and fails with one sentence:
 
+    kind        class            from -> to                                  contract
     images      Encoder          [B 3 H W] -> [B C h w]                      check_encoder
     fields      ContentField     [N 3] -> density [N], content [M C]         check_content_field
                 SemanticField    [N 3] -> [N D]                              check_semantic_field
@@ -14,11 +15,15 @@ contract in `fprf.testing` says what an implementation must hold, and fails with
                 DataManager      step -> batch of R pixels                   check_data_manager
     scale       BlockLayout      site -> cells                               check_layout
                 Executor         tasks -> results                            check_executor
-    scenes      Scene, SceneView, SceneLearner, Partition: a kind of scene of its own, built by `RunConfig.build`
+    scenes      Scene, SceneView, SceneLearner, Partition: a kind of scene, built by `RunConfig.build`
 
-Letters (all of them in `fprf.types`): B images · N M points · R rays · E edges · C content channels · D semantic channels ·
-L latent channels · T style codes · K scene regions · H W pixels. Tensors are float32 unless their inputs are of another type;
-device and type of results follow the inputs. Functions of points treat each alone: the same in any batch, and of none none.
+    letter  axis                 letter  axis                 letter  axis
+    B       images               C       content channels     T       style codes
+    N M     points               D       semantic channels    K       regions of the scene
+    R E     rays, edges          L       latent channels      H W     pixels; h w cells of features
+
+Tensors are float32 unless their inputs are of another type; device and type of results follow the inputs. A function of points
+treats each alone: the same in any batch, and of none none.
 """
 
 from abc import ABC, abstractmethod
@@ -51,9 +56,6 @@ if TYPE_CHECKING:
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-OPAQUE = 0.005
-"""Mean transparency of an image up to which its backdrop decides nothing."""
-
 
 class Encoder(nn.Module, ABC):
     """Images to features. Frozen; deterministic; normalises its input itself; may be called by several threads at once.
@@ -83,13 +85,26 @@ class Encoder(nn.Module, ABC):
         """
         behind = 1 - opacity[:, None]
         features: Tensor = self((image + behind).clamp(0, 1))
-        # Where next to nothing shows through, both backdrops give one picture, and encoders take most of the time.
-        if float(behind.mean((1, 2, 3)).amax()) > OPAQUE:
+        # Where less than 1/200 shows through, both backdrops give one picture, and encoders take most of the time.
+        if float(behind.mean((1, 2, 3)).amax()) > 0.005:
             features = (features + self(image.clamp(0, 1))) / 2
         return features
 
 
-class ContentField(nn.Module, ABC):
+class Regularised(nn.Module, ABC):
+    """A network with penalties on its own parameters."""
+
+    @abstractmethod
+    def penalties(self) -> dict[str, Tensor]:
+        """Regularisers by name, each a scalar, the same names at each call.
+
+        The weights of 'variation' and 'proposal_variation' are `loss.variation` and `loss.proposal_variation`; any other name
+        has weight 1 unless `loss.penalties` names it, so the scalar should include its own weight. One name in several parts
+        is added up.
+        """
+
+
+class ContentField(Regularised):
     """Points to density and content features (paper, scene content field). Stateless between calls.
 
     Every parameter has a gradient, through the density or the content, and is drawn from the seed of `build` alone.
@@ -103,29 +118,16 @@ class ContentField(nn.Module, ABC):
     def content(self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "M C"]:
         """Content features of some of the points, by their latents and unit viewing directions."""
 
-    @abstractmethod
-    def penalties(self) -> dict[str, Tensor]:
-        """Regularisers by name, each a scalar, the same names at each call.
 
-        The weights of 'variation' and 'proposal_variation' are `loss.variation` and `loss.proposal_variation`; any other name
-        has weight 1 unless `loss.penalties` names it, so the scalar should include its own weight. One name in several parts
-        is added up.
-        """
-
-
-class SemanticField(nn.Module, ABC):
+class SemanticField(Regularised):
     """Points to semantic features, without direction (paper, scene semantic field). Never moves density."""
 
     @abstractmethod
     def forward(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N D"]:
         """Semantic features at points of the unit cube."""
 
-    @abstractmethod
-    def penalties(self) -> dict[str, Tensor]:
-        """Regularisers by name, as of `ContentField`."""
 
-
-class Sampler(nn.Module, ABC):
+class Sampler(Regularised):
     """Rays to sample edges. May own proposal fields, which live in the unit cube: `space.locate` leads there."""
 
     @property
@@ -137,22 +139,11 @@ class Sampler(nn.Module, ABC):
         return nn.ModuleList()
 
     @abstractmethod
-    def forward(
-        self,
-        rays: Rays,
-        *,
-        space: "Space",
-        step: int | None,
-        generator: torch.Generator | None,
-    ) -> Sampled:
+    def forward(self, rays: Rays, *, space: "Space", step: int | None, generator: torch.Generator | None) -> Sampled:
         """Edges `s` in [0, 1] and `t` in [near, far] of each ray, [R E] with E >= 2, sorted; t = space.distance(s, near, far).
 
         `step` is that of the training, None in a view. A function of rays, step and generator; None = deterministic.
         """
-
-    @abstractmethod
-    def penalties(self) -> dict[str, Tensor]:
-        """Regularisers by name, as of `ContentField`."""
 
 
 class Decoder(nn.Module, ABC):
@@ -268,13 +259,7 @@ class Scene(ABC):
 
     @abstractmethod
     def paint(
-        self,
-        cameras: "Cameras",
-        view: int,
-        pixel: Annotated[Tensor, "R 2"],
-        values: Values,
-        *,
-        semantic: bool = True,
+        self, cameras: "Cameras", view: int, pixel: Annotated[Tensor, "R 2"], values: Values, *, semantic: bool = True
     ) -> tuple[Annotated[Tensor, "R X"], Annotated[Tensor, "R"]]:
         """Means over what each pixel sees of anything that follows from semantics, and the opacity.
 

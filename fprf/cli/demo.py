@@ -5,24 +5,19 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING
+from typing import Any
 
 from ..checks import at_least, positive
 from ..progress import Display
 from ..style.config import StyleConfig
 from ..style.files import StyleFile
+from .gallery import fading, page_styles, page_views
 from .parsing import parse
-from .showcase import photographs_of, restyled, write_shown
-
-if TYPE_CHECKING:
-    from ..interfaces import Scene
-    from ..io.images import Picture
-    from ..rendering.cameras import Cameras
 
 TITLE = "One garden, photographed once"
 LEAD = (
@@ -37,8 +32,6 @@ CREDITS = (
 )
 _NICE = 10
 """Added to the niceness of the process that compiles beside training."""
-FADE = 5
-"""Frames in which the film goes over to the next style."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,12 +61,15 @@ def run(args: list[str]) -> int:
     """Train the garden, or resume, then measure, restyle, film, export and write the page."""
     config = parse(DemoConfig(), args, prog="fprf demo", description="Train, restyle and show a garden that ships with fprf.")
     start = time.perf_counter()
+    from ..datamanagers.images import load_image
     from ..io.atomic import write_json
     from ..io.video import write_video
     from ..methods import fprf_splats
+    from ..page.writer import Page, Reference, write_page
     from ..rendering.paths import make_path
     from ..splats.files import write_gaussians
     from ..splats.loading import open_gaussians
+    from ..splats.scene import SplatScene
     from ..training.driver import train
     from ..training.quality import QualityConfig
     from ..training.run import Run
@@ -87,37 +83,38 @@ def run(args: list[str]) -> int:
         metrics = evaluate(EvalConfig(run=root, images=False))
     opened = open_gaussians(Run(root), training, "cpu", QualityConfig())
     scene, views = opened.scene, opened.known.test
-    references = {name: garden / "references" / f"{name}.jpg" for name in LOOKS}
+    names = {garden / "references" / f"{name}.jpg": name for name in LOOKS}
+    chosen = [(name, StyleFile(StyleConfig(references=(path,)))) for path, name in names.items()]
+    chosen.append(("all together", StyleFile(StyleConfig(references=tuple(names)))))
     with Display() as display:
-        chosen = [(name, (path,)) for name, path in references.items()] + [("all together", tuple(references.values()))]
         begun = time.perf_counter()
         scene.measured()
         looked = time.perf_counter() - begun
-        styles = restyled(scene, [(n, StyleFile(StyleConfig(references=p))) for n, p in chosen], views, display)
-        looks = [scene.restyled(style.styled.restyle) for style in styles]
-        for style, look in zip(styles, looks, strict=True):
+        styles = page_styles(scene, chosen, views, names, display)
+        for style, look in styles:
+            assert isinstance(look, SplatScene)
             # For viewers that do not compensate opacities; these depend on no colour, so that the views are looked at once.
             plain = scene.seen.plain(look.shown)
             write_gaussians(config.output / f"{style.name.replace(' ', '-')}.ply", plain, origin=scene.origin)
         # From one held-out view to the next, where other views surround the camera.
         tour = make_path(opened.known.cameras, views, "interpolate", config.frames, scene.origin)
-        frames = list(fading([scene, *looks[: len(references)]], tour, display))
+        frames = list(fading([scene, *(look for _, look in styles[: len(LOOKS)])], tour, display))
+        shown_views = page_views(opened, views, display)
     film = config.output / "film.mp4"
     if write_video(film, frames, fps=12) == "mp4v":  # browsers do not play that
         film = film.with_suffix(".webp")
         write_video(film, frames, fps=12)
+    figures: list[dict[str, Any]] = [dict(style.metrics) for style, _ in styles]
     metrics |= {
         "looked_seconds": looked,
-        "new_style_seconds": fmean(style.metrics["new_style_seconds"] for style in styles[: len(references)]),
-        "restyled_seconds_per_view": fmean(style.metrics["each_view_seconds"] for style in styles),
+        "new_style_seconds": fmean(each["new_style_seconds"] for each in figures[: len(LOOKS)]),
+        "restyled_seconds_per_view": fmean(each["each_view_seconds"] for each in figures),
         "total_seconds": time.perf_counter() - start,
     }
     write_json(config.output / "metrics.json", metrics)
     width, height = (int(v) for v in scene.cameras.size[0])
     page = config.output / "garden.html"
-    write_shown(
-        page,
-        scene,
+    content = Page(
         title=TITLE,
         lead=LEAD,
         facts={
@@ -128,16 +125,16 @@ def run(args: list[str]) -> int:
             "Unseen views": f"{metrics['psnr']:.1f} dB",
             "A new style": f"{metrics['new_style_seconds']:.1f} s",
         },
-        views=views,
-        originals=[scene.render(scene.cameras, view) for view in views],
-        photographs=photographs_of(opened.run, opened.known, views),
-        shown=styles,
-        references=references,
+        views=shown_views,
+        styles=[style for style, _ in styles],
+        references=[Reference(name, load_image(path, upright=True)) for path, name in names.items()],
+        scene=scene,
+        start=views[0],
         metrics={name: value for name, value in metrics.items() if name != "per_view"},
         film=film,
         credits=CREDITS,
-        megabytes=config.megabytes,
     )
+    write_page(page, content, megabytes=config.megabytes)
     print(
         f"PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.3f}; a new style in {metrics['new_style_seconds']:.2f} s "
         f"and {metrics['restyled_seconds_per_view']:.2f} s a view; all in {metrics['total_seconds']:.0f} s\n"
@@ -172,25 +169,6 @@ def _compile() -> None:
     point = torch.zeros(1, 3)
     with torch.inference_mode():
         scaled(point, torch.ones(1, 1), point, point, centre=point[0])
-
-
-def fading(looks: "Sequence[Scene]", cameras: "Cameras", display: Display) -> "Iterator[Picture]":
-    """Frames of a flight: every look for an equal share of them, each fading into the next.
-
-    Pictures fade, as their colours would: what is drawn is linear in these.
-    """
-    from ..io.images import to_uint8
-
-    share = len(cameras) / len(looks)
-    for frame in range(len(cameras)):
-        display.count(frame, len(cameras), "rendering")
-        place = min(int(frame / share), len(looks) - 1)
-        into = (frame - (place + 1) * share) / FADE + 1
-        rgb = looks[place].render(cameras, frame).rgb
-        if into > 0 and place + 1 < len(looks):
-            rgb = rgb.lerp(looks[place + 1].render(cameras, frame).rgb, into)
-        yield to_uint8(rgb)
-    display.count(len(cameras), len(cameras), "rendering")
 
 
 if __name__ == "__main__":

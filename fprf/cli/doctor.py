@@ -9,22 +9,45 @@ import shlex
 import shutil
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
+
+from rich.console import Console
+from rich.markup import escape
 
 from .. import __version__
 from ..errors import CheckpointError, ConfigError
 from ..plugins import registry
 from ..plugins.codec import Missing
 from ..plugins.slots import slots
-from .findings import Finding, show
-from .parsing import as_flag, parse
+from .parsing import parse
 
 _MIB = 1 << 20
 _LEAST_DISK = 1 << 30
 """Bytes below which a training may fail for want of room."""
+_SHIPPED: dict[str, tuple[str, ...]] = {"encoders": ("content", "semantic"), "decoders": ()}
+"""Weights that must be in the package; of decoders any will do."""
+_CACHES = (
+    (".cache/fprf/weights", "*"),
+    (".cache/torch/hub/checkpoints", "vgg19-*.pth"),
+    (".cache/huggingface/hub", "models--facebook--dino*"),
+)
+"""Folders in the user's home, and files in them, where downloaded weights lie."""
+
+
+class Finding(NamedTuple):
+    """One line of the report."""
+
+    what: str
+    found: str
+    remedy: str = ""
+    """The one command or act that mends it; empty where nothing is wrong."""
+    optional: bool = False
+    """Everything else works without it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,15 +71,21 @@ class DoctorConfig:
 
 
 def run(args: list[str]) -> int:
-    """Print the findings; 1 if something that is needed is wrong."""
+    """Print the findings as they come; 1 if something that is needed is wrong."""
     about = (
         "`fprf doctor` looks over this machine and tests its device, `fprf doctor RUN` a run, `fprf doctor DIR` a scene\n"
         "folder, `fprf doctor METHOD` what a method needs here."
     )
-    config = parse(DoctorConfig(), as_flag(args, "--target"), prog="fprf doctor", description=about)
+    config = parse(DoctorConfig(), args, prog="fprf doctor", description=about, positional=("target",))
     target = config.target
+    findings: Iterator[Finding]
     if config.clean:
-        findings: Iterator[Finding] = cleaned(feature_folder())
+        from ..training.prepare import cache_folder
+
+        folder = cache_folder() / "features"
+        size = _size(folder)
+        shutil.rmtree(folder, ignore_errors=True)
+        findings = iter([Finding("features", f"{(size - _size(folder)) / _MIB:.0f} MiB deleted in {folder}")])
     elif target is None:
         findings = chain(machine(), self_test(config.device))
     elif (target / "config.json").is_file():
@@ -67,27 +96,72 @@ def run(args: list[str]) -> int:
         from .doctor_scene import scene_folder
 
         findings = scene_folder(target)
-    return int(show(findings))
+    console, bad = Console(highlight=False), False
+    for finding in findings:
+        mark = "[green]ok[/]      " if not finding.remedy else "[yellow]optional[/]" if finding.optional else "[red]problem[/] "
+        bad |= bool(finding.remedy) and not finding.optional
+        console.print(f"{mark}  [bold]{escape(finding.what):<14}[/] {escape(finding.found)}", soft_wrap=True)
+        if finding.remedy:
+            console.print(f"{'':<26} → {escape(finding.remedy)}", soft_wrap=True)
+    return int(bad)
 
 
 def machine() -> Iterator[Finding]:
     """Versions, processors, accelerators, optional packages, weights, plug-ins."""
     yield Finding("fprf", f"{__version__}, Python {platform.python_version()}, {platform.platform()}")
-    yield from _packages()
+    # Packages that pyproject.toml requires, without importing them.
+    for requirement in requires("fprf") or ():
+        name = requirement.split(";")[0].split("<")[0].split(">")[0].split("=")[0].strip()
+        extra = requirement.partition("extra == ")[2].strip("\"'")
+        if extra in ("test", "dev"):
+            continue
+        if found := _version(name):
+            yield Finding(name, found)
+        else:
+            remedy = f'pip install "fprf[{extra}]"' if extra else f"pip install '{requirement}'"
+            yield Finding(name, f"not installed{f' (extra {extra})' if extra else ''}", remedy, optional=bool(extra))
     try:
-        yield from _torch()
+        yield from _devices()
     except Exception as error:  # a broken installation is a finding, not a crash
         yield Finding("torch", f"{type(error).__name__}: {error}", "pip install --force-reinstall torch")
+    from ..datamanagers.features import CACHED_BYTES
+    from ..training.prepare import cache_folder
+
     yield from speed(os.environ)
     free = shutil.disk_usage(Path.cwd()).free
     clean = "fprf doctor --clean    # deletes feature targets, which are made again when needed"
     yield Finding("disk", f"{free / 1024**3:.1f} GiB free here", clean if free < _LEAST_DISK else "")
-    yield _cache(feature_folder())
-    yield from _weights()
+    folder, most = cache_folder() / "features", 2 * CACHED_BYTES / _MIB  # content and semantics
+    yield Finding("features", f"{_size(folder) / _MIB:.0f} MiB of at most {most:.0f} in {folder}; --clean deletes them")
+    # Networks that ship with the package, and those that were downloaded.
+    for kind, names in _SHIPPED.items():
+        weights = Path(__file__).parents[1] / "plugins" / kind / "weights"
+        there = sorted(path.stem for path in weights.glob("*.safetensors"))
+        absent = [name for name in names if name not in there] or (["any"] if not there else [])
+        listed = ", ".join(there) or "none"
+        remedy = "pip install --force-reinstall --no-deps fprf" if absent else ""
+        yield Finding(kind, f"in the package: {listed}" + (f"; absent: {', '.join(absent)}" if absent else ""), remedy)
+    cached = [path.name for place, pattern in _CACHES for path in sorted((Path.home() / place).glob(pattern))]
+    yield Finding("cached", ", ".join(cached) or "no downloads yet")
     count = sum(len(registry.installed(group)) for group in registry.groups())
     yield Finding("plug-ins", f"{count} installed; `fprf plugins --check` loads each")
     for complaint in registry.unreadable():
         yield Finding("plug-ins", complaint, "reinstall or uninstall that package")
+
+
+def _devices() -> Iterator[Finding]:
+    """Processor and accelerators, as torch sees them."""
+    import torch
+
+    yield Finding("processor", f"{platform.machine()}, {_cores()} cores usable, {torch.get_num_threads()} threads")
+    if torch.cuda.is_available():
+        for at in range(torch.cuda.device_count()):
+            device = torch.cuda.get_device_properties(at)
+            yield Finding(f"cuda:{at}", f"{device.name}, {device.total_memory / 1024**3:.0f} GiB")
+    elif torch.backends.mps.is_available():
+        yield Finding("mps", "Apple GPU")
+    else:
+        yield Finding("accelerator", "none: `--device auto` takes the processor")
 
 
 def self_test(name: str) -> Iterator[Finding]:
@@ -148,29 +222,8 @@ def method_needs(name: str) -> Iterator[Finding]:
     yield Finding("next", f"fprf train {name} --data FOLDER")
 
 
-def cleaned(folder: Path) -> Iterator[Finding]:
-    """Delete the cached feature targets."""
-    size = _size(folder)
-    shutil.rmtree(folder, ignore_errors=True)
-    yield Finding("features", f"{(size - _size(folder)) / _MIB:.0f} MiB deleted in {folder}")
-
-
-def feature_folder() -> Path:
-    """Folder of cached feature targets."""
-    from ..training.prepare import cache_folder
-
-    return cache_folder() / "features"
-
-
 def _size(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-
-
-def _cache(folder: Path) -> Finding:
-    from ..datamanagers.features import CACHED_BYTES
-
-    most = 2 * CACHED_BYTES / _MIB  # content and semantics
-    return Finding("features", f"{_size(folder) / _MIB:.0f} MiB of at most {most:.0f} in {folder}; --clean deletes them")
 
 
 def _cores() -> int:
@@ -189,6 +242,7 @@ def run_folder(folder: Path) -> Iterator[Finding]:
     """Config, progress, plug-ins and what was computed of a run. Raises ConfigError where its config cannot be read."""
     from ..plugins.codec import load_config
     from ..training import checkpoint
+    from ..training.run import read_history
 
     config, method = load_config(folder / "config.json")
     yield Finding("run", f"method {method}, scene {config.data}, {config.steps} steps asked for")
@@ -210,72 +264,12 @@ def run_folder(folder: Path) -> Iterator[Finding]:
     measure = f"fprf eval {shlex.quote(str(folder))}"
     measured = (folder / "metrics.json").is_file()
     yield Finding("metrics", "there" if measured else "not measured yet", "" if measured else measure, True)
-    yield from _trouble(folder)
-    yield Finding("size", f"{_size(folder) / _MIB:.1f} MiB")
-
-
-def _trouble(folder: Path) -> Iterator[Finding]:
-    """Notes of the training: skipped steps, damaged checkpoints."""
-    from ..training.run import read_history
-
-    if not (folder / "events.jsonl").is_file():
-        return
-    try:
-        notes = [note for history in read_history(folder) for note in history.notes]
-    except CheckpointError:
-        return
+    # Notes of the training: skipped steps, damaged checkpoints.
+    events, notes = folder / "events.jsonl", list[str]()
+    if events.is_file():
+        with suppress(CheckpointError):
+            notes = [note for history in read_history(folder) for note in history.notes]
     if notes:
         more = f" and {len(notes) - 1} more" if len(notes) > 1 else ""
-        yield Finding("events", notes[-1] + more, f"read {shlex.quote(str(folder / 'events.jsonl'))}", True)
-
-
-def _packages() -> Iterator[Finding]:
-    """Packages that pyproject.toml requires, without importing them."""
-    for requirement in requires("fprf") or ():
-        name = requirement.split(";")[0].split("<")[0].split(">")[0].split("=")[0].strip()
-        extra = requirement.partition("extra == ")[2].strip("\"'")
-        if extra in ("test", "dev"):
-            continue
-        if found := _version(name):
-            yield Finding(name, found)
-        else:
-            remedy = f'pip install "fprf[{extra}]"' if extra else f"pip install '{requirement}'"
-            yield Finding(name, f"not installed{f' (extra {extra})' if extra else ''}", remedy, optional=bool(extra))
-
-
-def _torch() -> Iterator[Finding]:
-    import torch
-
-    yield Finding("processor", f"{platform.machine()}, {_cores()} cores usable, {torch.get_num_threads()} threads")
-    if torch.cuda.is_available():
-        for at in range(torch.cuda.device_count()):
-            device = torch.cuda.get_device_properties(at)
-            yield Finding(f"cuda:{at}", f"{device.name}, {device.total_memory / 1024**3:.0f} GiB")
-    elif torch.backends.mps.is_available():
-        yield Finding("mps", "Apple GPU")
-    else:
-        yield Finding("accelerator", "none: `--device auto` takes the processor")
-
-
-def _weights() -> Iterator[Finding]:
-    """Networks that ship with the package, and those that were downloaded."""
-    plugins = Path(__file__).parents[1] / "plugins"
-    for folder, names in _SHIPPED.items():
-        there = sorted(path.stem for path in (plugins / folder / "weights").glob("*.safetensors"))
-        absent = [name for name in names if name not in there] or (["any"] if not there else [])
-        listed = ", ".join(there) or "none"
-        remedy = "pip install --force-reinstall --no-deps fprf" if absent else ""
-        yield Finding(folder, f"in the package: {listed}" + (f"; absent: {', '.join(absent)}" if absent else ""), remedy)
-    cached = []
-    for folder, pattern in _CACHES:
-        cached += sorted((Path.home() / folder).glob(pattern))
-    yield Finding("cached", ", ".join(path.name for path in cached) or "no downloads yet")
-
-
-_SHIPPED: dict[str, tuple[str, ...]] = {"encoders": ("content", "semantic"), "decoders": ()}
-"""Files that must be there; of decoders any will do."""
-_CACHES = (
-    (".cache/fprf/weights", "*"),
-    (".cache/torch/hub/checkpoints", "vgg19-*.pth"),
-    (".cache/huggingface/hub", "models--facebook--dino*"),
-)
+        yield Finding("events", notes[-1] + more, f"read {shlex.quote(str(events))}", True)
+    yield Finding("size", f"{_size(folder) / _MIB:.1f} MiB")

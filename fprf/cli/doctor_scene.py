@@ -21,7 +21,7 @@ from ..datamanagers.parsers.config import DataParserConfig, parse_scene, recogni
 from ..datamanagers.scene import Scene, exposures_differ, find_sightings, sparser, with_exposure
 from ..errors import DataError
 from ..plugins import registry
-from .findings import Finding
+from .doctor import Finding
 
 LOOKED = 48
 """Views whose files are opened."""
@@ -59,7 +59,9 @@ def inspect_scene(data: Path, scene: Scene) -> Iterator[Finding]:
     looked = np.unique(np.linspace(0, count - 1, min(count, LOOKED)).round().astype(int)).tolist()
     if len(looked) < count:
         yield Finding("sample", f"masks, profiles, exposure and blur are looked at in {len(looked)} of {count} views")
-    yield from _coordinates(scene)
+    if any(scene.origin):
+        centre = ", ".join(f"{x:.9g}" for x in scene.origin)
+        yield Finding("coordinates", f"about ({centre}), beyond what float32 resolves: trained about that as a local origin")
     yield _points(data, scene)
     for name, masks in (("masks", scene.masks), ("sky masks", scene.sky_masks)):
         if masks:
@@ -75,13 +77,6 @@ def inspect_scene(data: Path, scene: Scene) -> Iterator[Finding]:
         yield Finding("images", f"{broken[0]}{more}", "replace them, or remove their poses")
     yield from _exposure(reduced, pixels)
     yield from _blurred(scene, pixels)
-
-
-def _coordinates(scene: Scene) -> Iterator[Finding]:
-    """The local origin of a capture that lies far from 0."""
-    if any(scene.origin):
-        centre = ", ".join(f"{x:.9g}" for x in scene.origin)
-        yield Finding("coordinates", f"about ({centre}), beyond what float32 resolves: trained about that as a local origin")
 
 
 def _points(data: Path, scene: Scene) -> Finding:
@@ -140,8 +135,12 @@ def _metadata(paths: Sequence[Path]) -> Iterator[Finding]:
         except DataError:
             continue  # what cannot be read is said where its pixels are
         turned += orientation != 1
-        if icc and "srgb" not in (profile := _profile(icc)).lower():
-            profiles[profile] += 1
+        try:
+            profile = ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(icc))).strip() if icc else "sRGB"
+        except (OSError, ImageCms.PyCMSError):
+            profile = "unreadable"
+        if "srgb" not in profile.lower():
+            profiles[profile or "unnamed"] += 1
     if profiles:
         named = ", ".join(f"{name} ({count})" for name, count in profiles.most_common())
         yield Finding("profiles", f"{named} of {len(paths)} images: converted to sRGB")
@@ -151,20 +150,21 @@ def _metadata(paths: Sequence[Path]) -> Iterator[Finding]:
         )
 
 
-def _profile(icc: bytes) -> str:
-    """Name of a colour profile."""
-    try:
-        return ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(icc))).strip() or "unnamed"
-    except (OSError, ImageCms.PyCMSError):
-        return "unreadable"
-
-
 def _duplicates(scene: Scene) -> Iterator[Finding]:
     """Files of the same content, and views of the same pose."""
+
+    def digest(view: int, most: int | None = None) -> bytes:
+        """Digest of a view's file, or of its last bytes."""
+        path = scene.paths[view]
+        with path.open("rb") as file:
+            if most is not None:
+                file.seek(max(0, path.stat().st_size - most))
+            return hashlib.sha256(file.read()).digest()
+
     views = range(len(scene.paths))
     files = _alike([views], lambda view: scene.paths[view].stat().st_size)
-    files = _alike(files, lambda view: _digest(scene.paths[view], _TAIL))  # whole files only where much is equal already
-    files = _alike(files, lambda view: _digest(scene.paths[view], None))
+    files = _alike(files, lambda view: digest(view, _TAIL))  # whole files only where much is equal already
+    files = _alike(files, digest)
     position = scene.cameras.pose[:, :, 3]
     extent = float((position.amax(0) - position.amin(0)).max()) or 1.0
     pose = torch.cat([scene.cameras.pose[:, :, :3].flatten(1), (position - position.mean(0)) / extent], 1)
@@ -186,14 +186,6 @@ def _alike(groups: Iterable[Sequence[int]], key: Callable[[int], Hashable]) -> l
             parts.setdefault(key(view), []).append(view)
         found += [part for part in parts.values() if len(part) > 1]
     return found
-
-
-def _digest(path: Path, tail: int | None) -> bytes:
-    """Digest of a file, or of its last bytes."""
-    with path.open("rb") as file:
-        if tail is not None:
-            file.seek(max(0, path.stat().st_size - tail))
-        return hashlib.sha256(file.read()).digest()
 
 
 def _pixels(scene: Scene, views: Sequence[int]) -> tuple[dict[int, Image], list[str]]:

@@ -5,19 +5,20 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import UsageError
 from ..export.config import FIT_MINUTES, KINDS, ExportConfig, Plan, plan
 from ..plugins.captures import endings
 from ..progress import Display
-from .style_flags import Look, make_looks, named_style, named_styles, read_flags, say
+from .style_flags import named_styles, read_flags, tidy
 
 if TYPE_CHECKING:
     from ..export.mesh import Maps
     from ..interfaces import Scene
     from ..rendering.cameras import Cameras
     from ..splats.gaussians import GaussianRows
+    from ..style.look import Restyle
     from ..training.loading import LoadedRun
 
 _DESCRIPTION = f"""A scene as files that other programs open, in the capture's own frame.
@@ -30,23 +31,34 @@ A look of the scene is a file: splats.ply as it is, splats.NAME.ply in a style, 
 
 def run(args: list[str]) -> int:
     """Render views, fit Gaussians to them or mesh them where that is wanted, write the files."""
-    config, file = read_flags(
-        ExportConfig(), _kinds_as_flag(args), prog="fprf export", description=_DESCRIPTION, positional=("run",)
-    )
+    words = ("run", "kinds")
+    config, file = read_flags(ExportConfig(), args, prog="fprf export", description=_DESCRIPTION, positional=words)
     what = plan(config.kinds, config.output or config.run / "exports")
-    styles = [*named_style(config.references, config.style, file), *named_styles(config.styles, file, say)]
+    styles = named_styles(config.styles, file)
+    if config.references:  # the style of the flags, called as its file or its photographs
+        own = "+".join(path.stem for path in config.references)
+        if config.style is not None:
+            own = config.style.resolve().parent.name if config.style.name == "style.json" else config.style.stem
+        styles.insert(0, (tidy(own) or "style", file))
+    names = [name for name, _ in styles]
+    for name in names:
+        if names.count(name) > 1:
+            raise UsageError(f"--styles {name}: two styles of this name; give each its own")
     if "lut" in what.kinds and not styles and (config.kinds or what.single):
         raise UsageError("fprf export: a lut is the way into a style; name one with --references, --style or --styles")
     if what.single is not None and len(styles) > 1:
         raise UsageError(f"--output {what.single}: one file holds one style, {len(styles)} are asked for; name a folder")
     from ..io.atomic import write_json
+    from ..style.restyle import apply_style
     from ..training.loading import open_run
 
     start = time.perf_counter()
     opened = open_run(config.run, config.device)
     # All looks share one geometry; a single file holds the last of them.
-    looks = make_looks(opened.scene, styles)[-1 if what.single else 0 :]
-    made: dict[str, Any] = {"run": opened.known.name, "step": opened.step, "styles": [style.name for style in styles]}
+    encoders = opened.scene.encoders() if styles else None
+    looks = [_Look("", None), *(_Look(name, apply_style(opened.scene, each, encoders).restyle) for name, each in styles)]
+    looks = looks[-1 if what.single else 0 :]
+    made: dict[str, Any] = {"run": opened.known.name, "step": opened.step, "styles": names}
     with Display() as display:
         export = _Export(config, what, opened, looks, display)
         made |= {
@@ -59,10 +71,19 @@ def run(args: list[str]) -> int:
     made["seconds"] = time.perf_counter() - start
     if what.single is None:
         write_json(what.folder / "export.json", made)
-    for line in _counts(made):
-        print(line)
+    if "gaussians" in made:
+        print(f"{made['gaussians']} Gaussians{''.join(f', {loss}' for loss in made['losses'])}")
+    if "vertices" in made:
+        print(f"mesh: {made['vertices']} vertices, {made['triangles']} triangles")
     print(f"{', '.join(what.kinds)} in {what.single or what.folder}  ({made['seconds']:.1f} s)")
     return 0
+
+
+class _Look(NamedTuple):
+    """The scene as it is (no name, no restyle), or in a style."""
+
+    name: str
+    restyle: "Restyle | None"
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +93,7 @@ class _Export:
     config: ExportConfig
     what: Plan
     opened: "LoadedRun[Scene]"
-    looks: Sequence[Look]
+    looks: Sequence[_Look]
     display: Display
 
     @cached_property
@@ -85,7 +106,7 @@ class _Export:
             train = tuple(train[round(k * (len(train) - 1) / (most - 1))] for k in range(most))
         return self.opened.scene.cameras.select(torch.tensor(train))
 
-    def maps(self, look: Look) -> "Maps":
+    def maps(self, look: _Look) -> "Maps":
         """Depth and colours of the views."""
         from ..export.mesh import default_reach, render_maps
 
@@ -96,7 +117,7 @@ class _Export:
     @cached_property
     def plain(self) -> "Maps":
         """The same of the scene as it is: all geometry comes from these."""
-        return self.maps(Look("", None))
+        return self.maps(_Look("", None))
 
     def gaussians(self) -> dict[str, Any]:
         """Gaussians as they are, or fitted to the scene's own renders; the same in each look, but for their colours."""
@@ -206,19 +227,3 @@ class _Export:
                 path = self.what.single or self.what.folder / "luts" / look.name / f"{region}.cube"
                 write_cube(path, table, f"{look.name} {region}")
         return {"luts": made}
-
-
-def _counts(made: dict[str, Any]) -> list[str]:
-    """Lines on what the files hold, and what they cannot hold."""
-    lines = [f"{made['gaussians']} Gaussians{''.join(f', {loss}' for loss in made['losses'])}"] if "gaussians" in made else []
-    return lines + ([f"mesh: {made['vertices']} vertices, {made['triangles']} triangles"] if "vertices" in made else [])
-
-
-def _kinds_as_flag(args: list[str]) -> list[str]:
-    """Words behind the run name kinds: RUN ply splat ... is RUN --kinds ply splat ..."""
-    end = 1
-    while end < len(args) and not args[end].startswith("-"):
-        end += 1
-    if end == 1 or args[0].startswith("-"):
-        return args
-    return [args[0], "--kinds", *args[1:end], *args[end:]]

@@ -1,23 +1,32 @@
 """`fprf gallery RUN --references DIR`: a run in every style, as one page that needs nothing else."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import fmean
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..checks import at_least, positive
-from ..errors import UsageError
-from ..plugins.stylizers.config import StylizerConfig
+from ..errors import FprfError, UsageError
 from ..progress import Display
 from ..style.config import StyleConfig
 from ..style.files import StyleFile, check_photographs, read_style
 from ..training.quality import QualityConfig
-from .parsing import parse
-from .showcase import frames_of, photographs_of, restyled, write_shown
-from .style_flags import read_preset, say, with_presets_named
+from .style_flags import read_flags
 
 if TYPE_CHECKING:
-    from ..training.run import Known
+    from ..interfaces import Scene
+    from ..io.images import Picture
+    from ..page.writer import PageView, Style
+    from ..rendering.cameras import Cameras
+    from ..style.dictionary import Reference
+    from ..training.loading import LoadedRun
+
+_REDUCED = 4.0
+"""Factor by which views are reduced whose matches are only counted, not shown."""
+_FADE = 5
+"""Frames in which a film goes over to the next look."""
 
 _DESCRIPTION = """A run in every style, as one page to walk through, with match maps, depth and figures. It loads nothing.
 
@@ -25,27 +34,15 @@ Each reference is a style of its own; with several of them all together are one 
 
 
 @dataclass(frozen=True, kw_only=True)
-class GalleryConfig(QualityConfig):
+class GalleryConfig(StyleConfig, QualityConfig):
     """Views and styles of the page."""
 
     run: Path = Path()
     """Run folder."""
-    references: tuple[Path, ...] = ()
-    """Photographs, or folders of them."""
     styles: tuple[Path, ...] = ()
     """Style files (style.json), each one more style."""
     together: bool = True
     """Also show all photographs as one style."""
-    strength: float = 1.0
-    """0 leaves the scene as it is, 1 is the full style; of photographs."""
-    luminance: float = 0.0
-    """Share of the scene's own luminance that is kept, in [0, 1]; of photographs."""
-    clusters: int = StyleConfig().clusters
-    """Local styles per photograph, at least 1."""
-    blend: float = StyleConfig().blend
-    """Share of the overall style in each local one, in [0, 1]; of photographs."""
-    stylizer: StylizerConfig = StyleConfig().stylizer
-    """Method that moves the scene's features; of photographs."""
     split: Literal["covered", "test", "train", "all"] = "covered"
     """Views to choose from. covered: at most 8, those that training views surround; test: those held out from training."""
     most: int = 6
@@ -66,120 +63,212 @@ class GalleryConfig(QualityConfig):
     """cpu, cuda, mps, or auto."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        self.style_of()
+        StyleConfig.__post_init__(self)
+        QualityConfig.__post_init__(self)
         at_least("most", self.most, 1)
         at_least("frames", self.frames, 0)
         positive("megabytes", self.megabytes)
 
-    def style_of(self, *references: Path) -> StyleFile:
-        """The style of some photographs. Raises ConfigError for a value out of its range."""
-        return StyleFile(
-            StyleConfig(
-                references=references,
-                strength=self.strength,
-                luminance=self.luminance,
-                clusters=self.clusters,
-                blend=self.blend,
-                stylizer=self.stylizer,
-            )
-        )
-
 
 def run(args: list[str]) -> int:
     """Render the views in every style, film, write the page."""
-    default, args = read_preset(GalleryConfig(), args)
-    config = parse(default, args, prog="fprf gallery", description=with_presets_named(_DESCRIPTION), positional=("run",))
+    config, file = read_flags(GalleryConfig(), args, prog="fprf gallery", description=_DESCRIPTION, positional=("run",))
     output = config.output if config.output is not None else config.run / "gallery.html"
     if output.suffix.lower() != ".html":
         raise UsageError(f"--output {output}: the page is an .html file; give such a name")
-    from ..datamanagers.images import photographs as find_photographs
+    from ..datamanagers.images import load_image
     from ..io.video import write_video
+    from ..page.writer import Page, Reference, write_page
+    from ..plugins.codec import read_json
     from ..rendering.paths import make_path
+    from ..splats.scene import SplatScene
     from ..training.loading import open_run
 
-    photographs = find_photographs(config.references, say)
     opened = open_run(config.run, config.device, config)
-    views, known, scene = _views(opened.known, config), opened.known, opened.scene
-    chosen = _chosen(config, photographs)
+    known, scene = opened.known, opened.scene
+    views = known.views(config.split, config.views)
+    # Evenly from the split; views that are named are all shown.
+    most = len(views) if config.views else min(config.most, len(views))
+    views = [views[k * len(views) // most] for k in range(most)]
+    chosen = _chosen(config, file)
+    called = _called([*config.references, *(path for _, each in chosen for path in each.style.references)])
     film = None
     with Display() as display:
-        originals = []
-        for i, view in enumerate(views):
-            display.count(i, len(views), "rendering")
-            originals.append(scene.render(scene.cameras, view))
-        shown = restyled(scene, chosen, views, display)
+        originals = page_views(opened, views, display)
+        styles = page_styles(scene, chosen, views, called, display)
         if config.frames:
             film = output.with_suffix(".mp4")
             flight = make_path(known.cameras, known.split("all"), config.path, config.frames, scene.origin)
-            write_video(film, frames_of(scene, flight, lambda _: shown[-1].styled.restyle, display), fps=24)
+            write_video(film, fading([styles[-1][1]], flight, display), fps=24)
+    measured: Any = {}
+    if (path := config.run / "metrics.json").is_file():
+        measured = read_json(path, "the metrics.json of `fprf eval`")
+    left_out = ("per_view", "method", "scene")
     width, height = known.cameras.size[views[0]].tolist()
-    write_shown(
-        output,
-        scene,
+    page = Page(
         title=config.title or known.name,
         facts={
             "Photographs": len(known.names),
             "Size": f"{width} × {height}",
             "Method": opened.method,
-            "Styles": len(shown),
+            "Styles": len(styles),
             "Trained for": f"{opened.seconds / 60:.1f} min",
         },
-        views=views,
-        originals=originals,
-        photographs=photographs_of(opened.run, known, [view for view in views if view in known.test]),
-        shown=shown,
-        references=_named(photographs, [path for each in shown for path in each.sources]),
-        metrics=_metrics(config.run),
+        views=originals,
+        styles=[style for style, _ in styles],
+        references=[Reference(name, load_image(path, upright=True)) for path, name in called.items()],
+        scene=scene if isinstance(scene, SplatScene) else None,
+        start=views[0],
+        metrics={name: value for name, value in measured.items() if name not in left_out} if isinstance(measured, dict) else {},
         film=film,
-        megabytes=config.megabytes,
     )
-    print(f"{len(views)} views in {len(shown)} styles: {output} ({output.stat().st_size / 2**20:.1f} MiB)")
+    write_page(output, page, megabytes=config.megabytes)
+    print(f"{len(views)} views in {len(styles)} styles: {output} ({output.stat().st_size / 2**20:.1f} MiB)")
     return 0
 
 
-def _chosen(config: GalleryConfig, photographs: list[Path]) -> list[tuple[str, StyleFile]]:
+def _chosen(config: GalleryConfig, together: StyleFile) -> list[tuple[str, StyleFile]]:
     """The styles with their names. Raises UsageError where there are none."""
-    chosen = [(name, config.style_of(path)) for name, path in _named(photographs, ()).items()]
+    names = _called(config.references)
+    # What names photographs one by one does not hold where each is alone.
+    alone = replace(together.style, weights=(), masks=(), pin=(), forbid=())
+    chosen = [(name, StyleFile(replace(alone, references=(path,)))) for path, name in names.items()]
     for path in config.styles:
         file = read_style(path)
         check_photographs(path, file)
         own = path.resolve().parent.name if path.name == "style.json" else path.stem
-        taken = {name for name, _ in chosen}
-        chosen.append((own if own not in taken else f"{own} ({len(chosen) + 1})", file))
-    if config.together and len(photographs) > 1:
-        names = list(_named(photographs, ()))
-        chosen.append((" + ".join(names) if len(names) <= 3 else f"all {len(names)}", config.style_of(*photographs)))
+        chosen.append((f"{own} ({len(chosen) + 1})" if own in dict(chosen) else own, file))
+    if config.together and len(names) > 1:
+        chosen.append((" + ".join(names.values()) if len(names) <= 3 else f"all {len(names)}", together))
     if not chosen:
         raise UsageError("fprf gallery: name photographs with --references, or style files with --styles")
     return chosen
 
 
-def _named(first: Sequence[Path], more: Sequence[Path]) -> dict[str, Path]:
-    """Photographs by their stems; where two agree, by their whole names, with a number where these agree as well."""
-    paths = list(dict.fromkeys([*first, *more]))
-    named: dict[str, Path] = {}
+def _called(paths: Sequence[Path]) -> dict[Path, str]:
+    """Names of photographs: their stems; where two agree, their whole names, with a number where these agree as well."""
+    names: dict[Path, str] = {}
+    paths = list(dict.fromkeys(paths))
     for path in paths:
         alike = sum(other.stem == path.stem for other in paths) > 1
         name = path.name if alike else path.stem
-        named[name if name not in named else f"{name} ({len(named) + 1})"] = path
-    return named
+        names[path] = f"{name} ({len(names) + 1})" if name in names.values() else name
+    return names
 
 
-def _views(known: "Known", config: GalleryConfig) -> list[int]:
-    """The views to show. Raises UsageError for a name that the run does not hold, or an empty split."""
-    views = known.views(config.split, config.views)
-    count = len(views) if config.views else min(config.most, len(views))
-    return [views[k * len(views) // count] for k in range(count)]
+def page_views(opened: "LoadedRun[Scene]", views: Sequence[int], display: Display) -> "list[PageView]":
+    """Views of a run as a page shows them: rendered, in depth, and photographed where they were held out.
+
+    Photographs are absent where the scene's folder is no longer what it was.
+    """
+    from ..datamanagers.images import load_images
+    from ..io.images import to_uint8
+    from ..io.maps import depth_image, depth_limits
+    from ..page.writer import PageView
+    from ..training.prepare import read_scene
+    from ..training.run import view_names
+
+    scene, known = opened.scene, opened.known
+    drawn = []
+    for done, view in enumerate(views):
+        display.count(done, len(views), "rendering")
+        drawn.append(scene.render(scene.cameras, view))
+    limits = depth_limits([each.depth for each in drawn], [each.opacity for each in drawn])
+    photographs: dict[int, Picture] = {}
+    try:
+        captured = read_scene(opened.run.load_config()[0])
+        if tuple(view_names(captured.paths)) == known.names:
+            unseen = [view for view in views if view in known.test]
+            photographs = dict(zip(unseen, load_images(captured, views=unseen), strict=True))
+    except FprfError:
+        pass
+    return [
+        PageView(scene.names[view], to_uint8(each.rgb), photographs.get(view), depth_image(each.depth, each.opacity, limits))
+        for view, each in zip(views, drawn, strict=True)
+    ]
 
 
-def _metrics(run: Path) -> dict[str, Any]:
-    """Metrics of `fprf eval` without the single views; empty where it has not run."""
-    from ..plugins.codec import read_json
+def page_styles(
+    scene: "Scene",
+    chosen: Sequence[tuple[str, StyleFile]],
+    views: Sequence[int],
+    called: Mapping[Path, str],
+    display: Display,
+) -> "list[tuple[Style, Scene]]":
+    """Each style on the views, with match maps and how well the views agree with each other, and the scene in that style.
 
-    path = run / "metrics.json"
-    if not path.is_file():
-        return {}
-    content = read_json(path, "the metrics.json of `fprf eval`")
-    told = content if isinstance(content, dict) else {}
-    return {name: value for name, value in told.items() if name not in ("per_view", "method", "scene")}
+    `called` are the names of all photographs. A photograph that is in several styles is encoded once, which counts as time of
+    the first of them.
+    """
+    import torch
+
+    from ..evaluation.consistency import consistency
+    from ..io.images import to_uint8
+    from ..page.writer import Style
+    from ..splats.scene import SplatScene
+    from ..style.config import labels
+    from ..style.match_maps import match_map, match_picture, summarize
+    from ..style.restyle import apply_style
+
+    encoders, made = scene.encoders(), []
+    encoded: dict[tuple[Path, Path], Reference] = {}
+    reduced = scene.cameras.scaled(_REDUCED)
+    shown_cameras = scene.cameras.select(torch.tensor(list(views), dtype=torch.int64))
+    for i, (name, file) in enumerate(chosen):
+        display.count(i, len(chosen), "restyling")
+        start = time.perf_counter()
+        styled = apply_style(scene, file, encoders, encoded=encoded)
+        built = time.perf_counter()
+        look = scene.restyled(styled.restyle)
+        drawn = [look.render(scene.cameras, view) for view in views]
+        done = time.perf_counter()
+        # Where there is one photograph nobody sees the map, and the figures need few pixels.
+        several = len(styled.codes.names) > 1
+        summaries, maps = [], []
+        for view in views:
+            matched = match_map(scene, styled, view, scene.cameras if several else reduced)
+            summaries.append(summarize(matched, styled.codes))
+            maps += [match_picture(matched, styled.codes)] if several else []
+        # Each view against the next one, warped onto it.
+        pairs = [(k, k + 1) for k in range(len(views) - 1)]
+        warped = consistency([each.rgb for each in drawn], [each.depth for each in drawn], shown_cameras, pairs)
+        paths = dict(zip(labels(file.style.references), file.style.references, strict=True))
+        style = Style(
+            name,
+            [to_uint8(each.rgb) for each in drawn],
+            look.shown.harmonics if isinstance(look, SplatScene) else None,
+            references=[called[paths[label]] for label in styled.codes.names],
+            shares=[
+                fmean(row["references"][k]["share"] for row in summaries) for k in range(len(styled.codes.names)) if several
+            ],
+            matches=maps,
+            metrics={
+                "match_score": fmean(row["score"] for row in summaries),
+                "match_entropy_bits": fmean(row["entropy_bits"] for row in summaries),
+                "warp_error": warped["rmse"],
+                "new_style_seconds": built - start,
+                "each_view_seconds": (done - built) / len(views),
+            },
+        )
+        made.append((style, look))
+    display.count(len(chosen), len(chosen), "restyling")
+    return made
+
+
+def fading(looks: "Sequence[Scene]", cameras: "Cameras", display: Display) -> "Iterator[Picture]":
+    """Frames of a flight: every look for an equal share of them, each fading into the next.
+
+    Pictures fade, as their colours would: what is drawn is linear in these.
+    """
+    from ..io.images import to_uint8
+
+    share = len(cameras) / len(looks)
+    for frame in range(len(cameras)):
+        display.count(frame, len(cameras), "rendering")
+        place = min(int(frame / share), len(looks) - 1)
+        into = (frame - (place + 1) * share) / _FADE + 1
+        rgb = looks[place].render(cameras, frame).rgb
+        if into > 0 and place + 1 < len(looks):
+            rgb = rgb.lerp(looks[place + 1].render(cameras, frame).rgb, into)
+        yield to_uint8(rgb)
+    display.count(len(cameras), len(cameras), "rendering")

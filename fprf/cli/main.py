@@ -54,33 +54,40 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run one verb and return its exit code."""
     given = list(sys.argv[1:] if args is None else args)
     debug = "--debug" in given or os.environ.get("FPRF_DEBUG", "") not in ("", "0")
+    given = [arg for arg in given if arg != "--debug"]
     try:
-        code = _dispatch([arg for arg in given if arg != "--debug"])
+        code = _run(given)
         sys.stdout.flush()
+        return code
+    except SystemExit as end:  # `fprf VERB --help` ends this way
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
     except BrokenPipeError:  # the reader left, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else the interpreter complains when it ends
         return _PIPE_CLOSED
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
-    except FprfError as error:
-        if debug:
-            traceback.print_exc()
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     except Exception as error:
         if debug:
             traceback.print_exc()
+        if isinstance(error, FprfError):
+            print(f"error: {error}", file=sys.stderr)
+            return 2
         if out_of_memory(error):
             print(f"error: {shortage('fprf', error, 'close other programs, or take a larger --downscale')}", file=sys.stderr)
             return 2
         if not debug:
-            print(_our_fault(error), file=sys.stderr)
+            frames = traceback.extract_tb(error.__traceback__)
+            place = f" ({os.path.relpath(frames[-1].filename)}:{frames[-1].lineno} in {frames[-1].name})" if frames else ""
+            print(f"internal error: {type(error).__name__}: {error}{place}", file=sys.stderr)
+            print(
+                "This is a fault of fprf or of a plug-in. Run it again with --debug and report the traceback.", file=sys.stderr
+            )
         return 1
-    return code
 
 
-def _dispatch(args: list[str]) -> int:
+def _run(args: list[str]) -> int:
+    """Run a verb, built-in or of a package. Raises UsageError where there is no such verb."""
     if not args or args[0] in ("-h", "--help"):
         print(_help())
         return 0 if args else 2
@@ -88,23 +95,9 @@ def _dispatch(args: list[str]) -> int:
         print(f"fprf {__version__}")
         return 0
     configure_process()
-    try:
-        return run_verb(args[0], args[1:])
-    except SystemExit as end:  # --help ends this way
-        return end.code if isinstance(end.code, int) else int(end.code is not None)
-
-
-def packaged() -> dict[str, str]:
-    """Verbs of packages: name to the packages that provide it. Imports nothing."""
-    return {
-        name: " and ".join(each.package for each in entries) for name, entries in installed(_GROUP).items() if name not in VERBS
-    }
-
-
-def run_verb(verb: str, args: list[str]) -> int:
-    """Run a verb, built-in or of a package, with its arguments. Raises UsageError where there is no such verb."""
+    verb, rest = args[0], args[1:]
     if verb in VERBS:
-        return int(importlib.import_module(f".{verb}", __package__).run(args))
+        return int(importlib.import_module(f".{verb}", __package__).run(rest))
     others = packaged()
     if verb not in others:
         known = [*VERBS, *others]
@@ -114,7 +107,14 @@ def run_verb(verb: str, args: list[str]) -> int:
 
     config = make(_GROUP, verb, CommandConfig)
     about = inspect.getdoc(type(config)) or ""
-    return parse(config, args, prog=f"fprf {verb}", description=about, positional=config.positional).run() or 0
+    return parse(config, rest, prog=f"fprf {verb}", description=about, positional=config.positional).run() or 0
+
+
+def packaged() -> dict[str, str]:
+    """Verbs of packages: name to the packages that provide it. Imports nothing."""
+    return {
+        name: " and ".join(each.package for each in entries) for name, entries in installed(_GROUP).items() if name not in VERBS
+    }
 
 
 def _help() -> str:
@@ -135,13 +135,3 @@ def _help() -> str:
         "`fprf VERB --help` shows every flag of a verb, `fprf train` lists the methods. Start with `fprf demo`.",
     ]
     return "\n".join(lines)
-
-
-def _our_fault(error: Exception) -> str:
-    """Kind, text and place of an error that is nobody's mistake but ours, or a plug-in's."""
-    frames = traceback.extract_tb(error.__traceback__)
-    place = f" ({os.path.relpath(frames[-1].filename)}:{frames[-1].lineno} in {frames[-1].name})" if frames else ""
-    return (
-        f"internal error: {type(error).__name__}: {error}{place}\n"
-        "This is a fault of fprf or of a plug-in. Run it again with --debug for the whole traceback, and report that."
-    )

@@ -23,10 +23,18 @@ from ..plugins.codec import Missing, load_config, method_config
 from ..plugins.slots import Slot, hints_of, is_slot, members, resolve, slots
 
 if TYPE_CHECKING:
-    from ..config import RunConfig, TrainConfig
+    from ..config import RunConfig
 
 
-_MANY = -1
+C = TypeVar("C")
+
+DESCRIBE = "--describe"
+"""Asks any verb for all of its flags with their meanings, as JSON."""
+_COLUMNS = 100
+"""Widest help text: a page, not a wide screen."""
+_TRUTHS = (["True"], ["False"], ["true"], ["false"])
+_NONES = (["none"], ["None"])
+_SCALARS = {bool: "True or False", int: "a whole number", float: "a number", str: "a text", Path: "a path", type(None): "none"}
 
 
 class Flag(NamedTuple):
@@ -34,7 +42,8 @@ class Flag(NamedTuple):
 
     path: str
     """Dotted field names."""
-    hint: Any
+    kinds: tuple[Any, ...]
+    """The types that it takes, None last."""
     owner: Any
     """The config that holds it."""
 
@@ -44,25 +53,9 @@ class Flag(NamedTuple):
         return f"--{_dashed(self.path)}"
 
     @property
-    def optional(self) -> bool:
-        """None is allowed."""
-        return type(None) in members(self.hint)
-
-    @property
-    def boolean(self) -> bool:
-        """It is true or false."""
-        return bool in members(self.hint)
-
-    @property
-    def arity(self) -> int:
-        """Values that follow it; _MANY if that varies."""
-        counts = {_count(hint) for hint in members(self.hint) if hint is not type(None)}
-        return counts.pop() if len(counts) == 1 else _MANY
-
-    @property
     def takes(self) -> str:
         """Its values in words."""
-        return " or ".join(map(_words, sorted(members(self.hint), key=lambda hint: hint is type(None))))
+        return " or ".join(map(_words, self.kinds))
 
 
 def flags_of(config: Any, prefix: str = "") -> dict[str, Flag]:
@@ -73,7 +66,7 @@ def flags_of(config: Any, prefix: str = "") -> dict[str, Flag]:
         if dataclasses.is_dataclass(value):
             flags |= flags_of(value, f"{path}.")
         elif not any(is_slot(each) for each in members(hint)):
-            flag = Flag(path, hint, config)
+            flag = Flag(path, tuple(sorted(members(hint), key=lambda kind: kind is type(None))), config)
             flags[flag.text] = flag
     return flags
 
@@ -87,13 +80,16 @@ def spell(args: Sequence[str], flags: dict[str, Flag]) -> list[str]:
     for at, arg in enumerate(args):
         key, equals, inline = arg.partition("=")
         flag = flags.get(_dashed(key))
+        opposite = flags.get(re.sub(r"(^--|\.)no-(?=[^.]*$)", r"\1", _dashed(arg)))
+        before = flags.get(_dashed(args[at - 1])) if at else None
         if flag and equals:
             spelled.append(f"{key}={_literal(inline, flag)}")
-        elif flag and flag.boolean and args[at + 1 : at + 2] not in (*_TRUTHS, *(_NONES if flag.optional else ())):
-            spelled += [arg, "True"]
-        elif (opposite := flags.get(re.sub(r"(^--|\.)no-(?=[^.]*$)", r"\1", _dashed(arg)))) and not flag and opposite.boolean:
+        elif flag and bool in flag.kinds:
+            values = (*_TRUTHS, *_NONES) if type(None) in flag.kinds else _TRUTHS
+            spelled += [arg] if args[at + 1 : at + 2] in values else [arg, "True"]
+        elif not flag and opposite and bool in opposite.kinds:
             spelled += [opposite.text, "False"]
-        elif at and not arg.startswith("--") and (before := flags.get(_dashed(args[at - 1]))):
+        elif before and not arg.startswith("--"):
             spelled.append(_literal(arg, before))
         else:
             spelled.append(arg)
@@ -107,7 +103,9 @@ def explain(refusal: str, config: Any, args: Sequence[str], *, positional: Seque
         key = arg.partition("=")[0]
         if re.match(r"--[a-zA-Z]", key) and _dashed(key) not in flags:
             return _unknown(key, config, flags, prog)
-    text = _plain(refusal)
+    # The text of the box, without its frame and colours, in one line.
+    text = re.sub(r"\x1b\[[0-9;]*m", "", refusal)
+    text = " ".join(re.sub(r"[╭╮╰╯│─]|-{3,}", " ", text).split())
     for flag in flags.values():
         if re.search(rf"(?<![\w.-]){re.escape(flag.text)}(?![\w.-])", text):
             given = _given(flag, args)
@@ -144,32 +142,20 @@ def _given(flag: Flag, args: Sequence[str]) -> list[str]:
             values = ([inline] if equals else []) if inside else values
         elif inside:
             values.append(arg)
-    return values if flag.arity == _MANY else values[: max(flag.arity, 1)]
+    several = any(get_origin(kind) in (tuple, list, dict) for kind in flag.kinds)
+    return values if several else values[:1]
 
 
 def _literal(value: str, flag: Flag) -> str:
-    if value == "none" and flag.optional:
+    if value == "none" and type(None) in flag.kinds:
         return "None"
-    if value in ("true", "false") and flag.boolean:
+    if value in ("true", "false") and bool in flag.kinds:
         return value.capitalize()
     return value
 
 
 def _dashed(key: str) -> str:
     return key.replace("_", "-")
-
-
-def _plain(refusal: str) -> str:
-    """Text of a box: no frame, no colours, one line."""
-    text = re.sub(r"\x1b\[[0-9;]*m", "", refusal)
-    return " ".join(re.sub(r"[╭╮╰╯│─]|-{3,}", " ", text).split())
-
-
-def _count(hint: Any) -> int:
-    if get_origin(hint) is tuple and Ellipsis not in get_args(hint):
-        counts = [_count(each) for each in get_args(hint)]
-        return _MANY if _MANY in counts else sum(counts)
-    return _MANY if get_origin(hint) in (tuple, list, dict) else 1
 
 
 def _words(hint: Any) -> str:
@@ -183,17 +169,6 @@ def _words(hint: Any) -> str:
     if get_origin(hint) is tuple:
         return f"{len(args)} values ({', '.join(map(_words, args))})"
     return _SCALARS.get(hint, str(hint))
-
-
-_TRUTHS = (["True"], ["False"], ["true"], ["false"])
-_NONES = (["none"], ["None"])
-_SCALARS = {bool: "True or False", int: "a whole number", float: "a number", str: "a text", Path: "a path", type(None): "none"}
-
-
-C = TypeVar("C")
-DESCRIBE = "--describe"
-"""Asks any verb for all of its flags with their meanings, as JSON."""
-_COLUMNS = 100
 
 
 def parse(default: C, args: Sequence[str], *, prog: str, description: str, positional: tuple[str, ...] = ()) -> C:
@@ -211,9 +186,7 @@ def parse(default: C, args: Sequence[str], *, prog: str, description: str, posit
     for slot in slots(config):
         if isinstance(slot.value, Missing):
             slot.value.build()
-    flags = flags_of(config)
-    if positional:
-        flags = {text: flag for text, flag in flags.items() if flag.path not in positional}
+    flags = {text: flag for text, flag in flags_of(config).items() if flag.path not in positional}
     rest = spell(rest, flags)
     # What tyro says of a mistake is a box of many lines; ours is one.
     heard = io.StringIO()
@@ -225,14 +198,13 @@ def parse(default: C, args: Sequence[str], *, prog: str, description: str, posit
             raise
         raise UsageError(explain(heard.getvalue(), config, rest, positional=positional, prog=prog)) from None
     except ConfigError as fault:
-        raise ConfigError(_located(str(fault), flags, rest)) from fault
+        # A range error names its field; here the flag that caused it, where the arguments tell which.
+        field, _, reason = str(fault).partition(": ")
+        given = {_dashed(arg.partition("=")[0]) for arg in rest if arg.startswith("--")}
+        fits = [text for text, flag in flags.items() if text in given and f".{flag.path}".endswith(f".{field}")]
+        raise ConfigError(f"{fits[0]}: {reason}" if len(fits) == 1 and reason else str(fault)) from fault
     sys.stderr.write(heard.getvalue())
     return parsed
-
-
-def as_flag(args: list[str], flag: str) -> list[str]:
-    """A leading word as the value of the flag that it stands for."""
-    return [flag, *args] if args and not args[0].startswith("-") else args
 
 
 def load_method(name: str) -> "tuple[RunConfig, str]":
@@ -248,24 +220,6 @@ def load_method(name: str) -> "tuple[RunConfig, str]":
     if (Path(name) / "config.json").is_file() and name not in registry.installed("fprf.methods"):
         raise UsageError(f"{name}: is a folder, not a method; to train with its config name {Path(name) / 'config.json'}")
     return method_config(name), name
-
-
-def load_field_method(name: str) -> "tuple[TrainConfig, str]":
-    """The same for what is made of fields alone. Raises UsageError for a method of another kind."""
-    from ..config import fields_only
-
-    config, method = load_method(name)
-    return fields_only(config, Path(name)), method
-
-
-def methods() -> Iterator[tuple[str, str]]:
-    """Names of the installed methods with the first line of their documentation; a broken one says so instead."""
-    for name in registry.installed("fprf.methods"):
-        try:
-            about = _first_line(registry.load_object("fprf.methods", name))
-        except PluginError as fault:
-            about = f"(broken) {fault}"
-        yield name, about
 
 
 def _tyro(config: C, args: list[str], *, prog: str, description: str, positional: tuple[str, ...]) -> C:
@@ -289,15 +243,15 @@ def _tyro(config: C, args: list[str], *, prog: str, description: str, positional
 
 
 def _with_positional(config: Any, names: tuple[str, ...]) -> Any:
-    """The config with some fields marked as positional, in a subclass that checks nothing yet; None can be left out."""
+    """The config with some fields marked as positional, in a subclass that checks nothing yet; None and () can be left out."""
     import tyro
 
     if not names:
         return config
-    hints = hints_of(type(config))
+    hints, optional = hints_of(type(config)), (None, ())
     marked = []
     for name in names:
-        hint = None if getattr(config, name) is None else "(required)"
+        hint = None if getattr(config, name) in optional else "(required)"
         arg = tyro.conf.arg(metavar=name.upper(), help_behavior_hint=hint)
         marked.append((name, Annotated[hints[name], tyro.conf.Positional, arg]))
     kind = dataclasses.make_dataclass(
@@ -309,7 +263,7 @@ def _with_positional(config: Any, names: tuple[str, ...]) -> Any:
         kw_only=True,
     )
     values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
-    return kind(**values | {name: tyro.MISSING for name in names if values[name] is not None})
+    return kind(**values | {name: tyro.MISSING for name in names if values[name] not in optional})
 
 
 def _slot_flags(filled: list[Slot]) -> Any:
@@ -318,7 +272,7 @@ def _slot_flags(filled: list[Slot]) -> Any:
 
     rows: list[tuple[str, Any, Any]] = []
     for slot in filled:
-        about = f"{_first_line(slot.kind)} One of {', '.join(slot.choices)}."
+        about = f"{first_line(slot.kind)} One of {', '.join(slot.choices)}."
         arg = tyro.conf.arg(name=slot.path, metavar="NAME", help=about)
         rows.append((slot.path.replace(".", "_"), Annotated[str, arg], dataclasses.field(default=_filled_by(slot))))
     kind = dataclasses.make_dataclass("PlugIns", rows, frozen=True, kw_only=True)
@@ -331,16 +285,9 @@ def _filled_by(slot: Slot) -> str:
     return "none" if slot.value is None else registry.name_of(slot.kind.group, type(slot.value))
 
 
-def _first_line(documented: object) -> str:
+def first_line(documented: object) -> str:
+    """The first line of a docstring."""
     return (documented.__doc__ or "").strip().partition("\n")[0]
-
-
-def _located(fault: str, flags: dict[str, Flag], args: Sequence[str]) -> str:
-    """A range error with the flag that caused it, where the arguments tell which."""
-    field, _, rest = fault.partition(": ")
-    given = {arg.partition("=")[0].replace("_", "-") for arg in args if arg.startswith("--")}
-    fits = [text for text, flag in flags.items() if text in given and f".{flag.path}".endswith(f".{field}")]
-    return f"{fits[0]}: {rest}" if len(fits) == 1 and rest else fault
 
 
 @contextlib.contextmanager
@@ -370,7 +317,7 @@ def describe(config: Any, *, prog: str, description: str, positional: Sequence[s
             "flag": f"--{_dashed(slot.path)}",
             "one of": slot.choices,
             "default": _filled_by(slot),
-            "meaning": _first_line(slot.kind),
+            "meaning": first_line(slot.kind),
         }
         for slot in slots(config)
     ]

@@ -96,23 +96,23 @@ def faults() -> Iterator[tuple[Row, str]]:
     """Load each plug-in and yield those that cannot be used, with the reason."""
     for row in rows():
         try:
-            if row.group == METHODS:
-                load_method(row.name)
-            elif row.group == SCENES:
-                registry.load_object(row.group, row.name)
-            else:
-                _check(row)
+            _check(row)
         except PluginError as fault:
             yield row, str(fault)
 
 
 def _check(row: Row) -> None:
+    """Load a plug-in and build its config from defaults. Raises PluginError."""
     from .main import VERBS
 
-    kinds = KINDS[row.group]
+    if row.group == METHODS:
+        load_method(row.name)
+        return
     loaded = registry.load_object(row.group, row.name)
-    if not (isinstance(loaded, type) and issubclass(loaded, kinds)):
-        registry.load(row.group, row.name, kinds[0])
+    if row.group == SCENES:
+        return
+    if not (isinstance(loaded, type) and issubclass(loaded, KINDS[row.group])):
+        registry.load(row.group, row.name, KINDS[row.group][0])  # says what it is instead
         return
     origin = f"{row.value} from {row.package}"
     if row.name == "none":

@@ -14,7 +14,7 @@ from ..style.config import StyleConfig
 from ..style.files import read_keyframes
 from ..style.restyle import keyed_looks
 from ..training.quality import QualityConfig
-from .style_flags import named_styles, read_flags, say
+from .style_flags import named_styles, read_flags
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
@@ -78,8 +78,11 @@ def run(args: list[str]) -> int:
     description = "Fly through a trained scene, plain or restyled, to a film or frames."
     config, file = read_flags(RenderVerbConfig(), args, prog="fprf render", description=description, positional=("run",))
     from ..datamanagers.images import load_image
+    from ..io.images import write_image
+    from ..io.sheet import side_by_side
     from ..io.video import FILMS, MAX_FPS, missing_frames, write_video
-    from ..rendering.paths import make_path
+    from ..rendering.paths import make_path, panoramas, upwards
+    from ..training.film import limits_of, panels
     from ..training.loading import open_run
 
     if config.output.suffix.lower() in _NO_FOLDERS:
@@ -93,7 +96,9 @@ def run(args: list[str]) -> int:
     # Captured views keep the stem of their image.
     names = [known.names[view] for view in views] if config.path == "dataset" else [f"{i:05d}" for i in range(len(cameras))]
     if config.lens != "own":
-        cameras = _all_round(opened, config, cameras)
+        if known.facts.space.kind == "ndc":  # nothing was seen behind the cameras
+            raise UsageError(f"--lens {config.lens}: this scene was captured from one side (space ndc); nothing is all round")
+        cameras = panoramas(cameras, config.across, upwards(known.cameras))
     takes = _takes(opened.scene, config, file)
     whole = config.output.suffix.lower() in FILMS
     folder = config.output.with_suffix(".frames") if whole else config.output
@@ -104,7 +109,13 @@ def run(args: list[str]) -> int:
         print(f"{len(paths) - len(todo)} of {len(paths)} frames are there already")
     start = time.perf_counter()
     with Display() as display:
-        _render(opened.scene, config, cameras, takes, {path: frame for frame, path in enumerate(paths)}, todo, display)
+        limits = limits_of(opened.scene, cameras) if "depth" in config.show and todo else None
+        for done, path in enumerate(todo):
+            left = (time.perf_counter() - start) / done * (len(todo) - done) if done else None
+            display.count(done, len(todo), "rendering", seconds_left=left)
+            # Each frame is written as soon as it is done, so that an interrupted film goes on.
+            write_image(path, side_by_side(panels(opened.scene, cameras, paths.index(path), takes, config.show, limits)))
+        display.count(len(todo), len(todo), "rendering")
         made = str(config.output)
         if whole:
             codec = write_video(config.output, (load_image(path) for path in paths), config.fps)
@@ -113,38 +124,6 @@ def run(args: list[str]) -> int:
     seconds = time.perf_counter() - start
     print(f"{len(cameras)} frames in {made}, {seconds / max(1, len(todo)):.2f} s each")
     return 0
-
-
-def _render(
-    scene: "Scene",
-    config: RenderVerbConfig,
-    cameras: "Cameras",
-    takes: "list[Take]",
-    numbers: dict[Path, int],
-    todo: list[Path],
-    display: Display,
-) -> None:
-    """Render the frames that are missing, each written as soon as it is done."""
-    from ..io.images import write_image
-    from ..io.sheet import side_by_side
-    from ..training.film import limits_of, panels
-
-    limits = limits_of(scene, cameras) if "depth" in config.show and todo else None
-    start = time.perf_counter()
-    for done, path in enumerate(todo):
-        left = (time.perf_counter() - start) / done * (len(todo) - done) if done else None
-        display.count(done, len(todo), "rendering", seconds_left=left)
-        write_image(path, side_by_side(panels(scene, cameras, numbers[path], takes, config.show, limits)))
-    display.count(len(todo), len(todo), "rendering")
-
-
-def _all_round(opened: "LoadedRun[Scene]", config: RenderVerbConfig, cameras: "Cameras") -> "Cameras":
-    """Panoramas in place of the path's cameras. Raises UsageError where the scene lies in front of its cameras alone."""
-    from ..rendering.paths import panoramas, upwards
-
-    if opened.known.facts.space.kind == "ndc":
-        raise UsageError(f"--lens {config.lens}: this scene was captured from one side (space ndc); there is nothing all round")
-    return panoramas(cameras, config.across, upwards(opened.known.cameras))
 
 
 def _key(opened: "LoadedRun[Scene]", config: RenderVerbConfig, cameras: "Cameras") -> str:
@@ -179,7 +158,7 @@ def _takes(scene: "Scene", config: RenderVerbConfig, file: "StyleFile") -> "list
         if text == "plain":
             takes.append(Take("plain", lambda frame: scene))
         else:
-            ((name, named),) = named_styles([text], file, say)
+            ((name, named),) = named_styles([text], file)
             takes.append(_styled_take(scene, name, named))
     takes = takes or [Take("plain", lambda frame: scene)]
     if "match" in config.show and not any(take.styled is not None for take in takes):

@@ -2,23 +2,20 @@
 
 import re
 import sys
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from ..errors import UsageError
 from ..style.config import PRESETS, StyleConfig, preset_flags, with_preset
 from ..style.files import StyleFile, check_photographs, read_style, with_folders
 from .parsing import parse
 
-if TYPE_CHECKING:
-    from ..interfaces import Scene
-    from ..style.look import Restyle
-
 C = TypeVar("C", bound=StyleConfig)
-D = TypeVar("D")
+
+_LONGEST = 60
+"""Characters of a style's name, which file names carry."""
 
 
 def read_flags(
@@ -35,10 +32,14 @@ def read_flags(
     file = read_style(path) if path is not None else StyleFile(StyleConfig())
     if path is not None:
         default = replace(default, **_styles(file.style))
-    default, args = read_preset(default, args)
-    config = parse(
-        default, _joined(args, default), prog=prog, description=with_presets_named(description), positional=positional
-    )
+    flags = {f"--{name}": name for name in PRESETS}
+    for flag in (arg for arg in args if arg in flags):
+        print(f"{flag}: {preset_flags(flags[flag])}")
+        default = with_preset(default, flags[flag])
+    args = [arg for arg in args if arg not in flags]
+    meanings = [f"{flag} stands for {preset_flags(name)}; other flags come over it." for flag, name in flags.items()]
+    about = "\n\n".join([description, *meanings])
+    config = parse(default, _joined(args, default), prog=prog, description=about, positional=positional)
     config = with_folders(config, say)
     file = file._replace(style=StyleConfig(**_styles(config)))
     given = {arg.partition("=")[0] for arg in args}
@@ -50,22 +51,6 @@ def read_flags(
 def say(text: str) -> None:
     """A line on standard error."""
     print(text, file=sys.stderr)
-
-
-def read_preset(default: D, args: Sequence[str]) -> tuple[D, list[str]]:
-    """The default with the preset whose flag is among the arguments, and the other arguments; says what the preset sets."""
-    flags = [f"--{name}" for name in PRESETS]
-    for flag in (arg for arg in args if arg in flags):
-        print(f"{flag}: {preset_flags(flag[2:])}")
-        default = with_preset(default, flag[2:])
-    return default, [arg for arg in args if arg not in flags]
-
-
-def with_presets_named(description: str) -> str:
-    """A verb's description, with the presets that it takes."""
-    return "\n\n".join(
-        [description, *(f"--{name} stands for {preset_flags(name)}; other flags come over it." for name in PRESETS)]
-    )
 
 
 def _styles(config: StyleConfig) -> dict[str, Any]:
@@ -102,34 +87,16 @@ def _style_flag(args: Sequence[str]) -> Path | None:
     return path
 
 
-_LONGEST = 60
-"""Characters of a style's name, which file names carry."""
+def named_styles(texts: Sequence[str], base: StyleFile) -> list[tuple[str, StyleFile]]:
+    """Styles from NAME=STYLE.json or NAME=PHOTO[,PHOTO ...], by name; photographs go with the other settings of `base`.
 
-
-class NamedStyle(NamedTuple):
-    """A style before it is made."""
-
-    name: str
-    file: StyleFile
-
-
-class Look(NamedTuple):
-    """The scene as it is (no name, no restyle), or in a style."""
-
-    name: str
-    restyle: "Restyle | None"
-
-
-def named_styles(texts: Sequence[str], base: StyleFile, report: Callable[[str], None] = warnings.warn) -> list[NamedStyle]:
-    """Styles from NAME=STYLE.json or NAME=PHOTO[,PHOTO ...]; photographs go with the other settings of `base`.
-
-    Folders stand for the images in them, and `report` is told which of these cannot be read. Raises UsageError for another
+    Folders stand for the images in them; those that cannot be read are named on standard error. Raises UsageError for another
     form, and what reading a style file raises.
     """
     styles = []
     for text in texts:
         name, equals, what = text.partition("=")
-        if not (equals and name and what) or name != _tidy(name):
+        if not (equals and name and what) or name != tidy(name):
             raise UsageError(
                 f"--styles {text}: write NAME=PHOTO,PHOTO or NAME=STYLE.json, with a name of letters, digits, + - and _"
             )
@@ -140,32 +107,11 @@ def named_styles(texts: Sequence[str], base: StyleFile, report: Callable[[str], 
             # What names photographs one by one does not carry over to others.
             photographs = tuple(Path(part) for part in what.split(","))
             style = replace(base.style, references=photographs, weights=(), masks=(), pin=(), forbid=())
-            file = StyleFile(with_folders(style, report))
-        styles.append(NamedStyle(name, file))
+            file = StyleFile(with_folders(style, say))
+        styles.append((name, file))
     return styles
 
 
-def named_style(references: Sequence[Path], style: Path | None, base: StyleFile) -> list[NamedStyle]:
-    """The style of a verb's own flags, called as its file, the folder of a style.json, or its photographs; none without any."""
-    if not references:
-        return []
-    own = "+".join(path.stem for path in references)
-    if style is not None:
-        own = style.resolve().parent.name if style.name == "style.json" else style.stem
-    return [NamedStyle(_tidy(own) or "style", base)]
-
-
-def make_looks(scene: "Scene", styles: Sequence[NamedStyle]) -> list[Look]:
-    """The scene as it is, and each style. Raises UsageError for two of one name, and what `apply_style` raises."""
-    from ..style.restyle import apply_style
-
-    names = [style.name for style in styles]
-    for name in names:
-        if names.count(name) > 1:
-            raise UsageError(f"--styles {name}: two styles of this name; give each its own")
-    encoders = scene.encoders() if styles else None
-    return [Look("", None), *(Look(s.name, apply_style(scene, s.file, encoders).restyle) for s in styles)]
-
-
-def _tidy(name: str) -> str:
+def tidy(name: str) -> str:
+    """A name as file names carry it: letters, digits, + - and _, at most 60."""
     return re.sub(r"[^\w+-]+", "_", name, flags=re.ASCII).strip("_")[:_LONGEST]

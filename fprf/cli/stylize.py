@@ -13,7 +13,6 @@ from .style_flags import read_flags
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
-    from ..style.match_maps import Region
     from ..style.regions import Regions
     from ..style.restyle import Styled
 
@@ -23,7 +22,7 @@ _LONGEST = 80
 _SHOWN = 0.1
 """References that a region takes less of are not in the table."""
 
-_HEAD = ("region", "share", "seen best at", "strength", "sure", "entropy", "takes")
+_HEAD: tuple[str, ...] = ("region", "share", "seen best at", "strength", "sure", "entropy", "takes")
 
 _DESCRIPTION = """Restyle captured views with photographs; no training, the same look from every viewpoint.
 
@@ -142,27 +141,21 @@ def print_explained(output: Path, regions: "Regions", styled: "Styled | None") -
 
     explained = explain(regions, styled)
     names = styled.dictionary.names if styled is not None else ()
-    _print_table([_HEAD if styled else _HEAD[:3], *(_cells(region) for region in explained)])
+    table = [_HEAD if styled else _HEAD[:3]]
+    for region in explained:
+        cells = [str(region.number), f"{region.share:.1%}", f"{region.view}:{region.pixel[0]},{region.pixel[1]}"]
+        if region.taken:
+            best = [taken for taken in region.taken if taken.share >= _SHOWN][:3] or list(region.taken[:1])
+            takes = ", ".join(f"{taken.name} {taken.share:.0%} (score {taken.score:.2f})" for taken in best)
+            strength = "kept" if region.strength == 0 else f"{region.strength:.2g}"
+            cells += [strength, f"{region.confidence:.0%}", f"{region.entropy:.1f} bit", takes]
+        table.append(tuple(cells))
+    widths = [max(len(cell) for cell in column) for column in zip(*table, strict=True)]
+    for row in table:
+        print("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
     write_json(output / "explain.json", {"references": list(names), "regions": [region_row(region) for region in explained]})
     write_image(output / "explain.png", contact_sheet([region_tile(region, names) for region in explained]))
     print(f"the same with pictures in {output / 'explain.png'} and explain.json")
-
-
-def _cells(region: "Region") -> tuple[str, ...]:
-    """A row of the table."""
-    place = (str(region.number), f"{region.share:.1%}", f"{region.view}:{region.pixel[0]},{region.pixel[1]}")
-    if not region.taken:
-        return place
-    best = [taken for taken in region.taken if taken.share >= _SHOWN][:3] or list(region.taken[:1])
-    takes = ", ".join(f"{taken.name} {taken.share:.0%} (score {taken.score:.2f})" for taken in best)
-    sure = f"{region.confidence:.0%}"
-    return (*place, "kept" if region.strength == 0 else f"{region.strength:.2g}", sure, f"{region.entropy:.1f} bit", takes)
-
-
-def _print_table(rows: list[tuple[str, ...]]) -> None:
-    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
-    for row in rows:
-        print("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
 def _name(config: StylizeConfig) -> str:

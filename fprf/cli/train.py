@@ -9,8 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from ..errors import UsageError
-from .parsing import load_method, methods, parse
+from ..errors import PluginError, UsageError
+from ..plugins import registry
+from .parsing import first_line, load_method, parse
 
 DEFAULT_METHOD = "fprf-splats"
 """Where none is named: the best quality for the time on every capture that was measured (docs/measurements.md)."""
@@ -30,8 +31,6 @@ def run(args: list[str]) -> int:
     if source.suffix == ".json" and config.output is None:
         config = replace(config, output=source.parent)
     rest, address = take_view(args[1:])
-    if "--plan" in rest:
-        raise UsageError("--plan: is gone; training says first how many blocks there are, and blocks.json where they lie")
     flags, changed = [arg for arg in rest if arg != CHANGED], CHANGED in rest
     about = (
         f"Train a scene with {method}.\n"
@@ -99,11 +98,26 @@ def viewed(run: Path, address: ViewAddress) -> Iterator[None]:
             process.wait()
 
 
+def methods() -> dict[str, str]:
+    """The installed methods with the first line of their documentation; a broken one says so instead."""
+    listed = {}
+    for name in registry.installed("fprf.methods"):
+        try:
+            listed[name] = first_line(registry.load_object("fprf.methods", name))
+        except PluginError as fault:
+            listed[name] = f"(broken) {fault}"
+    return listed
+
+
 def _usage() -> str:
-    lines = ["usage: fprf train [METHOD|CONFIG.json] --data DIR [any field]", ""]
-    lines += [f"methods ({DEFAULT_METHOD} where none is named):"]
-    listed = list(methods())
-    width = max(len(name) for name, _ in listed)
-    lines += [f"  {name:<{width}}  {about}" for name, about in listed]
-    lines += ["", "`fprf train METHOD --help` lists every field; a saved config.json goes on with its run."]
+    listed = methods()
+    width = max(map(len, listed))
+    lines = [
+        "usage: fprf train [METHOD|CONFIG.json] --data DIR [any field]",
+        "",
+        f"methods ({DEFAULT_METHOD} where none is named):",
+        *(f"  {name:<{width}}  {about}" for name, about in listed.items()),
+        "",
+        "`fprf train METHOD --help` lists every field; a saved config.json goes on with its run.",
+    ]
     return "\n".join(lines)

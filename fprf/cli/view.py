@@ -77,7 +77,11 @@ def run(args: list[str]) -> int:
         path = config.run
         if path is not None and not (config.follow or is_capture(path) or (path / "config.json").is_file()):
             raise CheckpointError(f"{path}: no config.json here, so it is no run folder; `fprf train` makes one")
-        references = _photographs(config.references)
+        references: Sequence[Path] = config.references
+        if any(each.is_dir() for each in references):  # decoding needs a library that the page does not wait for
+            from ..datamanagers.images import photographs
+
+            references = photographs(references, say)
         print(server.address, flush=True)
         if path is None:
             stack.callback(_start(server, config, references).close)
@@ -100,15 +104,6 @@ def run(args: list[str]) -> int:
             last.start()
             raise
     return 0
-
-
-def _photographs(references: Sequence[Path]) -> Sequence[Path]:
-    """The images of folders in the folders' place. Raises DataError where there are none."""
-    if not any(path.is_dir() for path in references):  # decoding needs a library that the page does not wait for
-        return references
-    from ..datamanagers.images import photographs
-
-    return photographs(references, say)
 
 
 def _start(server: "ViewerServer", config: ViewConfig, references: Sequence[Path]) -> "Start":
@@ -139,13 +134,13 @@ def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[st
     from ..plugins.stylizers.config import RegionToneConfig
     from ..splats.config import LookConfig
     from ..splats.files import read_capture
-    from .restyle import seen_capture
+    from ..splats.loading import open_capture
 
     def progress(done: int, total: int) -> None:
         if done == 0:
             notify("looking at the capture, once; a photograph can be dropped already")
 
     capture, look = read_capture(path), LookConfig(up=config.up, inside=config.inside, semantic=config.semantic)
-    scene = seen_capture(capture, look, progress=progress)
+    scene = open_capture(capture, look, progress=progress)
     name = name or path.resolve().name.partition(".")[0]
     return Viewed(scene, name, 0, root=config.output / name, capture=capture, stylizer=RegionToneConfig(centred=False))

@@ -169,7 +169,7 @@ class CellPart(Part):
         gaussians = whole.select(shown)
         # Only what lies inside and in the border becomes more: its share of all that may be added.
         around = int(cell.around(gaussians.means).sum())
-        cap = len(gaussians) + round(max(config.cap - len(whole), 0) * around / len(whole))
+        cap = len(gaussians) + round(max(config.most - len(whole), 0) * around / len(whole))
         tones = overview_tones(self.facts, start)
         learner = GaussianLearner(
             replace(config, cap=cap, rate=_RATE * config.rate),
@@ -254,7 +254,7 @@ def overview_config(config: GaussiansConfig, scene: Scene) -> tuple[GaussiansCon
         # The levels that one piece would be trained on, of images which are smaller already.
         coarse=min(1.0, config.coarse / config.overview / 3 ** math.log2(factor)),
         # As many as one piece would have by then.
-        cap=round(config.initial * (config.cap / config.initial) ** min(1.0, config.overview / config.grow)),
+        cap=round(config.initial * (config.most / config.initial) ** min(1.0, config.overview / config.grow)),
         steps=max(1, round(config.overview * config.steps), _VISITS * len(scene.train[::every])),
     )
     return own, every

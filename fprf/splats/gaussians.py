@@ -125,7 +125,7 @@ def from_arrays(
 ) -> Gaussians:
     """Gaussians of arrays of any float type; what is beyond float32 becomes infinite."""
     parts = (means, quaternions, log_scales, logits, harmonics)
-    return Gaussians(*(torch.from_numpy(np.array(part, np.float32, order="C")) for part in parts))
+    return Gaussians(*(torch.from_numpy(np.require(part, np.float32, ["C", "W"])) for part in parts))
 
 
 def from_rows(rows: Annotated[Tensor, "N R"]) -> Gaussians:

@@ -264,7 +264,7 @@ class GaussianLearner(SceneLearner):
         dead = np.flatnonzero(spare)
         chance[dead] = 0
         # The number grows evenly on a logarithmic scale: begun (cap / begun)^(share / grow).
-        cap = max(self.config.cap, self.begun)
+        cap = max(self.config.most, self.begun)
         wanted = int(self.begun * (cap / self.begun) ** min(1.0, share / self.config.grow))
         more = max(wanted - model.count, 0)
         # One half stays in its place, the other takes that of a dead one, or a new one at the end.

@@ -1,8 +1,9 @@
-"""Runs of 3D Gaussians, opened from their folder alone: semantics, levels of detail, exposures, poses of held-out views."""
+"""Runs of 3D Gaussians, opened from their folder alone (semantics, levels of detail, exposures, poses), and captures."""
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache
+from pathlib import Path
 from typing import Annotated
 
 import torch
@@ -17,19 +18,23 @@ from ..training.camera_optimizers import Poses, Tones, moved_cameras
 from ..training.driver import Schedule, learn
 from ..training.loading import LoadedRun
 from ..training.model import Facts, tones_of
-from ..training.prepare import reach_of
+from ..training.prepare import cache_folder, reach_of
 from ..training.quality import PRESETS, QualityConfig, mixed_tone
 from ..training.run import Run, in_training
-from .config import GaussiansConfig
+from ..training.tensorfiles import load_sealed, save_sealed
+from .config import GaussiansConfig, LookConfig
+from .files import Capture
 from .gaussians import from_tensors
 from .learner import MOVES, GaussianLearner
 from .levels import Levels, make_levels_of_detail, open_levels, write_levels
 from .photographs import load_photographs, make_levels
-from .scene import SplatScene, run_scene
+from .scene import SplatScene, cache_name, load_scene, look_at_capture, run_scene, scene_tensors
 from .semantics import Semantics, load_semantics, semantics_tensors
 
 _FIT_RATE, _FIT_STEPS = 2e-3, 120
 """Rate of poses (`GaussiansConfig.poses`) and steps of each view, where poses of views are fitted to a finished scene."""
+_CACHED = 24
+"""Captures of which the cache keeps what was found out."""
 _LEVELS, _MANY = "levels", 400_000
 """Folder of a run; Gaussians from which on levels of detail are kept there and mapped, not made in memory."""
 
@@ -78,13 +83,13 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
     shown = replace(
         whole,
         # What a training has learnt so far is looked at quickly, and not kept.
-        found=whole.found if training else cache(lambda: _semantics(run, saved.step, whole, config)),
+        found=whole.found if training else functools.cache(lambda: _semantics(run, saved.step, whole, config)),
         resolution=resolution if quality.resolution is None else quality.resolution,
         tone=mixed_tone(tones, known, quality.tone) if quality.tone else (1.0, 1.0, 1.0),
         tones=tones,
         poses=fit,
         merged=merged,
-        levels=cache(levels),
+        levels=functools.cache(levels),
     )
     return LoadedRun(run, run.load_config()[1], known, saved.step, saved.seconds, shown)
 
@@ -128,3 +133,40 @@ def _semantics(run: Run, step: int, scene: SplatScene, config: GaussiansConfig) 
     semantics = scene.found()
     run.save_tensors("style", {**semantics_tensors(semantics), **{name: torch.tensor(of) for name, of in wanted.items()}})
     return semantics
+
+
+def open_capture(
+    capture: Capture,
+    look: LookConfig,
+    *,
+    cache: Path | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    say: Callable[[str], None] = lambda text: None,
+) -> SplatScene:
+    """A capture as a scene: its Gaussians that can be drawn, with views and features from the cache.
+
+    What points up is as `look` says, else as the file does. Where views and features are absent, views are found here, and
+    features, which are then stored, when they are first asked for. `cache` is the folder; by default the user's own.
+    """
+    look = replace(look, up=look.up or capture.up)
+    folder, encoder = cache or cache_folder() / "captures", look.semantic.encoder.build()
+    path = folder / cache_name(capture.data, encoder.identity, look)
+    gaussians = capture.gaussians.drawable()
+    if path.is_file():
+        try:
+            scene = load_scene(load_sealed(path), gaussians, capture.antialiased, encoder)
+        except CheckpointError as error:
+            say(f"looking again: {error}")
+        else:
+            path.touch()
+            return replace(scene, origin=capture.origin)
+    scene = look_at_capture(gaussians, capture.antialiased, encoder, look, progress, capture.camera)
+
+    def found() -> Semantics:
+        semantics = scene.found()
+        save_sealed(path, scene_tensors(scene))
+        for old in sorted(folder.glob("*.safetensors"), key=lambda each: each.stat().st_mtime)[:-_CACHED]:
+            old.unlink(missing_ok=True)
+        return semantics
+
+    return replace(scene, found=functools.cache(found), origin=capture.origin)

@@ -1,8 +1,9 @@
 """Photographs as the rasteriser sees the world: through a pinhole, with what lies beyond a lens's picture left out."""
 
-from collections.abc import Mapping
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -27,8 +28,65 @@ _WIDEST = 4.0
 _SHARPEST = cv2.INTER_LANCZOS4
 """Out of its lens and back into it a photograph of 135 x 240 pixels comes with 43 dB; by cubic interpolation with 40."""
 
-Level = dict[int, Target]
+
+_KEPT = 1 << 31
+"""Bytes of photographs in the rasteriser's layout, some ten times as large as 8-bit pixels, that are kept between steps."""
+Level = Mapping[int, Target]
 """Training views at one scale, by view; their sizes may differ."""
+
+
+class _View(NamedTuple):
+    """A photograph without its lens, as 8-bit pixels."""
+
+    camera: Pinhole
+    image: Image
+    valid: NDArray[np.bool_] | None
+    sky: NDArray[np.bool_] | None
+
+
+class _Kept(OrderedDict[tuple[int, int], Target]):
+    """Targets by scale and view, the least recently used first; all scales of a scene share it."""
+
+    bytes = 0
+
+    def add(self, key: tuple[int, int], target: Target) -> None:
+        self[key] = target
+        self.bytes += _bytes(target)
+        while self.bytes > _KEPT and len(self) > 1:
+            self.bytes -= _bytes(self.popitem(last=False)[1])
+
+
+class _Scaled(Mapping[int, Target]):
+    """Views at 1/2^k of their size, brought into the rasteriser's layout when a step asks for them."""
+
+    def __init__(self, views: Mapping[int, _View], k: int, kept: _Kept) -> None:
+        self.views, self.k, self.kept = views, k, kept
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.views)
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __getitem__(self, view: int) -> Target:
+        key = self.k, view
+        if key in self.kept:
+            self.kept.move_to_end(key)
+            return self.kept[key]
+        camera, image, valid, sky = self.views[view]
+        size = max(1, camera.width >> self.k), max(1, camera.height >> self.k)
+        shrink = torch.tensor([[size[0] / camera.width], [size[1] / camera.height], [1.0]], dtype=torch.float64)
+        small = camera._replace(intrinsics=camera.intrinsics * shrink, width=size[0], height=size[1])
+        # Each size is reduced from the full one, so that errors do not add up; the camera shrinks with the image.
+        colours: Floats = np.divide(image, 255, dtype=np.float32)
+        reduced: Floats = np.asarray(cv2.resize(colours, size, interpolation=cv2.INTER_AREA), np.float32) if self.k else colours
+        target = target_of(small, reduced, _resized(valid, size), _resized(sky, size))
+        self.kept.add(key, target)
+        return target
+
+
+def _bytes(target: Target) -> int:
+    return sum(part.nbytes for part in target if isinstance(part, np.ndarray))
 
 
 def camera_of(cameras: Cameras, view: int, near: float = 0.01) -> Pinhole:
@@ -117,7 +175,7 @@ def make_levels(
     longest = max(max(each.width, each.height) for each in cameras.values())
     shortest = min(min(each.width, each.height) for each in cameras.values())
     count = max(2, min((longest // 120).bit_length(), (shortest // WINDOW).bit_length()))  # SSIM needs its window
-    levels: list[Level] = [{} for _ in range(count)]
+    pixels: dict[int, _View] = {}
 
     def straightened(masks: Masks, view: int) -> NDArray[np.bool_] | None:
         if view not in masks:
@@ -129,16 +187,9 @@ def make_levels(
         # The photograph and its masks without their lens: what lies beyond the lens's picture does not count.
         image, valid = undistorted(scene.cameras, view, images[view], camera)
         mask, sky = straightened(masks, view), straightened(skies or {}, view)
-        valid = mask if valid is None else valid if mask is None else valid & mask
-        # Each size is reduced from the full one, so that errors do not add up; the camera shrinks with the image.
-        colours: Floats = np.divide(image, 255, dtype=np.float32)
-        for k, level in enumerate(levels):
-            size = (max(1, camera.width >> k), max(1, camera.height >> k))
-            shrink = torch.tensor([[size[0] / camera.width], [size[1] / camera.height], [1.0]], dtype=torch.float64)
-            small = camera._replace(intrinsics=camera.intrinsics * shrink, width=size[0], height=size[1])
-            reduced: Floats = np.asarray(cv2.resize(colours, size, interpolation=cv2.INTER_AREA), np.float32) if k else colours
-            level[view] = target_of(small, reduced, _resized(valid, size), _resized(sky, size))
-    return levels
+        pixels[view] = _View(camera, image, mask if valid is None else valid if mask is None else valid & mask, sky)
+    kept = _Kept()
+    return [_Scaled(pixels, k, kept) for k in range(count)]
 
 
 def _resized(mask: NDArray[np.bool_] | None, size: tuple[int, int]) -> NDArray[np.bool_] | None:

@@ -18,6 +18,7 @@ from ..datamanagers.scene import Scene as ParsedScene
 from ..errors import CheckpointError, DataError
 from ..interfaces import Encoder, Scene, SceneView, Stylizer, Values
 from ..ops.rasterise_reference import MIN_ALPHA
+from ..plugins.captures import Data
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.cameras import Cameras, pixel_grid
 from ..rendering.renderer import enlarged
@@ -323,7 +324,7 @@ def load_scene(tensors: dict[str, Tensor], gaussians: Gaussians, antialiased: bo
     return captured(gaussians, antialiased, cameras, lambda: semantics, encoder)
 
 
-def cache_name(data: bytes, encoder: str, config: LookConfig) -> str:
+def cache_name(data: Data, encoder: str, config: LookConfig) -> str:
     """A name for what is found out about a file: by its content, the encoder, and how it is looked at."""
     digest = hashlib.sha256(data)
     digest.update(f"9 {encoder} {config.up} {config.inside} {config.views} {config.size} {config.regions}".encode())

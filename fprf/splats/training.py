@@ -56,9 +56,9 @@ def build(
     # Few photographs get few Gaussians, which they would else learn by heart; cells bound theirs by the whole scene.
     if config.cells == 1:
         pixels = int(scene.cameras.size[scene.train].prod(1).sum())
-        cap = max(1, min(config.cap, pixels // config.pixels_per_gaussian))
-        config = replace(config, cap=cap, initial=max(1, config.initial * cap // config.cap))
-    config = replace(config, surroundings=min(config.surroundings, config.cap // _SURROUNDINGS))
+        cap = max(1, min(config.most, pixels // config.pixels_per_gaussian))
+        config = replace(config, cap=cap, initial=max(1, config.initial * cap // config.most))
+    config = replace(config, surroundings=min(config.surroundings, config.most // _SURROUNDINGS))
     images, masks, skies = load_photographs(config, scene, scene.train.tolist())
     facts = saved or light_and_poses(config, scene, lambda view: images[view])
     # Gaussians begin at points of the reconstruction, or at matches between views ...
@@ -75,7 +75,7 @@ def build(
         config,
         make_levels(scene, images, masks, near, skies),
         scene_scale(scene),
-        max(config.cap, len(points.position) + config.surroundings),
+        max(config.most, len(points.position) + config.surroundings),
         None if sphere is None else sphere.encloses,
         limit_widths(scene, near, cells=config.cells > 1, sphere=sphere),
         near=near,

@@ -85,7 +85,7 @@ class Poses(nn.Module):
 
 def moved_cameras(cameras: Cameras, moves: Annotated[Tensor, "V 6"]) -> Cameras:
     """Cameras, each turned about its own centre and shifted."""
-    turn, shift = moves.to(cameras.pose).unflatten(1, (2, 3)).unbind(1)
+    turn, shift = moves.to(cameras.pose).view(-1, 2, 3).unbind(1)
     axes = [rotated(cameras.pose[:, :, axis], turn) for axis in range(3)]
     return replace(cameras, pose=torch.stack([*axes, cameras.pose[:, :, 3] + shift], -1))
 

@@ -29,7 +29,7 @@ from ..memory import out_of_memory, shortage
 from ..plugins.typed_json import leaves
 from ..progress import LINE_SECONDS, Display
 from . import checkpoint
-from .prepare import device_of, read_scene, scene_needs, with_downscale
+from .prepare import device_of, planned, read_scene, scene_needs
 from .run import Run, check_images, held, image_hashes, save_image_hashes
 
 REPORT_SECONDS = 0.5
@@ -363,26 +363,26 @@ def _check_needs(config: RunConfig, method: str, display: Display) -> None:
 
 
 def _sized(run: Run, config: RunConfig, display: Display) -> RunConfig:
-    """The config with the size of its images, which an existing run has decided already."""
-    if config.downscale is not None:
-        if config.downscale > 1 and not run.exists:
-            width, height = read_scene(config).cameras.size[0].tolist()
-            if min(width, height) < _SMALL:
-                display.say(
-                    f"warning: {width}x{height} pixels are few: --downscale {config.downscale} counts from the images as they "
-                    "are delivered, also in a folder images_N; leave it out"
-                )
-        return config
-    # Else a run would change its size with the machine or the minutes.
-    old = run.load_config()[0].downscale if run.exists else None
-    if old is not None:
-        return replace(config, downscale=old)
-    config = with_downscale(config)
-    if config.downscale != 1:
+    """The config with all decided that it leaves open, which an existing run has decided already."""
+    if config.downscale is not None and config.downscale > 1 and not run.exists:
         width, height = read_scene(config).cameras.size[0].tolist()
-        display.say(
-            f"images are reduced to 1/{config.downscale}, {width}x{height}, for this device and time: --downscale 1 keeps them"
-        )
+        if min(width, height) < _SMALL:
+            display.say(
+                f"warning: {width}x{height} pixels are few: --downscale {config.downscale} counts from the images as they "
+                "are delivered, also in a folder images_N; leave it out"
+            )
+    # Else a run would change its size with the machine or the minutes.
+    if run.exists:
+        old = run.load_config()[0]
+        decided = {name: getattr(old, name, None) for name in config.open if getattr(config, name) is None}
+        config = replace(config, **{name: value for name, value in decided.items() if value is not None})
+    asked, config = config, planned(config)
+    if asked is not config:
+        scene = read_scene(config)
+        width, height = scene.cameras.size[scene.train[0] if len(scene.train) else 0].tolist()
+        ends = f"{config.minutes:g} minutes" if config.minutes is not None else f"{config.limited(len(scene.train)):,} steps"
+        reduced = f" (1/{config.downscale}; --downscale 1 keeps them whole)" if config.downscale != 1 else ""
+        display.say(f"plan: {len(scene.train)} views at {width}x{height}{reduced}{config.described()}, {ends}")
     return config
 
 

@@ -52,12 +52,11 @@ def device_of(name: str) -> torch.device:
         raise PluginError(f"device: {name!r} is not available here; there is {known}{ray}") from e
 
 
-def with_downscale(config: RunConfig) -> RunConfig:
-    """The config with the size of its images decided: unchanged where `downscale` is a number. Raises as `read_scene`."""
-    if config.downscale is not None:
+def planned(config: RunConfig) -> RunConfig:
+    """The config with what it leaves open decided, the size of its images first. Raises as `read_scene`."""
+    if all(getattr(config, name) is not None for name in config.open):
         return config
-    delivered = read_scene(replace(config, downscale=1))
-    return replace(config, downscale=config.find_downscale(delivered, device_of(config.trained_on).type))
+    return config.planned(read_scene(replace(config, downscale=1)), device_of(config.trained_on).type)
 
 
 def read_scene(config: RunConfig, saved: Facts | None = None) -> Scene:
@@ -67,7 +66,7 @@ def read_scene(config: RunConfig, saved: Facts | None = None) -> Scene:
     """
     if config.data is None:
         raise UsageError("no scene is named: give --data FOLDER, or --data garden for the embedded one")
-    scene = parse_scene(config.data, with_downscale(config).downscale or 1, config.scene_parser)
+    scene = parse_scene(config.data, config.downscale or planned(config).downscale or 1, config.scene_parser)
     return scene if saved is None else at_origin(scene, saved.origin)
 
 

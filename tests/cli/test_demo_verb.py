@@ -13,7 +13,7 @@ import torch
 
 import fprf.methods
 from fprf.cli import main as cli
-from fprf.cli.demo import fading
+from fprf.cli.gallery import fading
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.progress import Display
 from fprf.splats.files import read_capture

@@ -6,9 +6,8 @@ import pytest
 from fake_packages import packages_in
 from tiny_world import World
 
-from fprf.cli.doctor import machine, method_needs, run, run_folder
+from fprf.cli.doctor import Finding, machine, method_needs, run, run_folder
 from fprf.cli.doctor_scene import scene_folder
-from fprf.cli.findings import Finding
 from fprf.methods import fprf_lite
 from fprf.plugins.codec import save_config
 
@@ -59,7 +58,7 @@ def test_scene_folders(world: World, capsys: pytest.CaptureFixture[str]) -> None
     found = _by_name(scene_folder(world.town))
     assert found["format"].found == "transforms" and found["views"].found == "10 of 32 x 24 pixels, pinhole lens"
     assert found["next"].found == f"fprf train --data {world.town}"
-    assert run(["--target", str(world.town)]) == 0 and "32 x 24" in capsys.readouterr().out
+    assert run([str(world.town)]) == 0 and "32 x 24" in capsys.readouterr().out
 
 
 METHOD = """

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.checks import at_least
-from fprf.cli.parsing import load_method, methods, parse
+from fprf.cli.parsing import load_method, parse
+from fprf.cli.train import methods
 from fprf.config import TrainConfig
 from fprf.errors import FprfError, PluginError, UsageError
 from fprf.methods import fprf, fprf_lite
@@ -136,7 +137,7 @@ def test_methods_by_name_and_by_file(tmp_path: Path) -> None:
         load_method(str(tmp_path))
     with pytest.raises(PluginError, match="did you mean 'fprf-lite'"):
         load_method("fprf-litee")
-    listed = dict(methods())
+    listed = methods()
     assert listed["fprf"].startswith("The paper's sizes") and {"fprf", "fprf-lite"} <= listed.keys()
 
 
@@ -154,7 +155,7 @@ def test_a_strangers_broken_method(tmp_path: Path, source: str, message: str) ->
         with pytest.raises(PluginError, match="'acme-m'") as caught:
             load_method("acme-m")
         assert message in str(caught.value)
-        assert "acme-m" in dict(methods())
+        assert "acme-m" in methods()
     assert "acme_methods" not in sys.modules
 
 

@@ -15,7 +15,7 @@ from fprf.methods import fprf_lite
 from fprf.training.driver import Report, forecast
 from fprf.training.learner import outcome
 from fprf.training.model import build_model
-from fprf.training.prepare import device_of, exposure_of, read_scene, with_downscale
+from fprf.training.prepare import device_of, exposure_of, planned, read_scene
 from fprf.training.run import Run
 
 
@@ -81,8 +81,8 @@ def test_more_time_and_fewer_images_never_reduce_further(side: int, views: int, 
 
 
 def test_a_config_gets_the_size_of_its_scene(world: World) -> None:
-    config = with_downscale(replace(world.config, downscale=None))
-    assert config == world.config and with_downscale(config) is config
+    config = planned(replace(world.config, downscale=None))
+    assert config == world.config and planned(config) is config
     half = read_scene(replace(config, downscale=2))
     assert half.cameras.size[0].tolist() == [16, 12]
     with pytest.raises(UsageError, match="--data FOLDER, or --data garden"):
