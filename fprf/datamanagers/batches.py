@@ -70,6 +70,7 @@ class PixelRuns:
     @staticmethod
     def of(masks: Iterable[tuple[int, Tensor]]) -> "PixelRuns":
         """Of masks of any shape, each with the number of its first entry, which rise; a run may go on in the next mask."""
+        # Where a mask changes runs begin and end; runs that touch across masks become one.
         starts, ends = [], []
         for first, mask in masks:
             edge = torch.zeros(1, dtype=torch.bool)
@@ -181,6 +182,7 @@ class RayBatches(DataManager):
                 rows = torch.from_numpy(image).reshape(-1, 3)
                 self._pixels[filled : filled + len(rows)] = rows
                 filled += len(rows)
+        # Pixels that may be drawn, those of sky, and those that show points.
         masks, skies = (scene.masks, scene.sky_masks) if config.masks else ((), ())
         self._chosen = None if seen is None and not masks else self._runs(masks, unmasked=True, seen=seen)
         if self._chosen is not None and not len(self._chosen):
@@ -283,6 +285,7 @@ class RayBatches(DataManager):
         sightings = find_sightings(replace(self._scene, seen=seen))
         if sightings is None:
             return None, None
+        # From a view and a pixel to the number among all training pixels.
         slots = torch.full((len(self._scene.cameras),), -1, dtype=torch.int64)
         slots[self._scene.train] = torch.arange(len(self._views))
         slot, pixel = slots[sightings.view], sightings.pixel.long()

@@ -142,6 +142,7 @@ def _nearest(scene: Scene) -> float | None:
 
 def _box(scene: Scene) -> Space:
     position = scene.cameras.pose[:, :, 3]
+    # The point that all cameras look at, or their middle where axes are parallel.
     centre, certain = focus(scene.cameras)
     if certain < 1e-4:
         centre = position.mean(0)

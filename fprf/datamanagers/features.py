@@ -102,6 +102,7 @@ def keep_within(folder: Path, size: int, used: Collection[str]) -> None:
 
     Whoever has one mapped keeps it on POSIX; on Windows it stays.
     """
+    # The file that was used longest ago first.
     files = []
     for path in folder.glob("[!.]*.safetensors"):
         with contextlib.suppress(OSError):  # another process was first
@@ -169,6 +170,7 @@ class FeatureStore:
         """Root mean square over the channels' standard deviations, over all pixels."""
         self.scale = self.std if self.std > 1e-6 * float(self._centre.abs().max()) else 1.0
         """The unit of losses: `std`, or 1 where the features do not change but for rounding."""
+        # Kernels read the coefficients where they lie, in mapped files.
         bits = [coefs.view(torch.uint16).numpy() for coefs in self._coefs]
         self._table = ViewTable(bits, self._size.numpy(), self._scale.numpy(), self._centre.numpy())
         self._packed: tuple[guided.Packed, Tensor] | None = None
@@ -325,6 +327,7 @@ def _basis(
     kept = read_tensors(folder, key)
     if kept is not None:
         return Basis.from_tensors(kept)
+    # As many cells of each view, drawn evenly.
     generator = torch.Generator().manual_seed(0)
     samples, held = [], 0
     for view in chosen:

@@ -257,6 +257,7 @@ def photographs(paths: Sequence[Path], report: Callable[[str], None]) -> list[Pa
             return str(error)
         return ""
 
+    # Those of folders are tried, in threads; those that are named are taken as they are.
     listed: dict[Path, None] = {}
     for path in paths:
         images = [path / name for name in image_names(path)] if path.is_dir() else []

@@ -93,6 +93,7 @@ def find_sightings(scene: Scene) -> Sightings | None:
     """The sightings of the training views; None without sparse points or where none is in any view."""
     if scene.points is None or not len(scene.points):
         return None
+    # Who saw what, where the reconstruction says so; else what each view may see.
     if scene.seen is not None:
         kept = scene.seen[torch.isin(scene.seen[:, 0], scene.train)]
         kept = kept[kept[:, 0].argsort(stable=True)]
@@ -113,6 +114,7 @@ def tile_of(cameras: Cameras, view: Annotated[Tensor, "O"], pixel: Annotated[Ten
 
 def _sighted(cameras: Cameras, view: Tensor, points: Tensor) -> Sightings:
     """Those of the pairs whose point falls into its image."""
+    # In front of the camera and inside of the image.
     pixel, depth = project(cameras, view, points)
     size = cameras.size[view].to(pixel)
     inside = (depth > 0) & ((pixel >= 0) & (pixel < size)).all(1)  # NaN is never inside

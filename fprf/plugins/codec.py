@@ -36,6 +36,7 @@ def save_config(path: Path, config: "RunConfig", method: str) -> None:
     """
     from ..config import IncompleteConfig, TrainConfig  # the knob tree is made of plug-in configs, which lie above this module
 
+    # A config whose method is not installed gives back what was kept of it.
     fields, packages = to_json(config), packages_of(config)
     if isinstance(config, IncompleteConfig):
         fields = {name: value for name, value in fields.items() if name not in ("reason", "unknown", "packages")}
@@ -72,8 +73,8 @@ def load_config(path: Path) -> "tuple[RunConfig, str]":
         unknown = {name: value for name, value in fields.items() if name not in known}
         theirs = {path: text for path, text in packages.items() if path.partition(".")[0] in {*unknown, "method"}}
         ours = from_json({name: value for name, value in fields.items() if name in known}, TrainConfig, packages=packages)
-        kept = {"unknown": json.dumps(unknown, allow_nan=False), "packages": json.dumps(theirs)}
-        return IncompleteConfig(**vars(ours), reason=reason, **kept), method
+        data = json.dumps(unknown, allow_nan=False)
+        return IncompleteConfig(**vars(ours), reason=reason, unknown=data, packages=json.dumps(theirs)), method
     except ConfigError as fault:
         raise ConfigError(f"{path}: {fault}") from fault
 

@@ -73,6 +73,7 @@ def forget() -> None:
 
 def entry(group: str, name: str, kind: type = object) -> Entry:
     """The one entry of that name. Raises PluginError where there is none or more than one; others of the kind are named."""
+    # Gone, never there, or there twice.
     entries = installed(group).get(name, ())
     if not entries and (group, name) in REMOVED:
         raise PluginError(f"{group}: {name!r} was removed; {REMOVED[group, name]}")

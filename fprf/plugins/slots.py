@@ -103,6 +103,7 @@ def resolve(config: C, args: Sequence[str]) -> tuple[C, list[str]]:
         name, rest = take_flag(rest, slot.path)
         if name is None:
             continue
+        # Nothing, the plug-in that is there, or another one.
         if name == "none":
             if not slot.optional:
                 raise UsageError(f"--{slot.path}: cannot be none; allowed are {', '.join(slot.choices)}")

@@ -142,6 +142,7 @@ def _read(data: Any, hint: Any, path: str, packages: Mapping[str, str]) -> Any:
         return _read_fields(fields, chosen, path, packages)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return _read_fields(_expect(data, dict, path), hint, path, packages)
+    # Containers, item by item.
     if origin in (tuple, list):
         items = _expect(data, list, path)
         hints = _items(hint, len(items))
@@ -156,6 +157,7 @@ def _read(data: Any, hint: Any, path: str, packages: Mapping[str, str]) -> Any:
             if type(value) is type(data) and value == data:  # True == 1
                 return meant
         raise ConfigError(f"{path}: {data!r} is not one of {', '.join(map(repr, allowed))}")
+    # Plain values.
     if hint is Path:
         return Path(_expect(data, str, path))
     if hint is float:

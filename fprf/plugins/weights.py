@@ -145,6 +145,7 @@ def input_statistics(
 def _download(source: WeightSource) -> Path:
     target = _folders()[0] / source.file
     target.parent.mkdir(parents=True, exist_ok=True)
+    # Into a file of its own, whose hash is checked before it takes the name.
     partial = target.with_name(f"{source.file}.{os.getpid()}.partial")
     try:
         # The origins are ours, https, and what comes is hashed before it is used.

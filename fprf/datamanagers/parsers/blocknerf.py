@@ -340,6 +340,7 @@ def _entry(example: Example, folder: Path, held: bool) -> dict[str, Any]:
     exposure = float(example.numbers("equivalent_exposure", 1)[0])
     if exposure <= 0:
         raise DataError(f"{example.where}: equivalent_exposure is {exposure}, it must be above 0; leave its file out")
+    # The image under a name that says its camera.
     index = example.integer("cam_idx")
     # Hashes are unsigned: neither a minus nor an order by size belongs in a file's name.
     name = f"cam{index:02d}-{example.integer('image_hash') & 0xFFFFFFFFFFFFFFFF:016x}"

@@ -263,6 +263,7 @@ Cloud = tuple[NDArray[np.float64], NDArray[np.int64] | None]
 
 def observed_points(model: ColmapModel, images: Sequence[ColmapImage]) -> list[NDArray[np.int64]]:
     """Rows of the model's points that each image observes; ids that are not in the model are left out."""
+    # By binary search among the sorted ids.
     order = np.argsort(model.point_ids, kind="stable")
     observed = []
     for image in images:
@@ -275,6 +276,7 @@ def observed_points(model: ColmapModel, images: Sequence[ColmapImage]) -> list[N
 
 def cloud_of_images(model: ColmapModel, observed: Sequence[NDArray[np.int64]]) -> Cloud:
     """Finite points of a model, and the pairs of views, in the order of `observed`, and points, each once."""
+    # A view may observe a point with several features.
     views = [np.unique(rows) for rows in observed]
     pairs = np.stack([np.repeat(np.arange(len(views)), [len(rows) for rows in views]), np.concatenate(views)], 1)
     return _finite(model.points, pairs.astype(np.int64))

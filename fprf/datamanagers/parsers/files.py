@@ -100,6 +100,7 @@ class NamedFiles:
         name, path = path_inside(self.root, where, text)
         if os.path.lexists(path):
             return name, path
+        # A folder is listed once: its files by their spelling, and by that without a suffix.
         if path.parent not in self._listed:
             listed: dict[str, str] = {}
             names = os.listdir(path.parent) if path.parent.is_dir() else []

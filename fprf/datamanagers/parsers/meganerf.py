@@ -37,6 +37,7 @@ class MegaNerfParser(DataParser):
                 raise DataError(f"{path}: pose_scale_factor is no number ({_first_line(error)}); write it again") from error
             if not 0 < unit < 1e9:
                 raise DataError(f"{path}: pose_scale_factor is {unit}; it must be above 0: write it again")
+        # Both parts in one order by name.
         files: list[tuple[Path, str]] = []
         for split in ("train", "val"):
             folder = data / split / "metadata"

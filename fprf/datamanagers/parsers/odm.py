@@ -82,6 +82,7 @@ def _reconstruction(file: Path) -> tuple[list[_Shot], NDArray[np.float64]]:
 
 def _shots(data: Path, file: Path) -> list[_Shot]:
     """Shots of a report, with the cameras beside it."""
+    # cameras.json is an object of cameras; the report one of features with properties.
     beside = data / "cameras.json"
     cameras = _objects(as_record(beside, {"cameras": read_json(beside)}), "cameras")
     shots = []

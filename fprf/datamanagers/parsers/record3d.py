@@ -49,6 +49,7 @@ class Record3DParser(DataParser):
             lenses = record.table("perFrameIntrinsicCoeffs", 4)
         if len(lenses) < len(poses):
             lenses = np.tile(record.numbers("K", 9)[[0, 4, 6, 7]], (len(poses), 1))
+        # At most so many, evenly through the recording.
         even = np.linspace(0, len(posed) - 1, min(len(posed), self.config.frames)).round().astype(int)
 
         def view(each: tuple[int, str]) -> View:

@@ -27,6 +27,7 @@ class ContentStudent(nn.Module):
 
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features at half the size, rounded up."""
+        # 2x2 pixels become channels, colours of about [-2, 2].
         x = F.pixel_unshuffle(4 * replicate_to_multiple(image, 2) - 2, 2)
         x = F.relu(self.first(reflect_pad(x)))
         x = F.relu(self.second(reflect_pad(x)))
@@ -52,6 +53,7 @@ class SemanticStudent(nn.Module):
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features at an eighth of the size, rounded up."""
         fine = self.fine(self.stem(4 * image - 2))
+        # Stride 16, with the mean over the whole image added; then both strides together.
         coarse = self.coarse(fine)
         coarse = F.relu(coarse + self.whole(coarse.mean(dim=(2, 3)))[:, :, None, None])
         coarse = F.interpolate(coarse, fine.shape[-2:], mode="bilinear", align_corners=False)

@@ -26,6 +26,7 @@ class ConcatEncoder(FrozenEncoder):
     def __init__(
         self, parts: Sequence[Encoder], weights: Sequence[float], units: Sequence[float], *, cells: Cells = "finest"
     ) -> None:
+        # Weights and units are part of the identity.
         names = [f"{weight!r}/{unit!r}*[{part.identity}]" for weight, unit, part in zip(weights, units, parts, strict=True)]
         kind = "concat:" if cells == "finest" else f"concat:{cells}:"
         super().__init__(kind + "+".join(names), sum(part.channels for part in parts))

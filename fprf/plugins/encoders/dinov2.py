@@ -71,12 +71,14 @@ class Dinov2(nn.Module):
 
         Only patches that are `shown` (bool, at least one) attend to each other; the others take the features of the nearest.
         """
+        # Tokens are patches with their learned positions, interpolated to this grid.
         patches = self.patch_embed(image)
         shape = patches.shape[-2:]
         positions = F.interpolate(self.pos_embed[None], shape, mode="bicubic", align_corners=False)
         tokens = (patches + positions).flatten(2).transpose(1, 2)
         if shown is not None:
             tokens = tokens[:, shown.flatten()]
+        # The class token attends and is attended to, and is dropped at the end.
         x = torch.cat([self.cls_token.expand(len(image), 1, -1), tokens], 1)
         for index, block in enumerate(self.blocks, start=1):
             x = block(x, keys and index == len(self.blocks))

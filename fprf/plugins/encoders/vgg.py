@@ -47,6 +47,7 @@ class VggEncoder(FrozenEncoder):
         scale: Annotated[Tensor, "C"] | None,
         source: str,
     ) -> None:
+        # Tensors of the convolutions up to the layer, each of which the file must hold.
         every = list(CONVOLUTIONS[network])
         names = every[: every.index(layer[4:]) + 1]
         used = {"mean": mean.float(), "std": std.float()}
@@ -67,6 +68,7 @@ class VggEncoder(FrozenEncoder):
                     found = f"{key} has shape {tuple(value.shape)}"
                     raise WeightsError(f"{source}: {found}, not that of a 3x3 convolution of {shown}")
                 used[f"{part}{index}"] = value
+        # What divides the features is part of the identity, as the tensors are.
         channels = len(used[f"bias{len(names) - 1}"])
         used["scale"] = torch.ones(channels) if scale is None else scale.float()
         kind = "plain" if scale is None else "normalised"
@@ -80,6 +82,7 @@ class VggEncoder(FrozenEncoder):
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features at stride 1, 2, 4, 8 or 16, by the block of the layer."""
         x = (image - self._column("mean", image)) / self._column("std", image)
+        # A pool before each block but the first, and the last ReLU only if the layer is one.
         for index, name in enumerate(self._names):
             if index and name.endswith("_1"):
                 x = F.max_pool2d(x, 2, ceil_mode=True)

@@ -32,6 +32,7 @@ class AdainStylizer(Stylizer):
 
     def __init__(self, dictionary: StyleDictionary, scene: SceneStyle) -> None:
         super().__init__()
+        # sigma_s / sigma_c of all references and the whole scene.
         mean, covariance = whole_style(dictionary)
         scene_mean = double(scene.mean)
         scene_sigma = deviation(scene_mean, double(scene.covariance).diagonal())
@@ -72,6 +73,7 @@ class LocalAdainStylizer(Stylizer):
     def __init__(self, dictionary: StyleDictionary, scene: SceneStyle, config: LocalAdainConfig) -> None:
         super().__init__()
         check_fit(dictionary, scene)
+        # Queries and keys from their own means, or from the encoder's zero (paper).
         self.matched = len(dictionary.keys) > 1 and dictionary.keys.shape[1] > 0
         # Both sides, such that their inner products are the scores R (paper, Eq. 5).
         theirs = share_mean(dictionary.keys, code_odds(dictionary).to(dictionary.keys))
@@ -86,6 +88,7 @@ class LocalAdainStylizer(Stylizer):
         # The only region of an undivided scene lies at its mean, where it says nothing about scores.
         spread = score_spread(queries if len(queries) > 1 else keys, keys) if config.relative else 1.0
         self.temperature = config.temperature * spread
+        # Statistics of the codes, or of all references at once where nothing is matched; sigma_s / sigma_c is a gain.
         mean, covariance = double(dictionary.mean), double(dictionary.covariance)
         if not self.matched:
             mean, covariance = (part[None] for part in whole_style(dictionary))
@@ -109,6 +112,7 @@ class LocalAdainStylizer(Stylizer):
         with full_precision(content):
             features = content.to(self.gain)
             if self.matched:
+                # M_w and Sigma_w of each point (Eq. 6).
                 assert semantic is not None, "Want.SEMANTIC was asked for"
                 return mixture.scaled(features, self.match(semantic), self.gain, self.style_mean, centre=self.content_mean).to(
                     content
