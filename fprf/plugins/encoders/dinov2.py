@@ -127,7 +127,7 @@ class Dinov2Encoder(FrozenEncoder):
         return features
 
 
-def load_dinov2(*, layer: int, kind: Literal["tokens", "keys"], stride: int | None, path: Path = WEIGHTS) -> Dinov2Encoder:
+def load_dinov2(*, layer: int, kind: Literal["tokens", "keys"], stride: int | None) -> Dinov2Encoder:
     """The encoder up to block `layer` (negative: from the last of 12). Raises WeightsError where the file has no such block."""
     block = layer if layer > 0 else BLOCKS + 1 + layer
     if not 1 <= block <= HELD:
@@ -136,7 +136,7 @@ def load_dinov2(*, layer: int, kind: Literal["tokens", "keys"], stride: int | No
         )
     with torch.device("meta"):  # no memory or time for weights that are replaced
         network = Dinov2(block)
-    tensors = dequantised(read_weights(path)[0])
+    tensors = dequantised(read_weights(WEIGHTS)[0])
     network.load_state_dict({name: tensors[name] for name in network.state_dict()}, assign=True)
     return Dinov2Encoder(network, kind=kind, stride=stride)
 

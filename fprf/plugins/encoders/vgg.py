@@ -104,8 +104,8 @@ def vgg_activations(encoder: VggEncoder, images: Annotated[Tensor, "B 3 H W"]) -
 FLAG = "--content.encoder.weights"
 ORIGIN = "https://download.pytorch.org/models/"
 SOURCES = {
-    "vgg16": WeightSource("VGG-16", "vgg16-397923af.pth", f"{ORIGIN}vgg16-397923af.pth", FLAG, pinned=True),
-    "vgg19": WeightSource("VGG-19", "vgg19-dcbb9e9d.pth", f"{ORIGIN}vgg19-dcbb9e9d.pth", FLAG, pinned=True),
+    "vgg16": WeightSource("VGG-16", "vgg16-397923af.pth", f"{ORIGIN}vgg16-397923af.pth", FLAG),
+    "vgg19": WeightSource("VGG-19", "vgg19-dcbb9e9d.pth", f"{ORIGIN}vgg19-dcbb9e9d.pth", FLAG),
 }
 """torchvision's files: their names carry the beginning of their own SHA-256."""
 CAFFE_FILES = r"vgg16-00b39a1b\.pth|vgg19-d01eb7cb\.pth"
