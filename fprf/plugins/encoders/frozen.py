@@ -20,10 +20,9 @@ def freeze(module: nn.Module) -> None:
     module.requires_grad_(False)
 
 
-def reflect_pad(x: Annotated[Tensor, "B C H W"], margin: int = 1) -> Annotated[Tensor, "B C H+2m W+2m"]:
+def reflect_pad(x: Annotated[Tensor, "B C H W"]) -> Annotated[Tensor, "B C H+2 W+2"]:
     """Mirror at the borders; repeat them where an axis is too short to mirror."""
-    mirrored = min(x.shape[-2:]) > margin
-    return F.pad(x, (margin, margin, margin, margin), mode="reflect" if mirrored else "replicate")
+    return F.pad(x, (1, 1, 1, 1), mode="reflect" if min(x.shape[-2:]) > 1 else "replicate")
 
 
 def replicate_to_multiple(x: Annotated[Tensor, "B C H W"], stride: int) -> Tensor:
