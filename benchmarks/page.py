@@ -166,7 +166,7 @@ def million(browser: Any, folder: Path, count: int) -> dict[str, float]:
     heap = page.evaluate("() => performance.memory.usedJSHeapSize") / 2**20
     size = (folder / "page.html").stat().st_size / 2**20
     # Shapes and order on the graphics card and in the page, projected Gaussians, means and keys of the sorter.
-    held = count * (2 * 16 + 2 * 4 + 40 + 4 + 4 + 12 + 4 + 2) / 2**20
+    held = count * (2 * 16 + 2 * 4 + 2 * 32 + 4 + 4 + 12 + 4 + 2) / 2**20
     sizes = {"heap_mib": round(heap, 1), "held_mib": round(held), "file_mib": round(size, 1)}
     return {"gaussians": count, "sort_milliseconds": round(min(sorts), 1), **sizes}
 

@@ -32,7 +32,7 @@ from ..splats.photographs import camera_of
 from ..splats.scene import SplatScene
 from ..style.look import Restyle
 from .live import read, script
-from .pack import colour_header, colour_section, header, importance, pack, sections
+from .pack import colour_header, colour_section, header, pack, sections
 
 CAPTURED = "Captured"
 _STILL, _VIEW, _MAP, _REFERENCE = 800, 512, 320, 320
@@ -122,7 +122,7 @@ def page_html(page: Page, *, megabytes: float | None = None, path: Path = Path("
         return fixed, 0
     harmonics = [scene.shown.harmonics, *(style.harmonics for style in page.styles if style.harmonics is not None)]
     # Pack all, and while it is too large keep the share that would fit, of the Gaussians that weigh most in the views.
-    empty, kept, weight = len(fixed.encode()), None, None
+    empty, kept = len(fixed.encode()), None
     for _ in range(4):
         head, parts = packed_scene(scene, harmonics, kept, page.start)
         text = _text(page, film, head, parts)
@@ -132,10 +132,8 @@ def page_html(page: Page, *, megabytes: float | None = None, path: Path = Path("
         share = (room - empty) / max(1, size - empty)
         if share <= 0.02:
             break
-        if weight is None:
-            weight = importance(scene.gaussians, scene.views, antialiased=scene.antialiased, near=scene.near)
         # A little less than would fit by the mean: what shows most compresses least.
-        kept = weight.topk(max(1, int(0.98 * share * count))).indices.sort().values
+        kept = scene.seen.weights.topk(max(1, int(0.98 * share * count))).indices.sort().values
     raise DataError(f"{path}: {empty / 2**20:.1f} MiB without any Gaussian; allow more than {megabytes:g} MiB")
 
 
