@@ -134,7 +134,7 @@ OFFSET = (1e6, -3e6, 5e5)
 """Metres: of the size of UTM coordinates."""
 
 
-def invariants(trained: Trained, scene: Scene | None, cameras: Cameras, references: Sequence[Path]) -> list[Check]:
+def invariants(trained: Trained, scene: Scene | None, cameras: Cameras, references: tuple[Path, ...]) -> list[Check]:
     """Of one view; what needs the scene's images or points is left out without them."""
     model, facts = trained.model, trained.known.facts
     rays = view_rays(model, cameras, 0)
@@ -221,7 +221,7 @@ def _worlds(trained: Trained, scene: Scene, cameras: Cameras, plain: Tensor) -> 
     return rows
 
 
-def _styles(trained: Trained, rays: Rays, plain: Tensor, references: Sequence[Path]) -> list[Check]:
+def _styles(trained: Trained, rays: Rays, plain: Tensor, references: tuple[Path, ...]) -> list[Check]:
     model, facts, config = trained.model, trained.known.facts, trained.config.render
     there = apply_style(trained, StyleFile(StyleConfig(references=references, stylizer=RegionOtConfig()))).restyle
     back = apply_style(trained, StyleFile(StyleConfig(references=references[::-1], stylizer=RegionOtConfig()))).restyle

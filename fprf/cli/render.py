@@ -12,7 +12,6 @@ from ..errors import ConfigError, UsageError
 from ..progress import Display
 from ..style.config import StyleConfig
 from ..style.files import read_keyframes
-from ..style.restyle import keyed_looks
 from ..training.quality import QualityConfig
 from .style_flags import named_styles, read_flags
 
@@ -146,6 +145,7 @@ def _key(opened: "LoadedRun[Scene]", config: RenderVerbConfig, cameras: "Cameras
 
 def _takes(scene: "Scene", config: RenderVerbConfig, file: "StyleFile") -> "list[Take]":
     """The looks of a film, at least one. Raises UsageError for a match map without a style to match."""
+    from ..style.restyle import keyed_looks
     from ..training.film import Take
 
     takes = []
