@@ -1,7 +1,7 @@
 """Stress: every stage on adversarial inputs, each against a reference and a bound."""
 
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
