@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from unittest import mock
 
 import torch
@@ -19,9 +18,8 @@ from torch import Tensor
 
 from fprf.config import RenderConfig
 from fprf.datamanagers.features import FeatureStore
-from fprf.fields import planes
-from fprf.ops import backend, dense, march, mixture, triplane
-from fprf.rendering import renderer, space
+from fprf.fields.planes import ProposalField
+from fprf.ops import backend, dense, mixture, triplane
 from fprf.rendering.cameras import Cameras
 from fprf.style import matching
 from fprf.style.config import StyleConfig
@@ -53,14 +51,11 @@ def plain_lookups(store: FeatureStore, view: Tensor, pixel: Tensor, rgb: Tensor)
 
 
 packed: dict[int, FeatureStore] = {}
-no_march = SimpleNamespace(usable=never)
 SWITCHES: dict[str, Patches] = {
     "tri-planes": [(triplane, "usable", never)],
     "tri-planes: total variation": [(triplane, "variation", triplane.variation_reference)],
     "networks": [(dense, "usable", never)],
-    "marching": [(march, "usable", never)],
-    "marching: proposals": [(planes, "march", no_march)],
-    "marching: weights and sums": [(renderer, "compiled", no_march), (space, "march", no_march)],
+    "proposals": [(ProposalField, "kernels_apply", never)],
     "styles at points": [(mixture, "usable", never), (matching, "usable", never)],
     "styles at points: matching": [(matching, "usable", never)],
     "styles at points: maps": [(mixture, "usable", never)],

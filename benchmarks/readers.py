@@ -394,7 +394,19 @@ def _gaussians(folder: Path) -> list[Target]:
         cases.normal(12, seed=26),
         0.1 * cases.normal(12, 4, 3, seed=27),
     )
-    made, names = Gaussians(*parts), ("x.ply", "x.compressed.ply", "x.splat", "x.spz", "x.sog", "meta.json")
+    made = Gaussians(*parts)
+    names = ["x.ply", "x.compressed.ply", "x.splat", "x.spz", "x.sog", "meta.json", "x.glb", "x.gltf"]
     for name in names:
         write_gaussians(folder / name, made)
+    # What is read alone, and text, by hand.
+    head, _, body = (folder / "x.ply").read_bytes().partition(b"end_header\n")
+    rows = np.frombuffer(body, "<f4").reshape(12, -1)
+    text = head.replace(b"binary_little_endian", b"ascii") + b"end_header\n"
+    (folder / "ascii.ply").write_bytes(text + "\n".join(" ".join(map(str, row)) for row in rows).encode())
+    section = struct.pack("<IIIIfHxxIIIIH", 12, 12, 12, 1, 5.0, 12, 0, 0, 1, 0, 0).ljust(1024, b"\0")
+    start = struct.pack("<BBxxIIIIHxxfff", 0, 1, 1, 1, 12, 12, 1, 0, 0, 0).ljust(4096, b"\0")
+    (folder / "x.ksplat").write_bytes(start + section + bytes(12) + bytes(range(24)) * 12)
+    index = {"filenames": ["meta.json"], "tree": {"lods": {"0": {"file": 0, "offset": 2, "count": 9}}}}
+    (folder / "lod-meta.json").write_text(json.dumps(index))
+    names += ["ascii.ply", "x.ksplat", "lod-meta.json"]
     return [Target(f"Gaussians, {name}", folder / name, partial(read_capture, folder / name)) for name in names]

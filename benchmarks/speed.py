@@ -223,7 +223,7 @@ def cached_rows(config: SpeedConfig, subject: Subject, styles: dict[str, Stylize
                 goal=_FAST if whole else None,
                 error=difference(calls[name](), calls[f"anew {name}"]()).largest,
                 error_kind="largest colour difference from the view rendered anew",
-                note=f"{size_of(camera)}, {view.bytes / 2**20:.0f} MiB cached",
+                note=size_of(camera),
             )
         )
     return rows

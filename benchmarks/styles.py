@@ -354,7 +354,7 @@ def run_figures(root: Path, config: StylesConfig, judges: Mapping[str, Encoder])
                 there = style.classes
             rows = judge_exhibit(Exhibit(plain, styled, regions, style.images, there), judges, full=config.full)
             for name, pictures in styled.items():
-                warped = consistency(pictures, [view.depth for view in cached], near, pairs)
+                warped = consistency(pictures, [view.restyled().depth for view in cached], near, pairs)
                 rows[name] |= {"consistency_rmse": warped["rmse"], "consistency_relative": warped["relative"]}
             cases[style.name] = rows
             shown[style.name] = {"reference": style.images[0], **{name: views[0] for name, views in styled.items()}}

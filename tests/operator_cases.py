@@ -11,7 +11,7 @@ import torch
 from ops.plain_forms import plainly
 from torch import Tensor
 
-from fprf.ops import dense, guided, march, mixture, triplane
+from fprf.ops import dense, guided, mixture, triplane
 from fprf.rendering import cameras, lens, space, splines, stepfun
 from fprf.rendering.lens import lens_reach
 from fprf.style import dictionary, light, look, matching, scene_style, statistics
@@ -56,15 +56,6 @@ def _covariances(count: int, channels: int) -> Tensor:
 
 def _planes(points: int) -> Made:
     return 2 * _unit(points, 3) - 1, 0.5 * _draw(triplane.rows((8, 16)), 16), 0.1 * _draw(32)
-
-
-def _weighed(density: Tensor, t: Tensor) -> tuple[Tensor, ...]:
-    with torch.no_grad():
-        if not march.usable(density, t):  # the plain form, as the renderer falls back to
-            weights = stepfun.transmittance_weights(density, t)
-            return weights, weights.sum(-1), torch.exp(-(density * t.diff(dim=-1)).sum(-1))
-        found = march.weigh(density, t, 0.0)
-        return found.weights, found.opacity, found.transmittance
 
 
 def _lenses(count: int) -> Made:
@@ -149,7 +140,6 @@ CASES = [
     Case("guided.apply", lambda n: (_draw(4, 5, 6, 4), 37 * _unit(n, 2), _unit(n, 3)),
          lambda c, p, rgb: guided.apply(c, p, rgb, (37, 37))),
     Case("space.distance", lambda n: (_edges(n, 21), _unit(n) + 0.05, 9 * _unit(n) + 2), _open("contraction").distance),
-    Case("march.weigh", lambda n: (4 * _unit(n, 20), 3 * _edges(n, 20)), _weighed),
     Case("mixture.affine", lambda n: (_draw(n, 16), _shares(n, 3), _draw(3, 16, 16), _draw(3, 16), _draw(16)),
          lambda x, s, m, b, c: mixture.affine(x, s, m, b, centre=c)),
     Case("mixture.affine, plain", lambda n: (_draw(n, 16), _shares(n, 3), _draw(3, 16, 16), _draw(3, 16), _draw(16)),

@@ -2,6 +2,7 @@
 
 import torch
 
+from fprf.splats.files.ply import Ply
 from fprf.splats.gaussians import HARMONIC, Gaussians
 
 
@@ -23,3 +24,8 @@ def ball(count: int, degree: int = 1, seed: int = 0) -> Gaussians:
     turns = torch.randn(count, 4, generator=draw)
     sizes = -1.8 + 0.3 * torch.rand(count, 3, generator=draw)
     return Gaussians(means, turns, sizes, torch.full((count,), 3.0), harmonics)
+
+
+def plain_ply(gaussians: Gaussians) -> bytes:
+    """The INRIA file of Gaussians."""
+    return b"".join(Ply().pack(gaussians, False, (0.0, 0.0, 0.0)))

@@ -1,4 +1,4 @@
-"""`fprf restyle CAPTURE --references A.jpg B.jpg --output OUT`: new colours for a finished capture of 3D Gaussians."""
+"""`fprf restyle CAPTURE... --references A.jpg B.jpg --output OUT`: new colours for finished captures of 3D Gaussians."""
 
 import functools
 import time
@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ..checks import at_least, positive
 from ..errors import UsageError
-from ..plugins.captures import endings, format_name
+from ..plugins.captures import endings, format_name, format_of, is_scene
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from ..progress import Display
 from ..splats.config import LookConfig
-from ..style.config import StyleConfig
+from ..style.config import NO_MASK, StyleConfig
 from ..style.files import StyleFile, write_style
 from .style_flags import read_flags
 from .stylize import print_explained
@@ -22,9 +22,10 @@ if TYPE_CHECKING:
     from ..splats.scene import SplatScene
     from ..style.restyle import Styled
 
-_DESCRIPTION = f"""Restyle a finished capture of 3D Gaussians with photographs; its own photographs and cameras are not needed.
+_DESCRIPTION = f"""Restyle finished captures of 3D Gaussians with photographs; their own photographs and cameras are not needed.
 
-Reads and writes {", ".join(endings())} and SOG folders (meta.json); the output's ending says which. In the
+Reads and writes {", ".join(endings())} and SOG folders (meta.json); the output's ending says which. A
+reference may also be a capture or a run: views of it stand for photographs. In the
 format that was read everything but colours is kept bit for bit. REGION is a region's number (--explain lists them), its name
 in a style file, VIEW:X,Y (a pixel of a view) or VIEW:MASK.png; in --pin also a place: box:X,Y,Z:X,Y,Z:BORDER,
 path:X,Y,Z:X,Y,Z:WIDTH,BORDER or everywhere. REFERENCE is a file or its number, from 0 in the order given."""
@@ -34,14 +35,16 @@ path:X,Y,Z:X,Y,Z:WIDTH,BORDER or everywhere. REFERENCE is a file or its number, 
 class RestyleConfig(StyleConfig, LookConfig):
     """Flags of `fprf restyle`: the capture, the style and the files to write."""
 
-    capture: Path = Path()
-    """The capture: a file of Gaussians, or a SOG folder."""
+    captures: tuple[Path, ...] = ()
+    """The captures: files of Gaussians, or SOG folders. Several take one style together, so that neighbours stay alike."""
     output: Path | None = None
-    """The restyled capture; its ending says the format."""
+    """The restyled capture; its ending says the format. A folder for several captures, or where it is one already."""
     style: Path | None = None
     """A style file, such as the style.json of an earlier run, of this scene or another; flags come over it."""
     stylizer: StylizerConfig = RegionToneConfig(centred=False)
     """Method that changes the colours of the capture."""
+    match_light: bool = False
+    """Take exposure and white balance of the references alone: one gain for each channel of the whole scene."""
     each: bool = False
     """Each reference is a style of its own; its name is added to those of the files."""
     sheet: Path | None = None
@@ -65,7 +68,7 @@ class RestyleConfig(StyleConfig, LookConfig):
 
 
 class _Restyled(NamedTuple):
-    """The capture in one style."""
+    """The captures in one style."""
 
     name: str
     """What is added to the names of its files; empty where there is one style."""
@@ -75,38 +78,58 @@ class _Restyled(NamedTuple):
 
 
 def run(args: list[str]) -> int:
-    """Look at the capture, or take what the cache knows of it; build each style; write files, sheet and page."""
-    config, file = read_flags(RestyleConfig(), args, prog="fprf restyle", description=_DESCRIPTION, positional=("capture",))
-    _check(config)
+    """Look at the captures, or take what the cache knows of them; build each style; write files, sheet and page."""
+    config, file = read_flags(
+        RestyleConfig(), _captures_as_flag(args), prog="fprf restyle", description=_DESCRIPTION, positional=()
+    )
+    outputs = _outputs(config)
+    from ..memory import peak
+    from ..splats.captures import light_alone, open_captures
     from ..splats.files import Written, read_capture, write_capture
-    from ..splats.loading import open_capture
     from ..style.regions import Regions
     from ..style.restyle import apply_style
 
     begun = time.perf_counter()
-    capture = read_capture(config.capture)
+    file = _with_views(config, file)
+    config = replace(config, references=file.style.references)
     with Display() as display:
         report = functools.partial(display.count, what="looking")
-        scene = open_capture(capture, config, cache=config.cache, progress=report, say=display.say)
+        seen = open_captures(config.captures, config, cache=config.cache, progress=report, say=display.say)
+        for note in seen.first.notes:
+            display.say(f"{seen.first.path}: {note}")
+        scene = seen.scene
         scene.found()
         looked = time.perf_counter() - begun
-        named, made, written, encoders = _styles(config, file), list[_Restyled](), Written(), scene.encoders()
-        for i, (name, each) in enumerate(named):
-            display.count(i, len(named), "restyling")
+        named, made, encoders = _styles(config, file), list[_Restyled](), scene.encoders()
+        for name, each in named:
             start = time.perf_counter()
             styled = apply_style(scene, each, encoders)
-            shown = scene.restyled(styled.restyle)
-            harmonics = shown.shown.harmonics  # computed now, so that its time counts
-            if (output := config.output) is not None:
-                folder = output.name.lower() == "meta.json"  # SOG: what lies beside a file lies within
-                stem, dot, ending = output.name.partition(".")
-                if name:
-                    output = output.parent / name / output.name if folder else output.with_name(f"{stem}-{name}{dot}{ending}")
+            styled = light_alone(styled) if config.match_light else styled
+            made.append(_Restyled(name, styled, scene.restyled(styled.restyle), time.perf_counter() - start))
+        # File by file, each in all styles: one of them is in memory at a time.
+        written, faults, count, steps = Written(), dict[str, None](), 0, len(config.captures) * len(named)
+        for k, path in enumerate(config.captures if outputs or len(config.captures) == 1 else ()):
+            capture = seen.first if k == 0 else read_capture(path)
+            count += len(capture.gaussians)
+            faults |= dict.fromkeys(capture.gaussians.faults())
+            for i, one in enumerate(made if outputs else ()):
+                display.count(k * len(named) + i, steps, "restyling")
+                start = time.perf_counter()
+                folder = outputs[k].name.lower() == "meta.json"  # SOG: what lies beside a file lies within
+                stem, dot, ending = outputs[k].name.partition(".")
+                output = outputs[k]
+                if one.name:
+                    output = (
+                        output.parent / one.name / output.name
+                        if folder
+                        else output.with_name(f"{stem}-{one.name}{dot}{ending}")
+                    )
+                harmonics = seen.harmonics(k, capture, one.styled.restyle)
                 written = write_capture(output, capture, harmonics, scene.views)
                 beside = "style.json" if folder else f"{output.name.partition('.')[0]}.style.json"
-                write_style(output.with_name(beside), styled.controls.saved)
-            made.append(_Restyled(name, styled, shown, time.perf_counter() - start))
-        display.count(len(named), len(named), "restyling")
+                write_style(output.with_name(beside), one.styled.controls.saved)
+                made[i] = one._replace(seconds=one.seconds + time.perf_counter() - start)
+        display.count(steps, steps, "restyling")
     for note in dict.fromkeys(note for each in made for note in each.styled.controls.notes):
         print(note)
     if config.explain:
@@ -118,24 +141,92 @@ def run(args: list[str]) -> int:
     if config.sheet is not None or config.page is not None:
         _show(config, scene, made)
     each_seconds = sum(each.seconds for each in made) / max(1, len(made))
-    left = "".join(f", {each} left {'out' if written.faulty else 'as they are'}" for each in capture.gaussians.faults())
+    left = "".join(f", {each} left {'out' if written.faulty else 'as they are'}" for each in faults)
     left += "".join(f", {loss}" for loss in written.losses())
-    count = len(capture.gaussians)
-    print(f"{count} Gaussians{left}; looked at in {looked:.1f} s, {each_seconds:.2f} s for each of {len(made)} styles")
+    files = f" in {len(config.captures)} files" if len(config.captures) > 1 else ""
+    print(
+        f"{count} Gaussians{files}{left}; looked at in {looked:.1f} s, {each_seconds:.2f} s for each of {len(made)} styles, "
+        f"at most {(peak() or 0) / 1e9:.1f} GB"
+    )
     return 0
 
 
-def _check(config: RestyleConfig) -> None:
-    """Raise UsageError for what cannot be written, before anything takes time."""
+def _captures_as_flag(args: list[str]) -> list[str]:
+    """Words before the first flag name captures: A B --output ... is --captures A B --output ..."""
+    end = next((i for i, arg in enumerate(args) if arg.startswith("-")), len(args))
+    return ["--captures", *args[:end], *args[end:]] if end else args
+
+
+def _outputs(config: RestyleConfig) -> list[Path]:
+    """The file for each capture; none where none is to be written.
+
+    Raises UsageError for what cannot be written, before anything takes time.
+    """
+    if not config.captures:
+        raise UsageError(
+            "fprf restyle: name a capture, for example fprf restyle scan.ply --references autumn.jpg --output new.ply"
+        )
     if config.output is None and not (config.sheet or config.page or config.explain):
         raise UsageError("fprf restyle: name what to write, with --output, --sheet, --page or --explain")
-    if config.output is not None and format_name(config.output) is None:
-        known = ", ".join(endings())
-        raise UsageError(f"--output {config.output}: no file of Gaussians by its name; known endings are {known}")
     if config.page is not None and config.page.suffix.lower() != ".html":
         raise UsageError(f"--page {config.page}: the page is an .html file; give such a name")
     if not config.references and not config.explain:
         raise UsageError("--references: at least one photograph is needed, for example --references autumn.jpg night.jpg")
+    if config.output is None:
+        return []
+    if config.output.is_dir() or (len(config.captures) > 1 and format_name(config.output) is None):
+        outputs = []
+        for path in config.captures:
+            index = path.name.lower() in ("meta.json", "lod-meta.json")
+            inside = config.output / (path.parent.name if index else path.name)
+            known = format_name(path)
+            outputs.append(inside / "meta.json" if index or path.is_dir() else inside)
+            if known is not None and not index and not format_of(path).writes:
+                outputs[-1] = inside.with_suffix(".ply")
+        same = [path for path in outputs if outputs.count(path) > 1]
+        if same:
+            raise UsageError(f"--output {config.output}: several captures would be written as {same[0]}; give them other names")
+        if any(path.resolve() in [each.resolve() for each in config.captures] for path in outputs):
+            raise UsageError(f"--output {config.output}: the captures lie there; name another folder")
+        return outputs
+    if len(config.captures) > 1:
+        raise UsageError(f"--output {config.output}: {len(config.captures)} captures need a folder; name one")
+    if format_name(config.output) is None:
+        known_endings = ", ".join(endings())
+        raise UsageError(f"--output {config.output}: no file of Gaussians by its name; known endings are {known_endings}")
+    if not format_of(config.output).writes:
+        raise UsageError(
+            f"--output {config.output}: files of this format are read, not written; name a .ply, .spz, .sog or .glb"
+        )
+    return [config.output]
+
+
+def _with_views(config: RestyleConfig, file: StyleFile) -> StyleFile:
+    """The style with rendered views in the place of captures and runs among its references."""
+    style = file.style
+    scenes = [path for path in style.references if is_scene(path)]
+    if not scenes:
+        return file
+    if config.each:
+        raise UsageError(f"--each: {scenes[0]} gives several views, which are one style; leave --each out")
+    from ..splats.captures import reference_views
+
+    rows: list[tuple[Path, Path, float]] = []
+    beside = config.output or config.sheet or config.page or Path("x")
+    weights, masks = style.weights or (1.0,) * len(style.references), style.masks or (NO_MASK,) * len(style.references)
+    for path, mask, weight in zip(style.references, masks, weights, strict=True):
+        if path not in scenes:
+            rows.append((path, mask, weight))
+            continue
+        folder = beside.parent / f"{beside.name.partition('.')[0]}.references" / f"{path.resolve().name.partition('.')[0]}"
+        pictures, covers, shares = reference_views(path, config, folder)
+        # All views of a scene weigh as much as one photograph.
+        rows += [
+            (picture, cover, weight * share / sum(shares))
+            for picture, cover, share in zip(pictures, covers, shares, strict=True)
+        ]
+    pictures, covers, numbers = zip(*rows, strict=True)
+    return file._replace(style=replace(style, references=pictures, masks=covers, weights=numbers))
 
 
 def _styles(config: RestyleConfig, file: StyleFile) -> list[tuple[str, StyleFile]]:
@@ -181,7 +272,7 @@ def _show(config: RestyleConfig, scene: "SplatScene", made: Sequence[_Restyled])
         harmonics = each.scene.shown.harmonics
         styles.append(Style(name, pictures, harmonics, references=of, metrics={"new_style_seconds": each.seconds}))
     page = Page(
-        title=config.capture.resolve().name.partition(".")[0] or "capture",
+        title=config.captures[0].resolve().name.partition(".")[0] or "capture",
         facts={"Gaussians": len(scene.gaussians), "Regions": len(scene.measured()[0].share), "Styles": len(styles)},
         views=[PageView(scene.names[view], picture) for view, picture in zip(views, before, strict=True)],
         styles=styles,

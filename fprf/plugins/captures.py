@@ -6,12 +6,14 @@ the longest does (`compressed.ply` before `ply`).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from mmap import mmap
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 from ..errors import DataError
-from ..io.atomic import write_bytes
+from ..io.atomic import atomic_path
 from . import registry
 from .config import PluginConfig
 
@@ -24,6 +26,10 @@ if TYPE_CHECKING:
     from ..types import Origin
 
 
+Data: TypeAlias = bytes | mmap
+"""The content of a file: large ones are mapped. Both are sliced into bytes, and read by np.frombuffer."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class CaptureFormat(PluginConfig):
     """A format of files of 3D Gaussians. It has no state: there is nothing to build."""
@@ -33,6 +39,8 @@ class CaptureFormat(PluginConfig):
     view_dependent: ClassVar[bool] = True
     """It holds harmonics, and whether opacities are compensated for antialiasing. Where it does not, it is given the mean
     colours and opacities that views show."""
+    writes: ClassVar[bool] = True
+    """False = files of it are read alone, and what was read from them is written as another format."""
     exact: ClassVar[bool] = False
     """It holds every number as it is, NaN too, and positions in float64. Where it does not, it is given Gaussians that can be
     drawn, about a local origin that stands in a file beside."""
@@ -41,13 +49,13 @@ class CaptureFormat(PluginConfig):
         """False where a file of `size` bytes that begin with `head` is certainly damaged or of another format."""
         raise NotImplementedError
 
-    def read(self, path: Path, data: bytes) -> Capture:
+    def read(self, path: Path, data: Data) -> Capture:
         """The Gaussians of a file, and how to recolour it. Raises DataError for anything else than a sound file."""
         raise NotImplementedError
 
-    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> bytes:
-        """A file of these Gaussians, on the CPU. `origin` is to be added to their positions; it is 0 unless `exact`."""
-        raise NotImplementedError
+    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> Iterable[bytes]:
+        """The file of these Gaussians, on the CPU, in pieces. `origin` is to be added to their positions; 0 unless `exact`."""
+        raise DataError(f"{type(self).__name__}: files of this format are read, not written; name a .ply, .spz, .sog or .glb")
 
     def keeps(self, gaussians: Gaussians) -> NDArray[np.bool_] | None:
         """Gaussians [N] that a file holds: all but outliers that would cost the others their precision; None = all."""
@@ -59,11 +67,12 @@ class CaptureFormat(PluginConfig):
 
     def holds(self, capture: Capture, read_as: CaptureFormat) -> bool:
         """Whether a capture's own file, recoloured, is a file of this format."""
-        return type(read_as) is type(self)
+        return self.writes and type(read_as) is type(self)
 
-    def write(self, path: Path, data: bytes) -> None:
+    def write(self, path: Path, pieces: Iterable[bytes]) -> None:
         """Write what `pack` or `Capture.recolour` gave, whole or not at all."""
-        write_bytes(path, data)
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            file.writelines(pieces)
 
 
 def endings() -> tuple[str, ...]:
@@ -76,7 +85,9 @@ def format_name(path: Path) -> str | None:
     name = path.name.lower()
     if name == "meta.json":
         return "sog"
-    return max((each for each in registry.installed(CaptureFormat.group) if name.endswith(f".{each}")), key=len, default=None)
+    installed = registry.installed(CaptureFormat.group)
+    fits = [each for each in installed if name.endswith(f".{each}") or (name == each and "." in each)]
+    return max(fits, key=len, default=None)
 
 
 def format_of(path: Path) -> CaptureFormat:
@@ -87,3 +98,10 @@ def format_of(path: Path) -> CaptureFormat:
             f"{path}: no file of Gaussians by its name; known endings are {', '.join(endings())}, or meta.json of a SOG folder"
         )
     return registry.make(CaptureFormat.group, name, CaptureFormat)
+
+
+def is_scene(path: Path) -> bool:
+    """Whether a path is that of a capture or of a run, and so of no photograph."""
+    if path.is_dir():
+        return any((path / name).is_file() for name in ("meta.json", "lod-meta.json", "config.json"))
+    return format_name(path) is not None

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from ..errors import ConfigError, DataError
 from ..io.atomic import write_json
+from ..plugins.captures import is_scene
 from ..plugins.codec import from_json, packages_of, read_json, to_json
 from ..plugins.registry import nearest
 from .config import NO_MASK, StyleConfig
@@ -104,7 +105,8 @@ def with_folders(style: S, report: Callable[[str], None] = warnings.warn) -> S:
     Images of folders that cannot be read are left out, and `report` is given the reason. Raises DataError for a folder
     without a readable image, ConfigError for a mask over a folder.
     """
-    if not any(path.is_dir() for path in style.references):
+    folders = {path for path in style.references if path.is_dir() and not is_scene(path)}
+    if not folders:
         return style
     from ..datamanagers.images import photographs
 
@@ -113,9 +115,10 @@ def with_folders(style: S, report: Callable[[str], None] = warnings.warn) -> S:
     for path, weight, mask in zip(
         style.references, style.weights or (1.0,) * count, style.masks or (NO_MASK,) * count, strict=True
     ):
-        if path.is_dir() and mask != NO_MASK:
+        if path in folders and mask != NO_MASK:
             raise ConfigError(f"masks: {mask} is for one photograph, {path} is a folder; write none, or name the photographs")
-        rows |= {file: (weight, mask) for file in photographs([path], report) if file not in rows}
+        files = photographs([path], report) if path in folders else [path]
+        rows |= {file: (weight, mask) for file in files if file not in rows}
     weights, masks = zip(*rows.values(), strict=True)
     return replace(style, references=tuple(rows), weights=weights if style.weights else (), masks=masks if style.masks else ())
 

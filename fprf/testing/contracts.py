@@ -389,6 +389,12 @@ def check_capture_format(form: CaptureFormat) -> None:
 
     check_config(form)
     name, path = type(form).__name__, Path("capture")
+    if not form.writes:
+        try:
+            form.read(path, b"")
+        except DataError:
+            return
+        require(False, f"{name}: an empty file must raise DataError")
     made = Gaussians(
         cases.normal(50, 3, seed=30),
         torch.nn.functional.normalize(cases.normal(50, 4, seed=31), dim=1),
@@ -396,7 +402,7 @@ def check_capture_format(form: CaptureFormat) -> None:
         cases.normal(50, seed=33),
         0.3 * cases.normal(50, 4 if form.view_dependent else 1, 3, seed=34),
     )
-    data = form.pack(made, form.view_dependent, (0.0, 0.0, 0.0))
+    data = b"".join(form.pack(made, form.view_dependent, (0.0, 0.0, 0.0)))
     require(form.recognises(data[:64], len(data)), f"{name}.recognises: must be True of a file that it wrote")
     read = form.read(path, data)
     found, apart = read.gaussians, torch.cdist(made.means, read.gaussians.means)
@@ -408,7 +414,7 @@ def check_capture_format(form: CaptureFormat) -> None:
     require(read.data == data, f"{name}: Capture.data must be the file")
     changed = np.arange(len(found)) % 2 == 0
     new = torch.where(torch.from_numpy(changed)[:, None, None], 0.5 * found.harmonics, found.harmonics)
-    again = form.read(path, read.recolour(new.numpy(), changed)).gaussians
+    again = form.read(path, b"".join(read.recolour(new.numpy(), changed))).gaussians
     for part in ("means", "quaternions", "log_scales", "logits"):
         same(getattr(again, part), getattr(found, part), 0.0, f"{name}.recolour: {part} must stay as they are")
     same(again.colours, 0.5 + HARMONIC * new[:, 0], 0.05, f"{name}.recolour: the new colours must be there")

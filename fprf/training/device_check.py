@@ -13,7 +13,7 @@ from torch import Tensor
 from ..config import ContentConfig, RenderConfig, SemanticConfig, TrainConfig
 from ..fields.config import PlanesConfig, SemanticPlanesConfig
 from ..memory import free_memory
-from ..ops import backend, march
+from ..ops import backend, dense
 from ..ops.precision import double
 from ..plugins.encoders.config import BundledContentConfig
 from ..plugins.samplers.config import ProposalConfig
@@ -68,9 +68,9 @@ def fast_paths(device: torch.device) -> Iterator[tuple[str, str]]:
     """Name and description of the kernels and the precision that a device uses, and of its free memory."""
     probe = torch.zeros(1, 3, device=device)
     with torch.no_grad():
-        compiled = march.usable(probe)
+        compiled = dense.usable(probe)
     if compiled:
-        yield "kernels", "numba's: tri-planes, networks, marching, matching, guided filter"
+        yield "kernels", "numba's: tri-planes, networks, proposals, matching, guided filter"
     else:
         yield "kernels", "none: everything by torch"
     if device.type == "cuda":

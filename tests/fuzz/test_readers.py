@@ -36,6 +36,8 @@ NAMES = [
     *(f"{kind} of ODM" for kind in ("reconstruction", "shots", "cameras")),
     *(f"Gaussians, {name}" for name in ("x.ply", "x.compressed.ply", "x.splat", "x.spz", "x.sog", "meta.json")),
 ]
+LATER = [f"Gaussians, {name}" for name in ("x.glb", "x.gltf", "ascii.ply", "x.ksplat", "lod-meta.json")]
+"""Readers that the corpus does not have."""
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
     return {target.name: target for target in targets(tmp_path_factory.mktemp("fuzz") / "files")}
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *LATER])
 def test_mutations_are_read_or_refused_in_one_line(made: dict[str, Target], name: str) -> None:
     found = fuzz(made[name], 40, seed=1)
     assert not found.faults
@@ -51,7 +53,7 @@ def test_mutations_are_read_or_refused_in_one_line(made: dict[str, Target], name
 
 
 @pytest.mark.fault
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *LATER])
 def test_many_mutations(made: dict[str, Target], name: str) -> None:
     rounds = int(os.environ.get("FPRF_FUZZ", "2000"))
     found = fuzz(made[name], rounds, seed=random.SystemRandom().randrange(2**31), watch_memory=True)

@@ -50,14 +50,14 @@ class Toy(CaptureFormat):
         def recolour(harmonics, changed):
             new = table.copy()
             new[changed, 11:] = 0.5 + HARMONIC * harmonics[changed, 0]
-            return b"toy!" + new.tobytes()
+            return [b"toy!", new.tobytes()]
 
         gaussians = from_arrays(table[:, :3], table[:, 7:11], table[:, 3:6], table[:, 6], colours)
         return Capture(path, gaussians, False, data, recolour)
 
     def pack(self, gaussians, antialiased, origin):
         parts = (gaussians.means, gaussians.log_scales, gaussians.logits[:, None], gaussians.quaternions, gaussians.colours)
-        return b"toy!" + np.concatenate([part.numpy() for part in parts], 1).astype("<f4").tobytes()
+        return [b"toy!", np.concatenate([part.numpy() for part in parts], 1).astype("<f4").tobytes()]
 '''
 
 

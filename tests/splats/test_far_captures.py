@@ -8,11 +8,10 @@ import pytest
 import torch
 import trimesh
 from moved_scene import UTM
-from splat_ball import ball
+from splat_ball import ball, plain_ply
 
 from fprf.rendering.local_frame import offset_file, read_offset
 from fprf.splats.files import read_capture, write_capture, write_gaussians, write_ply_parts
-from fprf.splats.files.ply import ply_bytes
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.views import clip_distance, find_views, seen_means
 
@@ -54,7 +53,7 @@ def test_parts_of_a_large_file_are_the_file(tmp_path: Path) -> None:
         assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
         assert read_offset(tmp_path / "a.ply") == read_offset(tmp_path / "b.ply") == (UTM if local else (0, 0, 0))
     write_gaussians(tmp_path / "c.ply", made)
-    assert (tmp_path / "c.ply").read_bytes() == ply_bytes(made, False), "float32 where there is no origin"
+    assert (tmp_path / "c.ply").read_bytes() == plain_ply(made), "float32 where there is no origin"
 
 
 def test_float32_positions_far_from_0_are_looked_at_about_their_middle(tmp_path: Path) -> None:

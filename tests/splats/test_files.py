@@ -161,7 +161,7 @@ def test_plain_opacities_show_thin_gaussians_as_compensation_does(tmp_path: Path
 def test_a_ply_in_parts_is_the_same_file_and_goes_on_where_it_was_cut_off(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fprf.splats.files._ROWS", 64)
+    monkeypatch.setattr("fprf.splats.files.ROWS", 64)
     gaussians, path = ball(300), tmp_path / "parts.ply"
     whole = written(tmp_path / "whole.ply", gaussians, antialiased=True).data
 
@@ -286,8 +286,7 @@ def test_gaussians_that_are_not_finite_are_kept_by_ply_alone(tmp_path: Path) -> 
 def test_what_is_refused_is_refused_in_one_line(tmp_path: Path) -> None:
     data, spz, sog = (written(tmp_path / f"x{ending}", cloud(1, 4)).data for ending in (".ply", ".spz", ".sog"))
     for name, content in (
-        ("2d.ply", data.replace(b"scale_2", b"scale_9")),
-        ("2dgs.ply", data.replace(b"format", b"comment SplatRenderMode: 2dgs\nformat", 1)),
+        ("1d.ply", data.replace(b"scale_1", b"scale_9")),
         ("text.ply", data.replace(b"binary_little_endian", b"ascii")),
         ("short.ply", data[:-1]),
         ("transparent.ply", data.replace(b"opacity", b"opaque_")),

@@ -13,7 +13,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from splat_ball import ball
+from splat_ball import ball, equal, plain_ply
 
 from fprf.cli import main as cli
 from fprf.errors import DataError
@@ -23,7 +23,6 @@ from fprf.rendering.local_frame import read_offset
 from fprf.rendering.splines import rotations
 from fprf.splats.config import LookConfig
 from fprf.splats.files import Capture, Written, read_capture, write_capture, write_gaussians
-from fprf.splats.files.ply import ply_bytes
 from fprf.splats.files.sog import bundle, unbundle
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.photographs import camera_of
@@ -49,7 +48,7 @@ BAD: dict[str, Callable[[Gaussians, int], None]] = {
 
 
 def capture_of(folder: Path, gaussians: Gaussians) -> Capture:
-    (folder / "in.ply").write_bytes(ply_bytes(gaussians, False))
+    (folder / "in.ply").write_bytes(plain_ply(gaussians))
     return read_capture(folder / "in.ply")
 
 
@@ -233,7 +232,7 @@ def test_headers_of_any_making(kind: str, ending: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("first", [True, False])
 def test_elements_with_lists_before_and_behind_the_gaussians(lists: str, first: bool, tmp_path: Path) -> None:
     made = ball(30)
-    data = ply_bytes(made, False)
+    data = plain_ply(made)
     faces = [[0, 1, 2], [3, 4, 5]] if lists == "equal" else [[], [5], [1, 2, 3]]
     rows = b"".join(struct.pack(f"<B{len(each)}i", len(each), *each) for each in faces)
     element = f"element face {len(faces)}\nproperty list uchar int vertex_indices\n".encode()
@@ -251,14 +250,14 @@ def test_elements_with_lists_before_and_behind_the_gaussians(lists: str, first: 
     capture = read_capture(tmp_path / "x.ply")
     assert torch.equal(capture.gaussians.means, made.means)
     write_capture(tmp_path / "y.ply", capture, capture.gaussians.harmonics * 0.5)
-    changed = ply_bytes(made.recoloured(made.harmonics * 0.5), False).partition(b"end_header\n")[2]
+    changed = plain_ply(made.recoloured(made.harmonics * 0.5)).partition(b"end_header\n")[2]
     assert (tmp_path / "y.ply").read_bytes() == data.replace(body, changed)
 
 
 def test_big_endian_and_integer_positions_are_read_and_recoloured_in_place(tmp_path: Path) -> None:
     made = ball(30)
     made.means.round_()
-    head, end, body = ply_bytes(made, False).partition(b"end_header\n")
+    head, end, body = plain_ply(made).partition(b"end_header\n")
     columns = np.frombuffer(body, "<f4").reshape(30, -1)
     kinds = [("x", ">i4"), ("y", ">f8"), *((f"p{k}", ">f4") for k in range(columns.shape[1] - 2))]
     rows = np.rec.fromarrays(columns.T, dtype=np.dtype(kinds))
@@ -268,6 +267,59 @@ def test_big_endian_and_integer_positions_are_read_and_recoloured_in_place(tmp_p
     assert all(map(torch.equal, vars(capture.gaussians).values(), vars(made).values()))
     write_capture(tmp_path / "y.ply", capture, made.harmonics * 0.5)
     assert torch.equal(read_capture(tmp_path / "y.ply").gaussians.harmonics, made.harmonics * 0.5)
+
+
+def ascii_ply(data: bytes, newline: str) -> bytes:
+    """The file of `plain_ply` as text, with an element of lists and one of numbers before the Gaussians."""
+    head, _, body = data.partition(b"end_header\n")
+    count = int(head.split(b"element vertex ")[1].split()[0])
+    rows = np.frombuffer(body, "<f4").reshape(count, -1)
+    lines = head.decode().replace("binary_little_endian", "ascii").splitlines()
+    extra = ["comment Vertical axis: z", "element face 2", "property list uchar int v", "element time 1", "property double t"]
+    lines = [*lines[:2], *extra, *lines[2:], "end_header", "3 0 1 2", "0", "2.5"]
+    return newline.join([*lines, *(" ".join(repr(float(v)) for v in row) for row in rows), ""]).encode()
+
+
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+def test_ascii_files_are_read_and_become_binary(newline: str, tmp_path: Path) -> None:
+    made, path = ball(30, degree=2), tmp_path / "x.ply"
+    path.write_bytes(ascii_ply(plain_ply(made), newline))
+    capture = read_capture(path)
+    assert equal(capture.gaussians, made) and capture.up == (0, 0, -1)
+    write_capture(tmp_path / "y.ply", capture, made.harmonics * 0.5)
+    again = read_capture(tmp_path / "y.ply")
+    assert equal(again.gaussians, made.recoloured(made.harmonics * 0.5)) and again.up == (0, 0, -1)
+    assert b"element time 1" in (tmp_path / "y.ply").read_bytes()
+    text = path.read_bytes()
+    for wrong in (text[: len(text) // 2], text.replace(b"2.5", b"two"), text.replace(b"vertex 30", b"vertex 999999999")):
+        path.write_bytes(wrong)
+        with pytest.raises(DataError):
+            read_capture(path)
+
+
+def test_colours_of_bytes_and_flat_gaussians_are_read_and_recoloured_in_place(tmp_path: Path) -> None:
+    made = ball(30, degree=0)
+    made.harmonics[:, 0] = torch.linspace(-1, 1, 90).view(30, 3)
+    columns = np.frombuffer(plain_ply(made).partition(b"end_header\n")[2], "<f4").reshape(30, 17)
+    names = [*"xyz", "nx", "ny", "nz", "red", "green", "blue", "opacity", "scale_0", "scale_1", *(f"rot_{i}" for i in range(4))]
+    kinds = [(name, "u1" if name in ("red", "green", "blue") else "<f4") for name in names]
+    columns = np.delete(columns, 12, 1)
+    columns[:, 6:9] = np.rint(255 * made.colours.numpy())
+    rows = np.rec.fromarrays(columns.T, dtype=np.dtype(kinds))
+    lines = ["ply", "format binary_little_endian 1.0", "comment SplatRenderMode: 2dgs", "element vertex 30"]
+    lines += [f"property {'uchar' if kind == 'u1' else 'float'} {name}" for name, kind in kinds]
+    data = "\n".join([*lines, "end_header", ""]).encode() + rows.tobytes()
+    (tmp_path / "x.ply").write_bytes(data)
+    capture = read_capture(tmp_path / "x.ply")
+    assert (capture.gaussians.colours - made.colours).abs().max() <= 0.5 / 255 + 1e-6
+    assert torch.equal(capture.gaussians.log_scales[:, :2], made.log_scales[:, :2])
+    assert bool((capture.gaussians.log_scales[:, 2] == -torch.inf).all()) and bool(capture.gaussians.finite.all())
+    write_capture(tmp_path / "y.ply", capture, capture.gaussians.harmonics * 0.5)
+    new = (tmp_path / "y.ply").read_bytes()
+    apart = np.frombuffer(new, np.uint8).astype(int) - np.frombuffer(data, np.uint8)
+    assert len(new) == len(data) and 60 < np.count_nonzero(apart) <= 90, "bytes of colours alone"
+    again = read_capture(tmp_path / "y.ply").gaussians
+    assert (again.harmonics - capture.gaussians.harmonics * 0.5).abs().max() <= 0.5 / 255 / 0.28
 
 
 @pytest.mark.parametrize(
@@ -314,7 +366,7 @@ def test_the_camera_in_a_file_is_the_first_view(legacy: bool, tmp_path: Path) ->
         values = np.asarray(values, kind).ravel()
         head += f"element {name} {len(values)}\nproperty {word} {name}\n".encode()
         rows += values.tobytes()
-    before, end, body = ply_bytes(made, False).partition(b"end_header\n")
+    before, end, body = plain_ply(made).partition(b"end_header\n")
     (tmp_path / "x.ply").write_bytes(before + head + end + body + rows)
     capture = read_capture(tmp_path / "x.ply")
     camera = capture.camera
@@ -335,7 +387,7 @@ def test_the_camera_in_a_file_is_the_first_view(legacy: bool, tmp_path: Path) ->
 
 
 def test_an_unsound_camera_is_left_alone(tmp_path: Path) -> None:
-    head, end, body = ply_bytes(ball(20), False).partition(b"end_header\n")
+    head, end, body = plain_ply(ball(20)).partition(b"end_header\n")
     element = b"element extrinsic 16\nproperty float e\nelement intrinsic 4\nproperty float i\n"
     for extrinsic, intrinsic in ((np.zeros(16), [9, 9, 9, 9]), (np.eye(4), [0, 9, 9, 9]), (np.eye(4), [9, np.nan, 9, 9])):
         rows = np.concatenate([extrinsic.ravel(), intrinsic]).astype("<f4").tobytes()
@@ -345,7 +397,7 @@ def test_an_unsound_camera_is_left_alone(tmp_path: Path) -> None:
 
 def test_up_of_the_file_decides_the_views_and_a_flag_before_it(tmp_path: Path) -> None:
     made = ball(300)
-    data = headed(ply_bytes(made, False), lambda head: head.replace(b"\nelement", b"\ncomment Vertical axis: 0 0 1\nelement"))
+    data = headed(plain_ply(made), lambda head: head.replace(b"\nelement", b"\ncomment Vertical axis: 0 0 1\nelement"))
     (tmp_path / "in.ply").write_bytes(data)
     style = tmp_path / "style.png"
     import cv2
@@ -486,7 +538,9 @@ def test_short_codebooks_and_models_of_sog(tmp_path: Path) -> None:
     with pytest.raises(DataError):
         read(scales=short | {"codebook": short["codebook"][:-1]})
     assert read(scales=short, model="antialiased").antialiased and not read(scales=short, model="default").antialiased
-    for wrong in ({"model": "2dgs"}, {"version": 3}, {"count": 0}, {"count": 4000}):
+    flat = read(scales=short, model="2dgs").gaussians.log_scales
+    assert bool((flat[:, 2] == -torch.inf).all()) and torch.equal(flat[:, :2], plain.gaussians.log_scales[:, :2])
+    for wrong in ({"version": 3}, {"count": 0}, {"count": 4000}):
         with pytest.raises(DataError):
             read(scales=short, **wrong)
 

@@ -1,6 +1,7 @@
 """Files of 3D Gaussians, read, recoloured and written in the formats that are installed (see `plugins.captures`)."""
 
 import glob
+import mmap
 import os
 import shutil
 from collections.abc import Callable
@@ -15,20 +16,20 @@ from torch import Tensor
 
 from ...errors import DataError
 from ...io.atomic import unwritable
-from ...plugins.captures import format_name, format_of
+from ...plugins.captures import Data, format_name, format_of
 from ...rendering.cameras import Cameras
 from ...rendering.local_frame import added_and_beside, read_offset, write_offset
 from ...training.run import held
 from ...types import Origin
 from ..gaussians import GaussianRows, Gaussians, bulk_of
 from ..views import seen_means
-from .base import Capture
+from .base import ROWS, Capture
 from .ply import ply_head, ply_rows
 
 __all__ = ["Capture", "Written", "read_capture", "write_capture", "write_gaussians", "write_ply_parts", "write_rows"]
 
-_ROWS = 1 << 17
-"""Gaussians that are in memory at a time while a large scene is written."""
+_MAPPED = 1 << 28
+"""Bytes from which on files are mapped."""
 _TESTED = 1 << 12
 """Gaussians of which it is asked at a time whether any can be drawn."""
 
@@ -54,11 +55,18 @@ def read_capture(path: Path) -> Capture:
         path = path / "meta.json"
     form = format_of(path)
     try:
-        data = path.read_bytes()
+        # Large files are mapped: what was decoded need not stay in memory beside the Gaussians.
+        if path.stat().st_size < _MAPPED:
+            data: Data = path.read_bytes()
+        else:
+            with path.open("rb") as file:
+                data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
     with np.errstate(over="ignore", invalid="ignore"):  # damaged files hold numbers of any kind
         capture = form.read(path, data)
+    if isinstance(data, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+        data.madvise(mmap.MADV_DONTNEED)
     if not len(capture.gaussians):
         raise DataError(f"{path}: holds no Gaussian")
     parts = (capture.gaussians.select(slice(start, start + _TESTED)) for start in range(0, len(capture.gaussians), _TESTED))
@@ -174,14 +182,14 @@ def write_ply_parts(
         try:
             with rows.open("r+b" if rows.is_file() else "w+b") as file:
                 # All but the last of the whole parts there have reached the disk.
-                begun = max(0, (file.seek(0, os.SEEK_END) - len(head)) // (row * _ROWS) - 1)
+                begun = max(0, (file.seek(0, os.SEEK_END) - len(head)) // (row * ROWS) - 1)
                 file.seek(0)
                 if not begun:
                     file.write(head)
-                file.truncate(len(head) + begun * row * _ROWS)
+                file.truncate(len(head) + begun * row * ROWS)
                 file.seek(0, os.SEEK_END)
-                for start in range(begun * _ROWS, count, _ROWS):
-                    file.write(ply_rows(part(slice(start, min(start + _ROWS, count))), added).tobytes())
+                for start in range(begun * ROWS, count, ROWS):
+                    file.write(ply_rows(part(slice(start, min(start + ROWS, count))), added).tobytes())
                     file.flush()
                     os.fsync(file.fileno())
             os.replace(rows, path)
@@ -204,7 +212,9 @@ def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N 
         written = write_gaussians(path, drawn, antialiased=capture.antialiased, views=views, origin=capture.origin)
         return written._replace(faulty=not bool(finite.all()))
     changed = (harmonics != before).flatten(1).any(1) & harmonics.isfinite().flatten(1).all(1)
-    data = capture.data if not bool(changed.any()) else capture.recolour(harmonics.numpy(), np.asarray(changed))
     write_offset(path, capture.offset)
-    form.write(path, data)
+    if bool(changed.any()):
+        form.write(path, capture.recolour(harmonics.numpy(), np.asarray(changed)))
+    else:
+        form.write(path, (capture.data[start : start + _MAPPED] for start in range(0, len(capture.data), _MAPPED)))
     return Written()

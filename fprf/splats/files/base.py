@@ -3,7 +3,7 @@
 Arrays are NumPy's. A reader never allocates on a file's word: what a header claims is held against the size of the file.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -13,20 +13,23 @@ import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ...ops.harmonics import HARMONIC
+from ...ops.harmonics import HARMONIC, spherical_harmonics
+from ...plugins.captures import Data
 from ...rendering.cameras import Cameras
 from ...rendering.local_frame import local_origin
 from ...types import Origin
-from ..gaussians import Gaussians, bulk_of, morton_order
+from ..gaussians import Gaussians, bulk_of, from_arrays, morton_order
 
 Floats: TypeAlias = NDArray[Any]
 Bools: TypeAlias = NDArray[np.bool_]
+Recolour: TypeAlias = Callable[[Floats, Bools], Iterable[bytes]]
 
+ROWS = 1 << 17
+"""Gaussians that are decoded or encoded at a time, so that the intermediate arrays of large files stay small."""
 _EDGE = 1e-6
 """Opacities of exactly 0 and 1 have no logit: both keep this distance, far below a 16-bit step."""
 _MOST = 64.0
 """Largest magnitude of harmonics and ln-scales that are written: far beyond what is seen, and no number spoils the others."""
-_ROOT = 2**0.5
 _APART = 4.0
 """Extents of the bulk from it, from which on Gaussians are ordered and bounded apart from it."""
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
@@ -41,10 +44,10 @@ class Capture:
     gaussians: Gaussians
     antialiased: bool
     """Trained with opacities compensated for the width that drawing adds (Mip-Splatting)."""
-    data: bytes
-    """The file. Of a folder, its files as one archive."""
-    recolour: Callable[[Floats, Bools], bytes]
-    """The file with the harmonics [N K 3] of some Gaussians (bool [N]) replaced and everything else as it was."""
+    data: Data
+    """The file; large ones are mapped, not in memory. Of a folder, its files as one archive."""
+    recolour: Recolour
+    """The file, in pieces, with the harmonics [N K 3] of some Gaussians (bool [N]) replaced and everything else as it was."""
     up: tuple[float, float, float] | None = None
     """Direction that points up, where the file says so."""
     camera: Cameras | None = None
@@ -53,6 +56,8 @@ class Capture:
     """What was taken off the file's coordinates, which lie far from 0."""
     offset: Origin = (0.0, 0.0, 0.0)
     """What a file beside it adds to them (see `rendering.local_frame`)."""
+    notes: tuple[str, ...] = ()
+    """How the file was understood where it could mean two things, each as a sentence."""
 
     @property
     def origin(self) -> Origin:
@@ -60,17 +65,35 @@ class Capture:
         return self.shift[0] + self.offset[0], self.shift[1] + self.offset[1], self.shift[2] + self.offset[2]
 
 
+def pieces(count: int) -> Iterator[slice]:
+    """Rows 0 to `count` in slices of at most `ROWS`."""
+    for start in range(0, count, ROWS):
+        yield slice(start, min(start + ROWS, count))
+
+
+def decoded(bands: int, *sections: tuple[int, Callable[[slice], tuple[Floats, ...]]]) -> tuple[Gaussians, Origin]:
+    """Gaussians about their local origin, and that: decoded piece by piece.
+
+    Each section has a number of rows and a function that gives means [n 3], quaternions [n 4], ln-scales [n 3], logits [n] and
+    harmonics [n K 3] of some of them, of any type.
+    """
+    count, start = sum(number for number, _ in sections), 0
+    shapes = ((count, 4), (count, 3), (count,), (count, bands, 3))
+    parts: list[Floats] = [np.empty((count, 3)), *(np.empty(shape, np.float32) for shape in shapes)]
+    for number, part in sections:
+        for rows in pieces(number):
+            for whole, some in zip(parts, part(rows), strict=True):
+                whole[start + rows.start : start + rows.stop] = some
+        start += number
+    shift = local_origin(torch.from_numpy(parts[0]))
+    parts[0] -= shift
+    return from_arrays(parts[0], parts[1], parts[2], parts[3], parts[4]), shift
+
+
 def arrays(gaussians: Gaussians) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Means [N 3], quaternions [N 4], ln-scales [N 3], logits [N] and harmonics [N K 3]."""
     means, turns, scales, logits, harmonics = (part.detach().cpu().numpy() for part in vars(gaussians).values())
     return means, turns, scales, logits, harmonics
-
-
-def centred(means: Floats) -> tuple[NDArray[np.float64], Origin]:
-    """Positions of any type about their local origin, and that."""
-    means = means.astype(np.float64)
-    shift = local_origin(torch.from_numpy(means))
-    return means - shift, shift
 
 
 def short(path: Path, has: int, needs: int, what: str) -> DataError:
@@ -81,6 +104,12 @@ def short(path: Path, has: int, needs: int, what: str) -> DataError:
 def steps(values: Floats, most: int) -> NDArray[np.int64]:
     """Values in [0, 1] as integers 0 to `most`, rounded; what lies outside is clipped, NaN becomes 0."""
     return np.rint(np.clip(np.nan_to_num(values.astype(np.float64), nan=0.0), 0, 1) * most).astype(np.int64)
+
+
+def shares(values: Floats, low: Floats, high: Floats) -> Floats:
+    """Where values lie between bounds: 0 to 1, and 0 where the bounds are one."""
+    span = np.asarray(high, np.float64) - low
+    return np.where(span > 0, (values - low) / np.where(span > 0, span, 1.0), 0.0)
 
 
 def finite(values: Floats, most: float = _MOST) -> NDArray[np.float64]:
@@ -109,25 +138,44 @@ def constants_of(colours: Floats) -> Floats:
     return (colours[:, None].astype(np.float64) - 0.5) / HARMONIC
 
 
+def unit_quaternions(quaternions: Floats) -> NDArray[np.float64]:
+    """Quaternions [N 4] of length 1."""
+    turns = quaternions.astype(np.float64)
+    return np.asarray(turns / np.linalg.norm(turns, axis=1, keepdims=True))
+
+
 def smallest_three(quaternions: Floats) -> tuple[NDArray[np.int64], Floats]:
     """Of unit quaternions [N 4], up to their sign: which component is the largest [N], and the others times sqrt 2 [N 3].
 
     The others lie in [-1, 1].
     """
-    unit = quaternions / np.linalg.norm(quaternions.astype(np.float64), axis=1, keepdims=True)
+    unit = unit_quaternions(quaternions)
     largest = np.abs(unit).argmax(1)
     rows = np.arange(len(unit))
     unit = unit * np.where(unit[rows, largest] < 0, -1.0, 1.0)[:, None]
-    return largest, unit[rows[:, None], _OTHERS[largest]] * _ROOT
+    return largest, unit[rows[:, None], _OTHERS[largest]] * 2**0.5
 
 
 def three_to_four(largest: NDArray[np.int64], three: Floats) -> Floats:
     """The quaternions [N 4] of `smallest_three`."""
-    rows, others = np.arange(len(three)), three / _ROOT
+    rows, others = np.arange(len(three)), three / 2**0.5
     out = np.empty((len(three), 4))
     out[rows[:, None], _OTHERS[largest]] = others
     out[rows, largest] = np.sqrt(np.maximum(0, 1 - (others**2).sum(1)))
     return out
+
+
+def turned_harmonics(rotation: Floats, bands: int) -> Floats:
+    """The matrix [K K] that turns harmonics as a rotation [3 3], or a mirroring, turns points.
+
+    It is solved for from values at directions before and after: exact, since each degree is closed under rotations.
+    """
+    there = torch.nn.functional.normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(0)).double(), dim=1)
+    before = there @ torch.from_numpy(np.asarray(rotation, np.float64))
+    degree = round(bands**0.5)
+    matrix = torch.linalg.lstsq(spherical_harmonics(there, degree), spherical_harmonics(before, degree)).solution
+    whole = matrix.round()  # turns by right angles and mirrorings are whole numbers, exactly
+    return np.asarray(torch.where((matrix - whole).abs() < 1e-9, whole, matrix))
 
 
 def levels_of(means: Floats) -> NDArray[np.int64]:

@@ -3,13 +3,14 @@
 INRIA       float32 x y z, f_dc_0..2, f_rest_* channel by channel, opacity (logit), scale_0..2 (ln), rot_0..3 (w x y z), and
             any other property and element, which are kept. Header comments: `SplatRenderMode: default|mip|2dgs` and
             `Vertical axis: x|y|z|X Y Z` (Brush), `antialiased 0|1` (Postshot). Elements `extrinsic`, `intrinsic` and
-            `image_size`: the camera of the one photograph that a capture was made of (SHARP).
+            `image_size`: the camera of the one photograph that a capture was made of (SHARP). Variants: red green blue as
+            bytes in the place of f_dc (Nerfstudio), no scale_2 (2D Gaussians), either byte order, ASCII.
 compressed  element `chunk`: bounds of positions, ln-scales and, mostly, colours; `vertex`: four 32-bit words, position and
             scale of 11, 10 and 11 bits, rotation of 2 + 3 x 10, RGBA of 8 each; `sh`: bytes, (v + 0.5) / 256 of [-4, 4].
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar, NamedTuple
@@ -19,21 +20,23 @@ import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ...plugins.captures import CaptureFormat
+from ...plugins.captures import CaptureFormat, Data
 from ...rendering.cameras import Cameras, ideal_cameras
 from ...types import Origin
-from ..gaussians import COUNTS, Gaussians, from_arrays
+from ..gaussians import COUNTS, Gaussians
 from .base import (
     Bools,
     Capture,
     Floats,
     arrays,
-    centred,
     colours_of,
     constants_of,
+    decoded,
     finite,
     levels_of,
     logit,
+    pieces,
+    shares,
     short,
     sigmoid,
     smallest_three,
@@ -61,10 +64,24 @@ _POSITION, _SCALE, _COLOUR = (
     for of in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
 )
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-_LONGEST = 64
-"""Values of lists, as of the corners of faces, that are passed over at once where all are as long."""
 _SPAN = 8.0
 """Harmonics of compressed files lie in [-4, 4]."""
+
+
+class _Element(NamedTuple):
+    """Rows of a file that have the same properties."""
+
+    kind: np.dtype[np.void]
+    rows: int
+    offset: int
+
+    def table(self, data: Data | bytearray) -> NDArray[np.void]:
+        """The rows, in the file's own memory."""
+        return np.frombuffer(data, self.kind, self.rows, self.offset)
+
+    def names(self) -> tuple[str, ...]:
+        """Properties in the order of the file."""
+        return self.kind.names or ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,27 +93,31 @@ class Ply(CaptureFormat):
     def recognises(self, head: bytes, size: int) -> bool:
         return head.startswith(b"ply")
 
-    def read(self, path: Path, data: bytes) -> Capture:
-        """A PLY of either layout. Raises DataError for others, 2D Gaussians among them."""
+    def read(self, path: Path, data: Data) -> Capture:
+        """A PLY of either layout. Raises DataError for others. ASCII files become binary ones of the same elements."""
         header = _header(data)
         if header is None:
             raise DataError(f"{path}: no PLY header from `ply` to `end_header`; the file is damaged or of another kind")
         elements = _elements(path, data, header)
+        if header.form == ["ascii", "1.0"]:
+            data, elements = _from_ascii(path, data, header, elements)
         # What comments say; of several on how opacities are meant the last counts.
         texts = (" ".join(words[1:]) for words in header.lines if words[0] in ("comment", "obj_info"))
         said = {found[1].lower(): found[2].lower() for text in texts if (found := _COMMENT.match(text))}
         modes = [key for key in said if key != "vertical axis"]
         mode = said[modes[-1]] if modes else ""
-        if mode == "2dgs":
-            raise DataError(f"{path}: 2D Gaussians (SplatRenderMode: 2dgs); only 3D Gaussians are read")
         read = _read_compressed if header.packed else _read_inria
-        up, camera = _up(said.get("vertical axis", "")), _camera(elements)
+        up, camera = _up(said.get("vertical axis", "")), _camera(data, elements)
         if up is None and camera is not None:
             up = (float(camera.pose[0, 0, 1]), float(camera.pose[0, 1, 1]), float(camera.pose[0, 2, 1]))
-        return replace(read(path, data, header, elements), antialiased=mode in ("mip", "1"), up=up, camera=camera)
+        return replace(read(path, data, elements), antialiased=mode in ("mip", "1"), up=up, camera=camera)
 
-    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> bytes:
-        return ply_bytes(gaussians, antialiased, origin)
+    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> Iterable[bytes]:
+        """Exact; with an origin positions are in the world, float64."""
+        first = ply_rows(gaussians.select(slice(0, 1)), origin)
+        yield ply_head({"vertex": first}, antialiased, len(gaussians))
+        for rows in pieces(len(gaussians)):
+            yield ply_rows(gaussians.select(rows), origin).tobytes()
 
     def holds(self, capture: Capture, read_as: CaptureFormat) -> bool:
         """A compressed file may be called .ply: under the same ending it stays what it is."""
@@ -109,7 +130,7 @@ class CompressedPly(Ply):
 
     exact: ClassVar[bool] = False
 
-    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> bytes:
+    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
         """Gaussians are put in spatial order, so that the bounds of chunks are narrow.
 
         No chunk holds both the bulk and what is far from it: before the latter transparent Gaussians fill up the last one.
@@ -140,7 +161,7 @@ class CompressedPly(Ply):
         if harmonics.shape[1] > 1:
             rest = _rest_bytes(harmonics)
             tables["sh"] = rest.view([(f"f_rest_{i}", "u1") for i in range(rest.shape[1])])[:, 0]
-        return ply_file(tables, antialiased)
+        return [ply_file(tables, antialiased)]
 
     def keeps(self, gaussians: Gaussians) -> Bools:
         """All but a few outliers, which would need chunks of their own."""
@@ -151,11 +172,6 @@ class CompressedPly(Ply):
     def holds(self, capture: Capture, read_as: CaptureFormat) -> bool:
         header = _header(capture.data) if isinstance(read_as, Ply) else None
         return header is not None and header.packed
-
-
-def ply_bytes(gaussians: Gaussians, antialiased: bool, origin: Origin = (0.0, 0.0, 0.0)) -> bytes:
-    """The INRIA file, exact; with an origin positions are in the world, float64."""
-    return ply_file({"vertex": ply_rows(gaussians, origin)}, antialiased)
 
 
 def ply_rows(gaussians: Gaussians, origin: Origin) -> NDArray[np.void]:
@@ -210,93 +226,109 @@ class _Header(NamedTuple):
         """SuperSplat's layout."""
         return any(words[0] == "property" and words[-1] == _PACKED[0] for words in self.lines)
 
+    @property
+    def form(self) -> list[str]:
+        """Words of the format and its version; none where no line says them."""
+        return next((words[1:] for words in self.lines if words[0] == "format"), [])
 
-def _read_inria(path: Path, data: bytes, header: _Header, elements: Mapping[str, NDArray[np.void]]) -> Capture:
-    table = elements.get("vertex")
-    if table is None:
+
+def _read_inria(path: Path, data: Data, elements: Mapping[str, _Element]) -> Capture:
+    vertex = elements.get("vertex")
+    if vertex is None:
         raise DataError(f"{path}: no element `vertex`; not a file of 3D Gaussians")
-    known = set(table.dtype.names or ())
-    if {"scale_0", "scale_1"} <= known and "scale_2" not in known:
-        raise DataError(f"{path}: 2D Gaussians (no scale_2); only 3D Gaussians are read")
-    # Properties may stand in any order, among any others.
+    known = set(vertex.names())
+    # Properties may stand in any order, among any others. 2D Gaussians have no third size, and lie in the plane of the others.
     rest = sum(bool(re.fullmatch(r"f_rest_\d+", name)) for name in known)
-    colours = [*(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest))]
+    byte_colours = "f_dc_0" not in known and {"red", "green", "blue"} <= known
+    constants = ("red", "green", "blue") if byte_colours else ("f_dc_0", "f_dc_1", "f_dc_2")
+    colours = [*constants, *(f"f_rest_{i}" for i in range(rest))]
+    sizes = ["scale_0", "scale_1", *(["scale_2"] if "scale_2" in known or "scale_1" not in known else [])]
     count = 1 + rest // 3
-    for name in [*"xyz", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)), *colours]:
+    for name in [*"xyz", "opacity", *sizes, *(f"rot_{i}" for i in range(4)), *colours]:
         if name not in known:
             raise DataError(f"{path}: no property {name}; not a file of 3D Gaussians")
-        if table.dtype[name].kind != "f" and name not in "xyz":
+        if byte_colours and name in constants and vertex.kind[name] != "u1":
+            raise DataError(f"{path}: property {name} is no byte; colours are bytes, or f_dc_0 to f_dc_2 of float")
+        if vertex.kind[name].kind != "f" and name not in "xyz" and not (byte_colours and name in constants):
             raise DataError(f"{path}: property {name} is of whole numbers; 3D Gaussians have float or double there")
     if rest % 3 or count not in COUNTS:
         raise DataError(f"{path}: {rest} properties f_rest_*; 0, 9, 24, 45 or 72 belong to degrees 0 to 4")
+    # The harmonic and the channel that each property of a colour is.
+    places = {name: (0, i) for i, name in enumerate(constants)}
+    places |= {f"f_rest_{i}": (1 + i % (count - 1), i // (count - 1)) for i in range(rest)}
+    whole = vertex.table(data)
 
-    def columns(*names: str) -> Floats:
-        return np.stack([table[name].astype(np.float32) for name in names], 1)
+    def part(rows: slice) -> tuple[Floats, ...]:
+        table = whole[rows]
+        harmonics, scales = np.empty((len(table), count, 3)), np.full((len(table), 3), -np.inf)
+        for name, (band, channel) in places.items():
+            harmonics[:, band, channel] = table[name]
+        if byte_colours:
+            harmonics[:, :1] = constants_of(harmonics[:, 0] / 255)
+        for axis, name in enumerate(sizes):
+            scales[:, axis] = table[name]
+        # Positions may be of any type; far from 0 they lose nothing by their local origin.
+        means, turns = (np.stack([table[name] for name in names], 1) for names in ("xyz", [f"rot_{i}" for i in range(4)]))
+        return means, turns, scales, table["opacity"], harmonics
 
-    harmonics = columns(*colours[:3])[:, None]
-    if rest:
-        harmonics = np.concatenate([harmonics, columns(*colours[3:]).reshape(-1, 3, count - 1).transpose(0, 2, 1)], 1)
-    # Positions may be of any type; far from 0 they lose nothing by their local origin.
-    means, shift = centred(np.stack([table[name] for name in "xyz"], 1))
-    gaussians = from_arrays(
-        means,
-        columns("rot_0", "rot_1", "rot_2", "rot_3"),
-        columns("scale_0", "scale_1", "scale_2"),
-        columns("opacity")[:, 0],
-        harmonics,
-    )
+    def recolour(harmonics: Floats, changed: Bools) -> Iterator[bytes]:
+        yield data[: vertex.offset]
+        for rows in pieces(vertex.rows):
+            table, here, new = whole[rows].copy(), changed[rows], harmonics[rows]
+            for name, (band, channel) in places.items():
+                column = new[here, band, channel]
+                if byte_colours and band == 0:
+                    column = steps(colours_of(new[here]), 255)[:, channel]
+                table[name][here] = column
+            yield table.tobytes()
+        yield data[vertex.offset + vertex.rows * vertex.kind.itemsize :]
 
-    def recolour(harmonics: Floats, changed: Bools) -> bytes:
-        out = bytearray(data)
-        target = _elements(path, out, header)["vertex"]
-        for name, column in zip(colours, _flat(harmonics).T, strict=True):
-            target[name][changed] = column[changed]
-        return bytes(out)
-
+    gaussians, shift = decoded(count, (vertex.rows, part))
     return Capture(path, gaussians, False, data, recolour, shift=shift)
 
 
-def _read_compressed(path: Path, data: bytes, header: _Header, elements: Mapping[str, NDArray[np.void]]) -> Capture:
-    chunk, vertex, sh = (elements.get(name) for name in ("chunk", "vertex", "sh"))
-    tinted = chunk is not None and _COLOUR[0][0] in (chunk.dtype.names or ())
+def _read_compressed(path: Path, data: Data, elements: Mapping[str, _Element]) -> Capture:
+    known = {name: element.names() for name, element in elements.items()}
+    tinted = _COLOUR[0][0] in known.get("chunk", ())
     bounds = [name for pair in (_POSITION, _SCALE, *([_COLOUR] if tinted else [])) for of in pair for name in of]
-    for element, names, kind in ((chunk, bounds, "<f4"), (vertex, _PACKED, "<u4")):
+    for element, names, kind in (("chunk", bounds, "<f4"), ("vertex", _PACKED, "<u4")):
         for name in names:
-            if element is None or name not in (element.dtype.names or ()) or element.dtype[name] != kind:
+            if name not in known.get(element, ()) or elements[element].kind[name] != kind:
                 raise DataError(f"{path}: no property {name}; not the compressed layout of SuperSplat")
-    assert chunk is not None and vertex is not None
+    chunk, vertex = (elements[name].table(data) for name in ("chunk", "vertex"))
     count, of = len(vertex), np.arange(len(vertex)) // _CHUNK
-    rest = [] if sh is None else list(sh.dtype.names or ())
-    wrong = 1 + len(rest) // 3 not in COUNTS or len(rest) % 3 or rest != [f"f_rest_{i}" for i in range(len(rest))]
+    sh = elements["sh"].table(data) if "sh" in elements else None
+    rest = known.get("sh", ())
+    wrong = 1 + len(rest) // 3 not in COUNTS or len(rest) % 3 or [*rest] != [f"f_rest_{i}" for i in range(len(rest))]
     if sh is not None and (wrong or len(sh) != count or any(sh.dtype[name] != "u1" for name in rest)):
         raise DataError(f"{path}: element `sh` with {len(rest)} properties and {len(sh)} rows; not SuperSplat's layout")
     if len(chunk) != -(-count // _CHUNK):
         raise DataError(f"{path}: {len(chunk)} chunks for {count} Gaussians; there is one for each {_CHUNK}")
 
-    def unpacked(share: Floats, pair: tuple[tuple[str, ...], tuple[str, ...]]) -> Floats:
-        low, high = (np.stack([chunk[name][of] for name in names], 1).astype(np.float64) for names in pair)
-        return np.asarray(low * (1 - share) + high * share)
+    def part(rows: slice) -> tuple[Floats, ...]:
+        def unpacked(share: Floats, pair: tuple[tuple[str, ...], tuple[str, ...]]) -> Floats:
+            low, high = (np.stack([chunk[name][of[rows]] for name in names], 1).astype(np.float64) for names in pair)
+            return np.asarray(low * (1 - share) + high * share)
 
-    words = {name: vertex[name] for name in _PACKED}
-    rgba = _unpack(words["packed_color"], (8, 8, 8, 8))
-    harmonics = constants_of(unpacked(rgba[:, :3], _COLOUR) if tinted else rgba[:, :3])
-    if sh is not None:
-        raw = np.stack([sh[name] for name in rest], 1)
-        share = np.where(raw == 0, 0.0, np.where(raw == 255, 1.0, (raw + 0.5) / 256))
-        harmonics = np.concatenate([harmonics, ((share - 0.5) * _SPAN).reshape(count, 3, -1).transpose(0, 2, 1)], 1)
-    turned = words["packed_rotation"]
-    means, shift = centred(unpacked(_unpack(words["packed_position"], (11, 10, 11)), _POSITION))
-    gaussians = from_arrays(
-        means,
-        three_to_four((turned >> 30).astype(np.int64), 2 * _unpack(turned, (10, 10, 10)) - 1),
-        unpacked(_unpack(words["packed_scale"], (11, 10, 11)), _SCALE),
-        logit(rgba[:, 3]),
-        harmonics,
-    )
+        position, turned, scale, colour = (vertex[name][rows] for name in _PACKED)
+        rgba = _unpack(colour, (8, 8, 8, 8))
+        harmonics = constants_of(unpacked(rgba[:, :3], _COLOUR) if tinted else rgba[:, :3])
+        if sh is not None:
+            raw = np.stack([sh[name][rows] for name in rest], 1)
+            share = np.where(raw == 0, 0.0, np.where(raw == 255, 1.0, (raw + 0.5) / 256))
+            bands = ((share - 0.5) * _SPAN).reshape(len(raw), 3, -1).transpose(0, 2, 1)
+            harmonics = np.concatenate([harmonics, bands], 1)
+        return (
+            unpacked(_unpack(position, (11, 10, 11)), _POSITION),
+            three_to_four((turned >> 30).astype(np.int64), 2 * _unpack(turned, (10, 10, 10)) - 1),
+            unpacked(_unpack(scale, (11, 10, 11)), _SCALE),
+            logit(rgba[:, 3]),
+            harmonics,
+        )
 
-    def recolour(harmonics: Floats, changed: Bools) -> bytes:
+    def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
         out = bytearray(data)
-        target, share = _elements(path, out, header), colours_of(finite(harmonics))
+        target, share = {name: element.table(out) for name, element in elements.items()}, colours_of(finite(harmonics))
         changed_here = changed
         if tinted:  # a chunk in which anything changes gets new bounds, and all of its colours are rounded again
             share, *limits = _in_chunks(share.clip(*_COLOURS))
@@ -305,16 +337,17 @@ def _read_compressed(path: Path, data: bytes, header: _Header, elements: Mapping
             for names, values in zip(_COLOUR, limits, strict=True):
                 for name, column in zip(names, values.T, strict=True):
                     target["chunk"][name][there] = column[there]
-        colour = _pack(share, (8, 8, 8)).astype(np.uint32) << 8 | (words["packed_color"] & 255)
+        colour = _pack(share, (8, 8, 8)).astype(np.uint32) << 8 | (vertex["packed_color"] & 255)
         target["vertex"]["packed_color"][changed_here] = colour[changed_here]
         for name, column in zip(rest, _rest_bytes(harmonics).T, strict=True):
             target["sh"][name][changed] = column[changed]
-        return bytes(out)
+        return [bytes(out)]
 
+    gaussians, shift = decoded(1 + len(rest) // 3, (count, part))
     return Capture(path, gaussians, False, data, recolour, shift=shift)
 
 
-def _header(data: bytes) -> _Header | None:
+def _header(data: Data) -> _Header | None:
     """The header, whose lines end as the first one does: with LF, CR LF or CR. None where it has no begin or no end."""
     first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", data)
     if first is None:
@@ -328,34 +361,65 @@ def _header(data: bytes) -> _Header | None:
     return _Header([each for each in words if each[0]], end.end())
 
 
-def _elements(path: Path, data: bytes | bytearray, header: _Header) -> dict[str, NDArray[np.void]]:
-    """Tables of elements by name, in the file's own memory; those with lists are passed over."""
-    form = next((words[1:] for words in header.lines if words[0] == "format"), [])
-    if form not in (["binary_little_endian", "1.0"], ["binary_big_endian", "1.0"]):
-        raise DataError(f"{path}: a PLY of format {' '.join(form) or 'unknown'}; binary ones are read: export it again as such")
+def _elements(path: Path, data: Data, header: _Header) -> dict[str, _Element]:
+    """Elements by name, where they lie; those with lists are passed over. Those of ASCII files lie nowhere yet."""
+    form, ascii_rows = header.form, header.form == ["ascii", "1.0"]
+    if form not in (["binary_little_endian", "1.0"], ["binary_big_endian", "1.0"]) and not ascii_rows:
+        raise DataError(f"{path}: a PLY of format {' '.join(form) or 'unknown'}; export it again as ascii or binary 1.0")
     types = {name: kind.replace("<", ">") if "big" in form[0] else kind for name, kind in _TYPES.items()}
     lines = [words for words in header.lines if words[0] in ("element", "property")]
     starts, offset, elements = [i for i, words in enumerate(lines) if words[0] == "element"], header.size, {}
     for start, stop in zip(starts, [*starts[1:], len(lines)], strict=False):
         words, properties = lines[start], lines[start + 1 : stop]
-        names = {each[-1] for each in properties if [kind in types for kind in _kinds(each)] in ([True], [True, True])}
+        kinds = [[types[kind] for kind in _kinds(each) if kind in types] for each in properties]
+        names = {each[-1] for each, of in zip(properties, kinds, strict=True) if of and len(of) == len(_kinds(each))}
         if len(words) != 3 or not re.fullmatch(r"\d{1,12}", words[2]) or len(names) != len(properties) or not names:
             raise DataError(f"{path}: {' '.join(words)!r} or its properties are no valid PLY; export the file again")
-        count, fields = int(words[2]), [[types[kind] for kind in _kinds(each)] for each in properties]
-        what = f"element {words[1]} of {count} rows"
-        if any(len(kinds) > 1 for kinds in fields):
-            if (after := _after_lists(data, offset, count, fields)) is None and "vertex" not in elements:
+        count, what = int(words[2]), f"element {words[1]} of {words[2]} rows"
+        if any(len(of) > 1 for of in kinds):
+            if ascii_rows:
+                elements[words[1]] = _Element(np.dtype([]), count, offset)
+                continue
+            if (after := _after_lists(data, offset, count, kinds)) is None and "vertex" not in elements:
                 raise DataError(f"{path}: {what} runs beyond the end of the file; copy it again, it is cut off or damaged")
             if after is None:
                 break  # what follows the Gaussians may be cut
             offset = after
             continue
-        table = np.dtype([(each[-1], kinds[0]) for each, kinds in zip(properties, fields, strict=True)])
-        if offset + count * table.itemsize > len(data):
-            raise short(path, len(data), offset + count * table.itemsize, what)
-        elements[words[1]] = np.frombuffer(data, table, count, offset)
-        offset += count * table.itemsize
+        table = np.dtype([(each[-1], of[0]) for each, of in zip(properties, kinds, strict=True)])
+        # A number of ASCII takes two bytes at least.
+        end = offset + count * (2 * len(kinds) if ascii_rows else table.itemsize)
+        if end > len(data) + ascii_rows:
+            raise short(path, len(data), end, what)
+        elements[words[1]] = _Element(table, count, offset)
+        offset = end
     return elements
+
+
+def _from_ascii(path: Path, data: Data, header: _Header, elements: Mapping[str, _Element]) -> tuple[bytes, dict[str, _Element]]:
+    """A little-endian file of the elements of an ASCII one, a line a row; those with lists are left out."""
+    lines = iter(data[header.size :].splitlines())
+    tables: dict[str, NDArray[np.void]] = {}
+    for name, element in elements.items():
+        try:
+            if element.names() and element.rows:
+                numbers = np.loadtxt(lines, np.float64, comments=None, max_rows=element.rows, ndmin=2)
+                table = np.empty(element.rows, element.kind)
+                for field, column in zip(element.names(), numbers.T, strict=True):
+                    table[field] = column
+                tables[name] = table
+            elif not element.names():
+                for _ in range(element.rows):
+                    next(lines)
+        except (ValueError, StopIteration) as error:
+            raise DataError(f"{path}: the rows of element {name} are no numbers for its properties ({error})") from error
+    head, newline = ply_head(tables, False), b"\n"
+    said = [" ".join(words).encode("latin-1") for words in header.lines if words[0] in ("comment", "obj_info")]
+    head = head.replace(b" 1.0\n", newline.join([b" 1.0", *said, b""]), 1)
+    whole = head + b"".join(table.tobytes() for table in tables.values())
+    binary = _header(whole)
+    assert binary is not None
+    return whole, _elements(path, whole, binary)
 
 
 def _kinds(words: list[str]) -> list[str]:
@@ -365,15 +429,8 @@ def _kinds(words: list[str]) -> list[str]:
     return words[1:2] if len(words) == 3 else []
 
 
-def _after_lists(data: bytes | bytearray, offset: int, count: int, fields: Sequence[Sequence[str]]) -> int | None:
+def _after_lists(data: Data, offset: int, count: int, fields: Sequence[Sequence[str]]) -> int | None:
     """Where rows with lists end; None where that is beyond the end of the file."""
-    if count and len(fields) == 1 and offset + np.dtype(fields[0][0]).itemsize <= len(data):
-        # Mostly all have as many values as the first.
-        length = max(0, int(np.frombuffer(data, fields[0][0], 1, offset)[0]))
-        row = np.dtype([("length", fields[0][0]), ("values", fields[0][1], (min(length, _LONGEST),))])
-        end = offset + count * row.itemsize
-        if length <= _LONGEST and end <= len(data) and (np.frombuffer(data, row, count, offset)["length"] == length).all():
-            return end
     for _ in range(count):
         for first, *values in fields:
             kind = np.dtype(first)
@@ -402,7 +459,7 @@ def _up(text: str) -> tuple[float, float, float] | None:
     return (x, y, z) if 0 < x * x + y * y + z * z < np.inf else None
 
 
-def _camera(elements: Mapping[str, NDArray[np.void]]) -> Cameras | None:
+def _camera(data: Data, elements: Mapping[str, _Element]) -> Cameras | None:
     """The camera of `extrinsic` (world to camera, OpenCV axes), `intrinsic` and `image_size`; None where there is no sound one.
 
     Older files have 12 numbers of `extrinsic`, its rotation transposed, and fx, fy, width and height as `intrinsic`.
@@ -410,8 +467,8 @@ def _camera(elements: Mapping[str, NDArray[np.void]]) -> Cameras | None:
     numbers = {}
     for name in ("extrinsic", "intrinsic", "image_size"):
         if name in elements:
-            columns = [elements[name][each].astype(np.float64) for each in elements[name].dtype.names or ()]
-            numbers[name] = np.stack(columns, 1).ravel()
+            table = elements[name].table(data)
+            numbers[name] = np.stack([table[each].astype(np.float64) for each in elements[name].names()], 1).ravel()
     matrix, lens = numbers.get("extrinsic", np.eye(4).ravel()), numbers.get("intrinsic", np.zeros(0))
     size = numbers.get("image_size", lens[2:4] if len(lens) == 4 else np.zeros(0))
     if len(matrix) not in (12, 16) or len(lens) not in (4, 9) or len(size) != 2:
@@ -447,8 +504,7 @@ def _in_chunks(values: Floats) -> tuple[Floats, Floats, Floats]:
     starts = np.arange(0, len(values), _CHUNK)
     low, high = (what.reduceat(values, starts, axis=0).astype(np.float32) for what in (np.minimum, np.maximum))
     at = np.arange(len(values)) // _CHUNK
-    span = (high - low).astype(np.float64)[at]
-    return np.where(span > 0, (values - low[at]) / np.where(span > 0, span, 1.0), 0.0), low, high
+    return shares(values, low[at], high[at]), low, high
 
 
 def _pack(shares: Floats, bits: Sequence[int]) -> NDArray[np.int64]:

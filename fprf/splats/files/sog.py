@@ -14,7 +14,7 @@ import io
 import json
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -27,18 +27,19 @@ from numpy.typing import NDArray
 from ...datamanagers.images import header_of
 from ...errors import DataError
 from ...io.atomic import write_bytes
-from ...plugins.captures import CaptureFormat
+from ...plugins.captures import CaptureFormat, Data
 from ...types import Origin
-from ..gaussians import COUNTS, Gaussians, from_arrays
+from ..gaussians import COUNTS, Gaussians
 from .base import (
     Bools,
     Capture,
     Floats,
     arrays,
-    centred,
+    decoded,
     finite,
     logit,
     precise,
+    shares,
     sigmoid,
     smallest_three,
     spatial_order,
@@ -69,10 +70,9 @@ class Sog(CaptureFormat):
     def recognises(self, head: bytes, size: int) -> bool:
         return head.startswith(b"PK")
 
-    def read(self, path: Path, data: bytes) -> Capture:
+    def read(self, path: Path, data: Data) -> Capture:
         """A .sog archive, or the meta.json of a folder. Raises DataError for what is neither."""
-        if not data.startswith(b"PK"):
-            data = bundle(_folder(path, data))
+        data = bytes(data) if data[:2] == b"PK" else bundle(_folder(path, bytes(data)))
         files = unbundle(path, data)
         folder = folder_of(path, files)
         parts = {name.removeprefix(folder): content for name, content in files.items() if name.startswith(folder)}
@@ -80,33 +80,32 @@ class Sog(CaptureFormat):
         version = meta.get("version", 1)
         if version not in (1, 2):
             raise DataError(f"{path}: SOG of version {version!r}; versions 1 and 2 are read")
-        if meta.get("model") == "2dgs":
-            raise DataError(f"{path}: 2D Gaussians (model 2dgs); only 3D Gaussians are read")
+        flat = meta.get("model") == "2dgs"
         pictures = _Pictures(path, parts, meta)
         count = pictures.count
-        low, high = (pictures.rows("means", i)[:, :3].astype(np.int64) for i in (0, 1))
+        low, high = (pictures.rows("means", i)[:, :3] for i in (0, 1))
         least, most = pictures.numbers("means", "mins", 3), pictures.numbers("means", "maxs", 3)
-        bent = least + (high << 8 | low) / 65535 * (most - least)
         turn, scale, base = pictures.rows("quats", 0), pictures.rows("scales", 0), pictures.rows("sh0", 0)
-        tag = turn[:, 3].astype(np.int64) - 252
-        quaternions = three_to_four(np.clip(tag, 0, 3), turn[:, :3] / 255 * 2 - 1)
-        quaternions[tag < 0] = (1, 0, 0, 0)
         labels, rest = pictures.palette()
-        # The alpha of sh0: opacities as they are, or, in version 1, logits of a range of their own.
-        if version == 2:
-            constants, logits = pictures.decoded("sh0", base[:, :3], 3), logit(base[:, 3] / 255)
-        else:
-            constants, logits = np.split(pictures.decoded("sh0", base, 4), [3], 1)
-        means, shift = centred(np.sign(bent) * np.expm1(np.minimum(np.abs(bent), 80)))
-        gaussians = from_arrays(
-            means,
-            quaternions,
-            pictures.decoded("scales", scale[:, :3], 3),
-            logits.reshape(-1),
-            np.concatenate([constants[:, None], rest[labels]], 1) if len(rest) else constants[:, None],
-        )
 
-        def recolour(harmonics: Floats, changed: Bools) -> bytes:
+        def part(rows: slice) -> tuple[Floats, ...]:
+            bent = least + (high[rows].astype(np.int64) << 8 | low[rows]) / 65535 * (most - least)
+            tag = turn[rows, 3].astype(np.int64) - 252
+            quaternions = three_to_four(np.clip(tag, 0, 3), turn[rows, :3] / 255 * 2 - 1)
+            quaternions[tag < 0] = (1, 0, 0, 0)
+            scales = pictures.decoded("scales", scale[rows, :3], 3)
+            if flat:
+                scales[:, 2] = -np.inf
+            # The alpha of sh0: opacities as they are, or, in version 1, logits of a range of their own.
+            if version == 2:
+                constants, logits = pictures.decoded("sh0", base[rows, :3], 3), logit(base[rows, 3] / 255)
+            else:
+                constants, logits = np.split(pictures.decoded("sh0", base[rows], 4), [3], 1)
+            harmonics = np.concatenate([constants[:, None], rest[labels[rows]]], 1) if len(rest) else constants[:, None]
+            means = np.sign(bent) * np.expm1(np.minimum(np.abs(bent), 80))
+            return means, quaternions, scales, logits.reshape(-1), harmonics
+
+        def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
             new, said = {}, json.loads(parts["meta.json"])
             name = said["sh0"]["files"][0]
             index, said["sh0"] = _quantized(harmonics[:, 0], said["sh0"])
@@ -120,9 +119,10 @@ class Sog(CaptureFormat):
                 index, said["shN"] = _quantized(np.where(seen[:, None, None], mixed, rest), said["shN"])
                 new[name] = _webp(_palette_picture(index))
             new["meta.json"] = json.dumps(said, separators=(",", ":")).encode()
-            return bundle(files | {folder + name: content for name, content in new.items()}, like=data)
+            return [bundle(files | {folder + name: content for name, content in new.items()}, like=data)]
 
         antialiased = meta.get("antialias") is True or meta.get("model") == "antialiased"
+        gaussians, shift = decoded(1 + rest.shape[1], (count, part))
         return Capture(path, gaussians, antialiased, data, recolour, shift=shift)
 
     def keeps(self, gaussians: Gaussians) -> Bools:
@@ -134,7 +134,7 @@ class Sog(CaptureFormat):
 
         return precise(gaussians.means.numpy().astype(np.float64), step, _PRECISION)
 
-    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> bytes:
+    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
         """A bundled file of version 2. Gaussians are put in spatial order, by which the images shrink."""
         gaussians = gaussians.select(torch.from_numpy(spatial_order(gaussians.means.numpy())))
         means, turns, log_scales, logits, harmonics = arrays(gaussians)
@@ -143,7 +143,7 @@ class Sog(CaptureFormat):
         shape = (-(-count // max(width, 1)), width)
         bent = _bent(means.astype(np.float64))
         least, most = bent.min(0), bent.max(0)
-        at = steps((bent - least) / np.where(most > least, most - least, 1.0), 65535)
+        at = steps(shares(bent, least, most), 65535)
         largest, three = smallest_three(turns)
         opacity = steps(sigmoid(logits), 255)
         scale, scales = _quantized(log_scales.clip(-20, 20), {"files": ["scales.webp"], "codebook": []})
@@ -173,17 +173,15 @@ class Sog(CaptureFormat):
             index, meta["shN"] = _quantized(entries, {"count": used, "bands": gaussians.degree, "codebook": [], "files": files})
             pictures[files[0]] = _palette_picture(index)
             pictures[files[1]] = _picture(np.stack([labels & 255, labels >> 8, 0 * labels], 1), shape)
-        return bundle(
-            {name: _webp(picture) for name, picture in pictures.items()}
-            | {"meta.json": json.dumps(meta, separators=(",", ":")).encode()}
-        )
+        parts = {name: _webp(picture) for name, picture in pictures.items()}
+        return [bundle(parts | {"meta.json": json.dumps(meta, separators=(",", ":")).encode()})]
 
-    def write(self, path: Path, data: bytes) -> None:
+    def write(self, path: Path, pieces: Iterable[bytes]) -> None:
         """An archive; of a meta.json its files, into the same folder."""
         if path.name.lower() != "meta.json":
-            write_bytes(path, data)
+            super().write(path, pieces)
             return
-        files = unbundle(path, data)
+        files = unbundle(path, b"".join(pieces))
         folder = folder_of(path, files)
         for name, content in files.items():
             own = name.removeprefix(folder)
@@ -391,7 +389,7 @@ def _quantized(values: Floats, about: Mapping[str, Any]) -> tuple[NDArray[np.int
     whole = isinstance(said["mins"], (int, float))
     axes = tuple(range(values.ndim)) if whole else tuple(range(values.ndim - 1))
     low, high = values.min(axes), values.max(axes)
-    index = steps((values - low) / np.where(high > low, high - low, 1.0), 255)
+    index = steps(shares(values, low, high), 255)
     if whole:
         return index, said | {"mins": float(low), "maxs": float(high)}
     return index, said | {"mins": [*low.tolist(), *said["mins"][3:]], "maxs": [*high.tolist(), *said["maxs"][3:]]}

@@ -10,10 +10,10 @@ from typing import ClassVar
 import numpy as np
 
 from ...errors import DataError
-from ...plugins.captures import CaptureFormat
+from ...plugins.captures import CaptureFormat, Data
 from ...types import Origin
-from ..gaussians import Gaussians, from_arrays
-from .base import Bools, Capture, Floats, arrays, centred, colours_of, constants_of, logit, sigmoid, steps
+from ..gaussians import Gaussians
+from .base import Bools, Capture, Floats, arrays, colours_of, constants_of, decoded, logit, sigmoid, steps, unit_quaternions
 
 _RECORD = np.dtype([("mean", "<f4", 3), ("deviation", "<f4", 3), ("rgba", "u1", 4), ("turn", "u1", 4)])
 _LEAST = 1e-12
@@ -29,34 +29,32 @@ class Splat(CaptureFormat):
     def recognises(self, head: bytes, size: int) -> bool:
         return size > 0 and size % _RECORD.itemsize == 0
 
-    def read(self, path: Path, data: bytes) -> Capture:
-        if not self.recognises(data, len(data)):
+    def read(self, path: Path, data: Data) -> Capture:
+        if not self.recognises(b"", len(data)):
             raise DataError(f"{path}: {len(data)} bytes; a .splat file has {_RECORD.itemsize} for each Gaussian")
-        table = np.frombuffer(data, _RECORD)
-        share = table["rgba"] / 255
-        means, shift = centred(table["mean"])
-        gaussians = from_arrays(
-            means,
-            (table["turn"].astype(np.float32) - 128) / 128,
-            np.log(np.maximum(table["deviation"], _LEAST)),
-            logit(share[:, 3]),
-            constants_of(share[:, :3]),
-        )
+        whole = np.frombuffer(data, _RECORD)
 
-        def recolour(harmonics: Floats, changed: Bools) -> bytes:
-            out = bytearray(data)
-            np.frombuffer(out, _RECORD)["rgba"][changed, :3] = steps(colours_of(harmonics[changed]), 255)
-            return bytes(out)
+        def part(rows: slice) -> tuple[Floats, ...]:
+            table = whole[rows]
+            share = table["rgba"] / 255
+            turns = (table["turn"].astype(np.float32) - 128) / 128
+            scales = np.log(np.maximum(table["deviation"], _LEAST))
+            return table["mean"], turns, scales, logit(share[:, 3]), constants_of(share[:, :3])
 
+        def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
+            out = whole.copy()
+            out["rgba"][changed, :3] = steps(colours_of(harmonics[changed]), 255)
+            return [out.tobytes()]
+
+        gaussians, shift = decoded(1, (len(whole), part))
         return Capture(path, gaussians, False, data, recolour, shift=shift)
 
-    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> bytes:
+    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
         """In the order of the Gaussians. The file cannot say that they are antialiased."""
         means, turns, scales, logits, harmonics = arrays(gaussians)
         table = np.empty(len(gaussians), _RECORD)
         table["mean"], table["deviation"] = means, np.exp(scales)
         table["rgba"][:, :3] = steps(colours_of(harmonics), 255)
         table["rgba"][:, 3] = steps(sigmoid(logits), 255)
-        unit = turns.astype(np.float64) / np.linalg.norm(turns.astype(np.float64), axis=1, keepdims=True)
-        table["turn"] = np.clip(np.rint(unit * 128 + 128), 0, 255)
-        return table.tobytes()
+        table["turn"] = np.clip(np.rint(unit_quaternions(turns) * 128 + 128), 0, 255)
+        return [table.tobytes()]

@@ -11,7 +11,6 @@ table. All are kept.
 """
 
 import itertools
-import math
 import struct
 import zlib
 from collections.abc import Mapping
@@ -20,20 +19,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ...ops.harmonics import spherical_harmonics
-from ...plugins.captures import CaptureFormat
+from ...plugins.captures import CaptureFormat, Data
 from ...types import Origin
-from ..gaussians import COUNTS, Gaussians, bulk_of, from_arrays
+from ..gaussians import COUNTS, Gaussians, bulk_of
 from .base import (
     Bools,
     Capture,
     Floats,
     arrays,
-    centred,
+    decoded,
     finite,
     logit,
     precise,
@@ -42,6 +39,7 @@ from .base import (
     smallest_three,
     steps,
     three_to_four,
+    turned_harmonics,
 )
 
 _MAGIC = 0x5053474E
@@ -88,7 +86,7 @@ class Spz(CaptureFormat):
     def recognises(self, head: bytes, size: int) -> bool:
         return head.startswith((b"\x1f\x8b", b"NGSP"))
 
-    def read(self, path: Path, data: bytes) -> Capture:
+    def read(self, path: Path, data: Data) -> Capture:
         """A .spz file of versions 1 to 4. Raises DataError for others, and for version 4 where `zstandard` is not installed."""
         # The streams, packed together or each alone.
         packed = data[:2] == b"\x1f\x8b"
@@ -106,46 +104,49 @@ class Spz(CaptureFormat):
         axes = _axes(path, _coordinates(extensions) if header.flags & 2 else _RUB, header.degree)
         means, opacity, tint, scales, turns, rest = (np.frombuffer(each, np.uint8) for each in streams)
         count, bands = header.number, COUNTS[header.degree]
-        # Positions and rotations are stored otherwise in each version; the rest never changed.
-        if header.version == 1:
-            points: Floats = means.view("<f2").reshape(count, 3).astype(np.float64)
-        else:
-            low, middle, high = means.reshape(count, 3, 3).astype(np.int32).transpose(2, 0, 1)
-            points = (((low | middle << 8 | high << 16) ^ 0x800000) - 0x800000) / 2.0**header.fraction
-        if header.version < 3:
-            three = turns.reshape(count, 3) / 127.5 - 1
-            quaternions = np.concatenate([np.sqrt(np.maximum(0, 1 - (three**2).sum(1, keepdims=True))), three], 1)
-        else:
-            word = turns.view("<u4")
-            parts = np.stack([word >> shift & 1023 for shift in (20, 10, 0)], 1).astype(np.int64)
-            found = three_to_four((word >> 30).astype(np.int64), (parts & 511) / 511 * np.where(parts >> 9, -1.0, 1.0))
-            quaternions = np.empty_like(found)
-            quaternions[:, _TURN] = found
-        bits = rest.reshape(count, bands - 1, 3).astype(np.float64)
-        harmonics = np.concatenate([(tint.reshape(count, 1, 3) / 255 - 0.5) / _TINT, (bits - 128) / 128], 1)
-        points, shift = centred(axes.points(points))
-        gaussians = from_arrays(
-            points,
-            axes.quaternions(quaternions),
-            scales.reshape(count, 3) / 16 - 10,
-            logit(opacity / 255),
-            axes.harmonics(harmonics),
-        )
 
-        def recolour(harmonics: Floats, changed: Bools) -> bytes:
+        def part(rows: slice) -> tuple[Floats, ...]:
+            # Positions and rotations are stored otherwise in each version; the rest never changed.
+            if header.version == 1:
+                points: Floats = means.view("<f2").reshape(count, 3)[rows].astype(np.float64)
+            else:
+                low, middle, high = means.reshape(count, 3, 3)[rows].astype(np.int32).transpose(2, 0, 1)
+                points = (((low | middle << 8 | high << 16) ^ 0x800000) - 0x800000) / 2.0**header.fraction
+            if header.version < 3:
+                three = turns.reshape(count, 3)[rows] / 127.5 - 1
+                quaternions = np.concatenate([np.sqrt(np.maximum(0, 1 - (three**2).sum(1, keepdims=True))), three], 1)
+            else:
+                word = turns.view("<u4")[rows]
+                parts = np.stack([word >> shift & 1023 for shift in (20, 10, 0)], 1).astype(np.int64)
+                found = three_to_four((word >> 30).astype(np.int64), (parts & 511) / 511 * np.where(parts >> 9, -1.0, 1.0))
+                quaternions = np.empty_like(found)
+                quaternions[:, _TURN] = found
+            constants = (tint.reshape(count, 1, 3)[rows] / 255 - 0.5) / _TINT
+            bits = rest.reshape(count, bands - 1, 3)[rows].astype(np.float64)
+            return (
+                axes.points(points),
+                axes.quaternions(quaternions),
+                scales.reshape(count, 3)[rows] / 16 - 10,
+                logit(opacity[rows] / 255),
+                axes.harmonics(np.concatenate([constants, (bits - 128) / 128], 1)),
+            )
+
+        def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
             colours = (tint.reshape(count, 3).copy(), rest.reshape(count, bands - 1, 3).copy())
-            for stream, bytes_ in zip(colours, _colour_bytes(axes.inverse(finite(harmonics[changed]))), strict=True):
+            new_bytes = _colour_bytes(axes.harmonics(finite(harmonics[changed]), back=True))
+            for stream, bytes_ in zip(colours, new_bytes, strict=True):
                 stream[changed] = bytes_
             new = dict(zip((2, 5), (stream.tobytes() for stream in colours), strict=True))
             if header.version > 3:
-                return _framed(path, data, header, new)
+                return [_framed(path, data, header, new)]
             parts = [new.get(i, each) for i, each in enumerate(streams)]
             whole = b"".join([unpacked[: header.size], *parts, extensions])
-            return _zipped(whole) + after if packed else whole
+            return [_zipped(whole), after] if packed else [whole]
 
+        gaussians, shift = decoded(bands, (count, part))
         return Capture(path, gaussians, bool(header.flags & 1), data, recolour, shift=shift)
 
-    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> bytes:
+    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
         """Version 3, with as many fractional bits as the largest coordinate leaves."""
         means, turns, scales, logits, harmonics = arrays(gaussians)
         axes, fraction = _Axes(False, (1.0, -1.0, -1.0)), -int(np.log2(_step(means)))
@@ -165,7 +166,7 @@ class Spz(CaptureFormat):
             word.astype("<u4").tobytes(),
             rest.tobytes(),
         ]
-        return _zipped(b"".join(parts))
+        return [_zipped(b"".join(parts))]
 
     def keeps(self, gaussians: Gaussians) -> Bools:
         """Those within the reach of 24 bits whose steps suit the bulk."""
@@ -212,32 +213,19 @@ class _Axes(NamedTuple):
         a, b, c = self.signs
         return np.asarray(turns * np.array([1.0, b * c, a * c, a * b]))
 
-    def harmonics(self, harmonics: Floats) -> Floats:
-        """Harmonics [N K 3] as `points`."""
+    def harmonics(self, harmonics: Floats, back: bool = False) -> Floats:
+        """Harmonics [N K 3] as `points`; `back`: those of a file."""
         bands = harmonics.shape[1]
-        turned = np.einsum("kj,njc->nkc", _turn(bands), harmonics) if self.turned else harmonics
-        return turned * self._parity(bands)
-
-    def inverse(self, harmonics: Floats) -> Floats:
-        """Harmonics [N K 3] of a file."""
-        bands = harmonics.shape[1]
-        mirrored = harmonics * self._parity(bands)
-        return np.einsum("jk,njc->nkc", _turn(bands), mirrored) if self.turned else mirrored
-
-    def _parity(self, bands: int) -> Floats:
-        """The sign of each harmonic [K 1] under mirroring."""
-        x, y, z = self.signs
-        third = [y, x * y * z, y, z, x, z, x]
-        fourth = [x * y, y * z, x * y, y * z, 1, x * z, 1, x * z, 1]
-        return np.array([1, y, z, x, x * y, y * z, 1, x * z, 1, *third, *fourth])[:bands, None]
-
-
-def _turn(bands: int) -> Floats:
-    """The orthogonal matrix [K K] of harmonics under the turn of `_Axes`: found from values before and after it."""
-    there = torch.nn.functional.normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(0)).double(), dim=1)
-    before = torch.stack([there[:, 0], -there[:, 2], there[:, 1]], 1)
-    degree = math.isqrt(bands)
-    return np.asarray(torch.linalg.lstsq(spherical_harmonics(there, degree), spherical_harmonics(before, degree)).solution)
+        degree = np.sqrt(np.arange(bands)).astype(np.int64)
+        order = np.arange(bands) - degree * (degree + 1)
+        odd = np.where(order < 0, -1.0, 1.0)  # those of negative order have the sign of y
+        flips = (odd * (-1.0) ** order, odd, (-1.0) ** (degree + order))
+        parity = np.prod([flip if sign < 0 else np.ones(bands) for flip, sign in zip(flips, self.signs, strict=True)], 0)
+        if not self.turned:
+            return np.asarray(harmonics * parity[:, None])
+        turn = turned_harmonics(np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]), bands)
+        matrix = parity[:, None] * turn
+        return np.asarray(np.matmul(matrix.T if back else matrix, harmonics))
 
 
 def _axes(path: Path, number: int, degree: int) -> _Axes:
@@ -270,7 +258,7 @@ def _colour_bytes(harmonics: Floats) -> tuple[NDArray[np.uint8], NDArray[np.uint
     return tint, np.clip(np.rint(harmonics[:, 1:] * 128) + 128, 0, 255).astype(np.uint8)
 
 
-def _header(path: Path, data: bytes) -> _Header:
+def _header(path: Path, data: Data) -> _Header:
     if len(data) < _HEADER.size:
         raise short(path, len(data), _HEADER.size, "the header")
     magic, version, count, degree, fraction, flags, _ = _HEADER.unpack_from(data)
@@ -286,9 +274,9 @@ def _header(path: Path, data: bytes) -> _Header:
     return _Header(version, count, degree, fraction, flags, _HEADER.size if version < 4 else _WIDE_HEADER.size)
 
 
-def _unzip(path: Path, data: bytes) -> tuple[bytes, bytes]:
+def _unzip(path: Path, data: Data) -> tuple[bytes, bytes]:
     """Return the content of all members of a gzip file, no more than its header announces, and what lies behind them."""
-    content, left, most = b"", data, _HEADER.size
+    content, left, most = b"", bytes(data), _HEADER.size
     try:
         while left[:2] == b"\x1f\x8b":
             packer, piece = zlib.decompressobj(31), left
@@ -324,7 +312,7 @@ def _zipped(data: bytes) -> bytes:
     return packer.compress(data) + packer.flush()
 
 
-def _frames(path: Path, data: bytes, header: _Header) -> list[bytes]:
+def _frames(path: Path, data: Data, header: _Header) -> list[bytes]:
     """The streams of version 4; harmonics of degree 0 have none."""
     from_, sizes = _toc(path, data, header)
     try:
@@ -347,7 +335,7 @@ def _frames(path: Path, data: bytes, header: _Header) -> list[bytes]:
     return [*streams, b""] if header.degree == 0 else streams
 
 
-def _toc(path: Path, data: bytes, header: _Header) -> tuple[int, list[tuple[int, int]]]:
+def _toc(path: Path, data: Data, header: _Header) -> tuple[int, list[tuple[int, int]]]:
     """Return the starts of the streams, and their packed and raw sizes."""
     if len(data) < _WIDE_HEADER.size:
         raise short(path, len(data), _WIDE_HEADER.size, "the header")
@@ -367,7 +355,7 @@ def _toc(path: Path, data: bytes, header: _Header) -> tuple[int, list[tuple[int,
     return end, sizes
 
 
-def _framed(path: Path, data: bytes, header: _Header, new: Mapping[int, bytes]) -> bytes:
+def _framed(path: Path, data: Data, header: _Header, new: Mapping[int, bytes]) -> bytes:
     """A file of version 4 with new streams; the others stay as they are packed."""
     import zstandard
 

@@ -1,0 +1,236 @@
+"""Finished captures, one or many and of any size: seen as one scene, recoloured file by file.
+
+What a style needs to know is found from a sample of the Gaussians of all files together, so that all take the same maps of
+colours. A Gaussian that is not in the sample takes the features of those of the sample in the smallest cell around it that
+holds any. Then each file is read and written once; of the others nothing is in memory.
+"""
+
+import hashlib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from ..errors import DataError, UsageError
+from ..io.images import to_uint8, write_image
+from ..style.look import ColourMaps, Restyle
+from ..style.restyle import Styled
+from ..training.loading import open_run
+from .config import LookConfig
+from .files import Capture, read_capture
+from .files.base import pieces
+from .gaussians import Gaussians, bulk_of
+from .loading import open_capture
+from .restyle import restyled_harmonics
+from .scene import SplatScene, look_at_capture
+
+SAMPLE = 2_000_000
+"""Gaussians that are looked at, at most: what is in memory of captures of any size, beside the file at hand."""
+_FINEST, _LEVELS = 1024, 12
+"""Cells along the longest side of the bulk at the finest level; levels, each of cells twice as wide."""
+_BLACK = 0.055
+"""Added to sRGB, it is a power of linear light."""
+_VIEW, _SOLID = (480, 360), 0.95
+"""Size of views in the place of photographs; opacity from which on their pixels count."""
+_GAP = 0.1
+"""Distance between captures that would overlap, as a share of their width, where they are put in a row."""
+
+
+@dataclass(frozen=True, eq=False)
+class Captures:
+    """Captures that are seen as one scene."""
+
+    scene: SplatScene
+    """A sample of all of them, about the origin of the first one."""
+    rows: tuple[slice, ...]
+    """Where the Gaussians of each capture are among those of the scene."""
+    moved: tuple[Annotated[Tensor, "3"], ...]
+    """What was added to the means of each capture, so that none lies in another's place."""
+    first: Capture
+    """The first capture, as it was read."""
+
+    def harmonics(self, index: int, capture: Capture, look: Restyle) -> Annotated[Tensor, "N K 3"]:
+        """Harmonics in a look of all Gaussians of capture number `index` that can be drawn."""
+        gaussians, rows = capture.gaussians, self.rows[index]
+        finite = gaussians.finite
+        gaussians = gaussians if bool(finite.all()) else gaussians.select(finite)
+        here = tuple(a - b for a, b in zip(capture.origin, self.scene.origin, strict=True))
+        means = gaussians.means + torch.tensor(here) if any(here) else gaussians.means
+        features = self.scene.found().features[rows]
+        if len(features) == len(gaussians):
+            return restyled_harmonics(gaussians.harmonics, means, features, look)
+        near = Neighbours(self.scene.gaussians.means[rows] - self.moved[index], features)
+        out = torch.empty_like(gaussians.harmonics)
+        for some in pieces(len(out)):
+            out[some] = restyled_harmonics(gaussians.harmonics[some], means[some], near(means[some]), look)
+        return out
+
+
+def open_captures(
+    paths: Sequence[Path],
+    look: LookConfig,
+    *,
+    sample: int = SAMPLE,
+    cache: Path | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Captures:
+    """Read captures and see them as one scene; arguments as those of `open_capture`.
+
+    Of several captures each gives a like share of the sample. Raises DataError where nothing can be seen.
+    """
+    first = read_capture(paths[0])
+    if len(paths) == 1 and len(first.gaussians) <= sample:
+        scene = open_capture(first, look, cache=cache, progress=progress, say=say)
+        return Captures(scene, (slice(0, len(scene.gaussians)),), (torch.zeros(3),), first)
+    parts, key, compensated = list[Gaussians](), hashlib.sha256(f"{sample} {len(paths)}".encode()), first.antialiased
+    for path in paths:
+        capture = first if path == paths[0] else read_capture(path)
+        key.update(hashlib.sha256(capture.data).digest())
+        here = torch.tensor([a - b for a, b in zip(capture.origin, first.origin, strict=True)])
+        part = sampled(capture.gaussians.drawable(), max(1, sample // len(paths)))
+        parts.append(replace(part, means=part.means + here) if bool(here.any()) else part)
+        compensated = compensated or capture.antialiased
+    moved = _apart(parts)
+    together = _joined([replace(part, means=part.means + by) for part, by in zip(parts, moved, strict=True)])
+    # What lies in one row is looked at as an object; a known camera is that of one capture alone.
+    alone = len(paths) == 1
+    whole = replace(
+        first,
+        gaussians=together,
+        antialiased=compensated,
+        data=key.digest(),
+        camera=first.camera if alone else None,
+    )
+    scene = open_capture(whole, look, cache=cache, progress=progress, say=say)
+    ends = torch.tensor([len(part) for part in parts]).cumsum(0).tolist()
+    rows = tuple(slice(end - len(part), end) for end, part in zip(ends, parts, strict=True))
+    return Captures(scene, rows, tuple(moved), first)
+
+
+def sampled(gaussians: Gaussians, most: int) -> Gaussians:
+    """At most so many of the Gaussians, at equal steps, and wider by as many as each stands for."""
+    count = len(gaussians)
+    if count <= most:
+        return gaussians
+    some = gaussians.select(torch.arange(most) * count // most)
+    # What is seen are surfaces: areas grow as the numbers shrink.
+    return replace(some, log_scales=some.log_scales + 0.5 * math.log(count / most))
+
+
+def _apart(parts: Sequence[Gaussians]) -> list[Annotated[Tensor, "3"]]:
+    """What takes captures apart, in a row along x, where some lie in one place; nothing where they are neighbours."""
+    boxes = []
+    for part in parts:
+        inner = part.means[torch.from_numpy(bulk_of(part.means.numpy()).apart <= 0.5)]
+        boxes.append((inner.amin(0), inner.amax(0)))
+    overlap = False
+    for i, (low, high) in enumerate(boxes):
+        for other_low, other_high in boxes[:i]:
+            shared = (torch.minimum(high, other_high) - torch.maximum(low, other_low)).clamp_min(0)
+            least = torch.minimum(high - low, other_high - other_low)
+            overlap = overlap or bool((shared > 0.5 * least).all())
+    moves, at = [], 0.0
+    for low, high in boxes:
+        moves.append(torch.tensor([at - float(low[0]), 0.0, 0.0]) if overlap else torch.zeros(3))
+        at += (1 + _GAP) * float(high[0] - low[0])
+    return moves
+
+
+def _joined(parts: Sequence[Gaussians]) -> Gaussians:
+    """All Gaussians of several, with as many harmonics as the most of them have."""
+    if len(parts) == 1:
+        return parts[0]
+    bands = max(part.harmonics.shape[1] for part in parts)
+    same = []
+    for part in parts:
+        missing = part.harmonics.new_zeros(len(part), bands - part.harmonics.shape[1], 3)
+        same.append(part.recoloured(torch.cat([part.harmonics, missing], 1)))
+    return Gaussians(*(torch.cat(each) for each in zip(*(vars(part).values() for part in same), strict=True)))
+
+
+def light_alone(styled: Styled) -> Styled:
+    """A style as its exposure and white balance alone: one gain a channel, in linear light, for the whole scene.
+
+    It is the median over regions, by their share, of what takes their mean colour to that of what they match; what a region is
+    made of plays no part where both sides show the same things. Raises UsageError for stylizers that carry no colours.
+    """
+    look, style = styled.restyle, styled.scene
+    if look.colours is None:
+        raise UsageError("--match-light: needs a stylizer that carries colours, such as --stylizer region-tone")
+    mean = style.region_mean.double()
+    # sRGB is a power of linear light but for the black end: a gain is a factor of colours plus 0.055.
+    matched = mean + mean[:, None].matmul(look.colours.matrix.double())[:, 0] + look.colours.bias.double()
+    ratio = ((matched.clamp(0, 1) + _BLACK) / (mean.clamp(0, 1) + _BLACK)).log()
+    order = ratio.argsort(0)
+    half = style.share.double()[order].cumsum(0) >= 0.5 * float(style.share.sum())
+    gain = ratio.gather(0, order).gather(0, half.long().argmax(0, keepdim=True))[0].exp()
+    matrix = gain.diag().expand(len(mean), 3, 3)
+    maps = ColourMaps(style, matrix, (_BLACK * (gain - 1)).expand(len(mean), 3), 1.0)
+    return styled._replace(restyle=replace(look, colours=maps, light=None, places=()))
+
+
+def reference_views(
+    path: Path, look: LookConfig, folder: Path, *, views: int = 12
+) -> tuple[tuple[Path, ...], tuple[Path, ...], tuple[float, ...]]:
+    """Write pictures of views of a capture or of a run into a folder: in the place of photographs, as references.
+
+    Returns them, masks of what they show, and the shares of them that show anything. Raises DataError where none does.
+    """
+    if (path / "config.json").is_file():
+        scene = open_run(path, device="cpu").scene
+        chosen = torch.linspace(0, len(scene.names) - 1, min(views, len(scene.names))).round().long()
+        cameras = scene.cameras.select(chosen)
+    else:
+        capture, encoder = read_capture(path), look.semantic.encoder.build()
+        gaussians = sampled(capture.gaussians.drawable(), SAMPLE)
+        look = replace(look, views=views, size=_VIEW, up=look.up or capture.up)
+        scene = look_at_capture(gaussians, capture.antialiased, encoder, look, camera=capture.camera)
+        cameras = scene.cameras
+    pictures, masks, weights = list[Path](), list[Path](), list[float]()
+    for view in range(len(cameras)):
+        shown = scene.render(cameras, view)
+        solid = shown.opacity > _SOLID
+        if bool(solid.any()):
+            pictures.append(folder / f"{view:02d}.png")
+            masks.append(folder / f"{view:02d}.mask.png")
+            weights.append(float(solid.double().mean()))
+            write_image(pictures[-1], to_uint8(shown.rgb))
+            write_image(masks[-1], to_uint8(solid[..., None].expand(-1, -1, 3).float()))
+    if not pictures:
+        raise DataError(f"{path}: nothing in it is opaque enough to be a reference")
+    return tuple(pictures), tuple(masks), tuple(weights)
+
+
+class Neighbours:
+    """Features at places, as the mean of those of the points in the smallest cell around that holds any."""
+
+    def __init__(self, points: Annotated[Tensor, "M 3"], features: Annotated[Tensor, "M D"]) -> None:
+        self.low, self.fallback = points.amin(0), features.float().mean(0)
+        self.edge = (bulk_of(points.numpy()).side or 1.0) / _FINEST
+        self.levels = []
+        for level in range(_LEVELS):
+            keys, cell = torch.unique(self._cells(points, level), return_inverse=True)
+            sums = torch.zeros(len(keys), features.shape[1]).index_add_(0, cell, features.float())
+            self.levels.append((keys, (sums / cell.bincount()[:, None]).half()))
+
+    def __call__(self, places: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N D"]:
+        """Half precision, as semantics are."""
+        out = self.fallback.half().expand(len(places), -1).clone()
+        left = torch.arange(len(places))
+        for level, (keys, means) in enumerate(self.levels):
+            cells = self._cells(places[left], level)
+            at = torch.searchsorted(keys, cells).clamp_max(len(keys) - 1)
+            found = keys[at] == cells
+            out[left[found]] = means[at[found]]
+            left = left[~found]
+        return out
+
+    def _cells(self, places: Annotated[Tensor, "N 3"], level: int) -> Annotated[Tensor, "N"]:
+        """Numbers of cells; places far outside share those at the border."""
+        cell: Tensor = ((places - self.low) / (self.edge * 2**level)).clamp(-1, 2.0**20).long() + 1
+        return (cell[:, 0] << 42) + (cell[:, 1] << 21) + cell[:, 2]

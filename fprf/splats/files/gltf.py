@@ -1,0 +1,289 @@
+"""glTF 2.0 with `KHR_gaussian_splatting`: a binary .glb, or a .gltf, which is written with its buffer inside.
+
+Primitives of points with POSITION, ROTATION (x y z w), SCALE, OPACITY in [0, 1] and SH_DEGREE_l_COEF_n, beside any other nodes,
+cameras and meshes, which are kept. SCALE is a size in the final text of the extension and its logarithm in the review draft: a
+negative one betrays the latter. Colours are sRGB or linear (`colorSpace`). Axes are right up back; what this module writes has
+those of PLY files, right down front, under a node that turns them by 180 degrees about x.
+"""
+
+import base64
+import json
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ...errors import DataError
+from ...io.images import srgb_to_linear
+from ...plugins.captures import CaptureFormat, Data
+from ...rendering.splines import quaternions, rotations
+from ...types import Origin
+from ..gaussians import COUNTS, Gaussians
+from .base import (
+    Bools,
+    Capture,
+    Floats,
+    arrays,
+    colours_of,
+    constants_of,
+    decoded,
+    finite,
+    logit,
+    pieces,
+    sigmoid,
+    steps,
+    turned_harmonics,
+    unit_quaternions,
+)
+
+_NAME = "KHR_gaussian_splatting"
+_HARMONICS = [f"{_NAME}:SH_DEGREE_{degree}_COEF_{k}" for degree in range(4) for k in range(2 * degree + 1)]
+_SHAPE = ("POSITION", f"{_NAME}:ROTATION", f"{_NAME}:SCALE", f"{_NAME}:OPACITY")
+_COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_UNSOUND = (LookupError, TypeError, ValueError, AttributeError, RecursionError, OverflowError, struct.error)
+"""What a document that is no glTF raises where it is taken apart."""
+_LEAST = 1e-30
+"""Sizes are at least this, so that their logarithm is finite."""
+
+
+class _Part(NamedTuple):
+    """A primitive of Gaussians as a node shows it: scale * rotation @ point + translation is right down front."""
+
+    columns: dict[str, NDArray[Any]]
+    """Attributes [N C] in the file's own memory."""
+    rotation: Floats
+    scale: float
+    translation: Floats
+    extension: dict[str, Any]
+    logarithmic: bool
+    """Its SCALE is a logarithm."""
+
+    @property
+    def linear(self) -> bool:
+        """Its colours are those of linear light."""
+        return str(self.extension.get("colorSpace")).startswith("lin")
+
+    def decoded(self, rows: slice, names: list[str]) -> tuple[Floats, ...]:
+        """Means, quaternions, ln-scales, logits and harmonics of some rows."""
+        points, turns, scale, opacity = (_values(self.columns[name][rows]) for name in _SHAPE)
+        # The quaternion product of the node's rotation and the Gaussians' own.
+        a, b, c, d = quaternions(torch.from_numpy(self.rotation)[None])[0].tolist()
+        product = np.array([[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]])
+        harmonics = np.stack([_values(self.columns[name][rows]) for name in names], 1)
+        harmonics = _in_other_light(harmonics, to_linear=False) if self.linear else harmonics
+        return (
+            self.scale * points @ self.rotation.T + self.translation,
+            np.roll(turns, 1, 1) @ product.T,
+            (scale if self.logarithmic else np.log(np.maximum(scale, _LEAST))) + np.log(self.scale),
+            logit(opacity[:, 0]),
+            np.matmul(turned_harmonics(self.rotation, len(names)), harmonics),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gltf(CaptureFormat):
+    """Khronos' .glb and .gltf."""
+
+    def recognises(self, head: bytes, size: int) -> bool:
+        return head.startswith(b"glTF") or head.lstrip()[:1] == b"{"
+
+    def read(self, path: Path, data: Data) -> Capture:
+        """All primitives of Gaussians of the file's scene. Raises DataError where there is none."""
+        try:
+            data = data if data[:4] == b"glTF" else _binary(path, json.loads(bytes(data)))
+            document, start = _document(data)
+            parts = _parts(path, document, data, start)
+            names = [name for name in _HARMONICS if parts and name in parts[0].columns]
+            if any({*names} ^ {name for name in part.columns if ":SH_" in name} for part in parts) or len(names) not in (
+                0,
+                *COUNTS,
+            ):
+                raise ValueError("harmonics of degrees that are not whole, or differ")
+        except _UNSOUND as error:
+            raise DataError(f"{path}: no sound glTF ({error!r}); copy it again, it is damaged or of another kind") from error
+        if not parts:
+            raise DataError(f"{path}: a glTF without {_NAME} in its scene; it holds no 3D Gaussians")
+
+        def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
+            out, begin = bytearray(data), 0
+            for part in _parts(path, document, out, start):
+                back = turned_harmonics(part.rotation, len(names)).T
+                for rows in pieces(len(part.columns["POSITION"])):
+                    here = slice(begin + rows.start, begin + rows.stop)
+                    which, new = changed[here], np.matmul(back, finite(harmonics[here]))
+                    new = _in_other_light(new, to_linear=True) if part.linear else new
+                    for name, column in zip(names, new.transpose(1, 0, 2), strict=True):
+                        part.columns[name][rows][which] = column[which]
+                    colour = part.columns.get("COLOR_0")
+                    if colour is not None and colour.dtype == np.uint8:  # what programs without the extension show
+                        colour[rows, :3][which] = steps(colours_of(new), 255)[which]
+                begin += len(part.columns["POSITION"])
+            return [bytes(out)]
+
+        sections = [(len(part.columns["POSITION"]), lambda rows, part=part: part.decoded(rows, names)) for part in parts]
+        gaussians, shift = decoded(len(names), *sections)
+        kind = "logarithms, as in the review draft" if parts[0].logarithmic else "linear, as in the final text"
+        compensated = parts[0].extension.get("extras") == {"antialiased": True}
+        return Capture(path, gaussians, compensated, data, recolour, shift=shift, notes=(f"sizes are {kind} of {_NAME}",))
+
+    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
+        """A .glb of one node; harmonics of degree 4 are left out."""
+        means, turns, scales, logits, harmonics = arrays(gaussians)
+        opacity = sigmoid(logits)[:, None]
+        shape = (means, np.roll(unit_quaternions(turns), -1, 1), np.exp(scales.clip(-80, 80)), opacity)
+        columns: dict[str, Floats] = dict(zip((*_SHAPE, *_HARMONICS), (*shape, *harmonics.transpose(1, 0, 2)), strict=False))
+        columns = {name: values.astype("<f4") for name, values in columns.items()}
+        columns["COLOR_0"] = steps(np.concatenate([colours_of(harmonics), opacity], 1), 255).astype(np.uint8)
+        views, accessors, size = [], [], 0
+        for k, values in enumerate(columns.values()):
+            kind, code = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]], 5126 if values.dtype == "<f4" else 5121
+            views.append({"buffer": 0, "byteOffset": size, "byteLength": values.nbytes, "target": 34962})
+            accessors.append({"bufferView": k, "componentType": code, "count": len(values), "type": kind})
+            size += values.nbytes
+        accessors[0] |= {"min": means.min(0).tolist(), "max": means.max(0).tolist()}
+        accessors[-1]["normalized"] = True
+        extension: dict[str, Any] = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
+        extension |= {"sortingMethod": "cameraDistance"} | ({"extras": {"antialiased": True}} if antialiased else {})
+        attributes = {name: k for k, name in enumerate(columns)}
+        document = {
+            "asset": {"version": "2.0", "generator": "fprf"},
+            "extensionsUsed": [_NAME],
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0, "rotation": [1, 0, 0, 0]}],
+            "meshes": [{"primitives": [{"attributes": attributes, "mode": 0, "extensions": {_NAME: extension}}]}],
+            "accessors": accessors,
+            "bufferViews": views,
+            "buffers": [{"byteLength": size}],
+        }
+        return _glb(document, [values.tobytes() for values in columns.values()])
+
+    def write(self, path: Path, pieces: Iterable[bytes]) -> None:
+        """A .glb; for a .gltf its document, with the buffer as base64."""
+        if path.suffix.lower() == ".gltf":
+            data = b"".join(pieces)
+            document, start = _document(data)
+            content = base64.b64encode(data[start : start + document["buffers"][0]["byteLength"]]).decode()
+            document["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{content}"
+            pieces = [json.dumps(document, ensure_ascii=False).encode()]
+        super().write(path, pieces)
+
+
+def _glb(document: dict[str, Any], body: Iterable[bytes]) -> list[bytes]:
+    """The pieces of a .glb: its header, its document and its one buffer."""
+    text, chunks = json.dumps(document, separators=(",", ":"), ensure_ascii=False).encode(), [*body]
+    text += b" " * (-len(text) % 4)
+    chunks.append(bytes(-sum(map(len, chunks)) % 4))
+    size = sum(map(len, chunks))
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + size) + struct.pack("<I4s", len(text), b"JSON")
+    return [head, text, struct.pack("<I4s", size, b"BIN\0"), *chunks]
+
+
+def _document(data: Data) -> tuple[dict[str, Any], int]:
+    """The document of a .glb, and where its buffer begins."""
+    _, version, _, size, kind = struct.unpack_from("<4sIII4s", data)
+    if version != 2 or kind != b"JSON" or 20 + size > len(data):
+        raise ValueError(f"version {version} with {size} bytes of JSON in {len(data)}")
+    document = json.loads(data[20 : 20 + size])
+    if document["asset"]["version"][:2] != "2.":
+        raise ValueError(f"asset of version {document['asset']['version']}")
+    return document, 28 + size
+
+
+def _binary(path: Path, document: dict[str, Any]) -> bytes:
+    """The .glb of a .gltf: with its buffers, from base64 or from files in its folder, as one."""
+    body, starts = b"", []
+    for about in document["buffers"]:
+        content, uri = b"", about["uri"]
+        if uri.startswith("data:"):
+            content = base64.b64decode(uri.partition(",")[2], validate=True)
+        else:
+            file = path.parent / uri
+            if not file.resolve().is_relative_to(path.parent.resolve()):
+                raise DataError(f"{path}: {uri!r} is no file beside it; not a glTF to be read")
+            try:
+                content = file.read_bytes()
+            except OSError as error:
+                raise DataError(f"{path}: {uri} beside it cannot be read; copy the whole folder") from error
+        starts.append(len(body))
+        body += content + bytes(-len(content) % 4)
+    for view in document["bufferViews"]:
+        view["byteOffset"] = view.get("byteOffset", 0) + starts[view["buffer"]]
+        view["buffer"] = 0
+    document["buffers"] = [{"byteLength": len(body)}]
+    return b"".join(_glb(document, [body]))
+
+
+def _parts(path: Path, document: dict[str, Any], data: Data | bytearray, start: int) -> list[_Part]:
+    """The primitives of Gaussians that nodes of the scene show; `data` has the buffer from `start` on."""
+    nodes, found, seen = document.get("nodes", []), list[_Part](), set[int]()
+    scene = document.get("scenes", [{"nodes": range(len(nodes))}])[document.get("scene", 0)]
+    waiting = [(index, np.diag([1.0, -1.0, -1.0, 1.0])) for index in scene.get("nodes", [])]
+    for index, above in waiting:
+        if index in seen:
+            raise ValueError(f"node {index} is reached twice")
+        seen.add(index)
+        node = nodes[index]
+        matrix = above @ _local(node)
+        waiting += [(child, matrix) for child in node.get("children", [])]
+        for primitive in document["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []:
+            extension = primitive.get("extensions", {}).get(_NAME)
+            if extension is None:
+                continue
+            if extension.get("extensions"):
+                raise DataError(f"{path}: Gaussians packed by {', '.join(extension['extensions'])}; export them uncompressed")
+            columns = {name: _column(document, data, start, at) for name, at in primitive["attributes"].items()}
+            widths = {name: columns[name].shape[1] for name in columns if name in _SHAPE or name in _HARMONICS}
+            wanted = dict.fromkeys(_HARMONICS, 3) | dict(zip(_SHAPE, (3, 4, 3, 1), strict=True))
+            sound = {*_SHAPE, _HARMONICS[0]} <= {*columns} and all(wanted[name] == width for name, width in widths.items())
+            if not sound or len({len(column) for column in columns.values()}) > 1:
+                raise DataError(f"{path}: Gaussians without one of {', '.join(_SHAPE)}, or of unequal shapes; export it again")
+            linear, scale = matrix[:3, :3], float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+            if not scale > 0 or not np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() < 1e-3:
+                raise DataError(f"{path}: a node shears, mirrors or stretches its Gaussians; apply its transform first")
+            sizes = columns[_SHAPE[2]]
+            logarithmic = any(bool((_values(sizes[rows]) < 0).any()) for rows in pieces(len(sizes)))
+            found.append(_Part(columns, linear / scale, scale, matrix[:3, 3], extension, logarithmic))
+    return found
+
+
+def _local(node: dict[str, Any]) -> Floats:
+    """The matrix [4 4] of a node, from its parent's frame."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    matrix, (x, y, z, w) = np.eye(4), node.get("rotation", (0, 0, 0, 1))
+    matrix[:3, :3] = rotations(torch.tensor([[w, x, y, z]], dtype=torch.float64))[0].numpy() * node.get("scale", (1, 1, 1))
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix
+
+
+def _column(document: dict[str, Any], data: Data | bytearray, start: int, index: int) -> NDArray[Any]:
+    """The rows of an accessor, in the file's own memory; NumPy holds them against its size."""
+    about = document["accessors"][index]
+    view = document["bufferViews"][about["bufferView"]]
+    kind, width, count = np.dtype(_COMPONENTS[about["componentType"]]), _WIDTHS[about["type"]], about["count"]
+    stride, offset = view.get("byteStride") or kind.itemsize * width, view.get("byteOffset", 0) + about.get("byteOffset", 0)
+    if "sparse" in about or view.get("buffer", 0) != 0 or count < 1 or stride < kind.itemsize * width or offset < 0:
+        raise ValueError(f"accessor {index} is sparse, empty or in another buffer")
+    return np.ndarray((count, width), kind, data, start + offset, (stride, kind.itemsize))
+
+
+def _values(column: NDArray[Any]) -> NDArray[np.float64]:
+    """Numbers of an attribute; whole numbers stand for shares of the largest."""
+    most = 1.0 if column.dtype.kind == "f" else float(np.iinfo(column.dtype).max)
+    return np.maximum(column / most, -1.0) if most > 1 else column.astype(np.float64)
+
+
+def _in_other_light(harmonics: Floats, to_linear: bool) -> Floats:
+    """Harmonics of sRGB as those of linear light, or back: the mean colour by the curve, what depends on views by its slope."""
+    mean = np.maximum(colours_of(harmonics), 0)
+    shown = mean if to_linear else np.where(mean <= 0.0031308, 12.92 * mean, 1.055 * mean ** (1 / 2.4) - 0.055)
+    slope = np.where(shown <= 0.04045, 1 / 12.92, 2.4 / 1.055 * ((shown + 0.055) / 1.055) ** 1.4)[:, None]
+    rest = harmonics[:, 1:] * slope if to_linear else harmonics[:, 1:] / slope
+    return np.concatenate([constants_of(srgb_to_linear(shown) if to_linear else shown), rest], 1)

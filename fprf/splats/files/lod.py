@@ -1,0 +1,83 @@
+"""Streamed SOG (PlayCanvas), read alone: a lod-meta.json, and folders of SOG that it names, at the finest level.
+
+`tree` has `children`, or at its leaves `lods`: by the number of a level, 0 the finest, the rows of one of `filenames`. Files
+of coarser levels alone are not opened. `environment` is one more SOG, which is always shown.
+"""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ...errors import DataError
+from ...plugins.captures import CaptureFormat, Data
+from .base import Capture, arrays, decoded
+from .sog import Sog, bundle
+
+_UNSOUND = (LookupError, TypeError, ValueError, AttributeError, RecursionError)
+"""What a document that is no index raises where it is taken apart."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamedSog(CaptureFormat):
+    """PlayCanvas' lod-meta.json."""
+
+    writes: ClassVar[bool] = False
+
+    def recognises(self, head: bytes, size: int) -> bool:
+        return head.lstrip()[:1] == b"{"
+
+    def read(self, path: Path, data: Data) -> Capture:
+        try:
+            index = json.loads(bytes(data))
+            if index.get("version", 1) != 1:
+                raise ValueError(f"version {index['version']!r}; version 1 is read")
+            wanted: dict[str, list[slice]] = {}
+            for leaf in _leaves(index["tree"]):
+                level = leaf["lods"][min(leaf["lods"], key=int)]
+                first, count = level["offset"], level["count"]
+                if not all(isinstance(number, int) and number >= 0 for number in (first, count, level["file"])):
+                    raise ValueError(f"a leaf of {count} Gaussians from {first} on")
+                wanted.setdefault(index["filenames"][level["file"]], []).append(slice(first, first + count))
+            if index.get("environment"):
+                wanted[index["environment"]] = [slice(0, None)]
+            root = path.parent.resolve()
+            files = {name: (path.parent / name, rows) for name, rows in wanted.items()}
+            if any(not file.resolve().is_relative_to(root) for file, _ in files.values()):
+                raise ValueError("a file outside of its folder")
+        except _UNSOUND as error:
+            raise DataError(f"{path}: no sound lod-meta.json ({error!r}); not a streamed SOG, or it is damaged") from error
+        parts, archives, antialiased = [], {path.name: bytes(data)}, True
+        for name, (file, rows) in files.items():
+            try:
+                content = file.read_bytes()
+            except OSError as error:
+                raise DataError(f"{path}: {name} beside it cannot be read; copy the whole folder") from error
+            chunk = Sog().read(file, content)
+            most = max(each.stop or 0 for each in rows)
+            if most > len(chunk.gaussians):
+                raise DataError(f"{path}: {name} has {len(chunk.gaussians)} Gaussians, not {most}; copy the folder again")
+            for each in rows:
+                means, *others = arrays(chunk.gaussians.select(each))
+                parts.append((means + np.array(chunk.shift), *others))
+            archives[name], antialiased = bytes(chunk.data), antialiased and chunk.antialiased
+        if len({part[-1].shape[1] for part in parts}) > 1:
+            raise DataError(f"{path}: files of different degrees of harmonics; export the capture again")
+        if not parts:
+            raise DataError(f"{path}: holds no Gaussian")
+        sections = [(len(part[0]), lambda rows, part=part: tuple(each[rows] for each in part)) for part in parts]
+        gaussians, shift = decoded(parts[0][-1].shape[1], *sections)
+        return Capture(path, gaussians, antialiased, bundle(archives), lambda harmonics, changed: (), shift=shift)
+
+
+def _leaves(root: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """The leaves of a tree that have Gaussians."""
+    waiting = [root]
+    while waiting:
+        node = waiting.pop()
+        waiting += reversed(node.get("children", []))
+        if node.get("lods"):
+            yield node
