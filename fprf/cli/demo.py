@@ -1,11 +1,6 @@
 """`fprf demo`: a garden from photographs to a page that shows it restyled. No network, no data."""
 
-import contextlib
-import os
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -30,8 +25,6 @@ CREDITS = (
     "Photographs of the garden: The SfM Tool Authors (sfmtool/sfmtool, test-data), Apache-2.0; reduced and re-encoded.",
     "Autumn and sunset: Aitzol Berasategi, CC BY 4.0; reduced. Winter and night: pictures of fprf's own towns.",
 )
-_NICE = 10
-"""Added to the niceness of the process that compiles beside training."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,10 +54,13 @@ def run(args: list[str]) -> int:
     """Train the garden, or resume, then measure, restyle, film, export and write the page."""
     config = parse(DemoConfig(), args, prog="fprf demo", description="Train, restyle and show a garden that ships with fprf.")
     start = time.perf_counter()
+    import torch
+
     from ..datamanagers.images import load_image
     from ..io.atomic import write_json
     from ..io.video import write_video
     from ..methods import fprf_splats
+    from ..ops.mixture import attention, scaled
     from ..page.writer import Page, Reference, write_page
     from ..rendering.paths import make_path
     from ..splats.files import write_gaussians
@@ -78,9 +74,13 @@ def run(args: list[str]) -> int:
     garden = Path(str(files("fprf") / "garden"))
     output = config.output / "run"
     training = replace(fprf_splats(), data=garden, downscale=config.downscale, output=output, minutes=config.minutes)
-    with compiling():  # waited for at the end
-        root = train(training, "fprf-splats")
-        metrics = evaluate(EvalConfig(run=root, images=False))
+    root = train(training, "fprf-splats")
+    metrics = evaluate(EvalConfig(run=root, images=False))
+    # What restyling needs is compiled at its first call, once for an installation (12 s): that is not the time of a style.
+    point = torch.zeros(1, 3)
+    with torch.inference_mode():
+        attention(point, point, 1.0)
+        scaled(point, torch.ones(1, 1), point, point, centre=point[0])
     opened = open_gaussians(Run(root), training, "cpu", QualityConfig())
     scene, views = opened.scene, opened.known.test
     names = {garden / "references" / f"{name}.jpg": name for name in LOOKS}
@@ -105,6 +105,7 @@ def run(args: list[str]) -> int:
         film = film.with_suffix(".webp")
         write_video(film, frames, fps=12)
     figures: list[dict[str, Any]] = [dict(style.metrics) for style, _ in styles]
+    # Of the single styles: the one of all together encodes nothing anew.
     metrics |= {
         "looked_seconds": looked,
         "new_style_seconds": fmean(each["new_style_seconds"] for each in figures[: len(LOOKS)]),
@@ -141,36 +142,3 @@ def run(args: list[str]) -> int:
         f"open {page}; {config.output}/*.ply open in any viewer of Gaussians"
     )
     return 0
-
-
-@contextlib.contextmanager
-def compiling() -> Iterator[None]:
-    """Compile what restyling needs in a process of low priority, where that was not done before: it takes 12 s of a core.
-
-    At the end it is waited for.
-    """
-    from ..ops import mixture_kernels
-
-    if any(Path(str(mixture_kernels.scaled.stats.cache_path)).glob("mixture_kernels.scaled*.nbi")):
-        yield
-        return
-    quiet = subprocess.DEVNULL
-    with subprocess.Popen([sys.executable, "-m", __name__], stdin=quiet, stdout=quiet, stderr=quiet):
-        yield
-
-
-def _compile() -> None:
-    import torch
-
-    from ..ops.mixture import attention, scaled
-
-    if hasattr(os, "nice"):
-        os.nice(_NICE)
-    point = torch.zeros(1, 3)
-    with torch.inference_mode():
-        attention(point, point, 1.0)
-        scaled(point, torch.ones(1, 1), point, point, centre=point[0])
-
-
-if __name__ == "__main__":
-    _compile()
