@@ -10,11 +10,14 @@ than after five at 504 x 378 (26.8 dB with 60 000 Gaussians); then 27.7 dB after
 import math
 import time
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import torch
 
 from ..datamanagers.scene import Scene
-from .config import GaussiansConfig
+
+if TYPE_CHECKING:
+    from .config import GaussiansConfig
 
 _PIXEL, _GAUSSIAN = 91e-9, 103e-9
 """A and B in seconds, on two x86-64 cores."""
@@ -32,7 +35,7 @@ _PROBE, _REPEATS, _REFERENCE = 1 << 16, 200, 55e-6
 """Numbers whose exponential is taken, how often, and the seconds of the fastest on one of the two cores named above."""
 
 
-def plan(config: GaussiansConfig, scene: Scene) -> GaussiansConfig:
+def plan(config: "GaussiansConfig", scene: Scene) -> "GaussiansConfig":
     """Return the config with `downscale` and `cap` decided for a scene at its own size; given ones stay."""
     sizes = scene.cameras.size[scene.train]
     if not len(sizes):
@@ -76,7 +79,7 @@ def machine_speed() -> float:
     return _REFERENCE / best * math.pow(threads / 2, 0.8)
 
 
-def _seconds(config: GaussiansConfig, pixels: float, gaussians: int) -> float:
+def _seconds(config: "GaussiansConfig", pixels: float, gaussians: int) -> float:
     """Seconds of a step, on average, on the machine of the constants."""
     coarse = config.coarse
     share = (1 - coarse) + coarse * 2 / 3 / 4 + coarse / 3 / 16
