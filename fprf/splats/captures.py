@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from ..errors import DataError, UsageError
+from ..interfaces import Scene
 from ..io.images import to_uint8, write_image
 from ..style.colours import ColourMaps
 from ..style.look import Restyle
@@ -176,22 +177,22 @@ def light_alone(styled: Styled) -> Styled:
 
 
 def reference_views(
-    path: Path, look: LookConfig, folder: Path, *, views: int = 12
+    path: Path, look: LookConfig, folder: Path, *, views: int = 16
 ) -> tuple[tuple[Path, ...], tuple[Path, ...], tuple[float, ...]]:
     """Write pictures of views of a capture or of a run into a folder: in the place of photographs, as references.
 
     Returns them, masks of what they show, and the shares of them that show anything. Raises DataError where none does.
     """
     if (path / "config.json").is_file():
-        scene = open_run(path, device="cpu").scene
-        chosen = torch.linspace(0, len(scene.names) - 1, min(views, len(scene.names))).round().long()
-        cameras = scene.cameras.select(chosen)
+        scene: Scene = open_run(path, device="cpu").scene
     else:
         capture, encoder = read_capture(path), look.semantic.encoder.build()
         gaussians = sampled(capture.gaussians.drawable(), SAMPLE)
-        look = replace(look, views=views, size=_VIEW, up=look.up or capture.up)
+        # As many views as a capture that takes the style is looked at from: of one place both show alike shares.
+        look = replace(look, size=_VIEW, up=look.up or capture.up)
         scene = look_at_capture(gaussians, capture.antialiased, encoder, look, camera=capture.camera)
-        cameras = scene.cameras
+    chosen = torch.linspace(0, len(scene.names) - 1, min(views, len(scene.names))).round().long()
+    cameras = scene.cameras.select(chosen)
     pictures, masks, weights = list[Path](), list[Path](), list[float]()
     for view in range(len(cameras)):
         shown = scene.render(cameras, view)
