@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from unittest import mock
 
 import torch
@@ -19,13 +18,14 @@ from torch import Tensor
 
 from fprf.config import RenderConfig
 from fprf.datamanagers.features import FeatureStore
-from fprf.fields import planes
-from fprf.ops import backend, dense, march, mixture, triplane
-from fprf.rendering import renderer, space
+from fprf.fields.planes import ProposalField
+from fprf.ops import backend, dense, mixture, triplane
 from fprf.rendering.cameras import Cameras
 from fprf.style import matching
+from fprf.style.config import StyleConfig
+from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
-from fprf.style.restyle import restyle
+from fprf.style.restyle import apply_style
 from fprf.training.views import render_view
 
 from .common import arguments, report, train_run
@@ -51,14 +51,11 @@ def plain_lookups(store: FeatureStore, view: Tensor, pixel: Tensor, rgb: Tensor)
 
 
 packed: dict[int, FeatureStore] = {}
-no_march = SimpleNamespace(usable=never)
 SWITCHES: dict[str, Patches] = {
     "tri-planes": [(triplane, "usable", never)],
     "tri-planes: total variation": [(triplane, "variation", triplane.variation_reference)],
     "networks": [(dense, "usable", never)],
-    "marching": [(march, "usable", never)],
-    "marching: proposals": [(planes, "march", no_march)],
-    "marching: weights and sums": [(renderer, "compiled", no_march), (space, "march", no_march)],
+    "proposals": [(ProposalField, "kernels_apply", never)],
     "styles at points": [(mixture, "usable", never), (matching, "usable", never)],
     "styles at points: matching": [(matching, "usable", never)],
     "styles at points: maps": [(mixture, "usable", never)],
@@ -101,7 +98,9 @@ def tasks(subject: Subject, config: SpeedConfig) -> dict[str, Callable[[], objec
 
     calls: dict[str, Callable[[], object]] = {f"{every} training steps": steps}
     looks = {"view": None} | {
-        f"view, {name}": restyle(trained, subject.references, stylizer, clusters=config.clusters).restyle
+        f"view, {name}": apply_style(
+            trained, StyleFile(StyleConfig(references=subject.references, stylizer=stylizer, clusters=config.clusters))
+        ).restyle
         for name, stylizer in STYLES.items()
     }
     for name, look in looks.items():

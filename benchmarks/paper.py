@@ -31,13 +31,13 @@ from fprf.plugins.encoders.config import Vgg19Config
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionToneConfig, StylizerConfig
 from fprf.progress import Display
 from fprf.style.config import StyleConfig
+from fprf.style.dictionary import Encoders
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
-from fprf.style.references import Encoders
 from fprf.style.restyle import apply_style
 from fprf.training.driver import Report, learn, schedule_of
 from fprf.training.learner import FieldLearner
-from fprf.training.loading import Trained, encoders_of
+from fprf.training.loading import Trained
 from fprf.training.prepare import device_of, prepare, read_scene
 from fprf.training.run import Run
 from fprf.training.style_pass import measure_style
@@ -197,9 +197,10 @@ def short_training(config: TrainConfig, folder: Path, progress: Progress) -> Sho
     learner = FieldLearner(config, prepared, device_of(config.device))
     learn(learner, run, schedule_of(config, len(prepared.scene.train)), report)
     model = learner.model.requires_grad_(False).eval()
-    trained = Trained(run, config, "", run.load_known(), model, config.steps, time.perf_counter() - start)
-    scene = measure_style(config, model, prepared.scene.cameras, prepared.scene.train)
-    return Short(trained, encoders_of(trained, scene, prepared.basis))
+    seconds = time.perf_counter() - start
+    style = measure_style(config, model, prepared.scene.cameras, prepared.scene.train), prepared.basis
+    trained = Trained(run, config, "", run.load_known(), model, config.steps, seconds, style=lambda: style)
+    return Short(trained, trained.encoders())
 
 
 def held_out(trained: Trained, views: int) -> Row:

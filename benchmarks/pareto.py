@@ -14,8 +14,10 @@ from fprf.config import RenderConfig
 from fprf.io.figures import number
 from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.rendering.cameras import Cameras
+from fprf.style.config import StyleConfig
+from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
-from fprf.style.restyle import restyle
+from fprf.style.restyle import apply_style
 from fprf.training.loading import Trained
 from fprf.training.quality import PRESETS, QualityConfig, at_quality
 from fprf.training.views import render_view
@@ -121,7 +123,13 @@ def pareto(config: ParetoConfig, root: Path, folder: Path, progress: Progress) -
     known, watch = trained.known, watch_of(config, trained)
     cameras = [small_view(known.cameras, view, config.rays) for view in (known.test or known.train)[: config.views]]
     curves: dict[str, list[Point]] = {}
-    for name, look in (("plain", None), ("region-ot", restyle(trained, subject.references, RegionOtConfig()).restyle)):
+    for name, look in (
+        ("plain", None),
+        (
+            "region-ot",
+            apply_style(trained, StyleFile(StyleConfig(references=subject.references, stylizer=RegionOtConfig()))).restyle,
+        ),
+    ):
         # Strength 0 is judged by the plain colours: it must cost nothing and change nothing.
         chosen = dict(knobs(trained, look))
         still = {key: chosen.pop(key) for key in list(chosen) if key == "style at strength 0"}

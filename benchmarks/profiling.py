@@ -20,8 +20,10 @@ from fprf.checks import at_least
 from fprf.interfaces import Stylizer
 from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.rendering.renderer import render_rays
+from fprf.style.config import StyleConfig
+from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
-from fprf.style.restyle import restyle
+from fprf.style.restyle import apply_style
 from fprf.training.model import Model, background_of
 from fprf.types import Rays, Want
 
@@ -141,7 +143,7 @@ def profile(config: ProfileConfig, root: Path, folder: Path, progress: Progress)
     progress(1, 3, "rendering")
     render = trained.config.render
     rays = Rays(*(x[: render.chunk] for x in view_rays(trained.model, test_view(config, trained), 0)))
-    look = restyle(trained, subject.references, RegionOtConfig()).restyle
+    look = apply_style(trained, StyleFile(StyleConfig(references=subject.references, stylizer=RegionOtConfig()))).restyle
     background = background_of(trained.known.facts, device)
     for name, style in (("render", None), ("stylised render, region-ot", look)):
 

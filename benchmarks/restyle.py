@@ -29,10 +29,9 @@ from fprf.plugins.stylizers.config import (
 )
 from fprf.progress import Display
 from fprf.style.config import StyleConfig, labels
-from fprf.style.dictionary import StyleDictionary, build_dictionary
+from fprf.style.dictionary import Encoders, StyleDictionary, build_dictionary, encode_photograph
 from fprf.style.files import StyleFile
-from fprf.style.references import Encoders, encode_photograph
-from fprf.style.restyle import dress
+from fprf.style.restyle import apply_dictionary
 from fprf.training.driver import train
 from fprf.training.loading import open_run
 from fprf.types import Want
@@ -192,7 +191,7 @@ def in_scene(
     """A stylizer of the scene."""
     start = time.perf_counter()
     style = StyleConfig(references=tuple(paths), stylizer=config, bold=bold)
-    look = dress(scene, StyleFile(style), encoders, dictionary).restyle
+    look = apply_dictionary(scene, StyleFile(style), encoders, dictionary).restyle
     spent = time.perf_counter() - start
     pictures, seconds = _each(views, lambda view: view.restyled(look).rgb)
     matched = Want.SEMANTIC in look.stylizer.needs

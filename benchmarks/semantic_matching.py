@@ -30,10 +30,9 @@ from fprf.errors import DataError
 from fprf.interfaces import Encoder
 from fprf.plugins.encoders.config import SEMANTICS, EncoderConfig
 from fprf.plugins.stylizers.config import RegionToneConfig
-from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
+from fprf.style.dictionary import Reference, build_dictionary, semantic_samples
 from fprf.style.light import light_of
-from fprf.style.references import semantic_samples
-from fprf.style.scene import scene_style
+from fprf.style.scene_style import scene_style
 
 from .common import SHARED, report
 from .style_metrics import MIXED, whole_cells
@@ -262,10 +261,6 @@ def measured_confidence(encoder: Encoder, triplet: Triplet) -> tuple[list[Tensor
     here, _, _, kinds = _sampled(triplet.content, triplet.content_regions, encoder, basis)
     there, beyond, colour, shown = _sampled(triplet.style, triplet.style_regions, encoder, basis)
     scene = scene_style(here[:, :3], here, torch.ones(len(here)), None, _REGIONS, 0)
-
-    def match(dictionary: StyleDictionary) -> Tensor:
-        return RegionToneConfig().build(dictionary=dictionary, scene=scene).region_match(scene.keys)
-
     regions, right, wrong = shared_regions(triplet), [], []
     for gone in (None, *regions):
         left = shown != gone if gone is not None else torch.ones_like(shown, dtype=torch.bool)
@@ -274,7 +269,7 @@ def measured_confidence(encoder: Encoder, triplet: Triplet) -> tuple[list[Tensor
         dictionary = build_dictionary(
             [Reference("style", there[left, :3], there[left], colour=colour[left], beyond=beyond[left])]
         )
-        light = light_of(scene, dictionary, match, (scene.region_mean, scene.region_covariance), bold=0.5)
+        light = light_of(scene, dictionary, RegionToneConfig(), (scene.region_mean, scene.region_covariance), bold=0.5)
         assert light is not None  # a photograph has several regions
         sure = light.confidence(here)[:, 0]
         if gone is None:

@@ -17,12 +17,11 @@ from fprf.interfaces import Decoder, Encoder
 from fprf.ops.guided import upsample
 from fprf.plugins.stylizers.config import StylizerConfig
 from fprf.splats.restyle import region_maps
-from fprf.style.colours import colour_maps, own_colours
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import StyleDictionary
 from fprf.style.light import light_of
-from fprf.style.look import Restyle
-from fprf.style.scene import SceneStyle, scene_style
+from fprf.style.look import Restyle, colour_maps, own_colours
+from fprf.style.scene_style import SceneStyle, scene_style
 from fprf.types import Want
 
 _CELL = 8
@@ -83,12 +82,8 @@ def flat_look(flat: Flat, dictionary: StyleDictionary, config: StylizerConfig, d
     stylizer = config.build(dictionary=dictionary, scene=flat.style).to(device)
     light = None
     if config.light:
-
-        def match(part: StyleDictionary) -> Annotated[Tensor, "K T"]:
-            return config.build(dictionary=part, scene=flat.style).region_match(flat.style.keys)
-
         own = own_colours(stylizer, flat.style, decoder)
-        light = light_of(flat.style, dictionary, match, own, bold=StyleConfig.bold)
+        light = light_of(flat.style, dictionary, config, own, bold=StyleConfig.bold)
         light = None if light is None else light.to(device)
     if decoder is None:
         maps = region_maps(stylizer, dictionary, flat.style, config)

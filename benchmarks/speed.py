@@ -23,8 +23,9 @@ from fprf.plugins import slots
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from fprf.rendering.cameras import Cameras
 from fprf.style.config import StyleConfig
+from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
-from fprf.style.restyle import restyle
+from fprf.style.restyle import apply_style
 from fprf.training.loading import Trained
 from fprf.training.model import Facts, Model
 from fprf.training.prepare import Prepared
@@ -203,7 +204,12 @@ def cached_rows(config: SpeedConfig, subject: Subject, styles: dict[str, Stylize
     camera = small_view(known.cameras, (known.test or known.train)[0], CACHED)
     whole = int(camera.size[0].prod()) > 0.9 * CACHED
     view = cache_view(trained.model, known.facts, camera, 0, render)
-    looks = {name: restyle(trained, subject.references, s, clusters=config.clusters).restyle for name, s in styles.items()}
+    looks = {
+        name: apply_style(
+            trained, StyleFile(StyleConfig(references=subject.references, stylizer=s, clusters=config.clusters))
+        ).restyle
+        for name, s in styles.items()
+    }
     calls: dict[str, Callable[[], Tensor]] = {}
     for name, look in looks.items():
         calls[name] = lambda look=look: view.restyled(look).rgb  # type: ignore[misc]
@@ -217,7 +223,7 @@ def cached_rows(config: SpeedConfig, subject: Subject, styles: dict[str, Stylize
                 goal=_FAST if whole else None,
                 error=difference(calls[name](), calls[f"anew {name}"]()).largest,
                 error_kind="largest colour difference from the view rendered anew",
-                note=f"{size_of(camera)}, {view.bytes / 2**20:.0f} MiB cached",
+                note=size_of(camera),
             )
         )
     return rows
@@ -307,7 +313,9 @@ def _rendering(config: SpeedConfig, subject: Subject) -> tuple[list[Row], dict[s
     pixels = int(camera.size[0].prod())
     looks: dict[str, Restyle | None] = {"render": None}
     for name, stylizer in STYLES.items():
-        made = restyle(trained, subject.references, stylizer, clusters=config.clusters)
+        made = apply_style(
+            trained, StyleFile(StyleConfig(references=subject.references, stylizer=stylizer, clusters=config.clusters))
+        )
         looks[f"stylised, {name}"] = made.restyle
     model, facts, render = trained.model, trained.known.facts, trained.config.render
     rays = view_rays(model, camera, 0)
@@ -346,7 +354,10 @@ def _restyling(config: SpeedConfig, subject: Subject) -> list[Row]:
     made: dict[str, Stylizer] = {}
 
     def dictionary() -> None:
-        made["new"] = restyle(trained, subject.references[:1], RegionOtConfig(), clusters=config.clusters).restyle.stylizer
+        made["new"] = apply_style(
+            trained,
+            StyleFile(StyleConfig(references=subject.references[:1], stylizer=RegionOtConfig(), clusters=config.clusters)),
+        ).restyle.stylizer
 
     def first() -> None:
         dictionary()

@@ -1,7 +1,7 @@
 """Stress: every stage on adversarial inputs, each against a reference and a bound."""
 
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -17,8 +17,10 @@ from fprf.errors import FprfError
 from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.renderer import render_rays
+from fprf.style.config import StyleConfig
+from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
-from fprf.style.restyle import restyle
+from fprf.style.restyle import apply_style
 from fprf.testing import cases
 from fprf.training import tensorfiles
 from fprf.training.loading import Trained
@@ -132,7 +134,7 @@ OFFSET = (1e6, -3e6, 5e5)
 """Metres: of the size of UTM coordinates."""
 
 
-def invariants(trained: Trained, scene: Scene | None, cameras: Cameras, references: Sequence[Path]) -> list[Check]:
+def invariants(trained: Trained, scene: Scene | None, cameras: Cameras, references: tuple[Path, ...]) -> list[Check]:
     """Of one view; what needs the scene's images or points is left out without them."""
     model, facts = trained.model, trained.known.facts
     rays = view_rays(model, cameras, 0)
@@ -219,11 +221,11 @@ def _worlds(trained: Trained, scene: Scene, cameras: Cameras, plain: Tensor) -> 
     return rows
 
 
-def _styles(trained: Trained, rays: Rays, plain: Tensor, references: Sequence[Path]) -> list[Check]:
+def _styles(trained: Trained, rays: Rays, plain: Tensor, references: tuple[Path, ...]) -> list[Check]:
     model, facts, config = trained.model, trained.known.facts, trained.config.render
-    there = restyle(trained, references, RegionOtConfig()).restyle
-    back = restyle(trained, references[::-1], RegionOtConfig()).restyle
-    none = restyle(trained, references, RegionOtConfig(), strength=0.0).restyle
+    there = apply_style(trained, StyleFile(StyleConfig(references=references, stylizer=RegionOtConfig()))).restyle
+    back = apply_style(trained, StyleFile(StyleConfig(references=references[::-1], stylizer=RegionOtConfig()))).restyle
+    none = apply_style(trained, StyleFile(StyleConfig(references=references, stylizer=RegionOtConfig(), strength=0.0))).restyle
     styled, turned, still = (colours(model, facts, rays, config, look) for look in (there, back, none))
     return [
         _row("references in another order", "the same image", _largest(turned, styled), 1e-6),

@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -10,15 +9,13 @@ import torch
 from torch import Tensor
 
 from fprf.errors import FprfError
-from fprf.ops import march
 from fprf.ops.guided import upsample
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from fprf.rendering.stepfun import resample, transmittance_weights
-from fprf.style.clusters import kmeans
 from fprf.style.dictionary import whole_style
 from fprf.style.matching import point_shares
-from fprf.style.scene import SceneStyle, own_style
-from fprf.style.statistics import covariance, empty, merge, moments
+from fprf.style.scene_style import SceneStyle, own_style
+from fprf.style.statistics import covariance, empty, kmeans, merge, moments
 from fprf.testing import cases
 from fprf.types import Want
 
@@ -101,27 +98,21 @@ def exact_weights(density: Annotated[Tensor, "R S"], t: Annotated[Tensor, "R E"]
 
 
 def weights() -> list[Check]:
-    """Every case through the plain and the compiled form."""
-    forms: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-        "plain": transmittance_weights,
-        "compiled": lambda density, t: march.weigh(density, t, 0.0).weights,
-    }
+    """Every case, and gradients."""
     rows = []
     for name, (density, t) in _rays().items():
         truth = exact_weights(density.double(), t)
         tau = (density.double() * (t[:, 1:] - t[:, :-1]).double()).cumsum(-1)
-        for form, function in forms.items():
-            if len(density):
-                rows.append(_ray_row(f"{name}, {form}", "float64", _law(function(density, t), truth, tau), 1.0, "4u(1+τ)"))
+        if len(density):
+            rows.append(_ray_row(name, "float64", _law(transmittance_weights(density, t), truth, tau), 1.0, "4u(1+τ)"))
     density, t = _grid()
-    rows.append(_ray_row("zip-NeRF's grid, compiled", "finite", unsound(forms["compiled"](density, t)), 0, "non-finite"))
     density.requires_grad_(True)
     found = transmittance_weights(density, t)
     found.sum().backward()  # type: ignore[no-untyped-call]
     assert density.grad is not None
     bad = unsound(found.detach(), density.grad)
-    rows.append(_ray_row("zip-NeRF's grid, values and gradients, plain", "finite", bad, 0, "non-finite"))
-    rows.append(_ray_row("fog before a wall, gradient, plain", "float64", _gradient_error(), 1e-5, "of the largest"))
+    rows.append(_ray_row("zip-NeRF's grid, values and gradients", "finite", bad, 0, "non-finite"))
+    rows.append(_ray_row("fog before a wall, gradient", "float64", _gradient_error(), 1e-5, "of the largest"))
     return rows
 
 

@@ -36,10 +36,9 @@ from fprf.errors import DataError
 from fprf.evaluation.metrics import image_metrics, mean_metrics
 from fprf.interfaces import Encoder
 from fprf.io.images import srgb_to_linear
-from fprf.style.clusters import kmeans
-from fprf.style.controls import luma
+from fprf.style.light import luma
 from fprf.style.matching import unit
-from fprf.style.statistics import covariance, moments, symmetric_root
+from fprf.style.statistics import covariance, kmeans, moments, symmetric_root
 
 _INSIDE = 2
 """Pixels around one that must be of its region for it to lie inside."""

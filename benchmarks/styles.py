@@ -38,10 +38,10 @@ from fprf.io.images import shrink, to_uint8, write_image
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import SEMANTICS, BundledContentConfig, EncoderConfig, RandomConfig, Vgg19Config
 from fprf.style.config import StyleConfig
-from fprf.style.controls import luma
 from fprf.style.dictionary import Reference as Samples
 from fprf.style.dictionary import build_dictionary
 from fprf.style.files import StyleFile
+from fprf.style.light import luma
 from fprf.style.look import Restyle
 from fprf.style.restyle import apply_style
 from fprf.training.loading import Trained, load_run
@@ -354,7 +354,7 @@ def run_figures(root: Path, config: StylesConfig, judges: Mapping[str, Encoder])
                 there = style.classes
             rows = judge_exhibit(Exhibit(plain, styled, regions, style.images, there), judges, full=config.full)
             for name, pictures in styled.items():
-                warped = consistency(pictures, [view.depth for view in cached], near, pairs)
+                warped = consistency(pictures, [view.restyled().depth for view in cached], near, pairs)
                 rows[name] |= {"consistency_rmse": warped["rmse"], "consistency_relative": warped["relative"]}
             cases[style.name] = rows
             shown[style.name] = {"reference": style.images[0], **{name: views[0] for name, views in styled.items()}}

@@ -27,10 +27,10 @@ from .plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from .rendering.cameras import Cameras
 from .rendering.paths import look_at, make_path, pinhole, upwards
 from .style.config import StyleConfig, with_preset
+from .style.dictionary import Encoders
 from .style.files import StyleFile, check_photographs, read_style, with_folders, write_style
 from .style.look import Restyle
 from .style.match_maps import MatchMap, match_map
-from .style.references import Encoders
 from .style.restyle import Styled, apply_style, mixed
 from .training.loading import LoadedRun, open_run
 from .training.quality import Name, QualityConfig

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
 
@@ -199,6 +199,8 @@ class RunConfig:
     """Fields that may differ when a run is resumed, beside RESUMABLE: nothing that is trained depends on them."""
     former: ClassVar[tuple[str, ...]] = ()
     """Fields of files written before that mean nothing any more."""
+    open: ClassVar[tuple[str, ...]] = ("downscale",)
+    """Fields whose value may be None, which `planned` decides before a run begins."""
 
     data: Path | None = None
     """Scene folder, which must be named; `garden` is the embedded one."""
@@ -265,6 +267,14 @@ class RunConfig:
         `device` is a kind of device: cpu, cuda, mps. Here the smallest at which no image has more pixels than 640 x 360.
         """
         return max(1, math.ceil(math.sqrt(int(scene.cameras.size.prod(1).max()) / _WHOLE_PIXELS)))
+
+    def planned(self, scene: "ParsedScene", device: str) -> "RunConfig":
+        """The config with what it leaves open decided, from a scene at its own size; arguments as of `find_downscale`."""
+        return self if self.downscale is not None else replace(self, downscale=self.find_downscale(scene, device))
+
+    def described(self) -> str:
+        """What a plan says beside views and their size, to be shown before training begins."""
+        return ""
 
     def changeable(self, before: "RunConfig") -> tuple[str, ...]:
         """Fields that may differ from those that a run was begun with when it goes on."""

@@ -47,11 +47,9 @@ if TYPE_CHECKING:
     from .rendering.renderer import Parts
     from .rendering.space import Space
     from .splats.gaussians import GaussianRows
-    from .style.colours import ColourMaps
-    from .style.dictionary import StyleDictionary
-    from .style.look import Restyle
-    from .style.references import Encoders
-    from .style.scene import SceneStyle
+    from .style.dictionary import Encoders, StyleDictionary
+    from .style.look import ColourMaps, Restyle
+    from .style.scene_style import SceneStyle
     from .training.model import Facts
     from .training.run import Run
 
@@ -180,7 +178,7 @@ class Stylizer(nn.Module, ABC):
     def shared(
         self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
     ) -> tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N K"] | None]:
-        """`forward`, and the points' shares of the scene's regions (`style.scene.membership`), if it has found them.
+        """`forward`, and the points' shares of the scene's regions (`style.scene_style.membership`), if it has found them.
 
         What follows, such as strengths and colours by region, then need not find them again.
         """

@@ -11,10 +11,10 @@ import torch
 from ops.plain_forms import plainly
 from torch import Tensor
 
-from fprf.ops import dense, guided, march, mixture, triplane
+from fprf.ops import dense, guided, mixture, triplane
 from fprf.rendering import cameras, lens, space, splines, stepfun
 from fprf.rendering.lens import lens_reach
-from fprf.style import clusters, controls, dictionary, matching, scene, statistics
+from fprf.style import dictionary, light, look, matching, scene_style, statistics
 
 Made = Sequence[Tensor]
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -56,15 +56,6 @@ def _covariances(count: int, channels: int) -> Tensor:
 
 def _planes(points: int) -> Made:
     return 2 * _unit(points, 3) - 1, 0.5 * _draw(triplane.rows((8, 16)), 16), 0.1 * _draw(32)
-
-
-def _weighed(density: Tensor, t: Tensor) -> tuple[Tensor, ...]:
-    with torch.no_grad():
-        if not march.usable(density, t):  # the plain form, as the renderer falls back to
-            weights = stepfun.transmittance_weights(density, t)
-            return weights, weights.sum(-1), torch.exp(-(density * t.diff(dim=-1)).sum(-1))
-        found = march.weigh(density, t, 0.0)
-        return found.weights, found.opacity, found.transmittance
 
 
 def _lenses(count: int) -> Made:
@@ -149,7 +140,6 @@ CASES = [
     Case("guided.apply", lambda n: (_draw(4, 5, 6, 4), 37 * _unit(n, 2), _unit(n, 3)),
          lambda c, p, rgb: guided.apply(c, p, rgb, (37, 37))),
     Case("space.distance", lambda n: (_edges(n, 21), _unit(n) + 0.05, 9 * _unit(n) + 2), _open("contraction").distance),
-    Case("march.weigh", lambda n: (4 * _unit(n, 20), 3 * _edges(n, 20)), _weighed),
     Case("mixture.affine", lambda n: (_draw(n, 16), _shares(n, 3), _draw(3, 16, 16), _draw(3, 16), _draw(16)),
          lambda x, s, m, b, c: mixture.affine(x, s, m, b, centre=c)),
     Case("mixture.affine, plain", lambda n: (_draw(n, 16), _shares(n, 3), _draw(3, 16, 16), _draw(3, 16), _draw(16)),
@@ -163,21 +153,19 @@ CASES = [
     Case("triplane.variation", lambda n: (_draw(triplane.rows((n,)), 8),), lambda t: triplane.variation(t, (_side(t),)),
          slopes=(0,), sizes=(2, 3, 37, 128)),
     Case("matching.match_keys", lambda n: (_draw(n, 6), _unit(n) + 0.1, _draw(5, 6), _unit(5) + 0.1),
-         lambda k, s, l, r: matching.match_keys(matching.Keys(k, s), matching.Keys(l, r),
-                                                 matching.Matching(1.0), torch.ones(5)), sizes=(1, 37, 500)),
-    Case("matching.whitener", lambda n: (_draw(n, 6), _unit(n) + 0.1),
-         lambda k, s: matching.whitener(matching.Keys(k, s), 0.5), sizes=(1, 37, 500)),
-    Case("clusters.kmeans", lambda n: (_draw(n, 4) + 20 * (_unit(n, 1) * 3).floor(),), lambda x: clusters.kmeans(x, 3, seed=0)),
-    Case("controls.blend_strength", lambda n: (_draw(n, 9), _draw(n, 9, seed=5), _unit(n, 1)), controls.blend_strength,
+         lambda k, s, l, r: matching.match_keys(k, s, l, r, torch.ones(5), temperature=1.0), sizes=(1, 37, 500)),
+    Case("matching.whitener", lambda n: (_draw(n, 6), _unit(n) + 0.1), lambda k, s: matching.whitener(k, s, 0.5),
+         sizes=(1, 37, 500)),
+    Case("statistics.kmeans", lambda n: (_draw(n, 4) + 20 * (_unit(n, 1) * 3).floor(),),
+         lambda x: statistics.kmeans(x, 3, seed=0)),
+    Case("look.blend_strength", lambda n: (_draw(n, 9), _draw(n, 9, seed=5), _unit(n, 1)), look.blend_strength,
          slopes=(0, 1)),
-    Case("controls.luma", lambda n: (_unit(n, 3),), controls.luma, slopes=(0,)),
-    Case("controls.keep_luminance", lambda n: (_unit(n, 3), _unit(n, 3, seed=5), _unit(n, 1)), controls.keep_luminance),
+    Case("light.luma", lambda n: (_unit(n, 3),), light.luma, slopes=(0,)),
+    Case("look.keep_luminance", lambda n: (_unit(n, 3), _unit(n, 3, seed=5), _unit(n, 1)), look.keep_luminance),
     Case("dictionary.blend_codes", lambda n: (*_code(n), _draw(6), _covariances(1, 6)[0]),
          lambda m, c, b, w, v: dictionary.blend_codes(m, c, w, v, b.clamp(0, 1)), sizes=(0, 1, 37, 500)),
     Case("matching.unit", lambda n: (_draw(n, 8), _draw(8)), matching.unit, slopes=(0,)),
     Case("matching.share_mean", lambda n: (_draw(n, 8), _unit(n) + 0.1), matching.share_mean, sizes=(1, 37, 20_000)),
-    Case("matching.compared", lambda n: (_draw(n, 8), _draw(7, 8), _draw(8, seed=5), _draw(8, seed=6)),
-         lambda q, k, a, b: matching.compared(q, k, "cosine", queries_centre=a, keys_centre=b)),
     Case("matching.scores", lambda n: (_draw(n, 8), _draw(7, 8)), matching.scores, slopes=(0, 1)),
     Case("matching.score_spread", lambda n: (_draw(n, 8), _draw(7, 8)),
          lambda q, k: torch.tensor(matching.score_spread(q, k), dtype=torch.float64)),
@@ -185,10 +173,11 @@ CASES = [
          lambda q, k, p: matching.attention(q, k, 0.7, p), slopes=(0, 1)),
     Case("matching.point_shares", lambda n: (_draw(n, 8), _draw(7, 8), _draw(8, seed=6)),
          lambda q, k, c: matching.point_shares(q, k, 0.7, centre=c)),
-    Case("scene.region_units", lambda n: (_draw(n, 8), _draw(8)), lambda k, c: scene.region_units(k, c)[0],
+    Case("scene_style.region_units", lambda n: (_draw(n, 8), _draw(8)), lambda k, c: scene_style.region_units(k, c)[0],
          sizes=(0, 1, 37, 500)),
-    Case("scene.membership", lambda n: (_draw(n, 8), _draw(8, seed=6), torch.nn.functional.normalize(_draw(5, 8), dim=-1)),
-         lambda x, c, u: scene.membership(x, c, u, 0.5)),
+    Case("scene_style.membership",
+         lambda n: (_draw(n, 8), _draw(8, seed=6), torch.nn.functional.normalize(_draw(5, 8), dim=-1)),
+         lambda x, c, u: scene_style.membership(x, c, u, 0.5)),
     Case("statistics.moments", lambda n: (_draw(n, 6) + 100, _unit(n)), _moments),
     Case("statistics.group_moments", lambda n: (_draw(n, 6), _shares(n, 3)), statistics.group_moments),
     Case("statistics.mix", _code, statistics.mix, sizes=(1, 37, 500)),

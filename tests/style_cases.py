@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
-from fprf.style.scene import SceneStyle, scene_style
+from fprf.style.scene_style import SceneStyle, scene_style
 
 
 class Setting(NamedTuple):

@@ -18,8 +18,10 @@ from tiny_world import World, prepared_for, taught
 from fprf.config import TrainConfig
 from fprf.ops import triplane
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
-from fprf.style.restyle import restyle
-from fprf.style.scene import to_tensors
+from fprf.style.config import StyleConfig
+from fprf.style.files import StyleFile
+from fprf.style.restyle import apply_style
+from fprf.style.scene_style import to_tensors
 from fprf.training import driver, learner
 from fprf.training.driver import Report
 from fprf.training.loading import load_run
@@ -140,7 +142,7 @@ def test_styles_are_those_of_the_cpu(world: World, device: Device, stylizer: Sty
     drawn = []
     for at in ("cpu", str(device.at)):
         run = load_run(world.run, at)
-        look = restyle(run, world.references, stylizer, clusters=4).restyle
+        look = apply_style(run, StyleFile(StyleConfig(references=world.references, stylizer=stylizer, clusters=4))).restyle
         drawn.append(render_view(run.model, run.known.facts, run.known.cameras, 2, run.config.render, look).rgb)
     assert (drawn[0] - drawn[1]).abs().max() <= 4 * LEVEL and (drawn[0] - drawn[1]).abs().mean() <= LEVEL / 10
 

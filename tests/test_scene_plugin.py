@@ -26,8 +26,8 @@ from fprf.interfaces import Figures, Scene, SceneLearner, SceneView, State
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.rendering.cameras import grid_rays
 from fprf.splats.restyle import Colours, region_maps
-from fprf.style.references import Encoders
-from fprf.style.scene import scene_style
+from fprf.style.dictionary import Encoders
+from fprf.style.scene_style import scene_style
 from fprf.training import checkpoint
 from fprf.training.loading import LoadedRun
 from fprf.training.prepare import facts_of

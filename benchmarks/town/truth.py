@@ -28,8 +28,7 @@ from fprf.datamanagers.config import GuidedConfig
 from fprf.errors import DataError, UsageError
 from fprf.interfaces import Scene, SceneView
 from fprf.rendering.cameras import Cameras
-from fprf.style.dictionary import StyleDictionary
-from fprf.style.references import Encoders
+from fprf.style.dictionary import Encoders, StyleDictionary
 from fprf.style.statistics import monge
 from fprf.training.prepare import read_scene
 from fprf.training.run import Known

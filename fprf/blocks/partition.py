@@ -230,8 +230,7 @@ def _interval(first: float, last: float, size: int) -> tuple[int, int]:
     return min(start, size - length), length
 
 
-_FORMAT, _FORMER = 6, 1
-"""Of both kinds, and of `blocks.json` before."""
+_FORMAT = 6
 _Windows = tuple[tuple[int, int, int, int, int], ...]
 """View, left, top, width, height of each."""
 
@@ -261,16 +260,10 @@ def write_cells(file: Path, cells: Sequence[Cell]) -> bool:
 
 
 def read_cells(file: Path) -> list[Cell]:
-    """Read a partition. Raises CheckpointError, also for blocks of a street, which were turned."""
+    """Read a partition. Raises CheckpointError."""
     with open_json(file, "train the scene again with --output ANOTHER") as document:
-        if document["format"] == _FORMER:
-            boxes = document["boxes"]
-            low, high, turn = (torch.tensor(boxes[key], dtype=torch.float64) for key in ("low", "high", "turn"))
-            if low.ndim != 2 or low.shape != high.shape or low.shape[1] != 3:
-                raise ValueError(f"boxes of shapes {tuple(low.shape)} and {tuple(high.shape)}")
-            if not torch.equal(turn, torch.eye(3, dtype=torch.float64).expand(len(low), 3, 3)):
-                raise ValueError("its blocks are turned, as --blocks street made them; --blocks adaptive cuts streets now")
-            return _blocks(list(zip(low, high, strict=True)), float(boxes["margin"]))
+        if document["format"] != _FORMAT:
+            raise ValueError(f"format {document['format']!r}, this fprf reads {_FORMAT}")
         frame = torch.tensor(document["frame"], dtype=torch.float64).reshape(3, 3)
         return [
             Cell(

@@ -78,8 +78,14 @@ def run(args: list[str]) -> int:
     )
     config = parse(DoctorConfig(), args, prog="fprf doctor", description=about, positional=("target",))
     target = config.target
+    findings: Iterator[Finding]
     if config.clean:
-        findings: Iterator[Finding] = cleaned(feature_folder())
+        from ..training.prepare import cache_folder
+
+        folder = cache_folder() / "features"
+        size = _size(folder)
+        shutil.rmtree(folder, ignore_errors=True)
+        findings = iter([Finding("features", f"{(size - _size(folder)) / _MIB:.0f} MiB deleted in {folder}")])
     elif target is None:
         findings = chain(machine(), self_test(config.device))
     elif (target / "config.json").is_file():
@@ -102,8 +108,6 @@ def run(args: list[str]) -> int:
 
 def machine() -> Iterator[Finding]:
     """Versions, processors, accelerators, optional packages, weights, plug-ins."""
-    from ..datamanagers.features import CACHED_BYTES
-
     yield Finding("fprf", f"{__version__}, Python {platform.python_version()}, {platform.platform()}")
     # Packages that pyproject.toml requires, without importing them.
     for requirement in requires("fprf") or ():
@@ -120,11 +124,14 @@ def machine() -> Iterator[Finding]:
         yield from _devices()
     except Exception as error:  # a broken installation is a finding, not a crash
         yield Finding("torch", f"{type(error).__name__}: {error}", "pip install --force-reinstall torch")
+    from ..datamanagers.features import CACHED_BYTES
+    from ..training.prepare import cache_folder
+
     yield from speed(os.environ)
     free = shutil.disk_usage(Path.cwd()).free
     clean = "fprf doctor --clean    # deletes feature targets, which are made again when needed"
     yield Finding("disk", f"{free / 1024**3:.1f} GiB free here", clean if free < _LEAST_DISK else "")
-    folder, most = feature_folder(), 2 * CACHED_BYTES / _MIB  # content and semantics
+    folder, most = cache_folder() / "features", 2 * CACHED_BYTES / _MIB  # content and semantics
     yield Finding("features", f"{_size(folder) / _MIB:.0f} MiB of at most {most:.0f} in {folder}; --clean deletes them")
     # Networks that ship with the package, and those that were downloaded.
     for kind, names in _SHIPPED.items():
@@ -213,20 +220,6 @@ def method_needs(name: str) -> Iterator[Finding]:
     filled = (f"{slot.path} {registry.name_of(slot.kind.group, type(slot.value))}" for slot in slots(config) if slot.value)
     yield Finding("method", f"{name}: {', '.join(filled)}")
     yield Finding("next", f"fprf train {name} --data FOLDER")
-
-
-def cleaned(folder: Path) -> Iterator[Finding]:
-    """Delete the cached feature targets."""
-    size = _size(folder)
-    shutil.rmtree(folder, ignore_errors=True)
-    yield Finding("features", f"{(size - _size(folder)) / _MIB:.0f} MiB deleted in {folder}")
-
-
-def feature_folder() -> Path:
-    """Folder of cached feature targets."""
-    from ..training.prepare import cache_folder
-
-    return cache_folder() / "features"
 
 
 def _size(folder: Path) -> int:

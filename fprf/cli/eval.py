@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from ..training.run import History
 
 
+_LONGEST = 1600
+"""Longest side of views as they are judged, where neither the user nor the training says another."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class EvalConfig(QualityConfig):
     """The run and the measurements."""
@@ -26,6 +30,8 @@ class EvalConfig(QualityConfig):
     """Run folder."""
     split: Literal["test", "train", "all"] = "test"
     """Views to judge."""
+    size: int | None = None
+    """Longest side in pixels at which views are judged; none = the photographs' own, up to 1600 pixels."""
     data: Path | None = None
     """Scene folder, where it has moved since training."""
     fit_poses: bool = False
@@ -70,9 +76,14 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
     scene, known = opened.scene, opened.known
     trained = opened.run.load_config()[0]
     trained = replace(trained, data=config.data or trained.data)
-    captured = at_origin(read_scene(trained), known.facts.origin)
+    captured = at_origin(read_scene(replace(trained, downscale=1)), known.facts.origin)
     if tuple(view_names(captured.paths)) != known.names:
         raise UsageError(f"{trained.data}: its images are not those of the run; name the folder with --data")
+    # What a person looks at are the photographs, whatever size they were trained at.
+    longest, before = int(captured.cameras.size.max()), known.cameras.size
+    wanted = min(longest, config.size or max(_LONGEST, int(before.max())))
+    captured = replace(captured, cameras=captured.cameras.scaled(longest / wanted) if wanted < longest else captured.cameras)
+    known = replace(known, cameras=known.cameras.resized(captured.cameras.size))
     views, fitted = known.views(config.split), {}
     with Display() as display:
         if config.fit_poses:
@@ -85,6 +96,8 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
         "scene": known.name,
         "split": config.split,
         "quality": config.quality,
+        "size": "{}x{}".format(*captured.cameras.size[views[0]].tolist()),
+        "trained_size": "{}x{}".format(*before[views[0]].tolist()),
         **found,
         "train_seconds": opened.seconds,
         "train_steps": opened.step,
@@ -133,4 +146,6 @@ def _print(metrics: dict[str, object]) -> None:
     assert isinstance(warped, dict)
     if warped["rmse"] is not None:
         table.add_row("consistency rmse", f"{warped['rmse']:.4f}", f"over {warped['valid_share']:.0%} of the pixels")
+    judged, trained = str(metrics["size"]), str(metrics["trained_size"])
+    table.add_row("size", judged, "" if judged == trained else f"trained at {trained}")
     Console(highlight=False).print(table)

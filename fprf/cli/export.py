@@ -31,9 +31,8 @@ A look of the scene is a file: splats.ply as it is, splats.NAME.ply in a style, 
 
 def run(args: list[str]) -> int:
     """Render views, fit Gaussians to them or mesh them where that is wanted, write the files."""
-    config, file = read_flags(
-        ExportConfig(), _kinds_as_flag(args), prog="fprf export", description=_DESCRIPTION, positional=("run",)
-    )
+    words = ("run", "kinds")
+    config, file = read_flags(ExportConfig(), args, prog="fprf export", description=_DESCRIPTION, positional=words)
     what = plan(config.kinds, config.output or config.run / "exports")
     styles = named_styles(config.styles, file)
     if config.references:  # the style of the flags, called as its file or its photographs
@@ -228,13 +227,3 @@ class _Export:
                 path = self.what.single or self.what.folder / "luts" / look.name / f"{region}.cube"
                 write_cube(path, table, f"{look.name} {region}")
         return {"luts": made}
-
-
-def _kinds_as_flag(args: list[str]) -> list[str]:
-    """Words behind the run name kinds: RUN ply splat ... is RUN --kinds ply splat ..."""
-    end = 1
-    while end < len(args) and not args[end].startswith("-"):
-        end += 1
-    if end == 1 or args[0].startswith("-"):
-        return args
-    return [args[0], "--kinds", *args[1:end], *args[end:]]

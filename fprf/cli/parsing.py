@@ -243,15 +243,15 @@ def _tyro(config: C, args: list[str], *, prog: str, description: str, positional
 
 
 def _with_positional(config: Any, names: tuple[str, ...]) -> Any:
-    """The config with some fields marked as positional, in a subclass that checks nothing yet; None can be left out."""
+    """The config with some fields marked as positional, in a subclass that checks nothing yet; None and () can be left out."""
     import tyro
 
     if not names:
         return config
-    hints = hints_of(type(config))
+    hints, optional = hints_of(type(config)), (None, ())
     marked = []
     for name in names:
-        hint = None if getattr(config, name) is None else "(required)"
+        hint = None if getattr(config, name) in optional else "(required)"
         arg = tyro.conf.arg(metavar=name.upper(), help_behavior_hint=hint)
         marked.append((name, Annotated[hints[name], tyro.conf.Positional, arg]))
     kind = dataclasses.make_dataclass(
@@ -263,7 +263,7 @@ def _with_positional(config: Any, names: tuple[str, ...]) -> Any:
         kw_only=True,
     )
     values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
-    return kind(**values | {name: tyro.MISSING for name in names if values[name] is not None})
+    return kind(**values | {name: tyro.MISSING for name in names if values[name] not in optional})
 
 
 def _slot_flags(filled: list[Slot]) -> Any:

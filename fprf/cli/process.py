@@ -92,14 +92,14 @@ def _check(root: Path) -> None:
     from ..datamanagers.parsers.config import parse_scene
     from ..splats.config import GaussiansConfig
     from ..training.driver import default_output
-    from ..training.prepare import with_downscale
+    from ..training.prepare import planned
     from .train import DEFAULT_METHOD
 
     config = GaussiansConfig(data=root, minutes=MINUTES)
     delivered = parse_scene(root, 1, None)
     for note in delivered.notes:
         print(f"note: {note}")
-    size = with_downscale(config).downscale or 1
+    size = planned(config).downscale or 1
     width, height = delivered.cameras.scaled(size).size[0].tolist()
     run = default_output(config, DEFAULT_METHOD)
     print(f"{len(delivered.train)} + {len(delivered.test)} views, trained at {width}x{height}")

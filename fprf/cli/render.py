@@ -11,7 +11,8 @@ from ..checks import at_least
 from ..errors import ConfigError, UsageError
 from ..progress import Display
 from ..style.config import StyleConfig
-from ..style.keyframes import keyed_looks, read_keyframes
+from ..style.files import read_keyframes
+from ..style.restyle import keyed_looks
 from ..training.quality import QualityConfig
 from .style_flags import named_styles, read_flags
 

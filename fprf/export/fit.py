@@ -22,7 +22,7 @@ from ..splats.gaussians import Gaussians
 from ..splats.initial import Points
 from ..splats.learner import GaussianLearner
 from ..splats.photographs import make_levels
-from ..splats.training import find_near, reach_of
+from ..splats.training import find_near, scene_scale
 from ..style.look import Restyle
 from ..training.driver import Report, Schedule, learn
 from .mesh import Maps
@@ -75,19 +75,19 @@ def fit_gaussians(
     draw, points = np.random.default_rng(0), seen_points(maps, max(1, round(_BEGIN * cap)))
     near = find_near(parsed, points)
     config = GaussiansConfig(cap=cap, background=background or (0.0, 0.0, 0.0))
-    reach = reach_of(parsed)
+    scale = scene_scale(parsed)
     learner = None
     for number, look in enumerate(looks):
         images = _renders(scene, cameras, look, report)
         levels = make_levels(parsed, images, {}, near)
         # The first look decides the geometry; in further ones the same Gaussians learn their colours at full size.
         if learner is None:
-            learner = GaussianLearner(config, levels, reach, cap)
+            learner = GaussianLearner(config, levels, scale, cap)
             learner.begin_at(points, draw)
             seconds = 60 * minutes
         else:
             before = learner
-            learner = GaussianLearner(replace(config, coarse=0.0), levels, reach, cap, only="colours")
+            learner = GaussianLearner(replace(config, coarse=0.0), levels, scale, cap, only="colours")
             learner.start_from(before.gaussians())
             seconds = 60 * minutes * _COLOURS
         what = "fitting Gaussians" if number == 0 else "fitting colours"

@@ -18,7 +18,7 @@ from ..interfaces import Scene
 from ..io.atomic import write_text
 from ..rendering.cameras import pixel_grid
 from ..style.look import Restyle
-from ..style.scene import Membership
+from ..style.scene_style import Membership
 
 SMOOTH, REACH = 1e-3, 0.25
 """s: pairs in a fourteenth of the cube outweigh the bending of a twentieth of its side. r: away from pairs D fades over it."""

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from ..interfaces import ContentField, SemanticField
-from ..ops import dense, march, triplane
+from ..ops import dense, triplane
 from ..ops.harmonics import spherical_harmonics
 from ..types import FieldSample
 from .config import PlanesConfig, SemanticPlanesConfig
@@ -164,4 +164,4 @@ class ProposalField(nn.Module):
 
     def kernels_apply(self, *tensors: Tensor) -> bool:
         """Return whether `ops.march.propose` may read the planes: without gradients, on the CPU, channels in whole vectors."""
-        return march.usable(*tensors) and triplane.usable(tensors[0], self.planes.table)
+        return dense.usable(*tensors) and triplane.usable(tensors[0], self.planes.table)

@@ -1,4 +1,4 @@
-"""The compiled loops behind `march`: what happens along one ray stays in the cache.
+"""The compiled loop behind `march.propose`: what happens along one ray stays in the cache.
 
 Arrays are flat, contiguous float32, rays side by side. `warp` holds 0 for a contraction, 1 for a box or 2 for the
 distances of a contraction with points as they are, then what a box subtracts and multiplies on each axis (`rendering.space`).
@@ -27,6 +27,7 @@ _0, _1, _HALF, _2 = np.float32(0), np.float32(1), np.float32(0.5), np.float32(2)
 def _distances(s, first, edges, near, far, warp, t, to):
     """`Space.distance` of one ray."""
     if warp[0] != _1:
+        # g is linear in s up to 1; beyond, its complement c keeps the relative accuracy.
         g_near = _HALF * near if near < _1 else _1 - _HALF / near
         g_far = _HALF * far if far < _1 else _1 - _HALF / far
         c_near = _1 - _HALF * near if near < _1 else _HALF / near
@@ -43,6 +44,7 @@ def _distances(s, first, edges, near, far, warp, t, to):
 @numba.njit(inline="always", cache=True)
 def _locate(origin, direction, ray, t, first, count, warp, out, to, apart, across):
     """Middles of `count` steps in the unit cube (`Space.locate`)."""
+    # Axis by axis, which the compiler turns into vectors.
     for axis in range(3):
         o, d = origin[3 * ray + axis], direction[3 * ray + axis]
         for k in range(count):
@@ -63,13 +65,8 @@ def _locate(origin, direction, ray, t, first, count, warp, out, to, apart, acros
 
 
 @numba.njit(inline="always", cache=True)
-def _padded(count):
-    return (count + WIDE - 1) // WIDE * WIDE
-
-
-@numba.njit(inline="always", cache=True)
 def _weights(tau, before, w, samples):
-    """w = exp(-before) (1 - exp(-tau)); arrays padded to whole vectors. Returns the optical depth of the ray."""
+    """w_i = exp(-sum_j<i tau_j) (1 - exp(-tau_i)) (paper, Eq. 2); arrays padded to whole vectors."""
     total = 0.0  # float64, so that the error does not grow with the number of samples
     for k in range(samples):
         before[k] = np.float32(-total)
@@ -81,7 +78,6 @@ def _weights(tau, before, w, samples):
         store(w, k, opaque(load(tau, k, WIDE)))
     for k in range(samples):
         w[k] *= before[k]
-    return np.float32(total)
 
 
 @numba.njit(inline="always", cache=True)
@@ -112,12 +108,14 @@ def propose(origin, direction, near, far, s, warp, table, size, channels, weight
     """
     rays = len(near)
     edges, count = len(s) // rays, len(out) // rays - 1
-    samples, room = edges - 1, _padded(edges - 1)
+    samples = edges - 1
+    room = (samples + WIDE - 1) // WIDE * WIDE
     for task in numba.prange((rays + RAYS - 1) // RAYS):
         t, point, feature = np.empty(edges, np.float32), np.empty(3 * STRETCH, np.float32), np.empty(channels, np.float32)
         corner, part = np.empty(3 * BLOCK, np.int64), np.empty(3 * BLOCK, np.float32)
         tau, before, w = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
         for ray in range(task * RAYS, min(rays, task * RAYS + RAYS)):
+            # Distances of the edges first; then density, stretch by stretch, as long as light gets there.
             _distances(s, ray * edges, edges, near[ray], far[ray], warp, t, 0)
             depth = _0
             for first in range(0, samples, STRETCH):
@@ -127,6 +125,7 @@ def propose(origin, direction, near, far, s, warp, table, size, channels, weight
                         tau[k] = _0
                     break
                 _locate(origin, direction, ray, t, first, some, warp, point, 0, 1, STRETCH)
+                # The field at the middles: the product of three planes, and one linear map of it.
                 cells(point, 0, some, 1, STRETCH, size, 0, channels, corner, part)
                 for k in range(some):
                     a, b, c = corner[k], corner[BLOCK + k], corner[2 * BLOCK + k]
@@ -134,130 +133,12 @@ def propose(origin, direction, near, far, s, warp, table, size, channels, weight
                     for g in range(0, channels, NARROW):
                         product_forward(table, feature, a + g, b + g, c + g, g, channels, size * channels, u, v, x, NARROW)
                     tau[first + k] = min(dot(feature, 0, weight, 0, channels) - _1, limit)
+                # Density times length is optical depth.
                 for k in range(first, min(room, first + STRETCH), WIDE):
                     store(tau, k, exp(load(tau, k, WIDE)))
                 for k in range(first, first + some):
                     tau[k] *= t[k + 1] - t[k]
                     depth += tau[k]
+            # The next edges lie where the weights are.
             _weights(tau, before, w, samples)
             _resample(s, ray * edges, w, samples, padding, count, shift[ray], out, ray * (count + 1))
-
-
-@_jit
-def distances(s, near, far, warp, t):
-    """Ray parameters t [R E] of edges s [R E]."""
-    rays = len(near)
-    edges = len(s) // rays
-    for task in numba.prange((rays + RAYS - 1) // RAYS):
-        for ray in range(task * RAYS, min(rays, task * RAYS + RAYS)):
-            _distances(s, ray * edges, edges, near[ray], far[ray], warp, t, ray * edges)
-
-
-@_jit
-def place(origin, direction, t, warp, point):
-    """Middles [R S 3] of the steps between edges t [R E], in the unit cube."""
-    rays = len(origin) // 3
-    edges = len(t) // rays
-    for task in numba.prange((rays + RAYS - 1) // RAYS):
-        for ray in range(task * RAYS, min(rays, task * RAYS + RAYS)):
-            _locate(origin, direction, ray, t, ray * edges, edges - 1, warp, point, ray * (edges - 1) * 3, 3, 1)
-
-
-@numba.njit(inline="always", cache=True)
-def _heaviest(w, samples, budget, order, keep, to):
-    """`stepfun.keep_heaviest` of one ray; returns how many are kept."""
-    light, kept = 0, 0
-    for k in range(samples):
-        # A sample above the budget stays whatever the others are; a NaN stays to be seen.
-        keep[to + k] = not (w[k] <= budget)
-        if keep[to + k]:
-            kept += 1
-            continue
-        at = light
-        while at > 0 and w[order[at - 1]] > w[k]:
-            order[at] = order[at - 1]
-            at -= 1
-        order[at] = k
-        light += 1
-    dropped = _0
-    for k in range(light):
-        dropped += w[order[k]]
-        if not (dropped <= budget):
-            keep[to + order[k]] = True
-            kept += 1
-    return kept
-
-
-@_jit
-def weigh(density, t, budget, weights, depth, opacity, transmittance, keep, kept):
-    """Weights [R S] of densities between edges, expected distance, opacity and its complement; which samples to keep."""
-    rays = len(depth)
-    samples = len(density) // rays
-    room = _padded(samples)
-    for task in numba.prange((rays + RAYS - 1) // RAYS):
-        tau, before, w = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
-        order = np.empty(samples, np.int64)
-        first = task * RAYS
-        last = min(rays, first + RAYS)
-        optical = np.zeros(_padded(RAYS), np.float32)
-        for ray in range(first, last):
-            edge = ray * (samples + 1)
-            for k in range(samples):
-                tau[k] = density[ray * samples + k] * (t[edge + k + 1] - t[edge + k])
-            optical[ray - first] = _weights(tau, before, w, samples)
-            total, mean = _0, _0
-            for k in range(samples):
-                weights[ray * samples + k] = w[k]
-                total += w[k]
-                mean += w[k] * (_HALF * (t[edge + k] + t[edge + k + 1]))
-            depth[ray] = mean / max(total, np.float32(1e-10))
-            kept[ray] = _heaviest(w, samples, budget, order, keep, ray * samples)
-        clear, solid = np.empty(len(optical), np.float32), np.empty(len(optical), np.float32)
-        for k in range(0, len(optical), WIDE):
-            store(solid, k, opaque(load(optical, k, WIDE)))
-        for k in range(len(optical)):
-            optical[k] = -optical[k]
-        for k in range(0, len(optical), WIDE):
-            store(clear, k, exp(load(optical, k, WIDE)))
-        for ray in range(first, last):
-            opacity[ray], transmittance[ray] = solid[ray - first], clear[ray - first]
-
-
-@_jit
-def gather(keep, start, weights, point, latent, view, kept_ray, kept_weight, kept_point, kept_latent, kept_view):
-    """The kept samples of all rays one after the other; start [R] = where each ray's begin."""
-    rays = len(start)
-    samples, width = len(weights) // rays, len(latent) // len(weights)
-    for task in numba.prange((rays + RAYS - 1) // RAYS):
-        for ray in range(task * RAYS, min(rays, task * RAYS + RAYS)):
-            at = start[ray]
-            for k in range(ray * samples, (ray + 1) * samples):
-                if not keep[k]:
-                    continue
-                kept_ray[at], kept_weight[at] = ray, weights[k]
-                for axis in range(3):
-                    kept_point[3 * at + axis] = point[3 * k + axis]
-                    kept_view[3 * at + axis] = view[3 * ray + axis]
-                if width % WIDE == 0:
-                    for c in range(0, width, WIDE):
-                        store(kept_latent, width * at + c, load(latent, width * k + c, WIDE))
-                else:
-                    for c in range(width):
-                        kept_latent[width * at + c] = latent[width * k + c]
-                at += 1
-
-
-@_jit
-def composite(weight, values, start, out):
-    """out [R C] = sum of weight * values over the samples start[r] to start[r + 1] of each ray."""
-    rays = len(start) - 1
-    width = len(out) // rays
-    for task in numba.prange((rays + RAYS - 1) // RAYS):
-        sums = np.empty(width, np.float32)
-        for ray in range(task * RAYS, min(rays, task * RAYS + RAYS)):
-            sums[:] = _0
-            for k in range(start[ray], start[ray + 1]):
-                value, w = values[width * k : width * (k + 1)], weight[k]
-                for c in range(width):
-                    sums[c] += w * value[c]
-            out[width * ray : width * (ray + 1)] = sums

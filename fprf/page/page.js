@@ -5,7 +5,11 @@ const make = (tag, props = {}, ...inside) => {
   return node;
 };
 const at = (id) => document.getElementById(id);
-const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+const bytes = (base64) => {
+  const text = atob(base64), data = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) data[i] = text.charCodeAt(i);
+  return data;
+};
 
 // Pictures in the place of a scene: views by styles, one over the other.
 class Pictures {
@@ -152,13 +156,19 @@ const open = async (data) => {
       const splats = await Splats.make(at("canvas"), data.scene, Object.fromEntries(["shape", "chunks", "palette"].map((name) => [name, section(name)])));
       await splats.add(styles[0].name, data.styles[0], section("style-0"));
       place = new Place(at("canvas"), data.scene, splats);
-      place.listeners.drawn = () => { root.classList.add("drawn"); };
     } catch (error) {
       place = fall(error.message);
     }
   } else place = fall("");
   const stage = new Stage(place, styles.slice(0, 1));
   window.fprf = { place, stage };
+  if (place.splats) {
+    // Other styles are read after the first picture; a page in the background draws none.
+    await new Promise((done) => {
+      place.listeners.drawn = () => { root.classList.add("drawn"); done(); };
+      setTimeout(done, 3000);
+    });
+  }
   for (const [k, style] of data.styles.entries()) {
     if (!k) continue;
     if (place.splats) {

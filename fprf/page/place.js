@@ -69,7 +69,7 @@ class Place {
   constructor(canvas, scene, splats, painter = null) {
     Object.assign(this, { canvas, scene, splats, painter, first: null, second: null, blend: 1, wipe: -1, at: 0 });
     this.camera = new Camera(scene.cameras[0]);
-    this.full = 0; // milliseconds of a frame at full resolution, as far as is known
+    this.full = splats?.software ? 300 : 0; // milliseconds of a frame at full resolution, as far as is known
     this.moved = this.changed = true;
     this.keys = new Set();
     this.still = 0;
@@ -79,7 +79,7 @@ class Place {
     new ResizeObserver(() => this.resize()).observe(canvas);
     if (splats) {
       canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); this.lost = true; });
-      canvas.addEventListener("webglcontextrestored", () => { this.lost = false; splats.start(); this.touch(); });
+      canvas.addEventListener("webglcontextrestored", () => { this.lost = false; splats.restore(); this.touch(); });
     }
     this.resize();
     requestAnimationFrame((now) => this.frame(now));

@@ -2,10 +2,12 @@
 //
 // Two passes: each Gaussian is projected and coloured once (transform feedback), then drawn as a quad that just holds it, the
 // nearest first, under what is there: colour += (1 - a) alpha c, a += (1 - a) alpha. Eight bits a channel lose what faint ones
-// add (37 dB on the garden against 42 with half floats, at two thirds of the time), so they are for cameras that move.
+// add (37 dB on the garden against 42 with half floats), so they are for cameras that move. Where the processor draws, whole
+// floats take half the time of half floats, and no more than bytes.
 "use strict";
 
 const WIDTH = 2048; // texels a row
+const MANY = 1024; // quads of an instance: one quad each costs software, and most cards, more than what it covers
 const COMMON = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
 `;
@@ -18,9 +20,8 @@ uniform mat4 range0, range1;            // columns 0 and 1: least colour and wid
 uniform mat4 view; uniform vec4 lens; uniform vec2 size; uniform float near, blend, wipe, largest; uniform vec3 eye;
 uniform int bands; uniform bool depth; uniform bool sharp;
 layout(location = 0) in uint index;
-out vec4 place;  // of the centre in the picture, and the longer half axis, at one standard deviation
-out vec4 look;   // colour, opacity
-out vec2 wide;   // the shorter half axis over the longer, and how many deviations the quad reaches
+flat out uvec4 place; // bits of the floats: centre in the picture, longer half axis at one standard deviation
+flat out uvec4 look;  // half floats: colour, opacity; shorter half axis over the longer, how many deviations the quad reaches; 0
 ivec2 texel(int i) { return ivec2(i % ${WIDTH}, i / ${WIDTH}); }
 vec3 shaded(vec4 texel4, mat4 range, sampler2D maps, vec3 rest) {
   vec3 mean = range[0].xyz + texel4.rgb * range[1].xyz;
@@ -33,7 +34,7 @@ vec3 shaded(vec4 texel4, mat4 range, sampler2D maps, vec3 rest) {
 }
 vec3 entry(int i) { vec3 v = texelFetch(palette, texel(i), 0).rgb; return largest * v * abs(v); }
 void main() {
-  place = vec4(0.); look = vec4(0.); wide = vec2(0.); // a quad without size is not drawn
+  place = uvec4(0u); look = uvec4(0u); // a quad without size is not drawn
   uvec4 w = texelFetch(shape, texel(int(index)), 0);
   int chunk = int(index >> 8u) * 3;
   vec4 a = texelFetch(chunks, texel(chunk), 0), b = texelFetch(chunks, texel(chunk + 1), 0), c = texelFetch(chunks, texel(chunk + 2), 0);
@@ -67,9 +68,9 @@ void main() {
   float reach = 2. * log(255. * alpha);
   vec2 centre = lens.zw + lens.xy * t, half_ = sqrt(reach * vec2(xx, yy));
   if (any(lessThan(centre + half_, vec2(0.))) || any(greaterThan(centre - half_, size))) return;
-  place = vec4(centre, sqrt(l1) * axis);
-  wide = vec2(sqrt(l2 / l1), sqrt(reach));
-  if (depth) { look = vec4(p.z, p.z, p.z, alpha); return; }
+  place = floatBitsToUint(vec4(centre, sqrt(l1) * axis));
+  uint wide = packHalf2x16(vec2(sqrt(l2 / l1), sqrt(reach)));
+  if (depth) { float far = min(p.z, 65504.); look = uvec4(packHalf2x16(vec2(far)), packHalf2x16(vec2(far, alpha)), wide, 0u); return; }
   vec3 rest = vec3(0.);
   if (bands > 1) {
     vec3 d = normalize(mean - eye);
@@ -84,24 +85,32 @@ void main() {
   float m = wipe >= 0. ? step(wipe * size.x, centre.x) : blend;
   vec3 shown = m < 1. ? shaded(texelFetch(first, texel(int(index)), 0), range0, maps0, rest) : vec3(0.);
   if (m > 0.) shown = mix(shown, shaded(texelFetch(second, texel(int(index)), 0), range1, maps1, rest), m);
-  look = vec4(shown, alpha);
+  look = uvec4(packHalf2x16(shown.rg), packHalf2x16(vec2(shown.b, alpha)), wide, 0u);
 }`;
 const NOTHING = `${COMMON}
 void main() {}`;
 const QUAD = `${COMMON}
-uniform vec2 size;
-layout(location = 0) in vec2 corner; layout(location = 1) in vec4 place; layout(location = 2) in vec4 look; layout(location = 3) in vec2 wide;
+uniform vec2 size; uniform usampler2D projected; uniform int kept;
+layout(location = 0) in uint corner; // of ${MANY} quads, four each
 out vec2 at; flat out vec4 colour;
 void main() {
-  at = corner * wide.y;
-  vec2 px = place.xy + at.x * place.zw + at.y * wide.x * vec2(-place.w, place.z);
+  gl_Position = vec4(2., 2., 2., 1.);
+  at = vec2(0.); colour = vec4(0.);
+  int i = gl_InstanceID * ${MANY} + int(corner >> 2u);
+  if (i >= kept) return;
+  ivec2 from = ivec2(i % ${WIDTH / 2} * 2, i / ${WIDTH / 2});
+  uvec4 a = texelFetch(projected, from, 0), b = texelFetch(projected, from + ivec2(1, 0), 0);
+  vec4 place = uintBitsToFloat(a);
+  vec2 wide = unpackHalf2x16(b.z), reach = vec2(corner & 1u, corner >> 1u & 1u) * 2. * wide.y - wide.y;
+  vec2 px = place.xy + reach.x * place.zw + reach.y * wide.x * vec2(-place.w, place.z);
   gl_Position = vec4(2. * px / size - 1., 0., 1.);
-  colour = look;
+  at = reach * .84932180; // exp(-x^2 / 2) = exp2(-(.849 x)^2)
+  colour = vec4(unpackHalf2x16(b.x), unpackHalf2x16(b.y));
 }`;
 const FRAGMENT = `${COMMON}
 in vec2 at; flat in vec4 colour; out vec4 o;
 void main() {
-  float a = min(.99, colour.a * exp(-.5 * dot(at, at)));
+  float a = min(.99, colour.a * exp2(-dot(at, at)));
   if (a < 1. / 255.) discard;
   o = vec4(colour.rgb * a, a);
 }`;
@@ -165,67 +174,83 @@ const woven = (planes, count, width) => {
 class Splats {
   // `head` is that of pack.py; `parts` are its deflated sections. Throws where WebGL 2 is missing.
   static async make(canvas, head, parts) {
-    const [shape, chunks, palette] = await Promise.all([parts.shape, parts.chunks, parts.palette].map(inflate));
-    return new Splats(canvas, head, new Uint32Array(woven(shape, head.count, 16).buffer), new Float32Array(chunks.buffer), palette);
-  }
-
-  constructor(canvas, head, shape, chunks, palette) {
-    Object.assign(this, { canvas, styles: new Map(), colours: new Map(), textures: {} });
-    this.load(head, shape, chunks, palette);
+    const splats = Object.assign(new Splats(), { canvas, styles: new Map(), colours: new Map(), textures: {} });
+    splats.compile(); // the graphics process does it while this one inflates
+    await splats.load(head, parts);
+    return splats;
   }
 
   // Other Gaussians in the place of these; styles have to be added again.
   async replace(head, parts) {
-    const [shape, chunks, palette] = await Promise.all([parts.shape, parts.chunks, parts.palette].map(inflate));
     this.worker.terminate();
     [...this.styles.keys()].forEach((name) => this.remove(name));
     Object.values(this.textures).forEach((texture) => this.gl.deleteTexture(texture));
-    this.load(head, new Uint32Array(woven(shape, head.count, 16).buffer), new Float32Array(chunks.buffer), palette);
+    await this.load(head, parts);
   }
 
-  load(head, shape, chunks, palette) {
+  async load(head, parts) {
+    const [planes, floats, palette] = await Promise.all([parts.shape, parts.chunks, parts.palette].map(inflate));
+    const shape = new Uint32Array(woven(planes, head.count, 16).buffer), chunks = new Float32Array(floats.buffer);
     Object.assign(this, { head, count: head.count, order: null, kept: 0, sortMilliseconds: 0 });
     this.source = { shape, chunks, palette }; // to come back from a lost context
     this.worker = new Worker(URL.createObjectURL(new Blob([`"use strict";(${sorter})()`], { type: "text/javascript" })));
     const means = decodedMeans(shape, chunks, head.count);
     this.worker.postMessage({ means }, [means.buffer]);
-    this.start();
+    this.fill();
   }
 
-  start() {
+  // After a lost context.
+  restore() {
+    this.compile();
+    this.fill();
+  }
+
+  compile() {
     const gl = this.gl = this.canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
     if (!gl) throw new Error("this browser has no WebGL 2");
-    this.floats = Boolean(gl.getExtension("EXT_color_buffer_float"));
-    this.programs = { project: this.link(VERTEX, NOTHING, ["place", "look", "wide"]), splat: this.link(QUAD, FRAGMENT), show: this.link(FULL, SHOW) };
+    const floats = gl.getExtension("EXT_color_buffer_float"), names = gl.getExtension("WEBGL_debug_renderer_info");
+    this.software = /swiftshader|llvmpipe|software/i.test(gl.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
+    const whole = floats && this.software && gl.getExtension("EXT_float_blend") && gl.getExtension("OES_texture_float_linear");
+    this.formats = { exact: whole ? gl.RGBA32F : floats ? gl.RGBA16F : gl.RGBA8, coarse: whole ? gl.RGBA32F : gl.RGBA8 };
+    this.programs = { project: this.link(VERTEX, NOTHING, ["place", "look"]), splat: this.link(QUAD, FRAGMENT), show: this.link(FULL, SHOW) };
+  }
+
+  // Textures and buffers of what was loaded.
+  fill() {
+    const gl = this.gl;
+    Object.values(this.programs).forEach((each) => this.check(each));
     const { shape, chunks, palette } = this.source;
     this.textures = {
       shape: this.texture(shape, gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT),
       chunks: this.texture(chunks, gl.RGBA32F, gl.RGBA, gl.FLOAT),
       palette: this.texture(palette.length ? new Int8Array(palette.buffer) : new Int8Array(4), gl.RGBA8_SNORM, gl.RGBA, gl.BYTE),
     };
-    const order = this.buffer = gl.createBuffer(), corners = gl.createBuffer();
-    this.projected = gl.createBuffer();
-    const arrays = (...rows) => { // place, size, type, bytes between, bytes before, an instance each
+    const arrays = (bind) => {
       const vertices = gl.createVertexArray();
       gl.bindVertexArray(vertices);
-      for (const [buffer, place, size, stride, offset, each] of rows) {
-        gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
-        gl.enableVertexAttribArray(place);
-        if (buffer === order) gl.vertexAttribIPointer(place, size, gl.UNSIGNED_INT, 0, 0);
-        else gl.vertexAttribPointer(place, size, gl.FLOAT, false, stride, offset);
-        gl.vertexAttribDivisor(place, each);
-      }
+      bind();
+      gl.enableVertexAttribArray(0);
+      gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
       gl.bindVertexArray(null);
       return vertices;
     };
-    gl.bindBuffer(gl.ARRAY_BUFFER, order);
-    gl.bufferData(gl.ARRAY_BUFFER, 4 * this.count, gl.DYNAMIC_DRAW);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.projected);
-    gl.bufferData(gl.ARRAY_BUFFER, 40 * this.count, gl.DYNAMIC_COPY);
-    gl.bindBuffer(gl.ARRAY_BUFFER, corners);
-    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]), gl.STATIC_DRAW);
-    this.ordered = arrays([order, 0, 1, 0, 0, 0]);
-    this.quads = arrays([corners, 0, 2, 0, 0, 0], [this.projected, 1, 4, 40, 0, 1], [this.projected, 2, 4, 40, 16, 1], [this.projected, 3, 2, 40, 32, 1]);
+    const filled = (place, data, use) => {
+      const buffer = gl.createBuffer();
+      gl.bindBuffer(place, buffer);
+      gl.bufferData(place, data, use);
+      return buffer;
+    };
+    const rows = Math.ceil(this.count / (WIDTH / 2));
+    this.ordered = arrays(() => { this.buffer = filled(gl.ARRAY_BUFFER, 4 * this.count, gl.DYNAMIC_DRAW); });
+    this.quads = arrays(() => {
+      filled(gl.ARRAY_BUFFER, Uint32Array.from({ length: 4 * MANY }, (_, i) => i), gl.STATIC_DRAW);
+      filled(gl.ELEMENT_ARRAY_BUFFER, Uint16Array.from({ length: 6 * MANY }, (_, i) => 4 * Math.floor(i / 6) + [0, 1, 2, 2, 1, 3][i % 6]), gl.STATIC_DRAW);
+    });
+    this.projected = filled(gl.ARRAY_BUFFER, 32 * rows * (WIDTH / 2), gl.DYNAMIC_COPY);
+    this.textures.projected = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, this.textures.projected);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, WIDTH, rows);
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
     this.feedback = gl.createTransformFeedback();
     this.empty = gl.createVertexArray();
     this.exact = this.coarse = null;
@@ -244,15 +269,19 @@ class Splats {
     }
     if (varyings) gl.transformFeedbackVaryings(program, varyings, gl.INTERLEAVED_ATTRIBS);
     gl.linkProgram(program);
+    return { program, places: {} };
+  }
+
+  // Wait until a program is linked, and find its uniforms.
+  check({ program, places }) {
+    const gl = this.gl;
     if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
       throw new Error(gl.getAttachedShaders(program).map((each) => gl.getShaderInfoLog(each)).join(" ") + gl.getProgramInfoLog(program));
     }
-    const places = {};
     for (let i = 0; i < gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS); i++) {
       const { name } = gl.getActiveUniform(program, i);
       places[name] = gl.getUniformLocation(program, name);
     }
-    return { program, places };
   }
 
   texture(data, inner, format, type, width = WIDTH) {
@@ -316,14 +345,14 @@ class Splats {
     gl.bufferSubData(gl.ARRAY_BUFFER, 0, this.order, 0, this.kept);
   }
 
-  // A picture to draw into; `exact` ones hold half floats.
+  // A picture to draw into; `exact` ones hold floats.
   frame(width, height, exact) {
-    const gl = this.gl, kind = exact && this.floats ? "exact" : "coarse";
+    const gl = this.gl, kind = exact && this.formats.exact !== this.formats.coarse ? "exact" : "coarse";
     if (this[kind]?.width === width && this[kind].height === height) return this[kind];
     if (this[kind]) { gl.deleteTexture(this[kind].picture); gl.deleteFramebuffer(this[kind].buffer); }
     const picture = gl.createTexture(), buffer = gl.createFramebuffer();
     gl.bindTexture(gl.TEXTURE_2D, picture);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, kind === "exact" ? gl.RGBA16F : gl.RGBA8, width, height);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, this.formats[kind], width, height);
     for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
     for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE);
     gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
@@ -357,7 +386,7 @@ class Splats {
   splat(target, view, lens, look, near, pixel) {
     const gl = this.gl, { program, places } = this.programs.project;
     const one = this.styles.get(look.first), two = this.styles.get(look.second) ?? one;
-    const all = { ...this.textures, first: one.rows, second: two.rows, maps0: one.maps, maps1: two.maps };
+    const { shape, chunks, palette, projected } = this.textures, all = { shape, chunks, palette, first: one.rows, second: two.rows, maps0: one.maps, maps1: two.maps };
     gl.useProgram(program);
     Object.entries(all).forEach(([name, texture], i) => {
       gl.activeTexture(gl.TEXTURE0 + i);
@@ -389,6 +418,12 @@ class Splats {
     gl.bindTransformFeedback(gl.TRANSFORM_FEEDBACK, null);
     gl.disable(gl.RASTERIZER_DISCARD);
 
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, projected);
+    gl.bindBuffer(gl.PIXEL_UNPACK_BUFFER, this.projected);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, Math.ceil(this.kept / (WIDTH / 2)), gl.RGBA_INTEGER, gl.UNSIGNED_INT, 0);
+    gl.bindBuffer(gl.PIXEL_UNPACK_BUFFER, null);
+
     const drawn = this.programs.splat;
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);
     gl.viewport(0, 0, target.width, target.height);
@@ -397,10 +432,12 @@ class Splats {
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.useProgram(drawn.program);
     gl.uniform2f(drawn.places.size, target.width, target.height);
+    gl.uniform1i(drawn.places.projected, 0);
+    gl.uniform1i(drawn.places.kept, this.kept);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE_MINUS_DST_ALPHA, gl.ONE);
     gl.bindVertexArray(this.quads);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.kept);
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * MANY, gl.UNSIGNED_SHORT, 0, Math.ceil(this.kept / MANY));
     gl.bindVertexArray(null);
     gl.disable(gl.SCISSOR_TEST);
   }

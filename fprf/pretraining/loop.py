@@ -120,11 +120,11 @@ def train(
         if steps := checkpoint.steps(run.checkpoints):
             say(f"resumed at step {steps[-1]}")
         network.train()
-        reached = learn(NetworkLearner(network, loss, config), run, schedule, report)
+        step, _ = learn(NetworkLearner(network, loss, config), run, schedule, report)
         network.eval()
-        show(reached.step)
+        show(step)
         shutil.rmtree(run.root)
-    return reached.step
+    return step
 
 
 def sheet(rows: Sequence[Sequence[Annotated[Tensor, "H W 3"]]]) -> Annotated[Tensor, "H W 3"]:

@@ -14,7 +14,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
@@ -29,6 +29,23 @@ from .images import lost_files
 from .scene_folder import MatchTables, Progress, SceneFolder, State, count_rows, reading, step_key
 from .worker import NO_MODEL, NO_PYCOLMAP
 
+Pair: TypeAlias = tuple[int, int]
+Descriptors = Annotated[NDArray[np.uint8], "N 128"]
+Words = Annotated[NDArray[np.float32], "W 128"]
+Reader = Callable[[int], Descriptors]
+
+_SAMPLE, _MOST = 40_000, 2000
+"""Descriptors that the words are made of, and evenly taken ones of an image that its vector is made of, at most."""
+_ROUNDS = 12
+"""Rounds of k-means, at most."""
+_ALL_PAIRS = 120
+"""Images up to which `auto` matches all with all."""
+_WORDS = 64
+_POLL = 0.2
+"""Seconds between looks at a running step."""
+_TITLES = {"features": "finding features", "matches": "matching", "mapping": "finding poses"}
+_COMMAND = (sys.executable, "-m", "fprf.reconstruction.worker")
+
 
 def descriptors(path: Path, name: str) -> NDArray[np.uint8]:
     """SIFT descriptors [N 128] of an image; none for an image without."""
@@ -41,9 +58,6 @@ def descriptors(path: Path, name: str) -> NDArray[np.uint8]:
     return np.frombuffer(row[2], np.uint8).reshape(row[0], row[1])
 
 
-Pair: TypeAlias = tuple[int, int]
-
-
 def sequential_pairs(count: int, overlap: int) -> list[Pair]:
     """Each with the next `overlap` ones, and with those at distances 2, 4, 8, ... up to 2 ** overlap."""
     steps = sorted({*range(1, overlap + 1), *(2**k for k in range(overlap + 1))})
@@ -52,6 +66,7 @@ def sequential_pairs(count: int, overlap: int) -> list[Pair]:
 
 def similar_pairs(vectors: Annotated[NDArray[np.float32], "V X"], nearest: int) -> list[Pair]:
     """Each with those whose unit vectors are most like its own, by cosine; an image without a vector (all 0) with none."""
+    # Cosines, without those of images with themselves and of images that nothing is known of.
     likeness = vectors @ vectors.T
     empty = ~vectors.any(axis=1)
     likeness[empty] = likeness[:, empty] = -np.inf
@@ -62,19 +77,9 @@ def similar_pairs(vectors: Annotated[NDArray[np.float32], "V X"], nearest: int) 
     return sorted(pairs)
 
 
-_SAMPLE = 40_000
-"""Descriptors that the words are made of, at most."""
-_MOST = 2000
-"""Descriptors of an image that its vector is made of, at most; taken evenly."""
-_ROUNDS = 12
-
-Descriptors = Annotated[NDArray[np.uint8], "N 128"]
-Words = Annotated[NDArray[np.float32], "W 128"]
-Reader = Callable[[int], Descriptors]
-
-
 def build_vocabulary(read: Reader, count: int, number: int, seed: int = 0) -> Words:
     """`number` visual words, or fewer where there are fewer descriptors; `read(i)` gives those of image i of `count`."""
+    # A sample of all descriptors, as many of each image.
     rng = np.random.default_rng(seed)
     each = max(1, _SAMPLE // max(1, count))
     parts = []
@@ -84,10 +89,12 @@ def build_vocabulary(read: Reader, count: int, number: int, seed: int = 0) -> Wo
     sample = np.concatenate(parts).astype(np.float32) if parts else np.zeros((0, 128), np.float32)
     if len(sample) <= number:
         return sample
+    # cv2 draws from a generator of its own.
     stop = (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, _ROUNDS, 1e-3)
     cv2.setRNGSeed(seed)
     start = rng.permutation(len(sample))[:number]
-    labels = np.argmax(-_distances(sample, sample[start]), axis=1).astype(np.int32)[:, None]
+    # k-means begins with some of the descriptors as centres: cv2 takes them as the labels of all.
+    labels = np.argmin(_distances(sample, sample[start]), axis=1).astype(np.int32)[:, None]
     centres = cv2.kmeans(sample, number, labels, stop, 1, cv2.KMEANS_USE_INITIAL_LABELS)[2]
     return np.asarray(centres, dtype=np.float32)
 
@@ -98,19 +105,17 @@ def vlad_vectors(read: Reader, count: int, vocabulary: Words) -> Annotated[NDArr
     for image in range(count):
         features = read(image)
         some = features[:: -(-len(features) // _MOST) or 1].astype(np.float32)
-        if len(some) and len(vocabulary):
-            result[image] = _vlad(some, vocabulary)
+        if not len(some) or not len(vocabulary):
+            continue
+        # Differences to the nearest word, summed word by word, tamed, and scaled to length 1 word by word and altogether.
+        nearest = np.argmin(_distances(some, vocabulary), axis=1)
+        sums = np.zeros_like(vocabulary)
+        np.add.at(sums, nearest, some - vocabulary[nearest])
+        sums = np.sign(sums) * np.sqrt(np.abs(sums))
+        sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
+        flat = sums.reshape(-1)
+        result[image] = flat / max(float(np.linalg.norm(flat)), 1e-12)
     return result
-
-
-def _vlad(features: NDArray[np.float32], vocabulary: NDArray[np.float32]) -> NDArray[np.float32]:
-    nearest = np.argmin(_distances(features, vocabulary), axis=1)
-    sums = np.zeros_like(vocabulary)
-    np.add.at(sums, nearest, features - vocabulary[nearest])
-    sums = np.sign(sums) * np.sqrt(np.abs(sums))
-    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
-    flat: NDArray[np.float32] = sums.reshape(-1)
-    return flat / max(float(np.linalg.norm(flat)), 1e-12)
 
 
 def _distances(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -119,20 +124,15 @@ def _distances(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.flo
     return distances
 
 
-_ALL_PAIRS = 120
-"""Images up to which `auto` matches all with all."""
-_WORDS = 64
-_POLL = 0.2
-"""Seconds between looks at a running step."""
-_TITLES = {"features": "finding features", "matches": "matching", "mapping": "finding poses"}
-_COMMAND = (sys.executable, "-m", "fprf.reconstruction.worker")
-
-
 def find_features(place: SceneFolder, state: State, config: SfmConfig, progress: Progress) -> None:
     """Features of every image; those of an image that has changed or gone take all others with them."""
     settings = [config.lens, config.cameras, config.features, config.side, config.seed]
     hashes = {name: image["sha256"] for name, image in state.images.items()}
-    before = _read(place.work / "features.json")
+    # Images may be added to those of before; other settings, or an image that has changed, begin anew.
+    before: Any = None
+    with contextlib.suppress(OSError, ValueError):
+        before = json.loads((place.work / "features.json").read_text(encoding="utf-8"))
+    before = before if isinstance(before, dict) else {}
     grown = before.get("settings") == settings and before.get("hashes", {}).items() <= hashes.items()
     if not grown:
         for old in place.work.glob("database.db*"):
@@ -140,7 +140,9 @@ def find_features(place: SceneFolder, state: State, config: SfmConfig, progress:
     key = step_key(settings, hashes)
     if state.done.get("features") == key and place.database.is_file():
         return
+    # From now on the database is of these images: a step that is cut off goes on with them.
     write_json(place.work / "features.json", {"settings": settings, "hashes": hashes})
+    # Images of one size and lens share a camera, unless each is to have its own.
     groups: dict[str, list[str]] = {}
     for name, image in state.images.items():
         alike = [image["width"], image["height"], image["lens"]] if config.cameras == "shared" else name
@@ -173,7 +175,12 @@ def find_matches(place: SceneFolder, state: State, config: SfmConfig, progress: 
     else:
         # Neighbours by name help where things look alike everywhere; in a video they are neighbours for certain.
         near = sequential_pairs(len(names), config.overlap if video else 2)
-        chosen = sorted({*near, *_similar_images(place, names, config)})
+
+        def read(image: int) -> Descriptors:
+            return descriptors(place.database, names[image])
+
+        vectors = vlad_vectors(read, len(names), build_vocabulary(read, len(names), _WORDS, config.seed))
+        chosen = sorted({*near, *similar_pairs(vectors, config.neighbours)})
     listed = place.work / "pairs.txt"
     write_text(listed, "".join(f"{names[a]} {names[b]}\n" for a, b in chosen))
     job = {"step": "matches", "pairs": str(listed)}
@@ -190,8 +197,15 @@ def find_poses(place: SceneFolder, state: State, config: SfmConfig, progress: Pr
     if state.done.get("mapping") == key and (place.model / "images.bin").is_file() and described.is_file():
         return list(json.loads(described.read_text(encoding="utf-8")))
     shutil.rmtree(described.parent, ignore_errors=True)
+
+    def registered() -> int:
+        """Images with a pose so far: a line for each but the first."""
+        lines = [line for line in place.progress.read_text(encoding="utf-8").splitlines() if line.startswith("{")]
+        return len(lines) + 1 if lines else 0
+
     job = {"step": "mapping", "models": str(described.parent)}
-    _run(place, state, config, job, lambda: _registered(place), len(state.images), progress)
+    _run(place, state, config, job, registered, len(state.images), progress)
+    # The model appears as a whole: copied beside its place, and renamed.
     fresh = place.root / "sparse" / ".fresh"
     shutil.rmtree(fresh, ignore_errors=True)
     shutil.copytree(described.parent / "best", fresh)
@@ -200,16 +214,6 @@ def find_poses(place: SceneFolder, state: State, config: SfmConfig, progress: Pr
     state.done["mapping"] = key
     state.save(place)
     return list(json.loads(described.read_text(encoding="utf-8")))
-
-
-def _similar_images(place: SceneFolder, names: Sequence[str], config: SfmConfig) -> list[Pair]:
-    """Pairs of images that look alike."""
-
-    def read(image: int) -> Any:
-        return descriptors(place.database, names[image])
-
-    vocabulary = build_vocabulary(read, len(names), _WORDS, config.seed)
-    return similar_pairs(vlad_vectors(read, len(names), vocabulary), config.neighbours)
 
 
 def _run(
@@ -246,12 +250,13 @@ def _run(
             if process.poll() is None:
                 process.terminate()
                 process.wait()
+    # Exit codes of the worker, in sentences.
     code = process.returncode
     if code == NO_PYCOLMAP:
         raise UsageError("fprf process: pycolmap 4 or newer is needed; install it with: pip install 'pycolmap>=4'")
     if code == NO_MODEL:
         # What the decoders lost comes first: it may be all that is wrong.
-        unread = sorted(set(state.images) - set(MatchTables(place.database).ids))
+        unread = sorted(set(state.images) - set(MatchTables(place.database).features))
         missed = f"COLMAP cannot decode {len(unread)} of {len(state.images)} images, for example {unread[0]}" if unread else ""
         lost = "; ".join(filter(None, [lost_files(state), missed]))
         rest = "no two of the other images fit together" if lost else "no two images fit together"
@@ -260,25 +265,8 @@ def _run(
             f"({place.log} has COLMAP's words)"
         )
     if code:
-        raise DataError(f"{place.root}: COLMAP's {name} ended with {code}: {_last(place.log)}; {place.log} has the rest")
+        lines = [line for line in place.log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+        last = lines[-1].strip()[-200:] if lines else "nothing was said"
+        raise DataError(f"{place.root}: COLMAP's {name} ended with {code}: {last}; {place.log} has the rest")
     progress(total, total, what)
     state.seconds[name] = round(time.perf_counter() - start, 2)
-
-
-def _registered(place: SceneFolder) -> int:
-    """Images with a pose so far."""
-    lines = [line for line in place.progress.read_text(encoding="utf-8").splitlines() if line.startswith("{")]
-    return len(lines) + 1 if lines else 0
-
-
-def _last(log: Path) -> str:
-    lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
-    return lines[-1][-200:] if lines else "nothing was said"
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}

@@ -37,7 +37,7 @@ class SfmConfig:
     gpu: bool = True
     """Let COLMAP use a GPU where there is one and it was built for it."""
     seed: int = 0
-    """Of COLMAP's random choices."""
+    """Seed of COLMAP's random choices."""
 
     def __post_init__(self) -> None:
         at_least("frames", self.frames, 3)

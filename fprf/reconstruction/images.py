@@ -9,7 +9,6 @@ import math
 import re
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -33,13 +32,18 @@ _NEIGHBOURS = 2
 """Windows on each side that a window's best frame is compared with."""
 
 
-class Choice(NamedTuple):
-    """One frame of each window, and what became of the others."""
-
-    chosen: list[int]
-    """Frames, in their order."""
-    dropped: dict[int, str]
-    """The other frames with the reason."""
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
+"""Suffixes of videos, in lower case."""
+_FRAME, _QUALITY = "frame_{:06d}.jpg", 95
+"""File of a frame, and its quality as JPEG."""
+_FEWEST = 3
+"""Images that a scene needs at least."""
+_FOREIGN = frozenset({"WebP", "AVIF", "HEIC"})
+"""Formats that COLMAP does not read, as it is packaged. It tells formats by their content, as we do."""
+_EXIF_BYTES = (1 << 16) - 16
+"""Bytes of an EXIF block that a JPEG takes."""
+_NAMED = 3
+"""Files, or reasons, that a sentence names, at most."""
 
 
 def sharpness(image: Image) -> float:
@@ -51,9 +55,10 @@ def sharpness(image: Image) -> float:
     return float(cv2.Laplacian(grey, cv2.CV_64F).var())
 
 
-def choose_frames(scores: Sequence[float], count: int, least: float) -> Choice:
-    """The sharpest frame of each of `count` windows of equal length; the first of equally sharp ones.
+def choose_frames(scores: Sequence[float], count: int, least: float) -> tuple[list[int], dict[int, str]]:
+    """The sharpest frame of each of `count` windows of equal length, and the other frames with the reason.
 
+    The first of equally sharp frames is taken.
     A window whose best frame has less than `least` times the median sharpness of the windows around it gives none: all of
     it is blurred, as in a quick turn. `least` lies in [0, 1). With `count` frames or fewer every frame is a window.
     """
@@ -65,6 +70,7 @@ def choose_frames(scores: Sequence[float], count: int, least: float) -> Choice:
         for frame in range(low, high):
             if frame != top:
                 dropped[frame] = f"less sharp than frame {top} ({scores[frame]:.0f} < {scores[top]:.0f})"
+    # The best frames of the windows around say how sharp images are there.
     chosen = []
     for k, top in enumerate(best):
         around = [scores[best[j]] for j in range(max(0, k - _NEIGHBOURS), min(windows, k + _NEIGHBOURS + 1)) if j != k]
@@ -73,27 +79,15 @@ def choose_frames(scores: Sequence[float], count: int, least: float) -> Choice:
             dropped[top] = f"blurred, like all frames around it (sharpness {scores[top]:.0f}, usual there is {usual:.0f})"
         else:
             chosen.append(top)
-    return Choice(chosen, dict(sorted(dropped.items())))
-
-
-VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
-"""Suffixes of videos, in lower case."""
-
-_QUALITY = 95
-
-
-def frame_name(frame: int) -> str:
-    """The file of a frame."""
-    return f"frame_{frame:06d}.jpg"
+    return chosen, dict(sorted(dropped.items()))
 
 
 def frame_scores(video: Path, progress: Progress) -> list[float]:
     """Sharpness of every frame, in their order. Raises DataError where the file holds no frames."""
-    with _opened(video) as (reader, expected):
-        scores: list[float] = []
-        for frame in _frames(reader):
-            progress(len(scores), max(expected, len(scores) + 1), "looking for sharp frames")
-            scores.append(sharpness(frame))
+    scores: list[float] = []
+    for expected, frame in _frames(video):
+        progress(len(scores), max(expected, len(scores) + 1), "looking for sharp frames")
+        scores.append(sharpness(frame))
     if not scores:
         raise DataError(f"{video}: no frame can be decoded; convert it to H.264 in an .mp4, or give a folder of images")
     progress(len(scores), len(scores), "looking for sharp frames")
@@ -102,47 +96,43 @@ def frame_scores(video: Path, progress: Progress) -> list[float]:
 
 def save_frames(video: Path, frames: Sequence[int], folder: Path, progress: Progress) -> None:
     """Write some of the frames, as JPEG (95), each whole or not at all; those that are there stay."""
-    wanted = {frame for frame in frames if not (folder / frame_name(frame)).is_file()}
+    wanted = {frame for frame in frames if not (folder / _FRAME.format(frame)).is_file()}
     if not wanted:
         return
     last, done = max(wanted), 0
-    with _opened(video) as (reader, _):
-        for index, image in enumerate(_frames(reader, wanted)):
-            if index in wanted:
-                coded, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-                assert coded
-                write_bytes(folder / frame_name(index), data.tobytes())
-                done += 1
-                progress(done, len(wanted), "writing frames")
-            if index == last:
-                return
+    for index, (_, image) in enumerate(_frames(video, wanted)):
+        if index in wanted:
+            coded, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+            assert coded
+            write_bytes(folder / _FRAME.format(index), data.tobytes())
+            done += 1
+            progress(done, len(wanted), "writing frames")
+        if index == last:
+            return
     raise DataError(f"{video}: frame {last} was there before and is not now; keep the video as it is while it is processed")
 
 
-@contextmanager
-def _opened(video: Path) -> Iterator[tuple[cv2.VideoCapture, int]]:
-    """The reader of a video and the number of frames that it claims to have."""
+def _frames(video: Path, wanted: set[int] | None = None) -> Iterator[tuple[int, Image]]:
+    """The number of frames that a video claims to have, with each of them; those that are not wanted come empty.
+
+    Raises DataError where it cannot be opened.
+    """
     reader = cv2.VideoCapture(str(video))
     try:
         if not reader.isOpened():
             raise DataError(f"{video}: no video that can be opened; convert it to H.264 in an .mp4, or give a folder of images")
-        yield reader, max(0, int(reader.get(cv2.CAP_PROP_FRAME_COUNT)))
+        expected, index = max(0, int(reader.get(cv2.CAP_PROP_FRAME_COUNT))), 0
+        while reader.grab():
+            image = np.empty((0, 0, 3), dtype=np.uint8)
+            if wanted is None or index in wanted:
+                done, frame = reader.retrieve()
+                if not done:
+                    return
+                image = np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+            yield expected, image
+            index += 1
     finally:
         reader.release()
-
-
-def _frames(reader: cv2.VideoCapture, wanted: set[int] | None = None) -> Iterator[Image]:
-    """Frames one by one; those that are not wanted come empty and are not decoded to pixels."""
-    index = 0
-    while reader.grab():
-        if wanted is None or index in wanted:
-            done, frame = reader.retrieve()
-            if not done:
-                return
-            yield np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-        else:
-            yield np.empty((0, 0, 3), dtype=np.uint8)
-        index += 1
 
 
 class Lens(NamedTuple):
@@ -152,7 +142,7 @@ class Lens(NamedTuple):
     focal: float = 0.0
     """Millimetres; 0 where the file does not say."""
     focal_35: int = 0
-    """The same as on 35 mm film."""
+    """Focal length on 35 mm film of the same angle."""
 
 
 def read_lens(path: Path) -> Lens:
@@ -180,16 +170,6 @@ def _exif(path: Path) -> PIL.Image.Exif:
         return PIL.Image.Exif()
 
 
-_FEWEST = 3
-"""Images that a scene needs at least."""
-_FOREIGN = frozenset({"WebP", "AVIF", "HEIC"})
-"""Formats that COLMAP does not read, as it is packaged. It tells formats by their content, as we do."""
-_EXIF_BYTES = (1 << 16) - 16
-"""Bytes of an EXIF block that a JPEG takes."""
-_NAMED = 3
-"""Files, or reasons, that a sentence names, at most."""
-
-
 def gather_images(source: Path, place: SceneFolder, state: State, config: SfmConfig, progress: Progress) -> None:
     """Bring images into the folder, and describe them and what was dropped in `state`.
 
@@ -208,8 +188,13 @@ def gather_images(source: Path, place: SceneFolder, state: State, config: SfmCon
         raise UsageError(f"{source}: neither a folder of images nor a video ({kinds}); check the path")
     if len(gathered) < _FEWEST:
         state.images = gathered
-        why = lost_files(state) or _holds(source)
+        why = lost_files(state) or "the video holds no more"
+        if source.is_dir() and not state.dropped:
+            endings = sorted({path.suffix.lower() for path in source.rglob("*") if path.is_file() and path.suffix})
+            there = f"it holds {' '.join(endings)} files" if endings else "it holds no files"
+            why = f"{there}, and what is read is {' '.join(sorted(IMAGE_SUFFIXES))}: convert the images to JPEG"
         raise DataError(f"{source}: {why}; {len(gathered)} usable images, at least {_FEWEST} are needed")
+    # Images that are no longer used go, but never from the source itself.
     for name in set(state.images) - set(gathered):
         if place.images.resolve() != source.resolve():
             (place.images / name).unlink(missing_ok=True)
@@ -236,17 +221,13 @@ def _some(words: list[str]) -> str:
 
 
 def natural_order(names: Iterable[str]) -> list[str]:
-    """Names as people number them: 2 before 10."""
-    return sorted(names, key=lambda name: [_rank(part) for part in _PARTS.findall(name)])
+    """Names as people number them: 2 before 10, and numbers before words."""
 
+    def rank(name: str) -> list[tuple[bool, int, str]]:
+        numbers = [("0" <= part[0] <= "9", part) for part in re.findall(r"[0-9]+|[^0-9]+", name)]
+        return [(not number, int(part) if number else 0, part) for number, part in numbers]
 
-_PARTS = re.compile(r"[0-9]+|[^0-9]+")
-
-
-def _rank(part: str) -> tuple[bool, int, str]:
-    """Numbers by their value, before words."""
-    number = "0" <= part[0] <= "9"
-    return not number, int(part) if number else 0, part
+    return sorted(names, key=rank)
 
 
 def _from_folder(source: Path, place: SceneFolder, state: State, progress: Progress) -> dict[str, dict[str, Any]]:
@@ -266,6 +247,7 @@ def _from_folder(source: Path, place: SceneFolder, state: State, progress: Progr
         name = re.sub(r"\s", "_", given)
         if name in entries or (inplace and name != given):
             raise UsageError(f"{path}: COLMAP takes no blanks in names; rename the image, so that no other is called {name}")
+        # What was gathered before, and has not changed, is not read again.
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
         try:
             kind = read_header(path).kind
@@ -298,13 +280,13 @@ def _from_video(
     key = step_key("frames", about.st_size, about.st_mtime_ns, config.frames, config.blurred)
     if state.done.get("frames") == key and all((place.images / name).is_file() for name in state.images):
         return state.images
-    choice = choose_frames(frame_scores(source, progress), config.frames, config.blurred)
-    save_frames(source, choice.chosen, place.images, progress)
-    state.dropped = {f"frame {frame}": reason for frame, reason in choice.dropped.items()}
+    chosen, dropped = choose_frames(frame_scores(source, progress), config.frames, config.blurred)
+    save_frames(source, chosen, place.images, progress)
+    state.dropped = {f"frame {frame}": reason for frame, reason in dropped.items()}
     state.done["frames"] = key
     frames = {}
-    for frame in choice.chosen:
-        path = place.images / frame_name(frame)
+    for frame in chosen:
+        path = place.images / _FRAME.format(frame)
         frames[path.name] = _described(path, hashlib.sha256(path.read_bytes()).hexdigest())
     return frames
 
@@ -320,15 +302,6 @@ def _write_jpeg(path: Path, target: Path) -> None:
     block = block if len(block) < _EXIF_BYTES else b""
     PIL.Image.fromarray(pixels).save(data, "JPEG", quality=97, subsampling=0, exif=block)
     write_bytes(target, data.getvalue())
-
-
-def _holds(source: Path) -> str:
-    """Description of a folder without images."""
-    if not source.is_dir():
-        return "the video holds no more"
-    endings = sorted({path.suffix.lower() for path in source.rglob("*") if path.is_file() and path.suffix})
-    there = f"it holds {' '.join(endings)} files" if endings else "it holds no files"
-    return f"{there}, and what is read is {' '.join(sorted(IMAGE_SUFFIXES))}: convert the images to JPEG"
 
 
 def _described(path: Path, digest: str) -> dict[str, Any]:

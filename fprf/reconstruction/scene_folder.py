@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ..errors import DataError, UsageError
 from ..io.atomic import write_json
@@ -50,7 +50,7 @@ class State:
     source: str = ""
     """Source of the images."""
     images: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Of each used image by its name: sha256, width, height, lens."""
+    """Used images by name, each with sha256, width, height and lens."""
     dropped: dict[str, str] = field(default_factory=dict)
     """Files or frames that were not used, with the reason."""
     done: dict[str, str] = field(default_factory=dict)
@@ -87,8 +87,6 @@ def step_key(*parts: object) -> str:
 
 _MAX_IMAGES = 2147483647
 """A pair of images is stored as _MAX_IMAGES * smaller id + larger id."""
-
-
 _LEAST = 15
 """Verified matches from which on COLMAP takes two images for neighbours."""
 
@@ -98,23 +96,14 @@ class MatchTables:
 
     def __init__(self, path: Path) -> None:
         with reading(path) as base:
-            self.ids: dict[str, int] = dict(base.execute("SELECT name, image_id FROM images"))
-            self.features: dict[int, int] = dict(base.execute("SELECT image_id, rows FROM keypoints"))
-            rows = base.execute("SELECT pair_id, rows FROM two_view_geometries").fetchall()
-        names = {id_: name for name, id_ in self.ids.items()}
-        self.matches: dict[tuple[str, str], int] = {}
-        for pair, count in rows:
-            a, b = divmod(pair, _MAX_IMAGES)
-            if a in names and b in names:
-                self.matches[names[a], names[b]] = count
-
-    def features_of(self, name: str) -> int:
-        """Features found in an image; 0 for one that is not there."""
-        return self.features.get(self.ids.get(name, -1), 0)
-
-    def partners(self, name: str) -> int:
+            names = dict(base.execute("SELECT image_id, name FROM images"))
+            features = dict(base.execute("SELECT image_id, rows FROM keypoints"))
+            pairs = base.execute("SELECT pair_id FROM two_view_geometries WHERE rows >= ?", (_LEAST,)).fetchall()
+        self.features: dict[str, int] = {name: features.get(number, 0) for number, name in names.items()}
+        """Features of each image that COLMAP could decode."""
+        fit = [divmod(pair, _MAX_IMAGES) for (pair,) in pairs]
+        self.partners = Counter(names[number] for pair in fit if names.keys() >= {*pair} for number in pair)
         """Images that share enough verified matches with an image."""
-        return sum(count >= _LEAST for pair, count in self.matches.items() if name in pair)
 
 
 def count_rows(path: Path) -> tuple[int, int]:
@@ -135,60 +124,50 @@ def reading(path: Path) -> Iterator[sqlite3.Connection]:
         base.close()
 
 
-class Drop(NamedTuple):
-    """An image that the scene goes without."""
-
-    image: str
-    step: str
-    """choosing, features, matching or mapping: where it was lost."""
-    reason: str
-
-
-def dropped_images(
-    names: Sequence[str], unused: Mapping[str, str], matches: MatchTables, models: Sequence[Mapping[str, Any]]
-) -> list[Drop]:
-    """Every image without a pose in the first of the `models`, in the order of the steps."""
-    posed = set(models[0]["images"]) if models else set()
-    drops = [Drop(name, "choosing", reason) for name, reason in unused.items()]
-    lost = [_lost(name, matches, models) for name in names if name not in posed]
-    order = ("features", "matching", "mapping")
-    return drops + sorted(lost, key=lambda drop: order.index(drop.step))
-
-
-def _lost(name: str, matches: MatchTables, models: Sequence[Mapping[str, Any]]) -> Drop:
-    features, partners = matches.features_of(name), matches.partners(name)
-    if name not in matches.ids:
-        return Drop(name, "features", "COLMAP cannot decode it; convert it to JPEG")
-    if not features:
-        return Drop(name, "features", "nothing with texture in it")
-    if not partners:
-        return Drop(name, "matching", f"{features} features, but it fits no other image; take views in between")
-    for number, model in enumerate(models[1:], 2):
-        if name in model["images"]:
-            size = len(model["images"])
-            return Drop(name, "mapping", f"in part {number} ({size} images), apart from the rest; take views in between")
-    return Drop(name, "mapping", f"fits {partners} images, but no pose was found for it")
-
-
 def report(
     state: Mapping[str, Any], matching: str, matches: MatchTables, models: Sequence[Mapping[str, Any]], version: str
 ) -> dict[str, Any]:
-    """The content of process.json. `state` is that of `place.State`, as a mapping."""
-    images = state["images"]
-    drops = dropped_images(list(images), state["dropped"], matches, models)
+    """The content of process.json; `state` as a mapping, and COLMAP's models, the largest first.
+
+    Every image without a pose in the first of these is dropped: in the order of the steps, choosing, features, matching and
+    mapping, with the one where it was lost and the reason.
+    """
+    images, unused = state["images"], state["dropped"]
     main = models[0] if models else {"images": [], "points": 0, "error_pixels": None, "track_length": None}
+    posed, size = set(main["images"]), [len(model["images"]) for model in models]
+    part_of: dict[str, int] = {}  # the largest part that has it
+    for number, model in enumerate(models, 1):
+        part_of = dict.fromkeys(model["images"], number) | part_of
+    lost: dict[str, list[tuple[str, str]]] = {"choosing": [*unused.items()], "features": [], "matching": [], "mapping": []}
+    for name in images:
+        features, partners, part = matches.features.get(name), matches.partners[name], part_of.get(name)
+        if name in posed:
+            continue
+        if features is None:
+            lost["features"].append((name, "COLMAP cannot decode it; convert it to JPEG"))
+        elif not features:
+            lost["features"].append((name, "nothing with texture in it"))
+        elif not partners:
+            lost["matching"].append((name, f"{features} features, but it fits no other image; take views in between"))
+        elif part is not None:
+            apart = f"in part {part} ({size[part - 1]} images), apart from the rest; take views in between"
+            lost["mapping"].append((name, apart))
+        else:
+            lost["mapping"].append((name, f"fits {partners} images, but no pose was found for it"))
     return {
         "format": 1,
         "fprf": version,
         "source": state["source"],
-        "images": {"given": len(images) + len(state["dropped"]), "used": len(images), "posed": len(main["images"])},
+        "images": {"given": len(images) + len(unused), "used": len(images), "posed": len(posed)},
         "points": main["points"],
         "error_pixels": main["error_pixels"],
         "track_length": main["track_length"],
-        "parts": [len(model["images"]) for model in models],
+        "parts": size,
         "matching": matching,
         "step_seconds": dict(state["seconds"]),
-        "dropped": [drop._asdict() for drop in drops],
+        "dropped": [
+            {"image": image, "step": step, "reason": reason} for step, drops in lost.items() for image, reason in drops
+        ],
     }
 
 

@@ -6,6 +6,7 @@ standard error.
 Exit codes: 0 done, 3 pycolmap is absent or too old, 4 no reconstruction; anything else is COLMAP's failure.
 """
 
+import itertools
 import json
 import sys
 from pathlib import Path
@@ -19,9 +20,10 @@ def main(job: dict[str, Any]) -> int:
     try:
         import pycolmap
 
+        # Another seed finds other points; the options looked up here are absent before pycolmap 4.
         steps = {"features": _features, "matches": _matches, "mapping": _mapping}
         pycolmap.set_random_seed(job["seed"])
-        pycolmap.FeatureExtractionOptions, pycolmap.ImportedPairingOptions  # noqa: B018 - absent before 4
+        pycolmap.FeatureExtractionOptions, pycolmap.ImportedPairingOptions  # noqa: B018
     except (ImportError, AttributeError) as error:
         print(f"pycolmap: {error}", file=sys.stderr)
         return NO_PYCOLMAP
@@ -34,7 +36,15 @@ def _features(pycolmap: Any, job: dict[str, Any]) -> int:
     options.max_image_size, options.num_threads = job["side"], job["threads"]
     options.sift.max_num_features = job["features"]
     for group in job["groups"]:
-        missing, camera = _missing(pycolmap, job["database"], group)
+        # Images of the group without features; the camera is that of those that have some, or a new one (-1).
+        missing, camera = [], -1
+        with pycolmap.Database.open(job["database"]) as base:
+            images = {image.name: image for image in base.read_all_images()}
+            for name in group:
+                image = images.get(name)
+                camera = camera if image is None else image.camera_id
+                if image is None or not base.exists_keypoints(image.image_id):
+                    missing.append(name)
         if not missing:
             continue
         reader = pycolmap.ImageReaderOptions()
@@ -49,20 +59,6 @@ def _features(pycolmap: Any, job: dict[str, Any]) -> int:
             device=pycolmap.Device.cpu if job["cpu"] else pycolmap.Device.auto,
         )
     return 0
-
-
-def _missing(pycolmap: Any, database: str, names: list[str]) -> tuple[list[str], int]:
-    """Images of a group without features, and the camera of those that have some; -1 where none has."""
-    camera, missing = -1, []
-    with pycolmap.Database.open(database) as base:
-        images = {image.name: image for image in base.read_all_images()}
-        for name in names:
-            image = images.get(name)
-            if image is not None:
-                camera = image.camera_id
-            if image is None or not base.exists_keypoints(image.image_id):
-                missing.append(name)
-    return missing, camera
 
 
 def _matches(pycolmap: Any, job: dict[str, Any]) -> int:
@@ -86,12 +82,12 @@ def _mapping(pycolmap: Any, job: dict[str, Any]) -> int:
     """Poses and points; every model is described in models.json, the largest one is written."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed, options.min_model_size = job["threads"], job["seed"], 3
-    registered = [0]
+    registered = itertools.count(1)
 
     def count() -> None:
-        registered[0] += 1
-        print(json.dumps({"registered": registered[0]}), flush=True)
+        print(json.dumps({"registered": next(registered)}), flush=True)
 
+    # COLMAP calls back for the first pair and for every image after it.
     out = Path(job["models"])
     out.mkdir(parents=True, exist_ok=True)
     mapped = pycolmap.incremental_mapping(

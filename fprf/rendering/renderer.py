@@ -20,7 +20,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..interfaces import ContentField, Decoder, Sampler, SemanticField
-from ..ops import march as compiled
 from ..ops.precision import full_precision
 from ..types import Rays, Rendered, Sampled, View, Want
 from .space import Space
@@ -56,8 +55,6 @@ class PackedSamples(NamedTuple):
     view: Annotated[Tensor, "M 3"]
     gradient_scale: Annotated[Tensor, "M"] | None = None
     """Factor of the gradients of their features in training; None = 1."""
-    start: Annotated[Tensor, "R+1"] | None = None
-    """Offsets of the samples of each ray, and their count at last; None = unknown."""
     whole: bool = False
     """True where every sample of every ray is kept, M = R S."""
 
@@ -92,13 +89,6 @@ def _march(rays: Rays, parts: Parts, budget: float, step: int | None, generator:
     # veil there. Scaling gradients by the square of the distance makes every piece of space count alike (Philip and
     # Deschaintre 2023); beyond a few times the nearest distance that is no longer needed.
     scaled = step is not None and space.kind in ("contraction", "open")
-    if not scaled and compiled.usable(rays.origin, sampled.t):
-        # The same without gradients, compiled, ray by ray.
-        place = compiled.place(rays, sampled.t, space.warp)
-        sample = parts.field.density(place.view(-1, 3))
-        weighed = compiled.weigh(sample.density.view(place.shape[:2]), sampled.t, budget)
-        kept = PackedSamples(*compiled.gather(weighed, place, sample.latent, rays.view), start=weighed.start)
-        return March(sampled, weighed.weights, weighed.depth, weighed.opacity, weighed.transmittance, kept)
     # Densities at the middle of each step, in the unit cube, where the fields live.
     middle = midpoints(sampled.t)
     points = rays.origin[:, None] + rays.direction[:, None] * middle[..., None]
@@ -165,8 +155,6 @@ def shade(
 def composite(kept: PackedSamples, values: Annotated[Tensor, "M C"], rays: int) -> Annotated[Tensor, "rays C"]:
     """Weighted sum over the kept samples of each ray (paper, Eq. 2)."""
     values = values.to(kept.weight.dtype)  # under autocast networks answer in half precision
-    if kept.start is not None and compiled.usable(kept.weight, values):
-        return compiled.composite(kept.weight, values, kept.start)
     if kept.whole and rays > 0:
         return (values * kept.weight[:, None]).view(rays, -1, values.shape[1]).sum(1)
     return values.new_zeros(rays, values.shape[1]).index_add(0, kept.ray, values * kept.weight[:, None])

@@ -20,7 +20,6 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor
 
-from ..ops import march
 from ..types import Rays
 
 Kind = Literal["box", "contraction", "ndc", "open"]
@@ -82,8 +81,6 @@ class Space:
         self, s: Annotated[Tensor, "R E"], near: Annotated[Tensor, "R"], far: Annotated[Tensor, "R"]
     ) -> Annotated[Tensor, "R E"]:
         """Ray parameters t of edges s in [0, 1]; increasing, with the ends on near and far."""
-        if march.usable(s, near, far):
-            return march.distances(s, near, far, self.warp)
         n, f = near[:, None], far[:, None]
         if self.kind in ("box", "ndc"):
             return n + (f - n) * s
@@ -95,9 +92,11 @@ class Space:
         return torch.where(g < 0.5, 2 * g, 0.5 / c.clamp(max=0.5))
 
     @cached_property
-    def warp(self) -> march.Warp:
-        """`locate` and `distance` as compiled kernels take them."""
-        return march.warp_of("box" if self.kind == "ndc" else self.kind, self.low, self.high)
+    def warp(self) -> Annotated[Tensor, "7"]:
+        """`locate` and `distance` as compiled kernels take them: 0 contraction, 1 box, 2 open, then the map of the box."""
+        number = {"contraction": 0.0, "box": 1.0, "ndc": 1.0, "open": 2.0}[self.kind]
+        low = torch.tensor(self.low)
+        return torch.cat([torch.tensor([number]), low, 2 / (torch.tensor(self.high) - low)])
 
     def metric(
         self, origin: Annotated[Tensor, "R 3"], direction: Annotated[Tensor, "R 3"], t: Annotated[Tensor, "R"]

@@ -18,8 +18,7 @@ from torch import Tensor
 from ..errors import DataError, UsageError
 from ..interfaces import Scene
 from ..io.images import to_uint8, write_image
-from ..style.colours import ColourMaps
-from ..style.look import Restyle
+from ..style.look import ColourMaps, Restyle
 from ..style.restyle import Styled
 from ..training.loading import open_run
 from .config import LookConfig

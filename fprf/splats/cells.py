@@ -4,8 +4,8 @@ The whole scene is trained first, on photographs of half the size, for most of t
 the poses that were refined there. It starts from Gaussians of the whole scene: those that its windows show explain what lies
 outside, and are dropped in the end.
 
-    RUN/views.json          where images and masks lie, so that no cell reads the whole scene folder again
-    RUN/checkpoints/        the union of all cells
+    RUN/overview, RUN/cells/NN      the whole scene, and the cells (see `training.tasks`)
+    RUN/checkpoints                 the union of all cells
 """
 
 import math
@@ -26,12 +26,10 @@ from ..datamanagers.images import load_images
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError
 from ..interfaces import Partition, State
-from ..io.atomic import write_json
-from ..io.strict_json import open_json
 from ..ops.rasterise import lift
 from ..ops.rasterise_training import compile_beside
-from ..plugins.codec import from_json
 from ..progress import Display
+from ..rendering.cameras import Cameras
 from ..training import checkpoint
 from ..training.camera_optimizers import Tones
 from ..training.driver import Schedule
@@ -46,12 +44,12 @@ from .initial import spatial_order
 from .learner import MOVES, GaussianLearner, Stage
 from .levels import in_view
 from .loading import refined
-from .photographs import cover, load_photographs, load_skies, make_levels
-from .training import build, limit_widths, lit_facts, reach_of
+from .photographs import cover, load_photographs, make_levels
+from .training import build, light_and_poses, limit_widths, scene_scale
 
 Number = TypeVar("Number", bound=np.generic)
 _FORMAT = 6
-"""Of what a cell is trained as."""
+"""Version of how a cell is trained: another one trains it anew."""
 _MOMENTS = "first", "second", "weight"
 _PIXELS, _SMALLEST = 16_000_000, 4
 """Pixels of all photographs that the whole scene is trained on, at most; how far they are reduced before some are left out."""
@@ -82,14 +80,14 @@ class Cells(Partition):
     def __init__(self, config: GaussiansConfig, scene: Scene, saved: Facts | None) -> None:
         self.config, self.scene = config, scene
         self.compiling = compile_beside((config.degree + 1) ** 2)
-        self._facts = saved or lit_facts(config, scene, lambda view: load_images(scene, config.background, [view])[0])
+        self._facts = saved or light_and_poses(config, scene, lambda view: load_images(scene, config.background, [view])[0])
 
     @property
     def facts(self) -> Facts:
         return self._facts
 
     def train(self, run: Run, display: Display, *, spent: float) -> None:
-        """The whole scene, all cells, those with the largest windows first, and their union. Finished ones stay."""
+        """Train the whole scene and all cells, those with the largest windows first, and unite them. Finished ones stay."""
         config, size = self.config, self.scene.cameras.size
         for process in self.compiling:
             process.wait()
@@ -103,44 +101,11 @@ class Cells(Partition):
         display.say(f"{unite(run.root, cells)} Gaussians")
 
     def write(self, run: Run) -> list[Cell]:
-        """Cut the scene and write all that tasks read. Cells of another cut, which could be taken for these, are removed."""
-        scene, data = self.scene, self.config.data or Path()
-        cells = bisect_sightings(scene, self.config.cells)
+        """Cut the scene and write the cells. Those of another cut, which could be taken for these, are removed."""
+        cells = bisect_sightings(self.scene, self.config.cells)
         if write_cells(run.root / "cells.json", cells):
             shutil.rmtree(run.root / "cells", ignore_errors=True)
-        views = run.root / "views.json"
-        views.unlink(missing_ok=True)
-        files = {"paths": scene.paths, "masks": scene.masks, "sky_masks": scene.sky_masks}
-        if all(path is None or path.is_relative_to(data) for paths in files.values() for path in paths):
-            named = {name: [path and path.relative_to(data).as_posix() for path in paths] for name, paths in files.items()}
-            write_json(views, named)
         return cells
-
-
-def read_views(root: Path, config: GaussiansConfig, data: Path) -> Scene:
-    """The views of a run's scene with their images in the folder `data`; parsed where the run does not list them.
-
-    Raises CheckpointError where the list cannot be read.
-    """
-    file, known = root / "views.json", Run(root).load_known()
-    if not file.is_file():
-        return read_scene(replace(config, data=data), known.facts)
-    with open_json(file, "train again to write it") as document:
-        paths = from_json(document["paths"], tuple[str, ...], path="paths")
-        masks = from_json(document["masks"], tuple[str | None, ...], path="masks")
-        skies = from_json(document.get("sky_masks", []), tuple[str | None, ...], path="sky_masks")  # older runs name none
-        if len(paths) != len(known.cameras) or not {len(masks), len(skies)} <= {0, len(paths)}:
-            raise ValueError(f"{len(paths)} images, {len(masks)} and {len(skies)} masks for {len(known.cameras)} cameras")
-    return Scene(
-        name=known.name,
-        paths=tuple(data / name for name in paths),
-        cameras=known.cameras,
-        train=torch.tensor(known.train),
-        test=torch.tensor(known.test, dtype=torch.int64),
-        masks=tuple(None if name is None else data / name for name in masks),
-        sky_masks=tuple(None if name is None else data / name for name in skies),
-        origin=known.facts.origin,
-    )
 
 
 def load_overview(root: Path) -> checkpoint.Saved:
@@ -192,23 +157,24 @@ class CellPart(Part):
     def build(self) -> GaussianLearner:
         """Go on from the whole scene, at lower rates."""
         config, cell, start = self.config, self.cell, self.start
-        # Photographs, from where the whole scene found its views, as far as the cell's windows reach.
-        scene = replace(self.scene, cameras=refined(self.scene.cameras, start))
-        images, masks = load_photographs(config, scene, list(cell.windows))
-        skies = load_skies(config, scene, images)
+        # Photographs, from where the whole scene found its views, as far as the cell's windows reach. Lengths follow from the
+        # cell's own cameras: points of the whole scene say nothing about it.
+        scene = replace(self.scene, cameras=refined(self.scene.cameras, start), points=None, seen=None)
+        images, masks, skies = load_photographs(config, scene, list(cell.windows))
         images, masks, skies = crop(cell, images), crop(cell, masks), crop(cell, skies)
         # Gaussians of the whole scene that these show.
         near, whole = float(start.model["near"]), from_tensors(start.model)
-        shown = shown_in_windows(scene, cell, whole, near)
-        gaussians, own = whole.select(shown), scene_in_windows(scene, cell)
+        own = scene_in_windows(scene, cell)
+        shown = shown_in_windows(own.cameras, cell, whole, near)
+        gaussians = whole.select(shown)
         # Only what lies inside and in the border becomes more: its share of all that may be added.
         around = int(cell.around(gaussians.means).sum())
-        cap = len(gaussians) + round(max(config.cap - len(whole), 0) * around / len(whole))
+        cap = len(gaussians) + round(max(config.most - len(whole), 0) * around / len(whole))
         tones = overview_tones(self.facts, start)
         learner = GaussianLearner(
             replace(config, cap=cap, rate=_RATE * config.rate),
             make_levels(own, images, masks, near, skies),
-            reach_of(own),
+            scene_scale(own),
             cap,
             cell.around,
             # Of all cameras: what lies before those of other cells is part of the union.
@@ -234,11 +200,12 @@ def open_cell(task: Task) -> Overview | CellPart:
     """
     root, number = Path(task.root), task.part
     folder, facts, config = folder_of(root, number), Run(root).load_known().facts, Run(root).load_config()[0]
-    assert isinstance(config, GaussiansConfig)
-    scene = read_views(root, config, Path(task.data))
+    assert isinstance(config, GaussiansConfig)  # by its kind
+    scene = read_scene(replace(config, data=Path(task.data)), facts)
+    # Fields of the config that may change without training a part anew.
     free = (*RESUMABLE, *config.untrained, "cells")
     if number == WHOLE:
-        own, every = reduced(replace(config, data=Path(task.data)), scene)
+        own, every = overview_config(replace(config, data=Path(task.data)), scene)
         return Overview(
             name="whole scene",
             folder=folder,
@@ -271,11 +238,12 @@ def open_cell(task: Task) -> Overview | CellPart:
     )
 
 
-def reduced(config: GaussiansConfig, scene: Scene) -> tuple[GaussiansConfig, int]:
+def overview_config(config: GaussiansConfig, scene: Scene) -> tuple[GaussiansConfig, int]:
     """How the whole scene is trained before its cells, and which one of so many photographs it learns from.
 
     Of smaller images, then of fewer, where memory would not be bounded.
     """
+    # Memory is in proportion to the pixels: half the size, then a third, a quarter, and then every other photograph ...
     pixels, factor = int(scene.cameras.size[scene.train].prod(1).sum()), 2
     while factor < _SMALLEST and pixels > factor**2 * _PIXELS:
         factor += 1
@@ -286,7 +254,7 @@ def reduced(config: GaussiansConfig, scene: Scene) -> tuple[GaussiansConfig, int
         # The levels that one piece would be trained on, of images which are smaller already.
         coarse=min(1.0, config.coarse / config.overview / 3 ** math.log2(factor)),
         # As many as one piece would have by then.
-        cap=round(config.initial * (config.cap / config.initial) ** min(1.0, config.overview / config.grow)),
+        cap=round(config.initial * (config.most / config.initial) ** min(1.0, config.overview / config.grow)),
         steps=max(1, round(config.overview * config.steps), _VISITS * len(scene.train[::every])),
     )
     return own, every
@@ -321,12 +289,12 @@ def crop(cell: Cell, images: dict[int, NDArray[Number]]) -> dict[int, NDArray[Nu
     return cropped
 
 
-def shown_in_windows(scene: Scene, cell: Cell, gaussians: Gaussians, near: float) -> Annotated[Tensor, "N"]:
+def shown_in_windows(cameras: Cameras, cell: Cell, gaussians: Gaussians, near: float) -> Annotated[Tensor, "N"]:
     """True for Gaussians that a window shows, and for all in the cell and its border.
 
-    What others hide, and what covers next to nothing, is not shown, so their number does not grow with the scene.
+    `cameras` are those of `scene_in_windows`. What others hide, and what covers next to nothing, is not shown, so their number
+    does not grow with the scene.
     """
-    cameras = scene_in_windows(scene, cell).cameras
     visible = cell.around(gaussians.means)
     # Runs [B R] of Gaussians near to each other, the last one repeated, with balls around what they show: most windows
     # show few of them.

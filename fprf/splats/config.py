@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from ..interfaces import Partition, SceneLearner
     from ..training.model import Facts
 
+_CAP = 60_000
+
 
 @dataclass(frozen=True, kw_only=True)
 class GaussianSemanticsConfig:
@@ -57,6 +59,7 @@ class GaussiansConfig(RunConfig):
     kind: ClassVar[str] = "gaussians"
     untrained: ClassVar[tuple[str, ...]] = ("semantic", "regions", "semantic_size", "executor")
     former: ClassVar[tuple[str, ...]] = ("rounds",)
+    open: ClassVar[tuple[str, ...]] = ("downscale", "cap")
 
     steps: int = 10_000
     """Optimiser steps: one view each."""
@@ -78,8 +81,11 @@ class GaussiansConfig(RunConfig):
     surroundings: int = 500
     """Further Gaussians on a distant sphere at the start: they hold sky, and fill what no photograph shows. Only cells
     split them. At most a tenth of `cap`; 0 = none."""
-    cap: int = 60_000
-    """Gaussians at the end, at most."""
+    cap: int | None = None
+    """Gaussians at the end, at most; none = by the minutes and this machine's speed, and saved with the run."""
+    longest: int = 1600
+    """Longest side in pixels, at most, to which photographs are reduced where `downscale` is not given. Where the minutes are
+    too few for that size they are reduced further."""
     pixels_per_gaussian: int = 20
     """Pixels of all training views for each Gaussian, at least: few photographs get fewer Gaussians. Not in cells."""
     degree: int = 2
@@ -113,8 +119,11 @@ class GaussiansConfig(RunConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("initial", "passes", "cap", "pixels_per_gaussian", "cells", "regions", "relocate_every"):
+        for name in ("initial", "passes", "pixels_per_gaussian", "cells", "regions", "relocate_every"):
             at_least(name, getattr(self, name), 1)
+        if self.cap is not None:
+            at_least("cap", self.cap, 1)
+        at_least("longest", self.longest, 32)
         at_least("surroundings", self.surroundings, 0)
         at_least("semantic_size", self.semantic_size, 32)
         if self.degree not in range(4):
@@ -144,6 +153,17 @@ class GaussiansConfig(RunConfig):
 
         return build(self, scene, saved, progress)
 
+    def planned(self, scene: "Scene", device: str) -> "GaussiansConfig":
+        """Size and number of Gaussians, as `splats.plan` finds them."""
+        from .plan import plan
+
+        return plan(self, scene)
+
+    @property
+    def most(self) -> int:
+        """`cap`; where neither the user nor a plan has said it, 60 000."""
+        return self.cap or _CAP
+
     @property
     def scene_parser(self) -> DataParserConfig | None:
         return self.parser
@@ -155,3 +175,6 @@ class GaussiansConfig(RunConfig):
     def limited(self, views: int) -> int:
         """At most so many passes over them."""
         return min(self.steps, self.passes * views)
+
+    def described(self) -> str:
+        return f", up to {self.most:,} Gaussians"

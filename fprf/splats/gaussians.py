@@ -1,7 +1,7 @@
 """3D Gaussians with view-dependent colours (Kerbl et al. 2023), as every part of fprf passes them.
 
 World axes are the capture's own. Colour seen along a unit direction d = max(0, 0.5 + sum_k Y_k(d) harmonics_k), sRGB, with
-the real spherical harmonics Y of `fields.harmonics`.
+the real spherical harmonics Y of `ops.harmonics`.
 """
 
 import math
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ..errors import CheckpointError, DataError
 from ..ops.harmonics import HARMONIC
+from ..ops.rasterise_training import HARMONICS, LOG_SCALES, LOGIT, MEANS, QUATERNION
 
 COUNTS = (1, 4, 9, 16, 25)
 """Harmonics a channel, by degree."""
@@ -58,7 +59,7 @@ class Gaussians:
 
     @property
     def opacities(self) -> Annotated[Tensor, "N"]:
-        """In [0, 1]."""
+        """Opacities in [0, 1]."""
         return torch.sigmoid(self.logits)
 
     @property
@@ -67,27 +68,31 @@ class Gaussians:
         return 0.5 + HARMONIC * self.harmonics[:, 0]
 
     @property
+    def rows(self) -> Annotated[Tensor, "N R"]:
+        """All parameters of a Gaussian in a row of R = 11 + 3 K, in the columns of `ops.rasterise_training`."""
+        parts = (self.means, self.log_scales, self.quaternions, self.logits[:, None])
+        return torch.cat([*parts, self.harmonics.flatten(1)], 1)
+
+    @property
     def finite(self) -> Annotated[Tensor, "N"]:
         """Gaussians that can be drawn, bool: with finite numbers below 1e15 and rotations of a length above 0.
 
         Infinite logits are opacities 0 and 1, and ln-scales of -inf those of flat Gaussians: both can be drawn.
         """
-        return self._bounded & ~self._unrotated
+        bounded, turned = self._sound()
+        return bounded & turned
 
-    @property
-    def _bounded(self) -> Annotated[Tensor, "N"]:
+    def _sound(self) -> tuple[Annotated[Tensor, "N"], Annotated[Tensor, "N"]]:
+        """Masks of the Gaussians whose numbers are within bounds, and of those that have a rotation."""
         parts = (self.means, self.quaternions, self.harmonics.flatten(1))
+        small = torch.stack([(part.abs() < _LARGEST).all(1) for part in parts]).all(0)
         sized = (self.log_scales <= _WIDEST).all(1)  # False for NaN
-        return torch.stack([(part.abs() < _LARGEST).all(1) for part in parts]).all(0) & sized & ~self.logits.isnan()
-
-    @property
-    def _unrotated(self) -> Annotated[Tensor, "N"]:
-        return (self.quaternions.abs() < 1e-12).all(1)
+        return small & sized & ~self.logits.isnan(), (self.quaternions.abs() >= 1e-12).any(1)
 
     def faults(self) -> list[str]:
         """How many Gaussians cannot be drawn, for each reason: "3 that are not finite"."""
-        bounded = self._bounded
-        counts = {"that are not finite": ~bounded, "without a rotation": bounded & self._unrotated}
+        bounded, turned = self._sound()
+        counts = {"that are not finite": ~bounded, "without a rotation": bounded & ~turned}
         return [f"{int(each.sum())} {what}" for what, each in counts.items() if bool(each.any())]
 
     def drawable(self) -> "Gaussians":
@@ -112,7 +117,7 @@ class GaussianRows:
     count: int
     part: Callable[[slice], Gaussians]
     antialiased: bool
-    """Their opacities are compensated for the width that drawing adds (Mip-Splatting)."""
+    """Opacities are compensated for the width that drawing adds (Mip-Splatting)."""
 
 
 def from_arrays(
@@ -121,6 +126,13 @@ def from_arrays(
     """Gaussians of arrays of any float type; what is beyond float32 becomes infinite."""
     parts = (means, quaternions, log_scales, logits, harmonics)
     return Gaussians(*(torch.from_numpy(np.require(part, np.float32, ["C", "W"])) for part in parts))
+
+
+def from_rows(rows: Annotated[Tensor, "N R"]) -> Gaussians:
+    """The Gaussians of `Gaussians.rows`."""
+    harmonics = rows[:, HARMONICS].reshape(len(rows), (rows.shape[1] - HARMONICS.start) // 3, 3)
+    parts = (rows[:, MEANS], rows[:, QUATERNION], rows[:, LOG_SCALES], rows[:, LOGIT.start], harmonics)
+    return Gaussians(*(part.contiguous() for part in parts))
 
 
 def tensors_of(gaussians: Gaussians, near: float) -> dict[str, Tensor]:
@@ -157,6 +169,7 @@ def bulk_of(points: Annotated[NDArray[Any], "N 3"]) -> Bulk:
 
 def morton_order(cells: Annotated[NDArray[np.int64], "N 3"]) -> NDArray[np.int64]:
     """Indices along a Morton curve (Z-order) of cells, 0 to 1023 a side: neighbours in space follow each other."""
+    # Bits of the three coordinates interleaved: each coordinate's are spread to every third place by doubling the gaps.
     code = np.zeros(len(cells), np.int64)
     for axis in range(3):
         v = cells[:, axis]

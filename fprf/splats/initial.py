@@ -31,7 +31,7 @@ _FAR = 10.0
 _BLUR = 8
 """Pixels of a photograph's shorter side once its colours are blurred for the surroundings."""
 _NEIGHBOURING = 8
-"""Seen directions around one that no view shows, whose mean colour it gets."""
+"""Directions that views show, nearest to one that none shows, whose mean colour it gets."""
 
 
 class Points(NamedTuple):
@@ -46,16 +46,13 @@ def initial_points(scene: Scene, images: Mapping[int, Image], count: int, rng: n
     if scene.points is not None and len(scene.points) >= _ENOUGH:
         position = scene.points.double().numpy()
         position = position[np.isfinite(position).all(1)]
-        chosen = rng.permutation(len(position))[:count]
-        position, kind = position[np.sort(chosen)], "points of the reconstruction"
-        points = Points(position, _mean_colours(scene, images, position)[0])
-    else:
-        points, kind = _matched(scene, images), "points matched between views"
-        if len(points.position) < _ENOUGH:
-            points, kind = _scattered(scene, images, min(count, 10_000), rng), "random points"
-        chosen = np.sort(rng.permutation(len(points.position))[:count])
-        points = Points(points.position[chosen], points.colour[chosen])
-    return points, kind
+        position = position[np.sort(rng.permutation(len(position))[:count])]
+        return Points(position, _mean_colours(scene, images, position)[0]), "points of the reconstruction"
+    points, kind = _matched(scene, images), "points matched between views"
+    if len(points.position) < _ENOUGH:
+        points, kind = _scattered(scene, images, min(count, 10_000), rng), "random points"
+    chosen = np.sort(rng.permutation(len(points.position))[:count])
+    return Points(points.position[chosen], points.colour[chosen]), kind
 
 
 def surroundings(scene: Scene, images: Mapping[int, Image], points: Points, count: int) -> Points:
@@ -63,6 +60,7 @@ def surroundings(scene: Scene, images: Mapping[int, Image], points: Points, coun
 
     Where no view looks, the colours of the nearest seen directions go on.
     """
+    # A sphere around the cameras, far outside of what they see.
     centres = scene.cameras.pose[scene.train][:, :, 3].numpy()
     centre = centres.mean(0)
     away = np.linalg.norm(points.position - centre, axis=1)
@@ -92,6 +90,7 @@ def spacing(position: Annotated[Doubles, "P 3"]) -> Annotated[Doubles, "P"]:
     count = len(position)
     if count < 4:
         return np.ones(count)
+    # Of each point the three least distances so far, to those that lie so many places apart on the curve, on either side.
     order = spatial_order(position)
     sorted_, near = position[order], np.full((3, count), np.inf)
     for step in range(1, min(_WINDOW, count - 1) + 1):
@@ -180,6 +179,7 @@ def _pairs(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[NDA
     """Mutual best matches whose second best is clearly worse (Lowe's ratio, 0.85)."""
     alike = first @ second.T
     rows = np.arange(len(first))
+    # The two best matches of each; distances of unit vectors follow from their cosines.
     two = np.argpartition(-alike, 1, axis=1)[:, :2]
     a, b = alike[rows, two[:, 0]], alike[rows, two[:, 1]]
     best = np.where(a >= b, two[:, 0], two[:, 1])
@@ -193,10 +193,12 @@ def _triangulated(rays: list[Doubles], pixels: tuple[Doubles, Doubles], centres:
     with np.errstate(divide="ignore", invalid="ignore"):
         homogeneous = cv2.triangulatePoints(rays[0], rays[1], pixels[0].T, pixels[1].T)
         position = (homogeneous[:3] / homogeneous[3]).T
+        # Points lie before both views and project to within some pixels of where they were seen ...
         good = np.isfinite(position).all(1)
         for matrix, pixel in zip(rays, pixels, strict=True):
             shown = position @ matrix[:, :3].T + matrix[:, 3]
             good &= (shown[:, 2] > 0) & (np.linalg.norm(shown[:, :2] / shown[:, 2:] - pixel, axis=1) < _PIXELS)
+        # ... and the angle between their rays says how far away they are.
         u, v = position - centres[0], position - centres[1]
         cosine = (u * v).sum(1) / np.linalg.norm(u, axis=1) / np.linalg.norm(v, axis=1)
     return np.where((good & (cosine < math.cos(_ANGLE)))[:, None], position, np.nan)
@@ -204,12 +206,14 @@ def _triangulated(rays: list[Doubles], pixels: tuple[Doubles, Doubles], centres:
 
 def _scattered(scene: Scene, images: Mapping[int, Image], count: int, rng: np.random.Generator) -> Points:
     """Points on random rays, their distances spread evenly over the logarithm: from a third to 30 times the cameras' spread."""
+    # Random pixels of random views, and their colours.
     views = rng.choice(scene.train.numpy(), count)
     centre = scene.cameras.pose[:, :, 3].numpy()
     spread = max(float(np.linalg.norm(centre - centre.mean(0), axis=1).mean()), _TINY)
     size = scene.cameras.size[views].numpy()
     pixel = rng.random((count, 2)) * size
     colour = np.stack([images[v][int(y), int(x)] for v, (x, y) in zip(views, pixel, strict=True)])
+    # Points at random depths on their rays, lenses left out: from OpenGL's camera axes into the world.
     depth = spread * np.exp(rng.uniform(math.log(1 / 3), math.log(30), count))
     plane = (pixel - scene.cameras.centre[views].numpy()) / scene.cameras.focal[views].numpy()
     local = np.stack([plane[:, 0], -plane[:, 1], -np.ones(count)], 1) * depth[:, None]

@@ -4,18 +4,26 @@ A step renders a training view and moves what it shows against the gradient of
 
     L = (1 - ssim) mean |f * render - photograph| + ssim (1 - SSIM(f * render, photograph))        (Kerbl et al., Eq. 7)
 
-where f are the factors of the view's own exposure (`tones`), 1 where none are learnt. Where views err, Gaussians are split
-(`_relocate`), in the place of those that became transparent, and until there are as many as the config allows.
+where f are the factors of the view's own exposure (`Tones`), 1 where none are learnt. Where views err, Gaussians are split, in
+the place of those that became transparent, and until there are as many as the config allows: the relocation of 3DGS-MCMC
+(Kheradmand et al. 2024) with the halves of Kerbl et al.
 
-N Gaussians, V views, R = 11 + 3 K parameters of a Gaussian with K = (degree + 1)^2 harmonics, in the columns that
-`ops.rasterise_training` names: means, logarithms of the standard deviations, quaternion, logit of the opacity, harmonics.
-Every draw is a function of (seed, step), so parameters, moments and the step are all the state there is.
+Shapes: N Gaussians, M of them that are split, V views, K = (degree + 1)^2 harmonics of a colour channel. A Gaussian is a row
+of R = 11 + 3 K float32 parameters, in the columns that `ops.rasterise_training` names:
+
+    MEANS        3     in the world
+    LOG_SCALES   3     natural logarithms of the standard deviations along the own axes
+    QUATERNION   4     own axes to world, w x y z, of any length above 0
+    LOGIT        1     opacity = 1 / (1 + exp(-logit)), in (0, 1)
+    HARMONICS    3 K   colour = 0.5 + sum_k Y_k(direction) h_k, sRGB; coefficient after coefficient, that of degree 0 first
+
+`share` in [0, 1) says how much of the schedule is over. Every draw is a function of (seed, step), so parameters, Adam's
+moments and the step are all the state there is.
 """
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -25,46 +33,54 @@ from torch import Tensor
 
 from ..interfaces import Figures, SceneLearner, State
 from ..ops.harmonics import HARMONIC
-from ..ops.rasterise_training import HARMONICS, LOG_SCALES, LOGIT, MEANS, QUATERNION, Learnt, Target, TrainableGaussians
+from ..ops.rasterise_training import (
+    HARMONICS,
+    LOG_SCALES,
+    LOGIT,
+    MEANS,
+    QUATERNION,
+    Floats,
+    Learnt,
+    Target,
+    TrainableGaussians,
+)
 from ..rendering.splines import rotations
-from ..training.camera_optimizers import Poses, Tones
+from ..training.camera_optimizers import Poses, Tones, rotated
 from ..training.model import Facts
 from ..training.run import Known, Run
 from .config import GaussiansConfig
-from .gaussians import Gaussians, from_arrays, from_tensors, tensors_of
+from .gaussians import Gaussians, from_arrays, from_rows, from_tensors, tensors_of
 from .initial import Points, spacing, spatial_order
-from .photographs import Floats, Level, moved
-from .scene import Semantics, SplatScene, find_semantics
+from .photographs import Level
+from .scene import SplatScene, run_scene
 
 _START_OPACITY, _START_SCALE, _FAR_OPACITY = 0.3, 0.7, 0.9
-"""Of the first Gaussians: opacity, standard deviation as a share of the distance to their neighbours, opacity far away."""
-_RATES = {"means": 2.5e-3, "scales": 0.08, "turns": 0.016, "opacity": 0.1, "colour": 0.07, "harmonics": 0.01}
-"""Learning rates at the beginning, the means' in units of `reach`. They fall to a fifth, the means' to a twentieth."""
+"""First Gaussians: opacity, standard deviation as a share of the distance to their neighbours, opacity far away."""
+_RATES = {"means": 2.5e-3, "scales": 0.08, "quats": 0.016, "opacities": 0.1, "sh0": 0.07, "shN": 0.01}
+"""Learning rates at the beginning, the means' in units of the scene scale. They fall to a fifth, the means' to a twentieth."""
 _DECAY, _DECAY_EVERY = 3e-3, 20
 """Weight decay of the harmonics above degree 0, a step, and the steps between its uses; it falls as the rates do. From where no
 photograph looks they would become any colour, which a style that refits cut colours brings into view as specks."""
-_GAIN, _EXPONENT = 0.005, 2e-3
+_GAIN_RATE, _EXPONENT_RATE = 0.005, 2e-3
 """Learning rates of the logarithms of a view's factors, whenever it is seen, and of the exponent. They fall to a tenth."""
 _SETTLE, _SORT_EVERY, _LAST = 200, 5, 0.85
 """Steps before the first relocation; relocations between sorts; share of training after which nothing is moved any more."""
-_JUDGES = 8
+_ERROR_VIEWS = 8
 """Views whose errors say where Gaussians are split."""
 _DEAD = 0.005
 """Opacity below which a Gaussian is moved elsewhere."""
 _SKY, _SEEN = 0.7, 1.0
-"""Share of a Gaussian's weight in sky, and its least weight in pixels of the views that judge, from which on it is moved."""
+"""Share of a Gaussian's weight in sky, and its least weight in pixels of these views, from which on it is moved."""
 _SPLIT_SIZE, _SPLIT_DISTANCE, _SPLIT_OPACITY = 0.6, 0.5, 0.85
-"""Of both halves: size and distance from the middle along the longest axis, as shares of its size, and share of the opacity."""
+"""Halves: size and distance from the middle along the longest axis, as shares of its size; share of the opacity."""
 _SMOOTHING = 0.95
 """Decay of running means."""
-_VIEWS = 32
-"""Training views that semantics are found in, at most."""
 MOVES = "poses.moves"
 """Name in checkpoints of where views were moved: `Poses.moved_by`."""
 _KEPT = "value", "first", "second", "steps"
 """Names in checkpoints of the parameter of a correction, its moments, and the steps of each view."""
 
-Narrow = Callable[[TrainableGaussians, int], None]
+LimitWidths = Callable[[TrainableGaussians, int], None]
 """Cuts standard deviations in place after a step."""
 
 
@@ -79,10 +95,10 @@ class Stage(NamedTuple):
 
 
 class GaussianLearner(SceneLearner):
-    """Gaussians in training. `reach` is the radius of the cameras' positions in world units: the unit of the means' rate.
+    """Gaussians in training. `scene_scale` is the unit of the means' learning rate, in world units.
 
     There is room for `room` of them. Only those whose means are `inside` are split or moved; None = all. After each step
-    `narrow` may cut the standard deviations; None = none is limited. Nothing nearer to a camera than `near` is drawn.
+    `limit_widths` may cut the standard deviations; None = none is limited. Nothing nearer to a camera than `near` is drawn.
     With `tones` each view's factors are learnt as well, with `poses` where each view was taken. `only` colours learns harmonics
     alone, `only` poses neither Gaussians nor factors. `known` is what scene.json will hold, for learners of a run; `origin`
     says where the first Gaussians come from.
@@ -92,10 +108,10 @@ class GaussianLearner(SceneLearner):
         self,
         config: GaussiansConfig,
         levels: list[Level],
-        reach: float,
+        scene_scale: float,
         room: int,
         inside: Callable[[Annotated[Tensor, "N 3"]], Annotated[Tensor, "N"]] | None = None,
-        narrow: Narrow | None = None,
+        limit_widths: LimitWidths | None = None,
         *,
         near: float = 0.01,
         tones: Tones | None = None,
@@ -105,8 +121,8 @@ class GaussianLearner(SceneLearner):
         known: Known | None = None,
         origin: str = "",
     ) -> None:
-        self.inside, self.narrow, self.near, self.known, self.origin = inside, narrow, near, known, origin
-        self.config, self.levels, self.reach, self.stage = config, levels, reach, stage or Stage()
+        self.inside, self.limit_widths, self.near, self.known, self.origin = inside, limit_widths, near, known, origin
+        self.config, self.levels, self.scene_scale, self.stage = config, levels, scene_scale, stage or Stage()
         self.bands = (config.degree + 1) ** 2
         self.model = TrainableGaussians(room, self.bands)
         self.begun = self.pixels = self.skipped = self.failed = 0
@@ -129,33 +145,27 @@ class GaussianLearner(SceneLearner):
         assert self.known is not None  # learners of a run have it
         return self.known.facts
 
-    @property
-    def count(self) -> int:
-        """Gaussians at this time."""
-        return self.model.count
-
     def begin_at(self, points: Points, rng: np.random.Generator, surroundings: Points | None = None) -> None:
         """Put a Gaussian at each point: as wide as the points lie apart, in any direction; those of surroundings are opaque."""
         # Neighbours in space follow each other, so that tiles find what they show close together.
         order = spatial_order(points.position)
         position, colour = points.position[order], points.colour[order]
-        size = spacing(position) * _START_SCALE
-        logit = np.full(len(position), math.log(_START_OPACITY / (1 - _START_OPACITY)))
+        size, opacity = spacing(position) * _START_SCALE, np.full(len(position), _START_OPACITY)
         if surroundings is not None:
             far = surroundings.position
             position, colour = np.concatenate([position, far]), np.concatenate([colour, surroundings.colour])
             size = np.concatenate([size, spacing(far) * _START_SCALE])
-            logit = np.concatenate([logit, np.full(len(far), math.log(_FAR_OPACITY / (1 - _FAR_OPACITY)))])
+            opacity = np.concatenate([opacity, np.full(len(far), _FAR_OPACITY)])
         # The same colour from everywhere: c = 0.5 + Y_0 h_0.
         harmonics = np.zeros((len(position), self.bands, 3), np.float32)
         harmonics[:, 0] = (colour - 0.5) / HARMONIC
-        turns, sizes = rng.normal(size=(4, len(position))).T, np.repeat(np.log(size)[:, None], 3, 1)
-        self.start_from(from_arrays(position, turns, sizes, logit, harmonics))
+        quaternions, log_scales = rng.normal(size=(4, len(position))).T, np.repeat(np.log(size)[:, None], 3, 1)
+        self.start_from(from_arrays(position, quaternions, log_scales, np.log(opacity / (1 - opacity)), harmonics))
 
     def start_from(self, gaussians: Gaussians) -> None:
         """Begin with Gaussians, of the config's degree, as they are."""
         self.begun = len(gaussians)
-        self.model.start(_rows(gaussians))
+        self.model.start(gaussians.rows.numpy())
 
     def step(self, index: int, share: float) -> None:
         """Learn from one view."""
@@ -169,7 +179,7 @@ class GaussianLearner(SceneLearner):
         view = views[np.random.default_rng((config.seed, epoch)).permutation(len(views))[turn]]
         target = self._target(level, view)
         # Render, compare, and move every Gaussian that the view shows; nothing moves where the loss is not finite.
-        rates, factors = self._rates(share), self._factors(view)
+        rates, factors = self._learning_rates(share), self._factors(view)
         measured = self.model.learn(target, background=config.background, ssim=config.ssim, rates=rates, factors=factors)
         if not math.isfinite(measured.l1 + measured.ssim):
             self.skipped, self.failed = self.skipped + 1, self.failed + 1
@@ -178,26 +188,36 @@ class GaussianLearner(SceneLearner):
         # Colours that no view shows fall back to their mean, and what grew too wide is cut.
         if step % _DECAY_EVERY == 0 and self.only is None:
             self.model.multiply(slice(HARMONICS.start + 3, None), 1 - _DECAY_EVERY * _DECAY * 0.2**share)
-        if self.narrow is not None:
-            self.narrow(self.model, step)
-        self._correct(view, target, measured, share)
+        if self.limit_widths is not None:
+            self.limit_widths(self.model, step)
+        self._correct_view(view, target, measured, share)
         # Gaussians move to where views err, but not while the first ones settle, nor so late that nothing learns them.
         due = (step + 1) % config.relocate_every == 0 and self.only is None
         if due and step >= _SETTLE and share < max(config.grow, _LAST):
-            self._relocate(step, level, share)
+            self._relocate_and_grow(step, level, share)
+        # Running means, which start at the first value.
         self.pixels += target.width * target.height
         for name, value in (("rgb", measured.squared), ("l1", measured.l1), ("ssim", measured.ssim)):
             self.means[name] = _SMOOTHING * self.means.get(name, value) + (1 - _SMOOTHING) * value
 
-    def figures(self) -> Figures:
-        means = self.means | {"gaussians": float(self.count)}
-        return Figures(means, self.pixels, self.skipped, self.failed, "the loss" if self.failed else "")
+    def _target(self, level: Level, view: int) -> Target:
+        """A photograph, taken from where its pose is now."""
+        target = level[view]
+        if self.poses is None:
+            return target
+        move = self.poses.moved_by()[view]
+        axes = rotated(torch.from_numpy(target.axes), move[:3].expand(3, 3))
+        return target.seen_from(axes.numpy(), target.centre + move[3:].numpy())
 
-    def _rates(self, share: float) -> Annotated[Floats, "R"]:
-        """Learning rates of the columns, when a share of the training is over."""
-        sizes = {"means": 3, "scales": 3, "turns": 4, "opacity": 1, "colour": 3, "harmonics": 3 * (self.bands - 1)}
+    def _factors(self, view: int) -> Annotated[Floats, "3"] | None:
+        """Factors of renders of a view; None = 1."""
+        return None if self.tones is None else self.tones(torch.tensor([view]))[0].detach().numpy()
+
+    def _learning_rates(self, share: float) -> Annotated[Floats, "R"]:
+        """Learning rates of the columns, when a share of the training is over; 0 of what is not learnt."""
+        sizes = {"means": 3, "scales": 3, "quats": 4, "opacities": 1, "sh0": 3, "shN": 3 * (self.bands - 1)}
         rates = np.concatenate([np.full(size, _RATES[name]) for name, size in sizes.items()])
-        rates[MEANS] *= self.reach
+        rates[MEANS] *= self.scene_scale
         falls = np.full(len(rates), 0.2**share)
         falls[MEANS] = 0.05**share
         if self.only is not None:
@@ -205,73 +225,65 @@ class GaussianLearner(SceneLearner):
         scaled: Floats = (self.config.rate * rates * falls).astype(np.float32)
         return scaled
 
-    def _target(self, level: Level, view: int) -> Target:
-        """A photograph, taken from where its pose is now."""
-        if self.poses is None:
-            return level[view]
-        move = self.poses.moved_by()[view]
-        return moved(level[view], move[:3], move[3:])
-
-    def _factors(self, view: int) -> Annotated[Floats, "3"] | None:
-        """Factors of renders of a view; None = 1."""
-        return None if self.tones is None else self.tones(torch.tensor([view]))[0].detach().numpy()
-
     @torch.no_grad()
-    def _correct(self, view: int, target: Target, measured: Learnt, share: float) -> None:
+    def _correct_view(self, view: int, target: Target, measured: Learnt, share: float) -> None:
         """Move the exposure and the pose of a view by a step of Adam; their rates fall to a tenth.
 
         Each view counts its own steps: with moments of all views together, one that is seen every thousandth step moved by the
         root of a thousand times the rate, and far scenes got worse.
         """
         if self.tones is not None and self.only != "poses":
+            # The factor is exp(gain + exponent * exposure): a slope by the exponent is that by the gain, times the exposure.
             pull, rate = torch.from_numpy(measured.pull), self.config.rate * 0.1**share
-            _adam([each[view] for each in self.corrections["tones.gain"]], pull, _GAIN * rate)
+            _adam_step([each[view] for each in self.corrections["tones.gain"]], pull, _GAIN_RATE * rate)
             if self.tones.exponent.requires_grad:
                 slope = pull.sum() * self.tones.exposure[view]
-                _adam(self.corrections["tones.exponent"], slope, _EXPONENT * rate)
+                _adam_step(self.corrections["tones.exponent"], slope, _EXPONENT_RATE * rate)
         if self.poses is not None:
             # The gradient of a rotation vector is taken for that of a further turn: exact to first order in how far views turn.
             gradient = torch.from_numpy(measured.of_camera)
             slope = torch.cat([torch.from_numpy(target.axes).T @ gradient[:3], self.poses.reach * gradient[3:]]).float()
-            _adam([each[view] for each in self.corrections["poses.offset"]], slope, self.config.poses * 0.1**share)
+            _adam_step([each[view] for each in self.corrections["poses.offset"]], slope, self.config.poses * 0.1**share)
 
-    def _relocate(self, step: int, level: Level, share: float) -> None:
+    def _relocate_and_grow(self, step: int, level: Level, share: float) -> None:
         """Split Gaussians where views err: as many as became transparent, which move there, and as the number grows by."""
-        draw = np.random.default_rng((self.config.seed, step, 1))
-        # What each Gaussian has to do with the errors of some views, with their sky, and with all that they show.
-        shown = np.zeros((self.count, 3))
-        for view in draw.permutation(list(level))[:_JUDGES]:
-            shown += self.model.errors(self._target(level, view), self.config.background, self._factors(view))
+        draw, model = np.random.default_rng((self.config.seed, step, 1)), self.model
+        # Of each Gaussian: the errors of some views, their sky, and all of their pixels, each times its weight there.
+        sums = np.zeros((model.count, 3))
+        for view in draw.permutation(list(level))[:_ERROR_VIEWS]:
+            sums += model.errors(self._target(level, view), self.config.background, self._factors(view))
+        error, sky, seen = sums.T
         # The chance of a split: opacity times error, so that neither haze nor what is right already becomes more.
-        opacity = 1 / (1 + np.exp(-self.model.read(LOGIT)[:, 0].astype(np.float64)))
-        chance = np.nan_to_num(shown[:, 0] * opacity)
+        opacity = 1 / (1 + np.exp(-model.read(LOGIT)[:, 0].astype(np.float64)))
+        chance = np.nan_to_num(error * opacity)
         # What is transparent, or shows almost only in the sky and so floats before it, can be had.
-        spare = (opacity < _DEAD) | (shown[:, 1] > _SKY * np.maximum(shown[:, 2], _SEEN))
+        spare = (opacity < _DEAD) | (sky > _SKY * np.maximum(seen, _SEEN))
         if self.inside is not None:
-            inside = self.inside(torch.from_numpy(self.model.read(MEANS))).numpy()
+            inside = self.inside(torch.from_numpy(model.read(MEANS))).numpy()
             chance, spare = chance * inside, spare & inside
         dead = np.flatnonzero(spare)
         chance[dead] = 0
         # The number grows evenly on a logarithmic scale: begun (cap / begun)^(share / grow).
-        cap = max(self.config.cap, self.begun)
+        cap = max(self.config.most, self.begun)
         wanted = int(self.begun * (cap / self.begun) ** min(1.0, share / self.config.grow))
-        more = max(wanted - self.count, 0)
+        more = max(wanted - model.count, 0)
+        # One half stays in its place, the other takes that of a dead one, or a new one at the end.
         many = min(len(dead) + more, int(np.count_nonzero(chance)))
         if many > 0:
-            # One half stays in its place, the other takes that of a dead one, or a new one at the end.
-            picked = draw.choice(self.count, many, replace=False, p=chance / chance.sum())
-            to = np.concatenate([dead, np.arange(self.count, self.count + more)])[:many]
-            self.model.split(picked, to, *halves(self.model.read(index=picked), opacity[picked]))
+            picked = draw.choice(model.count, many, replace=False, p=chance / chance.sum())
+            to = np.concatenate([dead, np.arange(model.count, model.count + more)])[:many]
+            model.split(picked, to, *halves(model.read(index=picked), opacity[picked]))
         # Neighbours in space drift apart in memory, and tiles slow down.
-        if (step + 1) % (_SORT_EVERY * self.config.relocate_every) == 0 or more > 0.3 * self.count:
-            self.model.reorder(spatial_order(self.model.read(MEANS)))
+        if (step + 1) % (_SORT_EVERY * self.config.relocate_every) == 0 or more > 0.3 * model.count:
+            model.reorder(spatial_order(model.read(MEANS)))
+
+    def figures(self) -> Figures:
+        means = self.means | {"gaussians": float(self.model.count)}
+        return Figures(means, self.pixels, self.skipped, self.failed, "the loss" if self.failed else "")
 
     def gaussians(self) -> Gaussians:
         """The Gaussians as they are now."""
-        rows = torch.from_numpy(self.model.read())
-        harmonics = rows[:, HARMONICS].reshape(-1, self.bands, 3)
-        parts = (rows[:, MEANS], rows[:, QUATERNION], rows[:, LOG_SCALES], rows[:, LOGIT.start], harmonics)
-        return Gaussians(*(part.contiguous() for part in parts))
+        return from_rows(torch.from_numpy(self.model.read()))
 
     def state(self) -> State:
         """Gaussians; Adam's moments and the weight in the second, exposures, poses, the number at the start."""
@@ -288,10 +300,10 @@ class GaussianLearner(SceneLearner):
 
         Checkpoints of before have no weights: their second moments are taken as they are.
         """
-        moments = state.optimizer
+        moments, rows = state.optimizer, from_tensors(state.model).rows.numpy()
         self.begun, self.failed = int(moments["begun"]), 0
         weight = moments["weight"].numpy() if "weight" in moments else 1
-        self.model.start(_rows(from_tensors(state.model)), moments["first"].numpy(), moments["second"].numpy(), weight)
+        self.model.start(rows, moments["first"].numpy(), moments["second"].numpy(), weight)
         for name, kept in self.corrections.items():
             for key, each in zip(_KEPT, kept, strict=True):
                 if f"{name}.{key}" in moments:
@@ -307,58 +319,34 @@ class GaussianLearner(SceneLearner):
         most = self.config.limited(len(self.levels[0]))
         passes = f"; at most {most} steps: {self.config.passes} passes over the photographs (--passes)"
         light = ", tones" if self.tones is not None else ""
-        return f", {self.count} Gaussians at {self.origin}{light}{passes if most < self.config.steps else ''}"
+        return f", {self.model.count} Gaussians at {self.origin}{light}{passes if most < self.config.steps else ''}"
 
 
 def halves(
     rows: Annotated[Floats, "M R"], opacity: Annotated[NDArray[np.float64], "M"]
 ) -> tuple[Annotated[Floats, "M R"], Annotated[Floats, "M R"]]:
     """Split Gaussians in two along their longest axes: both are smaller, fainter and beside the middle."""
-    first = rows.copy()
-    which = np.arange(len(rows))
+    first, which = rows.copy(), np.arange(len(rows))
     longest = first[:, LOG_SCALES].argmax(1)
     size = first[which, LOG_SCALES.start + longest]
     # The longest axis in the world is a column of the rotation.
     turns: Floats = rotations(torch.from_numpy(first[:, QUATERNION])).numpy()
     across = turns[which, :, longest] * np.exp(size)[:, None]
+    # Both halves are alike: shorter along that axis, and fainter, as they overlap.
     first[which, LOG_SCALES.start + longest] += math.log(_SPLIT_SIZE)
     each = np.clip(_SPLIT_OPACITY * opacity, _DEAD, 0.995)
     first[:, LOGIT] = np.log(each / (1 - each))[:, None]
+    # They lie on either side of the middle.
     second = first.copy()
     first[:, MEANS] += _SPLIT_DISTANCE * across
     second[:, MEANS] -= _SPLIT_DISTANCE * across
     return first, second
 
 
-def run_scene(config: GaussiansConfig, known: Known, gaussians: Gaussians, near: float, *, quick: bool = False) -> SplatScene:
-    """The scene of a run; its semantics are found when they are first asked for, `quick` in few, small views."""
-    encoder = cache(config.semantic.encoder.build)
-    count, side = (_VIEWS // 4, config.semantic_size // 2) if quick else (_VIEWS, config.semantic_size)
-
-    def found() -> Semantics:
-        every = torch.tensor(known.train)
-        views = known.cameras.select(every[torch.linspace(0, len(every) - 1, min(count, len(every))).round().long()])
-        views = views.scaled(max(1.0, float(views.size.amax()) / side))
-        return find_semantics(gaussians, True, encoder(), views, config.regions, near=near)
-
-    longest = min(side, int(known.cameras.size.amax()))
-    return SplatScene(
-        gaussians, True, known.cameras, known.names, cache(found), encoder, longest, near, config.background,
-        origin=known.facts.origin,
-    )  # fmt: skip
-
-
-def _adam(kept: Sequence[Tensor], gradient: Tensor, rate: float) -> None:
+def _adam_step(kept: Sequence[Tensor], gradient: Tensor, rate: float) -> None:
     """One step of Adam (Kingma and Ba 2015, Algorithm 1), in place, on a value, its two moments and the number of steps."""
     value, first, second, steps = kept
     steps += 1
     first.lerp_(gradient, 1 - 0.9)
     second.lerp_(gradient.square(), 1 - 0.999)
     value -= rate * first / (1 - 0.9**steps) / ((second / (1 - 0.999**steps)).sqrt() + 1e-8)
-
-
-def _rows(gaussians: Gaussians) -> Annotated[Floats, "N R"]:
-    """Gaussians in the columns of the rasteriser."""
-    parts = (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logits[:, None])
-    rows: Floats = torch.cat([*parts, gaussians.harmonics.flatten(1)], 1).numpy()
-    return rows

@@ -24,7 +24,7 @@ from torch import Tensor
 from ..io.atomic import atomic_path
 from ..ops.rasterise import Pinhole
 from ..rendering.splines import quaternions, rotations
-from .gaussians import Gaussians
+from .gaussians import Gaussians, from_rows
 from .initial import spatial_order
 
 _CHUNK, _GROUP, _LEVELS = 512, 4, 4
@@ -32,7 +32,7 @@ _CHUNK, _GROUP, _LEVELS = 512, 4, 4
 _DEVIATIONS = 3.0
 """How far a Gaussian reaches, in standard deviations."""
 _FARTHEST, _WIDENED = 3.5, 2.0
-"""The same where nothing may be left out, down to opacities of 1/255; pixels by which drawing widens them."""
+"""Reach in standard deviations where nothing may be left out, down to opacities of 1/255; pixels that drawing widens it by."""
 _OPAQUE = 0.995
 _TAIL = 0.02
 """Share of the means at either end that does not say how long a chunk is."""
@@ -45,28 +45,28 @@ _PART = 1 << 17
 _KEPT = 1 << 28
 """Bytes of colours that a look keeps of chunks it has drawn."""
 _TABLES = "begin", "spread", "centre", "radius", "core"
-_FILE, _LENGTH = "rows.bin", 8
-"""Rows, their order (int32), an .npz archive of the tables, the bytes of that archive as a number of this many bytes; all
-little endian."""
+_FILE, _FORMAT, _LENGTH = "rows.bin", 2, 8
+"""File of a run's levels: rows, their order (int32), an .npz archive of the tables, the bytes of that archive as a number of
+this many bytes; all little endian."""
 
 
 @dataclass(frozen=True, eq=False)
 class Levels:
     """B chunks in L levels, the rows of a chunk and level side by side in memory."""
 
-    rows: Annotated[NDArray[np.float32], "R 11+3K"]
-    """Mean, quaternion, logarithms of scales, logit, harmonics."""
+    rows: Annotated[NDArray[np.float32], "N R"]
+    """Gaussians as `Gaussians.rows`."""
     begin: Annotated[NDArray[np.int64], "B L+1"]
     """First row of each level of a chunk; then the end of the last one."""
     spread: Annotated[NDArray[np.float64], "B L"]
     """Distances over which a level merges, in world units; 0 in the finest."""
     centre: Annotated[NDArray[np.float64], "B 3"]
     radius: Annotated[NDArray[np.float64], "B"]
-    """Of a ball around all that a chunk shows."""
+    """Radius of a ball around all that a chunk shows."""
     core: Annotated[NDArray[np.float64], "B"]
-    """Of a ball around nearly all means of a chunk."""
+    """Radius of a ball around nearly all means of a chunk."""
     order: Annotated[NDArray[np.int32], "N"]
-    """Which Gaussian each row of the finest level is, chunk after chunk."""
+    """Number of the Gaussian in each row of the finest level, chunk after chunk."""
     mapped: mmap.mmap | None = None
     """The file that the rows lie in: of its pages none stays in memory."""
 
@@ -91,7 +91,7 @@ class Levels:
         nodes = np.concatenate(parts)
         if self.mapped is not None and hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
             self.mapped.madvise(mmap.MADV_DONTNEED)
-        return _gaussians(torch.from_numpy(nodes))
+        return from_rows(torch.from_numpy(nodes))
 
 
 class StyledLevels:
@@ -112,12 +112,14 @@ class StyledLevels:
         """Return what `Levels.select` would, recoloured."""
         chunks, level = self._levels.visible(camera, pixels)
         shown = self._levels.gather(chunks, level)
+        # Recolour what was never drawn, level by level, some chunks together.
         keys = list(zip(chunks.tolist(), level.tolist(), strict=True))
         new = np.array([key not in self._colours for key in keys], bool)
         for k in np.unique(level[new]):
             here = chunks[new & (level == k)]
             for first in range(0, len(here), _AT_ONCE):
                 self._add(here[first : first + _AT_ONCE], int(k))
+        # What was drawn last stays longest.
         parts = [self._colours[key] for key in keys]
         for key in keys:
             self._colours.move_to_end(key)
@@ -127,6 +129,7 @@ class StyledLevels:
 
     def _add(self, chunks: NDArray[np.int64], level: int) -> None:
         """Recolour the Gaussians of chunks and merge them up to a level."""
+        # New colours of the finest level; each coarser one has the means of the level before, by the weights of its Gaussians.
         levels = self._levels
         gaussians = levels.gather(chunks, np.zeros_like(chunks))
         index = np.concatenate([levels.order[_CHUNK * chunk : _CHUNK * (chunk + 1)] for chunk in chunks]).astype(np.int64)
@@ -167,6 +170,7 @@ def seen_by(gaussians: Gaussians, camera: Pinhole) -> Annotated[Tensor, "M"]:
 
 def make_levels_of_detail(gaussians: Gaussians) -> Levels:
     """Sort Gaussians into chunks and merge them; all must be finite."""
+    # Gaussians chunk after chunk, then level after level, each with how far apart lies what it merges.
     position = gaussians.means.double().numpy()
     order = torch.from_numpy(np.concatenate(_chunks(position, np.arange(len(position)))))
     levels = [gaussians.select(order)]
@@ -178,9 +182,10 @@ def make_levels_of_detail(gaussians: Gaussians) -> Levels:
         fill = np.pad(before, (0, -len(before) % _GROUP)).reshape(-1, _GROUP).max(1)
         levels.append(merged)
         sizes.append(np.hypot(apart, fill))
+    # Of each chunk the rows of its levels, one after the other, and the balls around what it shows and around its means.
     count = -(-len(order) // _CHUNK)
     width = [_CHUNK // _GROUP**k for k in range(_LEVELS)]
-    tables = [_rows(level).numpy() for level in levels]
+    tables = [level.rows.numpy() for level in levels]
     parts, begin, spread = [], np.zeros((count, _LEVELS + 1), np.int64), np.zeros((count, _LEVELS))
     centre, radius, core, at = np.zeros((count, 3)), np.zeros(count), np.zeros(count), 0
     reach = _DEVIATIONS * np.exp(levels[0].log_scales.double().amax(1).numpy())
@@ -221,7 +226,7 @@ def write_levels(folder: Path, gaussians: Gaussians, key: str) -> None:
         parts = dict(zip(_TABLES, (np.concatenate(column) for column in zip(*columns, strict=True)), strict=True))
         tables = io.BytesIO()
         width, count = np.array(levels.rows.shape[1]), np.array(len(gaussians))
-        np.savez(tables, allow_pickle=False, key=np.array(key), width=width, count=count, **parts)
+        np.savez(tables, allow_pickle=False, key=np.array(f"{_FORMAT} {key}"), width=width, count=count, **parts)
         file.write(tables.getvalue() + len(tables.getvalue()).to_bytes(_LENGTH, "little"))
 
 
@@ -230,12 +235,13 @@ def open_levels(folder: Path, key: str) -> Levels | None:
     try:
         with (folder / _FILE).open("rb") as file:
             mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        # From the end: the length of the archive, the archive, and what lies before it.
         end = len(mapped) - _LENGTH
         begin = end - int.from_bytes(mapped[end:], "little")
         if begin < 0:
             return None
         with np.load(io.BytesIO(mapped[begin:end])) as tables:
-            if str(tables["key"]) != key:
+            if str(tables["key"]) != f"{_FORMAT} {key}":
                 return None
             parts = {name: tables[name] for name in _TABLES}
             count = int(tables["count"])
@@ -258,7 +264,7 @@ def _chunks(position: Annotated[NDArray[np.float64], "N 3"], index: NDArray[np.i
 
 
 def _shares(gaussians: Gaussians) -> tuple[Annotated[Tensor, "M*4"], Annotated[Tensor, "M 4 1"], Annotated[Tensor, "M 4 1"]]:
-    """Which Gaussians are merged, `_GROUP` after `_GROUP`, their shares of what they become, and their weights."""
+    """Numbers of the Gaussians that are merged, `_GROUP` by `_GROUP`, their shares of what they become, and their weights."""
     missing = -len(gaussians) % _GROUP
     index = torch.arange(len(gaussians) + missing).clamp_max(len(gaussians) - 1)
     areas = gaussians.log_scales.double().exp().topk(2, dim=1).values.prod(1)
@@ -277,6 +283,7 @@ def _merged_harmonics(
 
 def _merged(gaussians: Gaussians) -> tuple[Gaussians, NDArray[np.float64]]:
     """Each `_GROUP` neighbours as one, and the standard deviation of their means along its longest axis."""
+    # Mean and covariance of a mixture: the mean of the covariances, and the covariance of the means.
     index, share, weight = _shares(gaussians)
     scales = gaussians.log_scales.double().exp()
     means = gaussians.means.double()[index].view(-1, _GROUP, 3)
@@ -285,6 +292,7 @@ def _merged(gaussians: Gaussians) -> tuple[Gaussians, NDArray[np.float64]]:
     covariance = (axes @ axes.mT)[index].view(-1, _GROUP, 3, 3)
     away = means - mean[:, None]
     between = (share[..., None] * away[..., :, None] * away[..., None, :]).sum(1)
+    # Its axes are a rotation, not a reflection; opacity times area is that of all of them together.
     values, vectors = torch.linalg.eigh((share[..., None] * covariance).sum(1) + between)
     vectors = vectors * torch.linalg.det(vectors).sign()[:, None, None]
     values = values.clamp_min(1e-20)
@@ -294,14 +302,3 @@ def _merged(gaussians: Gaussians) -> tuple[Gaussians, NDArray[np.float64]]:
     parts = (mean, quaternions(vectors), 0.5 * values.log(), torch.logit(opacity), harmonics)
     apart = torch.linalg.eigvalsh(between)[:, -1].clamp_min(0).sqrt()
     return Gaussians(*(part.float() for part in parts)), apart.numpy()
-
-
-def _rows(gaussians: Gaussians) -> Annotated[Tensor, "N 11+3K"]:
-    parts = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits[:, None])
-    return torch.cat([*parts, gaussians.harmonics.flatten(1)], 1)
-
-
-def _gaussians(rows: Annotated[Tensor, "N 11+3K"]) -> Gaussians:
-    harmonics = rows[:, 11:].reshape(len(rows), (rows.shape[1] - 11) // 3, 3)
-    parts = (rows[:, :3], rows[:, 3:7], rows[:, 7:10], rows[:, 10], harmonics)
-    return Gaussians(*(part.contiguous() for part in parts))

@@ -24,23 +24,15 @@ from ..training.run import Run, in_training
 from ..training.tensorfiles import load_sealed, save_sealed
 from .config import GaussiansConfig, LookConfig
 from .files import Capture
-from .gaussians import Gaussians, from_tensors
-from .learner import MOVES, GaussianLearner, run_scene
+from .gaussians import from_tensors
+from .learner import MOVES, GaussianLearner
 from .levels import Levels, make_levels_of_detail, open_levels, write_levels
 from .photographs import load_photographs, make_levels
-from .scene import (
-    Semantics,
-    SplatScene,
-    cache_name,
-    load_scene,
-    load_semantics,
-    look_at_capture,
-    scene_tensors,
-    semantics_tensors,
-)
+from .scene import SplatScene, cache_name, load_scene, look_at_capture, run_scene, scene_tensors
+from .semantics import Semantics, load_semantics, semantics_tensors
 
 _FIT_RATE, _FIT_STEPS = 2e-3, 120
-"""Of the poses of views that the scene is not learnt from: `GaussiansConfig.poses`, and steps of each view."""
+"""Rate of poses (`GaussiansConfig.poses`) and steps of each view, where poses of views are fitted to a finished scene."""
 _CACHED = 24
 """Captures of which the cache keeps what was found out."""
 _LEVELS, _MANY = "levels", 400_000
@@ -63,15 +55,30 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
     saved, _ = checkpoint.load_latest(run.checkpoints, verify=not key or open_levels(root / _LEVELS, key) is None)
     if saved is None:
         raise CheckpointError(f"{root}: no checkpoint yet; go on with `fprf train {root / 'config.json'} --output {root}`")
+    # The scene as training left it: its cameras where they were put, in the light that all views have in common.
     captured, gaussians = run.load_known(), from_tensors(saved.model)
     known = replace(captured, cameras=refined(captured.cameras, saved))
-    tones = tones_in(saved, known.facts)
+    tones = tones_of(known.facts)
+    if tones is not None:
+        kept = {name: saved.optimizer[f"tones.{name}.value"] for name, _ in tones.named_parameters()}
+        tones.load_state_dict(kept, strict=False)
+        tones.requires_grad_(False)
     near, training = float(saved.model.get("near", torch.tensor(0.01))), in_training(root)
     whole = run_scene(config, known, gaussians, near, quick=training)
     resolution = preset.resolution if preset is not None else 1.0
 
     def fit(scene: Scene, views: Sequence[int]) -> Annotated[Tensor, "V 6"]:
         return fit_poses(config, replace(scene, cameras=known.cameras), known.facts, whole, tones, views)
+
+    def levels() -> Levels:
+        """Levels of detail; those of many Gaussians lie in a file, written where there is none of this checkpoint."""
+        if len(gaussians) < _MANY:
+            return make_levels_of_detail(gaussians)
+        if open_levels(root / _LEVELS, key) is None:
+            write_levels(root / _LEVELS, gaussians, key)
+        mapped = open_levels(root / _LEVELS, key)
+        assert mapped is not None  # it was just written
+        return mapped
 
     shown = replace(
         whole,
@@ -82,7 +89,7 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
         tones=tones,
         poses=fit,
         merged=merged,
-        levels=functools.cache(lambda: _levels(root / _LEVELS, gaussians, key)),
+        levels=functools.cache(levels),
     )
     return LoadedRun(run, run.load_config()[1], known, saved.step, saved.seconds, shown)
 
@@ -100,27 +107,18 @@ def fit_poses(
 
     Gaussians stay as they are; the other views' moves are 0.
     """
+    # These views are all that is learnt from; of the others nothing may move.
     scene = replace(scene, train=torch.tensor(views))
-    images, masks = load_photographs(config, scene, list(views))
+    images, masks, _ = load_photographs(config, scene, list(views))
     others = tuple(sorted(set(range(len(scene.paths))) - set(views)))
     poses = Poses(scene.cameras.pose[:, :, 3], others, reach=reach_of(scene, facts.space), pace=1.0, still=True)
     levels = make_levels(scene, images, masks, shown.near)
+    # A learner of poses alone: the Gaussians are drawn as they are, in the light of each view.
     config = replace(config, poses=_FIT_RATE, degree=shown.gaussians.degree)
     learner = GaussianLearner(config, levels, 1.0, len(shown.gaussians), tones=tones, poses=poses, only="poses")
     learner.start_from(shown.gaussians)
     learn(learner, None, Schedule(_FIT_STEPS * len(views)), lambda report: None)
     return poses.moved_by()
-
-
-def tones_in(saved: checkpoint.Saved, facts: Facts) -> Tones | None:
-    """The exposures that a checkpoint holds; None where they were not learnt."""
-    tones = tones_of(facts)
-    if tones is not None:
-        tones.load_state_dict(
-            {name: saved.optimizer[f"tones.{name}.value"] for name, _ in tones.named_parameters()}, strict=False
-        )
-        tones.requires_grad_(False)
-    return tones
 
 
 def _semantics(run: Run, step: int, scene: SplatScene, config: GaussiansConfig) -> Semantics:
@@ -135,18 +133,6 @@ def _semantics(run: Run, step: int, scene: SplatScene, config: GaussiansConfig) 
     semantics = scene.found()
     run.save_tensors("style", {**semantics_tensors(semantics), **{name: torch.tensor(of) for name, of in wanted.items()}})
     return semantics
-
-
-def _levels(folder: Path, gaussians: Gaussians, key: str) -> Levels:
-    """Levels of detail of a run; those of many Gaussians lie in a file, written where there is none of its checkpoint."""
-    if len(gaussians) < _MANY:
-        return make_levels_of_detail(gaussians)
-    levels = open_levels(folder, key)
-    if levels is None:
-        write_levels(folder, gaussians, key)
-        levels = open_levels(folder, key)
-    assert levels is not None  # it was just written
-    return levels
 
 
 def open_capture(

@@ -1,9 +1,9 @@
 """Photographs as the rasteriser sees the world: through a pinhole, with what lies beyond a lens's picture left out."""
 
-from collections.abc import Mapping
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -16,12 +16,12 @@ from ..datamanagers.scene import Scene
 from ..errors import DataError
 from ..ops.photometric import WINDOW
 from ..ops.rasterise import Pinhole
-from ..ops.rasterise_training import Target, target_of
+from ..ops.rasterise_training import Floats, Target, target_of
 from ..rendering.cameras import Cameras, pixel_grid, project, rays_through
-from ..training.camera_optimizers import rotated
 from .config import GaussiansConfig
 
-Floats = NDArray[np.float32]
+Masks = dict[int, NDArray[np.bool_]]
+"""Masks [H W] by view."""
 _PANORAMA = 3
 _WIDEST = 4.0
 """Tangent of the widest angle that a pinhole shows: 76 degrees."""
@@ -29,8 +29,64 @@ _SHARPEST = cv2.INTER_LANCZOS4
 """Out of its lens and back into it a photograph of 135 x 240 pixels comes with 43 dB; by cubic interpolation with 40."""
 
 
-Level = dict[int, Target]
+_KEPT = 1 << 31
+"""Bytes of photographs in the rasteriser's layout, some ten times as large as 8-bit pixels, that are kept between steps."""
+Level = Mapping[int, Target]
 """Training views at one scale, by view; their sizes may differ."""
+
+
+class _View(NamedTuple):
+    """A photograph without its lens, as 8-bit pixels."""
+
+    camera: Pinhole
+    image: Image
+    valid: NDArray[np.bool_] | None
+    sky: NDArray[np.bool_] | None
+
+
+class _Kept(OrderedDict[tuple[int, int], Target]):
+    """Targets by scale and view, the least recently used first; all scales of a scene share it."""
+
+    bytes = 0
+
+    def add(self, key: tuple[int, int], target: Target) -> None:
+        self[key] = target
+        self.bytes += _bytes(target)
+        while self.bytes > _KEPT and len(self) > 1:
+            self.bytes -= _bytes(self.popitem(last=False)[1])
+
+
+class _Scaled(Mapping[int, Target]):
+    """Views at 1/2^k of their size, brought into the rasteriser's layout when a step asks for them."""
+
+    def __init__(self, views: Mapping[int, _View], k: int, kept: _Kept) -> None:
+        self.views, self.k, self.kept = views, k, kept
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.views)
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __getitem__(self, view: int) -> Target:
+        key = self.k, view
+        if key in self.kept:
+            self.kept.move_to_end(key)
+            return self.kept[key]
+        camera, image, valid, sky = self.views[view]
+        size = max(1, camera.width >> self.k), max(1, camera.height >> self.k)
+        shrink = torch.tensor([[size[0] / camera.width], [size[1] / camera.height], [1.0]], dtype=torch.float64)
+        small = camera._replace(intrinsics=camera.intrinsics * shrink, width=size[0], height=size[1])
+        # Each size is reduced from the full one, so that errors do not add up; the camera shrinks with the image.
+        colours: Floats = np.divide(image, 255, dtype=np.float32)
+        reduced: Floats = np.asarray(cv2.resize(colours, size, interpolation=cv2.INTER_AREA), np.float32) if self.k else colours
+        target = target_of(small, reduced, _resized(valid, size), _resized(sky, size))
+        self.kept.add(key, target)
+        return target
+
+
+def _bytes(target: Target) -> int:
+    return sum(part.nbytes for part in target if isinstance(part, np.ndarray))
 
 
 def camera_of(cameras: Cameras, view: int, near: float = 0.01) -> Pinhole:
@@ -52,6 +108,7 @@ def undistorted(cameras: Cameras, view: int, image: Image, camera: Pinhole) -> t
     """
     if int(cameras.lens[view]) == 0:
         return image, None
+    # Rays through the pixels of the pinhole, from OpenCV's axes to OpenGL's and into the world.
     width, height = cameras.size[view].tolist()
     x, y = torch.arange(camera.width).double() + 0.5, torch.arange(camera.height).double() + 0.5
     grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).view(-1, 2)
@@ -59,6 +116,7 @@ def undistorted(cameras: Cameras, view: int, image: Image, camera: Pinhole) -> t
     turned = torch.stack([local[:, 0], -local[:, 1], -torch.ones(len(local), dtype=torch.float64)], -1)
     pose = cameras.pose[view]
     points = turned @ pose[:, :3].T + pose[:, 3]
+    # Where the lens maps them; what falls beyond the outermost pixel centres would only repeat the edge.
     pixel, _ = project(cameras, torch.full((len(points),), view), points)
     place = pixel.view(camera.height, camera.width, 2).numpy()
     inside = np.isfinite(place).all(-1) & (place >= 0.5).all(-1) & (place <= np.array([width - 0.5, height - 0.5])).all(-1)
@@ -73,11 +131,13 @@ def cover(cameras: Cameras, view: int, near: float) -> tuple[Pinhole, Annotated[
     plain = camera_of(cameras, view, near)
     if int(cameras.lens[view]) == 0:
         return plain, None
+    # Tangents of all pixels' rays in OpenCV's axes: what lies behind the camera is put at the widest angle.
     width, height = plain.width, plain.height
     _, direction = rays_through(cameras, torch.full((width * height,), view), pixel_grid(cameras, view))
     local = direction @ cameras.pose[view][:, :3]
     ahead = (-local[:, 2]).clamp_min(1e-9)
     tangent = torch.stack([local[:, 0] / ahead, -local[:, 1] / ahead], -1).clamp(-_WIDEST, _WIDEST)
+    # The pinhole keeps the focal length, and is as large as these reach, with a border of two pixels to interpolate in.
     focal = cameras.focal[view]
     low, high = (tangent * focal).amin(0).floor() - 2, (tangent * focal).amax(0).ceil() + 2
     wide, tall = (high - low).int().tolist()
@@ -92,61 +152,44 @@ def distorted(
     return torch.from_numpy(np.atleast_3d(_sampled(image.numpy(), place.numpy(), cv2.INTER_LINEAR if linear else _SHARPEST)))
 
 
+def load_photographs(config: GaussiansConfig, scene: Scene, views: list[int]) -> tuple[dict[int, Image], Masks, Masks]:
+    """Images of views, then the masks that say where they count, and those that say where they show sky, of views with one."""
+    images = dict(zip(views, load_images(scene, config.background, views), strict=True))
+
+    def load_masks(paths: tuple[Path | None, ...]) -> Masks:
+        named = {view: paths[view] for view in views} if paths and config.masks else {}
+        return {view: load_mask(path, images[view].shape[1::-1]) for view, path in named.items() if path is not None}
+
+    # Without surroundings nothing could show the sky but what floats before it.
+    return images, load_masks(scene.masks), load_masks(scene.sky_masks if config.surroundings else ())
+
+
 def make_levels(
-    scene: Scene,
-    images: Mapping[int, Image],
-    masks: Mapping[int, NDArray[np.bool_]],
-    near: float,
-    skies: Mapping[int, NDArray[np.bool_]] = MappingProxyType({}),
+    scene: Scene, images: Mapping[int, Image], masks: Masks, near: float, skies: Masks | None = None
 ) -> list[Level]:
     """The training views at their own size, at half of it and so on, until the longer side has less than 240 pixels.
 
-    A view counts where its mask, if it has one, is true; where `skies` are true it shows sky.
+    A view counts where its mask, if it has one, is true; where that in `skies` is true it shows sky.
     """
-    views = scene.train.tolist()
-    cameras = {view: cover(scene.cameras, view, near)[0] for view in views}
+    cameras = {view: cover(scene.cameras, view, near)[0] for view in scene.train.tolist()}
     longest = max(max(each.width, each.height) for each in cameras.values())
     shortest = min(min(each.width, each.height) for each in cameras.values())
     count = max(2, min((longest // 120).bit_length(), (shortest // WINDOW).bit_length()))  # SSIM needs its window
-    levels: list[Level] = [{} for _ in range(count)]
-    for view in views:
-        camera = cameras[view]
+    pixels: dict[int, _View] = {}
+
+    def straightened(masks: Masks, view: int) -> NDArray[np.bool_] | None:
+        if view not in masks:
+            return None
+        grey = masks[view].astype(np.uint8) * 255
+        return np.asarray(undistorted(scene.cameras, view, grey, cameras[view])[0] > 254)
+
+    for view, camera in cameras.items():
+        # The photograph and its masks without their lens: what lies beyond the lens's picture does not count.
         image, valid = undistorted(scene.cameras, view, images[view], camera)
-        if view in masks:
-            seen = _undistorted_mask(scene.cameras, view, masks[view], camera)
-            valid = seen if valid is None else valid & seen
-        sky = _undistorted_mask(scene.cameras, view, skies[view], camera) if view in skies else None
-        colours: Floats = np.divide(image, 255, dtype=np.float32)
-        for k, level in enumerate(levels):
-            size = (max(1, camera.width >> k), max(1, camera.height >> k))
-            shrink = torch.tensor([[size[0] / camera.width], [size[1] / camera.height], [1.0]], dtype=torch.float64)
-            small = camera._replace(intrinsics=camera.intrinsics * shrink, width=size[0], height=size[1])
-            reduced: Floats = np.asarray(cv2.resize(colours, size, interpolation=cv2.INTER_AREA), np.float32) if k else colours
-            level[view] = target_of(small, reduced, _resized(valid, size), _resized(sky, size))
-    return levels
-
-
-def load_photographs(
-    config: GaussiansConfig, scene: Scene, views: list[int]
-) -> tuple[dict[int, Image], dict[int, NDArray[np.bool_]]]:
-    """Images of views, and the masks of those that have one."""
-    images = dict(zip(views, load_images(scene, config.background, views), strict=True))
-    return images, _load_masks(scene.masks if config.masks else (), images)
-
-
-def load_skies(config: GaussiansConfig, scene: Scene, images: Mapping[int, Image]) -> dict[int, NDArray[np.bool_]]:
-    """The masks of the sky of the views that have one; none without surroundings: nothing else could show the sky."""
-    return _load_masks(scene.sky_masks if config.masks and config.surroundings else (), images)
-
-
-def _load_masks(paths: tuple[Path | None, ...], images: Mapping[int, Image]) -> dict[int, NDArray[np.bool_]]:
-    """The masks of the views that have one, at the size of their images."""
-    named = {view: paths[view] for view in images} if paths else {}
-    return {view: load_mask(path, images[view].shape[1::-1]) for view, path in named.items() if path is not None}
-
-
-def _undistorted_mask(cameras: Cameras, view: int, mask: NDArray[np.bool_], camera: Pinhole) -> NDArray[np.bool_]:
-    return np.asarray(undistorted(cameras, view, mask.astype(np.uint8) * 255, camera)[0] > 254)
+        mask, sky = straightened(masks, view), straightened(skies or {}, view)
+        pixels[view] = _View(camera, image, mask if valid is None else valid if mask is None else valid & mask, sky)
+    kept = _Kept()
+    return [_Scaled(pixels, k, kept) for k in range(count)]
 
 
 def _resized(mask: NDArray[np.bool_] | None, size: tuple[int, int]) -> NDArray[np.bool_] | None:
@@ -154,12 +197,6 @@ def _resized(mask: NDArray[np.bool_] | None, size: tuple[int, int]) -> NDArray[n
     if mask is None or mask.shape[::-1] == size:
         return mask
     return np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999)
-
-
-def moved(target: Target, turn: Annotated[Tensor, "3"], shift: Annotated[Tensor, "3"]) -> Target:
-    """A photograph whose camera is turned about its own centre by a rotation vector and shifted, float64, world axes."""
-    axes = rotated(torch.from_numpy(target.axes), turn.expand(3, 3))
-    return target.seen_from(axes.numpy(), target.centre + shift.numpy())
 
 
 def _sampled(image: NDArray[Any], place: NDArray[np.float64], interpolation: int = _SHARPEST) -> NDArray[Any]:

@@ -17,11 +17,10 @@ from ..interfaces import Encoder, Stylizer
 from ..ops.harmonics import Directions, recoloured, spherical_harmonics
 from ..ops.precision import double
 from ..plugins.stylizers.config import StylizerConfig
-from ..style.colours import ColourMaps, carried_colours
-from ..style.controls import luma, place_weight
 from ..style.dictionary import StyleDictionary
-from ..style.look import Restyle
-from ..style.scene import SceneStyle, own_style
+from ..style.light import luma
+from ..style.look import ColourMaps, Restyle, carried_colours, place_weight
+from ..style.scene_style import SceneStyle, own_style
 
 _DIRECTIONS = 48
 """In which harmonics are evaluated to find where renderers cut their colours."""
@@ -34,7 +33,7 @@ class Colours(Encoder):
 
     @property
     def identity(self) -> str:
-        """They have no weights."""
+        """A constant: there are no weights."""
         return "colours"
 
     @property
@@ -97,27 +96,22 @@ def _change(
 
 
 def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N 4 3"]:
-    """A and b of one part at full strength."""
-    if part.light is None:
-        return _painted(part, semantic, None)
+    """A and b of one part at full strength: what its stylizer and colours paint, and the light that falls on it."""
     # Light and paint are of one scene, and so are the regions that they ask about.
-    belongs = part.light.membership(semantic)
-    paint = part.light.paint(semantic, belongs)
-    return paint[..., None] * _painted(part, semantic, belongs) + part.light.change(semantic, paint, belongs)
-
-
-def _painted(
-    part: Restyle, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None
-) -> Annotated[Tensor, "N 4 3"]:
-    """A and b of one part's stylizer and colours; `belongs` are the points' shares in the regions, where they are known."""
+    belongs = None if part.light is None else part.light.membership(semantic)
     if part.colours is not None:
         maps = part.colours
         share: Tensor = maps.membership(semantic) if belongs is None else belongs
-        return (share @ torch.cat([maps.matrix, maps.bias[:, None]], 1).flatten(1)).view(-1, 4, 3)
-    # An affine stylizer is known by what it makes of black and of each channel alone.
-    black = part.stylizer(semantic.new_zeros(len(semantic), 3), semantic)
-    rows = [part.stylizer(axis.expand(len(semantic), 3), semantic) - black - axis for axis in torch.eye(3)]
-    return part.features * torch.stack([*rows, black], 1)
+        painted = (share @ torch.cat([maps.matrix, maps.bias[:, None]], 1).flatten(1)).view(-1, 4, 3)
+    else:
+        # An affine stylizer is known by what it makes of black and of each channel alone.
+        black = part.stylizer(semantic.new_zeros(len(semantic), 3), semantic)
+        rows = [part.stylizer(axis.expand(len(semantic), 3), semantic) - black - axis for axis in torch.eye(3)]
+        painted = part.features * torch.stack([*rows, black], 1)
+    if part.light is None:
+        return painted
+    paint = part.light.paint(semantic, belongs)
+    return paint[..., None] * painted + part.light.change(semantic, paint, belongs)
 
 
 def region_maps(

@@ -1,4 +1,12 @@
-"""What training 3D Gaussians from photographs begins with: first points, photographs at all scales, limits of their sizes."""
+"""What training 3D Gaussians from photographs begins with: photographs at all scales, first points, limits of their widths.
+
+Shapes: N Gaussians, P points, V views, M training views. World axes and units are the capture's own, relative to its origin.
+Lengths that are needed before anything is learnt follow from the cameras and the sparse points:
+
+    scene scale    how far the cameras stand apart; the means' learning rate is in proportion to it
+    near           distance along z below which nothing is drawn
+    width          standard deviation along an axis of a Gaussian; bounded by the distance to the nearest camera
+"""
 
 import math
 from collections.abc import Callable
@@ -17,22 +25,24 @@ from ..training.prepare import exposure_of, facts_of
 from ..training.run import known_of
 from .config import GaussiansConfig
 from .initial import Points, initial_points, projected, surroundings
-from .learner import GaussianLearner, Narrow
-from .photographs import Floats, load_photographs, load_skies, make_levels
+from .learner import GaussianLearner, LimitWidths
+from .photographs import load_photographs, make_levels
 
 _SURROUNDINGS = 10
 """Gaussians, at most, for one of the surroundings."""
-_WIDE = 0.2
-"""Greatest standard deviation of one of them, as a share of their distance."""
-_CLEAR, _CLEAR_CELLS, _TOGETHER = 0.5, 0.25, 256
-"""Greatest standard deviation as a share of the distance to the nearest camera, and in scenes of cells; Gaussians whose
-distances are taken together."""
-_SOME = 4000
-"""Points whose depths say how near to a camera things are."""
-_NEAR = 0.25
-"""Of the distance that all but 1 % of the points in view have: nothing is drawn nearer to a camera."""
-_NEAR_UNSEEN, _DEPTHS = 1e-3, 10_000_000
-"""The same where no view has any point, in the radius of the cameras; depths that are looked at, at most."""
+_SPHERE_WIDTH, _INSIDE_SPHERE = 0.2, 0.5
+"""Greatest width of the surroundings, and distance from the middle up to which Gaussians are none of them: in radii."""
+_WIDTH, _WIDTH_IN_CELLS = 0.5, 0.25
+"""Greatest width of all others in distances to the nearest camera; in scenes of cells."""
+_EVERY, _EVERY_IN_CELLS, _SPHERE_EVERY = 20, 100, 10
+"""Steps between cuts of widths; in scenes of cells; of the surroundings."""
+_TOGETHER = 256
+"""Gaussians whose distances to cameras are taken together."""
+_NEAR_POINTS, _NEAR_DEPTHS = 4000, 10_000_000
+"""Points, and depths of them in all views, that say how near to a camera things are, at most."""
+_NEAR, _NEAR_UNSEEN = 0.25, 1e-3
+"""The near plane as a share of the distance that all but 1 % of the points in view have; of the scene scale, where no view has
+any point."""
 
 
 def build(
@@ -46,14 +56,15 @@ def build(
     # Few photographs get few Gaussians, which they would else learn by heart; cells bound theirs by the whole scene.
     if config.cells == 1:
         pixels = int(scene.cameras.size[scene.train].prod(1).sum())
-        cap = max(1, min(config.cap, pixels // config.pixels_per_gaussian))
-        config = replace(config, cap=cap, initial=max(1, config.initial * cap // config.cap))
-    config = replace(config, surroundings=min(config.surroundings, config.cap // _SURROUNDINGS))
-    images, masks = load_photographs(config, scene, scene.train.tolist())
-    facts = saved or lit_facts(config, scene, lambda view: images[view])
-    # Gaussians begin at points of the reconstruction, or at matches between views, and on a sphere around everything.
+        cap = max(1, min(config.most, pixels // config.pixels_per_gaussian))
+        config = replace(config, cap=cap, initial=max(1, config.initial * cap // config.most))
+    config = replace(config, surroundings=min(config.surroundings, config.most // _SURROUNDINGS))
+    images, masks, skies = load_photographs(config, scene, scene.train.tolist())
+    facts = saved or light_and_poses(config, scene, lambda view: images[view])
+    # Gaussians begin at points of the reconstruction, or at matches between views ...
     draw = np.random.default_rng((config.seed, 0))
     points, origin = initial_points(scene, images, config.initial, draw)
+    # ... and on a sphere around everything, which stays coarse: only what it encloses is split.
     far, sphere = None, None
     if config.surroundings:
         far = surroundings(scene, images, points, config.surroundings)
@@ -62,9 +73,9 @@ def build(
     near = find_near(scene, points)
     learner = GaussianLearner(
         config,
-        make_levels(scene, images, masks, near, load_skies(config, scene, images)),
-        reach_of(scene),
-        max(config.cap, len(points.position) + config.surroundings),
+        make_levels(scene, images, masks, near, skies),
+        scene_scale(scene),
+        max(config.most, len(points.position) + config.surroundings),
         None if sphere is None else sphere.encloses,
         limit_widths(scene, near, cells=config.cells > 1, sphere=sphere),
         near=near,
@@ -81,77 +92,73 @@ def build(
     return learner
 
 
-def lit_facts(config: GaussiansConfig, scene: Scene, image: Callable[[int], Image]) -> Facts:
-    """Facts of a scene with exposures and places of the views, where they are learnt; `image(view)` is a training view."""
+def light_and_poses(config: GaussiansConfig, scene: Scene, image: Callable[[int], Image]) -> Facts:
+    """Facts of a scene with exposures and places of the views, where these are learnt; `image(view)` is a training view."""
     exposure = exposure_of(config.tones, scene, lambda view: torch.from_numpy(image(view)).float() / 255)
     return facts_of(scene, config.background, exposure=exposure, poses=config.poses > 0)
 
 
 class _Sphere(NamedTuple):
-    """The sphere of the surroundings, which stay coarse (only what it encloses is split) and thin."""
+    """The sphere that the surroundings begin on."""
 
     centre: Annotated[Tensor, "3"]
     radius: float
 
     def encloses(self, means: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
-        """Whether means lie well within."""
+        """Mask of the means that lie well within."""
         apart: Tensor = (means - self.centre).norm(dim=1)
-        return apart < 0.5 * self.radius
-
-    def widest(self, means: Annotated[Floats, "N 3"]) -> Annotated[Floats, "N"]:
-        """Logarithms of the greatest standard deviations."""
-        square = np.square(means - self.centre.numpy()).sum(1)
-        return np.where(square < (0.5 * self.radius) ** 2, np.float32(np.inf), np.float32(math.log(_WIDE * self.radius)))
+        return apart < _INSIDE_SPHERE * self.radius
 
 
-def limit_widths(scene: Scene, near: float, *, cells: bool, sphere: _Sphere | None = None) -> Narrow:
-    """Keep standard deviations below a share of the distance to the nearest training camera.
+def limit_widths(scene: Scene, near: float, *, cells: bool, sphere: _Sphere | None = None) -> LimitWidths:
+    """Keep Gaussians narrower than a share of the distance to the nearest training camera, and the surroundings thin.
 
     What reaches a camera is drawn before the whole scene as haze, and mixes the semantics of everything. Of thousands of
     photographs each is seen rarely, so scenes of cells have a lower limit. Nothing nearer than `near` is drawn.
     """
     centres = scene.cameras.pose[scene.train][:, :, 3].float().contiguous()
-    share, every = (_CLEAR_CELLS, 100) if cells else (_CLEAR, 20)
+    share, every = (_WIDTH_IN_CELLS, _EVERY_IN_CELLS) if cells else (_WIDTH, _EVERY)
 
-    def nearest(points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
+    def nearest_camera(points: Annotated[Tensor, "P 3"]) -> Annotated[Tensor, "P"]:
         # Points lie within a ball, so the camera nearest to one of them is among those nearest to its centre.
         middle = (points.amin(0) + points.amax(0)) / 2
         radius, apart = (points - middle).norm(dim=1).amax(), (centres - middle).norm(dim=1)
         some = centres[apart <= 1.001 * (apart.amin() + 2 * radius)]
         return torch.cdist(points, some, compute_mode="donot_use_mm_for_euclid_dist").amin(1)
 
-    def narrow(gaussians: TrainableGaussians, step: int) -> None:
-        # The surroundings stay thin: seen from beside, a wide one would be drawn before the scene.
-        if sphere is not None and step % 10 == 0:
-            gaussians.limit_scales(sphere.widest(gaussians.read(MEANS)))
-        if step % every:
-            return
-        # Only what is wider than the share of `near` can be too wide anywhere.
-        wide = np.flatnonzero(gaussians.read(LOG_SCALES).max(1) > math.log(share * near))
-        if len(wide):
-            points = torch.from_numpy(gaussians.read(MEANS, wide))
-            widest = torch.cat([share * nearest(part) for part in torch.split(points, _TOGETHER)]).clamp_min(1e-12).log()
-            gaussians.limit_scales(widest.numpy(), wide)
+    def limit(gaussians: TrainableGaussians, step: int) -> None:
+        # Seen from beside, a wide one of the surroundings would be drawn before the scene.
+        if sphere is not None and step % _SPHERE_EVERY == 0:
+            square = np.square(gaussians.read(MEANS) - sphere.centre.numpy()).sum(1)
+            inside = square < (_INSIDE_SPHERE * sphere.radius) ** 2
+            gaussians.limit_scales(np.where(inside, np.float32(np.inf), np.float32(math.log(_SPHERE_WIDTH * sphere.radius))))
+        # What is narrower than the share of `near` is narrow enough everywhere that it is drawn: distances cost time.
+        if step % every == 0:
+            wide = np.flatnonzero(gaussians.read(LOG_SCALES).max(1) > math.log(share * near))
+            if len(wide):
+                points = torch.from_numpy(gaussians.read(MEANS, wide))
+                distance = torch.cat([nearest_camera(part) for part in torch.split(points, _TOGETHER)])
+                gaussians.limit_scales((share * distance).clamp_min(1e-12).log().numpy(), wide)
 
-    return narrow
+    return limit
 
 
-def reach_of(scene: Scene) -> float:
+def scene_scale(scene: Scene) -> float:
     """Unit of the means' learning rate: the radius of the training cameras' positions.
 
     At most the distance at which views commonly see points, where the capture knows: steps in proportion to the radius of a
     district scatter what its views show.
     """
     around = scene.cameras.pose[scene.train][:, :, 3]
-    reach = 1.1 * float((around - around.mean(0)).norm(dim=1).max()) or 1.0
+    radius = 1.1 * float((around - around.mean(0)).norm(dim=1).max()) or 1.0
     sightings = find_sightings(sparser(scene))
-    return reach if sightings is None else min(reach, float(sightings.distance.median()))
+    return radius if sightings is None else min(radius, float(sightings.distance.median()))
 
 
 def find_near(scene: Scene, points: Points) -> float:
     """Distance from cameras, along z, from which on things are drawn: below that at which all but 1 % of the points lie."""
-    some = torch.from_numpy(points.position[:: -(-len(points.position) // _SOME)])
+    some = torch.from_numpy(points.position[:: -(-len(points.position) // _NEAR_POINTS)])
     seen = torch.cat([depth[inside] for _, _, depth, inside in projected(scene, some)])
     if not len(seen):
-        return _NEAR_UNSEEN * reach_of(scene)
-    return _NEAR * float(seen[:: -(-len(seen) // _DEPTHS)].quantile(0.01))
+        return _NEAR_UNSEEN * scene_scale(scene)
+    return _NEAR * float(seen[:: -(-len(seen) // _NEAR_DEPTHS)].quantile(0.01))

@@ -30,7 +30,7 @@ from .photographs import camera_of, cover
 _LIFTS = (-8.0, 12.0, 32.0, 55.0)
 """Heights of the rings, in degrees above the middle."""
 _DISTANCES = (1.2, 1.7)
-"""Of the rings; at 1 the object just fits into the view."""
+"""Distances of the rings; at 1 the object just fits into the view."""
 OUTLYING = 128.0
 """Extents of the bulk from it, beyond which Gaussians are stray."""
 _FOV, _WIDE = 45.0, 70.0
@@ -57,7 +57,7 @@ _GRIDS = ((17, 3.0), (9, 0.375))
 _AROUND = (0.08, 0.2)
 """Distances of the cameras from that place, relative to the median distance of what they see."""
 _BACK = (0.0, 0.25)
-"""And against the mean direction of what is seen."""
+"""Distances behind that place, against the mean direction of what is seen, in the same unit."""
 _TARGETS, _NARROW = 12, 55.0
 """Directions looked in from there, and the vertical angle in degrees."""
 _CLOSE, _BLUR = 0.15, 3.0
@@ -96,20 +96,17 @@ class SeenMeans(NamedTuple):
     no compensation of opacities (Mip-Splatting), as in browsers and .splat files."""
 
     functions: Annotated[Tensor, "N K"]
-    """Of the functions of the harmonics, at most those of degree 3."""
+    """Means of the functions of the harmonics, at most those of degree 3."""
     opacities: Annotated[Tensor, "N"]
-
-    def colours(self, harmonics: Annotated[Tensor, "N K 3"]) -> Annotated[Tensor, "N 3"]:
-        """Mean colours; may leave [0, 1]."""
-        return 0.5 + torch.einsum("nk,nkc->nc", self.functions, harmonics[:, : self.functions.shape[1]])
 
     def plain(self, gaussians: Gaussians) -> Gaussians:
         """The Gaussians with mean opacities."""
         return replace(gaussians, logits=torch.logit(self.opacities, 1e-6))
 
     def gaussians(self, gaussians: Gaussians) -> Gaussians:
-        """The Gaussians with mean colours and opacities."""
-        return self.plain(gaussians.recoloured((self.colours(gaussians.harmonics) - 0.5)[:, None] / HARMONIC))
+        """The Gaussians with mean colours, which may leave [0, 1], and opacities."""
+        mean = 0.5 + torch.einsum("nk,nkc->nc", self.functions, gaussians.harmonics[:, : self.functions.shape[1]])
+        return self.plain(gaussians.recoloured((mean - 0.5)[:, None] / HARMONIC))
 
 
 @torch.inference_mode()
@@ -123,6 +120,7 @@ def seen_means(gaussians: Gaussians, cameras: Cameras, *, antialiased: bool) -> 
     shape = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)
     functions, opacities, weights = (torch.zeros(len(gaussians), n) for n in (bands**2, 1, 1))
     near = clip_distance(gaussians)
+    # Sums over views, each by the Gaussian's weight in its pixels; what none shows weighs the same in all of them.
     for view in torch.linspace(0, len(cameras) - 1, min(_MEAN_VIEWS, len(cameras))).round().long().tolist():
         camera = cover(cameras, view, near)[0]
         direction = torch.nn.functional.normalize(gaussians.means - cameras.pose[view, :, 3].float(), dim=1)
@@ -131,6 +129,7 @@ def seen_means(gaussians: Gaussians, cameras: Cameras, *, antialiased: bool) -> 
         functions += weight * spherical_harmonics(direction, bands)
         opacities += weight * project_reference(*shape, camera, antialiased=antialiased).opacity[:, None]
         weights += weight
+    # A Gaussian without finite numbers has no weight either.
     constant = torch.zeros(bands**2)
     constant[0] = HARMONIC
     functions, finite = functions / weights, functions.isfinite().all(1, keepdim=True)
@@ -157,18 +156,17 @@ def find_views(
     up = up.double() / up.double().norm()
     near = torch.from_numpy(bulk_of(gaussians.means.numpy()).apart <= OUTLYING)
     gaussians = gaussians if bool(near.all()) else gaussians.select(near)
-    if camera is not None:
-        # On the grid of the others, so that all of its picture lies within.
-        share = float((torch.tensor(size) / camera.size[0]).min())
-        first = camera.resized(torch.tensor([size]))
-        centre = torch.tensor(size) / 2 + share * (camera.centre - camera.size / 2)
-        first = replace(first, focal=camera.focal * share, centre=centre)
-        others = _views(gaussians, count - 1, size, up, inside, antialiased, camera.pose[0, :, 3].double())
-        return Cameras(*(torch.cat([getattr(each, field.name) for each in (first, others)]) for field in fields(first)))
-    chosen = _views(gaussians, count, size, up, inside, antialiased, None)
-    if not len(chosen):
-        raise DataError("no view shows anything of the capture; give the axis that points up (--up), or clean the file")
-    return chosen
+    place = None if camera is None else camera.pose[0, :, 3].double()
+    chosen = _views(gaussians, count - (camera is not None), size, up, inside, antialiased, place)
+    if camera is None:
+        if not len(chosen):
+            raise DataError("no view shows anything of the capture; give the axis that points up (--up), or clean the file")
+        return chosen
+    # On the grid of the others, so that all of its picture lies within.
+    share = float((torch.tensor(size) / camera.size[0]).min())
+    centre = torch.tensor(size) / 2 + share * (camera.centre - camera.size / 2)
+    first = replace(camera.resized(torch.tensor([size])), focal=camera.focal * share, centre=centre)
+    return Cameras(*(torch.cat([getattr(each, field.name) for each in (first, chosen)]) for field in fields(Cameras)))
 
 
 def _views(
@@ -181,12 +179,14 @@ def _views(
     place: Annotated[Tensor, "3"] | None,
 ) -> Cameras:
     """The views of `find_views`, about a place where that is known; none where nothing can be seen."""
+    # The box that most opacity lies in, and the Gaussians that show most, of which candidates are drawn.
     opacity = gaussians.opacities
     ends = torch.stack([_quantiles(axis, opacity, (0.02, 0.98)) for axis in gaussians.means.T]).double()
     coarse = gaussians
     if len(gaussians) > _PROBED:
         area = gaussians.log_scales.topk(2, dim=1).values.sum(1) + opacity.log()
         coarse = gaussians.select(area.topk(_PROBED).indices)
+    # About where sizes say that photographs were taken; else within what surrounds a free place; else around the object.
     within = _from_within(gaussians) if inside is None else inside
     if inside is not False:
         chosen = _around_place(gaussians, ends, up, size, count, antialiased, _SIZED_WITHIN if within else _SIZED, place)
@@ -197,6 +197,7 @@ def _views(
     if not len(cameras):
         cameras, near = _rings(gaussians, ends, up, size, count)
         worth = _probed(coarse, cameras, near, antialiased)[0]
+    # The best ones, in the order in which they were tried: the nearer ones first.
     best = worth.topk(min(count, len(worth))).indices.sort().values
     return cameras.select(best[worth[best] > 0])
 
@@ -212,6 +213,7 @@ def _around_place(
     known: Annotated[Tensor, "3"] | None,
 ) -> Cameras | None:
     """Views from about where the photographs were taken, if known; None where sizes do not tell as well as `sized`."""
+    # The place from which sizes are most alike, of some solid Gaussians: their size, at their distance the usual one in angle.
     solid = (gaussians.opacities > 0.2).nonzero()[:, 0]
     if len(solid) < 100:
         return None
@@ -229,12 +231,14 @@ def _around_place(
     picked = [int((ahead @ mean).argmax())]
     for _ in range(_TARGETS - 1):
         picked.append(int((ahead @ ahead[picked].T).amax(1).argmin()))
+    # Cameras at that place, a little behind it and to the sides, each looking in all of these directions.
     ring = _around(up, 4)
     back = torch.tensor(_BACK, dtype=torch.float64)[:, None] * -mean
     offsets = middle * torch.cat([back, *(far * ring for far in _AROUND)])
     eye = (place + offsets).repeat_interleave(_TARGETS, 0)
     target = (place + middle * ahead[picked]).repeat(len(offsets), 1)
     cameras = pinhole(look_at(eye, target, up), width=size[0], height=size[1], fov=_NARROW)
+    # Their worth on small pictures of those that show most there: how much is filled, less what is close or looks blurred.
     seen = 2 * (extent - torch.linalg.vector_norm(points - place, dim=1).clamp_min(0.05 * middle).log())
     shown = (seen + gaussians.opacities.log()).topk(min(_PROBED, len(seen))).indices
     coarse, points, extent = gaussians.select(shown), points[shown].float(), extent[shown].float()
@@ -256,19 +260,19 @@ def _size_centre(
     """The place from which sizes (logarithms) are most alike in angle, and how much more alike than the sizes themselves."""
     place, half = ends.mean(1), float((ends[:, 1] - ends[:, 0]).max()) / 2
     spread = deviation = float((extent - extent.median()).abs().median())
+    middle = points.mean(0)  # taken off: float32 tells distances in captures far from the origin
     for count, reach in _GRIDS:
         line = torch.linspace(-reach, reach, count, dtype=torch.float64) * half
         tried = place + torch.cartesian_prod(line, line, line)
-        each = torch.cat([_deviation(part, points, extent) for part in torch.split(tried, 512)])
-        place, deviation = tried[int(each.argmin())], float(each.min())
+        # Median absolute deviation of log(size / distance) from each place.
+        each = []
+        for part in torch.split(tried, 512):
+            apart = torch.cdist((part - middle).float(), (points - middle).float()).clamp_min(1e-9)
+            left = extent.float() - apart.log()
+            each.append((left - left.median(1, keepdim=True).values).abs().median(1).values)
+        deviations = torch.cat(each)
+        place, deviation = tried[int(deviations.argmin())], float(deviations.min())
     return place, deviation / max(spread, 1e-9)
-
-
-def _deviation(places: Annotated[Tensor, "P 3"], points: Tensor, extent: Tensor) -> Annotated[Tensor, "P"]:
-    """Median absolute deviation of log(size / distance) from each place."""
-    middle = points.mean(0)  # taken off: float32 tells distances in captures far from the origin
-    left = extent.float() - torch.cdist((places - middle).float(), (points - middle).float()).clamp_min(1e-9).log()
-    return (left - left.median(1, keepdim=True).values).abs().median(1).values
 
 
 def _rings(
@@ -281,12 +285,13 @@ def _rings(
     # Where all are at one place, their own size is that of the object.
     away = away.clamp_min(float(_quantiles(sizes, gaussians.opacities, (0.5,))[0]))
     reach = float(_quantiles(away.float(), gaussians.opacities, (0.95,))[0]) / math.sin(math.radians(_FOV / 2))
-    rings = [(lift, far) for far in _DISTANCES for lift in _LIFTS]
+    # Rings of cameras, each turned against the one before, so that none stands behind another.
+    rings = [(math.radians(height), far) for far in _DISTANCES for height in _LIFTS]
     each = max(4, round(1.6 * count / len(rings)))
     eyes = []
-    for ring, (lifted, far) in enumerate(rings):
+    for ring, (height, far) in enumerate(rings):
         flat = _around(up, each, 0.38 * ring)
-        eyes.append(centre + (math.cos(math.radians(lifted)) * flat + math.sin(math.radians(lifted)) * up) * far * reach)
+        eyes.append(centre + (math.cos(height) * flat + math.sin(height) * up) * far * reach)
     eye = torch.cat(eyes)
     cameras = pinhole(look_at(eye, centre.expand_as(eye), up), width=size[0], height=size[1], fov=_FOV)
     return cameras, 0.3 * torch.linalg.vector_norm(eye - centre, dim=1)
@@ -294,6 +299,7 @@ def _rings(
 
 def _from_within(gaussians: Gaussians) -> bool:
     """True where what lies far out is coarser than the rest, or reaches far beyond it."""
+    # Distances from the median, and sizes, of what can be seen.
     seen = gaussians.opacities > 0.3
     if int(seen.sum()) < 100:
         return False
@@ -310,6 +316,7 @@ def _from_within(gaussians: Gaussians) -> bool:
 
 def _free_places(gaussians: Gaussians, ends: Tensor, up: Tensor) -> Annotated[Tensor, "P 3"]:
     """Middles of cells of the capture's box that hold next to nothing, nor do their neighbours; spread over all such."""
+    # Opacity in each cell of a grid; a cell is free where neither it nor a neighbour holds more than next to nothing.
     low, span = ends[:, 0], (ends[:, 1] - ends[:, 0]).clamp_min(1e-9)
     at = ((gaussians.means.double() - low) / span * _CELLS).floor().long()
     kept = ((at >= 0) & (at < _CELLS)).all(1)
@@ -325,6 +332,7 @@ def _free_places(gaussians: Gaussians, ends: Tensor, up: Tensor) -> Annotated[Te
     height = places @ up
     bottom, top = (ends * up[:, None]).amin(1).sum(), (ends * up[:, None]).amax(1).sum()
     places = places[height <= bottom + 0.67 * (top - bottom)]
+    # The one nearest to the middle, then always the one farthest from all that were picked.
     picked: list[int] = []
     apart = torch.full((len(places),), math.inf, dtype=torch.float64)
     for _ in range(min(_PLACES, len(places))):
@@ -349,6 +357,7 @@ def _inside(
     every = torch.arange(0, len(cameras), 2)  # half of them overlap enough to tell
     near = 0.05 * float(gaussians.means.double().var(0, correction=0).sum().sqrt())
     _, filled = _probed(gaussians, cameras.select(every), torch.full((len(every),), near), antialiased)
+    # A place is enclosed where something fills the view in most directions.
     share = filled.view(len(places), _TURNS // 2).mean(1)
     if not len(places) or float(share.quantile(0.75)) < enclosed:
         return cameras.select(every[:0]), torch.zeros(0)
@@ -372,6 +381,7 @@ def _probed(
 
 def _around(up: Annotated[Tensor, "3"], count: int, begin: float = 0.0) -> Annotated[Tensor, "count 3"]:
     """Directions across `up`, spread evenly, turned by `begin` of the angle between them."""
+    # An orthonormal basis whose first axis is `up`, from the two axes of the world that are least along it.
     basis = torch.linalg.qr(torch.cat([up[:, None], torch.eye(3, dtype=up.dtype)[:, up.abs().argsort()[:2]]], 1))[0]
     turn = (torch.arange(count, dtype=torch.float64) + begin) * (2 * math.pi / count)
     ring: Tensor = turn.cos()[:, None] * basis[:, 1] + turn.sin()[:, None] * basis[:, 2]
@@ -379,6 +389,7 @@ def _around(up: Annotated[Tensor, "3"], count: int, begin: float = 0.0) -> Annot
 
 
 def _quantiles(values: Tensor, weights: Tensor, shares: tuple[float, ...]) -> Tensor:
+    """Quantiles of weighted values."""
     ordered, at = values.sort()
     mass = weights[at].double().cumsum(0)
     wanted = torch.tensor(shares, dtype=torch.float64) * mass[-1]

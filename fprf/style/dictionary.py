@@ -1,22 +1,40 @@
-"""The style dictionary (paper, section on semantic matching): local semantic codes and the styles that go with them."""
+"""The style dictionary (paper, section on semantic matching): reference photographs to pixel samples, samples to style codes.
+
+Letters: N pixel samples of a photograph, C content channels, D semantic channels in the scene's basis, T style codes of all
+references, K regions of the scene. Colours are sRGB in [0, 1].
+
+Content and semantics of a photograph pass the same guided filter as the scene's training targets, at its own pixels, so that
+a reference's statistics are in kind with the scene's. What moves them is the size that the encoder sees (VGG relu2_1: the
+deviations change by 4 to 12 % from 512 to 384 pixels a side), so photographs are encoded at the scene's own. What doesn't is
+how many pixels are looked at: every third and coarser filter cells change them by 0.6 % at most, and cost a fifth.
+"""
 
 import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
+import cv2
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
 from ..checks import at_least, between
+from ..datamanagers.config import GuidedConfig
+from ..datamanagers.images import Image, load_image, load_mask
 from ..errors import CheckpointError, DataError
+from ..interfaces import Encoder
 from ..io.atomic import write_bytes
+from ..ops.guided import apply, coefficients
 from ..ops.precision import double
-from .clusters import kmeans
-from .statistics import covariance, group_moments, mix, moments
+from .statistics import covariance, group_moments, kmeans, mix, moments
+
+if TYPE_CHECKING:
+    from ..datamanagers.basis import Basis
+    from .scene_style import SceneStyle
 
 BLEND = 0.1
 """Share of the whole image's (or scene's) statistics in each local code. The paper has none, its released code 0.3, which
@@ -25,10 +43,40 @@ ends further from the truth where that is known (docs/evidence)."""
 CLUSTERS = 20
 """Local codes a reference: with ten, as the paper suggests, trees and houses share some (docs/evidence)."""
 
+_SAMPLES = 20_000
+"""Pixels of a photograph that are looked at, about, on a regular grid."""
+SHORTEST_REFERENCE = 128
+"""References are encoded at the scene's size, but not below this: clusters would have too few pixels."""
+_SHORTEST = 64
+"""No side is encoded smaller: deep encoders have nothing to pad with on a photograph of a few pixels."""
+_CELL = 16
+"""Pixels between guided-filter coefficients."""
+_ROWS = 4096
+"""Pixels filtered at a time: bounds the memory."""
+
 _FORMAT = "fprf-style-1"
-_TENSORS = ("keys", "mean", "covariance", "share", "reference", "weight")
+_TABLES = ("keys", "mean", "covariance", "share", "weight")
+"""Fields of a dictionary with a row a code."""
 _COLOURS = ("colour_mean", "colour_covariance")
-_BEYOND = ("beyond",)
+_OPTIONAL = (*_COLOURS, "beyond")
+"""Fields with a row a code that may be None."""
+
+
+class Encoders(NamedTuple):
+    """Encoders and basis for references of a scene: loaded once for any number of styles."""
+
+    content: Encoder
+    semantic: Encoder | None
+    basis: "Basis | None"
+    scene: "SceneStyle"
+    device: torch.device = torch.device("cpu")
+    """Device of the encoders."""
+    longest: int = 512
+    """Longest side in pixels at which photographs are encoded: that of the scene's own views."""
+    guided: GuidedConfig = GuidedConfig()
+    """The filter that features of the scene's own images passed."""
+    seed: int = 0
+    """Of the clusters of a style dictionary."""
 
 
 class Reference(NamedTuple):
@@ -44,6 +92,83 @@ class Reference(NamedTuple):
     """The samples' own colours, sRGB in [0, 1]; None where nobody will ask."""
     beyond: Annotated[Tensor, "N"] | None = None
     """Squared length of semantics outside of the scene's basis (`Basis.beyond`); None = 0."""
+
+
+@torch.inference_mode()
+def encode_photograph(path: Path, encoders: Encoders, *, name: str, weight: float = 1.0, mask: Path | None = None) -> Reference:
+    """Encode one photograph to samples in the scene's terms: D is 0 without a semantic encoder or basis.
+
+    Of a photograph with a `mask`, a picture of the same shape, only what is white there is sampled; the encoders see all of
+    it. Raises DataError where a file is no readable image, or a mask does not fit.
+    """
+    photo = load_image(path, upright=True)
+    # Reduced to the size of the scene's views where the shape allows, and enlarged only where an encoder could not take it.
+    height, width = photo.shape[:2]
+    scale = min(1.0, max(encoders.longest, SHORTEST_REFERENCE) / max(height, width))
+    width, height = max(_SHORTEST, round(width * scale)), max(_SHORTEST, round(height * scale))
+    reduced = np.asarray(cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    image = torch.from_numpy(reduced).to(encoders.device).float() / 255
+    # Sample a regular grid of pixels; of a mask every n-th pixel, so that a small one is looked at closely.
+    if mask is None:
+        step = max(1, round((height * width / _SAMPLES) ** 0.5))
+        y, x = torch.meshgrid(torch.arange(step // 2, height, step), torch.arange(step // 2, width, step), indexing="ij")
+        pixel = torch.stack([x.flatten(), y.flatten()], 1)
+    else:
+        pixel = _read_mask(mask, path, photo, (width, height)).nonzero().flip(1)
+        step = max(1, round(len(pixel) / _SAMPLES))
+        pixel = pixel[step // 2 :: step]
+    pixel = pixel.to(image.device)
+    content = _filtered(_encode(encoders.content, image), image, pixel, encoders.guided)
+    colour = image[pixel[:, 1], pixel[:, 0]]
+    if encoders.semantic is None or encoders.basis is None:
+        return Reference(name, content, content.new_zeros(len(content), 0), weight, colour)
+    semantic, beyond = semantic_samples(image, pixel, encoders.semantic, encoders.basis, encoders.guided)
+    return Reference(name, content, semantic, weight, colour, beyond)
+
+
+def semantic_samples(
+    image: Annotated[Tensor, "H W 3"], pixel: Annotated[Tensor, "N 2"], encoder: Encoder, basis: "Basis", guided: GuidedConfig
+) -> tuple[Annotated[Tensor, "N D"], Annotated[Tensor, "N"]]:
+    """Sample filtered semantics at pixels (x, y, int64) in a scene's basis, and what lies beyond it (`Basis.beyond`)."""
+    maps = _encode(encoder, image)
+    cells = maps.flatten(1).T
+    low = basis.project(cells)
+    # Projecting is linear and so is the filter: fewer channels first.
+    fewer = torch.cat([low, basis.beyond(cells, low)], 1).T.reshape(-1, *maps.shape[1:])
+    samples = _filtered(fewer, image, pixel, guided)
+    return samples[:, :-1].contiguous(), samples[:, -1].clamp_min(0)
+
+
+def _encode(encoder: Encoder, image: Annotated[Tensor, "H W 3"]) -> Annotated[Tensor, "C h w"]:
+    features: Tensor = encoder(image.permute(2, 0, 1)[None])
+    return features[0].float()
+
+
+def _filtered(
+    maps: Annotated[Tensor, "C h w"], image: Annotated[Tensor, "H W 3"], pixel: Annotated[Tensor, "N 2"], guided: GuidedConfig
+) -> Annotated[Tensor, "N C"]:
+    """Apply the guided filter at pixels (x, y, int64)."""
+    height, width = image.shape[:2]
+    radius = round(guided.radius * min(height, width))
+    cells = coefficients(maps, image, radius=radius, eps=guided.eps, stride=_CELL)
+    parts = torch.split(pixel, _ROWS)
+    return torch.cat([apply(cells, at + 0.5, image[at[:, 1], at[:, 0]], (height, width)) for at in parts])
+
+
+def _read_mask(path: Path, photo_path: Path, photo: Image, size: tuple[int, int]) -> Annotated[Tensor, "H W"]:
+    """Read a mask at a size (width, height), bool: what is at least half covered, else whatever is covered at all."""
+    white = load_mask(path, upright=True)
+    (height, width), (own_height, own_width) = white.shape, photo.shape[:2]
+    if abs(width * own_height - height * own_width) > 0.5 * (width + height + own_width + own_height):
+        raise DataError(
+            f"{path}: a mask of {width}x{height} pixels does not fit {photo_path.name} of {own_width}x{own_height}; "
+            "draw it on the photograph itself"
+        )
+    cover = torch.from_numpy(np.asarray(cv2.resize(white.astype(np.float32), size, interpolation=cv2.INTER_AREA)))
+    selected = cover >= 0.5 if bool((cover >= 0.5).any()) else cover > 0
+    if not bool(selected.any()):
+        raise DataError(f"{path}: the mask selects no pixel of {photo_path.name}; paint white what makes the style")
+    return selected
 
 
 class StyleDictionary(NamedTuple):
@@ -70,7 +195,7 @@ class StyleDictionary(NamedTuple):
     beyond: Annotated[Tensor, "T"] | None = None
     """Mean squared length of each code's semantics outside of the scene's basis; None = 0."""
     allowed: Annotated[Tensor, "K references"] | None = None
-    """On one scene: which references each of its regions may take from, bool; None = all. See `style.regional`. Not saved."""
+    """On one scene: which references each of its regions may take from, bool; None = all. Not saved."""
     origin: Annotated[Tensor, "D"] | None = None
     """The encoder's zero, projected on the scene's semantic basis; None = 0. Not saved: it follows from the basis."""
 
@@ -93,15 +218,57 @@ def build_dictionary(
     at_least("clusters", clusters, 1)
     between("blend", blend, 0.0, 1.0)
     at_least("min_members", min_members, 1)
-    _check(references)
-    ordered = sorted(references, key=lambda r: (_content_hash(r), r.name, r.weight))
-    parts = [_codes(r, clusters, blend, seed, min_members) for r in ordered]
-    names: tuple[str, ...] = _TENSORS if any(r.colour is None for r in ordered) else _TENSORS + _COLOURS
-    names += () if any(r.beyond is None for r in ordered) else _BEYOND
-    tables = {name: torch.cat([part[name] for part in parts]).cpu() for name in names if name != "reference"}
-    count = torch.tensor([len(part["keys"]) for part in parts])
-    reference = torch.arange(len(parts)).repeat_interleave(count)
-    return StyleDictionary(**tables, reference=reference, names=tuple(r.name for r in ordered), blend=float(blend))
+    _check_references(references)
+
+    def content_hash(r: Reference) -> str:
+        digest = hashlib.sha256()
+        for part in (r.content, r.semantic):
+            digest.update(str(tuple(part.shape)).encode())
+            digest.update(part.detach().float().cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()
+
+    ordered = sorted(references, key=lambda r: (content_hash(r), r.name, r.weight))
+    parts = [_codes_of(r, clusters, blend, seed, min_members) for r in ordered]
+    return concatenate(parts, [r.name for r in ordered], [r.weight for r in ordered])
+
+
+def concatenate(parts: Sequence[StyleDictionary], names: Sequence[str], weights: Sequence[float]) -> StyleDictionary:
+    """Join dictionaries of one reference each, under new names and weights."""
+    counts = torch.tensor([len(part.keys) for part in parts])
+    fields = [name for name in (*_TABLES, *_OPTIONAL) if all(getattr(part, name) is not None for part in parts)]
+    tables = {name: torch.cat([getattr(part, name) for part in parts]) for name in fields}
+    tables["weight"] = torch.tensor(weights, dtype=torch.float32).repeat_interleave(counts)
+    reference = torch.arange(len(parts)).repeat_interleave(counts)
+    return StyleDictionary(**tables, reference=reference, names=tuple(names), blend=parts[0].blend)
+
+
+def _codes_of(r: Reference, clusters: int, blend: float, seed: int, min_members: int) -> StyleDictionary:
+    """Build the codes of one reference, float32, those of colours where it has some."""
+    # Local codes are clusters of the semantics; without semantics there is one.
+    label, keys = r.semantic.new_zeros(len(r.semantic), dtype=torch.int64), r.semantic[:1].float()
+    if r.semantic.shape[1] > 0:
+        keys, label = kmeans(r.semantic, clusters, seed=seed)
+    member = double(torch.nn.functional.one_hot(label, len(keys)))
+    share = member.sum(0) / len(label)
+    at = 1 - (1 - blend) * (share * len(label) / min_members).clamp_max(1.0)
+
+    def statistics(features: Annotated[Tensor, "N C"]) -> tuple[Annotated[Tensor, "T C"], Annotated[Tensor, "T C C"]]:
+        whole = moments(features, features.new_ones(len(features)))
+        mean, covariances, _ = group_moments(features, member)
+        return blend_codes(mean, covariances, whole.mean, covariance(whole), at)
+
+    tables = dict(zip(("mean", "covariance"), statistics(r.content), strict=True))
+    if r.colour is not None:
+        tables |= dict(zip(_COLOURS, statistics(r.colour), strict=True))
+    if r.beyond is not None:
+        tables["beyond"] = member.T @ double(r.beyond) / member.sum(0)
+    tables |= {"keys": keys, "share": share, "weight": torch.full_like(share, r.weight)}
+    return StyleDictionary(
+        **{name: table.float().cpu() for name, table in tables.items()},
+        reference=torch.zeros(len(keys), dtype=torch.int64),
+        names=(r.name,),
+        blend=float(blend),
+    )
 
 
 def blend_codes(
@@ -144,12 +311,11 @@ def code_odds(d: StyleDictionary) -> Annotated[Tensor, "T"]:
 
 
 def choose(d: StyleDictionary, references: Annotated[Tensor, "references"]) -> tuple[StyleDictionary, Annotated[Tensor, "T"]]:
-    """The dictionary of some of the references (bool, at least one), and which of the codes these are (bool)."""
+    """Select some of the references (bool, at least one); return their dictionary, and which of the codes these are (bool)."""
     codes = references[d.reference]
     renumbered = references.cumsum(0) - 1
     part = d._replace(
-        **{name: getattr(d, name)[codes] for name in ("keys", "mean", "covariance", "share", "weight")},
-        **{name: getattr(d, name)[codes] for name in _COLOURS + _BEYOND if getattr(d, name) is not None},
+        **{name: getattr(d, name)[codes] for name in (*_TABLES, *_OPTIONAL) if getattr(d, name) is not None},
         reference=renumbered[d.reference[codes]],
         names=tuple(name for name, taken in zip(d.names, references.tolist(), strict=True) if taken),
         allowed=None,
@@ -159,7 +325,8 @@ def choose(d: StyleDictionary, references: Annotated[Tensor, "references"]) -> t
 
 def save_dictionary(path: Path, d: StyleDictionary) -> None:
     """Write the dictionary to `path`; a crash leaves the old file or the new one, never a part."""
-    tensors = {name: getattr(d, name).detach().cpu().contiguous() for name in _stored(d)}
+    fields = [name for name in (*_TABLES, "reference", *_OPTIONAL) if getattr(d, name) is not None]
+    tensors = {name: getattr(d, name).detach().cpu().contiguous() for name in fields}
     meta = {"format": _FORMAT, "names": json.dumps(d.names), "blend": repr(d.blend), "sha256": _digest(tensors)}
     write_bytes(path, save(tensors, metadata=meta))
 
@@ -174,10 +341,8 @@ def load_dictionary(path: Path) -> StyleDictionary:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"{path}: not readable as safetensors ({error}); build the style again") from error
-    if meta.get("format") != _FORMAT or set(tensors) - {*_BEYOND} not in (
-        set(_TENSORS),
-        {*_TENSORS, *_COLOURS},
-    ):
+    needed = {*_TABLES, "reference"}
+    if meta.get("format") != _FORMAT or set(tensors) - {"beyond"} not in (needed, needed | {*_COLOURS}):
         raise CheckpointError(f"{path}: not a style dictionary of format {_FORMAT}; build the style again")
     if meta.get("sha256") != _digest(tensors):
         raise CheckpointError(f"{path}: checksum does not match, the file is damaged; build the style again")
@@ -187,52 +352,34 @@ def load_dictionary(path: Path) -> StyleDictionary:
     except (KeyError, ValueError, TypeError) as error:
         raise CheckpointError(f"{path}: its names or blend are unreadable; build the style again") from error
     d = StyleDictionary(**tensors, names=names, blend=blend)
-    _check_stored(path, d)
+    # The checksum says the file is whole; the rest says that it is a dictionary, whoever wrote it.
+    t = len(d.keys) if d.keys.ndim == 2 else 0
+    c = d.mean.shape[-1] if d.mean.ndim == 2 else 0
+    shapes = {"mean": (t, c), "covariance": (t, c, c), "share": (t,), "reference": (t,), "weight": (t,), "beyond": (t,)}
+    shapes |= {"colour_mean": (t, 3), "colour_covariance": (t, 3, 3)}
+    wrong = [name for name, shape in shapes.items() if name in tensors and tuple(tensors[name].shape) != shape]
+    if t == 0 or c == 0 or wrong:
+        raise CheckpointError(f"{path}: {', '.join(wrong) or 'keys'} of the wrong shape; build the style again")
+    if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
+        raise CheckpointError(f"{path}: a value is not finite; build the style again")
+    if d.reference.dtype != torch.int64 or not torch.equal(torch.unique(d.reference), torch.arange(len(names))):
+        raise CheckpointError(f"{path}: codes and {len(names)} reference names don't fit; build the style again")
+    if not bool((d.share > 0).all() & (d.weight > 0).all()) or not 0 <= d.blend <= 1:
+        raise CheckpointError(f"{path}: shares and weights must be above 0, blend in [0, 1]; build the style again")
     return d
 
 
-def _stored(d: StyleDictionary) -> tuple[str, ...]:
-    return tuple(name for name in _TENSORS + _COLOURS + _BEYOND if getattr(d, name) is not None)
-
-
-def _codes(r: Reference, clusters: int, blend: float, seed: int, min_members: int) -> dict[str, Tensor]:
-    """The tables of one reference, float32, those of colours where it has some."""
-    label, centres = _cluster(r.semantic, clusters, seed)
-    member = double(torch.nn.functional.one_hot(label, len(centres)))
-    share = member.sum(0) / len(label)
-    at = 1 - (1 - blend) * (share * len(label) / min_members).clamp_max(1.0)
-
-    def statistics(features: Annotated[Tensor, "N C"]) -> tuple[Annotated[Tensor, "T C"], Annotated[Tensor, "T C C"]]:
-        whole = moments(features, features.new_ones(len(features)))
-        mean, covariances, _ = group_moments(features, member)
-        return blend_codes(mean, covariances, whole.mean, covariance(whole), at)
-
-    mean, covariances = statistics(r.content)
-    tables = {"keys": centres, "mean": mean, "covariance": covariances, "share": share}
-    tables["weight"] = torch.full_like(share, r.weight)
-    if r.colour is not None:
-        tables["colour_mean"], tables["colour_covariance"] = statistics(r.colour)
-    if r.beyond is not None:
-        tables["beyond"] = member.T @ double(r.beyond) / member.sum(0)
-    return {name: table.float() for name, table in tables.items()}
-
-
-def _cluster(semantic: Tensor, clusters: int, seed: int) -> tuple[Tensor, Tensor]:
-    if semantic.shape[1] == 0:
-        return semantic.new_zeros(len(semantic), dtype=torch.int64), semantic[:1].float()
-    result = kmeans(semantic, clusters, seed=seed)
-    return result.label, result.centres
-
-
-def _content_hash(r: Reference) -> str:
+def _digest(tensors: dict[str, Tensor]) -> str:
     digest = hashlib.sha256()
-    for part in (r.content, r.semantic):
-        digest.update(str(tuple(part.shape)).encode())
-        digest.update(part.detach().float().cpu().contiguous().numpy().tobytes())
+    for name in sorted(tensors):
+        t = tensors[name]
+        digest.update(f"{name} {t.dtype} {tuple(t.shape)} ".encode())
+        digest.update(t.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()
 
 
-def _check(references: Sequence[Reference]) -> None:
+def _check_references(references: Sequence[Reference]) -> None:
+    """Raise DataError for references of which no dictionary can be built."""
     if not references:
         raise DataError("references: none given; name at least one photograph")
     first = references[0]
@@ -253,33 +400,3 @@ def _check(references: Sequence[Reference]) -> None:
             raise DataError(f"{r.name}: a feature is not finite; the image or the encoder's weights are damaged")
         if not 0 < r.weight < float("inf"):
             raise DataError(f"{r.name}: weight {r.weight}; a reference's weight must be above 0 and finite")
-
-
-def _check_stored(path: Path, d: StyleDictionary) -> None:
-    """The checksum says the file is whole; this says it is a dictionary, whoever wrote it."""
-    t = len(d.keys) if d.keys.ndim == 2 else 0
-    c = d.mean.shape[-1] if d.mean.ndim == 2 else 0
-    shapes = {"mean": (t, c), "covariance": (t, c, c), "share": (t,), "reference": (t,), "weight": (t,)}
-    if d.colour_mean is not None:
-        shapes |= {"colour_mean": (t, 3), "colour_covariance": (t, 3, 3)}
-    if d.beyond is not None:
-        shapes["beyond"] = (t,)
-    wrong = [name for name, shape in shapes.items() if tuple(getattr(d, name).shape) != shape]
-    if t == 0 or c == 0 or wrong:
-        raise CheckpointError(f"{path}: {', '.join(wrong) or 'keys'} of the wrong shape; build the style again")
-    if not all(bool(getattr(d, name).isfinite().all()) for name in _stored(d)):
-        raise CheckpointError(f"{path}: a value is not finite; build the style again")
-    used = torch.arange(len(d.names))
-    if d.reference.dtype != torch.int64 or not torch.equal(torch.unique(d.reference), used):
-        raise CheckpointError(f"{path}: codes and {len(d.names)} reference names don't fit; build the style again")
-    if not bool((d.share > 0).all() & (d.weight > 0).all()) or not 0 <= d.blend <= 1:
-        raise CheckpointError(f"{path}: shares and weights must be above 0, blend in [0, 1]; build the style again")
-
-
-def _digest(tensors: dict[str, Tensor]) -> str:
-    digest = hashlib.sha256()
-    for name in sorted(tensors):
-        t = tensors[name]
-        digest.update(f"{name} {t.dtype} {tuple(t.shape)} ".encode())
-        digest.update(t.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
-    return digest.hexdigest()

@@ -10,7 +10,7 @@ on another scene by its key, since numbers mean something on one scene alone.
 import hashlib
 import os
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
@@ -27,7 +27,7 @@ from .config import NO_MASK, StyleConfig
 _FORMAT = 1
 _KEYS = ("format", "fprf", "plugins", "style", "sha256", "semantic_encoder", "regions", "made")
 
-Key = tuple[float, ...]
+RegionKey = tuple[float, ...]
 S = TypeVar("S", bound=StyleConfig)
 
 
@@ -35,7 +35,7 @@ class StyleFile(NamedTuple):
     """Content of a style file; paths relative to the working directory."""
 
     style: StyleConfig
-    regions: Mapping[str, Key] = {}
+    regions: Mapping[str, RegionKey] = {}
     """Regions of the scene that the style was made on, by their semantics in the encoder's own channels."""
     semantic_encoder: str = ""
     """Identity of the encoder that the keys are of."""
@@ -150,3 +150,43 @@ def _hash(path: Path) -> str:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
+
+
+class Keyframe(NamedTuple):
+    """A frame, from 0, and its style file; None = the scene as it is."""
+
+    frame: int
+    style: Path | None
+
+
+def read_keyframes(path: Path) -> tuple[Keyframe, ...]:
+    """The keys of a file, by frame. Raises ConfigError naming the file and the key."""
+    whole = read_json(path, 'a keyframe file: {"format": 1, "keyframes": [{"frame": 0, "style": "style.json"}]}')
+    try:
+        if not isinstance(whole, dict) or whole.keys() != {"format", "keyframes"} or whole["format"] != _FORMAT:
+            raise ConfigError(f'expected an object with "format": {_FORMAT} and "keyframes", and nothing else')
+        rows = from_json(whole["keyframes"], list[dict[str, int | str | None]])
+        keys = [_keyframe(path, number, row) for number, row in enumerate(rows)]
+        frames = [key.frame for key in keys]
+        if not keys or len(set(frames)) < len(frames):
+            raise ConfigError("keyframes: at least one is needed, and no two at one frame")
+    except ConfigError as fault:
+        raise ConfigError(f"{path}: {fault}") from fault
+    return tuple(sorted(keys, key=lambda key: key.frame))
+
+
+def fade(frames: Sequence[int], at: int) -> tuple[int, int, float]:
+    """The keys before and after a frame, as places in `frames` (sorted), and how far it is from one to the other, in [0, 1]."""
+    after = next((i for i, frame in enumerate(frames) if frame > at), len(frames))
+    if after == 0 or after == len(frames):
+        only = min(after, len(frames) - 1)
+        return only, only, 0.0
+    way = (at - frames[after - 1]) / (frames[after] - frames[after - 1])
+    return after - 1, after, way * way * (3 - 2 * way)
+
+
+def _keyframe(path: Path, number: int, row: dict[str, int | str | None]) -> Keyframe:
+    frame, style = row.get("frame"), row.get("style")
+    if row.keys() != {"frame", "style"} or not isinstance(frame, int) or frame < 0 or isinstance(style, int):
+        raise ConfigError(f'keyframes.{number}: expected {{"frame": a number from 0, "style": a file or null}}')
+    return Keyframe(frame, None if style is None else path.parent / style)

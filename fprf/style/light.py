@@ -1,6 +1,7 @@
 """Light where a match is not sure: what the references do not show keeps its material and takes their light.
 
-Colours are sRGB in [0, 1], rows: c' = c A + b. A region k with mean m_k takes
+Letters: N points, D semantic channels, T style codes, K regions of the scene. Colours are sRGB in [0, 1], rows: c' = c A + b. A
+region k with mean m_k takes
 
     light_k(c)  =  (e_k m_k + q_k (c - m_k)) S,        S = (s I + (1 - s) L) diag(g)
 
@@ -24,17 +25,18 @@ claims. Both are set on painted pairs of photographs (`benchmarks/semantic_match
 matches are right where a right one is as likely as none.
 """
 
-from collections.abc import Callable
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from ..ops.precision import double
-from .controls import luma
 from .dictionary import StyleDictionary, choose, code_odds
 from .matching import score_spread, share_mean, unit
-from .scene import Membership, SceneStyle
+from .scene_style import Membership, SceneStyle
+
+if TYPE_CHECKING:
+    from ..plugins.stylizers.config import StylizerConfig
 
 SURE = 0.9
 """Likeness, in spreads of the scene's own regions, from which on a match counts wholly; at 0 it counts nothing."""
@@ -67,6 +69,13 @@ _LEAST_VOTE = 0.1
 """Vote of an unsure region on the exposure, beside 1 of a sure one: a scene of nothing but these has an exposure, too."""
 _AXES = ((0.5**0.5, 0.0, -(0.5**0.5)), (-(6**-0.5), (2 / 3) ** 0.5, -(6**-0.5)))
 """Red against blue, green against magenta; of unit length, at right angles to grey and to each other."""
+_LUMA = (0.2126, 0.7152, 0.0722)
+"""Rec. 709."""
+
+
+def luma(rgb: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 1"]:
+    """Luma of sRGB colours, in [0, 1] for colours in [0, 1]."""
+    return (rgb * rgb.new_tensor(_LUMA)).sum(-1, keepdim=True)
 
 
 class LightMaps(NamedTuple):
@@ -127,6 +136,7 @@ class Light(nn.Module):
         Likeness is that of a point to its nearest codes and that of its regions to those that they take, half each.
         """
         belongs, points = self._belongs(semantic, belongs), semantic.to(self.keys)
+        # The most like of all references, each by the mean cosine with its nearest codes.
         own = points.new_full((len(points),), -1.0)
         for i, middle in enumerate(self.middles):
             codes = (self.reference == i).nonzero().squeeze(1)
@@ -163,10 +173,9 @@ class Light(nn.Module):
         paint: Annotated[Tensor, "N 1"],
         belongs: Annotated[Tensor, "N K"] | None = None,
     ) -> Annotated[Tensor, "N 3"]:
-        """`change` of the scene's own colours."""
+        """What `change` adds to the scene's own colours."""
         maps = self.change(semantic, paint, belongs)
-        own = colour.to(maps)
-        return (torch.einsum("nc,ncd->nd", own, maps[:, :3]) + maps[:, 3]).to(colour)
+        return (torch.einsum("nc,ncd->nd", colour.to(maps), maps[:, :3]) + maps[:, 3]).to(colour)
 
     def _belongs(self, semantic: Tensor, belongs: Tensor | None) -> Annotated[Tensor, "N K"]:
         share: Tensor = self.membership(semantic) if belongs is None else belongs
@@ -176,7 +185,7 @@ class Light(nn.Module):
 def light_of(
     scene: SceneStyle,
     dictionary: StyleDictionary,
-    match: Callable[[StyleDictionary], Annotated[Tensor, "K T"]],
+    config: "StylizerConfig",
     colours: tuple[Annotated[Tensor, "K 3"], Annotated[Tensor, "K 3 3"]],
     *,
     bold: float,
@@ -184,8 +193,8 @@ def light_of(
 ) -> Light | None:
     """The light of references on a scene; None where all is painted (`bold` 1), or nothing tells regions or colours apart.
 
-    `match` gives the share of each code of a dictionary in each region, `colours` are mean and covariance of the regions' own
-    colours. A region that may not take from all references is lit as if there were only those that it may take from.
+    The stylizer of `config` matches codes and regions; `colours` are mean and covariance of the regions' own colours. A region
+    that may not take from all references is lit as if there were only those that it may take from.
     """
     if bold == 1 or len(scene.share) == 1 or dictionary.colour_mean is None:
         return None
@@ -195,9 +204,10 @@ def light_of(
     likeness, claim = mean.new_zeros(count), mean.new_zeros(count)
     maps = LightMaps(mean.new_zeros(count, 3, 3), torch.zeros_like(mean), torch.zeros_like(mean))
     for row in sorted({tuple(row) for row in every.tolist()}):
+        # All regions are matched with one choice of references; those that made it take their rows.
         chosen = torch.tensor(row)
         part, rows = choose(dictionary, chosen)[0], (every == chosen).all(1)
-        table = double(match(part)).cpu()
+        table = double(config.build(dictionary=part, scene=scene).region_match(scene.keys)).cpu()
         alike, alone = region_likeness(scene, part, table), unrivalled(scene, part, table)
         likeness[rows], claim[rows] = alike[rows], alone[rows]
         made = light_maps(mean, covariance, double(scene.share), table, part, ramp(alike) * alone)
@@ -275,6 +285,7 @@ def unrivalled(scene: SceneStyle, dictionary: StyleDictionary, table: Annotated[
     is like the region takes nothing from it, since what it claims is of its kind. Cosines between regions know no gap between
     two sets of pictures: codes come back to the scene (cycle consistency).
     """
+    # d, r and cos(k, l) of the formula; the least over rivals counts.
     units = unit(double(scene.keys), double(scene.semantic_mean))
     cosine = units @ unit(double(dictionary.keys), double(scene.semantic_mean)).T
     distance = (1 - cosine).clamp_min(1e-6)  # no ratio of two roundings
@@ -296,35 +307,42 @@ def light_maps(
     """The affine map of each region by the references' light, float64; see the top of the file."""
     assert dictionary.colour_mean is not None
     codes, odds = double(dictionary.colour_mean), code_odds(dictionary)
-    wanted, own, grey = table @ codes, luma(mean)[:, 0], luma(torch.eye(3, dtype=torch.float64))
+    painted, own, grey = table @ codes, luma(mean)[:, 0], luma(torch.eye(3, dtype=torch.float64))
+    # Smooth regions are sources of light, as the sky is; rough ones are things.
     deviation = torch.einsum("kij,ix,jx->k", covariance, grey, grey).clamp_min(0).sqrt()
     source = ((_ROUGH - deviation / (own + _BLACK)) / (_ROUGH - _SMOOTH)).clamp(0, 1)
     vote = share * (1 - source)
     vote = share if float(vote.sum()) < 1e-3 * float(share.sum()) else vote  # of a scene of nothing but sky, all
-    # Exposure, from the logarithms of luma.
-    change = (luma(wanted)[:, 0] + _BLACK).log() - (own + _BLACK).log()
+    # Exposure e, from the logarithms of luma: things take the median of their changes, sources the change of their match.
+    change = (luma(painted)[:, 0] + _BLACK).log() - (own + _BLACK).log()
     thing = torch.full_like(change, KNOWN * _quantile(change, vote * (sure + _LEAST_VOTE), 0.5))
     gain = torch.lerp(thing, change, source).exp().clamp(*_EXPOSURE)
     # What is nearly white already, as a marble statue is, cannot become brighter without losing its shape.
     gain = gain.minimum((_WHITE / (own + deviation)).clamp_min(1.0))
-    # White balance, from the logarithms of colours.
+    # White balance g, from the logarithms of colours: the cast of the references less that of the scene, axis by axis.
     axes = torch.tensor(_AXES, dtype=torch.float64)
     here, there = ((part.clamp_min(0) + _BLACK).log() @ axes.T for part in (mean, codes))
     bright = odds * (luma(codes)[:, 0] / _BRIGHT).clamp(0.05, 1)
     cast = []
     for a in range(len(axes)):
-        lit = shared(there[:, a], bright)
+        common = shared(there[:, a], bright)
         # Where the references share nothing, what the scene shares may be its material: a plant is yellowish throughout.
-        cast.append(lit - shared(here[:, a], share) if lit else 0.0)
+        cast.append(common - shared(here[:, a], share) if common else 0.0)
     balance = (KNOWN * torch.tensor(cast, dtype=torch.float64).clamp(-_CAST, _CAST) @ axes).exp()
+    # Saturation s of the references against the scene's, and S = (s I + (1 - s) L) diag(g).
     saturation = (_saturation(codes, odds) / _saturation(mean, share)).clamp(*_SATURATION)
     saturation = (saturation * torch.lerp(torch.ones_like(source), source.new_tensor(_SKY_SATURATION), source))[:, None, None]
     towards = (saturation * torch.eye(3).to(grey) + (1 - saturation) * grey.expand(3, 3)) * balance
-    # Two deviations above the mean stay below white, with at least a third of the contrast.
+    # Contrast q: two deviations above the mean stay below white, with at least a third of the contrast.
     contrast = gain.minimum(((1 - gain * own) / (2 * deviation).clamp_min(_BLACK)).clamp_min(gain.clamp_max(1) / 3))
     bias = torch.einsum("kc,kcd->kd", (gain - contrast)[:, None] * mean, towards)
+    # u takes green and magenta out of the middle of the lit and the painted mean, as far as these are opposite along red
+    # and blue.
     lit_mean = torch.einsum("kc,kcd->kd", gain[:, None] * mean, towards)
-    return LightMaps(contrast[:, None, None] * towards, bias, _ungreened(lit_mean, wanted, axes))
+    (red, green), (other_red, other_green) = (lit_mean @ axes.T).unbind(1), (painted @ axes.T).unbind(1)
+    opposite = (-red * other_red / red.square().maximum(other_red.square()).clamp_min(1e-12)).clamp(0, 1)
+    between = (-opposite * (green + other_green) / 2)[:, None] * axes[1]
+    return LightMaps(contrast[:, None, None] * towards, bias, between)
 
 
 def shared(value: Annotated[Tensor, "N"], weight: Annotated[Tensor, "N"]) -> float:
@@ -343,13 +361,6 @@ def _saturation(colour: Annotated[Tensor, "N 3"], weight: Annotated[Tensor, "N"]
     """Median distance of colours from grey, relative to their luma; never 0."""
     grey = luma(colour)
     return torch.tensor(_quantile((colour - grey).abs().amax(1) / (grey[:, 0] + _BLACK), weight, 0.5) + _BLACK)
-
-
-def _ungreened(lit: Tensor, painted: Tensor, axes: Tensor) -> Annotated[Tensor, "K 3"]:
-    """What takes green and magenta out of the middle of two colours, as far as they are opposite along red and blue."""
-    (red, green), (other_red, other_green) = (lit @ axes.T).unbind(1), (painted @ axes.T).unbind(1)
-    opposite = (-red * other_red / red.square().maximum(other_red.square()).clamp_min(1e-12)).clamp(0, 1)
-    return (-opposite * (green + other_green) / 2)[:, None] * axes[1]
 
 
 def _spread(scene: SceneStyle) -> float:

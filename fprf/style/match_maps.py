@@ -23,7 +23,7 @@ from ..rendering.cameras import Cameras, pixel_grid
 from .matching import unit
 from .regions import Regions, membership_view, shrunk
 from .restyle import Codes, Styled
-from .scene import Membership
+from .scene_style import Membership
 
 _LISTED = 0.005
 """Codes that less than this share of a view takes are not listed."""
@@ -198,7 +198,7 @@ class Region(NamedTuple):
 @torch.inference_mode()
 def explain(regions: Regions, styled: Styled | None = None) -> list[Region]:
     """All regions in their order, with what they take where there is a style."""
-    names, count = regions.views.names, len(regions.scene.share)
+    names, count = regions.scene.names, len(regions.style.share)
     looked = sorted({round(i * (len(names) - 1) / max(1, _VIEWS - 1)) for i in range(_VIEWS)})
     mass = torch.stack([_mass(regions, view) for view in looked])
     best = [looked[int(mass[:, k].argmax())] for k in range(count)]
@@ -206,13 +206,13 @@ def explain(regions: Regions, styled: Styled | None = None) -> list[Region]:
     rows = []
     for k, view in enumerate(best):
         colour, share = seen[view]
-        width, height = regions.views.cameras.size[view].tolist()
+        width, height = regions.scene.cameras.size[view].tolist()
         pixel = _middle(share[..., k], (width, height))
-        rows.append(Region(k, float(regions.scene.share[k]), names[view], pixel, highlight(colour, share[..., k])))
+        rows.append(Region(k, float(regions.style.share[k]), names[view], pixel, highlight(colour, share[..., k])))
     if styled is None:
         return rows
-    attention = styled.restyle.stylizer.match(regions.scene.keys.to(regions.views.device)).cpu().double()
-    sure = styled.restyle.confidence(regions.scene.keys.to(regions.views.device)).cpu()
+    attention = styled.restyle.stylizer.match(regions.style.keys.to(regions.scene.device)).cpu().double()
+    sure = styled.restyle.confidence(regions.style.keys.to(regions.scene.device)).cpu()
     return [_matched(row, styled, attention[row.number])._replace(confidence=float(sure[row.number])) for row in rows]
 
 
@@ -255,7 +255,7 @@ def _mass(regions: Regions, view: int) -> Annotated[Tensor, "K"]:
 def _seen(regions: Regions, view: int) -> tuple[Picture, Annotated[Tensor, "H W K"]]:
     """A view as it is, small, and where its regions are."""
     share, opacity = membership_view(regions, view, _FINE)
-    return to_uint8(regions.views.render(shrunk(regions.views.cameras, view, _FINE), 0).rgb), share * opacity[..., None]
+    return to_uint8(regions.scene.render(shrunk(regions.scene.cameras, view, _FINE), 0).rgb), share * opacity[..., None]
 
 
 def _middle(share: Annotated[Tensor, "H W"], size: tuple[int, int]) -> tuple[int, int]:

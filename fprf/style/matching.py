@@ -1,21 +1,28 @@
-"""Semantic correspondence (paper, Eq. 5 and 6): R = queries x keys^T, attention = softmax(R / temperature).
+"""Semantic matching (paper, section on semantic matching): which style codes points and regions take.
 
-Each side is centred on its own mean, so that what all of a scene (or all references) have in common, such as night
-against day, decides nothing. Temperatures are relative to the spread of the scores. At least float32, autocast or not.
+Letters: N points or queries, D semantic channels, T style codes with a key each, K regions of a scene with a key each.
+Semantics are vectors [D] in the scene's semantic basis, without a unit; scores are cosines in [-1, 1], or dot products; shares
+are in [0, 1]. At least float32, autocast or not; tables of regions are float64.
 
-Regions of a scene and style codes in one frame, before they are scored: what makes a region find its like.
+    R = queries x keys^T                        cross-correlation             paper, Eq. 5
+    R^S = softmax(R / temperature)              attention, rows sum to 1      paper, Eq. 6
+    M_w = R^S M,  Sigma_w = R^S Sigma           style of each row             paper, Eq. 6 (plugins/stylizers)
 
-Semantics of two sets of pictures differ by more than by what they show. A few directions hold most of the variance on either
-side (sky against ground), so cosines say little of the rest: both sides are partly whitened, each by its own scatter,
+The paper matches points with codes by dot products at temperature 1. Three things are ours, and each can be left out:
 
-    x'  =  (C / c + s I)^(-w/2) (x - m)        C the scatter of its keys, c its mean variance, w the share of whitening.
+- Cosines: both sides are directions from a centre, each side's own mean, so that what all of a scene (or all references) have
+  in common, such as night against day, decides nothing. Temperatures are relative to the spread of the scores.
+- Whitening: a few directions hold most of the variance on either side (sky against ground), so cosines say little of the rest.
+  Both sides are partly whitened, each by its own scatter,
 
-And the mean of the references depends on what they were pointed at: three photographs, two of façades, have a mean that
-looks like a façade, from which trees point elsewhere than they do in the scene. So the codes' mean is taken again with the
-weights at which the scene takes them, a few times over. Nothing is learnt, and either step can be left out.
+      x'  =  (C / c + s I)^(-w/2) (x - m)        C the scatter of its keys, c its mean variance, w the share of whitening.
+
+- Recentring: the mean of the references depends on what they were pointed at: three photographs, two of façades, have a mean
+  that looks like a façade, from which trees point elsewhere than they do in the scene. So the codes' mean is taken again with
+  the weights at which the scene takes them.
 """
 
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
@@ -29,6 +36,8 @@ Similarity = Literal["cosine", "dot"]
 
 _FLAT = 1e-6
 """Below this share of what they were computed from, lengths and spreads are float32 rounding."""
+_RIDGE = 0.1
+"""Variance added to every direction before whitening, relative to the mean one: what hardly varies is not blown up."""
 
 
 def unit(x: Annotated[Tensor, "N D"], centre: Annotated[Tensor, "D"]) -> Annotated[Tensor, "N D"]:
@@ -45,21 +54,6 @@ def share_mean(keys: Annotated[Tensor, "T D"], share: Annotated[Tensor, "T"]) ->
         return (share / share.sum()) @ keys
 
 
-def compared(
-    queries: Annotated[Tensor, "N D"],
-    keys: Annotated[Tensor, "T D"],
-    similarity: Similarity,
-    *,
-    queries_centre: Annotated[Tensor, "D"],
-    keys_centre: Annotated[Tensor, "D"],
-) -> tuple[Annotated[Tensor, "N D"], Annotated[Tensor, "T D"]]:
-    """Both sides, such that their inner products are the scores: cosines of the centred features, or plain dot products."""
-    if similarity == "cosine":
-        return unit(queries, queries_centre), unit(keys, keys_centre)
-    # Softmax does not see what is subtracted from all keys; the smaller numbers round less.
-    return queries, keys - keys_centre
-
-
 def scores(queries: Annotated[Tensor, "N D"], keys: Annotated[Tensor, "T D"]) -> Annotated[Tensor, "N T"]:
     """The cross-correlation matrix R (paper, Eq. 5), in float32 or wider."""
     with full_precision(queries):
@@ -67,7 +61,7 @@ def scores(queries: Annotated[Tensor, "N D"], keys: Annotated[Tensor, "T D"]) ->
 
 
 def score_spread(queries: Annotated[Tensor, "N D"], keys: Annotated[Tensor, "T D"]) -> float:
-    """Unit of the temperature: spread of the scores of a query between keys (rms); 1 where they never do.
+    """Unit of the temperature: spread of the scores of a query between keys (rms); 1 where they never differ.
 
     The unit cancels the encoder's scale and its contrast between things, both of which differ between encoders.
     """
@@ -107,6 +101,7 @@ def point_shares(
 
     Shares below `faint` of a point's largest become 0. Rows sum to 1. Within 4 (D + 4) u / temperature of the exact shares.
     """
+    # The kernel does in one pass over the points what the lines below do in five.
     if usable(x) and keys.dtype == torch.float32 and len(x) > 0 and temperature > 0:
         flat = 0.0 if centre is None else _FLAT * float(torch.linalg.vector_norm(centre))
         return mixture.attention(x, keys, temperature, centre=centre, flat=flat, prior=prior, faint=faint)
@@ -117,76 +112,62 @@ def point_shares(
     return share
 
 
-_RIDGE = 0.1
-"""Variance added to every direction before whitening, relative to the mean one: what hardly varies is not blown up."""
-
-
-class Matching(NamedTuple):
-    """Settings of the match between regions and codes."""
-
-    temperature: float
-    """Relative to the spread of the scores; above 0."""
-    similarity: Similarity = "cosine"
-    whitening: float = 0.0
-    """In [0, 1]; 0 = semantics as they are."""
-    recentred: int = 0
-    """Times that the codes' mean is taken again; 0 = the mean of all of them."""
-    centred: bool = True
-    """Cosines are taken from the mean of each side; False = from the encoder's own origin, without whitening."""
-
-
-class Keys(NamedTuple):
-    """One side: semantic centroids and the share of their side that each stands for."""
-
-    keys: Annotated[Tensor, "T D"]
-    share: Annotated[Tensor, "T"]
-
-
 def match_keys(
-    here: Keys,
-    there: Keys,
-    matching: Matching,
+    regions: Annotated[Tensor, "K D"],
+    region_share: Annotated[Tensor, "K"],
+    codes: Annotated[Tensor, "T D"],
+    code_share: Annotated[Tensor, "T"],
     prior: Annotated[Tensor, "T"],
+    *,
+    temperature: float,
+    similarity: Similarity = "cosine",
+    whitening: float = 0.0,
+    recentred: int = 0,
+    centred: bool = True,
     origin: Annotated[Tensor, "D"] | None = None,
 ) -> Annotated[Tensor, "K T"]:
     """Share of each code in each region, float64; rows sum to 1. `prior` > 0 multiplies the odds of each code.
 
-    `origin` is the encoder's, in the keys' own basis; None = 0. It counts where cosines are not centred: a single thing has
-    no sky, so its mean says nothing about that of a landscape.
+    Both sides are keys and the share of their side that each stands for. `temperature` is relative to the spread of the scores,
+    above 0; `whitening` in [0, 1], 0 = semantics as they are; `recentred` is how often the codes' mean is taken again. With
+    `centred` False cosines are taken from the encoder's own zero (`origin`, in the keys' basis; None = 0), without whitening: a
+    single thing has no sky, so its mean says nothing about that of a landscape.
 
     With cosines, moving one side or rotating both changes nothing. Dot products are the paper's, and know no frame.
     """
-    here, there = (Keys(double(side.keys), double(side.share) / double(side.share).sum()) for side in (here, there))
+    regions, region_share = double(regions), double(region_share) / double(region_share).sum()
+    codes, code_share = double(codes), double(code_share) / double(code_share).sum()
 
     def matched(queries: Annotated[Tensor, "K D"], keys: Annotated[Tensor, "T D"]) -> Annotated[Tensor, "K T"]:
-        return attention(queries, keys, matching.temperature * score_spread(queries, keys), double(prior))
+        return attention(queries, keys, temperature * score_spread(queries, keys), double(prior))
 
-    if matching.similarity == "dot":
-        centres = share_mean(*here), share_mean(*there)
-        return matched(*compared(here.keys, there.keys, "dot", queries_centre=centres[0], keys_centre=centres[1]))
-    if not matching.centred:
-        zero = torch.zeros_like(here.keys[0]) if origin is None else double(origin)
-        return matched(unit(here.keys, zero), unit(there.keys, zero))
-    queries = _directions(here.keys, share_mean(*here), whitener(here, matching.whitening))
-    white, weight = whitener(there, matching.whitening), there.share
-    for _ in range(matching.recentred + 1):
-        table = matched(queries, _directions(there.keys, share_mean(there.keys, weight), white))
-        weight = here.share @ table
+    if similarity == "dot":
+        # Softmax does not see what is subtracted from all keys; the smaller numbers round less.
+        return matched(regions, codes - share_mean(codes, code_share))
+    if not centred:
+        zero = torch.zeros_like(regions[0]) if origin is None else double(origin)
+        return matched(unit(regions, zero), unit(codes, zero))
+
+    def directions(x: Tensor, centre: Tensor, white: Tensor) -> Annotated[Tensor, "N D"]:
+        """Whitened directions from the centre; of what lies at the centre there is none (0)."""
+        return unit(unit(x, centre) @ white, torch.zeros_like(centre))
+
+    queries = directions(regions, share_mean(regions, region_share), whitener(regions, region_share, whitening))
+    white, weight = whitener(codes, code_share, whitening), code_share
+    for _ in range(recentred + 1):
+        table = matched(queries, directions(codes, share_mean(codes, weight), white))
+        # The next centre counts each code by how much of the scene takes it.
+        weight = region_share @ table
     return table
 
 
-def whitener(side: Keys, whitening: float) -> Annotated[Tensor, "D D"]:
+def whitener(keys: Annotated[Tensor, "T D"], share: Annotated[Tensor, "T"], whitening: float) -> Annotated[Tensor, "D D"]:
     """Matrix that partly whitens semantics of a side, float64 and symmetric; the identity where they do not vary, or for 0."""
-    away = double(side.keys) - share_mean(double(side.keys), double(side.share))
-    scatter = (away * (double(side.share) / double(side.share).sum())[:, None]).T @ away
+    away = double(keys) - share_mean(double(keys), double(share))
+    scatter = (away * (double(share) / double(share).sum())[:, None]).T @ away
     unity, size = torch.eye(len(scatter)).to(scatter), scatter.diagonal().mean()
     if whitening == 0 or not bool(size > 0):
         return unity
     values, vectors = torch.linalg.eigh(scatter / size + _RIDGE * unity)
     root: Tensor = (vectors * values.clamp_min(_RIDGE) ** (-whitening / 2)) @ vectors.T
     return root
-
-
-def _directions(x: Tensor, centre: Tensor, white: Tensor) -> Annotated[Tensor, "N D"]:
-    """Directions from the centre, whitened; of what lies at the centre there is none (0)."""
-    return unit(unit(x, centre) @ white, torch.zeros_like(centre))

@@ -1,6 +1,11 @@
-"""Choice of a scene's regions: by number, by name in a style file, by a pixel of a view, by a mask over one."""
+"""What a style asks of single regions of a scene: which regions its texts mean, and what each of them may take.
 
-from collections.abc import Mapping
+Letters: K regions of the scene, T style codes. A region is named by its number, by its name in a style file, by a pixel of a
+view (`VIEW:X,Y`) or by a mask over one (`VIEW:MASK.png`); the grammar is that of `style.config`.
+"""
+
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -14,10 +19,11 @@ from ..datamanagers.images import load_mask
 from ..errors import UsageError
 from ..interfaces import Scene
 from ..rendering.cameras import Cameras, pixel_grid
-from .config import Pixel, pixel_of
-from .files import Key
+from .config import Place, StyleConfig, find_reference, labels, parse_place, parse_region_value, parse_strength, pixel_of
+from .dictionary import StyleDictionary
+from .files import RegionKey, StyleFile
 from .matching import scores, unit
-from .scene import Membership, SceneStyle
+from .scene_style import Membership, SceneStyle
 
 ALIKE = 0.5
 """Least cosine of a region with a key from elsewhere: below, the scene has no such region.
@@ -36,10 +42,10 @@ _SOLID = 0.01
 class Regions(NamedTuple):
     """A scene's regions, and what is needed to find them."""
 
-    views: Scene
-    scene: SceneStyle
+    scene: Scene
+    style: SceneStyle
     basis: Basis | None
-    keys: Mapping[str, Key] = {}
+    keys: Mapping[str, RegionKey] = {}
     """Regions that a style file names."""
     encoder: str = ""
     """Identity of the encoder that the keys are of, if the file tells."""
@@ -55,36 +61,81 @@ class RegionMatch(NamedTuple):
     """Cosine with the key of that name; 1 where the region was pointed at."""
 
 
-def key_of(regions: Regions, number: int) -> Key:
+def key_of(regions: Regions, number: int) -> RegionKey:
     """The semantics of a region in the encoder's own channels, to six digits: what it can be found by on another scene."""
     if regions.basis is None:
         return ()
-    return tuple(float(f"{x:.6g}") for x in regions.basis.lift(regions.scene.keys[number]).tolist())
+    return tuple(float(f"{x:.6g}") for x in regions.basis.lift(regions.style.keys[number]).tolist())
 
 
 def find_regions(regions: Regions, text: str) -> list[RegionMatch]:
-    """The regions that a text means: one, those that a mask covers, or those like a region of the style file, if there are.
+    """Find the regions that a text means: one, those that a mask covers, or those like a region of the style file, if any are.
 
     Raises UsageError for what names nothing on this scene, DataError for an unreadable mask.
     """
-    count, names = len(regions.scene.share), regions.views.names
+    count, names = len(regions.style.share), regions.scene.names
     if text.isascii() and text.isdigit():
         if int(text) >= count:
             raise UsageError(f"region {text}: regions go from 0 to {count - 1}; --explain lists them")
         return [RegionMatch(int(text), text)]
     if text in regions.keys:
-        return _like(regions, text)
+        return _alike(regions, text)
+    # Longest names first: one view's name may begin with another's.
     for view in sorted(range(len(names)), key=lambda v: -len(names[v])):
         if text.startswith(f"{names[view]}:"):
             rest = text[len(names[view]) + 1 :]
             pixel = pixel_of(rest)
-            numbers = _covered(regions, view, Path(rest)) if pixel is None else _at(regions, view, pixel)
+            numbers = _covered(regions, view, Path(rest)) if pixel is None else [_at_pixel(regions, view, *pixel)]
             return [RegionMatch(k, str(k)) for k in numbers]
     named = f", a name in the style file ({', '.join(regions.keys)})" if regions.keys else ""
     raise UsageError(
         f"region {text!r}: neither a number{named}, nor VIEW:X,Y or VIEW:MASK.png with a view of the run "
         f"({names[0]} … {names[-1]})"
     )
+
+
+def _alike(regions: Regions, name: str) -> list[RegionMatch]:
+    """Find the regions that, of all that the style file knows, are most like the one of that name, and really like it."""
+    encoder, style, lengths = regions.scene.semantic_encoder, regions.style, {*map(len, regions.keys.values())}
+    if regions.basis is None or lengths != {len(regions.basis.mean)} or regions.encoder not in ("", encoder):
+        raise UsageError(
+            f"region {name!r}: the style file knows it by the semantic encoder {regions.encoder or '(unnamed)'}, the scene has "
+            f"{encoder or 'none'}; name the region by its number or a pixel of a view instead, or choose "
+            "that encoder with --semantic.encoder"
+        )
+    if len(style.share) == 1:
+        return [RegionMatch(0, name)]
+    there = regions.basis.project(torch.tensor(list(regions.keys.values())))
+    alike, nearest = scores(unit(style.keys, style.semantic_mean), unit(there, style.semantic_mean)).max(1)
+    mine = (nearest == list(regions.keys).index(name)) & (alike >= ALIKE)
+    return [RegionMatch(k, name, float(alike[k])) for k in mine.nonzero().flatten().tolist()]
+
+
+def _at_pixel(regions: Regions, view: int, x: float, y: float) -> int:
+    """Find the region at a pixel of a view."""
+    cameras = regions.scene.cameras
+    name, (width, height) = regions.scene.names[view], cameras.size[view].tolist()
+    if not (0 <= x < width and 0 <= y < height):
+        raise UsageError(f"{name}:{x:g},{y:g}: outside of the view; x goes from 0 to {width - 1}, y from 0 to {height - 1}")
+    centre = torch.tensor([[int(x) + 0.5, int(y) + 0.5]], dtype=torch.float64)
+    share, opacity = memberships(regions.scene, regions.style, cameras, view, centre)
+    if float(opacity[0]) < _SOLID:
+        raise UsageError(f"{name}:{x:g},{y:g}: there is nothing at that pixel; choose another")
+    return int(share[0].argmax())
+
+
+def _covered(regions: Regions, view: int, mask: Path) -> list[int]:
+    """Find regions of which the mask covers more than half of what the view shows, and the one that fills most of the mask."""
+    share, opacity = membership_view(regions, view, _SIDE)
+    height, width = opacity.shape
+    painted = load_mask(mask, upright=True).astype(np.float32)
+    white = torch.from_numpy(np.asarray(cv2.resize(painted, (width, height), interpolation=cv2.INTER_AREA)))
+    mass = (share * opacity[..., None]).flatten(0, 1)
+    inside, total = white.flatten() @ mass, mass.sum(0)
+    if float(inside.sum()) < _SOLID:
+        raise UsageError(f"{mask}: the mask selects nothing of view {regions.scene.names[view]}; paint white what counts")
+    most = inside / total.clamp_min(1e-10)
+    return sorted({int(inside.argmax()), *((most > 0.5) & (inside >= 1)).nonzero().flatten().tolist()})
 
 
 def memberships(
@@ -97,8 +148,8 @@ def memberships(
 
 def membership_view(regions: Regions, view: int, size: int) -> tuple[Annotated[Tensor, "H W K"], Annotated[Tensor, "H W"]]:
     """Share of each pixel that belongs to each region, and its opacity, with the longest side at most `size` pixels."""
-    cameras = shrunk(regions.views.cameras, view, size)
-    share, opacity = memberships(regions.views, regions.scene, cameras, 0, pixel_grid(cameras, 0))
+    cameras = shrunk(regions.scene.cameras, view, size)
+    share, opacity = memberships(regions.scene, regions.style, cameras, 0, pixel_grid(cameras, 0))
     width, height = (int(v) for v in cameras.size[0])
     return share.view(height, width, -1), opacity.view(height, width)
 
@@ -109,46 +160,151 @@ def shrunk(cameras: Cameras, view: int, size: int) -> Cameras:
     return one.scaled(max(1.0, float(one.size.amax()) / size))
 
 
-def _like(regions: Regions, name: str) -> list[RegionMatch]:
-    """The regions that, of all that the style file knows, are most like the one of that name, and really like it."""
-    encoder, scene, lengths = regions.views.semantic_encoder, regions.scene, {*map(len, regions.keys.values())}
-    if regions.basis is None or lengths != {len(regions.basis.mean)} or regions.encoder not in ("", encoder):
-        raise UsageError(
-            f"region {name!r}: the style file knows it by the semantic encoder {regions.encoder or '(unnamed)'}, the scene has "
-            f"{encoder or 'none'}; name the region by its number or a pixel of a view instead, or choose "
-            "that encoder with --semantic.encoder"
-        )
-    if len(scene.share) == 1:
-        return [RegionMatch(0, name)]
-    there = regions.basis.project(torch.tensor(list(regions.keys.values())))
-    alike, nearest = scores(unit(scene.keys, scene.semantic_mean), unit(there, scene.semantic_mean)).max(1)
-    mine = (nearest == list(regions.keys).index(name)) & (alike >= ALIKE)
-    return [RegionMatch(k, name, float(alike[k])) for k in mine.nonzero().flatten().tolist()]
+def allowed_references(
+    regions: int,
+    references: int,
+    *,
+    pin: Mapping[int, Set[int]] | None = None,
+    forbid: Sequence[tuple[int, int]] = (),
+) -> Annotated[Tensor, "regions references"]:
+    """References that each region may take codes from, bool: all, but for what the user excludes.
+
+    `pin` maps a region to the only references that it may take from; `forbid` holds (region, reference) pairs that may not
+    meet. Raises UsageError for numbers out of range or a region that is left with nothing.
+    """
+    pin = pin or {}
+    for k, i in (*((k, i) for k, chosen in pin.items() for i in sorted(chosen)), *forbid):
+        if not (0 <= k < regions and 0 <= i < references):
+            raise UsageError(
+                f"region {k} and reference {i}: regions go from 0 to {regions - 1}, references from 0 to {references - 1}"
+            )
+    allowed = torch.ones(regions, references, dtype=torch.bool)
+    for k, chosen in pin.items():
+        allowed[k] = False
+        allowed[k, sorted(chosen)] = True
+    for k, i in forbid:
+        allowed[k, i] = False
+    for k in (~allowed.any(1)).nonzero().flatten().tolist():
+        raise UsageError(f"region {k}: every reference is forbidden; allow one, or keep the region as it is")
+    return allowed
 
 
-def _at(regions: Regions, view: int, pixel: Pixel) -> list[int]:
-    cameras = regions.views.cameras
-    name, (width, height) = regions.views.names[view], cameras.size[view].tolist()
-    if not (0 <= pixel.x < width and 0 <= pixel.y < height):
-        raise UsageError(
-            f"{name}:{pixel.x:g},{pixel.y:g}: outside of the view; x goes from 0 to {width - 1}, y from 0 to {height - 1}"
-        )
-    centre = torch.tensor([[int(pixel.x) + 0.5, int(pixel.y) + 0.5]], dtype=torch.float64)
-    share, opacity = memberships(regions.views, regions.scene, cameras, view, centre)
-    if float(opacity[0]) < _SOLID:
-        raise UsageError(f"{name}:{pixel.x:g},{pixel.y:g}: there is nothing at that pixel; choose another")
-    return [int(share[0].argmax())]
+class RegionControls(NamedTuple):
+    """Controls of each of K regions."""
+
+    allowed: Annotated[Tensor, "K references"]
+    """References that it may take from, bool, in the order of the dictionary."""
+    strength: Annotated[Tensor, "K"]
+    """Strength of the style; 0 = kept."""
+    score: Annotated[Tensor, "K T"]
+    """Cosine of the region with each style code, both from the scene's mean, in [-1, 1]; 0 without semantics."""
+    saved: StyleFile
+    """The style with every region named in terms that hold on other scenes."""
+    regions: Regions
+    notes: tuple[str, ...]
+    """A line for each thing that the user may not expect."""
+    places: tuple[tuple[Place, Annotated[Tensor, "K references"]], ...]
+    """References that each region may take from in places, each over those before it."""
 
 
-def _covered(regions: Regions, view: int, mask: Path) -> list[int]:
-    """Regions of which the mask covers more than half of what the view shows, and the one that fills most of the mask."""
-    share, opacity = membership_view(regions, view, _SIDE)
-    height, width = opacity.shape
-    painted = load_mask(mask, upright=True).astype(np.float32)
-    white = torch.from_numpy(np.asarray(cv2.resize(painted, (width, height), interpolation=cv2.INTER_AREA)))
-    mass = (share * opacity[..., None]).flatten(0, 1)
-    inside, total = white.flatten() @ mass, mass.sum(0)
-    if float(inside.sum()) < _SOLID:
-        raise UsageError(f"{mask}: the mask selects nothing of view {regions.views.names[view]}; paint white what counts")
-    most = inside / total.clamp_min(1e-10)
-    return sorted({int(inside.argmax()), *((most > 0.5) & (inside >= 1)).nonzero().flatten().tolist()})
+def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleConfig) -> RegionControls:
+    """Find every region and reference that the style names. Raises UsageError for those that are not there, or contradict."""
+    names = _StyleNames(regions, dictionary, style.references)
+    # What the style asks for, in numbers of regions and references. Pins of places are kept apart.
+    pin_texts = [parse_region_value("pin", text) for text in style.pin]
+    place_of = {pin.region: place for pin in pin_texts if (place := parse_place("pin", pin.region))}
+    pins = names.find_pairs([pin for pin in pin_texts if pin.region not in place_of])
+    bans = names.find_pairs([parse_region_value("forbid", text) for text in style.forbid])
+    kept = [match for text in style.keep for match in names.find(text)]
+    parsed = [parse_strength("region_strength", text) for text in style.region_strength]
+    strengths = [(match, value) for text, value in parsed for match in names.find(text)]
+    pinned: dict[int, set[int]] = {}
+    for match, i in pins:
+        pinned.setdefault(match.number, set()).add(names.order[i])
+    allowed = allowed_references(
+        len(regions.style.share), len(dictionary.names), pin=pinned, forbid=[(f.number, names.order[i]) for f, i in bans]
+    )
+    for match in kept:
+        if match.number in pinned or match.number in {f.number for f, _ in strengths}:
+            raise UsageError(f"region {match.name}: is to be kept, and to be pinned or restyled in part; leave out one of both")
+    # Scores say whether the references show such a thing at all, so both sides are seen from the scene's mean. Matching, which
+    # only has to choose, centres each side on its own: there a rose's petals are as far from its leaves as the sky from the
+    # road, and something would always fit.
+    centre = regions.style.semantic_mean
+    score = scores(unit(regions.style.keys, centre), unit(dictionary.keys, centre))
+    strength = torch.ones(len(allowed))
+    for match, value in strengths:
+        strength[match.number] = value
+    strength[[match.number for match in kept]] = 0.0
+    if style.keep_below is not None:
+        best = score.masked_fill(~allowed[:, dictionary.reference], -torch.inf).amax(1)
+        poor = (best < style.keep_below).nonzero().flatten().tolist()
+        strength[[k for k in poor if k not in pinned]] = 0.0
+    # Places: what regions may take of these references; all of them where that is none.
+    references_of: dict[str, set[int]] = {}
+    for pin in pin_texts:
+        if pin.region in place_of:
+            references_of.setdefault(pin.region, set()).add(find_reference(pin.value, style.references))
+    places = []
+    for text, chosen in references_of.items():
+        only = torch.zeros(len(dictionary.names), dtype=torch.bool)
+        only[[names.order[i] for i in chosen]] = True
+        both = allowed & only
+        places.append((place_of[text], torch.where(both.any(1, keepdim=True), both, only)))
+    saved = replace(
+        style,
+        pin=(
+            *(f"{names.region(f)}={names.reference(i)}" for f, i in pins),
+            *(f"{text}={names.reference(i)}" for text, chosen in references_of.items() for i in sorted(chosen)),
+        ),
+        forbid=tuple(f"{names.region(f)}={names.reference(i)}" for f, i in bans),
+        keep=tuple(names.region(f) for f in kept),
+        region_strength=tuple(f"{names.region(f)}={value:g}" for f, value in strengths),
+    )
+    file = StyleFile(saved, names.keys, regions.scene.semantic_encoder)
+    return RegionControls(allowed, strength, score, file, regions, tuple(dict.fromkeys(names.notes)), tuple(places))
+
+
+class _StyleNames:
+    """Finds regions and references by what a style calls them, and collects the keys and notes that belong to them."""
+
+    def __init__(self, regions: Regions, dictionary: StyleDictionary, references: Sequence[Path]) -> None:
+        self.regions, self.references = regions, references
+        self.labels = labels(references)
+        self.order = [dictionary.names.index(label) for label in self.labels]
+        # All regions, not only those that are named: on another scene each must find its like among all of them.
+        every = {f"region{k}": key_of(regions, k) for k in range(len(regions.style.share)) if regions.basis is not None}
+        self.keys = dict(regions.keys) if regions.keys else every
+        self.notes: list[str] = []
+
+    def find(self, text: str) -> list[RegionMatch]:
+        """Find the regions that a text means, and note what is not obvious about them."""
+        matches = find_regions(self.regions, text)
+        if not matches:
+            self.notes.append(f"region {text!r} of the style: no region here is most like it, so it is left out")
+        for each in matches:
+            if each.name in self.regions.keys:
+                self.notes.append(f"region {text!r} of the style is region {each.number} here (cosine {each.alike:.2f})")
+        return matches
+
+    def find_pairs(self, texts: Sequence[tuple[str, str]]) -> list[tuple[RegionMatch, int]]:
+        """Find regions and references of REGION=REFERENCE; a mask may mean several regions."""
+        return [(match, find_reference(value, self.references)) for region, value in texts for match in self.find(region)]
+
+    def reference(self, number: int) -> str:
+        """A reference as a style file names it, wherever its photographs are moved to."""
+        name = self.references[number].name
+        return name if self.labels[number] == name else str(number)
+
+    def region(self, region: RegionMatch) -> str:
+        """Name of a region in a style file, which holds its key under that name."""
+        if region.name in self.regions.keys or not self.keys:
+            return region.name
+        key, name = key_of(self.regions, region.number), f"region{region.number}"
+        same_key = [other for other, its in self.keys.items() if its == key]
+        if same_key:
+            return same_key[0]
+        while name in self.keys:
+            name += "'"
+        self.keys[name] = key
+        return name

@@ -15,7 +15,7 @@ from ..rendering.cameras import Cameras
 from ..rendering.renderer import Parts
 from ..rendering.space import Space
 from ..style.dictionary import StyleDictionary
-from ..style.scene import SceneStyle
+from ..style.scene_style import SceneStyle
 from ..types import Batch, Rays, Site
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ..config import TrainConfig
     from ..rendering.renderer import Parts
     from ..style.dictionary import StyleDictionary
-    from ..style.scene import SceneStyle
+    from ..style.scene_style import SceneStyle
 
 POINTS = 5
 _SLACK = 1e-5

@@ -25,7 +25,7 @@ from ..datamanagers.scene import Scene
 from ..errors import ConfigError
 from ..interfaces import Learner, Partition
 from ..progress import Display
-from ..style.scene import to_tensors
+from ..style.scene_style import to_tensors
 from ..types import Cell
 from . import tensorfiles
 from .blocks import FILE, Built, folder_of, inset, load_blocks, load_finished, surroundings

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from ..datamanagers.scene import GAMMA
 from ..rendering.cameras import Cameras
-from ..types import Rays, Rendered
+from ..types import Rays
 
 _TINY = 1e-24
 """Square of an angle that float64 cannot tell from none: the root of nothing has no slope."""
@@ -61,17 +61,19 @@ class Poses(nn.Module):
         self, view: Annotated[Tensor, "R"], origin: Annotated[Tensor, "R 3"], direction: Annotated[Tensor, "R 3"]
     ) -> tuple[Annotated[Tensor, "R 3"], Annotated[Tensor, "R 3"]]:
         """World rays (float64, unit directions) of the views as they are now."""
-        move = _like(self.moves(), origin).index_select(0, view.to(origin.device))
+        # To the device first, since MPS has no float64.
+        moves = self.moves().to(origin.device).to(origin.dtype)
+        move = moves.index_select(0, view.to(origin.device))
         return origin + self.reach * move[:, 3:], rotated(direction, move[:, :3])
+
+    def refined(self, cameras: Cameras) -> Cameras:
+        """The cameras where they are now."""
+        return moved_cameras(cameras, self.moved_by())
 
     @torch.no_grad()
     def moved_by(self) -> Annotated[Tensor, "V 6"]:
         """Turn (radians) and shift (world units) of each view, float64, on the CPU."""
         return self.moves().cpu().double() * torch.tensor([1.0, 1, 1, self.reach, self.reach, self.reach], dtype=torch.float64)
-
-    def refined(self, cameras: Cameras) -> Cameras:
-        """The cameras where they are now."""
-        return moved_cameras(cameras, self.moved_by())
 
     def going_on(self, centres: Annotated[Tensor, "V 3"], held: tuple[int, ...]) -> "Poses":
         """Poses that start as these are now, and learn from other views."""
@@ -83,15 +85,9 @@ class Poses(nn.Module):
 
 def moved_cameras(cameras: Cameras, moves: Annotated[Tensor, "V 6"]) -> Cameras:
     """Cameras, each turned about its own centre and shifted."""
-    moves = _like(moves, cameras.pose)
-    return replace(cameras, pose=moved(cameras.pose, moves[:, :3], moves[:, 3:]))
-
-
-def moved(
-    pose: Annotated[Tensor, "V 3 4"], turn: Annotated[Tensor, "V 3"], shift: Annotated[Tensor, "V 3"]
-) -> Annotated[Tensor, "V 3 4"]:
-    """Poses, camera to world, turned about their own centres and shifted, both in world axes."""
-    return torch.stack([*(rotated(pose[:, :, axis], turn) for axis in range(3)), pose[:, :, 3] + shift], -1)
+    turn, shift = moves.to(cameras.pose).view(-1, 2, 3).unbind(1)
+    axes = [rotated(cameras.pose[:, :, axis], turn) for axis in range(3)]
+    return replace(cameras, pose=torch.stack([*axes, cameras.pose[:, :, 3] + shift], -1))
 
 
 def rotated(x: Annotated[Tensor, "N 3"], turn: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
@@ -108,16 +104,6 @@ def rotated(x: Annotated[Tensor, "N 3"], turn: Annotated[Tensor, "N 3"]) -> Anno
 def moving(rays: Rays) -> Rays:
     """Rays whose origin and direction alone lead gradients: samples are placed, and looks shaded, as if poses were fixed."""
     return Rays(rays.origin, rays.direction, rays.view.detach(), rays.near.detach(), rays.far.detach())
-
-
-def refined(poses: Poses | None, cameras: Cameras) -> Cameras:
-    """The cameras as a model has them."""
-    return cameras if poses is None else poses.refined(cameras)
-
-
-def _like(moves: Tensor, other: Tensor) -> Tensor:
-    """Moves with the device and dtype of another tensor: device first, since MPS has no float64."""
-    return moves.to(other.device).to(other.dtype)
 
 
 def _gauge(centres: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "6M G"]:
@@ -179,19 +165,3 @@ class Tones(nn.Module):
         factor = self(torch.tensor(views)).log()
         between: Tensor = (factor * torch.tensor(weights).to(factor)[:, None]).sum(0)
         return between.exp()
-
-
-def relative(exposure: Annotated[Tensor, "V"] | None, views: int) -> tuple[float, ...]:
-    """Logarithm of each view's exposure over their geometric mean; zeros where nothing is known."""
-    if exposure is None:
-        return (0.0,) * views
-    log = exposure.double().log()
-    return tuple((log - log.mean()).tolist())
-
-
-def toned(rendered: Rendered, tones: Tones | None, view: Annotated[Tensor, "R"]) -> Rendered:
-    """The render as the cameras of its rays took it."""
-    if tones is None or rendered.rgb is None:
-        return rendered
-    factor = tones(view)
-    return rendered._replace(rgb=rendered.rgb * factor)

@@ -13,7 +13,7 @@ from torch import Tensor
 from ..config import ContentConfig, RenderConfig, SemanticConfig, TrainConfig
 from ..fields.config import PlanesConfig, SemanticPlanesConfig
 from ..memory import free_memory
-from ..ops import backend, march
+from ..ops import backend, dense
 from ..ops.precision import double
 from ..plugins.encoders.config import BundledContentConfig
 from ..plugins.samplers.config import ProposalConfig
@@ -22,10 +22,9 @@ from ..rendering.cameras import Cameras
 from ..rendering.paths import look_at, pinhole
 from ..rendering.renderer import render_rays
 from ..rendering.space import Space
-from ..style.colours import colour_maps
 from ..style.dictionary import Reference, build_dictionary
-from ..style.look import Restyle
-from ..style.scene import scene_style
+from ..style.look import Restyle, colour_maps
+from ..style.scene_style import scene_style
 from ..types import Want
 from .model import Facts, Model, build_model
 from .views import render_view, view_rays
@@ -69,9 +68,9 @@ def fast_paths(device: torch.device) -> Iterator[tuple[str, str]]:
     """Name and description of the kernels and the precision that a device uses, and of its free memory."""
     probe = torch.zeros(1, 3, device=device)
     with torch.no_grad():
-        compiled = march.usable(probe)
+        compiled = dense.usable(probe)
     if compiled:
-        yield "kernels", "numba's: tri-planes, networks, marching, matching, guided filter"
+        yield "kernels", "numba's: tri-planes, networks, proposals, matching, guided filter"
     else:
         yield "kernels", "none: everything by torch"
     if device.type == "cuda":

@@ -13,12 +13,12 @@ import shlex
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ..config import RunConfig
 from ..datamanagers.images import useless_masks
@@ -29,7 +29,7 @@ from ..memory import out_of_memory, shortage
 from ..plugins.typed_json import leaves
 from ..progress import LINE_SECONDS, Display
 from . import checkpoint
-from .prepare import device_of, read_scene, scene_needs, with_downscale
+from .prepare import device_of, planned, read_scene, scene_needs
 from .run import Run, check_images, held, image_hashes, save_image_hashes
 
 REPORT_SECONDS = 0.5
@@ -91,13 +91,6 @@ class Report(NamedTuple):
     """Steps skipped because their loss or a gradient was not finite."""
 
 
-class Reached(NamedTuple):
-    """Where a training has ended."""
-
-    step: int
-    seconds: float
-
-
 def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images: bool = False) -> Path:
     """Train a scene to the end and return its run folder; an existing run there is resumed if its config and images fit.
 
@@ -141,13 +134,20 @@ def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images
             learner.train(run, display, spent=spent)
         else:
             display.say(shown + learner.begin(run))
-            forecast = Forecast(schedule := schedule_of(config, len(scene.train)), method, learner.device.type)
-            log = reporter(display, run)
+            # On a CPU the first steps tell how long all of them will take; a time limit says that itself.
+            warns = learner.device.type == "cpu" and config.minutes is None
+            schedule = schedule_of(config, len(scene.train))
+            log, first = reporter(display, run), None
 
             def report(event: Report) -> None:
+                nonlocal first, warns
                 log(event)
-                if line := forecast(event):
-                    display.say(line)
+                if first is None:  # its time holds the compilation of kernels
+                    first = event
+                elif warns and event.step > first.step and event.seconds - first.seconds >= _TIMED_SECONDS:
+                    warns = False
+                    if line := forecast(first, event, schedule.steps or 0, method):
+                        display.say(line)
 
             learn(learner, run, schedule, report, spent=spent)
             learner.finish(run, display)
@@ -164,8 +164,10 @@ def default_output(config: RunConfig, method: str) -> Path:
 
 def learn(
     learner: Learner, run: Run | None, schedule: Schedule, report: Callable[[Report], None], *, spent: float = 0.0
-) -> Reached:
+) -> tuple[int, float]:
     """Take steps, going on from the newest checkpoint of the run, until the schedule is over; `spent` seconds count as used.
+
+    Returns how many steps are made, and the seconds of training, those of earlier starts included.
 
     Without a `run` nothing is saved. An interrupt saves first, then goes on upwards. Steps that are not finite change nothing
     and are logged; PATIENCE of them in a row lead back to the last checkpoint: on CUDA with the next report. Raises
@@ -194,10 +196,11 @@ def learn(
         speed = figures.rays / max(time.perf_counter() - begun, 1e-9)
         return Report(step, share, clock, psnr, speed, figures.kept, dict(figures.means), figures.skipped)
 
-    with _signals_held_back() as stop:
+    with _SignalHandler() as signals:
         try:
             while (share := schedule.share(step, clock)) < 1:
-                stop.obey()
+                if signals.asked:
+                    raise KeyboardInterrupt
                 learner.step(step, share)
                 now = time.perf_counter()
                 due = now - last_report > REPORT_SECONDS
@@ -218,9 +221,10 @@ def learn(
                     pause = min(longest, max(_MIN_PAUSE, cost / _SAVING_SHARE)) if often else longest
                 if now - last_saved > pause:
                     save()
-            stop.obey()
+            if signals.asked:
+                raise KeyboardInterrupt
         except KeyboardInterrupt:
-            if not stop.hurried:  # else a step was cut in half
+            if not signals.hurried:  # else a step was cut in half
                 save()
             raise
         except Exception as error:
@@ -234,7 +238,7 @@ def learn(
         save()
     if step > first and figures is not None:
         report(measured(figures, 1.0))
-    return Reached(step, clock)
+    return step, clock
 
 
 def _resume(learner: Learner, run: Run) -> checkpoint.Saved | None:
@@ -279,41 +283,31 @@ def is_watched(root: Path) -> bool:
         return False
 
 
-class _Stop:
-    """Requests to stop."""
+class _SignalHandler:
+    """SIGINT and SIGTERM held back inside the block, and as before after it. Other threads than the first cannot, and don't."""
 
     def __init__(self) -> None:
         self.asked = False
         """Once: end when the step is done."""
         self.hurried = False
         """Twice: ended within a step, so that what is in memory is of no use."""
+        self.before: dict[int, Any] = {}
 
-    def __call__(self, number: int, frame: FrameType | None) -> None:
+    def __enter__(self) -> "_SignalHandler":
+        if threading.current_thread() is threading.main_thread():
+            self.before = {number: signal.signal(number, self.note) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for number, handler in self.before.items():
+            signal.signal(number, handler)
+
+    def note(self, number: int, frame: FrameType | None) -> None:
         """Take note of a signal; the second raises KeyboardInterrupt wherever the program is."""
         self.hurried = self.asked
         self.asked = True
         if self.hurried:
             raise KeyboardInterrupt
-
-    def obey(self) -> None:
-        """Raise KeyboardInterrupt if it was asked for."""
-        if self.asked:
-            raise KeyboardInterrupt
-
-
-@contextmanager
-def _signals_held_back() -> Iterator[_Stop]:
-    """Hold signals back inside the block, and as before after it. Other threads than the first cannot, and don't."""
-    stop = _Stop()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def reporter(display: Display, run: Run, name: str = "training") -> Callable[[Report], None]:
@@ -342,31 +336,17 @@ def reporter(display: Display, run: Run, name: str = "training") -> Callable[[Re
     return report
 
 
-class Forecast:
-    """Tells from the first steps of a training, once, that all of them will take hours on a CPU."""
-
-    def __init__(self, schedule: Schedule, method: str, device: str) -> None:
-        self.steps, self.method = schedule.steps or 0, method
-        self.first: Report | None = None
-        self.told = device != "cpu" or schedule.minutes is not None
-
-    def __call__(self, event: Report) -> str:
-        """A line to show, or nothing."""
-        if self.told:
-            return ""
-        first = self.first = self.first or event  # whose time holds the compilation of kernels
-        steps, seconds = event.step - first.step, event.seconds - first.seconds
-        if steps < 1 or seconds < _TIMED_SECONDS:
-            return ""
-        self.told = True
-        hours = (self.steps - event.step) * seconds / steps / 3600
-        if hours < _LONG_HOURS:
-            return ""
-        other = "; the method fprf-lite is made for a CPU and needs 8" if self.method == "fprf" else ""
-        return (
-            f"{self.steps:,} steps at {seconds / steps:.2g} s a step take {hours:,.0f} hours on this CPU; "
-            f"--minutes N fits steps and learning rate into N minutes{other}"
-        )
+def forecast(first: Report, now: Report, steps: int, method: str) -> str:
+    """A line about a training on a CPU that will take hours, from two of its first reports; else nothing."""
+    pace = (now.seconds - first.seconds) / (now.step - first.step)
+    hours = (steps - now.step) * pace / 3600
+    if hours < _LONG_HOURS:
+        return ""
+    other = "; the method fprf-lite is made for a CPU and needs 8" if method == "fprf" else ""
+    return (
+        f"{steps:,} steps at {pace:.2g} s a step take {hours:,.0f} hours on this CPU; "
+        f"--minutes N fits steps and learning rate into N minutes{other}"
+    )
 
 
 def _check_needs(config: RunConfig, method: str, display: Display) -> None:
@@ -383,26 +363,26 @@ def _check_needs(config: RunConfig, method: str, display: Display) -> None:
 
 
 def _sized(run: Run, config: RunConfig, display: Display) -> RunConfig:
-    """The config with the size of its images, which an existing run has decided already."""
-    if config.downscale is not None:
-        if config.downscale > 1 and not run.exists:
-            width, height = read_scene(config).cameras.size[0].tolist()
-            if min(width, height) < _SMALL:
-                display.say(
-                    f"warning: {width}x{height} pixels are few: --downscale {config.downscale} counts from the images as they "
-                    "are delivered, also in a folder images_N; leave it out"
-                )
-        return config
-    # Else a run would change its size with the machine or the minutes.
-    old = run.load_config()[0].downscale if run.exists else None
-    if old is not None:
-        return replace(config, downscale=old)
-    config = with_downscale(config)
-    if config.downscale != 1:
+    """The config with all decided that it leaves open, which an existing run has decided already."""
+    if config.downscale is not None and config.downscale > 1 and not run.exists:
         width, height = read_scene(config).cameras.size[0].tolist()
-        display.say(
-            f"images are reduced to 1/{config.downscale}, {width}x{height}, for this device and time: --downscale 1 keeps them"
-        )
+        if min(width, height) < _SMALL:
+            display.say(
+                f"warning: {width}x{height} pixels are few: --downscale {config.downscale} counts from the images as they "
+                "are delivered, also in a folder images_N; leave it out"
+            )
+    # Else a run would change its size with the machine or the minutes.
+    if run.exists:
+        old = run.load_config()[0]
+        decided = {name: getattr(old, name, None) for name in config.open if getattr(config, name) is None}
+        config = replace(config, **{name: value for name, value in decided.items() if value is not None})
+    asked, config = config, planned(config)
+    if asked is not config:
+        scene = read_scene(config)
+        width, height = scene.cameras.size[scene.train[0] if len(scene.train) else 0].tolist()
+        ends = f"{config.minutes:g} minutes" if config.minutes is not None else f"{config.limited(len(scene.train)):,} steps"
+        reduced = f" (1/{config.downscale}; --downscale 1 keeps them whole)" if config.downscale != 1 else ""
+        display.say(f"plan: {len(scene.train)} views at {width}x{height}{reduced}{config.described()}, {ends}")
     return config
 
 

@@ -29,10 +29,10 @@ from ..ops.precision import tf32
 from ..progress import Display
 from ..rendering.cameras import PixelRays
 from ..rendering.renderer import render_rays
-from ..style.scene import SceneStyle, to_tensors
+from ..style.scene_style import SceneStyle, to_tensors
 from ..types import Batch, Rays
 from . import checkpoint
-from .camera_optimizers import moving, toned
+from .camera_optimizers import moving
 from .loading import Trained
 from .losses import check_penalties, extra_term, terms, total, wanted
 from .model import Facts, Model, background_of, build_model
@@ -56,12 +56,6 @@ _FEW_STEPS = 600
 views; flower and fox are at 22.9 and 27.1 dB on held-out views after 754 and 775."""
 
 
-def optimizer_of(config: TrainConfig, model: Model) -> torch.optim.Optimizer:
-    """Adam on all that the model learns."""
-    knobs = config.optimizer
-    return torch.optim.Adam(model.learned(), lr=knobs.rate, betas=(0.9, knobs.beta2), eps=knobs.eps, fused=True)
-
-
 class FieldLearner(SceneLearner):
     """Fields in training: their model, its optimiser, and what lives between steps but is not saved: running means.
 
@@ -81,7 +75,9 @@ class FieldLearner(SceneLearner):
     ) -> None:
         self.config, self.prepared, self._device, self.lead = config, prepared, device, lead
         self.model = (build_model(config, prepared.facts) if model is None else model).to(device)
-        self.optimizer = optimizer_of(config, self.model)
+        adam = config.optimizer
+        betas = 0.9, adam.beta2
+        self.optimizer = torch.optim.Adam(self.model.learned(), lr=adam.rate, betas=betas, eps=adam.eps, fused=True)
         self.deferred = device.type == "cuda"
         """True where the host reads faults only with the figures."""
         self.tf32 = config.precision == "tf32" and device.type == "cuda"
@@ -139,7 +135,8 @@ class FieldLearner(SceneLearner):
                 content_moves_density=self.config.content.moves_density,
             )
         # Photographs differ in exposure: what is compared is the render as the view would have taken it.
-        rendered = toned(rendered, self.model.tones, batch.view)
+        if self.model.tones is not None and rendered.rgb is not None:
+            rendered = rendered._replace(rgb=rendered.rgb * self.model.tones(batch.view))
         with record_function("fprf.losses"):
             parts = terms(
                 self.config.loss,
@@ -154,40 +151,30 @@ class FieldLearner(SceneLearner):
             )
             loss = total(self.config.loss, parts, share)
         self.optimizer.zero_grad(set_to_none=True)
-        if self.deferred:
-            self._step_deferred(loss)
-        else:
-            self._step_checked(loss, parts, step)
+        with record_function("fprf.backward"):
+            loss.backward()  # type: ignore[no-untyped-call]
+        self._optimise(loss, parts, step)
         kept = rendered.counts["kept"] / max(1, rendered.counts["samples"])
         self.statistics.add(parts | {"kept": torch.full((), kept, device=loss.device)})
         self.rays += len(batch.rgb)
 
-    def _step_checked(self, loss: Tensor, parts: dict[str, Tensor], step: int) -> None:
-        """Check the loss and the gradients, then step."""
-        fault = unfit_terms(loss, parts)
-        if fault is None:
-            with record_function("fprf.backward"):
-                loss.backward()  # type: ignore[no-untyped-call]
-            fault = unfit_gradients(self.model.named_parameters())
-        if fault is not None:
-            self.fault, self.skipped, self.failed = fault, self.skipped + 1, self.failed + 1
+    def _optimise(self, loss: Tensor, parts: Mapping[str, Tensor], step: int) -> None:
+        """Take Adam's step, unless the loss or a gradient is not finite."""
+        unfit = unfit_step(loss, self.model.parameters())
+        if self.deferred:
+            # As torch's GradScaler does: the optimiser then changes neither parameters, moments nor its count of steps.
+            self.optimizer.found_inf = unfit  # type: ignore[attr-defined]
+            self.statistics.count_skipped(unfit)
+        elif bool(unfit):
+            self.fault = name_fault(loss, parts, self.model.named_parameters())
+            self.skipped, self.failed = self.skipped + 1, self.failed + 1
             return
         with record_function("fprf.optimizer"):
             self.optimizer.step()
-        if (step + 1) % CLEAR_EVERY == 0:
-            clear_denormals(self.optimizer)
-        self.failed = 0
-
-    def _step_deferred(self, loss: Tensor) -> None:
-        """Step, unless the device finds a loss or gradient that is not finite."""
-        with record_function("fprf.backward"):
-            loss.backward()  # type: ignore[no-untyped-call]
-        flag = unfit_step(loss, self.model.parameters())
-        with record_function("fprf.optimizer"):
-            # As torch's GradScaler does: the optimiser then changes neither parameters, moments nor its count of steps.
-            self.optimizer.found_inf = flag  # type: ignore[attr-defined]
-            self.optimizer.step()
-        self.statistics.count_skipped(flag)
+        if not self.deferred:
+            self.failed = 0
+            if (step + 1) % CLEAR_EVERY == 0:
+                clear_denormals(self.optimizer)
 
     def figures(self) -> Figures:
         """Running means, corrected for their start; a term that comes every few steps counts when it comes."""
@@ -212,8 +199,7 @@ class FieldLearner(SceneLearner):
         """The model as it is, which goes on learning with this learner."""
         scene, basis = self.prepared.scene, self.prepared.basis
         known = known_of(scene, self.config.data, self.facts)
-        if self.model.poses is not None:
-            known = replace(known, cameras=self.model.poses.refined(known.cameras))
+        known = replace(known, cameras=self.model.refined(known.cameras))
 
         def measured() -> tuple[SceneStyle, Basis | None]:
             return measure_style(self.config, self.model, scene.cameras, scene.train), basis
@@ -290,20 +276,12 @@ def rate(config: OptimizerConfig, step: int, share: float) -> float:
     return config.rate * warm * late * (config.final + (1 - config.final) * cosine)
 
 
-def unfit_terms(loss: Tensor, parts: Mapping[str, Tensor]) -> str | None:
-    """Names of the loss terms that are not finite; None where the loss is."""
-    if bool(torch.isfinite(loss)):
-        return None
-    bad = [name for name, value in parts.items() if not bool(torch.isfinite(value))]
-    return ", ".join(bad) or "the sum of the loss terms"
-
-
-def unfit_gradients(parameters: Iterable[tuple[str, nn.Parameter]]) -> str | None:
-    """Names of the parameters whose gradient is not finite, or too large to be squared; None where all are well."""
-    gradients = [(name, p.grad) for name, p in parameters if p.grad is not None]
-    if not gradients or bool(torch.nn.utils.get_total_norm([grad for _, grad in gradients]) < LARGEST):
-        return None
-    bad = [name for name, grad in gradients if not bool(grad.norm() < LARGEST)]
+def name_fault(loss: Tensor, parts: Mapping[str, Tensor], parameters: Iterable[tuple[str, nn.Parameter]]) -> str:
+    """Names of the loss terms that are not finite, else of the parameters whose gradient is not, or is too large to square."""
+    if not bool(torch.isfinite(loss)):
+        bad = [name for name, value in parts.items() if not bool(torch.isfinite(value))]
+        return ", ".join(bad) or "the sum of the loss terms"
+    bad = [name for name, p in parameters if p.grad is not None and not bool(p.grad.norm() < LARGEST)]
     more = f" and {len(bad) - _NAMED} more" if len(bad) > _NAMED else ""
     return f"the gradient of {', '.join(bad[:_NAMED]) or 'all parameters together'}{more}"
 

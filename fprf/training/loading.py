@@ -17,12 +17,9 @@ from ..interfaces import Decoder, Scene, Stylizer, Values
 from ..plugins.registry import entry, load_object
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.cameras import Cameras
-from ..rendering.local_frame import local_origin
-from ..style.colours import ColourMaps, colour_maps
-from ..style.dictionary import StyleDictionary
-from ..style.look import Restyle
-from ..style.references import Encoders
-from ..style.scene import SceneStyle, from_tensors
+from ..style.dictionary import Encoders, StyleDictionary
+from ..style.look import ColourMaps, Restyle, colour_maps
+from ..style.scene_style import SceneStyle, from_tensors
 from ..types import Origin, View
 from . import checkpoint
 from .blocks import load_blocked
@@ -64,8 +61,6 @@ class Trained(Scene):
     step: int
     seconds: float
     """Training time."""
-    damaged: tuple[str, ...] = ()
-    """A line for each newer checkpoint that could not be used."""
     look: Restyle | None = None
     """Look that it is rendered in; None = as it was captured."""
     style: Callable[[], tuple[SceneStyle, Basis | None]] | None = None
@@ -155,7 +150,20 @@ class Trained(Scene):
     @torch.inference_mode()
     def encoders(self) -> Encoders:
         """The encoders that the scene was trained with. Raises WeightsError where those at hand are others."""
-        return encoders_of(self, *self.measured())
+        (style, basis), config, facts = self.measured(), self.config, self.known.facts
+        content = config.content.encoder.build()
+        semantic = config.semantic.encoder.build() if config.semantic.encoder is not None and basis is not None else None
+        # Features of another encoder would mean something else: references and scene must speak of the same.
+        trained_with = ("content", content, facts.content_encoder), ("semantic", semantic, facts.semantic_encoder)
+        for name, encoder, known in trained_with:
+            if encoder is not None and encoder.identity != known:
+                raise WeightsError(
+                    f"{name} encoder: the scene was trained with {known}, this is {encoder.identity}; "
+                    "use the same weights, or train the scene again"
+                )
+        device, longest = self.device, int(self.cameras.size.amax())
+        moved = None if semantic is None else semantic.to(device)
+        return Encoders(content.to(device), moved, basis, style, device, longest, config.datamanager.guided, config.seed)
 
     def colour_maps(
         self,
@@ -192,23 +200,6 @@ def open_fields(run: Run, config: RunConfig, device: str, quality: QualityConfig
     return LoadedRun(run, trained.method, trained.known, trained.step, trained.seconds, trained)
 
 
-@torch.inference_mode()
-def encoders_of(trained: Trained, scene: SceneStyle, basis: Basis | None) -> Encoders:
-    """Encoders with a style and a basis that are at hand. Raises WeightsError where they are not those of the training."""
-    config, facts = trained.config, trained.known.facts
-    content = config.content.encoder.build()
-    semantic = config.semantic.encoder.build() if config.semantic.encoder is not None and basis is not None else None
-    for name, encoder, known in (("content", content, facts.content_encoder), ("semantic", semantic, facts.semantic_encoder)):
-        if encoder is not None and encoder.identity != known:
-            raise WeightsError(
-                f"{name} encoder: the scene was trained with {known}, this is {encoder.identity}; "
-                "use the same weights, or train the scene again"
-            )
-    device, longest = trained.model.device, int(trained.known.cameras.size.amax())
-    moved = None if semantic is None else semantic.to(device)
-    return Encoders(content.to(device), moved, basis, scene, device, longest, config.datamanager.guided, config.seed)
-
-
 def load_run(root: Path, device: str = "auto", max_memory: float | None = None) -> Trained:
     """Rebuild a run's model from its folder alone. Raises CheckpointError with what is missing and what to do.
 
@@ -217,45 +208,21 @@ def load_run(root: Path, device: str = "auto", max_memory: float | None = None) 
     run = Run(root)
     saved_config, method = run.load_config()
     config = fields_only(saved_config, root)
-    known = _in_local_frame(run.load_known())
+    known = run.load_known()
     if isinstance(config, IncompleteConfig) and not known.facts.channels:
         package = json.loads(config.packages)["method"]
         raise PluginError(f"{root}: {config.reason}; to open a scene of its kind install {package}")
-    # The space of blocks has no cube of its own: each block brings one.
     if known.facts.space.kind == "open":
-        blended, step, seconds = load_blocked(root, config, known.facts, device_of(device), max_memory)
-        return Trained(run, config, method, _where_refined(known, blended), blended, step, seconds)
-    saved, damaged = checkpoint.load_latest(run.checkpoints)
-    if saved is None:
-        raise CheckpointError(f"{root}: no checkpoint yet; go on with `fprf train {root / 'config.json'} --output {root}`")
-    model = build_model(config, known.facts)
-    checkpoint.restore(saved.state, model, None)
-    model.requires_grad_(False)
-    model = model.to(device_of(device)).eval()
-    return Trained(run, config, method, _where_refined(known, model), model, saved.step, saved.seconds, tuple(damaged))
-
-
-def _in_local_frame(known: Known) -> Known:
-    """What is known, about a local origin also where a run of before has none: the world meets a field in its space alone."""
-    facts = known.facts
-    origin = local_origin(known.cameras.pose[:, :, 3])
-    if any(facts.origin) or not any(origin):
-        return known
-    away = (-origin[0], -origin[1], -origin[2])
-    space = replace(facts.space, centre=_sum(facts.space.centre, away))
-    centres = tuple(_sum(centre, away) for centre in facts.centres)
-    return replace(
-        known, cameras=known.cameras.shifted(away), facts=replace(facts, space=space, centres=centres, origin=origin)
-    )
-
-
-def _sum(a: Origin, b: Origin) -> Origin:
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
-def _where_refined(known: Known, model: Model) -> Known:
-    """Facts of the scene, its cameras as refined by training."""
-    return known if model.poses is None else replace(known, cameras=model.poses.refined(known.cameras))
+        # Blocks: their space has no cube of its own, each brings one.
+        model, step, seconds = load_blocked(root, config, known.facts, device_of(device), max_memory)
+    else:
+        saved, _ = checkpoint.load_latest(run.checkpoints)
+        if saved is None:
+            raise CheckpointError(f"{root}: no checkpoint yet; go on with `fprf train {root / 'config.json'} --output {root}`")
+        model, step, seconds = build_model(config, known.facts), saved.step, saved.seconds
+        checkpoint.restore(saved.state, model, None)
+        model = model.requires_grad_(False).to(device_of(device)).eval()
+    return Trained(run, config, method, replace(known, cameras=model.refined(known.cameras)), model, step, seconds)
 
 
 def load_style(run: Run) -> tuple[SceneStyle, Basis | None]:

@@ -13,6 +13,7 @@ from ..config import TrainConfig
 from ..errors import WeightsError
 from ..interfaces import ContentField, Decoder, Sampler, SemanticField
 from ..plugins.decoders.config import pretrain_line
+from ..rendering.cameras import Cameras
 from ..rendering.renderer import Parts
 from ..rendering.space import Space
 from ..testing.outputs import check_parts
@@ -104,6 +105,10 @@ class Model(nn.Module):
         """Regularisers of all parts by name; those of one name are added up."""
         parts = (self.field, self.sampler, self.semantic)
         return add_penalties(part.penalties() for part in parts if part is not None)
+
+    def refined(self, cameras: Cameras) -> Cameras:
+        """The cameras of a capture where training has put them."""
+        return cameras if self.poses is None else self.poses.refined(cameras)
 
     @cached_property
     def penalty_names(self) -> frozenset[str]:

@@ -20,7 +20,6 @@ from ..errors import DataError, PluginError, UsageError, WeightsError
 from ..interfaces import DataManager, Encoder
 from ..plugins.config import Need
 from ..rendering.space import Space
-from .camera_optimizers import relative
 from .model import Facts, build_decoder
 
 
@@ -53,12 +52,11 @@ def device_of(name: str) -> torch.device:
         raise PluginError(f"device: {name!r} is not available here; there is {known}{ray}") from e
 
 
-def with_downscale(config: RunConfig) -> RunConfig:
-    """The config with the size of its images decided: unchanged where `downscale` is a number. Raises as `read_scene`."""
-    if config.downscale is not None:
+def planned(config: RunConfig) -> RunConfig:
+    """The config with what it leaves open decided, the size of its images first. Raises as `read_scene`."""
+    if all(getattr(config, name) is not None for name in config.open):
         return config
-    delivered = read_scene(replace(config, downscale=1))
-    return replace(config, downscale=config.find_downscale(delivered, device_of(config.trained_on).type))
+    return config.planned(read_scene(replace(config, downscale=1)), device_of(config.trained_on).type)
 
 
 def read_scene(config: RunConfig, saved: Facts | None = None) -> Scene:
@@ -68,7 +66,7 @@ def read_scene(config: RunConfig, saved: Facts | None = None) -> Scene:
     """
     if config.data is None:
         raise UsageError("no scene is named: give --data FOLDER, or --data garden for the embedded one")
-    scene = parse_scene(config.data, with_downscale(config).downscale or 1, config.scene_parser)
+    scene = parse_scene(config.data, config.downscale or planned(config).downscale or 1, config.scene_parser)
     return scene if saved is None else at_origin(scene, saved.origin)
 
 
@@ -171,16 +169,21 @@ def facts_of(
 def exposure_of(
     tones: bool | None, scene: Scene, image: Callable[[int], Annotated[Tensor, "H W 3"]], saved: Facts | None = None
 ) -> tuple[float, ...]:
-    """`relative` exposure of the views; empty where tones are not learnt: None = where exposures differ.
+    """Logarithm of each view's exposure over their geometric mean; empty where tones are not learnt.
 
-    `image(view)` is a training view, in [0, 1].
+    `tones` None = learn them where exposures differ. `image(view)` is a training view, in [0, 1].
     """
     if saved is not None:
         return saved.exposure
     if tones is False:
         return ()
     exposure = with_exposure(scene, image).exposure
-    return relative(exposure, len(scene.paths)) if tones or exposures_differ(exposure) else ()
+    if not tones and not exposures_differ(exposure):
+        return ()
+    if exposure is None:  # learnt from nothing: all are taken as alike
+        return (0.0,) * len(scene.paths)
+    log = exposure.double().log()
+    return tuple((log - log.mean()).tolist())
 
 
 def reach_of(scene: Scene, space: Space) -> float:

@@ -356,7 +356,7 @@ def _history(name: str, file: Path) -> History:
             event = parse_json(text, nan=True)
         except ValueError:
             continue
-        if not isinstance(event, dict) or "part" in event:  # seconds of a part, of runs of before
+        if not isinstance(event, dict):
             continue
         step = event.get("step")
         if type(step) is int and abs(step) < _LAST and _number(event.get("seconds")) is not None:

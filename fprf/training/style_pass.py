@@ -15,9 +15,8 @@ from ..config import TrainConfig
 from ..memory import in_parts
 from ..rendering.cameras import Cameras, rays_through
 from ..rendering.renderer import composite_mean, march_features
-from ..style.scene import SceneStyle, region_contacts, scene_style
+from ..style.scene_style import SceneStyle, region_contacts, scene_style
 from ..style.statistics import Moments, merge, moments
-from .camera_optimizers import refined
 from .model import Model
 
 POINTS = 2**18
@@ -60,7 +59,7 @@ def measure_style(config: TrainConfig, model: Model, cameras: Cameras, views: An
     `cameras` are the capture's; the model's own poses, if it has any, are taken into account here.
     """
     # Rays on a lattice over all training views, chunk by chunk; moments are merged, so that chunks do not matter.
-    cameras = refined(model.poses, cameras)
+    cameras = model.refined(cameras)
     device = model.device
     view, pixel = lattice(cameras, views, config.statistics.rays)
     whole = None

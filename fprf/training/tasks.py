@@ -104,8 +104,8 @@ def train_part(part: Part, report: Callable[[Report], None]) -> bool:
             return False
         begin(part.folder, part.asked["task"])
         learner = part.build()
-        reached = learn(learner, Run(part.folder), part.schedule, report)
-        document = {"format": _FORMAT, "asked": part.asked, "step": reached.step, "seconds": reached.seconds}
+        step, seconds = learn(learner, Run(part.folder), part.schedule, report)
+        document = {"format": _FORMAT, "asked": part.asked, "step": step, "seconds": seconds}
         write_json(part.folder / _DONE, document | {"tensors": part.keep(learner)})
     return True
 
@@ -171,8 +171,7 @@ def task_of(folder: Path) -> str | None:
     """What a part was begun as; None where its task.json is absent or damaged, which is as good as not begun."""
     try:
         with open_json(folder / _TASK, "") as document:
-            task = document["task"] if isinstance(document, dict) else document  # cells of before have the digest alone
-            return task if isinstance(task, str) else None
+            return from_json(document["task"], str, path="task")
     except CheckpointError:
         return None
 
@@ -194,9 +193,6 @@ def read_done(folder: Path) -> Done | None:
     if not file.is_file():
         return None
     with open_json(file, "remove it and train again") as document:
-        if "task" in document:  # of cells of before
-            asked = {name: value for name, value in document.items() if name != "format"}
-            document = {"format": _FORMAT, "asked": asked}
         return from_json(document, Done, path="done") if document["format"] == _FORMAT else None
 
 

@@ -55,17 +55,12 @@ def save_sealed(path: Path, tensors: Mapping[str, Tensor]) -> None:
 
 
 def load_sealed(path: Path) -> dict[str, Tensor]:
-    """The tensors of a sealed file, checked. Raises CheckpointError naming file and tensor.
-
-    A file without any metadata is of before there were seals, and taken as it is.
-    """
+    """The tensors of a sealed file, checked. Raises CheckpointError naming file and tensor."""
     try:
         with safe_open(path, framework="pt") as file:
-            metadata = file.metadata()
+            metadata = file.metadata() or {}
     except (OSError, SafetensorError) as e:
         raise CheckpointError(f"{path}: cannot be read ({e}); train again") from e
-    if metadata is None:
-        return read(path)
     try:
         manifest = json.loads(metadata[_MANIFEST])
         return load(path, {name: dict(entry) for name, entry in manifest.items()})

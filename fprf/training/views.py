@@ -1,7 +1,7 @@
 """Whole images from a trained model, and views whose geometry and features are kept."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -15,7 +15,7 @@ from ..ops.precision import float64_device
 from ..rendering.cameras import Cameras, PixelRays, grid_rays, rays_through
 from ..rendering.renderer import PackedSamples, composite, composite_mean, enlarged, march, march_features, render_rays, shade
 from ..style.look import Restyle
-from ..types import Rays, Rendered, View, Want
+from ..types import Rays, View, Want
 from .camera_optimizers import moving, rotated
 from .model import Facts, Model, background_of
 
@@ -36,73 +36,133 @@ def view_rays(
     return Rays(*(x.to(device) for x in model.space.rays(origin, direction))), origin, direction
 
 
-def on_host(*tensors: Tensor) -> list[Tensor]:
-    """Copy tensors of one dtype to the CPU, from an accelerator in a single copy, since the host waits for each."""
-    if all(each.device.type == "cpu" for each in tensors):
-        return list(tensors)
-    flat = torch.cat([each.reshape(-1) for each in tensors]).cpu()
-    parts = torch.split_with_sizes(flat, [each.numel() for each in tensors])
-    return [part.view(each.shape) for part, each in zip(parts, tensors, strict=True)]
+@dataclass(frozen=True)
+class Part:
+    """A chunk of rays, row after row of a view, on the device of its model; it knows no style."""
+
+    kept: PackedSamples
+    content: Annotated[Tensor, "M C"]
+    semantic: Annotated[Tensor, "M D"] | None
+    behind: Annotated[Tensor, "R 3"] | float
+    """Light of the background that reaches the eye."""
+    rays: int
+    depth: Annotated[Tensor, "R"]
+    """World units."""
+    opacity: Annotated[Tensor, "R"]
+    samples: int
+    """Number of samples before the light ones were dropped."""
+    tone: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Factor of the final colours."""
+
+    @property
+    def bytes(self) -> int:
+        """Memory that it holds."""
+        held = (*self.kept, self.content, self.semantic, self.depth, self.opacity)
+        return sum(t.numel() * t.element_size() for t in held if isinstance(t, Tensor))
+
+    @torch.inference_mode()
+    def colour(self, decoder: Decoder, restyle: Restyle | None) -> Annotated[Tensor, "R 3"]:
+        """Colours of its pixels in a style, or as they are, in [0, 1]."""
+        rgb = composite(self.kept, shade(decoder, self.content, self.semantic, restyle), self.rays) + self.behind
+        return (rgb if self.tone == (1.0, 1.0, 1.0) else rgb * rgb.new_tensor(self.tone)).clamp(0, 1)
+
+    @torch.inference_mode()
+    def mean(self, values: Annotated[Tensor, "M X"]) -> Annotated[Tensor, "R X"]:
+        """Mean of values over the samples that each pixel sees; 0 where it sees nothing."""
+        return composite_mean(self.kept, values, self.rays)
 
 
 @torch.inference_mode()
-def render_view(
-    model: Model,
-    facts: Facts,
-    cameras: Cameras,
-    view: int,
-    config: RenderConfig,
-    restyle: Restyle | None = None,
-    factor: Annotated[Tensor, "3"] | None = None,
-) -> View:
-    """Colour and depth of one view, in chunks of rays (see `memory.chunk_size`) and in one copy to the host.
+def view_parts(
+    model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig, *, semantic: bool = True
+) -> Iterator[Part]:
+    """Geometry and features of a view, chunk by chunk of its rays (see `memory.chunk_size`), for any style.
 
-    Below `config.resolution` 1 fewer rays are rendered, and what lies between is interpolated.
-
-    Colours are multiplied by `factor`, if one is given: how a camera took them (`tones`); else by the config's tone.
+    For those who may stop half-way or keep none. Without `semantic` the semantic field is not evaluated.
     """
-    if factor is None and config.tone is not None:
-        factor = torch.tensor(config.tone)
-    if config.resolution < 1:
-        small = cameras.select(torch.tensor([view])).scaled(1 / config.resolution)
-        shown = enlarged(_rendered(model, facts, small, 0, config, restyle, factor), cameras.size[view].tolist())
-    else:
-        shown = _rendered(model, facts, cameras, view, config, restyle, factor)
-    rgb, depth, opacity = on_host(shown.rgb, shown.depth, shown.opacity)
-    return View(rgb, depth, opacity, shown.kept)
-
-
-def _rendered(
-    model: Model,
-    facts: Facts,
-    cameras: Cameras,
-    view: int,
-    config: RenderConfig,
-    restyle: Restyle | None,
-    factor: Annotated[Tensor, "3"] | None,
-) -> View:
-    """All pixels of a view, still on the model's device."""
     rays, origin, direction = view_rays(model, cameras, view)
     background = background_of(facts, rays.origin.device)
+
+    def part(here: slice) -> Part:
+        chunk = Rays(*(x[here] for x in rays))
+        marched, content, semantics = march_features(chunk, model.parts, budget=config.budget, semantic=semantic)
+        kept = marched.kept
+        behind = 0.0 if background is None else marched.transmittance[:, None] * background
+        # Points and latents have done their part, and would be most of what is held.
+        bare = kept._replace(point=kept.point[:, :0].clone(), latent=kept.latent[:, :0].clone(), view=kept.view[:, :0].clone())
+        # Depths along the world's ray, whatever space the field lives in.
+        metric = model.space.metric(origin[here], direction[here], marched.depth.to(origin.device)).to(chunk.near.device)
+        samples, tone = marched.weights.numel(), config.tone or (1.0, 1.0, 1.0)
+        return Part(bare, content, semantics, behind, len(chunk.near), metric, marched.opacity, samples, tone)
+
+    yield from in_parts(len(rays.near), chunk_size(config.chunk, rays.near.device), part)
+
+
+@torch.inference_mode()
+def _view_of(parts: Iterable[Part], decoder: Decoder, restyle: Restyle | None, size: tuple[int, int]) -> View:
+    """The parts of a view of (height, width) pixels in a style, still on their device."""
     rgb, depth, opacity, kept, samples = [], [], [], 0, 0
+    for part in parts:
+        rgb.append(part.colour(decoder, restyle))
+        depth.append(part.depth)
+        opacity.append(part.opacity)
+        kept, samples = kept + len(part.kept.ray), samples + part.samples
+    share = kept / max(1, samples)
+    return View(torch.cat(rgb).view(*size, 3), torch.cat(depth).view(size), torch.cat(opacity).view(size), share)
 
-    def render(here: slice) -> Rendered:
-        part = Rays(*(x[here] for x in rays))
-        return render_rays(part, model.parts, want=Want.COLOUR, budget=config.budget, background=background, restyle=restyle)
 
-    for out in in_parts(len(rays.near), chunk_size(config.chunk, rays.near.device), render):
-        assert out.rgb is not None
-        rgb.append(out.rgb)
-        depth.append(out.depth)
-        opacity.append(out.opacity)
-        kept, samples = kept + out.counts["kept"], samples + out.counts["samples"]
-    # As the camera took it, and depths along the world's ray, whatever space the field lives in.
-    width, height = (int(v) for v in cameras.size[view])
-    colour = torch.cat(rgb)
-    colour = (colour if factor is None else colour * factor.to(colour.device)).clamp(0, 1)
-    metric = model.space.metric(origin, direction, torch.cat(depth).to(origin.device)).to(colour.device)
-    shape = (height, width)
-    return View(colour.view(*shape, 3), metric.view(shape), torch.cat(opacity).view(shape), kept / max(1, samples))
+def _on_host(view: View) -> View:
+    """A view on the CPU, copied from an accelerator in one piece, since the host waits for each copy."""
+    tensors = view.rgb, view.depth, view.opacity
+    if view.rgb.device.type == "cpu":
+        return view
+    flat = torch.cat([each.reshape(-1) for each in tensors]).cpu()
+    parts = torch.split_with_sizes(flat, [each.numel() for each in tensors])
+    rgb, depth, opacity = (part.view(each.shape) for part, each in zip(parts, tensors, strict=True))
+    return View(rgb, depth, opacity, view.kept)
+
+
+def render_view(
+    model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig, restyle: Restyle | None = None
+) -> View:
+    """Colour and depth of one view in a style, or as captured, in chunks of rays and in one copy to the host.
+
+    Below `config.resolution` 1 fewer rays are rendered, and what lies between is interpolated.
+    """
+    whole = cameras.size[view].tolist()
+    if config.resolution < 1:
+        cameras, view = cameras.select(torch.tensor([view])).scaled(1 / config.resolution), 0
+    width, height = cameras.size[view].tolist()
+    # Semantics are evaluated only where the style tells places apart by them.
+    semantic = restyle is not None and not restyle.idle and Want.SEMANTIC in restyle.needs
+    parts = view_parts(model, facts, cameras, view, config, semantic=semantic)
+    shown = _view_of(parts, model.decoder, restyle, (height, width))
+    return _on_host(enlarged(shown, whole) if config.resolution < 1 else shown)
+
+
+@dataclass(frozen=True)
+class CachedView(SceneView):
+    """One view of one model, with its geometry and features."""
+
+    decoder: Decoder
+    parts: tuple[Part, ...]
+    size: tuple[int, int]
+    """Height, width."""
+
+    def restyled(self, restyle: Restyle | None = None) -> View:
+        return _on_host(_view_of(self.parts, self.decoder, restyle, self.size))
+
+    @torch.inference_mode()
+    def match(self, restyle: Restyle) -> Annotated[Tensor, "N T"]:
+        # Where the scene has no semantics all points are alike: features without channels.
+        semantics = [part.content[:, :0] if part.semantic is None else part.semantic for part in self.parts]
+        return torch.cat([part.mean(restyle.match(at)).cpu() for part, at in zip(self.parts, semantics, strict=True)])
+
+
+def cache_view(model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig) -> CachedView:
+    """Render everything but a style (see `view_parts`)."""
+    width, height = cameras.size[view].tolist()
+    return CachedView(model.decoder, tuple(view_parts(model, facts, cameras, view, config)), (height, width))
 
 
 @torch.inference_mode()
@@ -131,114 +191,7 @@ def paint_pixels(
         return composite_mean(kept, painted, len(chunk.near)), marched.opacity
 
     painted, opacity = zip(*in_parts(len(rays.near), chunk_size(config.chunk, rays.near.device), paint), strict=True)
-    shown, seen = on_host(torch.cat(painted), torch.cat(opacity))
-    return shown, seen
-
-
-@dataclass(frozen=True)
-class Part:
-    """A chunk of rays, row after row of a view; it knows no style."""
-
-    kept: PackedSamples
-    content: Annotated[Tensor, "M C"]
-    semantic: Annotated[Tensor, "M D"] | None
-    behind: Annotated[Tensor, "R 3"] | float
-    """Light of the background that reaches the eye."""
-    rays: int
-    depth: Annotated[Tensor, "R"]
-    """World units, on the CPU."""
-    opacity: Annotated[Tensor, "R"]
-    """On the CPU."""
-    samples: int
-    """Number of samples before the light ones were dropped."""
-    tone: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Factor of the final colours."""
-
-    @property
-    def bytes(self) -> int:
-        """Memory that it holds."""
-        held = (*self.kept, self.content, self.semantic, self.depth, self.opacity)
-        return sum(t.numel() * t.element_size() for t in held if isinstance(t, Tensor))
-
-    @torch.inference_mode()
-    def colour(self, decoder: Decoder, restyle: Restyle | None) -> Annotated[Tensor, "R 3"]:
-        """Colours of its pixels in a style, or as they are, in [0, 1]; on the CPU."""
-        rgb = composite(self.kept, shade(decoder, self.content, self.semantic, restyle), self.rays) + self.behind
-        return (rgb if self.tone == (1.0, 1.0, 1.0) else rgb * rgb.new_tensor(self.tone)).clamp(0, 1).cpu()
-
-    @torch.inference_mode()
-    def mean(self, values: Annotated[Tensor, "M X"]) -> Annotated[Tensor, "R X"]:
-        """Mean of values over the samples that each pixel sees; 0 where it sees nothing."""
-        return composite_mean(self.kept, values, self.rays).cpu()
-
-
-@dataclass(frozen=True)
-class CachedView(SceneView):
-    """One view of one model, with its geometry and features."""
-
-    decoder: Decoder
-    parts: tuple[Part, ...]
-    size: tuple[int, int]
-    """Height, width."""
-
-    @property
-    def depth(self) -> Annotated[Tensor, "H W"]:
-        """World units."""
-        return torch.cat([part.depth for part in self.parts]).view(self.size)
-
-    @property
-    def opacity(self) -> Annotated[Tensor, "H W"]:
-        """Opacity of each ray, in [0, 1]."""
-        return torch.cat([part.opacity for part in self.parts]).view(self.size)
-
-    @property
-    def kept(self) -> float:
-        """Share of the samples that met the content network."""
-        return sum(len(part.kept.ray) for part in self.parts) / max(1, sum(part.samples for part in self.parts))
-
-    @property
-    def bytes(self) -> int:
-        """Memory that it holds."""
-        return sum(part.bytes for part in self.parts)
-
-    @torch.inference_mode()
-    def restyled(self, restyle: Restyle | None = None) -> View:
-        rgb = torch.cat([part.colour(self.decoder, restyle) for part in self.parts])
-        return View(rgb.view(*self.size, 3), self.depth, self.opacity, self.kept)
-
-    @torch.inference_mode()
-    def match(self, restyle: Restyle) -> Annotated[Tensor, "N T"]:
-        shares = [
-            part.mean(restyle.match(part.content[:, :0] if part.semantic is None else part.semantic)) for part in self.parts
-        ]
-        return torch.cat(shares)
-
-
-def cache_view(model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig) -> CachedView:
-    """Render everything but a style, in chunks of rays (see `memory.chunk_size`)."""
-    width, height = (int(v) for v in cameras.size[view])
-    return CachedView(model.decoder, tuple(view_parts(model, facts, cameras, view, config)), (height, width))
-
-
-@torch.inference_mode()
-def view_parts(model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig) -> Iterator[Part]:
-    """The same chunk by chunk, for those who may stop half-way or keep none."""
-    rays, origin, direction = view_rays(model, cameras, view)
-    background = background_of(facts, rays.origin.device)
-
-    def part(here: slice) -> Part:
-        chunk = Rays(*(x[here] for x in rays))
-        marched, content, semantic = march_features(chunk, model.parts, budget=config.budget)
-        kept = marched.kept
-        behind = 0.0 if background is None else marched.transmittance[:, None] * background
-        # Points and latents have done their part.
-        bare = kept._replace(point=kept.point[:, :0].clone(), latent=kept.latent[:, :0].clone(), view=kept.view[:, :0].clone())
-        metric = model.space.metric(origin[here], direction[here], marched.depth.to(origin.device))
-        depth, opacity = on_host(metric.to(chunk.near.device), marched.opacity)
-        samples, tone = marched.weights.numel(), config.tone or (1.0, 1.0, 1.0)
-        return Part(bare, content, semantic, behind, len(chunk.near), depth, opacity, samples, tone)
-
-    yield from in_parts(len(rays.near), chunk_size(config.chunk, rays.near.device), part)
+    return torch.cat(painted).cpu(), torch.cat(opacity).cpu()
 
 
 FIT_STEPS = 120

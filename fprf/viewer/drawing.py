@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..interfaces import Scene
 from ..io.images import Picture, to_uint8
 from ..io.maps import depth_image, match_image, palette
 from ..ops.harmonics import HARMONIC
@@ -22,8 +21,8 @@ from ..page.pack import Colours, Packed
 from ..rendering.cameras import Cameras
 from ..splats.scene import SplatScene
 from ..style.look import Restyle
-from ..style.regional import RegionWeight
 from ..style.restyle import Styled
+from ..style.scene_style import RegionWeight
 from ..training.loading import Trained
 from ..training.views import Part, view_parts
 from .look import Look
@@ -191,14 +190,15 @@ class FieldPainter:
         """A chunk as it is shown; of the map of depths, depth and opacity."""
         restyle, semantic = None if styled is None else styled.restyle, part.semantic
         if shown.map == "depth":
-            return torch.stack([part.depth, part.opacity], -1)
+            return torch.stack([part.depth, part.opacity], -1).cpu()
         colours: Tensor = part.colour(self._trained.model.decoder, restyle).cpu()
+        opacity = part.opacity.cpu()
         if shown.map == "matches":
             taken = None if styled is None or semantic is None else part.mean(styled.restyle.match(semantic)).cpu()
-            colours = _match_colours(styled, taken, part.opacity)
+            colours = _match_colours(styled, taken, opacity)
         if shown.map == "regions" or shown.region is not None:
             memberships = part.mean(_memberships(self._restyler, part.content[:, :0] if semantic is None else semantic)).cpu()
-            colours = _mapped(colours, memberships, part.opacity, shown)
+            colours = _mapped(colours, memberships, opacity, shown)
         return colours
 
     def _parts(self, cameras: Cameras, view: int) -> Iterable[Part]:
@@ -214,12 +214,6 @@ class FieldPainter:
             yield
         width, height = (int(v) for v in cameras.size[view])
         return to_uint8(torch.cat(rows).view(height, width, 3))
-
-
-def gaussian_frame(scene: Scene, cameras: Cameras, view: int, look: Restyle | None) -> Generator[None, None, Picture]:
-    """One frame of a film of Gaussians."""
-    yield
-    return to_uint8(scene.restyled(look).render(cameras, view).rgb)
 
 
 def resolutions(size: tuple[int, int]) -> list[tuple[int, int]]:

@@ -5,10 +5,9 @@ their photographs. The film is rendered from these very files, so the same comma
 """
 
 import shutil
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import replace
 from pathlib import Path
-from queue import Full, Queue
 from typing import NamedTuple, TypeAlias
 
 import torch
@@ -22,15 +21,13 @@ from ..plugins.stylizers.config import RegionToneConfig
 from ..rendering.camera_path import read_camera_path, write_camera_path
 from ..rendering.cameras import Cameras
 from ..rendering.paths import interpolate
-from ..style.files import StyleFile, write_style
-from ..style.keyframes import keyed_looks, read_keyframes
+from ..style.files import StyleFile, read_keyframes, write_style
 from ..style.look import Restyle
+from ..style.restyle import keyed_looks
 from ..types import Origin
 from .look import Look, style_config
 from .messages import Camera, cameras_of
-from .render_worker import Steps
 
-Frames: TypeAlias = Queue[Picture | Exception | None]
 Frame: TypeAlias = Callable[[Cameras, int, Restyle | None], Generator[None, None, Picture]]
 """Renders one frame, step by step."""
 _MAX_SECONDS = 600.0
@@ -108,68 +105,28 @@ def write_film_files(
     rows: list[dict[str, object]] = []
     for i, key in enumerate(plan.keys):
         if not key.look.plain and key.look not in looks:
-            looks[key.look] = _write_look(folder / f"style-{len(looks) + 1}", key.look, encoder, stylizer)
+            path = folder / f"style-{len(looks) + 1}" / "style.json"
+            path.parent.mkdir()
+            references = []
+            for k, (photograph, _) in enumerate(key.look.mix):
+                stem = photograph.name.rsplit(".", 1)[0]
+                plain = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stem)
+                references.append(path.with_name(f"{k + 1}-{plain or 'photograph'}.png"))
+                shutil.copyfile(photograph.path, references[-1])
+            style_of_look = replace(style_config(key.look, stylizer), references=tuple(references))
+            write_style(path, StyleFile(style_of_look, {}, encoder))
+            looks[key.look] = path
         style = looks.get(key.look)
         rows.append({"frame": i * plan.gap, "style": None if style is None else str(style.relative_to(folder))})
     write_json(folder / "keys.json", {"format": 1, "keyframes": rows})
 
 
-def film_frames(
-    folder: Path,
-    scene: Scene,
-    frame: Frame,
-    out: Frames,
-    progress: Callable[[int, int], None],
-    abandoned: Callable[[], bool] = lambda: False,
-) -> Steps:
-    """Render the frames of a film's folder into a queue, step by step; `progress(done, total)` of each.
+def film_frames(folder: Path, scene: Scene, frame: Frame) -> list[Generator[None, None, Picture]]:
+    """The frames of a film's folder, each to be rendered step by step."""
+    cameras, _ = read_camera_path(folder / "path.json", scene.origin)
+    looks = keyed_looks(scene, read_keyframes(folder / "keys.json"))
 
-    At last comes None, or the error that it ends with. Ends early once nobody takes frames any more (`abandoned`).
-    """
-    end: Exception | None = None
-    try:
-        cameras, _ = read_camera_path(folder / "path.json", scene.origin)
-        looks = keyed_looks(scene, read_keyframes(folder / "keys.json"))
-        for number in range(len(cameras)):
-            picture = yield from frame(cameras, number, looks(number))
-            while not _put(out, picture):
-                if abandoned():
-                    return
-                yield
-            progress(number + 1, len(cameras))
-    except Exception as error:
-        end = error
-        raise
-    finally:
-        while not _put(out, end):
-            out.get()
+    def rendered(number: int) -> Generator[None, None, Picture]:
+        return (yield from frame(cameras, number, looks(number)))
 
-
-def queued_frames(frames: Frames) -> Iterator[Picture]:
-    """The frames of a queue, up to None. Raises the error in their place."""
-    while (frame := frames.get()) is not None:
-        if isinstance(frame, Exception):
-            raise frame
-        yield frame
-
-
-def _put(out: Frames, item: Picture | Exception | None) -> bool:
-    try:
-        out.put(item, timeout=0.05)
-    except Full:
-        return False
-    return True
-
-
-def _write_look(folder: Path, look: Look, encoder: str, stylizer: RegionToneConfig | None) -> Path:
-    """Write the style file of a look, with copies of its photographs beside it."""
-    folder.mkdir(parents=True)
-    references = []
-    for i, (photograph, _) in enumerate(look.mix):
-        stem = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in photograph.name.rsplit(".", 1)[0])
-        references.append(folder / f"{i + 1}-{stem or 'photograph'}.png")
-        shutil.copyfile(photograph.path, references[-1])
-    style = replace(style_config(look, stylizer), references=tuple(references))
-    path = folder / "style.json"
-    write_style(path, StyleFile(style, {}, encoder))
-    return path
+    return [rendered(number) for number in range(len(cameras))]

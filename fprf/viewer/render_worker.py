@@ -8,10 +8,16 @@ import contextlib
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Generator, Hashable
+from concurrent.futures import Future
 from typing import Generic, TypeAlias, TypeVar
 
+from ..errors import UsageError
+
+T = TypeVar("T")
 Request = TypeVar("Request")
 Steps: TypeAlias = Generator[None, None, None]
+_POLL = 0.5
+"""Seconds between looks whether the worker is closed."""
 
 
 class RenderWorker(Generic[Request]):
@@ -58,15 +64,45 @@ class RenderWorker(Generic[Request]):
             self._idle_work.append(work)
             self._change.notify()
 
+    def result(self, name: Hashable, call: Callable[[], T]) -> T:
+        """Run a call as `run` does, from another thread, and return its result. Raises what it raises."""
+        done: Future[T] = Future()
+
+        def job() -> None:
+            try:
+                done.set_result(call())
+            except Exception as error:
+                done.set_exception(error)
+
+        self.run(name, job)
+        return self._wait(done)
+
+    def result_when_idle(self, work: Generator[None, None, T]) -> T:
+        """Advance `work` while no client waits, from another thread, and return its result. Raises what it raises."""
+        done: Future[T] = Future()
+
+        def steps() -> Steps:
+            try:
+                done.set_result((yield from work))
+            except Exception as error:
+                done.set_exception(error)
+
+        self.run_when_idle(steps())
+        return self._wait(done)
+
+    def _wait(self, done: "Future[T]") -> T:
+        while True:  # waiting for ever would keep the process from ending
+            try:
+                return done.result(_POLL)
+            except TimeoutError:
+                if self._closed and not done.done():
+                    raise UsageError("the viewer is ending") from None
+
     @property
     def idle(self) -> bool:
         """True where no client waits; work for idle times does not count."""
         with self._change:
             return not (self._busy or self._fresh or self._active or self._jobs)
-
-    @property
-    def closed(self) -> bool:
-        return self._closed
 
     def close(self, timeout: float = 5.0) -> None:
         """Stop after the current step and drop the rest."""

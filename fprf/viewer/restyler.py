@@ -4,7 +4,7 @@ A photograph is encoded when it comes and clustered once for each number of clus
 """
 
 from collections import OrderedDict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, NamedTuple, TypeVar
 
@@ -18,14 +18,13 @@ from ..io.images import shrink
 from ..plugins.stylizers.config import RegionToneConfig
 from ..rendering.cameras import Cameras
 from ..style.config import labels
-from ..style.dictionary import StyleDictionary, build_dictionary
+from ..style.dictionary import Encoders, StyleDictionary, build_dictionary, concatenate, encode_photograph
 from ..style.files import StyleFile
 from ..style.look import Restyle
 from ..style.matching import unit
-from ..style.references import Encoders, encode_photograph
 from ..style.regions import memberships
-from ..style.restyle import Styled, dress
-from ..style.scene import SceneStyle
+from ..style.restyle import Styled, apply_dictionary
+from ..style.scene_style import SceneStyle
 from .look import Look, Photograph, style_config
 
 Key = TypeVar("Key")
@@ -94,7 +93,7 @@ class Restyler:
             parts = [self._dictionary(photograph, look.clusters, look.blend) for photograph, _ in look.mix]
             style = style_config(look, self._stylizer)
             dictionary = concatenate(parts, labels(style.references), [weight for _, weight in look.mix])
-            self._styles[look] = dress(self.scene, StyleFile(style), self.encoders, dictionary)
+            self._styles[look] = apply_dictionary(self.scene, StyleFile(style), self.encoders, dictionary)
         return _use(self._styles, look)
 
     def retain(self, photographs: Collection[Photograph]) -> None:
@@ -133,32 +132,6 @@ class Restyler:
             seed = self.encoders.seed
             self._dictionaries[key] = build_dictionary([photograph.reference], clusters=clusters, blend=blend, seed=seed)
         return _use(self._dictionaries, key)
-
-
-def concatenate(parts: Sequence[StyleDictionary], names: Sequence[str], weights: Sequence[float]) -> StyleDictionary:
-    """Dictionaries of one reference each as one, under new names and weights.
-
-    `build_dictionary` of all references makes the same, in another order.
-    """
-    counts = torch.tensor([len(part.keys) for part in parts])
-    coloured = all(part.colour_mean is not None for part in parts)
-
-    def together(name: str) -> Tensor:
-        return torch.cat([getattr(part, name) for part in parts])
-
-    return StyleDictionary(
-        keys=together("keys"),
-        mean=together("mean"),
-        covariance=together("covariance"),
-        share=together("share"),
-        reference=torch.arange(len(parts)).repeat_interleave(counts),
-        weight=torch.tensor(weights, dtype=torch.float32).repeat_interleave(counts),
-        names=tuple(names),
-        blend=parts[0].blend,
-        colour_mean=together("colour_mean") if coloured else None,
-        colour_covariance=together("colour_covariance") if coloured else None,
-        beyond=together("beyond") if all(part.beyond is not None for part in parts) else None,
-    )
 
 
 def _use(cache: OrderedDict[Key, Value], key: Key) -> Value:

@@ -5,20 +5,18 @@ a newer one of the same kind takes the place of one that was not sent yet.
 """
 
 import threading
-from collections.abc import Callable, Generator, Hashable, Mapping
-from concurrent.futures import Future
+from collections.abc import Callable, Generator, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
-from queue import Queue
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
 import msgspec
 import numpy as np
 
 from ..errors import FprfError, UsageError
 from ..interfaces import Scene
-from ..io.images import Picture, encode, write_image
+from ..io.images import Picture, encode, to_uint8, write_image
 from ..io.maps import palette
 from ..io.video import write_video
 from ..page.pack import colour_header, colour_section, container, header, pack, sections
@@ -31,20 +29,17 @@ from ..style.look import Restyle
 from ..training.loading import Trained
 from ..training.run import Known, Run
 from . import messages
-from .drawing import FieldPainter, Map, Request, Shown, gaussian_colours, gaussian_frame
-from .film import FilmPlan, Frames, Key, film_frames, new_folder, queued_frames, write_film_files
+from .drawing import FieldPainter, Map, Request, Shown, gaussian_colours
+from .film import FilmPlan, Key, film_frames, new_folder, write_film_files
 from .look import Look, Photograph, apply_preset, only, renumbered, set_rule, set_weight
 from .render_worker import RenderWorker, Steps
 from .restyler import RegionInfo, Restyler, matching_regions
 from .uploads import Uploads, shown_name
 
-T = TypeVar("T")
 Post: TypeAlias = Callable[[Hashable | None, str, "Mapping[str, Any] | bytes"], None]
 """Sends a client, or all (None), a message under the name of its kind."""
 SHELF = 12
 """Photographs on the shelf; the oldest that no look needs makes room."""
-_POLL = 0.5
-"""Seconds between looks whether the worker is closed."""
 _MAX_KEYS = 64
 _QUALITY = {False: 72, True: 90}
 NOW = "Now"
@@ -235,7 +230,7 @@ class Session:
             self._delete_unused(photograph)
             return photograph
 
-        return self._result(("add", path), add)
+        return self._worker.result(("add", path), add)
 
     def warm_up(self) -> None:
         """Prepare what the first photograph needs while nobody waits: decoder, encoders, kernels, a style."""
@@ -286,7 +281,7 @@ class Session:
                 write_capture(path, viewed.capture, shown.harmonics)
             return path.read_bytes()
 
-        return self._result("gaussians", written)
+        return self._worker.result("gaussians", written)
 
     def _move(self, client: Hashable, request: Request) -> None:
         if self._painter is not None:
@@ -364,7 +359,8 @@ class Session:
     def _frame(self, cameras: Cameras, view: int, look: Restyle | None) -> Generator[None, None, Picture]:
         if self._painter is not None:
             return (yield from self._painter.frame(cameras, view, look))
-        return (yield from gaussian_frame(self.viewed.scene, cameras, view, look))
+        yield
+        return to_uint8(self.viewed.scene.restyled(look).render(cameras, view).rgb)
 
     def _save_picture(self, camera: messages.Camera) -> None:
         """Render what a camera sees, as large as it is there, into the scene's folder while no client waits for a picture."""
@@ -394,18 +390,18 @@ class Session:
             folder, scene = new_folder(self.viewed.root), self.viewed.scene
             write_film_files(folder, plan, scene.semantic_encoder, self.viewed.stylizer, scene.origin)
             self.apply(lambda state: replace(state, film=(0, 1, None)))
-        abandoned = threading.Event()
 
-        def progress(done: int, total: int) -> None:
-            self.apply(lambda state: replace(state, film=(done, total, None)))
+        def rendered(frames: list[Generator[None, None, Picture]]) -> Iterator[Picture]:
+            for done, frame in enumerate(frames, 1):
+                yield self._worker.result_when_idle(frame)
+                self.apply(lambda state, done=done: replace(state, film=(done, len(frames), None)))  # type: ignore[misc]
 
         def work() -> None:
-            frames: Frames = Queue(2)
             try:
-                self._worker.run_when_idle(film_frames(folder, scene, self._frame, frames, progress, abandoned.is_set))
-                write_video(folder / "film.mp4", queued_frames(frames), plan.fps)
+                # Frames are rendered one at a time, as the encoder asks for them.
+                frames = self._worker.result("film", lambda: film_frames(folder, scene, self._frame))
+                write_video(folder / "film.mp4", rendered(frames), plan.fps)
             except Exception as error:  # whatever it is, the next film can be made
-                abandoned.set()
                 self.apply(lambda state: replace(state, film=(0, 0, None)))
                 self.notify(f"film: {error}", bad=True)
                 return
@@ -413,24 +409,6 @@ class Session:
             self.notify(f"film: {folder / 'film.mp4'}")
 
         threading.Thread(target=work, name="fprf-film", daemon=True).start()
-
-    def _result(self, name: Hashable, call: Callable[[], T]) -> T:
-        """Run a call on the worker and return its result. Raises what it raises."""
-        done: Future[T] = Future()
-
-        def job() -> None:
-            try:
-                done.set_result(call())
-            except Exception as error:
-                done.set_exception(error)
-
-        self._worker.run(name, job)
-        while True:  # waiting for ever would keep the process from ending
-            try:
-                return done.result(_POLL)
-            except TimeoutError:
-                if self._worker.closed and not done.done():
-                    raise UsageError("the viewer is ending") from None
 
     def _delete_unused(self, added: Photograph) -> None:
         """Delete photographs that left the shelf and that no look needs, with what was made of them: some 6 MB each."""

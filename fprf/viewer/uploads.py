@@ -1,20 +1,18 @@
 """Photographs that clients upload: checked by their first bytes, then decoded by a process of its own.
 
-The result is a PNG that we wrote ourselves, of bounded size, in a folder of ours under a name of ours. The decoder
-(`python -m fprf.viewer.uploads`) is started once and kept, since starting it takes longer than decoding. Its memory is limited;
-one that takes too long is ended and replaced.
+The result is a PNG that we wrote ourselves, of bounded size, in a folder of ours under a name of ours. The decoder is started
+once and kept, since starting it takes longer than decoding. Its memory is limited; one that takes too long is replaced.
 """
 
-import contextlib
 import json
+import multiprocessing
 import os
-import subprocess
-import sys
+import signal
 import tempfile
 import threading
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from queue import Empty, Queue
-from typing import TextIO
 
 from ..datamanagers.images import kind_of
 from ..errors import DataError, FprfError
@@ -27,6 +25,8 @@ _TIMEOUT = 30.0
 """Seconds for one photograph, the start of the decoder included."""
 _MEMORY = 2 << 30
 """Bytes beyond what the decoder has at its start: 1e8 pixels take 0.3 GB, and some copies."""
+_MAX_ANSWER = 4096
+"""Bytes."""
 _NAME = 48
 """Characters of a name that is shown."""
 
@@ -53,16 +53,12 @@ class Uploads:
 
     def __init__(self, timeout: float = _TIMEOUT) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="fprf-view-")
+        self.folder = Path(self._folder.name)
         self._timeout = timeout
         self._lock = threading.Lock()
-        self._process: subprocess.Popen[str] | None = None
-        self._answers: Queue[str] = Queue()
+        self._process: SpawnProcess | None = None
+        self._pipe: Connection | None = None
         self._count = 0
-
-    @property
-    def folder(self) -> Path:
-        """Folder of the photographs as long as the viewer runs."""
-        return Path(self._folder.name)
 
     def start_decoder(self) -> None:
         """Start the decoder, so that the first photograph need not wait for it."""
@@ -77,10 +73,20 @@ class Uploads:
             source, target = self.folder / f"{self._count:04d}.part", self.folder / f"{self._count:04d}.png"
             source.write_bytes(data)
             try:
-                answer = self._ask({"source": str(source), "target": str(target), "side": MAX_SIDE})
+                pipe = self._started()
+                # Bytes and no pickles: whatever a photograph made of the decoder, its answer is text here.
+                pipe.send_bytes(json.dumps([str(source), str(target)]).encode())
+                if pipe.poll(self._timeout):
+                    answer = pipe.recv_bytes(_MAX_ANSWER).decode(errors="replace")
+                else:
+                    answer = f"not decoded within {self._timeout:g} s; export it again"
+                    self._end()
+            except (OSError, EOFError):  # it died over this one
+                answer = "cannot be decoded; export it again, or make it smaller"
+                self._end()
             finally:
                 source.unlink(missing_ok=True)
-        if answer != "ok":
+        if answer:
             raise DataError(f"photograph: {answer}")
         return target
 
@@ -90,52 +96,24 @@ class Uploads:
             self._end()
             self._folder.cleanup()
 
-    def _ask(self, question: dict[str, object]) -> str:
-        process = self._started()
-        assert process.stdin is not None
-        try:
-            process.stdin.write(json.dumps(question) + "\n")
-            process.stdin.flush()
-            answer: dict[str, str] = json.loads(self._answers.get(timeout=self._timeout))
-            return str(answer["said"])
-        except Empty:
+    def _started(self) -> Connection:
+        """The pipe to the decoder, which is started where none runs."""
+        if self._process is None or self._pipe is None or not self._process.is_alive():
             self._end()
-            return f"not decoded within {self._timeout:g} s; export it again"
-        except (OSError, ValueError, KeyError):  # it died over this one
-            self._end()
-            return "cannot be decoded; export it again, or make it smaller"
-
-    def _started(self) -> "subprocess.Popen[str]":
-        if self._process is None or self._process.poll() is not None:
-            self._end()
-            self._answers = Queue()
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "fprf.viewer.uploads"],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                text=True,
-            )
-            threading.Thread(target=_read_answers, args=(self._process, self._answers), daemon=True).start()
-        return self._process
+            context = multiprocessing.get_context("spawn")  # a fork would carry this process's threads and models
+            self._pipe, theirs = context.Pipe()
+            self._process = context.Process(target=decode_photographs, args=(theirs,), daemon=True)
+            self._process.start()
+            theirs.close()
+        return self._pipe
 
     def _end(self) -> None:
-        if self._process is not None:
+        if self._process is not None and self._pipe is not None:
             self._process.kill()
-            self._process.wait()
-            for pipe in (self._process.stdin, self._process.stdout):
-                assert pipe is not None
-                with contextlib.suppress(OSError):  # what it never read
-                    pipe.close()
-            self._process = None
-
-
-def _read_answers(process: "subprocess.Popen[str]", answers: "Queue[str]") -> None:
-    assert process.stdout is not None
-    with contextlib.suppress(ValueError):  # closed while it was read
-        for line in process.stdout:
-            answers.put(line)
-    answers.put("")
+            self._process.join()
+            self._process.close()
+            self._pipe.close()
+        self._process = self._pipe = None
 
 
 def limit_memory(room: int) -> None:
@@ -149,35 +127,26 @@ def limit_memory(room: int) -> None:
         return
 
 
-def serve_decoder(questions: TextIO, answers: TextIO) -> None:
-    """Answer lines {"source", "target", "side"} by {"said": "ok" or what is wrong} until the input ends."""
-    for line in questions:
-        try:
-            asked = json.loads(line)
-            _decode(Path(asked["source"]), Path(asked["target"]), int(asked["side"]))
-            said = "ok"
-        except FprfError as fault:
-            # The file's own name means nothing to the client.
-            said = str(fault).removeprefix(f"{asked['source']}: ")
-        except Exception as fault:  # whatever a decoder raises over a stranger's bytes
-            said = f"cannot be decoded ({type(fault).__name__}); export it again, or make it smaller"
-        answers.write(json.dumps({"said": said}) + "\n")
-        answers.flush()
-
-
-def _decode(source: Path, target: Path, side: int) -> None:
-    """Write a photograph as a PNG with sides of at most `side` pixels."""
+def decode_photographs(pipe: Connection) -> None:
+    """Answer each [source, target] by what is wrong with it, empty once the target is written, until the pipe is closed."""
     import cv2
 
     from ..datamanagers.images import load_image
     from ..io.images import shrink
 
-    small = shrink(load_image(source, upright=True), side)
-    target.write_bytes(cv2.imencode(".png", cv2.cvtColor(small, cv2.COLOR_RGB2BGR))[1].tobytes())
-
-
-if __name__ == "__main__":
-    from ..datamanagers import images  # noqa: F401  what it maps does not count against the limit
-
-    limit_memory(_MEMORY)
-    serve_decoder(sys.stdin, sys.stdout)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt at the terminal is the viewer's, which ends this one
+    limit_memory(_MEMORY)  # what is imported does not count
+    while True:
+        try:
+            source, target = json.loads(pipe.recv_bytes())
+        except EOFError:
+            return
+        try:
+            small = shrink(load_image(Path(source), upright=True), MAX_SIDE)
+            Path(target).write_bytes(cv2.imencode(".png", cv2.cvtColor(small, cv2.COLOR_RGB2BGR))[1].tobytes())
+            said = ""
+        except FprfError as fault:
+            said = str(fault).removeprefix(f"{source}: ")  # the file's own name means nothing to the client
+        except Exception as fault:  # whatever a decoder raises over a stranger's bytes
+            said = f"cannot be decoded ({type(fault).__name__}); export it again, or make it smaller"
+        pipe.send_bytes(said.encode(errors="replace")[:_MAX_ANSWER])

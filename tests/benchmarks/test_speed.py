@@ -25,7 +25,9 @@ from benchmarks.subject import (
 )
 from fprf.ops import triplane
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig
-from fprf.style.restyle import restyle
+from fprf.style.config import StyleConfig
+from fprf.style.files import StyleFile
+from fprf.style.restyle import apply_style
 from fprf.training.views import render_view
 
 
@@ -34,7 +36,11 @@ def test_exact_is_double_and_every_way_comes_near_it(world: World) -> None:
     known, model = trained.known, trained.model
     rays = view_rays(model, known.cameras, 1)
     for stylizer in (None, RegionOtConfig(), LocalAdainConfig()):
-        look = None if stylizer is None else restyle(trained, world.references, stylizer).restyle
+        look = (
+            None
+            if stylizer is None
+            else apply_style(trained, StyleFile(StyleConfig(references=world.references, stylizer=stylizer))).restyle
+        )
         truth = exact(model, known.facts, rays, look)
         assert truth.dtype == torch.float64 and truth.shape == (24 * 32, 3)
         render = replace(trained.config.render, budget=0.0)

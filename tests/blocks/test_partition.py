@@ -1,6 +1,5 @@
 """Partitions of both kinds: blocks hold what cameras see and fit their budget, cells of Gaussians cover all of space."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -153,14 +152,3 @@ def test_a_partition_comes_back_from_its_file(tmp_path: Path, kind: str) -> None
         file.write_text(text)
         with pytest.raises(CheckpointError):
             read_cells(file)
-
-
-def test_blocks_of_before_are_read_and_turned_ones_refused(tmp_path: Path) -> None:
-    file, eye = tmp_path / "blocks.json", torch.eye(3).tolist()
-    boxes = {"low": [[0.0, 0.0, 0.0]], "high": [[1.0, 2.0, 3.0]], "turn": [eye], "margin": 0.25}
-    file.write_text(json.dumps({"format": 1, "boxes": boxes, "rays": [5], "views": [1]}))
-    (cell,) = read_cells(file)
-    assert (cell.low.tolist(), cell.high.tolist(), cell.border.tolist()) == ([0.0] * 3, [1.0, 2.0, 3.0], [0.25] * 3)
-    file.write_text(json.dumps({"format": 1, "boxes": boxes | {"turn": [eye[::-1]]}}))
-    with pytest.raises(CheckpointError, match=r"--blocks street made them; .* --output ANOTHER"):
-        read_cells(file)

@@ -12,8 +12,8 @@ from tiny_world import World
 from fprf.errors import ConfigError
 from fprf.plugins.stylizers.config import AdainConfig
 from fprf.style.config import StyleConfig
-from fprf.style.files import StyleFile, write_style
-from fprf.style.keyframes import Key, fade, keyed_looks, read_keyframes
+from fprf.style.files import Keyframe, StyleFile, fade, read_keyframes, write_style
+from fprf.style.restyle import keyed_looks
 
 PLAIN = {"frame": 1, "style": None}
 
@@ -22,7 +22,7 @@ PLAIN = {"frame": 1, "style": None}
 def test_what_is_wrong_with_the_file_is_told(tmp_path: Path, rows: object) -> None:
     file = tmp_path / "k.json"
     file.write_text(json.dumps({"format": 1, "keyframes": [PLAIN]}))
-    assert read_keyframes(file) == (Key(1, None),)
+    assert read_keyframes(file) == (Keyframe(1, None),)
     for whole in ({"format": 1, "keyframes": rows}, {"format": 2, "keyframes": [PLAIN]}):
         file.write_text(json.dumps(whole))
         with pytest.raises(ConfigError) as caught:
@@ -54,7 +54,10 @@ def test_each_frame_has_its_look(world: World, tmp_path: Path) -> None:
     for path, reference, strength in zip(styles, world.references, (1.0, 0.8), strict=True):
         style = StyleConfig(references=(reference,), clusters=2, stylizer=AdainConfig(), strength=strength, luminance=0.5)
         write_style(path, StyleFile(style))
-    looks = keyed_looks(world.load(), [Key(2, None), Key(6, styles[0]), Key(10, styles[1]), Key(14, None), Key(20, None)])
+    looks = keyed_looks(
+        world.load(),
+        [Keyframe(2, None), Keyframe(6, styles[0]), Keyframe(10, styles[1]), Keyframe(14, None), Keyframe(20, None)],
+    )
     assert looks(0) is looks(2) is looks(14) is looks(17) is looks(30) is None
     first, second = looks(6), looks(10)
     assert first is not None and second is not None and first.others == second.others == ()

@@ -11,7 +11,9 @@ from tiny_world import World
 
 from fprf.export.lut import colour_pairs, fit_table, moved, write_cube
 from fprf.plugins.stylizers.config import RegionOtConfig
-from fprf.style.restyle import restyle
+from fprf.style.config import StyleConfig
+from fprf.style.files import StyleFile
+from fprf.style.restyle import apply_style
 
 seeds = st.integers(0, 2**31)
 
@@ -76,7 +78,10 @@ def test_a_table_does_to_pictures_most_of_what_the_style_does(world: World) -> N
     With one reference: what two of them do to one colour in two places, no table can do.
     """
     trained = world.load()
-    known, made = trained.known, restyle(trained, world.references[:1], RegionOtConfig()).restyle
+    known, made = (
+        trained.known,
+        apply_style(trained, StyleFile(StyleConfig(references=world.references[:1], stylizer=RegionOtConfig()))).restyle,
+    )
     (plain, styled), share = colour_pairs(trained, [None, made], known.train)
     assert len(plain) == len(styled) == len(share) and torch.allclose(share.sum(1), torch.ones(len(share)), atol=1e-4)
     table = fit_table(plain, styled, share.sum(1), 17)

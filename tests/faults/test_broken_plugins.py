@@ -17,7 +17,7 @@ from torch import Tensor
 from fprf.errors import PluginError
 from fprf.interfaces import Stylizer
 from fprf.plugins.stylizers.config import StylizerConfig
-from fprf.style.scene import own_style
+from fprf.style.scene_style import own_style
 from fprf.testing import cases
 from fprf.testing.outputs import check_parts, check_stylizer
 from fprf.training.model import build_model

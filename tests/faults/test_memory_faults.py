@@ -59,7 +59,8 @@ def rendered(config):
 
 def cached(config):
     kept = views.cache_view(model, facts, cameras, 0, config)
-    return [kept.restyled().rgb, kept.depth]
+    view = kept.restyled()
+    return [view.rgb, view.depth]
 
 wanted = cached(small) + rendered(small)
 assert not tried

@@ -5,7 +5,7 @@ import threading
 import pytest
 import torch
 
-from fprf.ops import backend, dense, march, triplane
+from fprf.ops import backend, dense, triplane
 from fprf.ops.precision import tf32
 
 
@@ -13,9 +13,9 @@ def test_plain_forms_alone_within_the_block() -> None:
     x, table = torch.zeros(4, 3), torch.zeros(12, 8)
     with torch.no_grad():
         for _ in range(2):
-            assert backend.compiled() and dense.usable(x) and march.usable(x) and triplane.usable(x, table)
+            assert backend.compiled() and dense.usable(x) and triplane.usable(x, table)
             with backend.plain():
-                assert not (backend.compiled() or dense.usable(x) or march.usable(x) or triplane.usable(x, table))
+                assert not (backend.compiled() or dense.usable(x) or triplane.usable(x, table))
                 with backend.plain():
                     assert not backend.compiled()
                 assert not backend.compiled()

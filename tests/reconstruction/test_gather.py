@@ -31,10 +31,10 @@ def photo(path: Path, seed: int = 0, size: tuple[int, int] = (24, 16)) -> Path:
 @settings(deadline=None)
 @given(st.lists(st.floats(0, 1e6), max_size=80), st.integers(1, 30), st.floats(0, 0.9))
 def test_every_frame_is_chosen_or_has_a_reason(scores: list[float], count: int, least: float) -> None:
-    choice = choose_frames(scores, count, least)
-    assert sorted([*choice.chosen, *choice.dropped]) == list(range(len(scores)))
-    assert len(choice.chosen) <= count and choice.chosen == sorted(choice.chosen)
-    assert all(choice.dropped.values())
+    chosen, dropped = choose_frames(scores, count, least)
+    assert sorted([*chosen, *dropped]) == list(range(len(scores)))
+    assert len(chosen) <= count and chosen == sorted(chosen)
+    assert all(dropped.values())
 
 
 def with_lens(path: Path, **options: object) -> Path:

@@ -13,20 +13,11 @@ from torch import Tensor, nn
 from toy_parts import Never, Ones, Shift, Squash, Uniform, parts_of, rays_of, space_of
 
 from fprf.plugins.samplers.config import UniformConfig
-from fprf.rendering import renderer
 from fprf.rendering.renderer import Parts, march, render_rays
 from fprf.rendering.space import Kind
 from fprf.rendering.stepfun import midpoints
 from fprf.style.look import Restyle
 from fprf.types import Rays, Rendered, Want
-
-
-@pytest.fixture(params=["compiled", "plain"], autouse=True)
-def form(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The march is compiled for float32 on a CPU without gradients."""
-    if request.param == "plain":
-        monkeypatch.setattr(renderer.compiled, "usable", lambda *given: False)
-
 
 ALL = Want.DENSITY | Want.COLOUR | Want.CONTENT | Want.SEMANTIC
 

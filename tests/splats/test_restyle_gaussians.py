@@ -25,8 +25,8 @@ from fprf.splats.restyle import all_around
 from fprf.splats.scene import SplatScene, load_scene, look_at_capture, scene_tensors
 from fprf.splats.views import draw, find_views
 from fprf.style.config import StyleConfig
-from fprf.style.controls import luma
 from fprf.style.files import StyleFile, write_style
+from fprf.style.light import luma
 from fprf.style.match_maps import match_map
 from fprf.style.restyle import Styled, apply_style
 

@@ -56,7 +56,7 @@ def test_a_run_of_before_with_its_rounds_is_read(tmp_path: Path) -> None:
     assert load_config(file) == (GaussiansConfig(cells=3), "fprf-splats")
 
 
-def test_the_union_holds_each_cell_s_own_and_workers_read_their_views_alone(town: Path, tmp_path: Path) -> None:
+def test_the_union_holds_each_cell_s_own(town: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     words = command(town, run, "--cells", "3")
     assert main(words) == 0
@@ -64,10 +64,6 @@ def test_the_union_holds_each_cell_s_own_and_workers_read_their_views_alone(town
     gaussians, cut = read_capture(tmp_path / "a.ply").gaussians, load_cells(run)
     assert [*map(repr, cut)] == [*map(repr, bisect_sightings(parse_scene(town, 1, None), 3))]
     assert len(gaussians) > 0 and torch.stack([cell.holds(gaussians.means) for cell in cut]).sum(0).eq(1).all()
-    before = part_of(run, town, 2).build().state().model["means"]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fprf.training.prepare.parse_scene", None)
-        assert torch.equal(part_of(run, town, 2).build().state().model["means"], before)
     assert main(["eval", str(run), "--split", "test"]) == 0
 
 

@@ -32,7 +32,7 @@ from fprf.splats.files import read_capture
 from fprf.splats.gaussians import Gaussians, tensors_of
 from fprf.splats.learner import GaussianLearner
 from fprf.splats.photographs import camera_of
-from fprf.splats.training import build, reach_of
+from fprf.splats.training import build, scene_scale
 from fprf.splats.views import draw
 from fprf.training import checkpoint, driver
 from fprf.training.camera_optimizers import Tones, moved_cameras
@@ -471,5 +471,5 @@ def test_means_move_by_what_views_see_not_by_how_far_apart_they_are(scene: Scene
     assert scene.points is not None
     train = torch.cat([scene.train, scene.train + len(pose)])
     twice = replace(scene, cameras=both, train=train, points=torch.cat([scene.points, scene.points + apart]), seen=None)
-    assert reach_of(twice) < 1.5 * reach_of(replace(scene, seen=None))
-    assert reach_of(replace(twice, points=None)) > 500
+    assert scene_scale(twice) < 1.5 * scene_scale(replace(scene, seen=None))
+    assert scene_scale(replace(twice, points=None)) > 500

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import NumericsError
-from fprf.style.clusters import kmeans
+from fprf.style.statistics import kmeans
 
 
 def blobs(n: int, d: int, k: int, *, spread: float, norm: float, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:

@@ -12,11 +12,9 @@ from torch import Tensor
 
 from fprf.interfaces import Decoder, Stylizer
 from fprf.plugins.stylizers.config import RegionToneConfig
-from fprf.style.colours import ColourMaps, colour_maps
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary, choose, load_dictionary, save_dictionary
-from fprf.style.look import Restyle
-from fprf.style.regional import RegionWeight
-from fprf.style.scene import SceneStyle, own_style, scene_style
+from fprf.style.look import ColourMaps, Restyle, colour_maps
+from fprf.style.scene_style import RegionWeight, SceneStyle, own_style, scene_style
 from fprf.types import Want
 
 COUNT, KINDS = 600, 3

@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 
 from fprf.errors import ConfigError, UsageError
 from fprf.style.config import RegionValue, find_reference, labels, parse_place, parse_region_value, parse_strength
-from fprf.style.controls import allowed_references, blend_strength, keep_luminance, luma, place_weight
+from fprf.style.light import luma
+from fprf.style.look import blend_strength, keep_luminance, place_weight
+from fprf.style.regions import allowed_references
 
 COLOUR = st.tuples(
     *[st.sampled_from([0.0, 1e-7, 0.2, 0.5, 1 / 3, 0.999, 1.0]) | st.floats(0, 1, width=32, allow_subnormal=False)] * 3

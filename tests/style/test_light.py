@@ -11,10 +11,10 @@ from fprf.ops.harmonics import as_drawn
 from fprf.plugins.stylizers.config import RegionToneConfig
 from fprf.splats.gaussians import HARMONIC
 from fprf.splats.restyle import all_around, region_maps, restyled_harmonics
-from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
+from fprf.style.dictionary import Reference, build_dictionary
 from fprf.style.light import KNOWN, Light, light_maps, light_of, shared, unrivalled
 from fprf.style.look import Restyle
-from fprf.style.scene import SceneStyle, scene_style
+from fprf.style.scene_style import SceneStyle, scene_style
 
 KINDS, EACH = 4, 150
 CONFIG = RegionToneConfig(smoothness=0.0)
@@ -54,11 +54,7 @@ def reference(colours: Tensor, name: str = "r", *, turned: bool = False, kinds: 
 def look_of(scene: SceneStyle, *references: Reference, bold: float = 0.5, strength: float = 1.0) -> Restyle:
     d = build_dictionary(references, clusters=KINDS, blend=0.0)
     stylizer = CONFIG.build(dictionary=d, scene=scene)
-
-    def match(part: StyleDictionary) -> Tensor:
-        return CONFIG.build(dictionary=part, scene=scene).region_match(scene.keys)
-
-    light = light_of(scene, d, match, (scene.region_mean, scene.region_covariance), bold=bold)
+    light = light_of(scene, d, CONFIG, (scene.region_mean, scene.region_covariance), bold=bold)
     return Restyle(stylizer, strength, features=0.0, colours=region_maps(stylizer, d, scene, CONFIG), light=light)
 
 

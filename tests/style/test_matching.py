@@ -1,5 +1,7 @@
 """Attention of points and of regions to codes: the formulas of the paper, and what they must not see."""
 
+from typing import Any
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -7,8 +9,6 @@ from hypothesis import strategies as st
 
 from fprf.errors import ConfigError
 from fprf.style.matching import (
-    Keys,
-    Matching,
     attention,
     match_keys,
     point_shares,
@@ -95,14 +95,16 @@ def test_directions_begin_just_above_rounding_and_have_gradients_at_the_centre()
     assert x.grad is not None and bool(x.grad.isfinite().all())
 
 
-FRAMES = [Matching(0.3), Matching(0.3, whitening=0.5), Matching(0.3, whitening=1.0), Matching(0.3, "cosine", 0.5, 5)]
+Side = tuple[torch.Tensor, torch.Tensor]
+"""Keys and their shares."""
+FRAMES: list[dict[str, Any]] = [{}, {"whitening": 0.5}, {"whitening": 1.0}, {"whitening": 0.5, "recentred": 5}]
 
 
-def side(count: int, dims: int, seed: int) -> Keys:
+def side(count: int, dims: int, seed: int) -> Side:
     g = torch.Generator().manual_seed(seed)
     stretch = torch.linspace(3.0, 0.3, dims, dtype=torch.float64)
     keys = torch.randn(count, dims, generator=g, dtype=torch.float64) * stretch
-    return Keys(keys, torch.rand(count, generator=g, dtype=torch.float64) + 0.1)
+    return keys, torch.rand(count, generator=g, dtype=torch.float64) + 0.1
 
 
 def turned(dims: int, seed: int) -> torch.Tensor:
@@ -110,16 +112,16 @@ def turned(dims: int, seed: int) -> torch.Tensor:
     return torch.linalg.qr(torch.randn(dims, dims, generator=g, dtype=torch.float64)).Q
 
 
-def table(here: Keys, there: Keys, matching: Matching) -> torch.Tensor:
-    return match_keys(here, there, matching, torch.ones(len(there.keys)))
+def table(here: Side, there: Side, temperature: float = 0.3, **frame: Any) -> torch.Tensor:
+    return match_keys(*here, *there, torch.ones(len(there[0])), temperature=temperature, **frame)
 
 
-@pytest.mark.parametrize("matching", FRAMES)
-def test_where_a_side_lies_and_how_both_are_turned_decides_nothing(matching: Matching) -> None:
-    here, there, rotation = side(6, 5, 2), side(9, 5, 3), turned(5, 4)
-    plain = table(here, there, matching)
-    moved = table(Keys(here.keys + 7, here.share), Keys(there.keys - 3, 5 * there.share), matching)
-    both = table(Keys(here.keys @ rotation, here.share), Keys(there.keys @ rotation, there.share), matching)
+@pytest.mark.parametrize("frame", FRAMES)
+def test_where_a_side_lies_and_how_both_are_turned_decides_nothing(frame: dict[str, Any]) -> None:
+    (here, share), (there, weight), rotation = side(6, 5, 2), side(9, 5, 3), turned(5, 4)
+    plain = table((here, share), (there, weight), **frame)
+    moved = table((here + 7, share), (there - 3, 5 * weight), **frame)
+    both = table((here @ rotation, share), (there @ rotation, weight), **frame)
     torch.testing.assert_close(moved, plain, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(both, plain, rtol=1e-9, atol=1e-9)
 
@@ -127,33 +129,33 @@ def test_where_a_side_lies_and_how_both_are_turned_decides_nothing(matching: Mat
 def test_whitening_takes_the_share_of_the_spread_that_it_is_told() -> None:
     keys = turned(6, 1)[:, :4] * torch.tensor([9.0, 3.0, 1.0, 1.0], dtype=torch.float64)
     keys = torch.cat([keys, -keys])  # centred
-    every = Keys(keys, torch.ones(12, dtype=torch.float64))
+    every = keys, torch.ones(12, dtype=torch.float64)
 
     def spread(whitening: float) -> torch.Tensor:
-        values = torch.linalg.svdvals(keys @ whitener(every, whitening))
+        values = torch.linalg.svdvals(keys @ whitener(*every, whitening))
         return values[0] / values[-1]
 
-    assert torch.equal(whitener(every, 0.0), torch.eye(4, dtype=torch.float64))
+    assert torch.equal(whitener(*every, 0.0), torch.eye(4, dtype=torch.float64))
     assert float(spread(0.0)) > float(spread(0.5)) > float(spread(1.0)) > 1
-    half = whitener(every, 0.5)
-    torch.testing.assert_close(half @ half, whitener(every, 1.0))
-    assert torch.equal(whitener(Keys(torch.ones(3, 4), torch.ones(3)), 1.0), torch.eye(4, dtype=torch.float64))
+    half = whitener(*every, 0.5)
+    torch.testing.assert_close(half @ half, whitener(*every, 1.0))
+    assert torch.equal(whitener(torch.ones(3, 4), torch.ones(3), 1.0), torch.eye(4, dtype=torch.float64))
 
 
 def test_what_references_show_too_much_of_does_not_move_the_centre() -> None:
     """Three kinds in the scene; the references show the first almost alone."""
     kinds, share = torch.eye(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
-    here, there = Keys(kinds, share), Keys(kinds + 0.5, torch.tensor([0.9, 0.05, 0.05], dtype=torch.float64))
-    once, settled = (table(here, there, Matching(0.5, recentred=times)) for times in (0, 5))
-    even = table(here, Keys(kinds + 0.5, share), Matching(0.5))
+    here, there = (kinds, share), (kinds + 0.5, torch.tensor([0.9, 0.05, 0.05], dtype=torch.float64))
+    once, settled = (table(here, there, 0.5, recentred=times) for times in (0, 5))
+    even = table(here, (kinds + 0.5, share), 0.5)
     assert float((settled - even).abs().max()) < 0.2 * float((once - even).abs().max()), "as if they showed all alike"
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(1, 6), st.integers(1, 9), st.integers(1, 5), st.sampled_from([0.0, 1e-12, 1e9]), st.sampled_from(FRAMES))
-def test_rows_are_shares_whatever_comes(k: int, t: int, dims: int, scale: float, matching: Matching) -> None:
-    here, there = side(k, dims, k), side(t, dims, t + 9)
-    found = table(Keys(here.keys * scale, here.share), Keys((there.keys * scale).float(), there.share.float()), matching)
+def test_rows_are_shares_whatever_comes(k: int, t: int, dims: int, scale: float, frame: dict[str, Any]) -> None:
+    (here, share), (there, weight) = side(k, dims, k), side(t, dims, t + 9)
+    found = table((here * scale, share), ((there * scale).float(), weight.float()), **frame)
     assert found.shape == (k, t) and found.dtype == torch.float64 and bool((found >= 0).all())
     torch.testing.assert_close(found.sum(1), torch.ones(k, dtype=torch.float64))
 
@@ -165,11 +167,12 @@ def test_spread_within_rounding_of_the_largest_score_is_none() -> None:
 
 def test_dot_products_know_no_frame_and_weights_count() -> None:
     here, there = side(4, 3, 7), side(5, 3, 8)
-    plain = table(here, there, Matching(0.3, "dot"))
-    assert torch.equal(table(here, there, Matching(0.3, "dot", 1.0, 5)), plain)
+    plain = table(here, there, similarity="dot")
+    assert torch.equal(table(here, there, similarity="dot", whitening=1.0, recentred=5), plain)
     favoured = torch.tensor([5.0, 1.0, 1.0, 1.0, 1.0])
-    for matching in (Matching(0.3, "dot"), FRAMES[1]):
-        more, before = match_keys(here, there, matching, favoured), table(here, there, matching)
+    for frame in ({"similarity": "dot"}, FRAMES[1]):
+        more = match_keys(*here, *there, favoured, temperature=0.3, **frame)
+        before = table(here, there, **frame)
         torch.testing.assert_close(more[:, 0] / more[:, 1], 5 * before[:, 0] / before[:, 1])
 
 

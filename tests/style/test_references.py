@@ -10,8 +10,7 @@ from fprf.datamanagers.basis import Basis
 from fprf.errors import DataError
 from fprf.ops.guided import upsample
 from fprf.plugins.encoders.config import RandomConfig
-from fprf.style.dictionary import build_dictionary
-from fprf.style.references import Encoders, encode_photograph
+from fprf.style.dictionary import Encoders, build_dictionary, encode_photograph
 from fprf.testing.cases import scene
 
 CONTENT = RandomConfig(channels=6, stride=2).build()

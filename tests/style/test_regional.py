@@ -13,8 +13,8 @@ from fprf.plugins.stylizers.config import (
 )
 from fprf.plugins.stylizers.region import TwoSidedStylizer
 from fprf.style.dictionary import build_dictionary, choose, whole_style
-from fprf.style.regional import regional
-from fprf.style.scene import Membership
+from fprf.style.look import regional
+from fprf.style.scene_style import Membership
 from fprf.types import Want
 
 ALL = (AdainConfig(), LocalAdainConfig(), region_adain(), RegionOtConfig())

@@ -14,14 +14,14 @@ from two_sided import region_adain
 from fprf.errors import DataError, UsageError
 from fprf.plugins.stylizers.config import AdainConfig
 from fprf.style.config import StyleConfig
-from fprf.style.files import Key, StyleFile
+from fprf.style.files import RegionKey, StyleFile
 from fprf.style.match_maps import explain, region_row, region_tile
-from fprf.style.regions import RegionMatch, Regions, find_regions, key_of, membership_view
-from fprf.style.restyle import RegionControls, Styled, apply_style, region_controls
+from fprf.style.regions import RegionControls, RegionMatch, Regions, find_regions, key_of, membership_view, region_controls
+from fprf.style.restyle import Styled, apply_style
 from fprf.training.loading import load_style
 
 
-def regions_of(world: World, keys: dict[str, Key] | None = None) -> Regions:
+def regions_of(world: World, keys: dict[str, RegionKey] | None = None) -> Regions:
     trained = world.load()
     return Regions(trained, *load_style(trained.run), keys or {})
 
@@ -59,10 +59,10 @@ def test_a_mask_means_what_it_covers(world: World, tmp_path: Path) -> None:
 def test_keys_find_their_own_regions_and_those_like_them(world: World) -> None:
     regions = regions_of(world)
     assert regions.basis is not None
-    count, middle = len(regions.scene.share), regions.scene.semantic_mean
+    count, middle = len(regions.style.share), regions.style.semantic_mean
     keys = {f"r{k}": key_of(regions, k) for k in range(count)}
     assert {len(key) for key in keys.values()} == {len(regions.basis.mean)}, "in the encoder's own channels"
-    weaker = middle + 0.4 * (regions.scene.keys - middle)
+    weaker = middle + 0.4 * (regions.style.keys - middle)
     for given in (keys, {f"r{k}": tuple(regions.basis.lift(weaker[k]).tolist()) for k in range(count)}):
         for k, name in enumerate(given):
             (found,) = find_regions(regions._replace(keys=given), name)
@@ -81,7 +81,7 @@ def style_of(references: Sequence[Path]) -> StyleConfig:
 def controls_of(world: World, styled: Styled, file: StyleFile | None = None, **wishes: object) -> RegionControls:
     style = replace(style_of(world.references), **wishes)  # type: ignore[arg-type]
     old = styled.controls.regions
-    regions = Regions(old.views, old.scene, old.basis, {} if file is None else file.regions)
+    regions = Regions(old.scene, old.style, old.basis, {} if file is None else file.regions)
     return region_controls(regions, styled.dictionary, style)
 
 
@@ -132,7 +132,7 @@ def test_what_is_saved_means_the_same_on_the_same_scene(world: World, styled: St
     saved = controls.saved
     assert all(text.partition("=")[0] in saved.regions for text in (*saved.style.pin, *saved.style.forbid, *saved.style.keep))
     old = styled.controls.regions
-    again = region_controls(Regions(old.views, old.scene, old.basis, saved.regions), styled.dictionary, saved.style)
+    again = region_controls(Regions(old.scene, old.style, old.basis, saved.regions), styled.dictionary, saved.style)
     assert torch.equal(again.allowed, controls.allowed) and torch.equal(again.strength, controls.strength)
     assert again.saved == saved, "names and keys stay as they are, however often it is saved"
     named = {text.partition("=")[0] for text in (*saved.style.pin, *saved.style.forbid, *saved.style.keep)}
@@ -141,7 +141,7 @@ def test_what_is_saved_means_the_same_on_the_same_scene(world: World, styled: St
 
 def test_the_place_of_a_region_is_in_the_view_that_shows_most_of_it(world: World) -> None:
     regions = regions_of(world)
-    names = regions.views.names
+    names = regions.scene.names
     shares = [membership_view(regions, v, 32) for v in range(len(names))]
     mass = torch.stack([(share * opacity[..., None]).mean((0, 1)) for share, opacity in shares])
     for each in explain(regions):
@@ -187,6 +187,6 @@ def test_what_means_nothing_is_refused(world: World, tmp_path: Path, monkeypatch
         regions = regions_of(world, keys)
         if text == "0002:5,5":
             with torch.no_grad():
-                regions.views.model.get_parameter("field.to_density.weight").fill_(-1e6)
+                regions.scene.model.get_parameter("field.to_density.weight").fill_(-1e6)
         with pytest.raises(DataError if text == "0002:absent.png" else UsageError):
             find_regions(regions, text)

@@ -13,8 +13,8 @@ from two_sided import region_adain
 from fprf.errors import ConfigError
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, StylizerConfig
 from fprf.style.config import NO_MASK, StyleConfig
+from fprf.style.dictionary import Encoders
 from fprf.style.files import StyleFile, write_style
-from fprf.style.references import Encoders
 from fprf.style.restyle import apply_style
 from fprf.training.loading import Trained
 from fprf.training.views import render_view

@@ -73,28 +73,6 @@ def test_fields_are_as_good_and_go_on_as_they_are(world: World, fields: Path, ut
     assert parameters(Run(tmp_path / "more"), 20).keys() == parameters(Run(tmp_path / "once"), 20).keys()
 
 
-def test_older_runs_open_where_they_were(fields: Path, utm: Path, tmp_path: Path) -> None:
-    """Fields that were trained in the world's coordinates, before there were origins, show the same and are exported right."""
-    old, origin = tmp_path / "old", np.array(Run(fields).load_known().facts.origin)
-    shutil.copytree(fields, old)
-    document = json.loads((old / "scene.json").read_text())
-    del document["facts"]["origin"]
-    pose = np.array(document["cameras"]["pose"])
-    pose[:, :, 3] += origin
-    document["cameras"]["pose"] = pose.tolist()
-    document["facts"]["space"]["centre"] = (np.array(document["facts"]["space"]["centre"]) + origin).tolist()
-    (old / "scene.json").write_text(json.dumps(document))
-    now, before = load_run(fields, "cpu"), load_run(old, "cpu")
-    assert before.origin == now.origin
-    shown = [each.render(each.cameras, 3) for each in (now, before)]
-    assert torch.allclose(shown[0].rgb, shown[1].rgb, atol=1e-4) and torch.allclose(shown[0].depth, shown[1].depth, rtol=1e-3)
-    assert psnr(old) == pytest.approx(psnr(fields), abs=0.01)
-    assert Run(old).load_known().facts.origin == (0, 0, 0)
-    train(replace(tiny(utm, old), steps=16), "fprf-lite", quiet=True)
-    assert Run(old).load_known().facts.origin == (0, 0, 0), "the run goes on in its own coordinates"
-    assert np.abs(Run(old).load_known().cameras.pose[:, :, 3].numpy() - pose[:, :, 3]).max() < 1e-8
-
-
 def test_surfaces_are_exported_where_the_capture_is(fields: Path, tmp_path: Path) -> None:
     origin = np.array(load_run(fields, "cpu").origin)
     world, local = tmp_path / "world", tmp_path / "local"

@@ -21,7 +21,7 @@ from fprf.methods import fprf_lite
 from fprf.plugins.codec import save_config
 from fprf.rendering.space import Space
 from fprf.splats import cells
-from fprf.splats.cells import Cells, load_cells, read_views
+from fprf.splats.cells import Cells, load_cells
 from fprf.splats.config import GaussiansConfig
 from fprf.training import blocks, checkpoint, tensorfiles
 from fprf.training.blocks import load_blocks, load_finished
@@ -65,7 +65,7 @@ class Example:
             path.write_bytes(content)
 
     def readers(self) -> Iterator[Callable[[], object]]:
-        root, data = self.root, self.root.parent / "town"
+        root = self.root
         yield Run(root).load_config
         yield Run(root).load_known
         yield lambda: check_images(root, self.scene, image_hashes(self.scene))
@@ -75,7 +75,6 @@ class Example:
         yield lambda: load_finished(self.parts[0])
         yield lambda: renumber(root / "blocks", {1: "other"})
         yield lambda: load_cells(root)
-        yield lambda: read_views(root, GaussiansConfig(), data)
         yield lambda: [read_done(folder) for folder in self.parts]
         yield lambda: [checkpoint.load_latest(folder / "checkpoints") for folder in self.parts]
         yield lambda: [begin(folder, task_of(folder) or "other") for folder in self.parts]

@@ -9,7 +9,7 @@ from tiny_world import World
 from fprf.config import TrainConfig
 from fprf.rendering.cameras import ideal_cameras, rays_through
 from fprf.rendering.renderer import march
-from fprf.style.scene import SceneStyle, from_tensors
+from fprf.style.scene_style import SceneStyle, from_tensors
 from fprf.training.run import Run
 from fprf.training.style_pass import lattice, measure_style
 

@@ -27,7 +27,7 @@ from fprf.training import driver
 from fprf.training.driver import Report, train
 from fprf.training.loading import open_run
 from fprf.training.run import Run
-from fprf.training.tasks import WHOLE, Task, read_done, renumber, task_of, train_all
+from fprf.training.tasks import WHOLE, Task, renumber, task_of, train_all
 
 
 @pytest.mark.parametrize("part", [WHOLE, 0])
@@ -138,17 +138,6 @@ def test_a_damaged_done_json_is_named_or_the_part_trained_again(
             task_world.train(root, 0)
     else:
         assert task_world.train(root, 0) and same(task_world.tensors(root, 0), task_world.tensors(task_world.root, 0))
-
-
-def test_cells_of_before_are_as_finished_as_they_were(cell_world: TaskWorld, tmp_path: Path) -> None:
-    root = cell_world.copy(tmp_path)
-    for part in (WHOLE, 0, 1):
-        folder, asked = cell_world.folder_of(root, part), cell_world.done(root, part)["asked"]
-        (folder / "done.json").write_text(json.dumps({"format": 6, **asked}))
-        (folder / "task.json").write_text(json.dumps(asked["task"]))
-        assert not cell_world.train(root, part)
-        found = read_done(folder)
-        assert found is not None and found.asked == asked and task_of(folder) == asked["task"]
 
 
 class Remembering(Executor):

@@ -54,11 +54,6 @@ def test_a_seal_of_nonsense_is_damage(tmp_path: Path, seal: str | None) -> None:
         tensorfiles.load_sealed(tmp_path / "x")
 
 
-def test_files_of_before_there_were_seals_are_read(tmp_path: Path) -> None:
-    save_file(tensors(), tmp_path / "x")
-    assert tensorfiles.load_sealed(tmp_path / "x").keys() == tensors().keys()
-
-
 def test_nothing_is_left_where_writing_failed(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="memory format"):
         tensorfiles.save(tmp_path / "x", {"t": torch.zeros(2).to_sparse()})

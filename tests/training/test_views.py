@@ -15,9 +15,11 @@ from fprf.plugins.stylizers.config import (
     StylizerConfig,
 )
 from fprf.rendering.cameras import pixel_grid
+from fprf.style.config import StyleConfig
+from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
-from fprf.style.restyle import restyle
-from fprf.style.scene import own_style
+from fprf.style.restyle import apply_style
+from fprf.style.scene_style import own_style
 from fprf.training.loading import Trained, load_style
 from fprf.training.views import view_parts
 
@@ -55,7 +57,9 @@ def test_the_scenes_own_style_returns_the_render(world: World, stylizer: Stylize
 def test_a_restyle_is_the_restyled_render(world: World, stylizer: StylizerConfig, strength: float, chunk: int) -> None:
     trained = rendering(world, chunk=chunk)
     cached = trained.cached(trained.cameras, 2)
-    look = restyle(trained, world.references, stylizer, strength=strength, clusters=3).restyle
+    look = apply_style(
+        trained, StyleFile(StyleConfig(references=world.references, stylizer=stylizer, strength=strength, clusters=3))
+    ).restyle
     for style in (None, look, None):
         found, wanted = cached.restyled(style), trained.restyled(style).render(trained.cameras, 2)
         torch.testing.assert_close(found, wanted, atol=0, rtol=0)
@@ -72,13 +76,15 @@ def test_budget_and_background_hold(world: World, budget: float) -> None:
     assert sum(part.rays for part in cached.parts) == 32 * 24
     per_sample = 4 * (1 + 48 + trained.known.facts.dim) + 8
     kept = sum(len(part.kept.ray) for part in cached.parts)
-    assert kept * per_sample <= cached.bytes <= kept * per_sample + 16 * 32 * 24 + 8
+    assert kept * per_sample <= sum(part.bytes for part in cached.parts) <= kept * per_sample + 16 * 32 * 24 + 8
 
 
 def test_chunk_by_chunk_nothing_is_computed_ahead_and_means_are_those_of_match_maps(world: World) -> None:
     trained = rendering(world, chunk=100)
     known = trained.known
-    stylizer = restyle(trained, world.references, RegionOtConfig(), clusters=3).restyle.stylizer
+    stylizer = apply_style(
+        trained, StyleFile(StyleConfig(references=world.references, stylizer=RegionOtConfig(), clusters=3))
+    ).restyle.stylizer
     parts = view_parts(trained.model, known.facts, known.cameras, 2, trained.config.render)
     first = next(parts)
     assert first.rays == 100 and first.semantic is not None

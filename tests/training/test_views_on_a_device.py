@@ -13,11 +13,10 @@ from tiny_world import World
 from fprf.ops import backend
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from fprf.style.config import StyleConfig
-from fprf.style.dictionary import StyleDictionary, build_dictionary
+from fprf.style.dictionary import Encoders, StyleDictionary, build_dictionary, encode_photograph
 from fprf.style.files import StyleFile
 from fprf.style.match_maps import match_map
-from fprf.style.references import Encoders, encode_photograph
-from fprf.style.restyle import dress
+from fprf.style.restyle import apply_dictionary
 from fprf.training.loading import Trained, load_run
 from fprf.training.views import cache_view, render_view
 
@@ -46,7 +45,7 @@ def shown(world: World, made: dict[str, Made], device: str, stylizer: StylizerCo
         made[device] = trained, encoders, build_dictionary(read, clusters=3, seed=0)
     trained, encoders, dictionary = made[device]
     style = StyleConfig(references=world.references, stylizer=stylizer, keep=("0",), strength=0.8, luminance=0.2)
-    styled = dress(trained, StyleFile(style), encoders, dictionary)
+    styled = apply_dictionary(trained, StyleFile(style), encoders, dictionary)
     view = trained.restyled(styled.restyle).render(trained.cameras, 3)
     again = trained.cached(trained.cameras, 3).restyled(styled.restyle)
     return [*dictionary[:6], *view[:3], again.rgb, *match_map(trained, styled, 3)]

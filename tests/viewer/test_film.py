@@ -1,8 +1,7 @@
 import json
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import replace
 from pathlib import Path
-from queue import Queue
 
 import cv2
 import numpy as np
@@ -11,18 +10,23 @@ from session_helpers import Listener, plan_of, until
 from tiny_world import World
 
 from fprf.cli import main as cli
-from fprf.errors import ConfigError, FprfError, UsageError
+from fprf.errors import ConfigError, UsageError
+from fprf.io.images import Picture
 from fprf.viewer import messages
 from fprf.viewer import session as viewer_session
 from fprf.viewer.drawing import FieldPainter
-from fprf.viewer.film import Frame, Frames, film_cameras, film_frames, new_folder, queued_frames, write_film_files
+from fprf.viewer.film import film_cameras, film_frames, new_folder, write_film_files
 from fprf.viewer.look import Look, Photograph, set_rule
 from fprf.viewer.restyler import Restyler
 from fprf.viewer.session import Session
 
 
-def frame_of(restyler: Restyler) -> Frame:
-    return FieldPainter(restyler.scene, restyler, lambda *shown: None).frame
+def rendered(frame: Generator[None, None, Picture]) -> Picture:
+    while True:
+        try:
+            next(frame)
+        except StopIteration as end:
+            return np.asarray(end.value)
 
 
 def test_the_film_is_what_fprf_render_makes_of_its_folder(
@@ -41,12 +45,8 @@ def test_the_film_is_what_fprf_render_makes_of_its_folder(
     style = json.loads((folder / "style-3" / "style.json").read_text())["style"]
     assert style["strength"] == 0.75
     assert style["references"] == ["1-dusk.png"] and (folder / "style-3" / "1-dusk.png").is_file()
-    out: Frames = Queue()
-    told: list[tuple[int, int]] = []
-    for _ in film_frames(folder, scene, frame_of(restyler), out, lambda done, total: told.append((done, total))):
-        pass
-    frames = list(queued_frames(out))
-    assert len(frames) == 13 and told == [(i + 1, 13) for i in range(13)]
+    frames = [rendered(each) for each in film_frames(folder, scene, FieldPainter(scene, restyler, lambda *shown: None).frame)]
+    assert len(frames) == 13
     args = ["render", str(run), "--path", str(folder / "path.json"), "--keyframes", str(folder / "keys.json")]
     assert cli.main([*args, "--output", str(tmp_path / "frames")]) == 0
     pictures = [cv2.imread(str(p))[..., ::-1] for p in sorted((tmp_path / "frames").glob("*.png"))]
@@ -68,19 +68,9 @@ def test_paths_pass_through_their_keys(world: World) -> None:
             film_cameras(plan._replace(**change))  # type: ignore[arg-type]
 
 
-def test_a_film_that_fails_ends_with_its_error(restyler: Restyler, tmp_path: Path) -> None:
-    out: Frames = Queue()
-    with pytest.raises(FprfError, match="no such camera path"):
-        list(film_frames(tmp_path, restyler.scene, frame_of(restyler), out, lambda done, total: None))
-    with pytest.raises(FprfError, match="no such camera path"):
-        list(queued_frames(out))
-
-
 def test_a_film_that_cannot_be_written_leaves_room_for_the_next(
     session: Session, listener: Listener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """More frames than wait in the queue are rendered while nobody takes them."""
-
     def full(path: Path, frames: Iterator[object], fps: float) -> None:
         next(frames)
         raise OSError("disk full")

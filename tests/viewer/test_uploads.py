@@ -1,5 +1,3 @@
-import io
-import json
 import os
 import struct
 import subprocess
@@ -15,7 +13,6 @@ import pytest
 from photo_files import HEIC, turned_jpeg
 
 from fprf.errors import DataError
-from fprf.viewer import uploads
 from fprf.viewer.uploads import MAX_BYTES, MAX_SIDE, Uploads, check_photograph, shown_name
 
 
@@ -78,7 +75,7 @@ def test_a_decoder_that_died_is_replaced(uploaded: Uploads) -> None:
     uploaded.store(png(20, 20))
     process = uploaded._process
     process.kill()
-    process.wait()
+    process.join()
     assert uploaded.store(png(20, 20)).is_file() and uploaded._process is not process
 
 
@@ -86,22 +83,6 @@ def test_one_that_takes_too_long_is_ended() -> None:
     with closing(Uploads(timeout=0.0)) as hasty, pytest.raises(DataError, match="not decoded within"):
         hasty.store(png(20, 20))
     assert not hasty.folder.exists()
-
-
-def test_the_decoder_answers_line_by_line_and_survives_everything(tmp_path: Path) -> None:
-    (tmp_path / "good.png").write_bytes(png(40, 20))
-    (tmp_path / "bad.png").write_bytes(b"nothing")
-    asked = [
-        {"source": str(tmp_path / "bad.png"), "target": str(tmp_path / "x.png"), "side": 8},
-        {"source": str(tmp_path / "good.png"), "target": str(tmp_path / "y.png"), "side": 10},
-        {"source": str(tmp_path / "good.png"), "target": str(tmp_path / "no" / "where.png"), "side": 10},
-    ]
-    lines = [json.dumps(each) for each in asked]
-    answers = io.StringIO()
-    uploads.serve_decoder(io.StringIO("\n".join([*lines, "not json", "{}"]) + "\n"), answers)
-    said = [json.loads(line)["said"] for line in answers.getvalue().splitlines()]
-    assert len(said) == 5 and said[1] == "ok" and "no PNG" in said[0] and str(tmp_path) not in said[0]
-    assert cv2.imread(str(tmp_path / "y.png")).shape == (5, 10, 3)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="limits are a matter of Unix")

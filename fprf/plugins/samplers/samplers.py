@@ -73,7 +73,13 @@ class ProposalSampler(Sampler):
         for field, count in zip(self.levels, counts, strict=True):
             with torch.set_grad_enabled(learns):
                 if sharpness == 1 and isinstance(field, ProposalField) and field.kernels_apply(rays.origin, s):
-                    s = self._compiled(field, rays, s, space, count, generator)
+                    # Nothing is learnt from these edges: the same, ray by ray.
+                    table, weight = field.planes.table, field.to_density.weight[0]
+                    padding, shift = self.config.padding, shifts(s, generator)
+                    size = field.planes.resolutions[0]
+                    s = march.propose(
+                        rays, s, space.warp, table, size, weight, limit=LIMIT, padding=padding, count=count, shift=shift
+                    )
                     continue
                 t = space.distance(s, rays.near, rays.far)
                 points = rays.origin[:, None] + rays.direction[:, None] * midpoints(t)[..., None]
@@ -84,23 +90,6 @@ class ProposalSampler(Sampler):
             trusted = w.detach() if sharpness == 1 else w.detach().clamp_min(1e-7) ** sharpness
             s = resample(s, trusted, count, padding=self.config.padding, generator=generator)
         return Sampled(s, space.distance(s, rays.near, rays.far), tuple(levels))
-
-    def _compiled(
-        self, field: ProposalField, rays: Rays, s: Tensor, space: Space, count: int, generator: torch.Generator | None
-    ) -> Tensor:
-        """The same edges, where nothing is learnt from them, ray by ray."""
-        return march.propose(
-            rays,
-            s,
-            space.warp,
-            field.planes.table,
-            field.planes.resolutions[0],
-            field.to_density.weight[0],
-            limit=LIMIT,
-            padding=self.config.padding,
-            count=count,
-            shift=shifts(s, generator),
-        )
 
     def penalties(self) -> dict[str, Tensor]:
         """'proposal_variation' of all levels' planes."""

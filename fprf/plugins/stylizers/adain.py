@@ -15,8 +15,8 @@ from ...interfaces import Stylizer
 from ...ops import mixture
 from ...ops.precision import double, full_precision
 from ...style.dictionary import StyleDictionary, code_odds, whole_style
-from ...style.matching import compared, point_shares, score_spread, share_mean
-from ...style.scene import SceneStyle, check_fit
+from ...style.matching import point_shares, score_spread, share_mean, unit
+from ...style.scene_style import SceneStyle, check_fit
 from ...style.statistics import deviation
 from ...types import Want
 from .config import LocalAdainConfig
@@ -73,15 +73,16 @@ class LocalAdainStylizer(Stylizer):
         super().__init__()
         check_fit(dictionary, scene)
         self.matched = len(dictionary.keys) > 1 and dictionary.keys.shape[1] > 0
-        centre, theirs = scene.semantic_mean, share_mean(dictionary.keys, code_odds(dictionary).to(dictionary.keys))
-        regions, origin = scene.keys, None
-        if not config.centred:
-            origin = torch.zeros_like(centre) if dictionary.origin is None else dictionary.origin
-            if config.similarity == "cosine":
-                centre, theirs = origin, origin
-            else:
-                regions = regions - origin
-        queries, keys = compared(regions, dictionary.keys, config.similarity, queries_centre=centre, keys_centre=theirs)
+        # Both sides, such that their inner products are the scores R (paper, Eq. 5).
+        theirs = share_mean(dictionary.keys, code_odds(dictionary).to(dictionary.keys))
+        zero = torch.zeros_like(scene.semantic_mean) if dictionary.origin is None else dictionary.origin
+        centre = scene.semantic_mean if config.centred else zero
+        cosine = config.similarity == "cosine"
+        if cosine:
+            queries, keys = unit(scene.keys, centre), unit(dictionary.keys, theirs if config.centred else zero)
+        else:
+            # Softmax does not see what is subtracted from all keys; the smaller numbers round less.
+            queries, keys = scene.keys if config.centred else scene.keys - zero, dictionary.keys - theirs
         # The only region of an undivided scene lies at its mean, where it says nothing about scores.
         spread = score_spread(queries if len(queries) > 1 else keys, keys) if config.relative else 1.0
         self.temperature = config.temperature * spread
@@ -91,8 +92,8 @@ class LocalAdainStylizer(Stylizer):
         scene_sigma = deviation(double(scene.mean), double(scene.covariance).diagonal())
         gain = deviation(mean, covariance.diagonal(dim1=-2, dim2=-1)) / scene_sigma
         self.register_buffer("content_mean", scene.mean.float())
-        self.register_buffer("centre", centre.float() if config.similarity == "cosine" else None)
-        self.register_buffer("origin", None if origin is None or config.similarity == "cosine" else origin.float())
+        self.register_buffer("centre", centre.float() if cosine else None)
+        self.register_buffer("origin", None if cosine or config.centred else zero.float())
         self.register_buffer("keys", keys.float())
         self.register_buffer("prior", (dictionary.weight / dictionary.weight.amax()).float())
         self.register_buffer("odds", code_odds(dictionary).to(keys.device).float())

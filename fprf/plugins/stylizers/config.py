@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from ...interfaces import Stylizer
     from ...style.dictionary import StyleDictionary
-    from ...style.scene import SceneStyle
+    from ...style.scene_style import SceneStyle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +43,7 @@ class StylizerConfig(PluginConfig):
     def smoothing(
         self, scene: SceneStyle, allowed: Annotated[Tensor, "K references"] | None = None
     ) -> Annotated[Tensor, "K K"] | None:
-        """Matrix that smooths the matches of regions (`style.scene.region_smoothing`); None = not smoothed."""
+        """Matrix that smooths the matches of regions (`style.scene_style.region_smoothing`); None = not smoothed."""
         return None
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
@@ -86,7 +86,7 @@ class LocalAdainConfig(StylizerConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _RegionConfig(StylizerConfig):
+class RegionConfig(StylizerConfig):
     """Common fields of two-sided stylizers: points belong to scene regions, regions match style codes."""
 
     handles_allowed_references: ClassVar[bool] = True
@@ -122,29 +122,27 @@ class _RegionConfig(StylizerConfig):
         self, scene: SceneStyle, allowed: Annotated[Tensor, "K references"] | None = None
     ) -> Annotated[Tensor, "K K"] | None:
         """By `smoothness`."""
-        from ...style.scene import region_smoothing
+        from ...style.scene_style import region_smoothing
 
         return region_smoothing(scene, self.smoothness, allowed)
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
-        from ...style.matching import Matching
         from .region import ChannelMaps, MatrixMaps, TwoSidedStylizer, plan_regions
 
-        matching = Matching(self.temperature, self.similarity, self.whitening, self.recentred, self.centred)
-        plan = plan_regions(dictionary, scene, matching, self.smoothing(scene, dictionary.allowed))
+        plan = plan_regions(dictionary, scene, self, self.smoothing(scene, dictionary.allowed))
         maps = MatrixMaps if self.transport else ChannelMaps
         return TwoSidedStylizer(plan, scene, maps(plan, scene, self.gain))
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegionOtConfig(_RegionConfig):
+class RegionOtConfig(RegionConfig):
     """Two-sided optimal transport: regions match style codes, all channels move together."""
 
     transport: ClassVar[bool] = True
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegionToneConfig(_RegionConfig):
+class RegionToneConfig(RegionConfig):
     """Two-sided (recommended): half of AdaIN's change, then each region's colours as a whole to those of its match."""
 
     features: float = 0.5

@@ -18,10 +18,11 @@ from ...interfaces import Stylizer
 from ...ops import mixture
 from ...ops.precision import double, full_precision
 from ...style.dictionary import StyleDictionary, choose, code_odds, whole_style
-from ...style.matching import Keys, Matching, match_keys, unit
-from ...style.scene import Membership, SceneStyle, check_fit, own_style
+from ...style.matching import match_keys, unit
+from ...style.scene_style import Membership, SceneStyle, check_fit, own_style
 from ...style.statistics import deviation, monge
 from ...types import Want
+from .config import RegionConfig
 
 _UNMATCHED, _MATCHED = 0.1, 0.4
 """Cosines with the nearest code, from the scene's mean: up to the first a region is unmatched, from the second on matched."""
@@ -29,17 +30,17 @@ _SIMILAR = 0.2
 """Squared distance of contents, in total variances of the scene, at which the weight of another region falls to 1/e."""
 
 
-def region_table(scene: SceneStyle, dictionary: StyleDictionary, matching: Matching) -> Annotated[Tensor, "K T"]:
+def region_table(scene: SceneStyle, dictionary: StyleDictionary, config: RegionConfig) -> Annotated[Tensor, "K T"]:
     """Share of each style code in each region, float64; rows sum to 1.
 
     A region that may not take from all references is matched with the codes of the others as if there were only these.
     """
     if dictionary.allowed is None:
-        return _matched(scene, dictionary, matching)
+        return _matched(scene, dictionary, config)
     table = torch.zeros(len(scene.share), len(dictionary.share), dtype=torch.float64)
     for k, chosen in enumerate(dictionary.allowed):
         part, codes = choose(dictionary, chosen)
-        table[k, codes] = _matched(scene, part, matching)[k]
+        table[k, codes] = _matched(scene, part, config)[k]
     return table
 
 
@@ -60,12 +61,12 @@ class RegionPlan(NamedTuple):
 
 
 def plan_regions(
-    dictionary: StyleDictionary, scene: SceneStyle, matching: Matching, smoothing: Annotated[Tensor, "K K"] | None = None
+    dictionary: StyleDictionary, scene: SceneStyle, config: RegionConfig, smoothing: Annotated[Tensor, "K K"] | None = None
 ) -> RegionPlan:
     """Match the regions with the codes. The scene's statistics are blended and smoothed as the dictionary's are."""
     check_fit(dictionary, scene)
     own = own_style(scene, dictionary.blend)._replace(origin=dictionary.origin)
-    same, table = region_table(scene, own, matching), region_table(scene, dictionary, matching)
+    same, table = region_table(scene, own, config), region_table(scene, dictionary, config)
     if smoothing is not None:
         same, table = smoothing @ same, smoothing @ table
     before = _mixed(own, same)
@@ -165,12 +166,20 @@ class TwoSidedStylizer(Stylizer):
         return self.table
 
 
-def _matched(scene: SceneStyle, dictionary: StyleDictionary, matching: Matching) -> Annotated[Tensor, "K T"]:
+def _matched(scene: SceneStyle, dictionary: StyleDictionary, config: RegionConfig) -> Annotated[Tensor, "K T"]:
     odds = code_odds(dictionary)
     if len(scene.keys) == 1 or scene.keys.shape[1] == 0:
         return odds.expand(len(scene.keys), -1)
-    here, there = Keys(scene.keys, scene.share), Keys(dictionary.keys, odds)
-    table = match_keys(here, there, matching, dictionary.weight, dictionary.origin)
+    table = match_keys(
+        *(scene.keys, scene.share, dictionary.keys, odds, dictionary.weight),
+        temperature=config.temperature,
+        similarity=config.similarity,
+        whitening=config.whitening,
+        recentred=config.recentred,
+        centred=config.centred,
+        origin=dictionary.origin,
+    )
+    # Whether the references show such a thing at all is asked from the scene's mean: centred on its own, each side always fits.
     score = (unit(scene.keys, scene.semantic_mean) @ unit(dictionary.keys, scene.semantic_mean).T).amax(1)
     return _replace_unmatched(table, scene, (double(score) - _UNMATCHED) / (_MATCHED - _UNMATCHED))
 

@@ -9,7 +9,7 @@ from fprf.errors import DataError
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig
 from fprf.style.dictionary import Reference, build_dictionary
 from fprf.style.matching import score_spread, share_mean, unit
-from fprf.style.scene import own_style
+from fprf.style.scene_style import own_style
 from fprf.types import Want
 
 

@@ -17,7 +17,7 @@ from fprf.plugins.stylizers.adain import LocalAdainStylizer
 from fprf.plugins.stylizers.config import LocalAdainConfig
 from fprf.style.dictionary import Reference, build_dictionary, load_dictionary
 from fprf.style.look import Restyle
-from fprf.style.scene import SceneStyle, scene_style
+from fprf.style.scene_style import SceneStyle, scene_style
 from fprf.training.loading import load_style
 from fprf.training.views import render_view
 from fprf.types import Want

@@ -1,6 +1,7 @@
 """Two-sided stylizers against their definition, written out in float64; identity and limits."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -18,12 +19,13 @@ from fprf.plugins.stylizers.config import (
 )
 from fprf.plugins.stylizers.region import region_table
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
-from fprf.style.matching import Matching, Similarity, score_spread, share_mean, unit
-from fprf.style.scene import Membership, SceneStyle, own_style
+from fprf.style.matching import Similarity, score_spread, share_mean, unit
+from fprf.style.scene_style import Membership, SceneStyle, own_style
 from fprf.style.statistics import deviation, monge
 from fprf.types import Want
 
 BOTH = (region_adain, RegionOtConfig)
+CONFIG = region_adain(whitening=0.0, recentred=0)
 PAPER = LocalAdainConfig(similarity="dot", centred=False, relative=False, temperature=1.0)
 Config = Callable[..., StylizerConfig]
 
@@ -100,11 +102,11 @@ def test_a_region_that_no_reference_shows_takes_the_codes_of_one_that_looks_like
     mean = scene.region_mean.clone()
     mean[2] = mean[like]
     mean[other] = mean[like] + 100.0
-    shown = region_table(scene._replace(region_mean=mean), near, Matching(0.4, "cosine"))
+    shown = region_table(scene._replace(region_mean=mean), near, CONFIG)
     torch.testing.assert_close(shown[2], shown[like], rtol=0.0, atol=1e-6)
     assert float((shown[2] - shown[other]).abs().sum()) > 0.5
     torch.testing.assert_close(shown[:2], plain_table(scene, near, 0.4)[:2], rtol=1e-6, atol=1e-9)
-    alone = region_table(scene._replace(share=torch.tensor([0.0, 0.0, 1.0])), near, Matching(0.4, "cosine"))
+    alone = region_table(scene._replace(share=torch.tensor([0.0, 0.0, 1.0])), near, CONFIG)
     assert bool(alone.isfinite().all()), "no region to take from"
 
 
@@ -132,6 +134,6 @@ def test_never_nan_for_degenerate_scenes_and_styles(
 @pytest.mark.parametrize("similarity", ["cosine", "dot"])
 def test_the_table_is_the_softmax_of_the_scores(similarity: Similarity) -> None:
     _, _, scene, d = setting(n=600)
-    table = region_table(scene, d, Matching(0.4, similarity))
+    table = region_table(scene, d, replace(CONFIG, similarity=similarity))
     torch.testing.assert_close(table, plain_table(scene, d, 0.4, similarity), rtol=1e-6, atol=1e-9)
     torch.testing.assert_close(table.sum(1), torch.ones(3, dtype=torch.float64))

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from style_cases import points
 
 from fprf.errors import CheckpointError, DataError
-from fprf.style.scene import Membership, from_tensors, region_smoothing, scene_style, to_tensors
+from fprf.style.scene_style import Membership, from_tensors, region_smoothing, scene_style, to_tensors
 
 
 def weighted() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -1,4 +1,8 @@
-"""Style of a trained scene: one set of content statistics and its semantic regions."""
+"""Style of a trained scene: one set of content statistics, its semantic regions, and which points belong to them.
+
+Letters: N points, C content channels, D semantic channels, K regions, P pairs of neighbouring pixels. Statistics are sums in
+float64 and kept in float32; memberships are in [0, 1], and those of a point sum to 1.
+"""
 
 from collections.abc import Mapping
 from typing import Annotated, NamedTuple
@@ -8,10 +12,9 @@ from torch import Tensor, nn
 
 from ..errors import CheckpointError, DataError
 from ..ops.precision import double
-from .clusters import kmeans
 from .dictionary import BLEND, StyleDictionary, blend_codes
 from .matching import point_shares, score_spread, unit
-from .statistics import Moments, covariance, group_moments
+from .statistics import Moments, covariance, group_moments, kmeans
 from .statistics import moments as moments_of
 
 _SOFTNESS = 0.3
@@ -21,7 +24,6 @@ regions' statistics are taken with it."""
 _FAINT = 0.01
 """Memberships below this share of the largest are dropped: a point then belongs to two or three regions and the others
 cost nothing. What jumps there is below an 8-bit step."""
-
 
 _ALIKE = 0.05
 """Difference of colours in [0, 1] at which two neighbouring pixels count 0.6 as one surface; at three times that, 0.01."""
@@ -73,16 +75,23 @@ def scene_style(
     if semantic.shape[1] > 0:
         keys = kmeans(semantic, regions, seed=seed, weights=weights).centres
     middle = (double(weights) @ double(semantic) / double(weights).sum()).to(semantic)
-    alive, belongs = _regions(semantic, keys, middle)
-    keys, belongs = keys[alive], belongs * double(weights)[:, None]
-    mean, covariances, share = group_moments(content, belongs)
+    # K-means compares distances and membership compares directions, so a cluster may win no point. Memberships are taken again
+    # without it, as the stylizers will: no region has statistics of nothing.
+    while True:
+        belongs = membership(semantic, middle, *region_units(keys, middle))
+        used = belongs.sum(0) > 0
+        if bool(used.all()):
+            break
+        keys = keys[used]
+    # Statistics of each region over its members, each by its weight and its membership.
+    mean, covariances, share = group_moments(content, double(belongs) * double(weights)[:, None])
     contacts = share.new_zeros(len(share), len(share))
     measured = (whole.mean, covariance(whole), keys, mean, covariances, share, middle, contacts)
     return SceneStyle(*(table.float().cpu() for table in measured))
 
 
 def region_units(keys: Annotated[Tensor, "K D"], centre: Annotated[Tensor, "D"]) -> tuple[Annotated[Tensor, "K D"], float]:
-    """Directions of the regions' keys, and the (absolute) temperature at which points belong to them."""
+    """Return directions of the regions' keys, and the (absolute) temperature at which points belong to them."""
     units = unit(keys, centre)
     return units, _SOFTNESS * score_spread(units, units)
 
@@ -118,6 +127,24 @@ class Membership(nn.Module):
         return membership(semantic.to(self.units), self.centre, self.units, self._temperature)
 
 
+class RegionWeight(nn.Module):
+    """One number a region, at points: by how much they belong to each."""
+
+    values: Annotated[Tensor, "K X"]
+
+    def __init__(self, scene: SceneStyle, values: Annotated[Tensor, "K X"]) -> None:
+        super().__init__()
+        self.membership = Membership(scene)
+        self.register_buffer("values", values.float())
+
+    def forward(
+        self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
+    ) -> Annotated[Tensor, "N X"]:
+        """The values, mixed by membership (`belongs`, where it is known): exactly 0 where all of a point's regions have 0."""
+        share: Tensor = self.membership(semantic) if belongs is None else belongs
+        return share.to(self.values) @ self.values
+
+
 def region_contacts(
     scene: SceneStyle, semantic: Annotated[Tensor, "P 2 D"], colour: Annotated[Tensor, "P 2 3"]
 ) -> Annotated[Tensor, "K K"]:
@@ -130,6 +157,7 @@ def region_contacts(
     ends = [
         double(membership(part.contiguous().to(units), scene.semantic_mean, units, softness)) for part in semantic.unbind(1)
     ]
+    # What one region loses between the ends of a pair, another gains; across an edge of colour it counts little.
     change = ends[0] - ends[1]
     even = torch.exp(-double(colour[:, 0] - colour[:, 1]).abs().amax(1).square() / (2 * _ALIKE**2))
     passed = -(change * even[:, None]).T @ change / max(1, len(change))
@@ -151,6 +179,7 @@ def region_smoothing(
     contacts = double(scene.contacts).to(unity)
     if allowed is not None:
         contacts = contacts * (allowed[:, None] == allowed[None]).all(-1).to(unity)
+    # The minimum solves (diag(s) + smoothness (diag(c 1) - c)) x = diag(s) v.
     share = torch.diag(double(scene.share).to(unity))
     smooth: Tensor = torch.linalg.solve(share + smoothness * (torch.diag(contacts.sum(1)) - contacts), share)
     return smooth
@@ -204,18 +233,3 @@ def from_tensors(tensors: Mapping[str, Tensor]) -> SceneStyle:
         if not bool(t.isfinite().all()):
             raise CheckpointError(f"scene statistics: {name} is not finite; compute the statistics again")
     return scene
-
-
-def _regions(semantic: Tensor, keys: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
-    """Keys that some point belongs to, and memberships among those alone: no region has statistics of nothing.
-
-    K-means compares distances and membership compares directions, so a cluster may win no point. Memberships are taken
-    again without it, as the stylizers will.
-    """
-    alive = torch.arange(len(keys), device=keys.device)
-    while True:
-        belongs = membership(semantic, centre, *region_units(keys[alive], centre))
-        used = belongs.sum(0) > 0
-        if bool(used.all()):
-            return alive, double(belongs)
-        alive = alive[used]

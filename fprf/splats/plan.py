@@ -1,0 +1,83 @@
+"""Size of the photographs and number of Gaussians that a time on this machine is best used for.
+
+P pixels of a photograph, V training views, N Gaussians, T seconds on the machine that the constants were measured on. A step
+takes A s P + B N, where s is the share of the full size's pixels that a step sees on average: the first steps see reduced ones.
+
+Size counts first, the number of Gaussians second: llff_flower at 1008 x 756 is better after one minute of that size (26.4 dB)
+than after five at 504 x 378 (26.8 dB with 60 000 Gaussians); then 27.7 dB after five minutes and 28.1 after fifteen with more.
+"""
+
+import math
+import time
+from dataclasses import replace
+
+import torch
+
+from ..datamanagers.scene import Scene
+from .config import GaussiansConfig
+
+_PIXEL, _GAUSSIAN = 91e-9, 103e-9
+"""A and B in seconds, on two x86-64 cores."""
+_START = 6.0
+"""Seconds before the first step, at least: reading photographs, first points."""
+_STEPS, _PASSES = 900, 5
+"""Steps, and passes over the views, below which photographs are reduced further."""
+_LEAST = 400 * 225
+"""Pixels below which none is reduced for lack of time."""
+_PATIENCE = 600.0
+"""Seconds within which steps have to end where no minutes are given: larger photographs are reduced."""
+_FEWEST, _MOST, _GROWTH = 60_000, 1_000_000, 0.6
+"""Gaussians of a minute, the most of all, and the power of the time that their number grows with."""
+_PROBE, _REPEATS, _REFERENCE = 1 << 16, 200, 55e-6
+"""Numbers whose exponential is taken, how often, and the seconds of the fastest on one of the two cores named above."""
+
+
+def plan(config: GaussiansConfig, scene: Scene) -> GaussiansConfig:
+    """Return the config with `downscale` and `cap` decided for a scene at its own size; given ones stay."""
+    sizes = scene.cameras.size[scene.train]
+    if not len(sizes):
+        return replace(config, downscale=config.downscale or 1, cap=config.most)
+    views, pixels, longest = len(sizes), float(sizes.double().prod(1).mean()), int(sizes.max())
+    speed = machine_speed()
+    budget = None if config.minutes is None else max(1.0, 60 * config.minutes - _START) * speed
+    smallest = max(1, math.ceil(longest / config.longest))
+    size, seconds = config.downscale or smallest, 0.0
+    while True:
+        each = _seconds(config, pixels / size**2, _FEWEST)
+        steps = config.limited(views)
+        if budget is None:
+            enough, seconds = steps * each <= _PATIENCE * speed, steps * each
+        else:
+            enough, seconds = budget / each >= max(_STEPS, _PASSES * views), min(budget, steps * each)
+        if enough or config.downscale is not None or pixels / (size + 1) ** 2 < _LEAST:
+            break
+        size += 1
+    cap = config.cap
+    if cap is None:
+        cap = min(_MOST, max(_FEWEST, round(_FEWEST * (seconds / 60) ** _GROWTH, -4)))
+        if config.cells == 1:
+            cap = min(cap, max(1, int(views * pixels / size**2) // config.pixels_per_gaussian))
+    return replace(config, downscale=size, cap=cap)
+
+
+def machine_speed() -> float:
+    """Speed of this machine relative to the one of the constants, from the exponentials that its fastest core takes in time."""
+    values, best = torch.linspace(-8.0, 0.0, _PROBE), math.inf
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        for _ in range(_REPEATS):
+            start = time.perf_counter()
+            torch.exp(values)
+            best = min(best, time.perf_counter() - start)
+    finally:
+        torch.set_num_threads(threads)
+    # A step's work is spread over the cores but for a part.
+    return _REFERENCE / best * math.pow(threads / 2, 0.8)
+
+
+def _seconds(config: GaussiansConfig, pixels: float, gaussians: int) -> float:
+    """Seconds of a step, on average, on the machine of the constants."""
+    coarse = config.coarse
+    share = (1 - coarse) + coarse * 2 / 3 / 4 + coarse / 3 / 16
+    return _PIXEL * share * pixels + _GAUSSIAN * gaussians

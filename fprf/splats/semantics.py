@@ -1,0 +1,284 @@
+"""Semantics of Gaussians, found by looking at them: features of rendered views, carried back to what they show.
+
+Views are encoded as photographs are; a guided filter brings the features to their pixels, regions compete for the pixels where
+they meet by colour and depth (`ops.local_mixture`), and each Gaussian takes the mean of the pixels that it shows in, by its
+weights there. The *content* of such a scene is its colour, as drawn: a style is then an affine map of colours, which acts on
+harmonics exactly. Statistics are those of pixels: Gaussians themselves have less contrast (deviation 0.13 against 0.17 on a
+plant), since what is seen is a mix of many.
+
+Shapes: N Gaussians, V views of H W pixels and h w cells of the encoder's, C channels of the encoder, D principal components of
+them that are kept, K regions. Layers are channels last; colours in [0, 1].
+"""
+
+import contextvars
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Annotated, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from ..datamanagers.basis import Basis, fit_basis
+from ..datamanagers.config import GuidedConfig
+from ..errors import CheckpointError, DataError
+from ..interfaces import Encoder
+from ..ops.backend import compiled
+from ..ops.guided import upsample
+from ..ops.local_mixture import explained
+from ..ops.rasterise import lift
+from ..rendering.cameras import Cameras
+from ..style.scene_style import SceneStyle, membership, region_contacts, region_units, scene_style
+from ..style.scene_style import from_tensors as style_from
+from ..style.scene_style import to_tensors as style_tensors
+from .gaussians import Gaussians, bulk_of
+from .levels import seen_by
+from .photographs import camera_of
+from .views import OUTLYING, draw
+
+_CHANNELS = 31
+"""Principal components of the semantics that are kept; with the weight they are carried back in four vectors of eight."""
+_SOLID = 0.5
+"""Pixels and cells less opaque than this say nothing about the scene."""
+_TRUST = 4.0
+"""Pixels count by this power of their opacity: a soft edge would carry the backdrop's semantics."""
+_SAMPLES = 65_536
+"""Pixels of all views together that statistics are taken of, about."""
+_COARSER = 2
+"""Features, which are smooth, are filtered and carried back at the views' resolution divided by this."""
+_MEETING = 0.25
+"""Half the width of the windows in which regions compete for pixels, as a share of the root of a view's area."""
+_GRAIN, _ROUGH = 0.03, 0.05
+"""Deviations of colours in [0, 1], and of the logarithm of depth, that tell nothing apart."""
+_TOGETHER = 8
+"""Components of the features that are spread at a time: of all Gaussians there are copies of so many."""
+_NEIGHBOURS, _NEIGHBOURHOODS, _EDGE = 1.0, 8, 0.02
+"""Pixels that the nearest neighbourhood counts for, half of it for each that is twice as wide; how many; the edge of the
+nearest one, as a share of the spread of the positions."""
+_VIEWS_AT_ONCE = 4
+"""Views that are looked at at the same time, at most: each takes the memory of what it draws."""
+_Result = TypeVar("_Result")
+
+
+class Semantics(NamedTuple):
+    """Semantics of N Gaussians, gathered from views."""
+
+    style: SceneStyle
+    basis: Basis
+    features: Annotated[Tensor, "N D"]
+    """Half precision."""
+    encoder: str
+    """Identity of the encoder."""
+
+
+class _Picture(NamedTuple):
+    """A view as drawn, and what the encoder makes of it."""
+
+    image: Annotated[Tensor, "H W 3"]
+    """Colours times opacity."""
+    opacity: Annotated[Tensor, "H W"]
+    depth: Annotated[Tensor, "H W"]
+    maps: Annotated[Tensor, "C h w"]
+
+
+@torch.inference_mode()
+def find_semantics(
+    gaussians: Gaussians,
+    antialiased: bool,
+    encoder: Encoder,
+    cameras: Cameras,
+    regions: int,
+    *,
+    near: float,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Semantics:
+    """Encode views of Gaussians, carry the features back, and find the regions. Lenses are left out.
+
+    Raises DataError where nothing is opaque enough to be seen.
+    """
+    count, total = len(cameras), 3 * len(cameras)
+
+    # 1. Draw the views and encode them; the encoder leaves out what is transparent.
+    def encoded(view: int) -> _Picture:
+        camera = camera_of(cameras, view, near)
+        drawn = draw(gaussians.select(seen_by(gaussians, camera)), camera, antialiased=antialiased)
+        maps = encoder.cutout(drawn.image.permute(2, 0, 1)[None], drawn.opacity[None])[0].float()
+        return _Picture(drawn.image, drawn.opacity, drawn.depth, maps)
+
+    pictures, solid = [], []
+    for view, picture in enumerate(_in_threads(encoded, count)):
+        progress(view, total)
+        pictures.append(picture)
+        cover = interpolate(picture.opacity[None, None], picture.maps.shape[1:], mode="area")[0, 0]
+        solid.append(picture.maps[:, cover > _SOLID].T)
+    if not any(len(each) for each in solid):
+        raise DataError("nothing in the capture is opaque enough to be seen; it cannot be restyled")
+
+    # 2. Bring the principal components of the encoder's cells to pixels, by the guided filter that photographs pass. Its window
+    # is a share of the root of the area: one of the shorter side of an upright view hardly covers two of the encoder's cells,
+    # and a fir before the sky was half sky.
+    basis, guided, reduced = fit_basis(torch.cat(solid), _CHANNELS), GuidedConfig(), cameras.scaled(_COARSER)
+
+    def filtered(view: int) -> tuple[Tensor, Tensor]:
+        """Colours times opacity, opacity and depth times opacity [h w 5], and features [h w D]."""
+        image, opacity, depth, maps = pictures[view]
+        width, height = reduced.size[view].tolist()
+        layers = torch.cat([image, opacity[..., None], (depth * opacity)[..., None]], 2)
+        coarse = interpolate(layers.permute(2, 0, 1)[None], (height, width), mode="area")[0].permute(1, 2, 0)
+        low = basis.project(maps.flatten(1).T).T.reshape(-1, *maps.shape[1:])
+        filled = (coarse[..., :3] + (1 - coarse[..., 3])[..., None]).clamp(0, 1)
+        radius = round(guided.radius * math.sqrt(width * height))
+        return coarse, upsample(low, filled, radius=radius, eps=guided.eps, stride=guided.stride)
+
+    pixels = []
+    for view, each in enumerate(_in_threads(filtered, count)):
+        progress(count + view, total)
+        pixels.append(each)
+    style = _statistics(pictures, pixels, regions)
+    pictures.clear()  # they are seen; what follows takes as much memory
+    # Before the threads begin: some of numba's own layers bear one caller at a time.
+    units = region_units(style.keys, style.semantic_mean)
+    shares = [membership(fine.flatten(0, 1), style.semantic_mean, *units).view(*fine.shape[:2], -1) for _, fine in pixels]
+
+    # 3. Where regions meet, features move to those that explain what a pixel looks like, by its colour and depth; then each
+    # Gaussian takes the mean of its pixels, by its weights there.
+    def carried(view: int) -> tuple[Tensor, Tensor]:
+        """Numbers of the Gaussians that the view shows, and sums of features and of weights over their pixels [M D+1]."""
+        (coarse, fine), share = pixels[view], shares[view]
+        opacity = coarse[..., 3]
+        depth = (coarse[..., 4] / opacity.clamp_min(_SOLID)).clamp_min(1e-30).log()
+        guide, noise = torch.cat([_colours(coarse), depth[..., None]], 2), torch.tensor([*3 * (_GRAIN,), _ROUGH])
+        after = explained(share, guide, opacity > _SOLID, radius=_MEETING * math.sqrt(opacity.numel()), noise=noise)
+        fine, trust = fine + (after - share) @ style.keys, coarse[..., 3:4] ** _TRUST
+        camera = camera_of(reduced, view, near)
+        index = seen_by(gaussians, camera)
+        shape = (gaussians.means[index], gaussians.quaternions[index], gaussians.log_scales[index], gaussians.logits[index])
+        return index, lift(*shape, camera, torch.cat([fine * trust, trust], 2), antialiased=antialiased)
+
+    dim = basis.matrix.shape[1]
+    sums, weights = torch.zeros(len(gaussians), dim), torch.zeros(len(gaussians))
+    for view, (index, lifted) in enumerate(_in_threads(carried, count)):
+        progress(2 * count + view, total)
+        sums.index_add_(0, index, lifted[:, :dim])
+        weights.index_add_(0, index, lifted[:, dim])
+    progress(total, total)
+    # As many pixels as the views have at their own size.
+    sums *= _COARSER**2
+    weights *= _COARSER**2
+    features = _spread(gaussians.means, sums, weights, style.semantic_mean)
+    return Semantics(style, basis, features, encoder.identity)
+
+
+def _statistics(pictures: list[_Picture], pixels: list[tuple[Tensor, Tensor]], regions: int) -> SceneStyle:
+    """Regions and statistics of pixels, and which regions meet, from some of the pixels at reduced resolution."""
+    every = max(1, sum(picture.opacity.numel() for picture in pictures) // (_SAMPLES * _COARSER**2))
+    samples, pairs = [], []
+    for (image, opacity, _, _), (coarse, fine) in zip(pictures, pixels, strict=True):
+        # Colours are those of single pixels of the whole picture: averages would have less contrast.
+        height, width = fine.shape[:2]
+        colour, seen = (each[::_COARSER, ::_COARSER][:height, :width].flatten(0, 1) for each in (image, opacity))
+        at = (seen[::every] > _SOLID).nonzero()[:, 0] * every
+        samples.append(((colour[at] / seen[at, None]).clamp(0, 1), fine.flatten(0, 1)[at], seen[at]))
+        # Neighbours along rows: where both are solid.
+        solid = coarse[..., 3] > _SOLID
+        pair = (solid[:, :-1] & solid[:, 1:]).flatten().nonzero()[::every, 0]
+        shown = torch.cat([_colours(coarse), fine], 2)
+        pairs.append(torch.stack([shown[:, :-1].flatten(0, 1)[pair], shown[:, 1:].flatten(0, 1)[pair]], 1))
+    colour, semantic, seen = (torch.cat(each) for each in zip(*samples, strict=True))
+    style, ends = scene_style(colour, semantic, seen, None, regions, seed=0), torch.cat(pairs)
+    if len(style.share) == 1:
+        return style
+    return style._replace(contacts=region_contacts(style, ends[..., 3:], ends[..., :3]))
+
+
+def _colours(coarse: Annotated[Tensor, "H W 4+"]) -> Annotated[Tensor, "H W 3"]:
+    """Colours of solid pixels without what is behind them."""
+    return (coarse[..., :3] / coarse[..., 3:4].clamp_min(_SOLID)).clamp(0, 1)
+
+
+def _in_threads(function: Callable[[int], _Result], count: int) -> Iterator[_Result]:
+    """function(0), function(1), ... function(count - 1) in order: several at a time, each on one thread.
+
+    For views. The operations on one are too short to be shared between threads, which would wait for each other most of the
+    time. At most one more is under way than there are threads, so memory is bounded.
+    """
+    before = torch.get_num_threads()
+    threads = min(before, _VIEWS_AT_ONCE)
+
+    def begin() -> None:
+        torch.set_num_threads(1)
+        if compiled():
+            import numba
+
+            numba.set_num_threads(1)
+
+    waiting: deque[Future[_Result]] = deque()
+    with ThreadPoolExecutor(threads, "fprf-views", begin) as pool:
+        try:
+            for number in range(count):
+                # Modes of this thread hold in others only if they are carried over.
+                run = contextvars.copy_context().run
+                waiting.append(pool.submit(run, torch.inference_mode()(function), number))
+                if len(waiting) > threads:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            torch.set_num_threads(before)  # which threads that begin later take over
+
+
+def _spread(
+    points: Annotated[Tensor, "N 3"], sums: Annotated[Tensor, "N D"], mass: Annotated[Tensor, "N"], none: Annotated[Tensor, "D"]
+) -> Annotated[Tensor, "N D"]:
+    """Means at points, drawn to those of ever larger neighbourhoods, which decide where little was seen: half precision.
+
+    A point far from whatever was seen takes `none`.
+    """
+    trust, levels = mass.clone(), []
+    # Neither stray Gaussians nor the distance from the origin decide how large neighbourhoods are, nor where they begin.
+    near = points[torch.from_numpy(bulk_of(points.numpy()).apart <= OUTLYING)].double()
+    edge = _EDGE * float(near.var(0, correction=0).mean().sqrt())
+    # Each level divides space into boxes twice as wide; a box counts for at most so many pixels, however much was seen there.
+    for level in range(_NEIGHBOURHOODS):
+        box = ((points - near.amin(0)) / max(edge * 2**level, 1e-30)).clamp(-1, 2.0**20).long() + 1
+        _, box = torch.unique((box[:, 0] << 42) + (box[:, 1] << 21) + box[:, 2], return_inverse=True)
+        weight = sums.new_zeros(int(box.max()) + 1).index_add_(0, box, mass)
+        share = weight.clamp_max(_NEIGHBOURS * 0.5**level) / weight.clamp_min(1e-12)
+        trust += (weight * share)[box]
+        levels.append((box.int(), share))
+    # Means of a point's own pixels and of its box in each level, by these weights.
+    out = torch.empty(sums.shape, dtype=torch.float16)
+    for some in torch.split(torch.arange(sums.shape[1]), _TOGETHER):
+        part = sums[:, some]
+        mean = part.clone()
+        for box, share in levels:
+            mean += (sums.new_zeros(len(share), len(some)).index_add_(0, box, part) * share[:, None])[box]
+        out[:, some] = torch.where(trust[:, None] > 1e-6, mean / trust.clamp_min(1e-12)[:, None], none[some]).half()
+    return out
+
+
+def semantics_tensors(found: Semantics) -> dict[str, Tensor]:
+    """Return semantics for a file of tensors."""
+    parts = {"style": style_tensors(found.style), "basis": found.basis.tensors()}
+    named = {f"{group}.{name}": tensor for group, tensors in parts.items() for name, tensor in tensors.items()}
+    return {**named, "semantic": found.features, "encoder": torch.tensor([*found.encoder.encode()], dtype=torch.uint8)}
+
+
+def load_semantics(tensors: dict[str, Tensor], count: int) -> Semantics:
+    """Read the tensors of `semantics_tensors`. Raises CheckpointError where they are not of as many Gaussians."""
+    features = tensors.get("semantic", torch.zeros(0, 0))
+    try:
+        basis = Basis.from_tensors(tensor_group(tensors, "basis"))
+        encoder = bytes(tensors["encoder"].tolist()).decode()
+    except (KeyError, ValueError, DataError) as error:
+        raise CheckpointError(f"what is known of a capture is incomplete ({error})") from error
+    if features.shape != (count, basis.matrix.shape[1]):
+        raise CheckpointError(f"what is known of a capture has features {tuple(features.shape)}; it is of another one")
+    return Semantics(style_from(tensor_group(tensors, "style")), basis, features.half(), encoder)
+
+
+def tensor_group(tensors: Mapping[str, Tensor], name: str) -> dict[str, Tensor]:
+    """Tensors whose names begin with `name` and a dot, without these."""
+    return {key.partition(".")[2]: tensor for key, tensor in tensors.items() if key.startswith(f"{name}.")}
