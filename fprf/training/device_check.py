@@ -70,7 +70,7 @@ def fast_paths(device: torch.device) -> Iterator[tuple[str, str]]:
     with torch.no_grad():
         compiled = dense.usable(probe)
     if compiled:
-        yield "kernels", "numba's: tri-planes, networks, proposals, matching, guided filter"
+        yield "kernels", "numba's: tri-planes, networks, maps of styles, guided filter"
     else:
         yield "kernels", "none: everything by torch"
     if device.type == "cuda":
@@ -110,17 +110,7 @@ def _tiny(encoder: str, channels: int) -> tuple[TrainConfig, Facts]:
     )
     axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     space = Space(kind="contraction", centre=(0.0, 0.0, 0.0), rotation=axes, scale=1.0, near=0.1, far=100.0)
-    facts = Facts(
-        space=space,
-        channels=channels,
-        dim=_DIM,
-        content_encoder=encoder,
-        semantic_encoder="",
-        content_scale=1.0,
-        semantic_scale=1.0,
-        background=None,
-    )
-    return config, facts
+    return config, Facts(space=space, channels=channels, dim=_DIM, content_encoder=encoder)
 
 
 def _camera() -> Cameras:
