@@ -101,7 +101,7 @@ def plan(kinds: Sequence[str], output: Path) -> Plan:
 
     Raises UsageError for what does not fit.
     """
-    formats = [ending[1:] for ending in endings()]
+    formats = [ending[1:] for ending in endings() if ending[1:] not in KINDS]
     wanted: list[str] = []
     for kind in kinds:
         if kind not in (*formats, *KINDS, *_ALSO, "splats"):
