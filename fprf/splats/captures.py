@@ -159,7 +159,7 @@ def light_alone(styled: Styled) -> Styled:
     It is the median over regions, by their share, of what takes their mean colour to that of what they match; what a region is
     made of plays no part where both sides show the same things. Raises UsageError for stylizers that carry no colours.
     """
-    look, style = styled.restyle, styled.scene
+    look, style = styled.restyle, styled.scene_style
     if look.colours is None:
         raise UsageError("--match-light: needs a stylizer that carries colours, such as --stylizer region-tone")
     mean = style.region_mean.double()

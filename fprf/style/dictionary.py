@@ -70,7 +70,7 @@ class Encoders(NamedTuple):
     content: Encoder
     semantic: Encoder | None
     basis: "Basis | None"
-    scene: "SceneStyle"
+    scene_style: "SceneStyle"
     device: torch.device = torch.device("cpu")
     """Device of the encoders."""
     longest: int = 512
