@@ -98,7 +98,7 @@ def _mapped(colours: Tensor, memberships: Tensor, opacity: Tensor, shown: Shown)
 
 
 def _memberships(restyler: Restyler, semantic: Tensor) -> Annotated[Tensor, "N K"]:
-    style = restyler.encoders.scene
+    style = restyler.encoders.scene_style
     share: Tensor = RegionWeight(style, torch.eye(len(style.share))).to(semantic.device)(semantic.float())
     return share
 
