@@ -21,7 +21,7 @@ from ..datamanagers.bounds import FAR, NEAR, ROUNDING, axes
 from ..datamanagers.scene import TILES, Scene, Sightings, find_sightings, tile_of
 from ..errors import ConfigError, DataError
 from ..rendering.cameras import Cameras, rays_through
-from ..rendering.space import Space
+from ..rendering.space import Space, slab
 from ..types import Cell, Site
 from .config import LayoutConfig
 from .routing import chart_of
@@ -144,9 +144,8 @@ def tile_rays(scene: Scene, space: Space, views: Annotated[Tensor, "M"], sightin
 def meets(tiles: Tiles, cell: Cell) -> Annotated[Tensor, "M TILES TILES"]:
     """True where the rays of a tile meet a block, border included, before they end: the slab test."""
     chart, origin = chart_of(cell), tiles.origin[:, None, None]
-    safe = torch.where(tiles.direction.abs() < 1e-9, torch.full_like(tiles.direction, 1e-9), tiles.direction)
-    a, b = (chart.low.to(origin) - origin) / safe, (chart.high.to(origin) - origin) / safe
-    enter, leave = torch.minimum(a, b).amax(-1).clamp_min(0), torch.maximum(a, b).amin(-1)
+    enter, leave = slab(origin, tiles.direction, chart.low.to(origin), chart.high.to(origin))
+    enter = enter.clamp_min(0)
     return (enter <= leave) & (enter <= tiles.reach) & (tiles.pixels > 0)
 
 

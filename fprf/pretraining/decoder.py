@@ -26,7 +26,7 @@ from ..plugins.weights import write_weights
 from ..style.statistics import deviation
 from ..training.prepare import device_of
 from .config import PretrainDecoderConfig
-from .loop import generator_of, sheet, train
+from .loop import generator_of, train
 from .photos import filtered_at, filtered_crop, filtered_whole, find_photos, load_photo, random_pixels, split
 
 Report = dict[str, float | int | str]
@@ -189,7 +189,6 @@ def restyling_losses(
 
 REPORT_PHOTOS = 20
 LONGEST = 384
-SAMPLE_PHOTOS, SAMPLE_LONGEST = 3, 192
 
 
 def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[[str], None]) -> Report:
@@ -241,7 +240,7 @@ def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[
         structure, style = restyling_losses(crops, network, decode, *pair)
         return identity + config.every * (config.content * structure + config.style * style)
 
-    steps = train(decoder, loss, config, output, say, _picture(encoder, held, decode, device))
+    steps = train(decoder, loss, config, output, say)
     # W (f - mean) / std + b as one linear layer of f, in float64.
     with torch.no_grad():
         weight = double(decoder.first.weight) / double(std)
@@ -292,24 +291,3 @@ def restyling_report(crops: Crops, network: StyleNetwork, decode: Decode) -> Rep
     losses = [restyling_losses(crops, network, decode, i[None], (i[None] + 1) % count) for i in index]
     content, style = (sum(float(each) for each in column) / count for column in zip(*losses, strict=True))
     return {"content_loss": round(content, 4), "style_loss": round(style, 4)}
-
-
-def _picture(
-    encoder: Encoder, held: Sequence[Path], decode: Decode, device: torch.device
-) -> Callable[[], Annotated[Tensor, "H W 3"]]:
-    """Rows of photo | decoded | decoded in the style of the next photo."""
-    photos = [load_photo(path, SAMPLE_LONGEST).to(device) for path in held[:SAMPLE_PHOTOS]]
-    features = [filtered_whole(encoder, photo)[None] for photo in photos]
-    styles = []
-    for each in features:
-        mean = each.mean(1)
-        styles.append((mean, deviation(mean, each.var(1, correction=0))))
-
-    def picture() -> Annotated[Tensor, "H W 3"]:
-        rows = []
-        for i, photo in enumerate(photos):
-            styled = adain(features[i], styles[i], styles[(i + 1) % len(photos)])
-            rows.append([photo, decode(features[i][0]).view_as(photo), decode(styled[0]).view_as(photo)])
-        return sheet(rows)
-
-    return picture

@@ -93,7 +93,17 @@ def orbit(cameras: Cameras, frames: int) -> Cameras:
     distance = offset.norm(dim=-1)
     azimuth = torch.atan2(offset @ north, offset @ east)
     elevation = torch.asin(((offset @ up) / distance.clamp(min=1e-12)).clamp(-1, 1))
-    angle = _sweep(azimuth, frames)
+    # A closed walk over the azimuths: a circle, or to and fro where more than 100 degrees hold no camera.
+    phase = torch.arange(frames, dtype=azimuth.dtype, device=azimuth.device) / frames
+    around = azimuth.sort().values
+    gaps = torch.cat([around[1:], around[:1] + 2 * math.pi]) - around
+    widest = int(gaps.argmax())
+    first = float(around[(widest + 1) % len(around)])
+    if float(gaps[widest]) < math.radians(100):
+        angle = first + 2 * math.pi * phase
+    else:
+        arc = 2 * math.pi - float(gaps[widest])
+        angle = first + arc * (1 - torch.cos(2 * math.pi * phase)) / 2
     # Von Mises kernel, about 15 degrees wide; the maximum is taken out so that an empty azimuth takes the nearest camera.
     closeness = 15 * torch.cos(angle[:, None] - azimuth)
     share = torch.softmax(closeness, dim=-1)
@@ -194,19 +204,6 @@ def _focus_depth(cameras: Cameras, view: int) -> float:
     spread = float((cameras.pose[:, :, 3] - pose[:, 3]).norm(dim=-1).max())
     # Parallel axes show something far away compared with the baseline, as in any capture that can be reconstructed.
     return ahead if ahead > 0 else (4 * spread if spread > 0 else 1.0)
-
-
-def _sweep(azimuth: Annotated[Tensor, "V"], frames: int) -> Annotated[Tensor, "F"]:
-    """Angles of a closed walk over the azimuths: a circle, or to and fro where more than 100 degrees hold no camera."""
-    phase = torch.arange(frames, dtype=azimuth.dtype, device=azimuth.device) / frames
-    around = azimuth.sort().values
-    gaps = torch.cat([around[1:], around[:1] + 2 * math.pi]) - around
-    widest = int(gaps.argmax())
-    first = float(around[(widest + 1) % len(around)])
-    if float(gaps[widest]) < math.radians(100):
-        return first + 2 * math.pi * phase
-    arc = 2 * math.pi - float(gaps[widest])
-    return first + arc * (1 - torch.cos(2 * math.pi * phase)) / 2
 
 
 MOTIONS = ("spiral", "orbit", "interpolate", "dataset")

@@ -32,6 +32,16 @@ def contract(x: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
     return (1 - 0.5 / m) * (x / m)
 
 
+def slab(
+    origin: Annotated[Tensor, "... 3"], direction: Annotated[Tensor, "... 3"], low: Tensor, high: Tensor
+) -> tuple[Annotated[Tensor, "..."], Annotated[Tensor, "..."]]:
+    """Ray parameters at which rays enter and leave a box; the first is the larger one where they miss it."""
+    # A direction along a face: any crossing so far away that it decides nothing.
+    safe = torch.where(direction.abs() < 1e-9, torch.full_like(direction, 1e-9), direction)
+    a, b = (low - origin) / safe, (high - origin) / safe
+    return torch.minimum(a, b).amax(-1), torch.maximum(a, b).amin(-1)
+
+
 @dataclass(frozen=True)
 class Space:
     """One scene's map to the unit cube; plain numbers, saved with the run."""
@@ -63,7 +73,9 @@ class Space:
         else:
             o = o * self.scale
             if self.kind == "box":
-                near, far = self._slab(o, d)
+                near, far = slab(o, d, self._constant("low", o), self._constant("high", o))
+                near = near.clamp_min(self.near)
+                far = torch.maximum(far, near)  # a ray that misses the box gets an empty interval
             else:
                 near, far = torch.full_like(o[:, 0], self.near), torch.full_like(o[:, 0], self.far)
         return Rays(o.float(), d.float(), direction.float(), near.float(), far.float())
@@ -153,12 +165,3 @@ class Space:
         dx, dy, dz = d.unbind(-1)
         way = torch.stack([-fx * (dx / dz - x / z), -fy * (dy / dz - y / z), -2 * self.near / z], -1)
         return first, way
-
-    def _slab(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-        """Ray parameters at which rays enter and leave the box; a ray that misses it gets an empty interval."""
-        low, high = self._constant("low", o), self._constant("high", o)
-        safe = torch.where(d.abs() < 1e-12, torch.full_like(d, 1e-12), d)
-        a, b = (low - o) / safe, (high - o) / safe
-        near = torch.minimum(a, b).amax(-1).clamp_min(self.near)
-        far = torch.maximum(a, b).amin(-1)
-        return near, torch.maximum(far, near)

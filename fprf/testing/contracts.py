@@ -49,8 +49,20 @@ from ..plugins.typed_json import from_json, to_json
 from ..rendering.renderer import render_rays
 from ..types import Batch, Rays, Rendered, Sampled, Want
 from . import cases
-from .breaches import Unread, close, follows, penalties, pointwise, require, same, shares, tensor, trainable
-from .outputs import check_affine, check_needs
+from .outputs import (
+    Unread,
+    check_affine,
+    check_needs,
+    close,
+    follows,
+    penalties,
+    pointwise,
+    require,
+    same,
+    shares,
+    tensor,
+    trainable,
+)
 
 Kind = TypeVar("Kind")
 

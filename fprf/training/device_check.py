@@ -110,17 +110,7 @@ def _tiny(encoder: str, channels: int) -> tuple[TrainConfig, Facts]:
     )
     axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     space = Space(kind="contraction", centre=(0.0, 0.0, 0.0), rotation=axes, scale=1.0, near=0.1, far=100.0)
-    facts = Facts(
-        space=space,
-        channels=channels,
-        dim=_DIM,
-        content_encoder=encoder,
-        semantic_encoder="",
-        content_scale=1.0,
-        semantic_scale=1.0,
-        background=None,
-    )
-    return config, facts
+    return config, Facts(space=space, channels=channels, dim=_DIM, content_encoder=encoder)
 
 
 def _camera() -> Cameras:

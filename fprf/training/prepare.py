@@ -151,12 +151,6 @@ def facts_of(
     others = tuple(sorted(set(range(len(scene.paths))) - set(scene.train.tolist())))
     return Facts(
         space=space,
-        channels=0,
-        dim=0,
-        content_encoder="",
-        semantic_encoder="",
-        content_scale=1.0,
-        semantic_scale=1.0,
         background=background,
         exposure=exposure,
         held=others if exposure or poses else (),

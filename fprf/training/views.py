@@ -113,13 +113,11 @@ def _view_of(parts: Iterable[Part], decoder: Decoder, restyle: Restyle | None, s
 
 def _on_host(view: View) -> View:
     """A view on the CPU, copied from an accelerator in one piece, since the host waits for each copy."""
-    tensors = view.rgb, view.depth, view.opacity
     if view.rgb.device.type == "cpu":
         return view
-    flat = torch.cat([each.reshape(-1) for each in tensors]).cpu()
-    parts = torch.split_with_sizes(flat, [each.numel() for each in tensors])
-    rgb, depth, opacity = (part.view(each.shape) for part, each in zip(parts, tensors, strict=True))
-    return View(rgb, depth, opacity, view.kept)
+    flat = torch.cat([each.reshape(-1) for each in (view.rgb, view.depth, view.opacity)]).cpu()
+    rgb, depth, opacity = torch.split_with_sizes(flat, [view.rgb.numel(), view.depth.numel(), view.opacity.numel()])
+    return View(rgb.view_as(view.rgb), depth.view_as(view.depth), opacity.view_as(view.opacity), view.kept)
 
 
 def render_view(

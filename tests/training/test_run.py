@@ -189,17 +189,14 @@ def test_the_history_of_a_training_that_was_resumed(tmp_path: Path) -> None:
     """What came after the step that it went on from is dropped, as are damaged lines and values."""
     run = write(
         tmp_path,
-        {"part": "preparing", "seconds": 2.5},
         step(1, 0.5, 12.0, rgb=0.3),
         step(5, 5, 30.0),
         step(9, 9),
         {"damaged": "step-9: model"},
-        {"part": "preparing", "seconds": 0.5},
         step(5, 5.5, 31.0, rgb=0.1, content=2.0),
         {"step": 7, "skipped": "rgb"},
         '{"step": 8, "seconds": 9, "psnr": NaN, "kept": true}',
         "[1]",
-        {"part": "training", "seconds": 7},
         '{"step": 9, "seco',
     )
     (history,) = read_history(run)

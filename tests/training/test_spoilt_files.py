@@ -104,7 +104,6 @@ def example(tmp_path_factory: pytest.TempPathFactory) -> Example:
         done = {"format": 1, "asked": {"task": "a"}, "step": 3, "seconds": 1.5, "tensors": manifest}
         write_json(part / "done.json", done)
         checkpoint.write(part / "checkpoints", TENSORS, TENSORS, step=3, seconds=1.5)
-        Run(part).log({"part": "preparing", "seconds": 0.5})
         Run(part).log({"step": 3, "seconds": 1.5, "psnr": 20.0, "losses": {"rgb": 0.1}})
     made.content.update({path: path.read_bytes() for path in root.rglob("*") if path.is_file()})
     return made
