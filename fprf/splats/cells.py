@@ -40,7 +40,7 @@ from ..training.tasks import WHOLE, Part, Task, digest_of, read_done, run_task, 
 from ..types import Cell
 from .config import GaussiansConfig
 from .gaussians import Gaussians, from_tensors, tensors_of
-from .initial import spatial_order
+from .initial import curve_order
 from .learner import MOVES, GaussianLearner, Stage
 from .levels import in_view
 from .loading import refined
@@ -298,7 +298,7 @@ def shown_in_windows(cameras: Cameras, cell: Cell, gaussians: Gaussians, near: f
     visible = cell.around(gaussians.means)
     # Runs [B R] of Gaussians near to each other, the last one repeated, with balls around what they show: most windows
     # show few of them.
-    order = torch.from_numpy(spatial_order(gaussians.means.double().numpy()))
+    order = torch.from_numpy(curve_order(gaussians.means.double().numpy()))
     order = torch.nn.functional.pad(order[None], (0, -len(order) % _RUN), mode="replicate").view(-1, _RUN)
     means, quaternions, log_scales = (x[order] for x in (gaussians.means, gaussians.quaternions, gaussians.log_scales))
     centre = (means.double().amin(1) + means.double().amax(1)) / 2
