@@ -190,6 +190,7 @@ class Blend(Router):
         named = (*blocks, len(self.cells))
         if not blocks:
             return [Group(named, index, None)]
+        # Only the blocks near these points are weighed, and only those with a say are ever fetched.
         weight = shares(points[index], [self.cells[block] for block in blocks])
         weight = torch.where(weight > SLIGHT, weight, torch.zeros_like(weight))
         most, best = weight.max(-1)
@@ -199,6 +200,7 @@ class Blend(Router):
             mine = index[alone & (best == place)]
             if len(mine):
                 groups.append(Group((member,), mine, None))
+        # In borders several have a say: their weights are scaled to 1 once the slight ones are left out.
         shared = (~alone).nonzero()[:, 0]
         if len(shared):
             own = weight[shared]

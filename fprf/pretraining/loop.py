@@ -50,12 +50,14 @@ class NetworkLearner(Learner):
         return next(self.network.parameters()).device
 
     def step(self, index: int, share: float) -> None:
+        # Linear warm-up, then one cosine to zero over the whole schedule.
         warm = min(1.0, share / WARM_UP + 0.01)
         self.optimizer.param_groups[0]["lr"] = self.config.rate * warm * 0.5 * (1 + math.cos(math.pi * share))
         value = self.loss(generator_of(self.config.seed, index))
         self.optimizer.zero_grad(set_to_none=True)
         value.backward()  # type: ignore[no-untyped-call]
         self.value, self.seen = value.detach(), self.seen + self.config.batch
+        # A loss that is not finite changes nothing.
         finite = bool(torch.isfinite(self.value))
         self.skipped, self.failed = self.skipped + (not finite), 0 if finite else self.failed + 1
         if finite:

@@ -205,6 +205,7 @@ def render_rays(
             semantics = parts.semantic(kept.point) if styled and parts.semantic is not None else None
             rgb = composite(kept, shade(parts.decoder, features, semantics, restyle), count) + backdrop
     if Want.SEMANTIC in want and parts.semantic is not None:
+        # Semantics follow the geometry and never move it (paper, semantic field).
         semantic = _semantics(
             marched, _detached(rays), parts, count if semantic_rays is None else semantic_rays, semantic_samples
         )
@@ -218,6 +219,7 @@ def _semantics(marched: March, rays: Rays, parts: Parts, count: int, samples: in
     weights = marched.weights[:count].detach()
     s = min(samples or weights.shape[1], weights.shape[1])
     heaviest, index = weights.topk(s, dim=-1, sorted=False)
+    # What the other samples would add is given to these, so that nothing is dimmer for being cheaper.
     scale = marched.opacity[:count, None] / heaviest.sum(-1, keepdim=True).clamp_min(1e-10)
     t = midpoints(marched.sampled.t[:count]).gather(1, index)
     points = rays.origin[:count, None] + rays.direction[:count, None] * t[..., None]

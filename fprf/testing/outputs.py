@@ -96,6 +96,7 @@ def follows(call: Callable[[], Tensor], like: Tensor, name: str) -> None:
 
     Called with float64 on the CPU, while new tensors that name no device are put elsewhere: those cannot be computed with.
     """
+    # Results first: then a tensor made without a device, which would land elsewhere on an accelerator.
     plain = call()
     kind_found, kind = f"{plain.dtype} on {plain.device}", f"{like.dtype} on {like.device}"
     require(kind_found == kind, f"{name}: expected {kind} for inputs of that kind, found {kind_found}")
@@ -180,6 +181,7 @@ def check_parts(config: "TrainConfig", parts: "Parts", channels: int, dim: int) 
     """Fields, decoder and sampler of a model on the CPU, at some points of the unit cube. Raises PluginError."""
     points = 0.9 * torch.sin(torch.arange(3.0 * POINTS).view(POINTS, 3))
     view = torch.nn.functional.normalize(points + 2, dim=1)
+    # Each part is fed what the one before it returned, as in a render, so the first breach names its maker.
     with told_of(config.content.field):
         sample = asked("density", parts.field.density, points)
         tensor(sample.density, (POINTS,), "density", low=0.0, slack=_SLACK)

@@ -62,6 +62,7 @@ def cut(
     # Features of all training views, into the cache that all blocks read.
     content, semantic = build_encoders(config)
     build_decoder(config, encoder=content.identity, channels=content.channels)  # refused now, not after all the features
+    # One store for all blocks: one basis and one unit of the losses, so that features mean the same in each.
     background, cache, views = behind(config, scene), cache_folder() / "features", scene.train.tolist()
 
     def image(view: int) -> Tensor:
@@ -74,6 +75,7 @@ def cut(
     if semantic is not None:
         dim = config.semantic.dim
         semantic_store = extract(cache / "semantic", views, image, semantic, guided, dim=dim, progress=progress)
+    # Exposures are relative to all views, not to those that a block sees.
     exposure = exposure_of(config.tones, scene, lambda view: image(view).float() / 255, saved)
     facts = field_facts(config, scene, plan.space, exposure, (content, semantic), (content_store, semantic_store))
     return Blocks(config, scene, plan, facts, None if semantic_store is None else semantic_store.basis)
@@ -143,6 +145,7 @@ def asked_of(
         "views": views,
         "facts": [facts.channels, facts.dim, facts.content_encoder, facts.semantic_encoder, facts.background, facts.exposure],
     }
+    # Tiles count as bytes: another layout around a block leaves its rays, and so its task, as they are.
     task = digest_of(config, FREE_IN_BLOCKS, scene, views, parts, rays["seen"].numpy().tobytes())
     return {"task": task, "steps": config.steps, "minutes": config.minutes}
 
@@ -204,6 +207,7 @@ def open_block(task: Task) -> Block:
     root, block = Path(task.root), task.part
     run, folder = Run(root), folder_of(root, block)
     config, facts = fields_only(run.load_config()[0], root), run.load_known().facts
+    # A worker may see the scene at another path; views are numbers, so it must be the same scene.
     scene, rays = read_scene(replace(config, data=Path(task.data)), facts), tensorfiles.read(folder / RAYS)
     if len(rays["views"]) and int(rays["views"].max()) >= len(scene.paths):
         raise ConfigError(f"{folder}: its views are not those of {scene.name}; train with the scene that the run was cut from")

@@ -96,6 +96,7 @@ def inset(config: TrainConfig, facts: Facts, cell: Cell, around: Built, views: A
     """
     chart = chart_of(cell)
     member = Member(chart, *build_fields(config, facts))
+    # What the surroundings have learnt of this place is not learnt again.
     inherit(member, around.member)
     # Decoder and tones stay as they are, so that all blocks mean the same by a colour; the surroundings go on learning.
     decoder = copy.deepcopy(around.model.decoder).requires_grad_(False)

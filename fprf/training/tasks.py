@@ -99,6 +99,7 @@ def train_part(part: Part, report: Callable[[Report], None]) -> bool:
     A folder that was trained as something else is started anew. Raises DataError where another process trains there.
     """
     with held(part.folder):
+        # Whoever runs a task again, on whichever machine, finds out here that nothing is left to do.
         done = read_done(part.folder)
         if done is not None and done.asked == part.asked and part.is_intact():
             return False
@@ -155,6 +156,7 @@ def digest_of(
     content: bytes = b"",
 ) -> str:
     """Digest of what a part is trained as: the config but for fields that are `free`, its views, and whatever else decides."""
+    # Poses and intrinsics, as floats in full; images as checksums of their files.
     tree = to_json(config)
     assert isinstance(tree, dict)
     document = {
@@ -178,6 +180,7 @@ def task_of(folder: Path) -> str | None:
 
 def begin(folder: Path, task: str) -> None:
     """Begin a part as a task, or resume it: what was trained there as another one is removed."""
+    # First of all: a part that is trained further is not finished, even if this is cut short.
     (folder / _DONE).unlink(missing_ok=True)
     if task_of(folder) == task:
         return

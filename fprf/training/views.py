@@ -179,6 +179,7 @@ def paint_pixels(
     Pixels that see nothing get 0. `values` is given features without channels where the scene has no semantics or
     `semantic` is false. Neither content nor colour is computed.
     """
+    # Geometry and semantics alone; content, the widest network, is not needed.
     rays, _, _ = view_rays(model, cameras, view, pixel)
 
     def paint(here: slice) -> tuple[Tensor, Tensor]:
@@ -216,17 +217,20 @@ def fit_pose(
     """
     device, tones = model.device, model.tones
     through, background = PixelRays(cameras.select(torch.tensor([view]))), background_of(facts, device)
+    # Photographs are compared as the view took them: a held-out view by what its exposure says.
     factor = torch.ones(3) if tones is None else tones(torch.tensor([view]))[0].detach().cpu()
     pixels, generator = truth.reshape(-1, 3), torch.Generator().manual_seed(view)
     used = None if where is None or not bool(where.any()) else where.reshape(-1).nonzero()[:, 0]
     move = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     optimizer = torch.optim.Adam([move], lr=_FIT_RATE, betas=(0.9, 0.95))
+    # A few random pixels a step are enough for six numbers.
     for step in range(FIT_STEPS):
         optimizer.param_groups[0]["lr"] = 0.5 * _FIT_RATE * (1 + math.cos(math.pi * step / FIT_STEPS))
         at = torch.randint(len(pixels) if used is None else len(used), (_FIT_RAYS,), generator=generator)
         at = at if used is None else used[at]
         pixel = torch.stack([at % truth.shape[1], at // truth.shape[1]], -1) + 0.5
         origin, direction = through(torch.zeros_like(at), pixel)
+        # Only the move has a gradient: samples are placed as if the pose were fixed (see `moving`).
         turned = rotated(direction, move[:3].expand_as(direction))
         rays = moving(model.space.rays(origin + reach * move[3:], turned))
         rays = Rays(*(x.to(device) for x in rays))
