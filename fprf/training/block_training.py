@@ -25,18 +25,16 @@ from ..datamanagers.scene import Scene
 from ..errors import ConfigError
 from ..interfaces import Learner, Partition
 from ..progress import Display
-from ..style.scene_style import to_tensors
 from ..types import Cell
 from . import tensorfiles
 from .blocks import FILE, Built, folder_of, inset, load_blocks, load_finished, surroundings
 from .driver import Schedule
-from .learner import FieldLearner, outcome
+from .learner import FieldLearner, finish
 from .loading import load_run
 from .model import Facts, build_decoder
 from .prepare import Prepared, behind, build_encoders, cache_folder, device_of, exposure_of, field_facts, read_scene
 from .run import Run
-from .style_pass import measure_style
-from .tasks import WHOLE, Part, Task, digest_of, renumber, run_task, task_of, train_all
+from .tasks import WHOLE, Part, Task, digest_of, renumber, task_of, train_all
 
 RAYS = "rays.safetensors"
 """In a block's folder: `views` [M] and their tiles `seen` [M TILES TILES] that it learns from."""
@@ -99,11 +97,8 @@ class Blocks(Partition):
         display.say(f"{len(self.plan.cells)} blocks and their surroundings")
         executor = config.executor.on(device_of(config.device).type).build()
         order = self.plan.rays.argsort(descending=True).tolist()
-        train_all(config, run, executor, run_block, order, whole_share=SHARE, spent=spent, quiet=display.quiet)
-        display.say("measuring the scene's own style")
-        trained = load_run(run.root, config.device)
-        run.save_tensors("style", to_tensors(measure_style(config, trained.model, scene.cameras, scene.train)))
-        display.say(outcome(run, config, scene))
+        train_all(config, run, executor, open_block, order, whole_share=SHARE, spent=spent, quiet=display.quiet)
+        finish(run, display, config, load_run(run.root, config.device).model, scene)
 
     def write(self, run: Run) -> None:
         """Write all that tasks read. Blocks that were trained as what another number is now are moved there."""
@@ -223,8 +218,3 @@ def open_block(task: Task) -> Block:
         facts=facts,
         rays=rays,
     )
-
-
-def run_block(task: Task) -> None:
-    """Train a block, here or on a worker."""
-    run_task(task, open_block)

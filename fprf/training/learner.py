@@ -218,11 +218,7 @@ class FieldLearner(SceneLearner):
         return f", space {facts.space.kind}, {facts.channels} content{semantics} channels{', tones' * bool(facts.exposure)}"
 
     def finish(self, run: Run, display: Display) -> None:
-        """Measure the scene's own style, and say what quality training reached."""
-        display.say("measuring the scene's own style")
-        style = measure_style(self.config, self.model, self.prepared.scene.cameras, self.prepared.scene.train)
-        run.save_tensors("style", to_tensors(style))
-        display.say(outcome(run, self.config, self.prepared.scene))
+        finish(run, display, self.config, self.model, self.prepared.scene)
 
     def _rays(self, batch: Batch) -> tuple[Rays, Tensor | None]:
         """The rays of a batch, and their parameters at its known distances."""
@@ -353,6 +349,13 @@ def clear_denormals(optimizer: torch.optim.Optimizer) -> None:
         if first is not None and second is not None:
             torch.hardshrink(first, FAINT_FIRST, out=first)
             torch.threshold_(second, FAINT_SECOND, 0.0)
+
+
+def finish(run: Run, display: Display, config: TrainConfig, model: Model, scene: ParsedScene) -> None:
+    """Measure and keep the scene's own style, and say what quality training reached."""
+    display.say("measuring the scene's own style")
+    run.save_tensors("style", to_tensors(measure_style(config, model, scene.cameras, scene.train)))
+    display.say(outcome(run, config, scene))
 
 
 def outcome(run: Run, config: TrainConfig, scene: ParsedScene) -> str:

@@ -19,6 +19,7 @@ import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -123,7 +124,7 @@ def train_all(
     config: RunConfig,
     run: Run,
     executor: Executor,
-    work: Callable[[Task], None],
+    open_part: Callable[[Task], Part],
     order: Sequence[int],
     *,
     whole_share: float,
@@ -144,6 +145,7 @@ def train_all(
         if config.minutes is not None:
             left = config.minutes - (time.perf_counter() - begun) / 60
             minutes = share * max(left, 0.05 * config.minutes)
+        work = partial(run_task, open_part=open_part)  # which other processes can be sent
         executor.map(work, [Task(root=root, data=data, part=part, minutes=minutes, quiet=quiet) for part in parts])
 
 
