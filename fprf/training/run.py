@@ -157,7 +157,7 @@ class Run:
 
     def save_tensors(self, name: str, tensors: dict[str, Tensor]) -> None:
         """Write NAME.safetensors, with a checksum for each tensor."""
-        tensorfiles.save_sealed(self.root / f"{name}.safetensors", tensors)
+        tensorfiles.save(self.root / f"{name}.safetensors", tensors, sealed=True)
 
     def load_tensors(self, name: str) -> dict[str, Tensor]:
         """Read NAME.safetensors. Raises CheckpointError where training did not get that far, or the file is damaged."""

@@ -51,11 +51,6 @@ def save(path: Path, tensors: Mapping[str, Tensor], *, sealed: bool = False) -> 
     return entries
 
 
-def save_sealed(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Write the tensors with their own manifest inside. Raises DataError where the system refuses."""
-    save(path, tensors, sealed=True)
-
-
 def load_sealed(path: Path) -> dict[str, Tensor]:
     """The tensors of a sealed file, checked. Raises CheckpointError naming file and tensor."""
     try:
