@@ -185,12 +185,10 @@ def _with(node: ast.AST, **changes: object) -> ast.AST:
 
 
 MODULES: dict[str, tuple[str, ...]] = {
-    "fprf/ops/march.py": ("ops/test_march.py",),
     "fprf/ops/triplane.py": ("ops/test_triplane.py",),
     "fprf/ops/dense.py": ("ops/test_dense.py",),
     "fprf/ops/guided.py": ("ops/test_guided.py",),
     "fprf/ops/mixture.py": ("ops/test_mixture.py",),
-    "fprf/ops/march_kernels.py": ("ops/test_march.py",),
     "fprf/ops/dense_kernels.py": ("ops/test_dense.py",),
     "fprf/ops/guided_kernels.py": ("datamanagers/test_features.py",),
     "fprf/ops/mixture_kernels.py": ("ops/test_mixture.py",),

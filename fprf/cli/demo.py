@@ -162,13 +162,12 @@ def compiling() -> Iterator[None]:
 def _compile() -> None:
     import torch
 
-    from ..ops.mixture import attention, scaled
+    from ..ops.mixture import scaled
 
     if hasattr(os, "nice"):
         os.nice(_NICE)
     point = torch.zeros(1, 3)
     with torch.inference_mode():
-        attention(point, point, 1.0)
         scaled(point, torch.ones(1, 1), point, point, centre=point[0])
 
 

@@ -72,7 +72,7 @@ def run(args: list[str]) -> int:
     access = make_access(config.host, config.token)
     with contextlib.ExitStack() as stack:
         server = stack.enter_context(ViewerServer(access, config.port))
-        from ..viewer.scene_files import is_capture
+        from ..viewer.uploads import is_capture
 
         path = config.run
         if path is not None and not (config.follow or is_capture(path) or (path / "config.json").is_file()):
@@ -122,8 +122,8 @@ def _start(server: "ViewerServer", config: ViewConfig, references: Sequence[Path
 
 def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[str], None]) -> "Viewed":
     """The scene of a run or a capture, under its own name where none is given."""
-    from ..viewer.scene_files import is_capture
     from ..viewer.session import Viewed, view_of_run
+    from ..viewer.uploads import is_capture
 
     if not is_capture(path):
         from ..training.loading import open_run

@@ -105,6 +105,7 @@ def render_maps(scene: Scene, cameras: Cameras, *, side: int, reach: float, repo
 
 def build_mesh(maps: Maps, *, edge: float | None = None, report: Report = lambda done, total: None) -> Mesh:
     """The mesh of near surfaces. Raises DataError where no surface comes out."""
+    # Depths of all views become distances on a lattice, and their zero a mesh.
     cell, origin, width = _lattice(maps, edge)
     known, value = _signed_distance(maps, cell, origin, width, report)
     at, face = surface_nets(cell[known], value)
@@ -130,6 +131,7 @@ def vertex_colours(maps: Maps, mesh: Mesh) -> Annotated[Tensor, "N 3"]:
     One view alone would give neighbours the exposures of different pictures. Where no view sees a vertex, those count that miss
     it least.
     """
+    # A view's weight: its pixels on the surface there, and steeply less where it sees something else.
     total, share = torch.zeros(len(mesh.point), 3, dtype=torch.float64), torch.zeros(len(mesh.point), 1, dtype=torch.float64)
     for view, rgb in enumerate(maps.rgb):
         gap, distance, pixel = _gaps(maps, view, mesh.point)
@@ -163,6 +165,7 @@ def _gaps(maps: Maps, view: int, point: Annotated[Tensor, "P 3"]) -> tuple[Tenso
 def _lattice(maps: Maps, edge: float | None) -> tuple[Annotated[Tensor, "M 3"], Annotated[Tensor, "3"], float]:
     """Lattice points near what is seen, the place of (0, 0, 0), and the edge: doubled until they are few enough."""
     origin, seen = maps.cameras.pose[:, :, 3].mean(0), []
+    # The lattice is as fine as the pixels on the surface are; what is seen too coarsely stays out.
     width = torch.cat([(depth / maps.cameras.focal[view].mean())[depth.isfinite()] for view, depth in enumerate(maps.depth)])
     if not len(width):
         raise DataError("export: no view sees a surface within reach; raise --reach, or train longer (see `fprf eval`)")

@@ -164,7 +164,3 @@ class ProposalField(nn.Module):
     def forward(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
         """Density per space unit at points of the unit cube."""
         return self.planes.density(points, self.to_density.weight[0])[0]
-
-    def kernels_apply(self, *tensors: Tensor) -> bool:
-        """Return whether `ops.march.propose` may read the planes: without gradients, on the CPU, channels in whole vectors."""
-        return dense.usable(*tensors) and triplane.usable(tensors[0], self.planes.table)

@@ -101,21 +101,17 @@ def resolve(config: C, args: Sequence[str]) -> tuple[C, list[str]]:
         slot = todo[0]
         seen.add(slot.path)
         name, rest = take_flag(rest, slot.path)
-        if name is not None:
-            config = _fill(config, slot, name)
+        if name is None:
+            continue
+        # Nothing, the plug-in that is there, or another one.
+        if name == "none":
+            if not slot.optional:
+                raise UsageError(f"--{slot.path}: cannot be none; allowed are {', '.join(slot.choices)}")
+            config = replace(config, slot.path, None)
+            continue
+        try:
+            if type(slot.value) is not registry.load(slot.kind.group, name, slot.kind):
+                config = replace(config, slot.path, registry.make(slot.kind.group, name, slot.kind))
+        except PluginError as error:
+            raise PluginError(f"--{slot.path}: {error}") from error
     return config, rest
-
-
-def _fill(config: C, slot: Slot, name: str) -> C:
-    if name == "none":
-        if not slot.optional:
-            raise UsageError(f"--{slot.path}: cannot be none; allowed are {', '.join(slot.choices)}")
-        return replace(config, slot.path, None)
-    try:
-        chosen = registry.load(slot.kind.group, name, slot.kind)
-        if type(slot.value) is chosen:
-            return config
-        value = registry.make(slot.kind.group, name, slot.kind)
-    except PluginError as error:
-        raise PluginError(f"--{slot.path}: {error}") from error
-    return replace(config, slot.path, value)

@@ -111,13 +111,6 @@ class Space:
         # Both round: the clamp keeps them in order where they meet, since a negative step would be a negative weight.
         return torch.where(g < 0.5, 2 * g, 0.5 / c.clamp(max=0.5))
 
-    @cached_property
-    def warp(self) -> Annotated[Tensor, "7"]:
-        """`locate` and `distance` as compiled kernels take them: 0 contraction, 1 box, 2 open, then the map of the box."""
-        number = {"contraction": 0.0, "box": 1.0, "ndc": 1.0, "open": 2.0}[self.kind]
-        low = torch.tensor(self.low)
-        return torch.cat([torch.tensor([number]), low, 2 / (torch.tensor(self.high) - low)])
-
     def metric(
         self, origin: Annotated[Tensor, "R 3"], direction: Annotated[Tensor, "R 3"], t: Annotated[Tensor, "R"]
     ) -> Annotated[Tensor, "R"]:

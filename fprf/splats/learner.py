@@ -317,7 +317,7 @@ class GaussianLearner(SceneLearner):
 
     def begin(self, run: Run) -> str:
         most = self.config.limited(len(self.levels[0]))
-        passes = f"; at most {most} steps: {self.config.passes} passes over the photographs (--passes)"
+        passes = f"; at most {most} steps: {self.config.most_passes} passes over the photographs (--passes)"
         light = ", tones" if self.tones is not None else ""
         return f", {self.model.count} Gaussians at {self.origin}{light}{passes if most < self.config.steps else ''}"
 

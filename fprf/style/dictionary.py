@@ -227,6 +227,7 @@ def build_dictionary(
             digest.update(part.detach().float().cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()
 
+    # By content, so that the order in which they were named does not show even in the rounding of sums.
     ordered = sorted(references, key=lambda r: (content_hash(r), r.name, r.weight))
     parts = [_codes_of(r, clusters, blend, seed, min_members) for r in ordered]
     return concatenate(parts, [r.name for r in ordered], [r.weight for r in ordered])
@@ -248,6 +249,7 @@ def _codes_of(r: Reference, clusters: int, blend: float, seed: int, min_members:
     label, keys = r.semantic.new_zeros(len(r.semantic), dtype=torch.int64), r.semantic[:1].float()
     if r.semantic.shape[1] > 0:
         keys, label = kmeans(r.semantic, clusters, seed=seed)
+    # Codes with few members say little: the fewer, the more of the whole image they take.
     member = double(torch.nn.functional.one_hot(label, len(keys)))
     share = member.sum(0) / len(label)
     at = 1 - (1 - blend) * (share * len(label) / min_members).clamp_max(1.0)
@@ -295,6 +297,7 @@ def whole_style(d: StyleDictionary) -> tuple[Annotated[Tensor, "C"], Annotated[T
         own = d.reference == i
         mean, total = mix(d.mean[own], d.covariance[own], d.share[own])
         if d.blend < 1:
+            # The blended means scatter (1 - b)^2 as much as the true ones, of whose scatter b (1 - b) is missing in the total.
             share = double(d.share[own])
             apart = (double(d.mean[own]) - mean) * (share / share.sum()).sqrt()[:, None]
             total = total + d.blend / (1 - d.blend) * apart.T @ apart
@@ -312,6 +315,7 @@ def code_odds(d: StyleDictionary) -> Annotated[Tensor, "T"]:
 
 def choose(d: StyleDictionary, references: Annotated[Tensor, "references"]) -> tuple[StyleDictionary, Annotated[Tensor, "T"]]:
     """Select some of the references (bool, at least one); return their dictionary, and which of the codes these are (bool)."""
+    # References that stay are numbered anew, from 0.
     codes = references[d.reference]
     renumbered = references.cumsum(0) - 1
     part = d._replace(
@@ -341,6 +345,7 @@ def load_dictionary(path: Path) -> StyleDictionary:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"{path}: not readable as safetensors ({error}); build the style again") from error
+    # Older dictionaries know neither colours nor what lies beyond the basis.
     needed = {*_TABLES, "reference"}
     if meta.get("format") != _FORMAT or set(tensors) - {"beyond"} not in (needed, needed | {*_COLOURS}):
         raise CheckpointError(f"{path}: not a style dictionary of format {_FORMAT}; build the style again")
@@ -382,6 +387,7 @@ def _check_references(references: Sequence[Reference]) -> None:
     """Raise DataError for references of which no dictionary can be built."""
     if not references:
         raise DataError("references: none given; name at least one photograph")
+    # All must be encoded as the first is.
     first = references[0]
     for r in references:
         if len(r.content) == 0 or len(r.content) != len(r.semantic):

@@ -19,7 +19,7 @@ from ..datamanagers.images import load_mask
 from ..errors import UsageError
 from ..interfaces import Scene
 from ..rendering.cameras import Cameras, pixel_grid
-from .config import Place, StyleConfig, find_reference, labels, parse_place, parse_region_value, parse_strength, pixel_of
+from .config import Place, StyleConfig, find_reference, labels, parse_pixel, parse_place, parse_region_value, parse_strength
 from .dictionary import StyleDictionary
 from .files import RegionKey, StyleFile
 from .matching import scores, unit
@@ -84,7 +84,7 @@ def find_regions(regions: Regions, text: str) -> list[RegionMatch]:
     for view in sorted(range(len(names)), key=lambda v: -len(names[v])):
         if text.startswith(f"{names[view]}:"):
             rest = text[len(names[view]) + 1 :]
-            pixel = pixel_of(rest)
+            pixel = parse_pixel(rest)
             numbers = _covered(regions, view, Path(rest)) if pixel is None else [_at_pixel(regions, view, *pixel)]
             return [RegionMatch(k, str(k)) for k in numbers]
     named = f", a name in the style file ({', '.join(regions.keys)})" if regions.keys else ""
@@ -105,6 +105,7 @@ def _alike(regions: Regions, name: str) -> list[RegionMatch]:
         )
     if len(style.share) == 1:
         return [RegionMatch(0, name)]
+    # Among all keys of the file: a region that is more like another name is left to that.
     there = regions.basis.project(torch.tensor(list(regions.keys.values())))
     alike, nearest = scores(unit(style.keys, style.semantic_mean), unit(there, style.semantic_mean)).max(1)
     mine = (nearest == list(regions.keys).index(name)) & (alike >= ALIKE)
@@ -126,6 +127,7 @@ def _at_pixel(regions: Regions, view: int, x: float, y: float) -> int:
 
 def _covered(regions: Regions, view: int, mask: Path) -> list[int]:
     """Find regions of which the mask covers more than half of what the view shows, and the one that fills most of the mask."""
+    # Mass of each region in the view, and how much of it lies under the mask, on a small copy of both.
     share, opacity = membership_view(regions, view, _SIDE)
     height, width = opacity.shape
     painted = load_mask(mask, upright=True).astype(np.float32)
@@ -251,6 +253,7 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
         only[[names.order[i] for i in chosen]] = True
         both = allowed & only
         places.append((place_of[text], torch.where(both.any(1, keepdim=True), both, only)))
+    # What is saved names regions by keys, which hold on other scenes, and references by file.
     saved = replace(
         style,
         pin=(

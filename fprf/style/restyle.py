@@ -57,6 +57,7 @@ def apply_style(
     style = file.style
     if not style.references:
         raise UsageError("--references: at least one photograph is needed, for example --references autumn.jpg night.jpg")
+    # Photographs are encoded once, whatever name, weight or style they are used under.
     encoders = here.encoders() if encoders is None else encoders
     encoded = {} if encoded is None else encoded
     references = []
@@ -85,6 +86,7 @@ def apply_dictionary(here: Scene, file: StyleFile, encoders: Encoders, dictionar
     The dictionary's names are the labels of the style's references. Raises UsageError for regions that the scene does not have.
     """
     style, scene, basis = file.style, encoders.scene, encoders.basis
+    # Cosines that are not centred start from the encoder's zero, which the basis knows.
     if basis is not None:
         dictionary = dictionary._replace(origin=basis.origin().to(dictionary.keys))
     controls = region_controls(Regions(here, scene, basis, file.regions, file.semantic_encoder), dictionary, style)
@@ -124,6 +126,7 @@ def mixed(a: Styled, b: Styled, at: float) -> Styled:
 
     The dictionary and the controls stay those of `a`; codes and notes are those of both.
     """
+    # Codes of both, one after the other, as `Restyle.match` lists them.
     reference = torch.cat([a.codes.reference, b.codes.reference + len(a.codes.names)])
     codes = Codes(reference, a.codes.names + b.codes.names, torch.cat([a.codes.units, b.codes.units]))
     controls = a.controls._replace(notes=a.controls.notes + b.controls.notes)
@@ -142,6 +145,7 @@ def keyed_looks(scene: Scene, keys: Sequence[Keyframe]) -> Callable[[int], Resty
             looks[key.style] = styled.restyle
             for note in styled.controls.notes:
                 print(f"{key.style}: {note}")
+    # Between two keys one look fades into the other; to and from the plain scene by its strength.
     frames = [key.frame for key in keys]
 
     def look(at: int) -> Restyle | None:

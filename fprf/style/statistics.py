@@ -79,6 +79,7 @@ def moments(features: Annotated[Tensor, "N C"], weights: Annotated[Tensor, "N"])
 
 def merge(a: Moments, b: Moments) -> Moments:
     """Moments of both inputs together (Chan, Golub, LeVeque 1979). Commutative and associative within 1e-12."""
+    # The mean moves by b's share of the way; the scatter gains what the means lie apart.
     weight = a.weight + b.weight
     share = b.weight / torch.where(weight > 0, weight, 1.0)
     shift = b.mean - a.mean
@@ -105,6 +106,7 @@ def group_moments(
         moments(features[inside.to(features.device)], membership[inside, k])
         for k, inside in enumerate((column > 0).nonzero().squeeze(1) for column in membership.T)
     ]
+    # Shares of all weight; where there is none at all they are 0, not NaN.
     weight = torch.stack([g.weight for g in groups])
     mean = torch.stack([g.mean for g in groups])
     return mean, torch.stack([covariance(g) for g in groups]), weight / weight.sum().clamp_min(torch.finfo().tiny)
@@ -221,6 +223,7 @@ def kmeans(x: Annotated[Tensor, "N D"], k: int, *, seed: int, weights: Annotated
         return Clusters(x[:0], torch.zeros(len(x), dtype=torch.int64, device=x.device))
     if not bool(mass.any()):
         mass = torch.ones_like(mass)
+    # Centred first: what follows compares squared lengths.
     middle = mass @ points / mass.sum()
     points = points - middle
     generator = torch.Generator().manual_seed(seed)
@@ -260,11 +263,13 @@ def _lloyd(points: Tensor, mass: Tensor, centres: Tensor, steps: int) -> tuple[T
 
 def _seed(points: Tensor, mass: Tensor, k: int, generator: torch.Generator) -> Tensor:
     """Draw centres by weight x squared distance to the nearest so far (k-means++); fewer if points run out."""
+    # One number a centre, drawn on the CPU: the same on every device.
     draws = torch.rand(k, generator=generator, dtype=torch.float64).to(points.device)
     chosen = _draw(mass, draws[0])
     centres = [points[chosen]]
     distance = (points - centres[0]).square().sum(1)
     for draw in draws[1:]:
+        # No row is left that is not a centre already: fewer clusters than asked for.
         odds = mass * distance
         if not bool(odds.any()):
             break

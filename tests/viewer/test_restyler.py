@@ -9,8 +9,7 @@ from fprf.style.look import Restyle
 from fprf.style.regions import Regions, membership_view
 from fprf.style.restyle import apply_style
 from fprf.training.views import render_view
-from fprf.viewer.look import Look, Photograph, set_rule, style_config
-from fprf.viewer.restyler import Restyler, matching_regions
+from fprf.viewer.restyler import Look, Photograph, Restyler, matching_regions, set_rule, style_config
 
 
 def rendered(restyler: Restyler, restyle: Restyle | None) -> torch.Tensor:

@@ -38,6 +38,7 @@ def load_decoder(path: Path | None, *, encoder: str, channels: int, objective: O
     """
     if path is not None:
         return _loaded(path, *_read(path), encoder=encoder, channels=channels)
+    # The one that ships for this encoder and objective.
     shipped = set()
     for file in sorted(FOLDER.glob("*.safetensors")):
         tensors, metadata = _read(file)

@@ -58,6 +58,7 @@ def build_vit(family: str, name: str, *, layer: int, stride: int | None) -> VitE
             f"{family}: needs the package transformers ({error}); pip install 'fprf[encoders]', "
             "or choose one that ships: --semantic.encoder dinov2"
         ) from error
+    # The model up to the block alone: transformers loads only as many as the config says.
     verbosity = logging.get_verbosity()
     logging.set_verbosity_error()  # else it lists the blocks that are left out
     try:
