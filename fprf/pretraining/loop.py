@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from ..interfaces import Figures, Learner, State
 from ..training import checkpoint
 from ..training.driver import Report, Schedule, learn
-from ..training.run import Run, held
+from ..training.run import Run, lock_folder
 from ..training.tasks import begin
 from .config import PretrainConfig
 
@@ -98,7 +98,7 @@ def train(
     # The folder is a run's, as far as the driver needs one; it goes when the weights are there.
     run = Run(training_folder(output))
     schedule = Schedule(config.steps, None if config.steps is not None else config.minutes, _SAVED / 60)
-    with held(run.root):
+    with lock_folder(run.root):
         begin(run.root, repr(replace(config, device="auto")))
         if steps := checkpoint.steps(run.checkpoints):
             say(f"resumed at step {steps[-1]}")

@@ -27,12 +27,12 @@ from ..interfaces import Learner, Partition
 from ..progress import Display
 from ..types import Cell
 from . import tensorfiles
-from .blocks import FILE, Built, folder_of, inset, load_blocks, load_finished, surroundings
+from .blocks import FILE, Built, block_in_surroundings, folder_of, load_blocks, load_finished, surroundings
 from .driver import Schedule
 from .learner import FieldLearner, finish
 from .loading import load_run
 from .model import Facts, build_decoder
-from .prepare import Prepared, behind, build_encoders, cache_folder, device_of, exposure_of, field_facts, read_scene
+from .prepare import Prepared, build_encoders, cache_folder, device_of, exposure_of, field_facts, read_scene, scene_background
 from .run import Run
 from .tasks import WHOLE, Part, Task, digest_of, renumber, task_of, train_all
 
@@ -61,7 +61,7 @@ def cut(
     content, semantic = build_encoders(config)
     build_decoder(config, encoder=content.identity, channels=content.channels)  # refused now, not after all the features
     # One store for all blocks: one basis and one unit of the losses, so that features mean the same in each.
-    background, cache, views = behind(config, scene), cache_folder() / "features", scene.train.tolist()
+    background, cache, views = scene_background(config, scene), cache_folder() / "features", scene.train.tolist()
 
     def image(view: int) -> Tensor:
         width, height = scene.cameras.size[view].tolist()
@@ -115,7 +115,7 @@ class Blocks(Partition):
         folder = folder_of(run.root, 0).parent
         if any(task_of(part) for part in folder.glob("*")):  # digests read all images
             blocks = range(len(plan.cells))
-            asked = {z: asked_of(self.config, self.facts, self.scene, plan.cells, z, rays[z])["task"] for z in blocks}
+            asked = {z: block_task(self.config, self.facts, self.scene, plan.cells, z, rays[z])["task"] for z in blocks}
             renumber(folder, asked)
         for block, own in rays.items():
             folder_of(run.root, block).mkdir(parents=True, exist_ok=True)
@@ -123,7 +123,7 @@ class Blocks(Partition):
         write_cells(run.root / "blocks.json", plan.cells)
 
 
-def asked_of(
+def block_task(
     config: TrainConfig, facts: Facts, scene: Scene, cells: Sequence[Cell], block: int, rays: dict[str, Tensor]
 ) -> dict[str, Any]:
     """What a block is trained as (`Part.asked`). `rays` is its rays.safetensors.
@@ -164,7 +164,7 @@ class Block(Part):
             done, tensors = load_finished(folder_of(self.run.root, WHOLE))
             built.restore({name: tensor.clone() for name, tensor in tensors.items()})  # training writes to them
             built.member.requires_grad_(True)
-            built = inset(config, facts, load_blocks(self.run.root)[self.block], built, self.rays["views"])
+            built = block_in_surroundings(config, facts, load_blocks(self.run.root)[self.block], built, self.rays["views"])
             # Its sampler goes on where that of the surroundings stopped.
             lead = done.step
             config = replace(config, optimizer=replace(config.optimizer, warm_up=min(config.optimizer.warm_up, WARM_UP)))
@@ -209,7 +209,7 @@ def open_block(task: Task) -> Block:
     return Block(
         name="surroundings" if block == WHOLE else f"block {block:02d}",
         folder=folder,
-        asked=asked_of(config, facts, scene, load_blocks(root), block, rays),
+        asked=block_task(config, facts, scene, load_blocks(root), block, rays),
         schedule=Schedule(config.steps, task.minutes, config.checkpoint_minutes),
         run=run,
         block=block,

@@ -30,7 +30,7 @@ from ..plugins.typed_json import leaves
 from ..progress import LINE_SECONDS, Display
 from . import checkpoint
 from .prepare import device_of, planned, read_scene, scene_needs
-from .run import Run, check_images, held, image_hashes, save_image_hashes
+from .run import Run, check_images, image_hashes, lock_folder, save_image_hashes
 
 REPORT_SECONDS = 0.5
 """Time between reports."""
@@ -103,7 +103,7 @@ def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images
     # What is missing is said before there is a folder.
     with Display(quiet=quiet) as display:
         _check_needs(config, method, display)
-    with held(output), Display(quiet=quiet) as display:
+    with lock_folder(output), Display(quiet=quiet) as display:
         display.say(f"{method} on {config.data}, run folder {output}")
         # An existing run goes on with its own config and images; what was cut short there is removed.
         config = _sized(run, config, display)

@@ -32,7 +32,7 @@ from ..rendering.renderer import render_rays
 from ..style.scene_style import SceneStyle, to_tensors
 from ..types import Batch, Rays
 from . import checkpoint
-from .camera_optimizers import moving
+from .camera_optimizers import rays_of_moving_cameras
 from .loading import Trained
 from .losses import check_penalties, extra_term, terms, total, wanted
 from .model import Facts, Model, background_of, build_model
@@ -228,7 +228,7 @@ class FieldLearner(SceneLearner):
         if batch.distance is not None:
             ends = space.parameter(origin, direction, batch.distance.to(there)).to(self.device)
         if self.model.poses is not None:
-            rays = moving(space.rays(*self.model.poses(batch.view, origin, direction)))
+            rays = rays_of_moving_cameras(space.rays(*self.model.poses(batch.view, origin, direction)))
         else:
             rays = space.rays(origin, direction)
         return Rays(*(x.to(self.device) for x in rays)), ends
@@ -355,10 +355,10 @@ def finish(run: Run, display: Display, config: TrainConfig, model: Model, scene:
     """Measure and keep the scene's own style, and say what quality training reached."""
     display.say("measuring the scene's own style")
     run.save_tensors("style", to_tensors(measure_style(config, model, scene.cameras, scene.train)))
-    display.say(outcome(run, config, scene))
+    display.say(training_summary(run, config, scene))
 
 
-def outcome(run: Run, config: TrainConfig, scene: ParsedScene) -> str:
+def training_summary(run: Run, config: TrainConfig, scene: ParsedScene) -> str:
     """One line on what a training reached, by its events.jsonl or those of its blocks, and the command that raises it."""
     try:
         trained = [history for history in read_history(run.root) if history.values.get("psnr", [None])[-1] is not None]

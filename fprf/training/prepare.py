@@ -88,7 +88,7 @@ def prepare(
         cache=cache_folder() / "features",
         seed=config.seed,
         progress=progress,
-        background=behind(config, scene),
+        background=scene_background(config, scene),
     )
     stores = manager.content_store, manager.semantic_store
     exposure = exposure_of(config.tones, scene, manager.image, saved)
@@ -131,7 +131,7 @@ def field_facts(
     # Scales are the spread of the targets: losses in their units weigh the same with any encoder.
     (content, semantic), (content_store, semantic_store) = encoders, stores
     return replace(
-        facts_of(scene, behind(config, scene), space=space, exposure=exposure, poses=config.poses > 0),
+        facts_of(scene, scene_background(config, scene), space=space, exposure=exposure, poses=config.poses > 0),
         channels=content.channels,
         dim=semantic_store.channels if semantic_store is not None else 0,
         content_encoder=content.identity,
@@ -193,7 +193,7 @@ def reach_of(scene: Scene, space: Space) -> float:
     return space.near if space.kind == "ndc" else 1 / space.scale
 
 
-def behind(config: TrainConfig, scene: Scene) -> tuple[float, float, float] | None:
+def scene_background(config: TrainConfig, scene: Scene) -> tuple[float, float, float] | None:
     """Colour behind everything: images and renders show the same. None where nothing is assumed."""
     return config.render.background or (WHITE if scene.alpha else None)
 

@@ -207,7 +207,7 @@ _NOTE = 200
 
 
 @contextmanager
-def held(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path) -> Iterator[None]:
     """Hold a folder for the length of the block; it is made if need be, and removed again if it stays empty.
 
     Raises DataError where another process holds it, naming that, and where nothing can be written: before any work is done.

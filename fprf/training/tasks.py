@@ -32,7 +32,7 @@ from ..io.strict_json import open_json
 from ..plugins.codec import from_json, to_json
 from ..progress import Display
 from .driver import Report, Schedule, learn, reporter
-from .run import Run, held
+from .run import Run, lock_folder
 
 WHOLE = -1
 """The number of the whole scene among the parts."""
@@ -99,7 +99,7 @@ def train_part(part: Part, report: Callable[[Report], None]) -> bool:
 
     A folder that was trained as something else is started anew. Raises DataError where another process trains there.
     """
-    with held(part.folder):
+    with lock_folder(part.folder):
         # Whoever runs a task again, on whichever machine, finds out here that nothing is left to do.
         done = read_done(part.folder)
         if done is not None and done.asked == part.asked and part.is_intact():
