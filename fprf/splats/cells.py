@@ -36,7 +36,7 @@ from ..training.driver import Schedule
 from ..training.model import Facts
 from ..training.prepare import read_scene
 from ..training.run import Run, known_of
-from ..training.tasks import WHOLE, Part, Task, digest_of, read_done, run_task, train_all
+from ..training.tasks import WHOLE, Part, Task, digest_of, read_done, train_all
 from ..types import Cell
 from .config import GaussiansConfig
 from .gaussians import Gaussians, from_tensors, tensors_of
@@ -97,7 +97,7 @@ class Cells(Partition):
         display.say(f"{len(cells)} cells, whose windows are {share:.2f} times the photographs")
         order = sorted(range(len(cells)), key=lambda cell: -pixels[cell])
         executor = config.executor.on("cpu").build()
-        train_all(config, run, executor, run_cell, order, whole_share=config.overview, spent=spent, quiet=display.quiet)
+        train_all(config, run, executor, open_cell, order, whole_share=config.overview, spent=spent, quiet=display.quiet)
         display.say(f"{unite(run.root, cells)} Gaussians")
 
     def write(self, run: Run) -> list[Cell]:
@@ -258,11 +258,6 @@ def overview_config(config: GaussiansConfig, scene: Scene) -> tuple[GaussiansCon
         steps=max(1, round(config.overview * config.steps), _VISITS * len(scene.train[::every])),
     )
     return own, every
-
-
-def run_cell(task: Task) -> None:
-    """Train the whole scene or a cell, here or on a worker."""
-    run_task(task, open_cell)
 
 
 def other_views(scene: Scene, views: Iterable[int]) -> tuple[int, ...]:

@@ -25,7 +25,7 @@ from ..style.look import Restyle
 from ..style.restyle import Styled
 from ..style.scene_style import RegionWeight
 from ..training.loading import Trained
-from ..training.views import Part, view_parts
+from ..training.views import ViewChunk, view_chunks
 from .messages import Camera
 from .render_worker import Steps
 from .restyler import Look, Restyler
@@ -136,7 +136,7 @@ class _Kept:
     """A client's last view."""
 
     camera: Camera
-    parts: dict[tuple[int, int], list[Part]] = field(default_factory=dict)
+    parts: dict[tuple[int, int], list[ViewChunk]] = field(default_factory=dict)
 
 
 class FieldPainter:
@@ -164,7 +164,7 @@ class FieldPainter:
             start, again = time.perf_counter(), size in kept.parts
             rows: list[Tensor] = []
             captured: list[Tensor] = []
-            parts: list[Part] = []
+            parts: list[ViewChunk] = []
             for part in kept.parts[size] if again else self._parts(cameras_of([request.camera], size), 0):
                 rows.append(self._colours(part, styled, request.shown))
                 if request.captured:
@@ -188,7 +188,7 @@ class FieldPainter:
             yield
 
     @torch.inference_mode()
-    def _colours(self, part: Part, styled: Styled | None, shown: Shown) -> Annotated[Tensor, "N 3"]:
+    def _colours(self, part: ViewChunk, styled: Styled | None, shown: Shown) -> Annotated[Tensor, "N 3"]:
         """A chunk as it is shown; of the map of depths, depth and opacity."""
         restyle, semantic = None if styled is None else styled.restyle, part.semantic
         if shown.map == "depth":
@@ -203,10 +203,10 @@ class FieldPainter:
             colours = _mapped(colours, memberships, opacity, shown)
         return colours
 
-    def _parts(self, cameras: Cameras, view: int) -> Iterable[Part]:
+    def _parts(self, cameras: Cameras, view: int) -> Iterable[ViewChunk]:
         trained = self._trained
         config = replace(trained.config.render, chunk=min(CHUNK, trained.config.render.chunk))
-        return view_parts(trained.model, trained.known.facts, cameras, view, config)
+        return view_chunks(trained.model, trained.known.facts, cameras, view, config)
 
     def frame(self, cameras: Cameras, view: int, look: Restyle | None) -> Generator[None, None, Picture]:
         """Render one frame of a film, step by step, and return it."""
