@@ -18,10 +18,8 @@ from torch import Tensor
 
 from fprf.config import RenderConfig
 from fprf.datamanagers.features import FeatureStore
-from fprf.fields.planes import ProposalField
 from fprf.ops import backend, dense, mixture, triplane
 from fprf.rendering.cameras import Cameras
-from fprf.style import matching
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
@@ -55,10 +53,7 @@ SWITCHES: dict[str, Patches] = {
     "tri-planes": [(triplane, "usable", never)],
     "tri-planes: total variation": [(triplane, "variation", triplane.variation_reference)],
     "networks": [(dense, "usable", never)],
-    "proposals": [(ProposalField, "kernels_apply", never)],
-    "styles at points": [(mixture, "usable", never), (matching, "usable", never)],
-    "styles at points: matching": [(matching, "usable", never)],
-    "styles at points: maps": [(mixture, "usable", never)],
+    "styles at points": [(mixture, "usable", never)],
     "guided features": [(FeatureStore, "at", plain_lookups)],
 }
 """What is replaced where a kernel is off."""

@@ -185,22 +185,17 @@ def _with(node: ast.AST, **changes: object) -> ast.AST:
 
 
 MODULES: dict[str, tuple[str, ...]] = {
-    "fprf/ops/march.py": ("ops/test_march.py",),
     "fprf/ops/triplane.py": ("ops/test_triplane.py",),
     "fprf/ops/dense.py": ("ops/test_dense.py",),
     "fprf/ops/guided.py": ("ops/test_guided.py",),
     "fprf/ops/mixture.py": ("ops/test_mixture.py",),
-    "fprf/ops/march_kernels.py": ("ops/test_march.py",),
     "fprf/ops/dense_kernels.py": ("ops/test_dense.py",),
     "fprf/ops/guided_kernels.py": ("datamanagers/test_features.py",),
     "fprf/ops/mixture_kernels.py": ("ops/test_mixture.py",),
     "fprf/ops/triplane_kernels.py": ("ops/test_triplane.py",),
     "fprf/ops/simd.py": ("ops/test_dense.py", "ops/test_triplane.py", "ops/test_rasterise.py"),
-    "fprf/style/clusters.py": ("style/test_clusters.py",),
-    "fprf/style/colours.py": ("style/test_colours.py",),
-    "fprf/style/controls.py": ("style/test_controls.py",),
+    "fprf/style/look.py": ("style/test_look.py", "style/test_colours.py"),
     "fprf/style/matching.py": ("style/test_matching.py", "ops/test_mixture.py"),
-    "fprf/style/regional.py": ("style/test_regional.py",),
     "fprf/style/statistics.py": ("style/test_statistics.py",),
     "fprf/rendering/stepfun.py": ("rendering/test_stepfun.py",),
     "fprf/rendering/space.py": ("rendering/test_space.py", "ops/test_march.py"),

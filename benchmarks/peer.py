@@ -14,7 +14,6 @@ from fprf.datamanagers.images import IMAGE_SUFFIXES, load_image
 from fprf.datamanagers.parsers.files import Record, as_record, read_bytes, read_json, read_npy, read_npz
 from fprf.datamanagers.parsers.views import rigid_pose
 from fprf.errors import DataError
-from fprf.evaluation.consistency import published
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig
 from fprf.progress import Display
 from fprf.rendering.cameras import Cameras, grid_rays
@@ -23,7 +22,7 @@ from fprf.training.views import render_view
 
 from .common import ReportConfig, write_report
 from .report import provenance, words
-from .steadiness import steadiness
+from .steadiness import published, steadiness
 from .style_metrics import matched_regions, mean_scores, structure, style_distances
 
 Frames = Mapping[str, Annotated[Tensor, "H W 3"]]

@@ -15,7 +15,6 @@ from torch import Tensor
 from fprf.checks import at_least, between, positive
 from fprf.cli.parsing import parse
 from fprf.errors import ConfigError, UsageError
-from fprf.evaluation.consistency import published
 from fprf.interfaces import Scene, SceneView
 from fprf.io.images import Picture, to_uint8, write_image
 from fprf.methods import fprf_lite
@@ -39,7 +38,7 @@ from fprf.types import Want
 from .common import ReportConfig, console, write_report
 from .report import Column, contact_sheet, markdown, printed, provenance, words
 from .single_image import encoded, flat_look, flat_scene, histogram_matching, reinhard, render_flat
-from .steadiness import steadiness
+from .steadiness import published, steadiness
 from .town.truth import (
     CUT,
     Matched,
@@ -202,7 +201,7 @@ def one_by_one(
     scene: Scene, plain: Sequence[Image], config: StylizerConfig, dictionary: StyleDictionary, encoders: Encoders
 ) -> Shown:
     """The stylizer on each picture as a photograph of its own: its own statistics and regions, the same dictionary."""
-    guided, decoder, regions, seed = encoders.guided, scene.decoder, len(encoders.scene.share), encoders.seed
+    guided, decoder, regions, seed = encoders.guided, scene.decoder, len(encoders.scene_style.share), encoders.seed
     taken = []
 
     def restyled(view: Image) -> Image:
@@ -286,7 +285,7 @@ def restyle(config: RestyleConfig, root: Path, folder: Path, progress: Progress)
             "view_size": [int(side) for side in stage.views.size[0]],
             "clusters": config.clusters,
             "blend": config.blend,
-            "regions": len(encoders.scene.share),
+            "regions": len(encoders.scene_style.share),
             "semantic_encoder": scene.semantic_encoder,
         },
         "recommended": best,
@@ -420,7 +419,7 @@ def _case(
 
 
 PUBLISHED = {f"{gap}_{figure}": (gap, figure) for gap in ("short", "long") for figure in ("lpips", "rmse")}
-"""Figures of `consistency.published` by their names in a row."""
+"""Figures of `steadiness.published` by their names in a row."""
 SECONDS = ("style_seconds", "view_seconds")
 
 
@@ -487,7 +486,7 @@ the street and its sky.
 - **style s**: to make the style of the references, once. **view s**: to colour a view whose geometry is there (for `reinhard`,
   `histogram` and `2d`: a rendered picture).
 - **LPIPS**: AlexNet, version 0.1, to the truth; less is nearer. The JSON also has consistency as other papers report it
-  (`short_lpips`, `short_rmse`, `long_lpips`, `long_rmse`: `published` in `fprf/evaluation/consistency.py`).
+  (`short_lpips`, `short_rmse`, `long_lpips`, `long_rmse`: `published` in `benchmarks/steadiness.py`).
 - **2d** is the recommended stylizer on each picture alone, with the picture's own statistics and regions.
 - **true classes** is no method: it knows the classes, and carries the colours of each to those of the same class in the
   references, as a perfect match would.

@@ -5,6 +5,12 @@
 Only places that the unstylised render itself shows alike count. Colours are compared as means over windows, since a texture
 finer than a pixel differs in every frame. Sharpness is the steepest change of colour in a neighbourhood over the range of
 colours there. Frames are warped as in `fprf.evaluation.consistency`.
+
+`published` is consistency as other papers report it. A blurred or dull film scores well there.
+
+    rmse   = mean over t of sqrt( mean over valid pixels and channels of (I_t - W(I_{t-k}))² )     Stylos, AnyStyle, StyleRF
+    e_warp = mean over t of the same mean square                                                   FPRF, after Lai et al. 2018
+    lpips  = mean over t of LPIPS(M I_t, M W(I_{t-k})), M = 0 where not valid: black in both       Stylos, AnyStyle, StyleRF
 """
 
 import math
@@ -16,8 +22,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from fprf.errors import DataError, NumericsError
-from fprf.evaluation.consistency import LONG, SHORT, warp
+from fprf.evaluation.consistency import warp
+from fprf.evaluation.lpips import lpips
 from fprf.rendering.cameras import Cameras
+
+SHORT, LONG = 1, 7
+"""Frames between the two views of a pair (Lai et al. 2018, and every peer since)."""
 
 _ALIKE = 0.1
 """Distance of sRGB colours up to which the unstylised render shows a place alike in two frames."""
@@ -123,3 +133,30 @@ def _steepness(image: Annotated[Tensor, "H W 3"]) -> tuple[Annotated[Tensor, "H 
 
 def _highest(maps: Annotated[Tensor, "1 C H W"]) -> Annotated[Tensor, "1 C H W"]:
     return F.max_pool2d(maps, _WINDOW, 1, _WINDOW // 2)
+
+
+def published(
+    images: Sequence[Annotated[Tensor, "H W 3"]], depths: Sequence[Annotated[Tensor, "H W"]], cameras: Cameras
+) -> dict[str, dict[str, float | int | None]]:
+    """`short` and `long`: `rmse`, `e_warp` (both of colours in [0, 1]), `lpips` and the number of `pairs` compared.
+
+    Raises DataError where images, depths and cameras differ in number.
+    """
+    if not len(images) == len(depths) == len(cameras):
+        raise DataError(f"{len(images)} images, {len(depths)} depths, {len(cameras)} cameras: one of each per frame is needed")
+    summary: dict[str, dict[str, float | int | None]] = {}
+    for name, gap in (("short", SHORT), ("long", LONG)):
+        squares, perceived = [], []
+        for t in range(gap, len(images)):
+            there, valid = warp(images[t - gap], depths[t], depths[t - gap], cameras, t, t - gap)
+            if bool(valid.any()):
+                squares.append(float((images[t][valid].double() - there[valid].double()).square().mean()))
+                perceived.append(lpips(torch.where(valid[..., None], images[t], 0.0), there))
+        count = len(squares)
+        summary[name] = {
+            "rmse": math.fsum(map(math.sqrt, squares)) / count if count else None,
+            "e_warp": math.fsum(squares) / count if count else None,
+            "lpips": math.fsum(perceived) / count if count else None,
+            "pairs": count,
+        }
+    return summary

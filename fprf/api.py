@@ -11,6 +11,7 @@ Scenes never change: what restyles one returns another, and both share the train
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -25,6 +26,10 @@ from .plugins.registry import nearest
 from .plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from .rendering.cameras import Cameras
 from .rendering.paths import look_at, make_path, pinhole, upwards
+from .splats.captures import Captures, light_alone, open_captures
+from .splats.config import LookConfig
+from .splats.files import Capture, write_capture
+from .splats.gaussians import Gaussians
 from .style.config import StyleConfig, with_preset
 from .style.dictionary import Encoders
 from .style.files import StyleFile, check_photographs, read_style, with_folders, write_style
@@ -222,3 +227,65 @@ class TrainedScene:
         if len(one) != 1:
             raise UsageError(f"{what}: {len(one)} cameras; give one, or render them all with `film`")
         return one
+
+
+@dataclass(frozen=True, eq=False)
+class FinishedCapture:
+    """A finished capture of 3D Gaussians, as it was read or in a style. Make one with `fprf.read`."""
+
+    capture: Capture
+    """The file, with what it says beside the Gaussians."""
+    look: LookConfig
+    """How it is looked at before it is restyled."""
+    harmonics: Annotated[Tensor, "N K 3"] | None = None
+    """New ones of all Gaussians that can be drawn, or of all; None = as they were read."""
+    seen: Callable[[], Captures] | None = field(default=None, repr=False)
+    """Views and semantics, found at the first style and kept for the next."""
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The Gaussians as the file has them, about `capture.origin`; `.numpy()` of its tensors is the same memory."""
+        read = self.capture.gaussians
+        if self.harmonics is None:
+            return read
+        finite, new = read.finite, self.harmonics
+        return read.recoloured(new if len(new) == len(read) else read.harmonics.index_copy(0, finite.nonzero()[:, 0], new))
+
+    def restyled(
+        self,
+        references: Sequence[PathLike],
+        *,
+        weights: Sequence[float] = (),
+        strength: float = 1.0,
+        luminance: float = 0.0,
+        match_light: bool = False,
+        stylizer: StylizerConfig | None = None,
+    ) -> "FinishedCapture":
+        """The capture, as it was read, in the style of photographs; arguments as those of `fprf restyle`.
+
+        Raises UsageError for no references, DataError for unreadable photographs and where nothing can be seen.
+        """
+        seen = self.seen or cache(lambda: open_captures([self.capture.path], self.look, first=self.capture))
+        style = StyleConfig(
+            references=tuple(Path(path) for path in references),
+            weights=tuple(weights),
+            strength=strength,
+            luminance=luminance,
+            stylizer=RegionToneConfig(centred=False) if stylizer is None else stylizer,
+        )
+        styled = apply_style(seen().scene, StyleFile(with_folders(style)))
+        styled = light_alone(styled) if match_light else styled
+        return replace(self, harmonics=seen().harmonics(0, self.capture, styled.restyle), seen=seen)
+
+    def recoloured(self, harmonics: Annotated[Tensor, "N K 3"]) -> "FinishedCapture":
+        """The capture with harmonics of your own for all Gaussians. Raises DataError where they are of other shapes."""
+        return replace(self, harmonics=self.capture.gaussians.recoloured(harmonics).harmonics)
+
+    def write(self, path: PathLike) -> list[str]:
+        """Write a file, whole or not at all; its ending says the format. Returns what the format does not hold, as phrases.
+
+        In the format that was read everything but colours stays as it was, bit for bit.
+        """
+        harmonics = self.capture.gaussians.harmonics if self.harmonics is None else self.harmonics
+        views = None if self.seen is None else self.seen().scene.views
+        return write_capture(Path(path), self.capture, harmonics, views).losses()

@@ -22,7 +22,7 @@ def layer(parts: tuple[str, ...]) -> str:
     """The layer of a module by its path below `fprf`."""
     if parts in ((), ("__init__",)):
         return "version"
-    if parts in (("testing", "breaches"), ("testing", "outputs")):  # which the program uses as well
+    if parts == ("testing", "outputs"):  # which the program uses as well
         return "outputs"
     plugins = parts[0] == "plugins" and len(parts) <= 2 and parts[-1] != "weights"
     return "configs" if plugins or (f"{parts[-1]}.py" in MECHANISM and parts[0] != "export") else parts[0]

@@ -69,7 +69,7 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
     RayConfig: {"workers": [0], "processors": [0.0], "retries": [-1], "gpus": [-1.0]},
     DistilConfig: {name: [0] for name in ("minutes", "steps", "batch", "rate", "crops")}
     | {"seed": [-1], "photos": [1], "size": [8]},
-    PretrainDecoderConfig: {name: [-1] for name in ("noise", "style", "content", "samples")} | {"crops": [1], "pairs": [0]},
+    PretrainDecoderConfig: {name: [-1] for name in ("noise", "style", "content")} | {"crops": [1], "pairs": [0]},
     StyleConfig: {
         "strength": [1.1],
         "at": [nan],

@@ -14,12 +14,12 @@ from collections.abc import Iterable, Sequence
 from typing import Annotated
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..fields.planes import Planes
 from ..interfaces import ContentField, Sampler, SemanticField
 from ..ops.triplane import AXES, split
+from ..rendering.cameras import look_up
 from ..rendering.space import Space
 from ..types import FieldSample, Rays, Sampled
 from .routing import Chart, Group, Router
@@ -47,7 +47,7 @@ class Members(ABC):
         """One of them."""
 
 
-class Held(Members):
+class ResidentMembers(Members):
     """Members that are all in memory."""
 
     def __init__(self, members: Sequence[Member]) -> None:
@@ -230,10 +230,10 @@ def inherit(member: Member, around: Member) -> None:
         for mine, theirs in zip(own.modules(), other.modules(), strict=True):
             if isinstance(mine, Planes) and isinstance(theirs, Planes):
                 with torch.no_grad():
-                    mine.table.copy_(relay(theirs, member.chart, around.chart))
+                    mine.table.copy_(resample_planes(theirs, member.chart, around.chart))
 
 
-def relay(planes: Planes, chart: Chart, old: Chart) -> Annotated[Tensor, "rows F"]:
+def resample_planes(planes: Planes, chart: Chart, old: Chart) -> Annotated[Tensor, "rows F"]:
     """The table of planes over `chart` that say what `planes` say over `old`, exact at the nodes."""
     middle, half = (chart.low + chart.high) / 2, (chart.high - chart.low) / 2
     parts = []
@@ -244,7 +244,7 @@ def relay(planes: Planes, chart: Chart, old: Chart) -> Annotated[Tensor, "rows F
             cube = torch.zeros(len(nodes), len(nodes), 3, dtype=torch.float64)
             cube[..., a], cube[..., b] = nodes[None, :], nodes[:, None]
             at = old.locate((cube * half + middle).view(-1, 3)).view(cube.shape)
-            where = torch.stack([at[..., a], at[..., b]], -1)[None].to(grid)
-            values = F.grid_sample(grid.permute(2, 0, 1)[None], where, align_corners=True, padding_mode="border")
-            parts.append(values[0].permute(1, 2, 0).reshape(-1, grid.shape[2]))
+            # Nodes -1 to 1 are the centres of the first and the last pixel.
+            pixel = 0.5 * (torch.stack([at[..., a], at[..., b]], -1) + 1) * (len(nodes) - 1) + 0.5
+            parts.append(look_up(grid, pixel.view(-1, 2)).to(grid))
     return torch.cat(parts)

@@ -21,7 +21,7 @@ from ..datamanagers.bounds import FAR, NEAR, ROUNDING, axes
 from ..datamanagers.scene import TILES, Scene, Sightings, find_sightings, tile_of
 from ..errors import ConfigError, DataError
 from ..rendering.cameras import Cameras, rays_through
-from ..rendering.space import Space
+from ..rendering.space import Space, slab
 from ..types import Cell, Site
 from .config import LayoutConfig
 from .routing import chart_of
@@ -74,6 +74,7 @@ def open_space(scene: Scene, sightings: Sightings | None) -> Space:
         unit = SPACINGS * float(apart.topk(2, largest=False).values[:, 1].median()) if len(position) > 1 else 0.0
     if unit <= ROUNDING * max(1.0, float(position.abs().amax())):
         raise DataError(f"{scene.name}: all cameras stand in one place and there are no points; capture from several places")
+    # Nothing nearer than half of the nearest point is looked at.
     near = NEAR if nearest is None else min(NEAR, max(1e-3, 0.5 * nearest / unit))
     first, second, third = ((float(row[0]), float(row[1]), float(row[2])) for row in turn)
     middle = (float(centre[0]), float(centre[1]), float(centre[2]))
@@ -144,9 +145,8 @@ def tile_rays(scene: Scene, space: Space, views: Annotated[Tensor, "M"], sightin
 def meets(tiles: Tiles, cell: Cell) -> Annotated[Tensor, "M TILES TILES"]:
     """True where the rays of a tile meet a block, border included, before they end: the slab test."""
     chart, origin = chart_of(cell), tiles.origin[:, None, None]
-    safe = torch.where(tiles.direction.abs() < 1e-9, torch.full_like(tiles.direction, 1e-9), tiles.direction)
-    a, b = (chart.low.to(origin) - origin) / safe, (chart.high.to(origin) - origin) / safe
-    enter, leave = torch.minimum(a, b).amax(-1).clamp_min(0), torch.maximum(a, b).amin(-1)
+    enter, leave = slab(origin, tiles.direction, chart.low.to(origin), chart.high.to(origin))
+    enter = enter.clamp_min(0)
     return (enter <= leave) & (enter <= tiles.reach) & (tiles.pixels > 0)
 
 
@@ -184,6 +184,7 @@ class Plan:
 
 def make_plan(scene: Scene, layout: LayoutConfig) -> Plan:
     """Cut the scene and find out who sees what. Raises ConfigError where a block would have nothing to learn from."""
+    # Geometry alone: no image is decoded to find out who sees what.
     sightings = find_sightings(scene)
     space = open_space(scene, sightings)
     cells = layout.build().cut(site_of(scene, space))
@@ -192,6 +193,7 @@ def make_plan(scene: Scene, layout: LayoutConfig) -> Plan:
         tiles = tile_rays(scene, space, views, sightings)
         parts.append((torch.stack([meets(tiles, cell) for cell in cells], 1), tiles.pixels))
     seen, pixels = (torch.cat(column) for column in zip(*parts, strict=True))
+    # A block that no pixel sees would learn nothing: it is part of the surroundings.
     used = [block for block in range(len(cells)) if int((seen[:, block] * pixels).sum())]
     if not used:
         raise ConfigError(f"{scene.name}: no training view sees any block of this layout; choose another --blocks")

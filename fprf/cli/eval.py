@@ -1,5 +1,6 @@
 """`fprf eval RUN`: measure a run on views it has not seen."""
 
+import math
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -64,7 +65,7 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
     Raises UsageError where the images at hand are not those of the run, or the split has no views.
     """
     from ..datamanagers.scene import at_origin
-    from ..evaluation.evaluate import described, judge
+    from ..evaluation.metrics import judge
     from ..io.atomic import write_json
     from ..io.video import write_frames
     from ..training.camera_optimizers import moved_cameras
@@ -90,7 +91,11 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
         if config.fit_poses:
             moves = scene.fit_poses(captured, views, display.count)
             known = replace(known, cameras=moved_cameras(known.cameras, moves))
-            fitted = {"fitted_poses": {known.names[view]: described(moves[view]) for view in views}}
+            poses = {}
+            for view in views:
+                turn, shift = float(moves[view, :3].norm()), float(moves[view, 3:].norm())
+                poses[known.names[view]] = {"turn_degrees": math.degrees(turn), "shift": shift}
+            fitted = {"fitted_poses": poses}
         found, images = judge(scene, known, captured, views, display.count, masks=trained.masked)
     metrics = {
         "method": opened.method,

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _DESCRIPTION = f"""A scene as files that other programs open, in the capture's own frame.
 
-Kinds may follow the run: {", ".join(ending[1:] for ending in endings())} = 3D Gaussians; {
+Kinds may follow the run: {", ".join(ending[1:] for ending in endings() if ending[1:] not in KINDS)} = 3D Gaussians; {
     "; ".join(f"{name} = {what}" for name, what in KINDS.items())
 }.
 A look of the scene is a file: splats.ply as it is, splats.NAME.ply in a style, with the same Gaussians in the same order."""

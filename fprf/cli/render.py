@@ -3,9 +3,10 @@
 import hashlib
 import shutil
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from ..checks import at_least
 from ..errors import ConfigError, UsageError
@@ -17,13 +18,26 @@ from .style_flags import named_styles, read_flags
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
+    from ..io.images import Picture
     from ..rendering.cameras import Cameras
     from ..style.files import StyleFile
-    from ..training.film import Take
+    from ..style.restyle import Styled
     from ..training.loading import LoadedRun
 
 _NO_FOLDERS = frozenset({".avi", ".bmp", ".exr", ".jpeg", ".jpg", ".m4v", ".mkv", ".mov", ".mpg", ".png", ".tif", ".webm"})
 """Endings that nobody gives a folder."""
+_PROBES, _PROBE_RESOLUTION = 4, 0.25
+"""Frames, and their size, that the range of depths is taken from: one range for a whole film."""
+
+
+class Take(NamedTuple):
+    """A look of the scene along a flight."""
+
+    name: str
+    scene: "Callable[[int], Scene]"
+    """In its look of each frame."""
+    styled: "Styled | None" = None
+    """The style where it is one throughout, for match maps."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,10 +92,10 @@ def run(args: list[str]) -> int:
     config, file = read_flags(RenderVerbConfig(), args, prog="fprf render", description=description, positional=("run",))
     from ..datamanagers.images import load_image
     from ..io.images import write_image
+    from ..io.maps import depth_limits
     from ..io.sheet import side_by_side
     from ..io.video import FILMS, MAX_FPS, missing_frames, write_video
     from ..rendering.paths import make_path, panoramas, upwards
-    from ..training.film import limits_of, panels
     from ..training.loading import open_run
 
     if config.output.suffix.lower() in _NO_FOLDERS:
@@ -108,12 +122,17 @@ def run(args: list[str]) -> int:
         print(f"{len(paths) - len(todo)} of {len(paths)} frames are there already")
     start = time.perf_counter()
     with Display() as display:
-        limits = limits_of(opened.scene, cameras) if "depth" in config.show and todo else None
+        limits = None
+        if "depth" in config.show and todo:
+            # One range of depths for the whole film, from a few small frames: else colours would flicker.
+            some = sorted({k * (len(cameras) - 1) // (_PROBES - 1) for k in range(_PROBES)})
+            probes = [opened.scene.render(cameras, k, resolution=_PROBE_RESOLUTION) for k in some]
+            limits = depth_limits([view.depth for view in probes], [view.opacity for view in probes])
         for done, path in enumerate(todo):
             left = (time.perf_counter() - start) / done * (len(todo) - done) if done else None
             display.count(done, len(todo), "rendering", seconds_left=left)
             # Each frame is written as soon as it is done, so that an interrupted film goes on.
-            write_image(path, side_by_side(panels(opened.scene, cameras, paths.index(path), takes, config.show, limits)))
+            write_image(path, side_by_side(_panels(opened.scene, cameras, paths.index(path), takes, config, limits)))
         display.count(len(todo), len(todo), "rendering")
         made = str(config.output)
         if whole:
@@ -123,6 +142,39 @@ def run(args: list[str]) -> int:
     seconds = time.perf_counter() - start
     print(f"{len(cameras)} frames in {made}, {seconds / max(1, len(todo)):.2f} s each")
     return 0
+
+
+def _panels(
+    scene: "Scene",
+    cameras: "Cameras",
+    frame: int,
+    takes: "list[Take]",
+    config: RenderVerbConfig,
+    limits: tuple[float, float] | None,
+) -> "list[Picture]":
+    """Panels of one frame in the order of `config.show`: colour and match maps once for each take, geometry once for all."""
+    from ..io.images import to_uint8
+    from ..io.maps import depth_image
+    from ..rendering.cameras import normals
+    from ..style.match_maps import match_map, match_picture
+
+    views = [take.scene(frame).render(cameras, frame) for take in takes] if "colour" in config.show else []
+    geometry = views[0] if views else scene.render(cameras, frame)
+    shown: list[Picture] = []
+    for channel in config.show:
+        if channel == "colour":
+            shown += [to_uint8(view.rgb) for view in views]
+        elif channel == "depth":
+            shown.append(depth_image(geometry.depth, geometry.opacity, limits))
+        elif channel == "normals":
+            # In camera axes: red to the right, green up, blue towards the viewer; grey where nothing is.
+            turned = normals(cameras, frame, geometry.depth).double() @ cameras.pose[frame, :, :3]
+            cover = geometry.opacity[..., None].clamp(0, 1).double() * (turned.norm(dim=-1, keepdim=True) > 0.5)
+            shown.append(to_uint8(0.5 + 0.5 * turned * cover))
+        else:
+            styles = [take.styled for take in takes if take.styled is not None]
+            shown += [match_picture(match_map(scene, styled, frame, cameras), styled.codes) for styled in styles]
+    return shown
 
 
 def _key(opened: "LoadedRun[Scene]", config: RenderVerbConfig, cameras: "Cameras") -> str:
@@ -146,7 +198,6 @@ def _key(opened: "LoadedRun[Scene]", config: RenderVerbConfig, cameras: "Cameras
 def _takes(scene: "Scene", config: RenderVerbConfig, file: "StyleFile") -> "list[Take]":
     """The looks of a film, at least one. Raises UsageError for a match map without a style to match."""
     from ..style.restyle import keyed_looks
-    from ..training.film import Take
 
     takes = []
     if config.keyframes is not None:
@@ -168,7 +219,6 @@ def _takes(scene: "Scene", config: RenderVerbConfig, file: "StyleFile") -> "list
 
 def _styled_take(scene: "Scene", name: str, file: "StyleFile") -> "Take":
     from ..style.restyle import apply_style
-    from ..training.film import Take
 
     styled = apply_style(scene, file)
     for note in styled.controls.notes:

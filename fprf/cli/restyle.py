@@ -217,7 +217,9 @@ def _with_views(config: RestyleConfig, file: StyleFile) -> StyleFile:
             for picture, cover, share in zip(pictures, covers, shares, strict=True)
         ]
     pictures, covers, numbers = zip(*rows, strict=True)
-    return file._replace(style=replace(style, references=pictures, masks=covers, weights=numbers))
+    # A capture shows what there is, not a mood: where no photograph is among them, everything takes its match.
+    bold = 1.0 if len(scenes) == len(style.references) and style.bold == StyleConfig().bold else style.bold
+    return file._replace(style=replace(style, references=pictures, masks=covers, weights=numbers, bold=bold))
 
 
 def _styles(config: RestyleConfig, file: StyleFile) -> list[tuple[str, StyleFile]]:

@@ -73,7 +73,7 @@ def run(args: list[str]) -> int:
     with contextlib.ExitStack() as stack:
         # The address is taken first: while torch is imported the browser already has a page.
         server = stack.enter_context(ViewerServer(access, config.port))
-        from ..viewer.scene_files import is_capture
+        from ..viewer.uploads import is_capture
 
         path = config.run
         if path is not None and not (config.follow or is_capture(path) or (path / "config.json").is_file()):
@@ -124,8 +124,8 @@ def _start(server: "ViewerServer", config: ViewConfig, references: Sequence[Path
 
 def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[str], None]) -> "Viewed":
     """The scene of a run or a capture, under its own name where none is given."""
-    from ..viewer.scene_files import is_capture
     from ..viewer.session import Viewed, view_of_run
+    from ..viewer.uploads import is_capture
 
     if not is_capture(path):
         from ..training.loading import open_run

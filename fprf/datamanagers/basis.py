@@ -71,11 +71,13 @@ def fit_basis(samples: Annotated[Tensor, "N I"], dim: int) -> Basis:
         raise DataError(f"basis: samples {tuple(samples.shape)}; at least one feature vector [N I] is needed")
     if not torch.isfinite(samples).all():
         raise NumericsError(f"basis: some of the {len(samples)} feature samples are not finite; check the encoder")
+    # Eigenvectors of the covariance, most variance first.
     x = samples.detach().cpu().double()
     mean = x.mean(0)
     centred = x - mean
     values, vectors = torch.linalg.eigh(centred.T @ centred / len(x))
     values, vectors = values.flip(0).clamp_min(0), vectors.flip(1)[:, :dim]
+    # An eigenvector has either sign.
     largest = vectors.abs().argmax(0, keepdim=True)
     vectors = vectors * vectors.gather(0, largest).sign()
     total = values.sum()

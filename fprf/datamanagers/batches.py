@@ -70,6 +70,7 @@ class PixelRuns:
     @staticmethod
     def of(masks: Iterable[tuple[int, Tensor]]) -> "PixelRuns":
         """Of masks of any shape, each with the number of its first entry, which rise; a run may go on in the next mask."""
+        # Where a mask changes runs begin and end; runs that touch across masks become one.
         starts, ends = [], []
         for first, mask in masks:
             edge = torch.zeros(1, dtype=torch.bool)
@@ -121,18 +122,6 @@ def generator_of(seed: int, step: int, device: torch.device | None = None, *, pu
     return torch.Generator(device or "cpu").manual_seed(number)
 
 
-class _Marks(NamedTuple):
-    """Pixels that show a point of the reconstruction."""
-
-    at: Annotated[Tensor, "O"]
-    """int64 among all training pixels."""
-    distance: Annotated[Tensor, "O"]
-    """World distance along the ray."""
-
-    def to(self, device: torch.device) -> "_Marks":
-        return _Marks(self.at.to(device), self.distance.to(device))
-
-
 class _Source(NamedTuple):
     """Pixels, masks and points that batches are drawn from, on one device."""
 
@@ -147,10 +136,10 @@ class _Source(NamedTuple):
     chosen: PixelRuns | None
     """Pixels that may be drawn; None = all."""
     sky: PixelRuns | None
-    marks: _Marks | None
-
-    def to(self, device: torch.device) -> "_Source":
-        return _Source._make(None if part is None else part.to(device) for part in self)
+    marked: Annotated[Tensor, "O"] | None
+    """int64 pixels that show a point of the reconstruction; None = none do."""
+    distance: Annotated[Tensor, "O"] | None
+    """World distance of that point along the ray."""
 
 
 class RayBatches(DataManager):
@@ -193,13 +182,14 @@ class RayBatches(DataManager):
                 rows = torch.from_numpy(image).reshape(-1, 3)
                 self._pixels[filled : filled + len(rows)] = rows
                 filled += len(rows)
+        # Pixels that may be drawn, those of sky, and those that show points.
         masks, skies = (scene.masks, scene.sky_masks) if config.masks else ((), ())
         self._chosen = None if seen is None and not masks else self._runs(masks, unmasked=True, seen=seen)
         if self._chosen is not None and not len(self._chosen):
             raise DataError(f"{scene.name}: none of {len(self._views)} training views shows what is to be learnt")
         sky = self._runs(skies, unmasked=False) if skies else None
-        marks = self._marked() if config.depth_share > 0 else None
-        self._source = _Source(self._pixels, scene.train, self._sizes, self._ends, self._chosen, sky, marks)
+        marked, distance = self._marked() if config.depth_share > 0 else (None, None)
+        self._source = _Source(self._pixels, scene.train, self._sizes, self._ends, self._chosen, sky, marked, distance)
         features = partial(extract, views=self._views, image=self._stored, config=config.guided, progress=progress)
         self.content_store = None if content is None else features(cache / "content", encoder=content)
         self.semantic_store = None if semantic is None else features(cache / "semantic", encoder=semantic, dim=dim, basis=basis)
@@ -208,18 +198,20 @@ class RayBatches(DataManager):
         """The pixels of a step; the first `semantic_share` of them carry semantics."""
         source = self._source
         device = source.pixels.device
+        # Pixels among all that may be drawn.
         room = len(source.pixels) if source.chosen is None else len(source.chosen)
         generator = generator_of(self._seed, step, device)
         at = torch.randint(room, (self._config.rays,), generator=generator, device=device)
         at = at if source.chosen is None else source.chosen.pick(at)
         distance = None
-        if source.marks is not None:
-            # The last rays: the first ones carry semantics, which must stay an even sample.
+        if source.marked is not None and source.distance is not None:
+            # Some through sparse points, as the last rays: the first ones carry semantics, which must stay an even sample.
             count = round(self._config.depth_share * len(at))
-            mark = torch.randint(len(source.marks.at), (count,), generator=generator, device=device)
-            at = torch.cat([at[: len(at) - count], source.marks.at[mark]])
+            mark = torch.randint(len(source.marked), (count,), generator=generator, device=device)
+            at = torch.cat([at[: len(at) - count], source.marked[mark]])
             unknown = torch.full((len(at) - count,), torch.nan, device=device)
-            distance = torch.cat([unknown, source.marks.distance[mark]])
+            distance = torch.cat([unknown, source.distance[mark]])
+        # From the number of a pixel to its view and its place there.
         slot = torch.searchsorted(source.ends, at, right=True)
         width, height = source.size[slot].unbind(1)
         local = at - (source.ends[slot] - width * height)
@@ -248,7 +240,7 @@ class RayBatches(DataManager):
         if device.type != "cuda" or self.held_bytes > room:
             return self
         there = copy.copy(self)
-        there._source = self._source.to(device)
+        there._source = _Source._make(None if part is None else part.to(device) for part in self._source)
         there.content_store = None if self.content_store is None else self.content_store.to(device)
         there.semantic_store = None if self.semantic_store is None else self.semantic_store.to(device)
         return there
@@ -281,8 +273,8 @@ class RayBatches(DataManager):
 
         return PixelRuns.of(masks())
 
-    def _marked(self) -> _Marks | None:
-        """Sightings of sparse points in the training views, among the pixels that are learnt from.
+    def _marked(self) -> tuple[Annotated[Tensor, "O"], Annotated[Tensor, "O"]] | tuple[None, None]:
+        """Pixels that are learnt from and show a sparse point, and its world distance along the ray; None where none does.
 
         Of a reconstruction that says who saw what, points count that two of these views saw: one alone says nothing of depth.
         """
@@ -292,11 +284,12 @@ class RayBatches(DataManager):
             seen = seen[torch.bincount(seen[:, 1])[seen[:, 1]] >= 2]
         sightings = find_sightings(replace(self._scene, seen=seen))
         if sightings is None:
-            return None
+            return None, None
+        # From a view and a pixel to the number among all training pixels.
         slots = torch.full((len(self._scene.cameras),), -1, dtype=torch.int64)
         slots[self._scene.train] = torch.arange(len(self._views))
         slot, pixel = slots[sightings.view], sightings.pixel.long()
         width, height = self._sizes[slot].unbind(1)
         at = self._ends[slot] - width * height + pixel[:, 1] * width + pixel[:, 0]
         kept = torch.ones(len(at), dtype=torch.bool) if self._chosen is None else self._chosen.holds(at)
-        return _Marks(at[kept], sightings.distance[kept].float()) if bool(kept.any()) else None
+        return (at[kept], sightings.distance[kept].float()) if bool(kept.any()) else (None, None)

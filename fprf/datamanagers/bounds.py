@@ -37,6 +37,7 @@ ROUNDING = 1e-12
 
 def focus(cameras: Cameras) -> tuple[Annotated[Tensor, "3"], float]:
     """The point nearest to all optical axes, and how well it is determined: smallest over largest eigenvalue."""
+    # Least squares: sum_i (1 - a_i a_i^T)(x - o_i) = 0 with the axes a_i, about the cameras' mean, where float64 is finest.
     middle, axis = cameras.pose[:, :, 3].mean(0), -cameras.pose[:, :, 2]
     origin = cameras.pose[:, :, 3] - middle
     axis = axis / axis.norm(dim=-1, keepdim=True)
@@ -61,6 +62,7 @@ def find_kind(scene: Scene) -> Kind:
     """Choose the one of the three that fits."""
     if scene.alpha:
         return "box"
+    # Forward-facing: the cameras look one way ...
     cameras = scene.cameras
     axis = -cameras.pose[:, :, 2]
     mean = axis.mean(0)
@@ -69,6 +71,7 @@ def find_kind(scene: Scene) -> Kind:
     mean = mean / mean.norm()
     if (axis @ mean).amin() < math.cos(FORWARD_ANGLE) or (depth := _depths(scene)) is None:
         return "contraction"
+    # ... and stand close together against the depth of what they see.
     offset = cameras.pose[:, :, 3] - cameras.pose[:, :, 3].mean(0)
     return "ndc" if offset.norm(dim=-1).amax() < FORWARD_SPREAD * depth.median() else "contraction"
 
@@ -94,6 +97,7 @@ def axes(cameras: Cameras) -> Tensor:
     if up.norm() < 0.3:  # a full turn about the optical axis, or nadir views from all sides: any axis is as good
         up = torch.tensor([0.0, 0.0, 1.0], dtype=up.dtype)
     up = up / up.norm()
+    # The direction of most spread across the vertical.
     offset = cameras.pose[:, :, 3] - cameras.pose[:, :, 3].mean(0)
     flat = offset - (offset @ up)[:, None] * up
     along = torch.linalg.svd(flat, full_matrices=False).Vh[0] if len(flat) > 1 else cameras.pose[0, :, 0]
@@ -110,10 +114,12 @@ def _contraction(scene: Scene) -> Space:
     cameras = scene.cameras
     position = cameras.pose[:, :, 3]
     rotation = axes(cameras)
+    # The centre is what the cameras look at, where they surround something; else they stand around it.
     point, certain = focus(cameras)
     ahead = ((point - position) * -cameras.pose[:, :, 2]).sum(-1) > 0
     inward = certain > 0.02 and ahead.double().mean() > 0.9
     centre = point if inward else position.mean(0)
+    # The inner radius holds most of the cameras, and half of the points if these are not much farther away.
     local = (position - centre) @ rotation.T
     radius = float(local.abs().amax(-1).quantile(0.9))
     if scene.points is not None and len(scene.points) >= 8:
@@ -136,6 +142,7 @@ def _nearest(scene: Scene) -> float | None:
 
 def _box(scene: Scene) -> Space:
     position = scene.cameras.pose[:, :, 3]
+    # The point that all cameras look at, or their middle where axes are parallel.
     centre, certain = focus(scene.cameras)
     if certain < 1e-4:
         centre = position.mean(0)
@@ -148,33 +155,30 @@ def _box(scene: Scene) -> Space:
 def _ndc(scene: Scene) -> Space:
     cameras = scene.cameras
     pose = cameras.pose
+    # Axes of the mean camera: back, right, and what is across both.
     back = pose[:, :, 2].mean(0)
     back = back / back.norm()
     right = torch.linalg.cross(pose[:, :, 1].mean(0), back)
     right = right / right.norm()
     rotation = torch.stack([right, torch.linalg.cross(back, right), back])
-    centre = pose[:, :, 3].mean(0)
     nearest = _nearest(scene)
     assert nearest is not None  # find_kind asked
     size = cameras.size.double().mean(0)
-    focal = 2 * cameras.focal.mean(0) / size
-    whole = Space("ndc", _three(centre), _rows(rotation), 1.0, 0.9 * nearest, 1.0, focal=(float(focal[0]), float(focal[1])))
-    low, high = _span(whole, cameras)
-    return replace(whole, low=(low[0], low[1], -1.0), high=(high[0], high[1], 1.0))
-
-
-def _span(space: Space, cameras: Cameras) -> tuple[list[float], list[float]]:
-    """Range of all image corners in NDC x and y, from the near plane to infinity, a little widened."""
+    fx, fy = (2 * cameras.focal.mean(0) / size).tolist()
+    centre = _three(pose[:, :, 3].mean(0))
+    whole = Space("ndc", centre, _rows(rotation), 1.0, 0.9 * nearest, 1.0, focal=(fx, fy))
+    # The box is what the rays of all image corners span from the near plane to infinity, a little widened.
     ends = []
     for view in range(len(cameras)):
         w, h = cameras.size[view].tolist()
         corner = torch.tensor([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]], dtype=torch.float64)
-        rays = space.rays(*rays_through(cameras, torch.full((4,), view), corner))
+        rays = whole.rays(*rays_through(cameras, torch.full((4,), view), corner))
         ends += [rays.origin, rays.origin + rays.direction]
     spread = torch.cat(ends).double()
     low, high = spread.amin(0), spread.amax(0)
     middle, half = (low + high) / 2, (high - low) / 2 * MARGIN
-    return (middle - half).tolist(), (middle + half).tolist()
+    (left, bottom, _), (right_end, top, _) = (middle - half).tolist(), (middle + half).tolist()
+    return replace(whole, low=(left, bottom, -1.0), high=(right_end, top, 1.0))
 
 
 def _three(x: Tensor) -> tuple[float, float, float]:

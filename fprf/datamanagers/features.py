@@ -65,19 +65,6 @@ class Entry(NamedTuple):
         return coefs.transpose(2, 3)
 
 
-def pack(coefs: Annotated[Tensor, "s t C 4"], size: tuple[int, int]) -> Entry:
-    """Coefficients of `ops.guided` in storage form; moments are zero until somebody measures them."""
-    channels = coefs.shape[2]
-    runs = coefs.detach().cpu().float().transpose(2, 3).clone()
-    runs[..., 3, :] += GREY * runs[..., :3, :].sum(2)
-    centre = runs[..., 3, :].mean((0, 1))
-    runs[..., 3, :] -= centre
-    scale = runs.abs().amax((0, 1, 2)) / TOP
-    scale = torch.where(scale > 0, scale, torch.ones_like(scale))
-    halves = F.pad(runs / scale, (0, -channels % LANES)).half()
-    return Entry(halves, scale, centre, torch.tensor(size), torch.zeros(2, channels, dtype=torch.float64))
-
-
 def digest(*parts: str | bytes) -> str:
     """SHA-256 of the parts and the format, as 32 hexadecimal digits; parts cannot run into each other."""
     state = hashlib.sha256(FORMAT.encode())
@@ -86,12 +73,6 @@ def digest(*parts: str | bytes) -> str:
         state.update(len(data).to_bytes(8, "little"))
         state.update(data)
     return state.hexdigest()[:32]
-
-
-def read_entry(folder: Path, key: str) -> Entry | None:
-    """The memory-mapped entry of a key; None where it is absent or not what it should be."""
-    tensors = read_tensors(folder, key)
-    return Entry(**tensors) if tensors is not None and tensors.keys() == set(Entry._fields) else None
 
 
 def write_tensors(folder: Path, key: str, tensors: Mapping[str, Tensor]) -> None:
@@ -121,6 +102,7 @@ def keep_within(folder: Path, size: int, used: Collection[str]) -> None:
 
     Whoever has one mapped keeps it on POSIX; on Windows it stays.
     """
+    # The file that was used longest ago first.
     files = []
     for path in folder.glob("[!.]*.safetensors"):
         with contextlib.suppress(OSError):  # another process was first
@@ -133,14 +115,6 @@ def keep_within(folder: Path, size: int, used: Collection[str]) -> None:
             with contextlib.suppress(OSError):
                 path.unlink()
                 total -= bytes_of
-
-
-def remove_stale(folder: Path, hours: float = 1.0) -> None:
-    """Delete unfinished files of processes that died; younger ones may belong to a living writer."""
-    for path in folder.glob(".*.safetensors"):
-        with contextlib.suppress(OSError):  # another process was first
-            if time.time() - path.stat().st_mtime > 3600 * hours:
-                path.unlink()
 
 
 def _checksum(tensors: Mapping[str, Tensor]) -> int:
@@ -170,8 +144,6 @@ class FeatureStore:
     """Targets of some views of a scene; see `extract`."""
 
     def __init__(self, entries: Mapping[int, Entry], basis: Basis | None = None) -> None:
-        from ..ops.guided_kernels import ViewTable
-
         if not entries:
             raise DataError("feature store: no views; a scene needs at least one training view")
         self.basis = basis
@@ -196,8 +168,9 @@ class FeatureStore:
         """Root mean square over the channels' standard deviations, over all pixels."""
         self.scale = self.std if self.std > 1e-6 * float(self._centre.abs().max()) else 1.0
         """The unit of losses: `std`, or 1 where the features do not change but for rounding."""
-        bits = [coefs.view(torch.uint16).numpy() for coefs in self._coefs]
-        self._table = ViewTable(bits, self._size.numpy(), self._scale.numpy(), self._centre.numpy())
+        # Kernels read the coefficients where they lie, in mapped files.
+        self._address = torch.tensor([coefs.data_ptr() for coefs in self._coefs])
+        self._shape = torch.cat([torch.tensor([coefs.shape[:2] for coefs in self._coefs]), self._size], 1)
         self._packed: tuple[guided.Packed, Tensor] | None = None
 
     def to(self, device: torch.device) -> "FeatureStore":
@@ -223,6 +196,9 @@ class FeatureStore:
         if self._packed is not None and view.device == self._packed[1].device:
             packed, numbers = self._packed
             return guided.apply_packed(packed, numbers[view], pixel, rgb, grey=GREY)
+        from ..ops import guided_kernels as kernels
+
+        # Entries of the views, and a clear word for those that have none.
         asked = view.detach().cpu()
         slot = self._numbers[asked.clamp(0, len(self._numbers) - 1)]
         missing = asked[self._slots[slot] != asked]
@@ -230,7 +206,11 @@ class FeatureStore:
             raise DataError(f"feature store: view {int(missing.min())} has no features; {len(self._coefs)} training views have")
         positions, colours = (x.detach().cpu().float().contiguous() for x in (pixel, rgb))
         out = torch.empty(len(view), self.channels)
-        self._table.gather(slot.numpy(), positions.numpy(), (colours - GREY).numpy(), out.numpy())
+        table = (self._address, self._shape, self._scale, self._centre)
+        kernels.gather(
+            slot.numpy(), *(part.numpy() for part in table), self._coefs[0].shape[3],
+            positions.numpy(), (colours - GREY).numpy(), out.numpy(),
+        )  # fmt: skip
         return out.to(view.device)
 
 
@@ -252,7 +232,12 @@ def extract(
     NumericsError where the encoder's features are not finite, PluginError where they are not of the shape it promises.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    remove_stale(folder)
+    # Unfinished files of processes that died go; those of the last hour may belong to a living writer.
+    for path in folder.glob(".*.safetensors"):
+        with contextlib.suppress(OSError):  # another process was first
+            if time.time() - path.stat().st_mtime > 3600:
+                path.unlink()
+    # What a view's features depend on begins with its pixels.
     prints = {}
     for view in views:
         pixels = image(view)
@@ -265,6 +250,7 @@ def extract(
     place = () if device.type == "cpu" else (device.type,)  # other devices round otherwise, TF32 by 1e-3
     entries: dict[int, Entry] = {}
     keys = {}
+    # View by view, what is not there yet.
     for done, view in enumerate(views):
         if progress is not None:
             progress(done, len(views), f"features of {encoder.identity}")
@@ -273,14 +259,14 @@ def extract(
         stride = min(config.stride, max(1, (2 * radius + 1) // CELLS_PER_WINDOW))
         settings = f"radius {radius} eps {config.eps!r} stride {stride} fineness {guided.FINENESS}"
         keys[view] = key = digest(prints[view], encoder.identity, settings, projection, *place)
-        entry, features = read_entry(folder, key), remembered.pop(view, None)
-        if entry is None:
+        tensors, features = read_tensors(folder, key), remembered.pop(view, None)
+        if tensors is None or tensors.keys() != set(Entry._fields):
             features = _encode(encoder, pixels, view) if features is None else features
-            made = _make(features, pixels, basis, radius=radius, eps=config.eps, stride=stride)
-            write_tensors(folder, key, made._asdict())
+            made = _make(features, pixels, basis, radius=radius, eps=config.eps, stride=stride)._asdict()
+            write_tensors(folder, key, made)
             # Read back: what trains is what lies on disk, mapped rather than held in memory.
-            entry = read_entry(folder, key) or made
-        entries[view] = entry
+            tensors = read_tensors(folder, key) or made
+        entries[view] = Entry(**tensors)
     keep_within(folder, CACHED_BYTES, set(keys.values()))
     if progress is not None:
         progress(len(views), len(views), f"features of {encoder.identity}")
@@ -308,12 +294,22 @@ def _encode(encoder: Encoder, pixels: Annotated[Tensor, "H W 3"], view: int) -> 
 
 
 def _make(features: Tensor, pixels: Tensor, basis: Basis | None, *, radius: int, eps: float, stride: int) -> Entry:
-    """A view's entry, moments measured on what it will answer."""
+    """A view's entry: coefficients in storage form, and moments measured on what they will answer."""
     if basis is not None:
         features = basis.project(features.movedim(0, -1)).movedim(-1, 0)
     guide = pixels.float() / 255
     size = (int(pixels.shape[0]), int(pixels.shape[1]))
-    entry = pack(guided.coefficients(features, guide, radius=radius, eps=eps, stride=stride), size)
+    coefs = guided.coefficients(features, guide, radius=radius, eps=eps, stride=stride)
+    # b at mid-grey and about its mean, each channel by its largest number: half precision keeps 11 bits of what is left.
+    runs = coefs.detach().cpu().float().transpose(2, 3).clone()
+    runs[..., 3, :] += GREY * runs[..., :3, :].sum(2)
+    centre = runs[..., 3, :].mean((0, 1))
+    runs[..., 3, :] -= centre
+    scale = runs.abs().amax((0, 1, 2)) / TOP
+    scale = torch.where(scale > 0, scale, torch.ones_like(scale))
+    halves = F.pad(runs / scale, (0, -len(scale) % LANES)).half()
+    entry = Entry(halves, scale, centre, torch.tensor(size), torch.zeros(2, len(scale), dtype=torch.float64))
+    # Mean and variance over pixels drawn evenly.
     at = torch.randint(size[0] * size[1], (MOMENT_PIXELS,), generator=torch.Generator().manual_seed(0))
     pixel = torch.stack([at % size[1], at // size[1]], 1) + 0.5
     values = guided.apply(entry.plain(), pixel, guide.reshape(-1, 3)[at], size).double()
@@ -335,6 +331,7 @@ def _basis(
     kept = read_tensors(folder, key)
     if kept is not None:
         return Basis.from_tensors(kept)
+    # As many cells of each view, drawn evenly.
     generator = torch.Generator().manual_seed(0)
     samples, held = [], 0
     for view in chosen:

@@ -115,6 +115,7 @@ def header_of(file: IO[bytes], name: object) -> ImageHeader:
 
 def open_image(file: IO[bytes], name: object) -> tuple[str, ImageFile]:
     """The format of an open file and its first image, of which only the header was read. Raises DataError as `header_of`."""
+    # The first bytes say the format, whatever the name says.
     file.seek(0)
     head = file.read(64)
     if not head:
@@ -153,6 +154,7 @@ def load_image(
     # In strips: the whole would be copied three times, which takes as long as decoding.
     for top in range(0, rgb.height, _STRIP):
         pixels[top : top + _STRIP] = np.asarray(rgb.crop((0, top, rgb.width, min(top + _STRIP, rgb.height))))
+    # Straight alpha over the background.
     if alpha is not None:
         share = np.asarray(alpha, dtype=np.float32)[:, :, None] / 255
         behind = np.asarray(WHITE if background is None else background, dtype=np.float32) * 255
@@ -176,6 +178,7 @@ def load_mask(path: Path, size: tuple[int, int] | None = None, *, upright: bool 
     width, height = colour.size
     if size is not None and abs(size[0] * height - size[1] * width) > width + height + size[0] + size[1]:
         raise DataError(f"{path}: {width}x{height} pixels do not fit an image of {size[0]}x{size[1]}; mend it")
+    # What varies decides: alpha, else luminance, else the darker of both.
     grey = np.asarray(colour.convert("L"))
     if alpha is not None:
         opaque = np.asarray(alpha)
@@ -255,6 +258,7 @@ def photographs(paths: Sequence[Path], report: Callable[[str], None]) -> list[Pa
             return str(error)
         return ""
 
+    # Those of folders are tried, in threads; those that are named are taken as they are.
     listed: dict[Path, None] = {}
     for path in paths:
         images = [path / name for name in image_names(path)] if path.is_dir() else []
@@ -288,7 +292,16 @@ def _decode(
                 if "transparency" in image.info:  # Pillow scales grey of 2 and 4 bits, but not the transparent one
                     image.info["transparency"] *= {"L;2": 85, "L;4": 17}.get(str(image.tile[0].args), 1)
             deep = ";16" in str(image.tile)
-            turn = _TURNS.get(_load(kind, image, upright))
+            # Decode, and find the orientation by which the pixels are still to be turned.
+            stored = exif_orientation(image) if kind == "TIFF" else 1
+            image.load()
+            if kind == "TIFF":
+                # Pillow has turned them: they are turned back. 6 and 8 are each other's inverse, the rest their own.
+                stored = 1 if upright else {6: 8, 8: 6}.get(stored, stored)
+            elif kind == "AVIF" or (upright and kind != "HEIC"):
+                stored = exif_orientation(image)
+            turn = _TURNS.get(stored)
+    # Grey of 16 bits and what is transparent in it; colours of 16 bits; transparency of the others; then few modes are left.
     profile, alpha = image.info.get("icc_profile"), None
     pixels: PIL.Image.Image = image
     if image.mode.startswith("I;16"):
@@ -306,6 +319,7 @@ def _decode(
         alpha, pixels = pixels.getchannel("A"), pixels.getchannel("R") if grey else pixels.convert("RGB")
     if pixels.mode not in ("L", "RGB", "CMYK"):
         pixels = pixels.convert("L" if pixels.mode == "1" else "RGB")
+    # To sRGB, and upright.
     if profile:
         mode, transform = _transform(profile)
         if mode == "RGB" and pixels.mode == "L":
@@ -314,17 +328,6 @@ def _decode(
     if turn is not None:
         pixels, alpha = pixels.transpose(turn), alpha and alpha.transpose(turn)
     return pixels, alpha
-
-
-def _load(kind: str, image: ImageFile, upright: bool) -> int:
-    """Decode an image; the EXIF orientation by which its pixels are still to be turned."""
-    if kind == "TIFF":
-        # Pillow turns TIFFs while it loads them: they are turned back. 6 and 8 are each other's inverse, the rest their own.
-        stored = exif_orientation(image)
-        image.load()
-        return 1 if upright else {6: 8, 8: 6}.get(stored, stored)
-    image.load()
-    return exif_orientation(image) if kind == "AVIF" or (upright and kind != "HEIC") else 1
 
 
 def exif_orientation(image: ImageFile) -> int:

@@ -93,6 +93,7 @@ def find_sightings(scene: Scene) -> Sightings | None:
     """The sightings of the training views; None without sparse points or where none is in any view."""
     if scene.points is None or not len(scene.points):
         return None
+    # Who saw what, where the reconstruction says so; else what each view may see.
     if scene.seen is not None:
         kept = scene.seen[torch.isin(scene.seen[:, 0], scene.train)]
         kept = kept[kept[:, 0].argsort(stable=True)]
@@ -113,6 +114,7 @@ def tile_of(cameras: Cameras, view: Annotated[Tensor, "O"], pixel: Annotated[Ten
 
 def _sighted(cameras: Cameras, view: Tensor, points: Tensor) -> Sightings:
     """Those of the pairs whose point falls into its image."""
+    # In front of the camera and inside of the image.
     pixel, depth = project(cameras, view, points)
     size = cameras.size[view].to(pixel)
     inside = (depth > 0) & ((pixel >= 0) & (pixel < size)).all(1)  # NaN is never inside
@@ -122,6 +124,7 @@ def _sighted(cameras: Cameras, view: Tensor, points: Tensor) -> Sightings:
 
 def _nearest(cameras: Cameras, view: int, points: Tensor) -> Sightings:
     """The nearest layer of all points in a view."""
+    # The least distance in each tile, and what is not much farther away.
     sightings = _sighted(cameras, torch.full((len(points),), view), points)
     column, row = tile_of(cameras, sightings.view, sightings.pixel).unbind(1)
     tile = row * TILES + column
@@ -155,6 +158,7 @@ def with_exposure(scene: Scene, image: Callable[[int], Annotated[Tensor, "H W 3"
     """
     if scene.exposure is not None or len(scene.train) < 2:
         return scene
+    # g of the training views; their mean is what nobody knows, and 0.
     sightings = find_sightings(sparser(scene))
     gain = None if sightings is None else _gains(sightings, scene, image)
     if gain is None:
@@ -163,6 +167,7 @@ def with_exposure(scene: Scene, image: Callable[[int], Annotated[Tensor, "H W 3"
     gain[train] -= gain[train].mean()
     # Correlation of neighbours, from the squares of their differences: 0 where the order says nothing.
     alike = (1 - gain[train].diff().square().mean() / (2 * gain[train].var()).clamp_min(1e-12)).clamp(0, 1)
+    # A held-out view is as bright as the ones before and after, as far as those resemble each other.
     after = torch.searchsorted(train, scene.test)
     before, after = train[(after - 1).clamp_min(0)], train[after.clamp_max(len(train) - 1)]
     gain[scene.test] = alike * (gain[before] + gain[after]) / 2
@@ -184,6 +189,7 @@ def _gains(
     sightings: Sightings, scene: Scene, image: Callable[[int], Annotated[Tensor, "H W 3"]]
 ) -> Annotated[Tensor, "V"] | None:
     """g of the training views, 0 of those that too few sightings tell of; None where none is left. float64."""
+    # Brightness b of each sighting, where its pixel is neither dark nor clipped.
     rgb = torch.full((len(sightings.view), 3), torch.nan, dtype=torch.float64)
     for view in scene.train.tolist():
         at = (sightings.view == view).nonzero()[:, 0]
@@ -192,6 +198,7 @@ def _gains(
     kept = ((rgb >= DARK) & (rgb <= BRIGHT)).all(1)
     view, bright = sightings.view[kept], rgb[kept].log().mean(1)
     point = torch.unique(sightings.point[kept], dim=0, return_inverse=True)[1]
+    # Twice: the second time without what the first fit calls outliers. Points that one view saw say nothing.
     gain = None
     for _ in range(2):
         known = torch.bincount(view, minlength=len(scene.paths))[view] >= LEAST
@@ -218,6 +225,7 @@ def _solve(
     def gathered(values: Tensor) -> Tensor:
         return values.new_zeros(views).index_add(0, view, values)
 
+    # With the mean over each point's sightings taken out of g and b alike, a drops out; conjugate gradients on what is left.
     gain = bright.new_zeros(views)
     residual = gathered(centred(bright))
     direction, power = residual, float(residual @ residual)

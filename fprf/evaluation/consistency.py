@@ -6,13 +6,7 @@ b's frame, in front of it, and at the depth that b itself has there (occlusion).
 `consistency` is the error of warped colours, also relative to the contrast of what was compared (a dull image scores well for
 nothing): 0 = perfect agreement, sqrt(2) = unrelated colours.
 
-    RMSE = sqrt( Σ_pairs Σ_valid |I_a(p) - I_b(p')|² / (3 Σ_pairs #valid) ),  pairs (t, t + 1) short, (t, t + 7) long
-
-`published` is consistency as other papers report it. A blurred or dull film scores well there.
-
-    rmse   = mean over t of sqrt( mean over valid pixels and channels of (I_t - W(I_{t-k}))² )     Stylos, AnyStyle, StyleRF
-    e_warp = mean over t of the same mean square                                                   FPRF, after Lai et al. 2018
-    lpips  = mean over t of LPIPS(M I_t, M W(I_{t-k})), M = 0 where not valid: black in both       Stylos, AnyStyle, StyleRF
+    RMSE = sqrt( Σ_pairs Σ_valid |I_a(p) - I_b(p')|² / (3 Σ_pairs #valid) )
 """
 
 import math
@@ -24,10 +18,6 @@ from torch import Tensor
 
 from ..errors import DataError, NumericsError
 from ..rendering.cameras import Cameras, grid_rays, look_up, project
-from .lpips import lpips
-
-SHORT, LONG = 1, 7
-"""Frames between the two views of a pair (Lai et al. 2018, and every peer since)."""
 
 _TOLERANCE = 0.02
 """Of the distance: below it, two surfaces count as one. Bilinear depth on a slope is off by far less."""
@@ -57,6 +47,7 @@ def warp(
     _sized(image_b.shape[:2], cameras, b, "image")
     _sized(depth_a.shape, cameras, a, "depth")
     _sized(depth_b.shape, cameras, b, "depth")
+    # Lift view a's pixels to the world by its depth, and look at them from view b.
     origin, direction = grid_rays(cameras, a)
     depth = depth_a.reshape(-1).to(origin)
     solid = torch.isfinite(depth) & (depth > 0)
@@ -66,6 +57,7 @@ def warp(
     # Half a pixel from the border there is no neighbour to interpolate with. The slack is rounding.
     inside = ((there >= 0.5 - 1e-6) & (there <= size - 0.5 + 1e-6)).all(dim=-1) & (ahead > 0)
     pixel = torch.where(inside[:, None], there, size / 2)
+    # Where b's own depth differs from the point's distance, something else is in front or the point is not there.
     distance = (points - cameras.pose[b, :, 3]).norm(dim=-1)
     met = look_up(torch.where(torch.isfinite(depth_b), depth_b, 0.0)[..., None], pixel)[:, 0]
     same = (met - distance).abs() <= _TOLERANCE * distance
@@ -136,30 +128,3 @@ def _sized(shape: Sequence[int], cameras: Cameras, view: int, what: str) -> None
     if tuple(shape) != (height, width):
         size = "x".join(str(side) for side in reversed(shape))
         raise DataError(f"view {view}: the {what} is {size}, its camera {width}x{height}; render at the camera's size")
-
-
-def published(
-    images: Sequence[Annotated[Tensor, "H W 3"]], depths: Sequence[Annotated[Tensor, "H W"]], cameras: Cameras
-) -> dict[str, dict[str, float | int | None]]:
-    """`short` and `long`: `rmse`, `e_warp` (both of colours in [0, 1]), `lpips` and the number of `pairs` compared.
-
-    Raises DataError where images, depths and cameras differ in number.
-    """
-    if not len(images) == len(depths) == len(cameras):
-        raise DataError(f"{len(images)} images, {len(depths)} depths, {len(cameras)} cameras: one of each per frame is needed")
-    summary: dict[str, dict[str, float | int | None]] = {}
-    for name, gap in (("short", SHORT), ("long", LONG)):
-        squares, perceived = [], []
-        for t in range(gap, len(images)):
-            there, valid = warp(images[t - gap], depths[t], depths[t - gap], cameras, t, t - gap)
-            if bool(valid.any()):
-                squares.append(float((images[t][valid].double() - there[valid].double()).square().mean()))
-                perceived.append(lpips(torch.where(valid[..., None], images[t], 0.0), there))
-        count = len(squares)
-        summary[name] = {
-            "rmse": math.fsum(map(math.sqrt, squares)) / count if count else None,
-            "e_warp": math.fsum(squares) / count if count else None,
-            "lpips": math.fsum(perceived) / count if count else None,
-            "pairs": count,
-        }
-    return summary

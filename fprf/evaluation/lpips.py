@@ -37,6 +37,7 @@ def lpips(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"], where: A
     """
     if a.shape != b.shape or a.ndim != 3 or a.shape[-1] != 3 or a.numel() == 0:
         raise DataError(f"lpips: images of shape {tuple(a.shape)} and {tuple(b.shape)}; both must be [H W 3] of one size")
+    # Both images as one batch; small ones are enlarged, since the second pooling would leave nothing of them.
     weights = {name: value.to(a.device) for name, value in _weights().items()}
     pair = torch.stack([a, b.to(a.device)]).float().permute(0, 3, 1, 2)
     if min(pair.shape[2:]) < _SMALLEST:
@@ -45,8 +46,10 @@ def lpips(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"], where: A
         pair = F.interpolate(pair, size, mode="bilinear", align_corners=False)
     total = 0.0
     for layer, features in enumerate(_activations(weights, pair), start=1):
+        # Features of unit length, compared channel by channel by the weights of the layer's head.
         first, second = features / (features.square().sum(1, keepdim=True).sqrt() + _EPS)
         apart = torch.einsum("chw,c->hw", (first - second).square(), weights[f"head{layer}"]).double()
+        # A cell counts by the share of it that lies in the mask.
         share = torch.ones_like(apart)
         if where is not None:
             share = F.interpolate(where[None, None].to(apart), apart.shape, mode="area")[0, 0]

@@ -1,18 +1,27 @@
-"""Image metrics: PSNR and SSIM, with LPIPS. Pure functions of images [H W 3] in [0, 1], to floats.
+"""Renders against photographs: PSNR, SSIM and LPIPS of images [H W 3] in [0, 1], and the report of `fprf eval` on a run.
 
 PSNR = -10 log10(mean squared error), in decibels. SSIM after Wang et al. 2004: Gaussian window of 11 pixels (σ 1.5),
 K = (0.01, 0.03), dynamic range 1, mean over channels and over the windows that lie wholly inside.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Annotated, Any
 
 import torch
 from kornia.metrics import ssim as _ssim_map
 from torch import Tensor
 
+from ..datamanagers.images import Image
+from ..datamanagers.scene import Scene as ParsedScene
 from ..errors import DataError, NumericsError
+from ..interfaces import Scene
+from ..io.images import to_uint8
+from ..memory import peak
+from ..training.run import Known
+from ..types import View
+from .consistency import WarpError
 from .lpips import lpips
 
 PSNR_CAP = 99.0
@@ -50,12 +59,14 @@ def ssim(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"], where: An
     An image with a side below 11 pixels is judged with the largest odd window that fits. Raises as `psnr`.
     """
     first, second = _pair(a, b)
+    # The window must be odd, and fit.
     shortest = min(first.shape[:2])
     window = min(_WINDOW, shortest - 1 + shortest % 2)
     x, y = first.permute(2, 0, 1)[None], second.permute(2, 0, 1)[None]
     # No eps: K keeps the denominator above 9e-8, and kornia's 1e-12 would cost black images 1e-5.
     windows = _ssim_map(x, y, window, eps=0.0, padding="valid")
     if where is not None:
+        # Windows stand at the pixels in their middle, without a rim.
         edge = window // 2
         about = where[edge : edge + windows.shape[2], edge : edge + windows.shape[3]]
         windows = windows[..., about] if bool(about.any()) else windows
@@ -75,6 +86,7 @@ def image_metrics(
         return {"psnr": psnr(render, truth), "ssim": ssim(render, truth), "lpips": lpips(render, truth)}
     if not bool(where.any()):
         raise DataError("a mask leaves nothing of a view that is to be judged; leave the view out, or its mask")
+    # Pixels that are left out are made equal, so that windows over them see no difference.
     filled = torch.where(where[..., None], render, truth)
     return {
         "psnr": psnr(render[where][None], truth[where][None]),
@@ -92,3 +104,52 @@ def mean_metrics(views: Iterable[Mapping[str, float]]) -> dict[str, float]:
     if not rows:
         raise DataError("no views to average metrics over; the split is empty")
     return {name: math.fsum(row[name] for row in rows) / len(rows) for name in rows[0]}
+
+
+def judge(
+    scene: Scene,
+    known: Known,
+    captured: ParsedScene,
+    views: Sequence[int],
+    progress: Callable[[int, int, str], None],
+    *,
+    masks: bool = True,
+) -> tuple[dict[str, Any], list[Image]]:
+    """Metrics of views of a scene (means and each by name), and their images, each in the light that it was taken in.
+
+    `captured` has the photographs; pixels that its `masks` leave out do not count. Seconds are those of rendering alone.
+    Consistency warps each view into the next one of the list by the rendered depth.
+    """
+    cameras = known.cameras
+    images: list[Image] = []
+    before: View | None = None
+    rows, seconds, kept, pixels = {}, 0.0, 0.0, 0
+    warped = WarpError(cameras.select(torch.tensor(list(views), dtype=torch.int64)))
+    for i, view in enumerate(views):
+        progress(i, len(views), "rendering")
+        # As it was taken: in its exposure and tone. Only rendering is timed.
+        taken, start = scene.as_taken(view), time.perf_counter()
+        render = taken.render(cameras, view)
+        seconds += time.perf_counter() - start
+        images.append(to_uint8(render.rgb))
+        kept += render.kept
+        # Two renders are held at a time, whatever the number of views.
+        if before is not None:
+            warped.add(i - 1, i, before.rgb, render.rgb, before.depth, render.depth)
+        before = render
+        truth, where = known.photograph(captured, view, masks=masks)
+        pixels += truth.shape[0] * truth.shape[1]
+        rows[known.names[view]] = image_metrics(render.rgb, truth, where)
+    progress(len(views), len(views), "rendering")
+    means = mean_metrics(rows.values())
+    return {
+        **means,
+        "views": len(views),
+        "render_seconds": seconds,
+        "seconds_per_view": seconds / max(1, len(views)),
+        "rays_per_second": pixels / max(seconds, 1e-9),
+        "kept_samples_share": kept / max(1, len(views)),
+        "peak_rss_mib": (peak() or 0) / 2**20,
+        "consistency": warped.summary(),
+        "per_view": rows,
+    }, images

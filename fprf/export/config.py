@@ -90,18 +90,18 @@ class Plan(NamedTuple):
         return tuple(kind for kind in self.kinds if kind not in KINDS)
 
     def paths(self, base: str, look: str, *suffixes: str) -> list[Path]:
-        """Files of a look: mesh.ply for the scene as it is, mesh.dusk.ply in the look `dusk`; or the single one."""
+        """Name the files of a look: mesh.ply for the scene as it is, mesh.dusk.ply in the look `dusk`; or the single one."""
         if self.single is not None:
             return [self.single]
         return [self.folder / f"{base}{f'.{look}' if look else ''}{suffix}" for suffix in suffixes]
 
 
 def plan(kinds: Sequence[str], output: Path) -> Plan:
-    """From kinds (none = the usual ones) and an output, which is a file if it ends like one.
+    """Plan the files of kinds (none = the usual ones); the output is a file if it ends like one.
 
     Raises UsageError for what does not fit.
     """
-    formats = [ending[1:] for ending in endings()]
+    formats = [ending[1:] for ending in endings() if ending[1:] not in KINDS]
     wanted: list[str] = []
     for kind in kinds:
         if kind not in (*formats, *KINDS, *_ALSO, "splats"):
@@ -109,13 +109,14 @@ def plan(kinds: Sequence[str], output: Path) -> Plan:
             raise UsageError(f"fprf export: {kind!r} is nothing to export{near} (kinds: {', '.join([*formats, *KINDS])})")
         wanted += ["ply", "splat"] if kind == "splats" else [_ALSO.get(kind, kind)]
     wanted = [*dict.fromkeys(wanted)]
-    held = format_name(output) or _ENDINGS.get(output.suffix.lower())
-    if held is None or output.is_dir():
+    kind_of_file = format_name(output) or _ENDINGS.get(output.suffix.lower())
+    if kind_of_file is None or output.is_dir():
         return Plan(tuple(wanted) or _DEFAULT, output, None)
-    allowed = [held, "glb"] if held == "ply" else [held]
+    # A .ply holds Gaussians or a mesh.
+    allowed = [kind_of_file, "glb"] if kind_of_file == "ply" else [kind_of_file]
     if len(wanted) > 1 or (wanted and wanted[0] not in allowed):
         raise UsageError(
             f"--output {output}: a single file of this ending holds {' or '.join(allowed)}, not {' and '.join(wanted)}; "
             "name a folder, or one kind that fits"
         )
-    return Plan((wanted[0] if wanted else held,), output.parent, output)
+    return Plan((wanted[0] if wanted else kind_of_file,), output.parent, output)

@@ -6,13 +6,11 @@ Gaussians in the same order.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from ..datamanagers.images import Image
 from ..datamanagers.scene import Scene as ParsedScene
 from ..interfaces import Scene
 from ..io.images import to_uint8
@@ -39,6 +37,7 @@ _SKY = 3.0
 
 def seen_points(maps: Maps, most: int) -> Points:
     """Places and colours of random pixels of views, at most so many; where a view sees nothing, of a dome of sky."""
+    # Where each pixel's ray meets a surface (infinite where none), its direction, and its colour.
     place, colour, middle = [], [], maps.cameras.pose[:, :, 3].mean(0)
     for view, depth in enumerate(maps.depth):
         origin, direction = grid_rays(maps.cameras, view)
@@ -46,6 +45,7 @@ def seen_points(maps: Maps, most: int) -> Points:
         colour.append(maps.rgb[view].view(-1, 3))
     every = torch.randperm(sum(map(len, place)), generator=torch.Generator().manual_seed(0))[:most]
     (at, direction), shade = torch.split(torch.cat(place)[every], 3, 1), torch.cat(colour)[every]
+    # What sees no surface is put on a dome beyond all that there is.
     solid = at.isfinite().all(1)
     far = _SKY * float((at[solid] - middle).norm(dim=1).max()) if bool(solid.any()) else 1.0
     return Points(torch.where(solid[:, None], at, middle + far * direction).numpy(), shade.float().numpy())
@@ -78,7 +78,10 @@ def fit_gaussians(
     scale = scene_scale(parsed)
     learner = None
     for number, look in enumerate(looks):
-        images = _renders(scene, cameras, look, report)
+        shown, images = scene.restyled(look), {}
+        for view in range(len(cameras)):
+            report(view, len(cameras), "rendering views")
+            images[view] = to_uint8(shown.render(cameras, view).rgb)
         levels = make_levels(parsed, images, {}, near)
         # The first look decides the geometry; in further ones the same Gaussians learn their colours at full size.
         if learner is None:
@@ -91,20 +94,12 @@ def fit_gaussians(
             learner.start_from(before.gaussians())
             seconds = 60 * minutes * _COLOURS
         what = "fitting Gaussians" if number == 0 else "fitting colours"
-        learn(learner, None, Schedule(None, seconds / 60), partial(_tell, report, what))
+
+        def show(event: Report, what: str = what) -> None:
+            report(round(100 * event.share), 100, what)
+
+        learn(learner, None, Schedule(None, seconds / 60), show)
         yield learner.gaussians()
-
-
-def _tell(report: Callable[[int, int, str], None], what: str, event: Report) -> None:
-    report(round(100 * event.share), 100, what)
-
-
-def _renders(scene: Scene, cameras: Cameras, look: Restyle | None, report: Callable[[int, int, str], None]) -> dict[int, Image]:
-    shown, images = scene.restyled(look), {}
-    for view in range(len(cameras)):
-        report(view, len(cameras), "rendering views")
-        images[view] = to_uint8(shown.render(cameras, view).rgb)
-    return images
 
 
 def _with_midpoints(cameras: Cameras) -> Cameras:
@@ -114,8 +109,8 @@ def _with_midpoints(cameras: Cameras) -> Cameras:
     alike = torch.einsum("va,wa->vw", turns[:, :, 2], turns[:, :, 2])
     apart = torch.cdist(centre, centre).masked_fill(alike < _ALIKE, torch.inf).fill_diagonal_(torch.inf)
     distance, other = apart.min(1)
-    mean = (turns + turns[other]) / 2
-    left, _, right = torch.linalg.svd(mean)  # the rotation nearest to the mean
+    # The rotation nearest to the mean of both, and the middle between their places.
+    left, _, right = torch.linalg.svd((turns + turns[other]) / 2)
     between = torch.cat([left @ right, ((centre + centre[other]) / 2)[:, :, None]], 2)
     chosen = (distance < torch.inf).nonzero()[:, 0]
     added = replace(cameras, pose=between).select(chosen)

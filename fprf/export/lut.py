@@ -30,6 +30,7 @@ def colour_pairs(
     scene: Scene, looks: Sequence[Restyle | None], views: Sequence[int]
 ) -> tuple[list[Annotated[Tensor, "R 3"]], Annotated[Tensor, "R K"]]:
     """Colours of R solid pixels of views in each look, and the share of each of the scene's regions in them."""
+    # Views are shrunk together until they hold about as many pixels as a table is fitted to.
     weight, chosen = Membership(scene.measured()[0]), scene.cameras.select(torch.tensor(list(views)))
     small = chosen.scaled(max(1.0, float(chosen.size.double().prod(1).sum() / _PIXELS) ** 0.5))
     shown, shares = [list[Tensor]() for _ in looks], []
@@ -54,7 +55,6 @@ def fit_table(
     """D of a colour map; 0 where no pair has weight. Float64, by L-BFGS."""
     x, y, h = source.double(), target.double(), 1 / (size - 1)
     w = weight.double()[:, None] / weight.double().sum().clamp_min(1e-12)
-
     unknown = torch.zeros(3, size, size, size, dtype=torch.float64, requires_grad=True)
     # Nodes near pairs are held firmly, others loosely: in units of the one or the other they are found alike fast.
     (near,) = torch.autograd.grad((w * moved(unknown, x)).sum(), unknown)
@@ -62,6 +62,7 @@ def fit_table(
     solver = torch.optim.LBFGS([unknown], max_iter=_STEPS, line_search_fn="strong_wolfe", tolerance_change=1e-12)
 
     def energy() -> Tensor:
+        """The sum at the top of the file; integrals are sums over nodes times h^3, differences of neighbours are h grad D."""
         solver.zero_grad()
         table = unknown * unit
         bend = torch.stack([table.diff(dim=axis).square().sum() for axis in (1, 2, 3)]).sum()

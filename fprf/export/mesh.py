@@ -12,7 +12,7 @@ distances along the unit ray through a pixel's centre.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -105,6 +105,7 @@ def render_maps(scene: Scene, cameras: Cameras, *, side: int, reach: float, repo
 
 def build_mesh(maps: Maps, *, edge: float | None = None, report: Report = lambda done, total: None) -> Mesh:
     """The mesh of near surfaces. Raises DataError where no surface comes out."""
+    # Depths of all views become distances on a lattice, and their zero a mesh.
     cell, origin, width = _lattice(maps, edge)
     known, value = _signed_distance(maps, cell, origin, width, report)
     at, face = surface_nets(cell[known], value)
@@ -130,6 +131,7 @@ def vertex_colours(maps: Maps, mesh: Mesh) -> Annotated[Tensor, "N 3"]:
     One view alone would give neighbours the exposures of different pictures. Where no view sees a vertex, those count that miss
     it least.
     """
+    # A view's weight: its pixels on the surface there, and steeply less where it sees something else.
     total, share = torch.zeros(len(mesh.point), 3, dtype=torch.float64), torch.zeros(len(mesh.point), 1, dtype=torch.float64)
     for view, rgb in enumerate(maps.rgb):
         gap, distance, pixel = _gaps(maps, view, mesh.point)
@@ -163,6 +165,7 @@ def _gaps(maps: Maps, view: int, point: Annotated[Tensor, "P 3"]) -> tuple[Tenso
 def _lattice(maps: Maps, edge: float | None) -> tuple[Annotated[Tensor, "M 3"], Annotated[Tensor, "3"], float]:
     """Lattice points near what is seen, the place of (0, 0, 0), and the edge: doubled until they are few enough."""
     origin, seen = maps.cameras.pose[:, :, 3].mean(0), []
+    # The lattice is as fine as the pixels on the surface are; what is seen too coarsely stays out.
     width = torch.cat([(depth / maps.cameras.focal[view].mean())[depth.isfinite()] for view, depth in enumerate(maps.depth)])
     if not len(width):
         raise DataError("export: no view sees a surface within reach; raise --reach, or train longer (see `fprf eval`)")
@@ -246,19 +249,15 @@ def surface_nets(
     vertex = torch.full((len(cell),), -1)
     vertex[crossed] = torch.arange(int(crossed.sum()))
     corner = value[find(cell[crossed][:, None] + _CORNERS)]
+    # On each of the 12 edges of a cell the zero lies where the values say, if their signs differ.
     (first, second), place = torch.tensor(_EDGES).T, _CORNERS.double()
     crosses = (corner[:, first] < 0) != (corner[:, second] < 0)
     part = corner[:, first] / torch.where(crosses, corner[:, first] - corner[:, second], 1.0)
     along = place[first] + part[..., None] * (place[second] - place[first])
     mean = (along * crosses[..., None]).sum(1) / crosses.sum(1, keepdim=True)
     at = cell[crossed].double() + mean
-    return at, torch.cat([*_quads(cell, inside, vertex, at, find)])
-
-
-def _quads(
-    cell: Tensor, inside: Tensor, vertex: Tensor, at: Tensor, find: Callable[[Tensor], Tensor]
-) -> Iterator[Annotated[Tensor, "F 3"]]:
-    """Two triangles for each lattice edge that crosses zero, split along the shorter diagonal; one axis after the other."""
+    # Two triangles for each lattice edge that crosses zero, split along the shorter diagonal; one axis after the other.
+    faces = []
     for step in torch.eye(3, dtype=torch.int64):
         b, c = step.roll(1), step.roll(2)
         ahead = find(cell + step)
@@ -271,7 +270,8 @@ def _quads(
         corner = torch.where(outwards[:, None], corner, corner.flip(1))
         one, other = ((at[corner[:, k]] - at[corner[:, k + 2]]).norm(dim=-1) for k in (0, 1))
         corner = torch.where((one <= other)[:, None], corner, corner.roll(-1, 1))
-        yield from (corner[:, [0, 1, 2]], corner[:, [0, 2, 3]])
+        faces += [corner[:, [0, 1, 2]], corner[:, [0, 2, 3]]]
+    return at, torch.cat(faces)
 
 
 def _keys(cell: Annotated[Tensor, "... 3"]) -> Annotated[Tensor, "..."]:

@@ -48,16 +48,6 @@ def _flush(path: Path, mode: int) -> None:
         os.close(handle)
 
 
-def _is_refusal(error: OSError, temporary: Path) -> bool:
-    """True where the system refuses to write to `temporary`; False for an error about another file, a pipe or a network.
-
-    An error of a file that is open names none.
-    """
-    if error.filename is None:
-        return error.errno is not None and not isinstance(error, (ConnectionError, TimeoutError))
-    return str(temporary) in (str(error.filename), str(error.filename2))
-
-
 @contextmanager
 def atomic_path(final: Path) -> Iterator[Path]:
     """A hidden name beside `final` to write to; it becomes `final` when the block ends, and is removed if it fails.
@@ -86,7 +76,14 @@ def atomic_path(final: Path) -> Iterator[Path]:
     except BaseException as error:
         with suppress(OSError):  # it would hide the error that led here
             temporary.unlink()
-        if isinstance(error, OSError) and (block_ended or _is_refusal(error, temporary)):
+        if not isinstance(error, OSError):
+            raise
+        # Errors about another file, a pipe or a network are the block's own; an error of a file that is open names none.
+        if error.filename is None:
+            refused = error.errno is not None and not isinstance(error, (ConnectionError, TimeoutError))
+        else:
+            refused = str(temporary) in (str(error.filename), str(error.filename2))
+        if block_ended or refused:
             raise unwritable(final, error) from error
         raise
     if os.name != "posix":  # a folder cannot be opened there; the rename is then as durable as the system makes it

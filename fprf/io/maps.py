@@ -86,7 +86,13 @@ def match_image(
     pixel takes no style at all, shown pale. Raises DataError for numbers that do not fit together.
     """
     _fitting(attention, reference, names)
-    colours = _code_colours(reference.cpu(), len(names))
+    # Each code has its reference's hue, from a quarter darker to a quarter lighter in the order of the codes.
+    hues, colours = palette(len(names)), torch.empty(len(reference), 3)
+    for index in range(len(names)):
+        codes = (reference.cpu() == index).nonzero()[:, 0]
+        for place, code in enumerate(codes.tolist()):
+            shade = 0.0 if len(codes) == 1 else 0.5 * place / (len(codes) - 1) - 0.25
+            colours[code] = torch.lerp(hues[index], torch.full((3,), float(shade > 0)), abs(shade))
     weights = attention.detach().cpu().float()
     # Doubt never hides the hue: the darkest is 45 %.
     light = 0.45 + 0.55 * (1 - _entropy(weights) / math.log(max(2, weights.shape[-1])))
@@ -154,18 +160,6 @@ def _entropy(weights: Annotated[Tensor, "H W T"]) -> Annotated[Tensor, "H W"]:
     """In nats; 0 log 0 = 0."""
     entropy: Tensor = torch.special.entr(weights.clamp(min=0)).sum(dim=-1)
     return entropy
-
-
-def _code_colours(reference: Annotated[Tensor, "T"], count: int) -> Annotated[Tensor, "T 3"]:
-    """The colour of every code: its reference's, from a quarter darker to a quarter lighter in the order of the codes."""
-    hues = palette(count)
-    colours = torch.empty(len(reference), 3)
-    for index in range(count):
-        codes = (reference == index).nonzero()[:, 0]
-        for place, code in enumerate(codes.tolist()):
-            shade = 0.0 if len(codes) == 1 else 0.5 * place / (len(codes) - 1) - 0.25
-            colours[code] = torch.lerp(hues[index], torch.full((3,), float(shade > 0)), abs(shade))
-    return colours
 
 
 def _fitting(attention: Tensor, reference: Tensor, names: Sequence[str]) -> None:

@@ -6,7 +6,6 @@ from typing import Annotated, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ..errors import DataError
@@ -37,6 +36,7 @@ def highlight(picture: Picture, inside: Annotated[Tensor, "H W"]) -> Picture:
     """
     height, width = checked(picture).shape[:2]
     share = np.clip(cv2.resize(inside.detach().cpu().float().numpy(), (width, height), interpolation=cv2.INTER_LINEAR), 0, 1)
+    # Outside half as bright and without colour, mixed by the share; then the edge of what is more than half inside.
     grey = cv2.cvtColor(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB).astype(np.float32)
     dim = 0.35 * grey + 40
     mixed = np.asarray(dim + (picture - dim) * share[..., None]).clip(0, 255).astype(np.uint8)
@@ -63,29 +63,21 @@ def _tile(tile: Tile) -> Picture:
     height, width = checked(tile.picture).shape[:2]
     picture = resized(tile.picture, _SIDE, max(1, round(height * _SIDE / width)))
     below = np.full((_BAR + _LINE * len(tile.lines) + _GAP, _SIDE, 3), _PAPER, dtype=np.uint8)
+    # A bar of the references' shares, one after the other; what is missing to 1 stays pale.
     if tile.shares:
-        _draw_bar(below[:_BAR], tile.shares)
+        below[:_BAR] = _FAINT
+        edge = 0.0
+        colours = (palette(len(tile.shares)) * 255).round().int().tolist()
+        for share, colour in zip(tile.shares, colours, strict=True):
+            below[:_BAR, round(edge * _SIDE) : round((edge + share) * _SIDE)] = colour
+            edge += share
+    # As much of each line as the tile is wide.
     for i, line in enumerate(tile.lines):
-        text, scale = line.encode("ascii", "replace").decode(), 0.42
-        at = (1, _BAR + _LINE * i + 14)
-        cv2.putText(below, _cut(text, scale), at, cv2.FONT_HERSHEY_SIMPLEX, scale, _INK, 1, cv2.LINE_AA)
+        text, scale, font = line.encode("ascii", "replace").decode(), 0.42, cv2.FONT_HERSHEY_SIMPLEX
+        while text and cv2.getTextSize(text, font, scale, 1)[0][0] > _SIDE - 2:
+            text = text[:-1]
+        cv2.putText(below, text, (1, _BAR + _LINE * i + 14), font, scale, _INK, 1, cv2.LINE_AA)
     return np.concatenate([picture, below])
-
-
-def _draw_bar(bar: NDArray[np.uint8], shares: Sequence[float]) -> None:
-    bar[:] = _FAINT
-    colours = (palette(len(shares)) * 255).round().int().tolist()
-    edge = 0.0
-    for share, colour in zip(shares, colours, strict=True):
-        bar[:, round(edge * _SIDE) : round((edge + share) * _SIDE)] = colour
-        edge += share
-
-
-def _cut(text: str, scale: float) -> str:
-    """As much of a line as a tile is wide."""
-    while text and cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0] > _SIDE - 2:
-        text = text[:-1]
-    return text
 
 
 _SEAM = 2

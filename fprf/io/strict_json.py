@@ -2,10 +2,10 @@
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from ..errors import CheckpointError, ConfigError
 
@@ -15,9 +15,22 @@ _UNEXPECTED = (OSError, ValueError, LookupError, TypeError, AttributeError, Arit
 
 def parse_json(text: str, *, nan: bool = False) -> Any:
     """Parse a JSON value, NaN and infinities too where `nan` allows them. Raises ValueError, and nothing else."""
-    constant: Callable[[str], float] = float if nan else _not_json
+
+    def constant(text: str) -> float:
+        if not nan:
+            raise ValueError(f"{text} is not a number that JSON knows")
+        return float(text)
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        members: dict[str, Any] = {}
+        for key, value in pairs:
+            if key in members:
+                raise ValueError(f"the key {key!r} stands twice in one object")
+            members[key] = value
+        return members
+
     try:
-        value = json.loads(text, object_pairs_hook=_unique, parse_constant=constant, parse_float=_real, parse_int=_whole)
+        value = json.loads(text, object_pairs_hook=unique, parse_constant=constant, parse_float=_real, parse_int=_whole)
         if "\\u" in text:
             json.dumps(value, ensure_ascii=False).encode()  # half of a surrogate pair has no UTF-8
     except json.JSONDecodeError as error:
@@ -40,15 +53,6 @@ def open_json(path: Path, remedy: str) -> Iterator[Any]:
         raise CheckpointError(f"{path}: cannot be read ({reason}); {remedy}") from error
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    members: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in members:
-            raise ValueError(f"the key {key!r} stands twice in one object")
-        members[key] = value
-    return members
-
-
 def _real(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
@@ -59,7 +63,3 @@ def _real(text: str) -> float:
 def _whole(text: str) -> int:
     _real(text)
     return int(text)
-
-
-def _not_json(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is not a number that JSON knows")

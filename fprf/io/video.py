@@ -1,6 +1,8 @@
 """Frames to a film or to numbered pictures, one frame in memory at a time; to an animated picture, all of them."""
 
+import importlib
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from fractions import Fraction
 from itertools import chain, pairwise
 from pathlib import Path
@@ -31,14 +33,6 @@ MAX_FPS = 1000
 """Frames per second of a film, at most: animated pictures count whole milliseconds."""
 
 
-def _even(frame: Picture) -> Picture:
-    """4:2:0 colour needs even sizes: repeat the last row and column."""
-    bottom, right = frame.shape[0] % 2, frame.shape[1] % 2
-    if not bottom and not right:
-        return frame
-    return np.pad(frame, ((0, bottom), (0, right), (0, 0)), mode="edge")
-
-
 def _alike(frames: Iterable[Picture], path: Path) -> Iterator[Picture]:
     """The frames, even-sized; DataError at the first whose size differs from that of the first of all."""
     shape: tuple[int, ...] | None = None
@@ -50,7 +44,9 @@ def _alike(frames: Iterable[Picture], path: Path) -> Iterator[Picture]:
                 f"{path}: frame {index} is {frame.shape[1]}x{frame.shape[0]}, the first was {shape[1]}x{shape[0]}; "
                 "render all views of a film at one size, or write a folder of pictures"
             )
-        yield _even(checked(frame))
+        # 4:2:0 colour needs even sizes: the last row and column are repeated.
+        bottom, right = frame.shape[0] % 2, frame.shape[1] % 2
+        yield np.pad(checked(frame), ((0, bottom), (0, right), (0, 0)), mode="edge") if bottom or right else checked(frame)
 
 
 def _with_av(av: "ModuleType", path: Path, frames: Iterator[Picture], size: tuple[int, int], fps: Fraction) -> None:
@@ -65,17 +61,6 @@ def _with_av(av: "ModuleType", path: Path, frames: Iterator[Picture], size: tupl
             picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
             container.mux(stream.encode(picture.reformat(format="yuv420p", dst_colorspace="ITU709")))
         container.mux(stream.encode(None))
-
-
-def _with_cv2(path: Path, frames: Iterator[Picture], size: tuple[int, int], fps: Fraction) -> None:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), float(fps), size)
-    if not writer.isOpened():
-        raise DataError(f"{path}: no video encoder here; install one with pip install 'fprf[video]', or write a folder")
-    try:
-        for frame in frames:
-            writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
-    finally:
-        writer.release()
 
 
 def write_video(path: Path, frames: Iterable[Picture], fps: float, *, h264: bool = True) -> Codec:
@@ -97,13 +82,24 @@ def write_video(path: Path, frames: Iterable[Picture], fps: float, *, h264: bool
     size = (first.shape[1], first.shape[0])
     if path.suffix.lower() in _ANIMATIONS:
         return _animated(path, [first, *even], fps)
-    av = _av() if h264 else None
+    # PyAV, unless it is absent or was built without x264, as some distributions do; else OpenCV.
+    av = None
+    if h264:
+        with suppress(ImportError):
+            av = importlib.import_module("av")
     with atomic_path(path) as temporary:
-        if av is None:
-            _with_cv2(temporary, chain([first], even), size, rate)
-            return "mp4v"
-        _with_av(av, temporary, chain([first], even), size, rate)
-        return "h264"
+        if av is not None and "libx264" in av.codecs_available:
+            _with_av(av, temporary, chain([first], even), size, rate)
+            return "h264"
+        writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), float(rate), size)
+        if not writer.isOpened():
+            raise DataError(f"{path}: no video encoder here; install one with pip install 'fprf[video]', or write a folder")
+        try:
+            for frame in chain([first], even):
+                writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+        finally:
+            writer.release()
+        return "mp4v"
 
 
 def _animated(path: Path, frames: list[Picture], fps: float) -> Codec:
@@ -120,15 +116,6 @@ def _animated(path: Path, frames: list[Picture], fps: float) -> Codec:
         raise DataError(f"{path}: OpenCV cannot write it here; write an .mp4, or a folder")
     write_bytes(path, data.tobytes())
     return kind
-
-
-def _av() -> "ModuleType | None":
-    try:
-        import av
-    except ImportError:
-        return None
-    # Some distributions build it without x264.
-    return av if "libx264" in av.codecs_available else None
 
 
 def write_frames(folder: Path, names: Iterable[str], frames: Iterable[Picture]) -> list[Path]:
@@ -157,6 +144,7 @@ def missing_frames(folder: Path, key: str, paths: Sequence[Path]) -> list[Path]:
     The key is written down at once, so that what is rendered from now on counts. Frames are whole or absent.
     Raises DataError where the system refuses to write there.
     """
+    # What the folder was rendered from, if that can be read.
     record = folder / _RECORD
     try:
         known = parse_json(record.read_text("utf-8")).get("key")

@@ -11,16 +11,13 @@ Part of the inputs may be shared by several points, as the direction of a ray is
 # mypy: disable-error-code="call-arg"
 
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from .backend import compiled
-
-Last = Literal["linear", "relu"]
-"""Activation of the last layer."""
 
 Floats = np.ndarray[tuple[int], np.dtype[np.float32]]
 
@@ -47,9 +44,8 @@ def network(
     *,
     shared: Annotated[Tensor, "P J"] | None = None,
     row: Annotated[Tensor, "N"] | None = None,
-    last: Last = "linear",
 ) -> Annotated[Tensor, "N O"]:
-    """ReLU(x W^T + b) layer after layer; `last` is the activation of the last one.
+    """x W^T + b layer after layer, with ReLU between them.
 
     Weights are [outputs, inputs]. Point n has the inputs x[n] and behind them shared[row[n]]. Each layer of the kernel errs by
     at most (I + 3) u (|x| |W|^T + |b|), u = 2^-24.
@@ -59,7 +55,7 @@ def network(
             x = torch.cat([x, shared.index_select(0, row)], -1)
         for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
             x = torch.nn.functional.linear(x.relu_() if layer > 0 else x, weight, bias)
-        return x.relu_() if last == "relu" else x
+        return x
     from . import dense_kernels as kernels
     from .simd import WIDE
 
@@ -76,7 +72,7 @@ def network(
     rows, out = torch.empty(0, dtype=torch.int64) if row is None else row.contiguous(), torch.empty(len(x), len(weights[-1]))
     kernels.network(
         array(x), x.shape[1], array(torch.cat(packed)), array(torch.cat(shifts)), np.asarray(widths), array(side),
-        rows.numpy(), int(last == "relu"), out.view(-1).numpy(), out.shape[1],
+        rows.numpy(), out.view(-1).numpy(), out.shape[1],
     )  # fmt: skip
     return out
 

@@ -80,8 +80,9 @@ def add_shift(bias, at, side, s_at, out, to):
 
 
 @numba.njit(inline="always", cache=True)
-def _layers(source, at, depth, weights, biases, widths, side, row, last, first, rows, here, there, out, outputs):
+def _layers(source, at, depth, weights, biases, widths, side, row, first, rows, here, there, out, outputs):
     """A block of rows of `source` through all layers, to rows `first` on of `out`; `source` may be `there`."""
+    # Sums start from the biases, or from these and what is shared.
     start, s_row = biases, 0
     if len(row) > 0:
         width, start, s_row = widths[0], here, widths[0]
@@ -92,7 +93,7 @@ def _layers(source, at, depth, weights, biases, widths, side, row, last, first, 
     w_at, b_at, layers = 0, 0, len(widths)
     for layer in range(layers):
         width = widths[layer]
-        floor = np.float32(0) if layer < layers - 1 or last == 1 else _LEAST
+        floor = np.float32(0) if layer < layers - 1 else _LEAST
         # Sums that start from `here` may end there: a tile is read whole before it is written.
         goal = here if layer % 2 == 0 else there
         product(source, at, depth, 1, BLOCK, weights, w_at, width, start, b_at, s_row, goal, 0, width, depth, floor)
@@ -108,8 +109,8 @@ def _layers(source, at, depth, weights, biases, widths, side, row, last, first, 
 
 
 @_jit
-def network(x, inputs, weights, biases, widths, side, row, last, out, outputs):
-    """out [N outputs] = the network of x [N inputs]: ReLU between layers; last: 0 nothing, 1 ReLU.
+def network(x, inputs, weights, biases, widths, side, row, out, outputs):
+    """out [N outputs] = the network of x [N inputs]: ReLU between layers.
 
     `side` [rows, first width] is added before the first ReLU, row[n] of it to point n; both empty = nothing.
     """
@@ -125,7 +126,7 @@ def network(x, inputs, weights, biases, widths, side, row, last, out, outputs):
             source, at = there, 0
             there[: rows * inputs] = x[first * inputs : (first + rows) * inputs]
             there[rows * inputs : BLOCK * inputs] = np.float32(0)
-        _layers(source, at, inputs, weights, biases, widths, side, row, last, first, rows, here, there, out, outputs)
+        _layers(source, at, inputs, weights, biases, widths, side, row, first, rows, here, there, out, outputs)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -71,6 +71,7 @@ def coefficients(
     y = _axis(height, features.shape[1], radius, stride, fineness)
     x = _axis(width, features.shape[2], radius, stride, fineness)
 
+    # Statistics of the guide, float64 and about its mean.
     wide = float64_device(features.device)
     y, x = (_Axis(*(operator.to(wide) for operator in axis)) for axis in (y, x))
     pixels = guide.detach().to(device=wide, dtype=torch.float64).permute(2, 0, 1)
@@ -83,6 +84,7 @@ def coefficients(
     def ready(z: Tensor) -> Tensor:
         return z.to(device=features.device, dtype=torch.float32)
 
+    # Then the features, float32, a group of channels at a time.
     mean, inverse, moments, colour = (ready(z) for z in (mean, inverse, moments, colour.reshape(3, 1, 1, 1)))
     operators = [ready(m) for m in (y.window, x.window.T, y.keep, x.keep.T)]
     channels = features.shape[0]
@@ -184,6 +186,7 @@ def _solve(
     features: Tensor, mean: Tensor, inverse: Tensor, moments: Tensor, colour: Tensor, operators: list[Tensor]
 ) -> Annotated[Tensor, "4 C s t"]:
     """A and b of a group of channels."""
+    # cov(I, p) in every window; A = (cov(I, I) + eps)^-1 cov(I, p) and b = mean(p) - A mean(I) (He et al., Eq. 19 and 20).
     window_y, window_x, keep_y, keep_x = operators
     centre = features.mean((1, 2))[:, None, None]
     nodes = F.interpolate((features - centre)[None], moments.shape[1:], mode="bilinear", align_corners=False)[0]
@@ -219,6 +222,7 @@ def _axis(pixels: int, cells: int, radius: int, stride: int, fineness: float) ->
     stored = math.ceil(pixels / stride)
     centres = min(pixels, stored * math.ceil(pixels / (stored * spacing)))
 
+    # Windows around the centres as shares of the axis, in nodes and in centres; then the least-squares fit of the cells.
     hat = _interpolation(nodes, pixels)
     middle = (torch.arange(centres).double() + 0.5) / centres
     reach = 0.5 * size / pixels

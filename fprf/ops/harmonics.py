@@ -105,6 +105,7 @@ def recoloured(
         flat = [array(x.float()) for x in (harmonics, change, weight, directions.values, directions.fit)]
         kernels.recolour(*flat, len(directions.values), np.float32(MAX_COLOUR), out.view(-1).numpy())
         return out
+    # All harmonics by A; the zeroth again, as colour A + b within its limit.
     drawn = as_drawn(harmonics, directions)
     matrix = torch.eye(3).to(change) + change[:, :3]
     colour = 0.5 + HARMONIC * drawn[:, 0]

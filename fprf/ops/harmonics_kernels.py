@@ -70,8 +70,10 @@ def recolour(rows, change, weight, values, fit, count, most, out):
                 continue
             for i in range(run):
                 drawn[i] = rows[at + i]
+            # As renderers draw it: where some colour is cut, fitted again.
             if _may_be_cut(rows, at, count):
                 _cut(rows, at, count, values, fit, size, colour, drawn)
+            # colour A + b, of every harmonic; then the mean colour, which has a limit.
             for k in range(0, run, 3):
                 x, y, z = drawn[k], drawn[k + 1], drawn[k + 2]
                 for c in range(3):

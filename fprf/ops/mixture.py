@@ -1,4 +1,4 @@
-"""Styles at points without gradients: which of several each takes, and what the mixture makes of its features.
+"""Styles at points without gradients: what a mixture of maps makes of the features of each.
 
 Each has a plain form, the reference for every device and dtype (within `backend.plain`, for all), and one compiled for float32
 on the CPU.
@@ -69,33 +69,6 @@ def scaled(
     width = padded[0].shape[1]
     given = [array(part) for part in (x, centre, share, *padded)]
     kernels.scaled(*given, x.shape[1], width, np.zeros(width, np.float32), out.view(-1).numpy())
-    return out
-
-
-def attention(
-    x: Annotated[Tensor, "N D"],
-    keys: Annotated[Tensor, "T D"],
-    temperature: float,
-    *,
-    centre: Annotated[Tensor, "D"] | None = None,
-    flat: float = 0.0,
-    prior: Annotated[Tensor, "T"] | None = None,
-    faint: float = 0.0,
-) -> Annotated[Tensor, "N T"]:
-    """Softmax of x keys^T / temperature, odds multiplied by the prior; the compiled form alone (see `style.matching`).
-
-    With a centre, x are the directions from it, and 0 within `flat` of it. Shares below `faint` of the largest are dropped.
-    """
-    from . import mixture_kernels as kernels
-
-    out, columns = torch.empty(len(x), len(keys)), _whole(keys.T)
-    odds = torch.zeros(len(keys)) if prior is None else prior.log()
-    middle, least = (torch.zeros(x.shape[1]), -1.0) if centre is None else (centre, flat)
-    sharpness = 1 / max(temperature, torch.finfo(torch.float32).tiny)
-    kernels.attention(
-        array(x), array(middle), np.float32(least), array(columns), columns.shape[1], np.float32(sharpness), array(odds),
-        np.float32(faint), np.zeros(columns.shape[1], np.float32), out.view(-1).numpy(),
-    )  # fmt: skip
     return out
 
 

@@ -11,7 +11,8 @@ from typing import Any
 import numba
 import numpy as np
 
-from .simd import LANES, absolute, as_float, lanes, load, on_threads, splat, store, take, total, traced, where_greater
+from .simd import LANES, absolute, as_float, lanes, load, splat, store, total, traced, where_greater
+from .threads import on_threads, take
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 WINDOW = 11
@@ -94,6 +95,7 @@ def _down_both(image, target, at, padded, line, x, room):
 def _similarity(line, x, room, blurred, at, beyond, across, scale, moves, d, layer):
     """SSIM of the windows from x on; and what each one's mean of the image, of its square and of its product with the target
     must move by, to moves."""
+    # Means, squares and the product in the windows: (2 m_a m_b + c1)(2 v_ab + c2) / ((m_a^2 + m_b^2 + c1)(v_a + v_b + c2)).
     ma, aa, ab = _across(line, x), _across(line, room + x), _across(line, 2 * room + x)
     mb, bb = load(blurred, at), load(blurred, beyond + at)
     n1, n2 = 2 * ma * mb + _C1, 2 * (ab - ma * mb) + _C2
@@ -149,7 +151,7 @@ def _loss(counters, image, target, target_blurred, width, height, share, rooms, 
         last = min(height, first + _STRIP)
         alike, apart = 0.0, 0.0
         if similar:
-            # Windows that begin above the strip reach into it.
+            # SSIM of the windows, and what it moves. Windows that begin above the strip reach into it.
             for y in range(first - WINDOW + 1, last):
                 at = unit // strips * area + y * padded
                 d = (y - first + WINDOW - 1) * room
@@ -166,6 +168,7 @@ def _loss(counters, image, target, target_blurred, width, height, share, rooms, 
                     )
                     if y >= first:
                         alike += total(similarity)
+        # The gradient gathers what all windows around a pixel move; then the difference is added.
         for y in range(first, last):
             at = unit // strips * area + y * padded
             if similar:

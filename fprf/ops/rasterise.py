@@ -3,7 +3,7 @@
 N Gaussians, K harmonics of a colour channel (1, 4, 9 or 16), C feature channels, H W pixels; H16 W16 whole tiles of them.
 
 `rasterise_reference` defines what is computed, in plain torch, for every device and dtype. On the CPU in float32 compiled
-kernels do (`rasterise_kernels`, `rasterise_gradient_kernels`), by these steps:
+kernels do (`rasterise_blocks`, `rasterise_kernels`, `rasterise_gradient_kernels`), by these steps:
 
     project     mean -> image position and depth, Sigma' = J W Sigma W^T J^T + 0.3 I, colour from its harmonics
     bin         every Gaussian into the tiles of 16 x 16 pixels that it reaches, each tile sorted by depth
@@ -87,6 +87,7 @@ def rasterise(
         planes, passing, counts = _Rasterise.apply(*given, camera, antialiased)  # type: ignore[no-untyped-call]
     else:
         planes, passing, counts, _ = _composite(_view(*shape, logits, harmonics, camera, antialiased), features, background)
+    # The mean depth by weight.
     opacity = 1 - passing
     depth = planes[..., 3] / opacity.clamp_min(1e-6)  # a drawn alpha is at least 1/255
     return Rasterised(planes[..., :3], depth, opacity, planes[..., 4:], counts)
@@ -236,11 +237,12 @@ def _view(
     antialiased: bool,
 ) -> _View:
     from . import rasterise_kernels as kernels
+    from .rasterise_blocks import FIXED, pack
     from .simd import LANES, aligned
 
     bands, seen, whole = harmonics.shape[1], camera_array(camera, antialiased), -(-len(means) // LANES) * LANES
-    blocks, splats = aligned(whole * (kernels.FIXED + 3 * bands)), aligned(whole * kernels.SLOTS)
-    kernels.pack(*(x.detach().contiguous().numpy() for x in (means, quaternions, log_scales, logits, harmonics)), blocks)
+    blocks, splats = aligned(whole * (FIXED + 3 * bands)), aligned(whole * kernels.SLOTS)
+    pack(*(x.detach().contiguous().numpy() for x in (means, quaternions, log_scales, logits, harmonics)), blocks)
     tiles = kernels.see(blocks, len(means), bands, seen, camera.width, camera.height, splats)
     counts = dict(zip(_SKIPPED, tiles.skipped.tolist(), strict=True)) | {"entries": len(tiles.ids), "saturated": 0}
     return _View(tiles, blocks, bands, seen, counts)

@@ -12,26 +12,20 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from .rasterise_blocks import BLOCKS, FIXED, Floats, basis, colour, direction, direction_slopes, jit
 from .rasterise_kernels import (
-    BLOCKS,
     BLUR,
-    FIXED,
     MAX_ALPHA,
     SIDE,
     SLOTS,
     TILE,
-    Floats,
     Tiles,
     alpha_of,
     axes,
-    basis,
     block_places,
-    colour,
-    direction,
     entry_of,
     footprint,
     inside,
-    jit,
     opacity,
     open_blocks,
 )
@@ -40,18 +34,17 @@ from .simd import (
     aligned,
     load,
     lowest_bit,
-    on_threads,
     splat,
     square_root,
     stack,
     store,
     sums,
     swapped,
-    take,
     traced,
     transposed,
     where_greater,
 )
+from .threads import on_threads, take
 
 SUMS = LANES
 GEOMETRY = 6
@@ -92,6 +85,7 @@ def _nothing(memory, count):
 @traced
 def _composite_block(entry, block, memory, places, found, geometry):
     """Add a block to the sums of an entry: those of the shape, then of channels."""
+    # Alpha as in the forward pass, and what it lets pass.
     dx, dy, a, b, c, d, *value = entry
     dx, dy = dx + memory[block + places], dy + memory[block + places + LANES]
     power = d + dx * (a * dx + b * dy) + c * dy * dy
@@ -105,6 +99,7 @@ def _composite_block(entry, block, memory, places, found, geometry):
     summed = [each + weight * g for each, g in zip(found[len(shape) :], slope, strict=True)]
     if not geometry:
         return summed
+    # dL / d ln alpha = weight <value, gradient> - alpha / (1 - alpha) <what is behind, gradient>.
     gain = splat(memory, 0)
     for each, g in zip(value, slope, strict=True):
         gain = gain + each * g
@@ -145,6 +140,7 @@ def _composite_back(channels, geometry):
                 _begin(
                     row, memory, channels, geometry, bx, by, width, height, out, left, grad, grad_left, d, padded, area
                 )  # fmt: skip
+            # Front to back as in the forward pass, with the same blocks left alone.
             k, end, unsaturated = start[tile], start[tile + 1], 0xFFFF
             while k < end and unsaturated != 0:
                 stop = min(k + 32, end)
@@ -217,58 +213,6 @@ def _add(memory, at, found, slot):
     store(memory, at, load(memory, at) + load(found, slot))
 
 
-def _direction_slopes(x, y, z, bands, blocks, at, red, green, blue):
-    """The gradient of the colour in a unit direction, from that of its channels; components along the direction are left in."""
-    gx = gy = gz = splat(x, 0)
-    c1 = 0.4886025119029199
-    for k in range(1, bands):
-        o = at + (FIXED + 3 * k) * LANES
-        s = red * load(blocks, o) + green * load(blocks, o + LANES) + blue * load(blocks, o + 2 * LANES)
-        if k == 1:
-            gy = gy - c1 * s
-        elif k == 2:
-            gz = gz + c1 * s
-        elif k == 3:
-            gx = gx - c1 * s
-        elif k == 4:
-            s = s * 1.0925484305920792
-            gx, gy = gx + s * y, gy + s * x
-        elif k == 5:
-            s = s * -1.0925484305920792
-            gy, gz = gy + s * z, gz + s * y
-        elif k == 6:
-            s = s * 0.31539156525252005
-            gx, gy, gz = gx - 2 * s * x, gy - 2 * s * y, gz + 4 * s * z
-        elif k == 7:
-            s = s * -1.0925484305920792
-            gx, gz = gx + s * z, gz + s * x
-        elif k == 8:
-            s = s * 0.5462742152960396
-            gx, gy = gx + 2 * s * x, gy - 2 * s * y
-        elif k == 9:
-            s = s * -0.5900435899266435
-            gx, gy = gx + s * 6 * x * y, gy + s * 3 * (x * x - y * y)
-        elif k == 10:
-            s = s * 2.890611442640554
-            gx, gy, gz = gx + s * y * z, gy + s * x * z, gz + s * x * y
-        elif k == 11:
-            s = s * -0.4570457994644658
-            gx, gy, gz = gx - 2 * s * x * y, gy + s * (4 * z * z - x * x - 3 * y * y), gz + 8 * s * y * z
-        elif k == 12:
-            s = s * 0.3731763325901154
-            gx, gy, gz = gx - 6 * s * x * z, gy - 6 * s * y * z, gz + s * (6 * z * z - 3 * (x * x + y * y))
-        elif k == 13:
-            s = s * -0.4570457994644658
-            gx, gy, gz = gx + s * (4 * z * z - 3 * x * x - y * y), gy - 2 * s * x * y, gz + 8 * s * x * z
-        elif k == 14:
-            s = s * 1.445305721320277
-            gx, gy, gz = gx + 2 * s * x * z, gy - 2 * s * y * z, gz + s * (x * x - y * y)
-        else:
-            s = s * -0.5900435899266435
-            gx, gy = gx + s * 3 * (x * x - y * y), gy - s * 6 * x * y
-    return gx, gy, gz
-
-
 def _block_gradient(blocks, at, bands, view, summed):
     """The gradient of the parameters of a block, a vector a row, from sums: shape (6), colour, depth; and its part of the
     gradient of the camera: the turn about its own centre (rotation vector in camera axes), and the shift in the world.
@@ -334,7 +278,7 @@ def _block_gradient(blocks, at, bands, view, summed):
     colours = [
         where_greater(was, 0, slope, 0) for was, slope in zip(colour(blocks, at, values), (red, green, blue), strict=True)
     ]
-    gx, gy, gz = _direction_slopes(dx, dy, dz, bands, blocks, at, *colours)
+    gx, gy, gz = direction_slopes(dx, dy, dz, bands, blocks, at, *colours)
     along = gx * dx + gy * dy + gz * dz
     of_means = [
         view[r] * g_x + view[3 + r] * g_y + view[6 + r] * g_z + (g - d * along) * shrink
@@ -349,6 +293,7 @@ def _block_gradient(blocks, at, bands, view, summed):
 @traced
 def _learn_block(blocks, first, second, weight, start, bands, view, memory, rates, of_camera):
     at = start * (FIXED + 3 * bands)
+    # Adam, whose second moment is weighted by how often a Gaussian was seen.
     w = load(weight, start)
     w = w + (1 - _BETAS[1]) * (1 - w)
     store(weight, start, w)

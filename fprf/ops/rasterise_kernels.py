@@ -1,7 +1,6 @@
 """Compiled forward pass of the rasteriser of 3D Gaussians: projection, tiles, compositing. `rasterise` is their bridge.
 
-Blocks     Parameters of LANES Gaussians lie together, one row of LANES numbers each: mean 0-2, ln scale 3-5, quaternion wxyz
-           6-9, logit of the opacity 10, then harmonics [K 3]. A flat array of blocks, so that every load is one vector.
+Blocks     Parameters of LANES Gaussians, a row each (`rasterise_blocks`).
 Camera     25 numbers: rotation world to camera 0-8, translation 9-11, fx fy cx cy 12-15, place in the world 16-18, limits of
            the tangents (left right top bottom) 19-22, near 23, and 1 for anti-aliasing 24.
 Splats     SLOTS numbers a Gaussian after projection: x y 0-1, A B C D with log2 alpha = A dx^2 + B dx dy + C dy^2 + D 2-5, red
@@ -17,15 +16,14 @@ Entries    A Gaussian in a tile, with a bit for each block of pixels that it may
 import math
 from typing import Annotated, Any, NamedTuple
 
-import numba
 import numpy as np
 
+from .rasterise_blocks import BLOCKS, FIXED, MARK, Floats, basis, colour, direction, jit
 from .simd import (
     LANES,
     added_in_fours,
     as_float,
     exp2,
-    exp2_rough,
     floor,
     greater_bits,
     lanes,
@@ -36,22 +34,20 @@ from .simd import (
     lowest_bit,
     maximum,
     minimum,
-    on_threads,
     splat,
     square_root,
     stack,
     store,
     swapped,
-    take,
     traced,
     transposed,
     where_greater,
 )
+from .threads import on_threads, take
 
-Floats = np.ndarray[Any, np.dtype[np.float32]]
 _Ints = np.ndarray[Any, np.dtype[np.int32]]
-FIXED, SLOTS, SIDE = 11, 16, 16
-"""Rows of a block of Gaussians before its harmonics; numbers of a splat; pixels of a tile's side."""
+SLOTS, SIDE = 16, 16
+"""Numbers of a splat; pixels of a tile's side."""
 BLUR = 0.3
 """Variance in pixels that every projected Gaussian gets: the footprint of a pixel."""
 MIN_ALPHA, MAX_ALPHA = 1 / 255, 0.99
@@ -59,98 +55,12 @@ STOP = 1e-3
 """Blocks of a tile through which no more than this share of light passes are left alone."""
 FAINT, BEHIND, OUTSIDE, INVALID = 0, 1, 2, 3
 
-jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz"})
-
 _f = np.float32
 _LOG2E, _LN2 = 1 / math.log(2), math.log(2)
 LOG_MIN = _f(math.log2(MIN_ALPHA))
 _ZERO, _VECTOR = _f(0), LANES
-BLOCKS = 64
-"""Blocks that a thread takes at a time."""
-_HUGE, _LARGE, _MOST_LOG, _MARK = 1e16, _f(1e15), _f(30), _f(-70)
-"""Square pixels and coordinates beyond which a Gaussian is invalid; most of a logarithm; the logit of the invalid."""
-
-
-@jit
-def _pack(counters, means, quaternions, log_scales, logits, harmonics, blocks):
-    count, bands = harmonics.shape[0], harmonics.shape[1]
-    rows = FIXED + 3 * bands
-    while True:
-        begin = take(counters, 0) * BLOCKS * LANES
-        if begin >= count:
-            break
-        for i in range(begin, min(begin + BLOCKS * LANES, (count + LANES - 1) // LANES * LANES)):
-            o = i // LANES * rows * LANES + i % LANES
-            fine = i < count
-            if fine:
-                fine = logits[i] == logits[i]
-                for c in range(3):
-                    fine = fine and abs(means[i, c]) < _LARGE and log_scales[i, c] == log_scales[i, c]
-                    for k in range(bands):
-                        fine = fine and abs(harmonics[i, k, c]) < _LARGE
-                for c in range(4):
-                    fine = fine and abs(quaternions[i, c]) < _LARGE
-            if not fine:
-                for row in range(rows):
-                    blocks[o + row * LANES] = _f(0)
-                blocks[o + 10 * LANES] = _MARK
-                continue
-            for c in range(3):
-                blocks[o + c * LANES] = means[i, c]
-                blocks[o + (3 + c) * LANES] = min(max(log_scales[i, c], -_MOST_LOG), _MOST_LOG)
-            for c in range(4):
-                blocks[o + (6 + c) * LANES] = quaternions[i, c]
-            blocks[o + 10 * LANES] = min(max(logits[i], -_MOST_LOG), _MOST_LOG)
-            for k in range(bands):
-                for c in range(3):
-                    blocks[o + (FIXED + 3 * k + c) * LANES] = harmonics[i, k, c]
-
-
-def pack(means: Floats, quaternions: Floats, log_scales: Floats, logits: Floats, harmonics: Floats, blocks: Floats) -> None:
-    """Put arrays [N 3], [N 4], [N 3], [N], [N K 3] into blocks. Scales and opacities are limited to what float32 can square; a
-    Gaussian with NaN, or with another number beyond 1e15, is marked as invalid by its logit."""
-    on_threads(_pack, means, quaternions, log_scales, logits, harmonics, blocks)
-
-
-def direction(mean, view):
-    """Unit vectors from the camera to the means, and 1 / distance."""
-    dx, dy, dz = mean[0] - view[16], mean[1] - view[17], mean[2] - view[18]
-    shrink = 1 / square_root(maximum(dx * dx + dy * dy + dz * dz, 1e-24))
-    return dx * shrink, dy * shrink, dz * shrink, shrink
-
-
-def basis(x, y, z, bands):
-    """The first `bands` of the 16 real spherical harmonics at unit vectors."""
-    values = [splat(x, 0.28209479177387814)]
-    if bands > 1:
-        values += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
-    if bands > 4:
-        values += [
-            1.0925484305920792 * x * y,
-            -1.0925484305920792 * y * z,
-            0.31539156525252005 * (2 * z * z - x * x - y * y),
-            -1.0925484305920792 * x * z,
-            0.5462742152960396 * (x * x - y * y),
-        ]
-    if bands > 9:
-        values += [
-            -0.5900435899266435 * y * (3 * x * x - y * y),
-            2.890611442640554 * x * y * z,
-            -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
-            0.3731763325901154 * z * (2 * z * z - 3 * (x * x + y * y)),
-            -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
-            1.445305721320277 * z * (x * x - y * y),
-            -0.5900435899266435 * x * (x * x - 3 * y * y),
-        ]
-    return values
-
-
-def colour(blocks, at, basis):
-    """0.5 + harmonics times the basis: three vectors, before they are cut at 0."""
-    colours = [splat(basis[0], 0.5)] * 3
-    for k, b in enumerate(basis):
-        colours = [each + b * load(blocks, at + (FIXED + 3 * k + c) * LANES) for c, each in enumerate(colours)]
-    return colours
+_HUGE = 1e16
+"""Square pixels beyond which a Gaussian is invalid."""
 
 
 def axes(blocks, at, view):
@@ -202,11 +112,13 @@ def opacity(logit):
 
 @traced
 def _project_block(blocks, at, bands, view, width, height, splats_out, to):
+    # Sigma' and its inverse, whose determinants differ by the blur.
     mean, centre, _, _, _, camera = axes(blocks, at, view)
     (u, v, *_), _, (xx0, yy0, xy, det0) = footprint(centre, camera, view)
     xx, yy = xx0 + BLUR, yy0 + BLUR
     det = det0 + BLUR * (xx0 + yy0) + BLUR * BLUR
     invert = 1 / det
+    # Opacity, fainter where the blur makes it wider.
     logit = load(blocks, at + 10 * LANES)
     alpha = opacity(logit)
     alpha = where_greater(view[24], 0, alpha * square_root(det0 * invert + 1e-8), alpha)
@@ -215,6 +127,7 @@ def _project_block(blocks, at, bands, view, width, height, splats_out, to):
     reach = (highest - LOG_MIN) * (2 * _LN2)
     half_width, half_height = square_root(maximum(reach, 0) * xx), square_root(maximum(reach, 0) * yy)
     px, py = view[12] * u + view[14], view[13] * v + view[15]
+    # Half the width, or why there is nothing to draw.
     shown = where_greater(as_float(width), px - half_width, half_width, -OUTSIDE)
     shown = where_greater(px + half_width, 0, shown, -OUTSIDE)
     shown = where_greater(as_float(height), py - half_height, shown, -OUTSIDE)
@@ -222,8 +135,9 @@ def _project_block(blocks, at, bands, view, width, height, splats_out, to):
     shown = where_greater(centre[2], view[23], shown, -BEHIND)
     shown = where_greater(reach, 0, shown, -FAINT)
     shown = where_greater(_HUGE, xx + yy, shown, -INVALID)
-    shown = where_greater(logit, 0.5 * _MARK, shown, -INVALID)
+    shown = where_greater(logit, 0.5 * MARK, shown, -INVALID)
     colours = (maximum(each, 0) for each in colour(blocks, at, basis(*direction(mean, view)[:3], bands)))
+    # log2 alpha as a polynomial of the distance; a row of splats a Gaussian.
     k = -0.5 * _LOG2E * invert
     inverse_yy = 1 / yy
     rows = [
@@ -282,11 +196,13 @@ def _bands(splats_in, o, row, height, width):
 
     Between the pixel centres of a row of blocks the ellipse is widest at its right and left end or where these are cut off.
     """
+    # Rows of pixels of each row of blocks, cut to the ellipse, relative to its middle.
     mx, my, rx, ry = splats_in[o] - 0.5, splats_in[o + 1] - 0.5, splats_in[o + 10], splats_in[o + 11]
     slope, part, inverse_yy, right = splats_in[o + 12], splats_in[o + 13], splats_in[o + 14], splats_in[o + 15]
     y = as_float(row) * 4 + lanes(mx, range(0, 4 * LANES, 4))
     above = maximum(y, maximum(-floor(ry - my), 0)) - my
     below = minimum(y + 3, minimum(floor(my + ry), as_float(height) - 1)) - my
+    # Where the ellipse is widest between them, and how far it reaches there.
     end, begin = minimum(maximum(right, above), below), minimum(maximum(-right, above), below)
     reach = ry * ry * inverse_yy
     far = mx + slope * end + square_root(maximum(part * (reach - end * end * inverse_yy), 0))
@@ -319,6 +235,7 @@ def _find(splats_in, bits, count, width, height, first_slot, seen, key, tile_of,
         if not splats_in[o + 10] > _ZERO:
             skipped[int(-splats_in[o + 10])] += 1
             continue
+        # Four rows of tiles at a time: the range of blocks in each row, then the tiles of each column.
         before = entries
         top, bottom = splats_in[o + 1] - splats_in[o + 11], splats_in[o + 1] + splats_in[o + 11]
         r0, r1 = int(top) // SIDE if top > _ZERO else 0, int(bottom) // SIDE if bottom < height else (height - 1) // SIDE
@@ -357,6 +274,7 @@ def _sort(
     shift = 0
     while (high - low) >> shift >= 1 << 22:
         shift += 1
+    # How often each digit occurs gives where those of each begin.
     for q in range(visible):
         k = (key[q] - low) >> shift
         key[q] = k
@@ -365,6 +283,7 @@ def _sort(
     for c in range(2048):
         digits[0, c + 1] += digits[0, c]
         digits[1, c + 1] += digits[1, c]
+    # By the low digit, then by the high one, which keeps the order of equals.
     for q in range(visible):
         k = key[q]
         d = digits[0, k & 2047]
@@ -375,6 +294,7 @@ def _sort(
         d = digits[1, k]
         digits[1, k] = d + 1
         seen[d] = other[q]
+    # Entries to their tiles, front to back.
     for tile in range(len(start) - 1):
         start[tile + 1] += start[tile]
         fill[tile] = start[tile]
@@ -436,7 +356,7 @@ def open_blocks(memory):
 
 def alpha_of(power):
     """Alpha from its log2, which is at most 0."""
-    return where_greater(power, LOG_MIN, minimum(exp2_rough(power), MAX_ALPHA), 0)
+    return where_greater(power, LOG_MIN, minimum(exp2(power, 3), MAX_ALPHA), 0)
 
 
 @traced
@@ -498,6 +418,7 @@ def _composite(channels):
             if tile >= across * down:
                 break
             bx, by = tile % across * SIDE, tile // across * SIDE
+            # Nothing passes outside of the image.
             _begin(memory, channels, bx, by, width, height)
             k, end, unsaturated = start[tile], start[tile + 1], 0xFFFF
             while k < end and unsaturated != 0:
@@ -509,6 +430,7 @@ def _composite(channels):
                         while todo != 0:
                             _composite_block(entry, lowest_bit(todo), memory, places)
                             todo &= todo - 1
+                # Blocks that hardly any light passes are left alone from here on.
                 k = stop
                 unsaturated = open_blocks(memory)
             skipped += end - k

@@ -148,6 +148,7 @@ def _tile(
     splats: Projected, values: Tensor, background: Tensor, vertical: tuple[int, int], horizontal: tuple[int, int]
 ) -> Annotated[Tensor, "h w C+2"]:
     """Values, depth and transmittance of the pixels between two rows and two columns."""
+    # Those that reach into the tile, front to back as before.
     (top, bottom), (left, right) = vertical, horizontal
     (x, y), (rx, ry) = splats.mean.detach().unbind(-1), splats.extent.unbind(-1)
     here = ((y + ry > top) & (y - ry < bottom) & (x + rx > left) & (x - rx < right)).nonzero()[:, 0]

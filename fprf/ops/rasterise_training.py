@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from . import photometric
 from . import rasterise_gradient_kernels as backward
 from . import rasterise_kernels as forward
-from .rasterise_kernels import FIXED, SIDE, SLOTS
+from .rasterise_blocks import FIXED
+from .rasterise_kernels import SIDE, SLOTS
 from .simd import LANES, aligned
 
 if TYPE_CHECKING:
@@ -204,6 +205,7 @@ class TrainableGaussians:
         a channel, before they are compared.
         """
         width, height, camera, planes, blurred, valid, _ = target
+        # Render, expose, compare: the loss and its slope by every pixel.
         area, pull = target.area, np.zeros(3, np.float32)
         tiles, out, left = self._render(target, background)
         shown = _exposed(out, area, factors)

@@ -9,21 +9,12 @@ scalar: it cannot prove that their arrays do not overlap.
 The instructions are plain LLVM code for any processor; narrower ones split a vector. Multiply and add may fuse and a division
 may become a product with the reciprocal, nothing else: NaN and infinity keep their meaning. Only `sums` and `total` add lanes,
 in pairs: no other result depends on the width of vectors, but for that fusion. A number among vectors counts in every lane.
-
-Kernels run on threads of `on_threads`. Numba's own cost half of the compilation and split work evenly, which pixels and
-Gaussians are not.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg"
 
-import math
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 from typing import Any
 
-import numba
 import numpy as np
 from llvmlite import binding, ir
 from numba import types
@@ -253,39 +244,6 @@ def stack(typing, count):
     return types.CPointer(types.float32)(count), generate
 
 
-@intrinsic
-def take(typing, counters, k):
-    """counters[k] before 1 is added to it, as one step for all threads."""
-
-    def generate(context, build, sig, args):
-        data = context.make_array(sig.args[0])(context, build, args[0]).data
-        place = build.gep(data, [context.cast(build, args[1], sig.args[1], types.intp)])
-        return build.atomic_rmw("add", place, ir.Constant(_LONG, 1), "monotonic")
-
-    return types.int64(counters, k), generate
-
-
-@cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="fprf-ops")
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)  # a child has none of its parent's threads
-
-
-def on_threads(kernel: Callable[..., Any], *args: Any) -> list[Any]:
-    """kernel(counters, *args) on each of `numba.get_num_threads()` threads; what each returned.
-
-    `counters` are two zeros (int64) for `simd.take`: threads take what is to be done one by one, and numbers for themselves.
-    """
-    counters, others = np.zeros(2, np.int64), numba.get_num_threads() - 1
-    if others == 0:
-        return [kernel(counters, *args)]
-    running = [_pool(others).submit(kernel, counters, *args) for _ in range(others)]
-    return [kernel(counters, *args), *(each.result() for each in running)]
-
-
 @traced
 def load(array, at, lanes=LANES):
     """array[at : at + lanes]."""
@@ -497,62 +455,16 @@ _EXP2 = {
 }
 
 
-def _rounded(x):
-    """The whole numbers next to x, and integers whose low bits they are."""
-    build, large = x.build, _same(_ROUND, x.lanes)
-    rounded = build.fadd(x.value, large)  # these must not be simplified
-    return Vector(build, build.fsub(rounded, large)), build.bitcast(rounded, _ints(x.lanes))
-
-
-def _exp2(x, degree):
-    build, lanes = x.build, x.lanes
-    whole, bits = _rounded(x)
-    part = Vector(build, build.fsub(x.value, whole.value))
+def exp2(x, degree=5):
+    """2^x for |x| < 126; relative error 3e-7, or 1.1e-4 with degree 3."""
+    build, lanes, large = x.build, x.lanes, _same(_ROUND, x.lanes)
+    # x = n + r with a whole n, the low bits of the sum, and |r| <= 1/2; these two must not be simplified.
+    rounded = build.fadd(x.value, large)
+    part = Vector(build, build.fsub(x.value, build.fsub(rounded, large)))
+    # 2^r by a polynomial; n is added to its exponent.
     value = build.bitcast(_polynomial(_EXP2[degree], part).value, _ints(lanes))
-    return Vector(build, build.bitcast(build.add(build.shl(bits, _same_int(23, lanes)), value), _floats(lanes)))
-
-
-def exp2_rough(x):
-    """2^x for |x| < 126; relative error 1.1e-4."""
-    return _exp2(x, 3)
-
-
-def exp2(x):
-    """2^x for |x| < 126; relative error 3e-7."""
-    return _exp2(x, 5)
-
-
-# exp and 1 - exp(-x):  x = n ln 2 + r,  |r| <= ln 2 / 2,  e^x - 1 = 2^n p + (2^n - 1)  with  p = e^r - 1 by its series to r^7.
-# The remainder is below 5e-9 |p|, so p errs by about one unit round-off and so do the functions (at most 3u, u = 2^-24).
-_LOWEST, _HIGHEST = -87.33, 88.3
-"""Between them 2^n is a normal float32."""
-# ln 2 in two parts: n times the first is exact for |n| <= 128.
-_LN2_HIGH = 355 / 512
-_LN2_LOW = math.log(2) - _LN2_HIGH
-_SERIES = [1 / math.factorial(k) for k in range(2, 8)]
-
-
-def _exp_parts(x):
-    """e^r - 1 and 2^n of x between the limits."""
-    build, lanes = x.build, x.lanes
-    n, bits = _rounded(x * (1 / math.log(2)))
-    r = x - n * _LN2_HIGH - n * _LN2_LOW
-    exponent = build.shl(build.add(bits, _same_int(127, lanes)), _same_int(23, lanes))
-    return r * r * _polynomial(_SERIES, r) + r, Vector(build, build.bitcast(exponent, _floats(lanes)))
-
-
-@traced
-def exp(x):
-    """e^x within 3u; 0 below -87.33 and infinite above 88.3, where 2^n would leave float32's normal range. NaN stays NaN."""
-    p, power = _exp_parts(minimum(_HIGHEST, maximum(_LOWEST, x)))
-    return where_greater(x, _HIGHEST, math.inf, where_greater(_LOWEST, x, 0, power * p + power))
-
-
-@traced
-def opaque(x):
-    """1 - exp(-x) for x >= 0, within 3u; NaN stays NaN."""
-    p, power = _exp_parts(minimum(0, maximum(-18, -x)))  # below 2^-25 of 1 nothing is left of exp(-x)
-    return -(power * p + (power - 1))
+    exponent = build.shl(build.bitcast(rounded, _ints(lanes)), _same_int(23, lanes))
+    return Vector(build, build.bitcast(build.add(exponent, value), _floats(lanes)))
 
 
 _LOG2 = (
@@ -568,7 +480,7 @@ def log2(x):
     """log2 of a positive normal number; error 3e-7 of the larger of 1 and itself."""
     build, lanes = x.build, x.lanes
     bits, places = build.bitcast(x.value, _ints(lanes)), _same_int(23, lanes)
-    # From 2^-0.5 on: 0x3f3504f3 are the bits of the square root of one half.
+    # x = 2^n (1 + m) with 1 + m from 2^-0.5 on: 0x3f3504f3 are the bits of the square root of one half.
     exponent = build.ashr(build.sub(bits, _same_int(0x3F3504F3, lanes)), places)
     part = Vector(build, build.bitcast(build.sub(bits, build.shl(exponent, places)), _floats(lanes))) - 1.0
     return _polynomial(_LOG2, part) * part + Vector(build, build.sitofp(exponent, _floats(lanes)))

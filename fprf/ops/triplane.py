@@ -66,19 +66,6 @@ def lookup_reference(
     return torch.cat(scales, -1)
 
 
-def point_slopes_reference(
-    points: Annotated[Tensor, "N 3"],
-    table: Annotated[Tensor, "rows F"],
-    resolutions: Sequence[int],
-    grad: Annotated[Tensor, "N scales*F"],
-) -> Annotated[Tensor, "N 3"]:
-    """Gradient of the points for one of the features, in the plain form; 0 along an axis on which a point lies outside."""
-    with torch.enable_grad():
-        given = points.detach().requires_grad_()
-        (slopes,) = torch.autograd.grad(lookup_reference(given, table.detach(), resolutions), given, grad)
-    return slopes
-
-
 def variation_reference(table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]) -> Tensor:
     """Mean squared difference of neighbouring nodes, summed over both directions and all scales: a scalar."""
     total = table.new_zeros(())

@@ -19,21 +19,22 @@ _jit_sum = numba.njit(parallel=True, cache=True, nogil=True, fastmath={"contract
 
 
 @numba.njit(inline="always", cache=True)
-def cells(points, first, count, apart, across, size, start, channels, corner, part):
+def _cells(points, first, count, size, start, channels, corner, part):
     """For `count` <= BLOCK points: first number of the lower corner's vector in each plane, share of the next node per axis.
 
-    Points lie `apart` numbers apart, their coordinates `across`. Outside counts as the border; the comparison is written so
-    that NaN falls on the lower one: an index must never leave the table.
+    Outside counts as the border; the comparison is written so that NaN falls on the lower one: an index must never leave the
+    table.
     """
     last, plane = np.float32(size - 1), size * size
     half, top = np.float32(0.5) * last, np.float32(size - 2)
     for axis in range(3):
         for n in range(count):
-            at = (points[(first + n) * apart + axis * across] + np.float32(1)) * half
+            at = (points[3 * (first + n) + axis] + np.float32(1)) * half
             at = min(at, last) if at > np.float32(0) else np.float32(0)
             low = min(np.floor(at), top)
             part[axis * BLOCK + n] = at - low
             corner[axis * BLOCK + n] = np.int64(low)
+    # Rows of the table by plane: (0, 1), (0, 2), (1, 2).
     for n in range(count):
         i, j, k = corner[n], corner[BLOCK + n], corner[2 * BLOCK + n]
         corner[n] = (start + j * size + i) * channels
@@ -98,7 +99,7 @@ def _features(points, first, count, table, channels, sizes, starts, corner, part
     scales = len(sizes)
     for scale in range(scales):
         size = sizes[scale]
-        cells(points, first, count, 3, 1, size, starts[scale], channels, corner, part)
+        _cells(points, first, count, size, starts[scale], channels, corner, part)
         for n in range(count):
             a, b, c = corner[n], corner[BLOCK + n], corner[2 * BLOCK + n]
             u, v, w = part[n], part[BLOCK + n], part[2 * BLOCK + n]
@@ -138,7 +139,7 @@ def backward(points, table, channels, sizes, starts, grad, slices, out):
         for block in range(part_of * blocks // slices, (part_of + 1) * blocks // slices):
             first = block * BLOCK
             count = min(BLOCK, total - first)
-            cells(points, first, count, 3, 1, size, starts[scale], channels, corner, part)
+            _cells(points, first, count, size, starts[scale], channels, corner, part)
             o, apart = (first * scales + scale) * channels + here, scales * channels
             for n in range(count):
                 a, b, c = corner[n] + here, corner[BLOCK + n] + here, corner[2 * BLOCK + n] + here
@@ -173,7 +174,7 @@ def point_slopes(points, table, channels, sizes, starts, grad, out):
         for scale in range(scales):
             size = sizes[scale]
             half, last = np.float32(0.5) * np.float32(size - 1), np.float32(size - 1)
-            cells(points, first, count, 3, 1, size, starts[scale], channels, corner, part)
+            _cells(points, first, count, size, starts[scale], channels, corner, part)
             o, apart = (first * scales + scale) * channels, scales * channels
             for n in range(count):
                 a, b, c = corner[n], corner[BLOCK + n], corner[2 * BLOCK + n]

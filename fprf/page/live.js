@@ -24,8 +24,8 @@ const unpacked = async (answer) => {
 
 class Live {
   constructor() {
-    Object.assign(this, { place: null, stage: null, scene: null, state: null, asked: false, last: {}, cards: new Map() });
-    this.start = new Start(this);
+    Object.assign(this, { place: null, stage: null, scene: null, state: null, asked: false, last: {}, cards: new Map(), pending: new Map() });
+    this.start = new Start();
     this.controls();
     this.connect();
   }
@@ -71,16 +71,15 @@ class Live {
     at("place").classList.toggle("field", !scene.gaussians);
     at("save-ply").hidden = !scene.gaussians;
     head.alone = true;
+    const splats = scene.gaussians ? before ? this.place.splats : new Splats(at("canvas")) : null;
+    if (splats) {
+      await splats.load(head, parts);
+      await splats.add("Captured", head.styles[0], parts["style-0"]);
+    }
     if (before) { // a newer state of its training
-      if (scene.gaussians) { await this.place.splats.replace(head, parts); await this.place.splats.add("Captured", head.styles[0], parts["style-0"]); }
       this.place.scene = head;
       this.place.touch();
       return;
-    }
-    let splats = null;
-    if (scene.gaussians) {
-      splats = await Splats.make(at("canvas"), head, parts);
-      await splats.add("Captured", head.styles[0], parts["style-0"]);
     }
     this.place = new Place(at("canvas"), head, splats, splats ? null : () => this.paintField());
     this.place.listeners.pick = (x, y) => this.pick(x, y);
@@ -199,13 +198,10 @@ class Live {
     return Object.assign(node, { weight });
   }
 
-  // At most one message of a kind in 60 ms, the last one for certain.
+  // The last message of a kind in 40 ms.
   steady(kind, send) {
-    const timers = this.timers ??= {};
-    if (timers[kind]) { timers[kind].next = send; return; }
-    send();
-    timers[kind] = { next: null };
-    setTimeout(() => { const { next } = timers[kind]; delete timers[kind]; if (next) this.steady(kind, next); }, 60);
+    if (!this.pending.size) setTimeout(() => { this.pending.forEach((each) => each()); this.pending.clear(); }, 40);
+    this.pending.set(kind, send);
   }
 
   fillRegion(picked, rows) {
@@ -242,13 +238,20 @@ class Live {
   }
 
   controls() {
-    const carries = (event) => [...(event.dataTransfer?.types ?? [])].includes("Files");
-    let depth = 0;
-    const on = (name, act) => addEventListener(name, (event) => { if (this.scene && carries(event)) { event.preventDefault(); act(event); at("veil").hidden = depth <= 0; } });
-    on("dragenter", () => { depth += 1; });
-    on("dragover", (event) => { event.dataTransfer.dropEffect = "copy"; });
-    on("dragleave", () => { depth -= 1; });
-    on("drop", (event) => { depth = 0; this.send(event.dataTransfer.files); });
+    const over = (event, on) => {
+      if (!event.dataTransfer?.types.includes("Files")) return false;
+      event.preventDefault();
+      at("veil").hidden = !(on && this.scene);
+      at("drop").classList.toggle("over", on);
+      return true;
+    };
+    addEventListener("dragover", (event) => over(event, true));
+    addEventListener("dragleave", (event) => { if (!event.relatedTarget) over(event, false); });
+    addEventListener("drop", (event) => {
+      if (!over(event, false)) return;
+      if (this.scene) this.send(event.dataTransfer.files);
+      else this.start.drop(event.dataTransfer);
+    });
     addEventListener("paste", (event) => {
       const files = [...(event.clipboardData?.files ?? [])].filter((file) => file.type.startsWith("image/"));
       if (this.scene && files.length) this.send(files);
@@ -271,7 +274,7 @@ class Live {
     at("make-film").onclick = () => this.tell("film", { seconds: +at("seconds").value });
     at("save-ply").onclick = () => this.offer("/gaussians", "", true);
     at("save-picture").onclick = () => this.tell("picture", { camera: this.camera() });
-    at("scenes").onclick = () => post("/start/leave", "{}").catch((error) => say(error.message, true));
+    at("scenes").onclick = () => post("/start", JSON.stringify({ type: "leave" })).catch((error) => say(error.message, true));
   }
 }
 

@@ -140,7 +140,7 @@ class Stage {
 
 // A page of one file: everything lies in it.
 const open = async (data) => {
-  const styles = data.styles.map(({ name, thumb }) => ({ name, thumb })), root = at("place");
+  const styles = data.styles.map(({ name }) => ({ name, thumb: data.stills[name][0] })), root = at("place");
   const fall = (why) => {
     root.classList.add("pictures");
     root.dataset.why = why;
@@ -153,7 +153,8 @@ const open = async (data) => {
   let place = null;
   if (data.scene) {
     try {
-      const splats = await Splats.make(at("canvas"), data.scene, Object.fromEntries(["shape", "chunks", "palette"].map((name) => [name, section(name)])));
+      const splats = new Splats(at("canvas"));
+      await splats.load(data.scene, Object.fromEntries(["shape", "chunks", "palette"].map((name) => [name, section(name)])));
       await splats.add(styles[0].name, data.styles[0], section("style-0"));
       place = new Place(at("canvas"), data.scene, splats);
     } catch (error) {

@@ -79,7 +79,7 @@ class Place {
     new ResizeObserver(() => this.resize()).observe(canvas);
     if (splats) {
       canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); this.lost = true; });
-      canvas.addEventListener("webglcontextrestored", () => { this.lost = false; splats.restore(); this.touch(); });
+      canvas.addEventListener("webglcontextrestored", () => { this.lost = false; splats.compile(); splats.fill(); this.touch(); });
     }
     this.resize();
     requestAnimationFrame((now) => this.frame(now));

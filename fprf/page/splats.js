@@ -91,17 +91,16 @@ const NOTHING = `${COMMON}
 void main() {}`;
 const QUAD = `${COMMON}
 uniform vec2 size; uniform usampler2D projected; uniform int kept;
-layout(location = 0) in uint corner; // of ${MANY} quads, four each
 out vec2 at; flat out vec4 colour;
 void main() {
   gl_Position = vec4(2., 2., 2., 1.);
   at = vec2(0.); colour = vec4(0.);
-  int i = gl_InstanceID * ${MANY} + int(corner >> 2u);
+  int i = gl_InstanceID * ${MANY} + (gl_VertexID >> 2); // four vertices a quad
   if (i >= kept) return;
   ivec2 from = ivec2(i % ${WIDTH / 2} * 2, i / ${WIDTH / 2});
   uvec4 a = texelFetch(projected, from, 0), b = texelFetch(projected, from + ivec2(1, 0), 0);
   vec4 place = uintBitsToFloat(a);
-  vec2 wide = unpackHalf2x16(b.z), reach = vec2(corner & 1u, corner >> 1u & 1u) * 2. * wide.y - wide.y;
+  vec2 wide = unpackHalf2x16(b.z), reach = vec2(gl_VertexID & 1, gl_VertexID >> 1 & 1) * 2. * wide.y - wide.y;
   vec2 px = place.xy + reach.x * place.zw + reach.y * wide.x * vec2(-place.w, place.z);
   gl_Position = vec4(2. * px / size - 1., 0., 1.);
   at = reach * .84932180; // exp(-x^2 / 2) = exp2(-(.849 x)^2)
@@ -172,25 +171,20 @@ const woven = (planes, count, width) => {
 };
 
 class Splats {
-  // `head` is that of pack.py; `parts` are its deflated sections. Throws where WebGL 2 is missing.
-  static async make(canvas, head, parts) {
-    const splats = Object.assign(new Splats(), { canvas, styles: new Map(), colours: new Map(), textures: {} });
-    splats.compile(); // the graphics process does it while this one inflates
-    await splats.load(head, parts);
-    return splats;
+  // Throws where WebGL 2 is missing. Shaders compile in the graphics process while this one inflates what is loaded.
+  constructor(canvas) {
+    Object.assign(this, { canvas, styles: new Map(), colours: new Map(), textures: {} });
+    this.compile();
   }
 
-  // Other Gaussians in the place of these; styles have to be added again.
-  async replace(head, parts) {
-    this.worker.terminate();
-    [...this.styles.keys()].forEach((name) => this.remove(name));
-    Object.values(this.textures).forEach((texture) => this.gl.deleteTexture(texture));
-    await this.load(head, parts);
-  }
-
+  // Gaussians, in the place of any from before; styles are added then. `head` is that of pack.py; `parts` are its deflated sections.
   async load(head, parts) {
     const [planes, floats, palette] = await Promise.all([parts.shape, parts.chunks, parts.palette].map(inflate));
     const shape = new Uint32Array(woven(planes, head.count, 16).buffer), chunks = new Float32Array(floats.buffer);
+    const coloured = [...this.styles.values()].flatMap(({ rows, maps }) => [rows, maps]);
+    [...Object.values(this.textures), ...coloured].forEach((texture) => this.gl.deleteTexture(texture));
+    this.colours.clear();
+    this.worker?.terminate();
     Object.assign(this, { head, count: head.count, order: null, kept: 0, sortMilliseconds: 0 });
     this.source = { shape, chunks, palette }; // to come back from a lost context
     this.worker = new Worker(URL.createObjectURL(new Blob([`"use strict";(${sorter})()`], { type: "text/javascript" })));
@@ -199,12 +193,7 @@ class Splats {
     this.fill();
   }
 
-  // After a lost context.
-  restore() {
-    this.compile();
-    this.fill();
-  }
-
+  // Begin with a canvas, or begin again after a lost context and call `fill`.
   compile() {
     const gl = this.gl = this.canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
     if (!gl) throw new Error("this browser has no WebGL 2");
@@ -225,34 +214,25 @@ class Splats {
       chunks: this.texture(chunks, gl.RGBA32F, gl.RGBA, gl.FLOAT),
       palette: this.texture(palette.length ? new Int8Array(palette.buffer) : new Int8Array(4), gl.RGBA8_SNORM, gl.RGBA, gl.BYTE),
     };
-    const arrays = (bind) => {
-      const vertices = gl.createVertexArray();
-      gl.bindVertexArray(vertices);
-      bind();
-      gl.enableVertexAttribArray(0);
-      gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-      gl.bindVertexArray(null);
-      return vertices;
-    };
+    const rows = Math.ceil(this.count / (WIDTH / 2));
+    this.textures.projected = this.texture(null, gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT, WIDTH, WIDTH * rows);
     const filled = (place, data, use) => {
       const buffer = gl.createBuffer();
       gl.bindBuffer(place, buffer);
       gl.bufferData(place, data, use);
       return buffer;
     };
-    const rows = Math.ceil(this.count / (WIDTH / 2));
-    this.ordered = arrays(() => { this.buffer = filled(gl.ARRAY_BUFFER, 4 * this.count, gl.DYNAMIC_DRAW); });
-    this.quads = arrays(() => {
-      filled(gl.ARRAY_BUFFER, Uint32Array.from({ length: 4 * MANY }, (_, i) => i), gl.STATIC_DRAW);
-      filled(gl.ELEMENT_ARRAY_BUFFER, Uint16Array.from({ length: 6 * MANY }, (_, i) => 4 * Math.floor(i / 6) + [0, 1, 2, 2, 1, 3][i % 6]), gl.STATIC_DRAW);
-    });
-    this.projected = filled(gl.ARRAY_BUFFER, 32 * rows * (WIDTH / 2), gl.DYNAMIC_COPY);
-    this.textures.projected = gl.createTexture();
-    gl.bindTexture(gl.TEXTURE_2D, this.textures.projected);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, WIDTH, rows);
-    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
+    this.projected = filled(gl.ARRAY_BUFFER, 16 * WIDTH * rows, gl.DYNAMIC_COPY);
+    this.quads = gl.createVertexArray(); // no attributes
+    gl.bindVertexArray(this.quads);
+    filled(gl.ELEMENT_ARRAY_BUFFER, Uint16Array.from({ length: 6 * MANY }, (_, i) => 4 * Math.floor(i / 6) + [0, 1, 2, 2, 1, 3][i % 6]), gl.STATIC_DRAW);
+    this.ordered = gl.createVertexArray();
+    gl.bindVertexArray(this.ordered);
+    this.buffer = filled(gl.ARRAY_BUFFER, 4 * this.count, gl.DYNAMIC_DRAW);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.bindVertexArray(null);
     this.feedback = gl.createTransformFeedback();
-    this.empty = gl.createVertexArray();
     this.exact = this.coarse = null;
     this.styles.clear();
     for (const [name, style] of this.colours) this.upload(name, style);
@@ -284,13 +264,14 @@ class Splats {
     }
   }
 
-  texture(data, inner, format, type, width = WIDTH) {
-    const gl = this.gl, texels = data.length / 4, rows = Math.max(1, Math.ceil(texels / width)), full = Math.floor(texels / width);
+  // A texture of four values a texel; without data an empty one.
+  texture(data, inner, format, type, width = WIDTH, texels = data.length / 4) {
+    const gl = this.gl, rows = Math.max(1, Math.ceil(texels / width)), full = Math.floor(texels / width);
     const texture = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D, texture);
     gl.texStorage2D(gl.TEXTURE_2D, 1, inner, width, rows);
     // Whole rows as they lie, then what is left: no padded copy of all.
-    if (full) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, full, format, type, data.subarray(0, 4 * width * full));
+    if (data && full) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, full, format, type, data.subarray(0, 4 * width * full));
     if (full < rows) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, full, texels - width * full, 1, format, type, data.subarray(4 * width * full));
     for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
     return texture;
@@ -314,13 +295,6 @@ class Splats {
       range, rows: this.texture(rows, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE),
       maps: this.texture(padded, gl.RGBA32F, gl.RGBA, gl.FLOAT, padded.length / 4),
     });
-  }
-
-  remove(name) {
-    const style = this.styles.get(name);
-    if (style) { this.gl.deleteTexture(style.rows); this.gl.deleteTexture(style.maps); }
-    this.styles.delete(name);
-    this.colours.delete(name);
   }
 
   // Order the Gaussians for a camera; `view` is world to camera by columns. One at a time.
@@ -378,7 +352,7 @@ class Splats {
     gl.uniform2f(places.scale, ...scale);
     gl.uniform1f(places.height, height);
     gl.uniform3f(places.background, ...background);
-    gl.bindVertexArray(this.empty);
+    gl.bindVertexArray(this.quads);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 

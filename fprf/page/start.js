@@ -25,8 +25,8 @@ const tidy = (rows) => {
 };
 
 class Start {
-  constructor(page) {
-    Object.assign(this, { page, sending: null, drawn: -1 });
+  constructor() {
+    Object.assign(this, { sending: null, drawn: -1 });
     at("pick-files").onclick = () => at("files").click();
     at("pick-folder").onclick = () => at("folder").click();
     for (const id of ["files", "folder"]) {
@@ -38,19 +38,13 @@ class Start {
     at("path").onsubmit = (event) => { event.preventDefault(); this.open(at("path-of").value); };
     at("show").onclick = () => this.stop("show");
     at("stop").onclick = () => this.stop("leave");
-    const over = (event, on) => { if (!page.scene) { event.preventDefault(); at("drop").classList.toggle("over", on); } };
-    addEventListener("dragover", (event) => over(event, true));
-    addEventListener("dragleave", (event) => { if (!event.relatedTarget) over(event, false); });
-    addEventListener("drop", (event) => {
-      over(event, false);
-      if (!page.scene && !at("choose").hidden) this.attempt(async () => this.send(await carried(event.dataTransfer)));
-    });
   }
 
   get minutes() { return Number(at("minutes").value) || 2; }
+  drop(data) { if (!at("choose").hidden) this.attempt(async () => this.send(await carried(data))); }
   fault(text) { at("fault").textContent = text; at("fault").hidden = !text; if (text) scrollTo(0, 0); }
   attempt(act) { return act().catch((error) => this.fault(error.message)); }
-  ask(name, value) { return post(`/start/${name}`, JSON.stringify(value)); }
+  ask(type, more) { return post("/start", JSON.stringify({ type, ...more })); }
   open(path) { return this.attempt(async () => { this.fault(""); await this.ask("open", { path, minutes: this.minutes }); }); }
 
   stop(then) {

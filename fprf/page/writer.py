@@ -35,8 +35,8 @@ from .live import read, script
 from .pack import colour_header, colour_section, header, importance, pack, sections
 
 CAPTURED = "Captured"
-_STILL, _VIEW, _MAP, _REFERENCE, _THUMB = 800, 512, 320, 320, 160
-"""Longest sides in pixels: of pictures on the stage and below it, of match maps, references and cards."""
+_STILL, _VIEW, _MAP, _REFERENCE = 800, 512, 320, 320
+"""Longest sides in pixels: of pictures on the stage and below it, of match maps and references."""
 _CAMERAS = 48
 """Captured cameras that one can go to, at most."""
 _ROOM = 1.6
@@ -246,10 +246,7 @@ def _text(page: Page, film: str, head: Mapping[str, Any] | None, parts: Mapping[
     heads = [{}] * len(names) if head is None else head["styles"]
     data = {
         "scene": None if head is None else {key: value for key, value in head.items() if key != "styles"},
-        "styles": [
-            {"name": name, "thumb": data_uri(shrink(row[0], _THUMB)), **about_colours}
-            for name, row, about_colours in zip(names, pictures, heads, strict=True)
-        ],
+        "styles": [{"name": name, **about_colours} for name, about_colours in zip(names, heads, strict=True)],
         "stills": dict(zip(names, stills, strict=True)),
     }
     height, width = page.views[0].original.shape[:2]

@@ -36,6 +36,7 @@ def save_config(path: Path, config: "RunConfig", method: str) -> None:
     """
     from ..config import IncompleteConfig, TrainConfig  # the knob tree is made of plug-in configs, which lie above this module
 
+    # A config whose method is not installed gives back what was kept of it.
     fields, packages = to_json(config), packages_of(config)
     if isinstance(config, IncompleteConfig):
         fields = {name: value for name, value in fields.items() if name not in ("reason", "unknown", "packages")}
@@ -51,35 +52,31 @@ def save_config(path: Path, config: "RunConfig", method: str) -> None:
 
 def load_config(path: Path) -> "tuple[RunConfig, str]":
     """The config of a file and the name of its method. Raises ConfigError naming the file and the field."""
+    from ..config import IncompleteConfig, TrainConfig
+
     whole = read_json(path)
     try:
         _check(whole)
-        return _config(whole), whole["method"]
+        fields, method, packages = whole["config"], whole["method"], whole["plugins"]
+        try:
+            kind = type(method_config(method))
+            if isinstance(fields, dict):
+                fields = {name: value for name, value in fields.items() if name not in kind.former}
+            return from_json(fields, kind, packages=packages), method
+        except PluginError as fault:  # not installed, or broken
+            reason = str(fault)
+        # Only a method whose package is on record had fields of its own; elsewhere an unknown field is a mistake.
+        if "method" not in packages or not isinstance(fields, dict):
+            return from_json(fields, TrainConfig, packages=packages), method
+        # What fprf knows is read as ever; the rest, and the packages of its plug-ins, is kept as data.
+        known = hints_of(TrainConfig)
+        unknown = {name: value for name, value in fields.items() if name not in known}
+        theirs = {path: text for path, text in packages.items() if path.partition(".")[0] in {*unknown, "method"}}
+        ours = from_json({name: value for name, value in fields.items() if name in known}, TrainConfig, packages=packages)
+        data = json.dumps(unknown, allow_nan=False)
+        return IncompleteConfig(**vars(ours), reason=reason, unknown=data, packages=json.dumps(theirs)), method
     except ConfigError as fault:
         raise ConfigError(f"{path}: {fault}") from fault
-
-
-def _config(whole: dict[str, Any]) -> "RunConfig":
-    from ..config import IncompleteConfig, TrainConfig
-
-    fields, method, packages = whole["config"], whole["method"], whole["plugins"]
-    try:
-        kind = type(method_config(method))
-        if isinstance(fields, dict):
-            fields = {name: value for name, value in fields.items() if name not in kind.former}
-        return from_json(fields, kind, packages=packages)
-    except PluginError as fault:  # not installed, or broken
-        reason = str(fault)
-    known = hints_of(TrainConfig)
-    # Only a method whose package is on record had fields of its own; elsewhere an unknown field is a mistake.
-    if "method" not in packages or not isinstance(fields, dict):
-        return from_json(fields, TrainConfig, packages=packages)
-    unknown = {name: value for name, value in fields.items() if name not in known}
-    theirs = {path: text for path, text in packages.items() if path.partition(".")[0] in {*unknown, "method"}}
-    ours = from_json({name: value for name, value in fields.items() if name in known}, TrainConfig, packages=packages)
-    return IncompleteConfig(
-        **vars(ours), reason=reason, unknown=json.dumps(unknown, allow_nan=False), packages=json.dumps(theirs)
-    )
 
 
 def method_config(name: str) -> "RunConfig":
@@ -129,6 +126,7 @@ def read_json(path: Path, name: str = "a config.json") -> Any:
 
 
 def _check(whole: Any) -> None:
+    # The format first: what another one holds is not ours to judge.
     if not isinstance(whole, dict) or "format" not in whole:
         raise ConfigError('expected an object with "format": 1, as `fprf train` writes it')
     if whole["format"] != _FORMAT or type(whole["format"]) is not int:
@@ -142,6 +140,7 @@ def _check(whole: Any) -> None:
     for key in whole:
         if key not in _KEYS:
             raise ConfigError(f"unknown key {key!r}{registry.nearest(key, list(_KEYS))} (allowed: {', '.join(_KEYS)})")
+    # What is read before the config itself.
     if not isinstance(whole["method"], str):
         raise ConfigError(f"method: expected a name, found {whole['method']!r}")
     plugins = whole["plugins"]

@@ -35,6 +35,6 @@ class PluginConfig:
         return ()
 
 
-def absent_file(path: Path | None, what: str = "weights file") -> tuple[Need, ...]:
-    """The need for a file that is named and not there; none where no file is named."""
-    return () if path is None or path.is_file() else (Need(f"{path}: no such {what}", "name one that exists"),)
+def absent_file(path: Path | None) -> tuple[Need, ...]:
+    """The need for a file of weights that is named and not there; none where no file is named."""
+    return () if path is None or path.is_file() else (Need(f"{path}: no such weights file", "name one that exists"),)

@@ -8,7 +8,7 @@ import re
 import sys
 from collections.abc import Mapping
 from functools import cache
-from importlib.metadata import Distribution, EntryPoint, distributions
+from importlib.metadata import EntryPoint, distributions
 from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
@@ -41,29 +41,29 @@ class Entry(NamedTuple):
         return f"{self.point.value} from {self.package}"
 
 
-class _Scan(NamedTuple):
-    groups: Mapping[str, Mapping[str, tuple[Entry, ...]]]
-    unreadable: tuple[str, ...]
-
-
 def installed(group: str) -> Mapping[str, tuple[Entry, ...]]:
     """Entries of a group by name, sorted. A name that several packages claim has several entries."""
-    return _scan().groups.get(group, MappingProxyType({}))
+    return _scan()[0].get(group, MappingProxyType({}))
 
 
 def choices(group: str, kind: type = object) -> list[str]:
     """Names of a group that may be of the kind: all but those known, without importing anything, to be of another."""
-    return [name for name in installed(group) if not isinstance(known := peek(group, name), type) or issubclass(known, kind)]
+    names = []
+    for name, entries in installed(group).items():
+        known = _imported(entries[0].point) if len(entries) == 1 else None
+        if not isinstance(known, type) or issubclass(known, kind):
+            names.append(name)
+    return names
 
 
 def groups() -> tuple[str, ...]:
     """Every group that some package registers in."""
-    return tuple(sorted(_scan().groups))
+    return tuple(sorted(_scan()[0]))
 
 
 def unreadable() -> tuple[str, ...]:
     """Packages whose entry points cannot be read, each with the reason. They register nothing and hurt nobody else."""
-    return _scan().unreadable
+    return _scan()[1]
 
 
 def forget() -> None:
@@ -73,6 +73,7 @@ def forget() -> None:
 
 def entry(group: str, name: str, kind: type = object) -> Entry:
     """The one entry of that name. Raises PluginError where there is none or more than one; others of the kind are named."""
+    # Gone, never there, or there twice.
     entries = installed(group).get(name, ())
     if not entries and (group, name) in REMOVED:
         raise PluginError(f"{group}: {name!r} was removed; {REMOVED[group, name]}")
@@ -132,6 +133,7 @@ def make(group: str, name: str, kind: type[T]) -> T:
 
 def name_of(group: str, cls: type) -> str:
     """The name that a plug-in is saved under: the inverse of `load`. Imports nothing."""
+    # By what metadata say, or by the object itself where a class is re-exported.
     value = f"{cls.__module__}:{cls.__qualname__}"
     for name, entries in installed(group).items():
         if any(each.point.value == value or _imported(each.point) is cls for each in entries):
@@ -142,12 +144,6 @@ def name_of(group: str, cls: type) -> str:
     )
 
 
-def peek(group: str, name: str) -> object | None:
-    """Object of that name if its module is imported already, else None. Imports nothing."""
-    entries = installed(group).get(name, ())
-    return _imported(entries[0].point) if len(entries) == 1 else None
-
-
 def nearest(name: str, allowed: Mapping[str, object] | list[str]) -> str:
     """`; did you mean 'x'?` where something allowed is close, else nothing."""
     close = difflib.get_close_matches(name, list(allowed), n=1)
@@ -156,6 +152,7 @@ def nearest(name: str, allowed: Mapping[str, object] | list[str]) -> str:
 
 def _imported(point: EntryPoint) -> object | None:
     """The object of an entry point, from the modules that are imported already: a class may be re-exported."""
+    # `package.module:Class.attribute`, of which the module may not be imported yet.
     module, _, attributes = point.value.partition(":")
     value: object | None = sys.modules.get(module.strip())
     for attribute in attributes.strip().split("."):
@@ -163,23 +160,37 @@ def _imported(point: EntryPoint) -> object | None:
     return value
 
 
+_PREFIX = "fprf."
+
+
 @cache
-def _scan() -> _Scan:
+def _scan() -> tuple[Mapping[str, Mapping[str, tuple[Entry, ...]]], tuple[str, ...]]:
+    """Entries by group and name, and complaints about packages that cannot be read."""
     entries: dict[str, dict[str, list[Entry]]] = {}
-    bad: list[str] = []
+    complaints: list[str] = []
     seen: set[str] = set()
     for distribution in distributions():
         try:
-            package = _package(distribution)
+            # Name and version are looked for in the text: to parse it whole takes ten times as long, per package.
+            text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
+            name, version = (re.search(rf"^{key}: *(\S+)", text, re.MULTILINE) for key in ("Name", "Version"))
+            package = f"{name[1]} {version[1]}" if name and version else f"{distribution.name} {distribution.version}"
             ours = f"[{_PREFIX}" in (distribution.read_text("entry_points.txt") or "")
             points = list(distribution.entry_points) if ours else []
         except Exception as error:  # whatever a damaged file makes the reader raise
-            bad.extend(_complaint(distribution, error))
+            try:
+                text = distribution.read_text("entry_points.txt") or ""
+            except Exception:  # the file itself is the damaged one: it may be about us
+                text = f"[{_PREFIX}"
+            if f"[{_PREFIX}" in text:
+                place, reason = distribution.locate_file(""), f"{type(error).__name__}: {error}"
+                complaints.append(f"{place}: a package's entry points cannot be read ({reason})")
             continue
-        name = re.sub(r"[-_.]+", "-", package.partition(" ")[0]).lower()
-        if name in seen:  # an older copy further down sys.path
+        # Of several copies on sys.path the first one counts.
+        spelling = re.sub(r"[-_.]+", "-", package.partition(" ")[0]).lower()
+        if spelling in seen:
             continue
-        seen.add(name)
+        seen.add(spelling)
         for point in points:
             if point.group.startswith(_PREFIX):
                 entries.setdefault(point.group, {}).setdefault(point.name, []).append(Entry(point, package))
@@ -187,25 +198,4 @@ def _scan() -> _Scan:
         group: MappingProxyType({name: tuple(sorted(names[name], key=lambda each: each.package)) for name in sorted(names)})
         for group, names in entries.items()
     }
-    return _Scan(MappingProxyType(groups), tuple(bad))
-
-
-def _package(distribution: Distribution) -> str:
-    """Name and version. Their two lines are looked for in the text: to parse it whole takes ten times as long, per package."""
-    text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
-    name, version = (re.search(rf"^{key}: *(\S+)", text, re.MULTILINE) for key in ("Name", "Version"))
-    return f"{name[1]} {version[1]}" if name and version else f"{distribution.name} {distribution.version}"
-
-
-def _complaint(distribution: Distribution, error: Exception) -> list[str]:
-    """Fault of a package whose metadata cannot be read, if it has plug-ins of ours at all."""
-    try:
-        text = distribution.read_text("entry_points.txt") or ""
-    except Exception:  # the file itself is the damaged one: it may be about us
-        text = f"[{_PREFIX}"
-    if f"[{_PREFIX}" not in text:
-        return []
-    return [f"{distribution.locate_file('')}: a package's entry points cannot be read ({type(error).__name__}: {error})"]
-
-
-_PREFIX = "fprf."
+    return MappingProxyType(groups), tuple(complaints)

@@ -69,6 +69,7 @@ def slots(config: Any, prefix: str = "") -> Iterator[Slot]:
 
 def replace(config: C, path: str, value: object) -> C:
     """`dataclasses.replace` along a dotted path."""
+    # From the inside out, each level as a copy.
     head, _, rest = path.partition(".")
     inner = replace(getattr(config, head), rest, value) if rest else value
     changed: C = dataclasses.replace(config, **{head: inner})  # type: ignore[type-var]  # C is a dataclass by contract
@@ -79,6 +80,7 @@ def take_flag(args: Sequence[str], flag: str) -> tuple[str | None, list[str]]:
     """Value of `--flag V` or `--flag=V` (the last one wins), and the other arguments. '-' and '_' are one letter."""
     value: str | None = None
     rest: list[str] = []
+    # Flags of other slots and of fields are left for whoever knows them.
     waiting = iter(args)
     for arg in waiting:
         key, equals, inline = arg.partition("=")
@@ -101,21 +103,17 @@ def resolve(config: C, args: Sequence[str]) -> tuple[C, list[str]]:
         slot = todo[0]
         seen.add(slot.path)
         name, rest = take_flag(rest, slot.path)
-        if name is not None:
-            config = _fill(config, slot, name)
+        if name is None:
+            continue
+        # Nothing, the plug-in that is there, or another one.
+        if name == "none":
+            if not slot.optional:
+                raise UsageError(f"--{slot.path}: cannot be none; allowed are {', '.join(slot.choices)}")
+            config = replace(config, slot.path, None)
+            continue
+        try:
+            if type(slot.value) is not registry.load(slot.kind.group, name, slot.kind):
+                config = replace(config, slot.path, registry.make(slot.kind.group, name, slot.kind))
+        except PluginError as error:
+            raise PluginError(f"--{slot.path}: {error}") from error
     return config, rest
-
-
-def _fill(config: C, slot: Slot, name: str) -> C:
-    if name == "none":
-        if not slot.optional:
-            raise UsageError(f"--{slot.path}: cannot be none; allowed are {', '.join(slot.choices)}")
-        return replace(config, slot.path, None)
-    try:
-        chosen = registry.load(slot.kind.group, name, slot.kind)
-        if type(slot.value) is chosen:
-            return config
-        value = registry.make(slot.kind.group, name, slot.kind)
-    except PluginError as error:
-        raise PluginError(f"--{slot.path}: {error}") from error
-    return replace(config, slot.path, value)

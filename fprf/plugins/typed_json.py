@@ -77,7 +77,7 @@ def from_json(data: Any, kind: type[T], *, packages: Mapping[str, str] | None = 
     A key that is absent takes the code's default; an unknown one is refused. `packages` says by dotted path which
     package each plug-in came from, for the message about a missing one.
     """
-    value: T = _Reader(packages or {}).read(data, kind, path)
+    value: T = _read(data, kind, path, packages or {})
     return value
 
 
@@ -85,6 +85,7 @@ def _encode(value: Any, hint: Any, path: str) -> Any:
     if isinstance(value, Missing):
         return {"type": value.name, **json.loads(value.data)}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        # In a slot a config carries the name that it is installed under.
         kind = next(filter(is_slot, members(hint)), None)
         tag = {"type": registry.name_of(kind.group, type(value))} if kind else {}
         hints = hints_of(type(value))
@@ -109,93 +110,56 @@ def _encode(value: Any, hint: Any, path: str) -> Any:
     raise ConfigError(f"{path}: {type(value).__name__} cannot be saved; use numbers, text, paths, tuples")
 
 
-class _Reader:
-    """JSON to configs by type hint."""
-
-    def __init__(self, packages: Mapping[str, str]) -> None:
-        self.packages = packages
-
-    def read(self, data: Any, hint: Any, path: str) -> Any:
-        if hint is Any:
-            return data
-        choices = [h for h in members(hint) if h is not type(None)]
-        if data is None and len(choices) < len(members(hint)):
-            return None
-        if len(choices) > 1:
-            return self._union(data, choices, path)
-        hint = choices[0]
-        if is_slot(hint):
-            return self._plugin(data, hint, path)
-        if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-            return self._dataclass(_expect(data, dict, path), hint, path)
-        return self._container(data, hint, path)
-
-    def _container(self, data: Any, hint: Any, path: str) -> Any:
-        origin, args = get_origin(hint), get_args(hint)
-        if origin is Literal:
-            for allowed in args:
-                if type(allowed) is type(data) and allowed == data:  # True == 1
-                    return allowed
-            raise ConfigError(f"{path}: {data!r} is not one of {', '.join(map(repr, args))}")
-        if origin in (tuple, list):
-            items = _expect(data, list, path)
-            hints = _items(hint, len(items))
-            if len(items) != len(hints):
-                raise ConfigError(f"{path}: expected {len(hints)} values, found {len(items)}")
-            return origin(self.read(v, h, f"{path}.{i}") for i, (v, h) in enumerate(zip(items, hints, strict=True)))
-        if origin is dict:
-            return {k: self.read(v, args[1], f"{path}.{k}") for k, v in _expect(data, dict, path).items()}
-        return _scalar(data, hint, path)
-
-    def _union(self, data: Any, choices: list[Any], path: str) -> Any:
+def _read(data: Any, hint: Any, path: str, packages: Mapping[str, str]) -> Any:
+    if hint is Any:
+        return data
+    # Of a union the first kind that the value is of; where it is of none, what each of them expected is told.
+    choices = [h for h in members(hint) if h is not type(None)]
+    if data is None and len(choices) < len(members(hint)):
+        return None
+    if len(choices) > 1:
         faults = []
         for choice in choices:
             try:
-                return self.read(data, choice, path)
+                return _read(data, choice, path, packages)
             except ConfigError as fault:
                 faults.append(str(fault).removeprefix(f"{path}: "))
         raise ConfigError(f"{path}: {', nor '.join(faults)}")
-
-    def _plugin(self, data: Any, kind: type[PluginConfig], path: str) -> Any:
+    hint = choices[0]
+    origin, args = get_origin(hint), get_args(hint)
+    if is_slot(hint):
+        # A plug-in is named; one that cannot be loaded is kept as data.
         fields = dict(_expect(data, dict, path))
         name = fields.pop("type", None)
         if not isinstance(name, str):
             raise ConfigError(f'{path}: expected the plug-in\'s name as "type", found {name!r}')
         try:
-            chosen = registry.load(kind.group, name, kind)
+            chosen = registry.load(hint.group, name, hint)
         except PluginError as reason:
-            slot = path.partition(".")[2]
-            text, package = json.dumps(fields, allow_nan=False), self.packages.get(slot, "")
-            package = package.removeprefix(f"{name} ")
-            return Missing(slot=slot, kind=kind.group, name=name, data=text, package=package, reason=str(reason))
-        return self._dataclass(fields, chosen, path)
-
-    def _dataclass(self, data: dict[str, Any], cls: type, path: str) -> Any:
-        hints = hints_of(cls)
-        names = [f.name for f in dataclasses.fields(cls) if f.init]
-        for key in data:
-            if key not in names:
-                raise ConfigError(
-                    f"{path}: {cls.__name__} has no field {key!r}{registry.nearest(key, names)} "
-                    f"(its fields: {', '.join(names) or 'none'})"
-                )
-        values = {key: self.read(value, hints[key], f"{path}.{key}") for key, value in data.items()}
-        try:
-            return cls(**values)
-        except ConfigError as fault:
-            raise ConfigError(f"{path}: {fault}") from fault
-        except TypeError as fault:  # a field without a default is absent
-            raise ConfigError(f"{path}: {fault}") from fault
-
-
-def _scalar(data: Any, hint: Any, path: str) -> Any:
+            slot, text = path.partition(".")[2], json.dumps(fields, allow_nan=False)
+            package = packages.get(slot, "").removeprefix(f"{name} ")
+            return Missing(slot=slot, kind=hint.group, name=name, data=text, package=package, reason=str(reason))
+        return _read_fields(fields, chosen, path, packages)
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        return _read_fields(_expect(data, dict, path), hint, path, packages)
+    # Containers, item by item.
+    if origin in (tuple, list):
+        items = _expect(data, list, path)
+        hints = _items(hint, len(items))
+        if len(items) != len(hints):
+            raise ConfigError(f"{path}: expected {len(hints)} values, found {len(items)}")
+        return origin(_read(v, h, f"{path}.{i}", packages) for i, (v, h) in enumerate(zip(items, hints, strict=True)))
+    if origin is dict:
+        return {k: _read(v, args[1], f"{path}.{k}", packages) for k, v in _expect(data, dict, path).items()}
+    if origin is Literal or (isinstance(hint, type) and issubclass(hint, enum.Enum)):
+        allowed = {value: value for value in args} if origin is Literal else {each.value: each for each in hint}
+        for value, meant in allowed.items():
+            if type(value) is type(data) and value == data:  # True == 1
+                return meant
+        raise ConfigError(f"{path}: {data!r} is not one of {', '.join(map(repr, allowed))}")
+    # Plain values.
     if hint is Path:
         return Path(_expect(data, str, path))
-    if isinstance(hint, type) and issubclass(hint, enum.Enum):
-        for member in hint:
-            if type(member.value) is type(data) and member.value == data:
-                return member
-        raise ConfigError(f"{path}: {data!r} is not one of {', '.join(repr(m.value) for m in hint)}")
     if hint is float:
         number = _expect(data, (float, int), path)
         try:
@@ -210,6 +174,23 @@ def _scalar(data: Any, hint: Any, path: str) -> Any:
     raise ConfigError(f"{path}: a field of type {hint} cannot be read from a file")
 
 
+def _read_fields(data: dict[str, Any], cls: type, path: str, packages: Mapping[str, str]) -> Any:
+    """A dataclass of the fields in an object."""
+    hints = hints_of(cls)
+    names = [f.name for f in dataclasses.fields(cls) if f.init]
+    for key in data:
+        if key not in names:
+            raise ConfigError(
+                f"{path}: {cls.__name__} has no field {key!r}{registry.nearest(key, names)} "
+                f"(its fields: {', '.join(names) or 'none'})"
+            )
+    values = {key: _read(value, hints[key], f"{path}.{key}", packages) for key, value in data.items()}
+    try:
+        return cls(**values)
+    except (ConfigError, TypeError) as fault:  # out of its range, or a field without a default is absent
+        raise ConfigError(f"{path}: {fault}") from fault
+
+
 def _items(hint: Any, count: int) -> tuple[Any, ...]:
     """Types of the items of `tuple[A, B]`, `tuple[A, ...]` or `list[A]`."""
     args = get_args(hint)
@@ -220,13 +201,9 @@ def _expect(data: Any, kind: type | tuple[type, ...], path: str) -> Any:
     """The datum itself if it is exactly of that type: a bool is no int, 1.0 is no int, "5" is no number."""
     kinds = kind if isinstance(kind, tuple) else (kind,)
     if type(data) not in kinds:
-        raise ConfigError(f"{path}: expected {_NAMES[kinds[0]]}, found {_shown(data)}")
+        text = json.dumps(data)
+        raise ConfigError(f"{path}: expected {_NAMES[kinds[0]]}, found {text if len(text) <= 60 else f'{text[:57]}...'}")
     return data
-
-
-def _shown(data: Any) -> str:
-    text = json.dumps(data)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 _NAMES = {

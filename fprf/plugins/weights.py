@@ -26,8 +26,10 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise WeightsError(f"{path}: no such weights file; name an existing one or make it with `fprf pretrain`")
     try:
         with safe_open(path, framework="pt") as file:
-            tensors = {name: _widened(file.get_tensor(name)) for name in file.keys()}  # noqa: SIM118
-            return tensors, dict(file.metadata() or {})
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            halves = (torch.float16, torch.bfloat16)
+            wide = {name: tensor.float() if tensor.dtype in halves else tensor for name, tensor in tensors.items()}
+            return wide, dict(file.metadata() or {})
     except (SafetensorError, OSError) as error:
         raise WeightsError(f"{path}: not a readable safetensors file ({error}); copy or download it again") from error
 
@@ -39,6 +41,7 @@ def write_weights(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
 
 def tensors_hash(tensors: Mapping[str, Tensor]) -> str:
     """First 12 hex digits of the SHA-256 over names, shapes and float32 values, in the order of the names."""
+    # Values as float32, so that a file in half precision and its copy in full have one hash.
     digest = hashlib.sha256()
     for name in sorted(tensors):
         value = tensors[name].detach().to("cpu", torch.float32).contiguous()
@@ -47,11 +50,6 @@ def tensors_hash(tensors: Mapping[str, Tensor]) -> str:
     return digest.hexdigest()[:12]
 
 
-def _widened(tensor: Tensor) -> Tensor:
-    return tensor.float() if tensor.dtype in (torch.float16, torch.bfloat16) else tensor
-
-
-Triple = tuple[float, float, float]
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 CHUNK = 1 << 20
 TIMEOUT_SECONDS = 30
@@ -65,34 +63,27 @@ class WeightSource(NamedTuple):
     file: str
     """Name that the caches are searched for."""
     origin: str
-    """Origin of the file: its URL if `pinned`."""
+    """Its URL; the file's name carries the beginning of its own SHA-256."""
     flag: str
     """Flag that names another file."""
-    pinned: bool = False
-    """The file's name carries its hash, so that it may be downloaded."""
-
-
-def torchvision_file(network: str, file: str, flag: str) -> WeightSource:
-    """One of torchvision's files: their names carry the beginning of their own SHA-256."""
-    return WeightSource(network, file, f"https://download.pytorch.org/models/{file}", flag, pinned=True)
 
 
 def weights_needed(source: WeightSource, path: Path | None) -> tuple[Need, ...]:
     """Weights that `find_weights` would have to download."""
     if path is not None or _cached(source) is not None:
         return absent_file(path)
-    target = _cache_folder() / source.file
-    command = f"curl --create-dirs --output {target} {source.origin}" if source.pinned else f"put it there: {source.origin}"
-    named = f"{command}, or name a file with {source.flag} FILE"
-    return (Need(f"{source.network}'s weights {target}", named, downloaded=source.pinned),)
+    target = _folders()[0] / source.file
+    command = f"curl --create-dirs --output {target} {source.origin}, or name a file with {source.flag} FILE"
+    return (Need(f"{source.network}'s weights {target}", command, downloaded=True),)
+
+
+def _folders() -> tuple[Path, Path]:
+    """fprf's cache, which downloads go to, and torch's."""
+    return Path.home() / ".cache/fprf/weights", Path.home() / ".cache/torch/hub/checkpoints"
 
 
 def _cached(source: WeightSource) -> Path | None:
     return next((folder / source.file for folder in _folders() if (folder / source.file).is_file()), None)
-
-
-def _folders() -> tuple[Path, Path]:
-    return _cache_folder(), Path.home() / ".cache/torch/hub/checkpoints"
 
 
 def find_weights(source: WeightSource, path: Path | None) -> Path:
@@ -102,60 +93,9 @@ def find_weights(source: WeightSource, path: Path | None) -> Path:
     cached = _cached(source)
     if cached is not None:
         return cached
-    if source.pinned:
-        return _download(source)
-    raise WeightsError(
-        f"{source.network}: {source.file} is not in {' nor in '.join(map(str, _folders()))}; put it there ({source.origin}), "
-        f"or name a file with {source.flag} FILE"
-    )
-
-
-def read_tensors(path: Path, source: WeightSource) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors and metadata of a safetensors file, or of a file of `torch.save` (which has no metadata), hash checked.
-
-    Raises WeightsError where the file is absent, damaged, or another than its name promises.
-    """
-    if path.suffix == ".safetensors":
-        return read_weights(path)
-    if not path.is_file():
-        raise WeightsError(f"{path}: no such weights file; {source.network}'s is {source.origin}")
-    _check_hash(path, path.name, source)
-    try:
-        tensors = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # the unpickler raises whatever the bytes lead it to
-        raise WeightsError(
-            f"{path}: not a file of tensors ({type(error).__name__}); {source.network}'s is {source.origin}"
-        ) from error
-    if not isinstance(tensors, dict):
-        raise WeightsError(
-            f"{path}: holds a {type(tensors).__name__}, not named tensors; {source.network}'s is {source.origin}"
-        )
-    return {name: value.float() for name, value in tensors.items() if isinstance(value, Tensor)}, {}
-
-
-def input_statistics(
-    metadata: Mapping[str, str], path: Path, mean: Triple = IMAGENET_MEAN, std: Triple = IMAGENET_STD
-) -> tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]:
-    """Mean and deviation of a network's input, as the file's metadata says; those given where it says nothing."""
-    return _stated_triple(metadata, "mean", mean, path), _stated_triple(metadata, "std", std, path)
-
-
-def _stated_triple(metadata: Mapping[str, str], key: str, default: Triple, path: Path) -> Annotated[Tensor, "3"]:
-    if key not in metadata:
-        return torch.tensor(default)
-    try:
-        return torch.tensor(json.loads(metadata[key]), dtype=torch.float32).view(3)
-    except (ValueError, RuntimeError, TypeError) as error:
-        raise WeightsError(f"{path}: metadata {key!r} is {metadata[key]!r}, not three numbers such as [0.5,0.5,0.5]") from error
-
-
-def _cache_folder() -> Path:
-    return Path.home() / ".cache/fprf/weights"
-
-
-def _download(source: WeightSource) -> Path:
-    target = _cache_folder() / source.file
+    target = _folders()[0] / source.file
     target.parent.mkdir(parents=True, exist_ok=True)
+    # Into a file of its own, whose hash is checked before it takes the name.
     partial = target.with_name(f"{source.file}.{os.getpid()}.partial")
     try:
         # The origins are ours, https, and what comes is hashed before it is used.
@@ -172,6 +112,43 @@ def _download(source: WeightSource) -> Path:
     finally:
         partial.unlink(missing_ok=True)
     return target
+
+
+def read_tensors(path: Path, source: WeightSource) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and metadata of a safetensors file, or of a file of `torch.save` (which has no metadata), hash checked.
+
+    Raises WeightsError where the file is absent, damaged, or another than its name promises.
+    """
+    if path.suffix == ".safetensors":
+        return read_weights(path)
+    if not path.is_file():
+        raise WeightsError(f"{path}: no such weights file; {source.network}'s is {source.origin}")
+    # A name with a hash is a promise that is kept before anything is unpacked.
+    _check_hash(path, path.name, source)
+    try:
+        tensors = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # the unpickler raises whatever the bytes lead it to
+        raise WeightsError(
+            f"{path}: not a file of tensors ({type(error).__name__}); {source.network}'s is {source.origin}"
+        ) from error
+    if not isinstance(tensors, dict):
+        raise WeightsError(
+            f"{path}: holds a {type(tensors).__name__}, not named tensors; {source.network}'s is {source.origin}"
+        )
+    return {name: value.float() for name, value in tensors.items() if isinstance(value, Tensor)}, {}
+
+
+def input_statistics(metadata: Mapping[str, str], path: Path) -> tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]:
+    """Mean and deviation of a network's input, as the file's metadata says; ImageNet's where it says nothing."""
+    stated = []
+    for key, default in (("mean", IMAGENET_MEAN), ("std", IMAGENET_STD)):
+        try:
+            numbers = json.loads(metadata[key]) if key in metadata else default
+            stated.append(torch.tensor(numbers, dtype=torch.float32).view(3))
+        except (ValueError, RuntimeError, TypeError) as error:
+            found = f"metadata {key!r} is {metadata[key]!r}"
+            raise WeightsError(f"{path}: {found}, not three numbers such as [0.5,0.5,0.5]") from error
+    return stated[0], stated[1]
 
 
 def _expected(name: str) -> str | None:

@@ -31,8 +31,6 @@ class PretrainConfig:
     """Every draw is a function of it."""
     device: str = "auto"
     """cpu, cuda, mps, or auto. Draws are the same on each."""
-    samples: float = 60.0
-    """Seconds between sample pictures, in a folder beside the output; 0 = none."""
 
     def __post_init__(self) -> None:
         if self.photos is not None:
@@ -43,7 +41,6 @@ class PretrainConfig:
         at_least("batch", self.batch, 1)
         positive("rate", self.rate)
         at_least("seed", self.seed, 0)
-        at_least("samples", self.samples, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)

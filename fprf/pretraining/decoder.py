@@ -26,7 +26,7 @@ from ..plugins.weights import write_weights
 from ..style.statistics import deviation
 from ..training.prepare import device_of
 from .config import PretrainDecoderConfig
-from .loop import generator_of, sheet, train
+from .loop import generator_of, train
 from .photos import filtered_at, filtered_crop, filtered_whole, find_photos, load_photo, random_pixels, split
 
 Report = dict[str, float | int | str]
@@ -147,15 +147,18 @@ def prepare_crops(
     loaded = [load_photo(path, longest).to(device) for path in photos]
     side = min(side, *(min(photo.shape[:2]) for photo in loaded))
     made = [filtered_crop(encoder, photo, side, generator_of(seed, i)) for i, photo in enumerate(loaded)]
+    # Units first: activations below are divided by them.
     images = [rgb.view(side, side, 3).permute(2, 0, 1) for _, rgb in made]
     if measure:
         network.measure(images)
+    # The content's structure is its normalised activations: they take the deviation of any style later (AdaIN).
     seen = [network(image[None]) for image in images]
     structure = []
     for each in seen:
         mean, std = (half[:, :, None, None] for half in style_statistics([each[CONTENT]])[0].chunk(2, 1))
         structure.append(((each[CONTENT] - mean) / std).half())
     statistics = [style_statistics(each) for each in seen]
+    # Moments of features in float64; the features themselves are kept in half precision, since there are many.
     wide = [double(features) for features, _ in made]
     own = [(each.mean(0), each.var(0, correction=0)) for each in wide]
     return Crops(
@@ -176,12 +179,14 @@ def restyling_losses(
     style: Annotated[Tensor, "B"],
 ) -> tuple[Annotated[Tensor, ""], Annotated[Tensor, ""]]:
     """Content loss and style loss (paper, L_c and L_s) of crops `content` in the styles of crops `style`."""
+    # The paper's training pair: content features with the moments of the style, decoded to a picture (t, and g(t)).
     features = adain(
         crops.features[content].float(), (crops.mean[content], crops.std[content]), (crops.mean[style], crops.std[style])
     )
     colour = decode(features.flatten(0, 1)).view(len(content), crops.side, crops.side, 3)
     activations = network(colour.permute(0, 3, 1, 2))
     wanted = [layer[style] for layer in crops.style]
+    # L_c compares with AdaIN in VGG's own space, L_s with the style's moments layer by layer.
     mean, std = (half[:, :, None, None] for half in wanted[CONTENT].chunk(2, 1))
     structure = F.mse_loss(activations[CONTENT], crops.structure[content].float() * std + mean)
     return structure, style_distance(style_statistics(activations), wanted)
@@ -189,7 +194,6 @@ def restyling_losses(
 
 REPORT_PHOTOS = 20
 LONGEST = 384
-SAMPLE_PHOTOS, SAMPLE_LONGEST = 3, 192
 
 
 def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[[str], None]) -> Report:
@@ -241,7 +245,7 @@ def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[
         structure, style = restyling_losses(crops, network, decode, *pair)
         return identity + config.every * (config.content * structure + config.style * style)
 
-    steps = train(decoder, loss, config, output, say, _picture(encoder, held, decode, device))
+    steps = train(decoder, loss, config, output, say)
     # W (f - mean) / std + b as one linear layer of f, in float64.
     with torch.no_grad():
         weight = double(decoder.first.weight) / double(std)
@@ -292,24 +296,3 @@ def restyling_report(crops: Crops, network: StyleNetwork, decode: Decode) -> Rep
     losses = [restyling_losses(crops, network, decode, i[None], (i[None] + 1) % count) for i in index]
     content, style = (sum(float(each) for each in column) / count for column in zip(*losses, strict=True))
     return {"content_loss": round(content, 4), "style_loss": round(style, 4)}
-
-
-def _picture(
-    encoder: Encoder, held: Sequence[Path], decode: Decode, device: torch.device
-) -> Callable[[], Annotated[Tensor, "H W 3"]]:
-    """Rows of photo | decoded | decoded in the style of the next photo."""
-    photos = [load_photo(path, SAMPLE_LONGEST).to(device) for path in held[:SAMPLE_PHOTOS]]
-    features = [filtered_whole(encoder, photo)[None] for photo in photos]
-    styles = []
-    for each in features:
-        mean = each.mean(1)
-        styles.append((mean, deviation(mean, each.var(1, correction=0))))
-
-    def picture() -> Annotated[Tensor, "H W 3"]:
-        rows = []
-        for i, photo in enumerate(photos):
-            styled = adain(features[i], styles[i], styles[(i + 1) % len(photos)])
-            rows.append([photo, decode(features[i][0]).view_as(photo), decode(styled[0]).view_as(photo)])
-        return sheet(rows)
-
-    return picture

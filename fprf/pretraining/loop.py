@@ -1,4 +1,4 @@
-"""Training of a network by any loss: Adam, one cosine to zero by time or steps, checkpoints, sample pictures.
+"""Training of a network by any loss: Adam, one cosine to zero by time or steps, checkpoints.
 
 A batch is a function of (seed, step). The checkpoints lie in a folder beside the output until the training is finished.
 """
@@ -6,24 +6,20 @@ A batch is a function of (seed, step). The checkpoints lie in a folder beside th
 import math
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
 
 import torch
 from torch import Tensor, nn
 
 from ..interfaces import Figures, Learner, State
-from ..io.images import to_uint8, write_image
 from ..training import checkpoint
 from ..training.driver import Report, Schedule, learn
-from ..training.run import Run, held
+from ..training.run import Run, lock_folder
 from ..training.tasks import begin
 from .config import PretrainConfig
 
-GAP = 4
-"""Pixels between the pictures of a sheet."""
 WARM_UP = 0.02
 """Share of the run in which the rate rises."""
 _SAVED, _SPOKEN = 60.0, 15.0
@@ -40,11 +36,6 @@ def training_folder(output: Path) -> Path:
     return output.with_name(output.name + ".training")
 
 
-def samples_folder(output: Path) -> Path:
-    """Folder of the sample pictures of these weights."""
-    return output.with_name(output.stem + ".samples")
-
-
 class NetworkLearner(Learner):
     """A network in training. `loss` draws its batch from the generator of a step."""
 
@@ -59,12 +50,14 @@ class NetworkLearner(Learner):
         return next(self.network.parameters()).device
 
     def step(self, index: int, share: float) -> None:
+        # Linear warm-up, then one cosine to zero over the whole schedule.
         warm = min(1.0, share / WARM_UP + 0.01)
         self.optimizer.param_groups[0]["lr"] = self.config.rate * warm * 0.5 * (1 + math.cos(math.pi * share))
         value = self.loss(generator_of(self.config.seed, index))
         self.optimizer.zero_grad(set_to_none=True)
         value.backward()  # type: ignore[no-untyped-call]
         self.value, self.seen = value.detach(), self.seen + self.config.batch
+        # A loss that is not finite changes nothing.
         finite = bool(torch.isfinite(self.value))
         self.skipped, self.failed = self.skipped + (not finite), 0 if finite else self.failed + 1
         if finite:
@@ -88,53 +81,29 @@ def train(
     config: PretrainConfig,
     output: Path,
     say: Callable[[str], None],
-    picture: Callable[[], Annotated[Tensor, "H W 3"]] | None = None,
 ) -> int:
     """Train in place until the budget is spent; the number of steps. A training of the same config goes on, another is dropped.
 
-    `picture` shows what the network can do, in [0, 1]: it is written to `samples_folder` every `config.samples` seconds and
-    at the end. Raises as `training.driver.learn`.
+    Raises as `training.driver.learn`.
     """
-    spoken = shown = time.monotonic()
-
-    @torch.no_grad()
-    def show(step: int) -> None:
-        if picture is not None and config.samples > 0:
-            write_image(samples_folder(output) / f"step-{step:07d}.png", to_uint8(picture()))
+    spoken = time.monotonic()
 
     def report(event: Report) -> None:
-        nonlocal spoken, shown
+        nonlocal spoken
         now = time.monotonic()
         if now - spoken > _SPOKEN:
             say(f"step {event.step}  {100 * event.share:.0f} %  loss {event.losses['loss']:.5f}")
             spoken = now
-        if now - shown > config.samples and event.share < 1:
-            show(event.step)
-            shown = now
 
     # The folder is a run's, as far as the driver needs one; it goes when the weights are there.
     run = Run(training_folder(output))
     schedule = Schedule(config.steps, None if config.steps is not None else config.minutes, _SAVED / 60)
-    with held(run.root):
-        begin(run.root, repr(replace(config, samples=0.0, device="auto")))
+    with lock_folder(run.root):
+        begin(run.root, repr(replace(config, device="auto")))
         if steps := checkpoint.steps(run.checkpoints):
             say(f"resumed at step {steps[-1]}")
         network.train()
         step, _ = learn(NetworkLearner(network, loss, config), run, schedule, report)
         network.eval()
-        show(step)
         shutil.rmtree(run.root)
     return step
-
-
-def sheet(rows: Sequence[Sequence[Annotated[Tensor, "H W 3"]]]) -> Annotated[Tensor, "H W 3"]:
-    """Pictures of any sizes in rows, on white, aligned at their top left corners: one picture of all."""
-    height = [max(picture.shape[0] for picture in row) for row in rows]
-    width = [max(row[i].shape[1] for row in rows if i < len(row)) for i in range(max(len(row) for row in rows))]
-    whole = torch.ones(sum(height) + GAP * (len(rows) - 1), sum(width) + GAP * (len(width) - 1), 3)
-    for y, row in enumerate(rows):
-        top = sum(height[:y]) + GAP * y
-        for x, picture in enumerate(row):
-            left = sum(width[:x]) + GAP * x
-            whole[top : top + picture.shape[0], left : left + picture.shape[1]] = picture.detach().to(whole)
-    return whole

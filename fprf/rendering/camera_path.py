@@ -7,12 +7,13 @@ Poses are in the capture's own coordinates, whatever the scene's origin, with Op
 principal point is the middle: the format can say nothing else.
 """
 
-import json
 import math
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, Literal
 
+import msgspec
 import torch
+from msgspec import Meta, Struct
 from torch import Tensor
 
 from ..errors import DataError
@@ -20,12 +21,34 @@ from ..io.atomic import write_json
 from ..types import Origin
 from .cameras import Cameras, ideal_cameras
 
-_FPS = 24.0
-"""Nerfstudio's value where a file has none."""
-_FAR = 1e30
-"""Numbers of a pose lie below: an integer of JSON may be larger than any float."""
 _STRAY = 1e-3
 """Tolerance of a rotation's orthonormality: viewers round to a few digits."""
+_Matrix = Annotated[list[Annotated[float, Meta(gt=-1e30, lt=1e30)]], Meta(min_length=16, max_length=16)]
+_Side = Annotated[float, Meta(ge=1, le=65536, multiple_of=1)]
+
+
+class _Frame(Struct):
+    """A frame of a file; other fields are passed over."""
+
+    camera_to_world: list[Any]
+    """16 numbers row by row, or 4 rows of them."""
+    fov: Annotated[float, Meta(gt=0, lt=180)]
+
+
+class _CameraPath(Struct):
+    """A file, with Nerfstudio's values where it leaves some out."""
+
+    render_width: _Side
+    render_height: _Side
+    camera_path: Annotated[list[_Frame], Meta(min_length=1)]
+    camera_type: Literal["perspective"] = "perspective"
+    fps: Annotated[float, Meta(gt=0, lt=1000)] = 24.0
+
+
+class _Poses(Struct):
+    """The matrices of a file's frames, row by row."""
+
+    camera_path: list[_Matrix]
 
 
 def read_camera_path(path: Path, origin: Origin = (0.0, 0.0, 0.0)) -> tuple[Cameras, float]:
@@ -34,31 +57,34 @@ def read_camera_path(path: Path, origin: Origin = (0.0, 0.0, 0.0)) -> tuple[Came
     Raises DataError with the place.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = msgspec.json.decode(path.read_bytes(), type=_CameraPath)
+        # Matrices are nested or flat; once they are flat, their numbers are checked.
+        rows = [frame.camera_to_world for frame in content.camera_path]
+        flat = [[x for row in matrix for x in (row if isinstance(row, list) else [row])] for matrix in rows]
+        matrices = msgspec.convert({"camera_path": flat}, _Poses).camera_path
+        poses = [_orthonormal(f"$.camera_path[{index}]", matrix) for index, matrix in enumerate(matrices)]
     except FileNotFoundError as error:
         raise DataError(f"{path}: no such camera path; give spiral, interpolate, dataset or a JSON file") from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: not readable as JSON ({error}); export the camera path again") from error
-    if not isinstance(content, dict):
-        _wrong(path, "", "an object with 'camera_path'", content)
-    kind = content.get("camera_type", "perspective")
-    if kind != "perspective":
-        _wrong(path, "camera_type", "'perspective'", kind)
-    width, height = (_size(path, content, name) for name in ("render_width", "render_height"))
-    fps = _number(path, "fps", content.get("fps", _FPS), 0.0, 1000.0)
-    frames = content.get("camera_path")
-    if not isinstance(frames, list) or not frames:
-        _wrong(path, "camera_path", "a list of at least one frame", frames)
-    poses, focals = [], []
-    for index, frame in enumerate(frames):
-        where = f"camera_path[{index}]"
-        if not isinstance(frame, dict):
-            _wrong(path, where, "an object with 'camera_to_world' and 'fov'", frame)
-        poses.append(_pose(path, f"{where}.camera_to_world", frame.get("camera_to_world")))
-        fov = _number(path, f"{where}.fov", frame.get("fov"), 0.0, 180.0)
-        focals.append(height / 2 / math.tan(math.radians(fov) / 2))
+    except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError) as error:
+        raise DataError(f"{path}: cannot be read ({error}); export the camera path again") from error
+    width, height = int(content.render_width), int(content.render_height)
+    # Pixels are square: the vertical field of view decides both focal lengths.
+    focals = [height / 2 / math.tan(math.radians(frame.fov) / 2) for frame in content.camera_path]
     frames = ideal_cameras(torch.stack(poses), torch.tensor(focals, dtype=torch.float64), (width, height))
-    return frames.shifted([-x for x in origin]), fps
+    return frames.shifted([-x for x in origin]), content.fps
+
+
+def _orthonormal(where: str, matrix: _Matrix) -> Annotated[Tensor, "3 4"]:
+    """The pose whose rotation is the nearest orthonormal one: files hold a few digits.
+
+    Raises ValidationError where there is a scale or a mirroring.
+    """
+    pose = torch.tensor(matrix, dtype=torch.float64).view(4, 4)[:3]
+    left, scales, right = torch.linalg.svd(pose[:, :3])
+    turn = left @ right
+    if float((scales - 1).abs().max()) > _STRAY or float(torch.linalg.det(turn)) < 0:
+        raise msgspec.ValidationError(f"Expected a rotation and a position, without scale or mirroring - at `{where}`")
+    return torch.cat([turn, pose[:, 3:]], dim=1)
 
 
 def write_camera_path(path: Path, cameras: Cameras, fps: float, origin: Origin = (0.0, 0.0, 0.0)) -> None:
@@ -69,6 +95,7 @@ def write_camera_path(path: Path, cameras: Cameras, fps: float, origin: Origin =
     if not len(cameras):
         raise DataError(f"{path}: a camera path of no frames cannot be written")
     width, height = (int(side) for side in cameras.size[0])
+    # Files are in the capture's coordinates, cameras about the local origin.
     cameras, frames = cameras.shifted(origin), []
     for view in range(len(cameras)):
         matrix = [*cameras.pose[view].flatten().tolist(), 0.0, 0.0, 0.0, 1.0]
@@ -86,37 +113,3 @@ def write_camera_path(path: Path, cameras: Cameras, fps: float, origin: Origin =
         "keyframes": [],
     }
     write_json(path, content)
-
-
-def _wrong(path: Path, where: str, allowed: str, value: object) -> NoReturn:
-    shown = json.dumps(value)
-    shown = shown if len(shown) <= 60 else f"{shown[:57]}..."
-    raise DataError(f"{path}: {where or 'the file'} is {shown}; must be {allowed}; export the camera path again")
-
-
-def _number(path: Path, where: str, value: object, low: float, high: float) -> float:
-    """A number within (low, high)."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not low < value < high:
-        _wrong(path, where, f"a number between {low:g} and {high:g}", value)
-    return float(value)
-
-
-def _size(path: Path, content: dict[str, object], name: str) -> int:
-    value = content.get(name)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 1 <= value <= 65536 or value != round(value):
-        _wrong(path, name, "a whole number of pixels from 1 to 65536", value)
-    return int(value)
-
-
-def _pose(path: Path, where: str, value: object) -> Annotated[Tensor, "3 4"]:
-    """16 numbers, or 4 rows of them, as a pose whose rotation is exactly orthonormal."""
-    rows = value if isinstance(value, list) else []
-    flat = [number for row in rows for number in (row if isinstance(row, list) else [row])]
-    if len(flat) != 16 or not all(isinstance(number, int | float) and abs(number) < _FAR for number in flat):
-        _wrong(path, where, "16 finite numbers, row by row, below 1e30", value)
-    pose = torch.tensor(flat, dtype=torch.float64).reshape(4, 4)[:3]
-    left, scales, right = torch.linalg.svd(pose[:, :3])
-    turn = left @ right
-    if float((scales - 1).abs().max()) > _STRAY or float(torch.linalg.det(turn)) < 0:
-        _wrong(path, where, "a rotation and a position, without scale or mirroring", value)
-    return torch.cat([turn, pose[:, 3:]], dim=1)

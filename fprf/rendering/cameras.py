@@ -107,6 +107,7 @@ def rays_through(
     A pixel that the lens maps nothing to gets the outermost direction on its side.
     """
     plane = _plane(cameras, view, pixel)
+    # From pixels to the plane at depth 1, through the lens, into the world.
     local = unbend(cameras.distortion[view], cameras.lens[view], cameras.reach[view], plane)
     pose = cameras.pose[view]
     # OpenCV's lens axes to OpenGL's camera axes: y and z turn round.
@@ -156,6 +157,7 @@ class PixelRays:
     def __init__(self, cameras: Cameras, *, limit: int = LIMIT) -> None:
         self.cameras = cameras
         self.pinholes = bool((cameras.lens == PINHOLE).all())
+        # Views with one lens share a table: most captures have one camera.
         described = torch.cat(
             [cameras.focal, cameras.centre, cameras.distortion, cameras.size.double(), cameras.lens[:, None].double()], -1
         )
@@ -165,7 +167,7 @@ class PixelRays:
         self.start = area.cumsum(0) - area
         self.table: Tensor | None = None
         if int(area.sum()) * 24 <= limit:
-            self.table = torch.cat([self._solve(int(view)) for view in first])
+            self.table = torch.cat([_lens_directions(cameras, int(view), cameras.pose.device) for view in first])
 
     @property
     def waits(self) -> bool:
@@ -198,12 +200,6 @@ class PixelRays:
         pose = self.cameras.pose[view]
         return pose[:, :, 3], (pose[:, :, :3] @ local[:, :, None])[:, :, 0]
 
-    def _solve(self, view: int) -> Annotated[Tensor, "P 3"]:
-        """Unit directions in camera axes of all pixels of a view."""
-        pixel = pixel_grid(self.cameras, view)
-        _, world = rays_through(self.cameras, torch.full((len(pixel),), view), pixel)
-        return world @ self.cameras.pose[view, :, :3]
-
 
 def grid_rays(
     cameras: Cameras, view: int, device: torch.device | None = None
@@ -212,16 +208,20 @@ def grid_rays(
 
     The frames of a path, and mostly the views of a capture, look through one lens: the last two are remembered.
     """
-    numbers = (cameras.focal, cameras.centre, cameras.distortion)
-    width, height = cameras.size[view].tolist()
     pose = cameras.pose[view].to(device)
-    local = _local(*(tuple(x[view].tolist()) for x in numbers), width, height, int(cameras.lens[view]), pose.device)
-    direction = local @ pose[:, :3].T
+    direction = _lens_directions(cameras, view, pose.device) @ pose[:, :3].T
     return pose[:, 3].expand_as(direction), direction
 
 
+def _lens_directions(cameras: Cameras, view: int, device: torch.device) -> Annotated[Tensor, "N 3"]:
+    """Unit directions in camera axes through all pixels of a view."""
+    numbers = (cameras.focal, cameras.centre, cameras.distortion)
+    width, height = cameras.size[view].tolist()
+    return _solved(*(tuple(x[view].tolist()) for x in numbers), width, height, int(cameras.lens[view]), device)
+
+
 @lru_cache(maxsize=2)
-def _local(
+def _solved(
     focal: tuple[float, ...],
     centre: tuple[float, ...],
     distortion: tuple[float, ...],
@@ -230,7 +230,7 @@ def _local(
     lens: int,
     device: torch.device,
 ) -> Annotated[Tensor, "N 3"]:
-    """Unit directions in camera axes: a function of the lens alone."""
+    """`_lens_directions` by plain numbers, which a cache can compare."""
     still = torch.cat([torch.eye(3, dtype=torch.float64), torch.zeros(3, 1, dtype=torch.float64)], 1)
     focals, centres, bends = (torch.tensor([x], dtype=torch.float64) for x in (focal, centre, distortion))
     camera = Cameras(still[None], focals, centres, torch.tensor([[width, height]]), bends, torch.tensor([lens]))

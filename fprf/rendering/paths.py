@@ -93,7 +93,17 @@ def orbit(cameras: Cameras, frames: int) -> Cameras:
     distance = offset.norm(dim=-1)
     azimuth = torch.atan2(offset @ north, offset @ east)
     elevation = torch.asin(((offset @ up) / distance.clamp(min=1e-12)).clamp(-1, 1))
-    angle = _sweep(azimuth, frames)
+    # A closed walk over the azimuths: a circle, or to and fro where more than 100 degrees hold no camera.
+    phase = torch.arange(frames, dtype=azimuth.dtype, device=azimuth.device) / frames
+    around = azimuth.sort().values
+    gaps = torch.cat([around[1:], around[:1] + 2 * math.pi]) - around
+    widest = int(gaps.argmax())
+    first = float(around[(widest + 1) % len(around)])
+    if float(gaps[widest]) < math.radians(100):
+        angle = first + 2 * math.pi * phase
+    else:
+        arc = 2 * math.pi - float(gaps[widest])
+        angle = first + arc * (1 - torch.cos(2 * math.pi * phase)) / 2
     # Von Mises kernel, about 15 degrees wide; the maximum is taken out so that an empty azimuth takes the nearest camera.
     closeness = 15 * torch.cos(angle[:, None] - azimuth)
     share = torch.softmax(closeness, dim=-1)
@@ -111,12 +121,14 @@ def interpolate(cameras: Cameras, order: Annotated[Tensor, "M"], frames_between:
     """
     _at_least("frames_between", frames_between, 0)
     _at_least("the number of views", len(order), 1)
+    # Intrinsics of all views in pixels of the first one: captures mix sizes.
     keys = cameras.select(order)
     keys = keys.resized(keys.size[:1].expand(len(keys), 2))
     frame = torch.arange((len(keys) - 1) * (frames_between + 1) + 1, device=keys.pose.device)
     gap, u = frame // (frames_between + 1), (frame % (frames_between + 1)) / keys.pose.new_tensor(frames_between + 1)
     after = (gap + 1).clamp(max=len(keys) - 1)
     turn = quaternions(keys.pose[:, :, :3])
+    # Rotations the short way round, positions along a spline that visits every key.
     rotation = rotations(slerp(turn[gap], turn[after], u))
     position = catmull_rom(keys.pose[:, :, 3], gap, u)
     return Cameras(
@@ -173,6 +185,7 @@ def _meeting(pose: Annotated[Tensor, "V 3 4"]) -> Annotated[Tensor, "3"] | None:
     less than half of its distance.
     """
     forward = -pose[:, :, 2]
+    # Least squares: the sum of squared distances to the axes has the normal matrix of projections across them.
     across = torch.eye(3, dtype=pose.dtype, device=pose.device) - forward[:, :, None] * forward[:, None, :]
     system = across.mean(dim=0)
     values = torch.linalg.eigvalsh(system)
@@ -194,19 +207,6 @@ def _focus_depth(cameras: Cameras, view: int) -> float:
     spread = float((cameras.pose[:, :, 3] - pose[:, 3]).norm(dim=-1).max())
     # Parallel axes show something far away compared with the baseline, as in any capture that can be reconstructed.
     return ahead if ahead > 0 else (4 * spread if spread > 0 else 1.0)
-
-
-def _sweep(azimuth: Annotated[Tensor, "V"], frames: int) -> Annotated[Tensor, "F"]:
-    """Angles of a closed walk over the azimuths: a circle, or to and fro where more than 100 degrees hold no camera."""
-    phase = torch.arange(frames, dtype=azimuth.dtype, device=azimuth.device) / frames
-    around = azimuth.sort().values
-    gaps = torch.cat([around[1:], around[:1] + 2 * math.pi]) - around
-    widest = int(gaps.argmax())
-    first = float(around[(widest + 1) % len(around)])
-    if float(gaps[widest]) < math.radians(100):
-        return first + 2 * math.pi * phase
-    arc = 2 * math.pi - float(gaps[widest])
-    return first + arc * (1 - torch.cos(2 * math.pi * phase)) / 2
 
 
 MOTIONS = ("spiral", "orbit", "interpolate", "dataset")
@@ -287,6 +287,7 @@ def coverage(cameras: Cameras, train: Sequence[int], space: Space) -> Annotated[
     pixels = torch.cartesian_prod(*centres).double()
     others = torch.tensor(_thinned(train, _MOST))
     score = torch.zeros(len(cameras), dtype=torch.float64)
+    # Points along a few rays of each view, looked at by all others: in their image, and from about its direction?
     for views in torch.split(torch.tensor(_thinned(range(len(cameras)), _MOST)), _CHUNK):
         view = views.repeat_interleave(len(pixels))
         origin, direction = rays_through(cameras, view, pixels.repeat(len(views), 1) * cameras.size[view])

@@ -32,6 +32,16 @@ def contract(x: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
     return (1 - 0.5 / m) * (x / m)
 
 
+def slab(
+    origin: Annotated[Tensor, "... 3"], direction: Annotated[Tensor, "... 3"], low: Tensor, high: Tensor
+) -> tuple[Annotated[Tensor, "..."], Annotated[Tensor, "..."]]:
+    """Ray parameters at which rays enter and leave a box; the first is the larger one where they miss it."""
+    # A direction along a face: any crossing so far away that it decides nothing.
+    safe = torch.where(direction.abs() < 1e-9, torch.full_like(direction, 1e-9), direction)
+    a, b = (low - origin) / safe, (high - origin) / safe
+    return torch.minimum(a, b).amax(-1), torch.maximum(a, b).amin(-1)
+
+
 @dataclass(frozen=True)
 class Space:
     """One scene's map to the unit cube; plain numbers, saved with the run."""
@@ -58,12 +68,22 @@ class Space:
         """World rays (float64, unit directions) as float32 rays of this space."""
         o, d = self._recentred(origin, direction)
         if self.kind == "ndc":
-            o, d = self._device_coordinates(o, d)
+            # From the near plane (t = 0) to infinity (t = 1); a ray that looks backwards is bent to a grazing one.
+            dz = d[:, 2].clamp(max=-1e-6)
+            slopes = d[:, :2] / dz[:, None]
+            start = o + (-(self.near + o[:, 2]) / dz)[:, None] * torch.cat([d[:, :2], dz[:, None]], -1)
+            fx, fy = self.focal
+            x, y, z = start.unbind(-1)
+            # NeRF, appendix C: the projection of the start, and its change along the ray.
+            o = torch.stack([-fx * x / z, -fy * y / z, 1 + 2 * self.near / z], -1)
+            d = torch.stack([-fx * (slopes[:, 0] - x / z), -fy * (slopes[:, 1] - y / z), -2 * self.near / z], -1)
             near, far = torch.zeros_like(o[:, 0]), torch.ones_like(o[:, 0])
         else:
             o = o * self.scale
             if self.kind == "box":
-                near, far = self._slab(o, d)
+                near, far = slab(o, d, self._constant("low", o), self._constant("high", o))
+                near = near.clamp_min(self.near)
+                far = torch.maximum(far, near)  # a ray that misses the box gets an empty interval
             else:
                 near, far = torch.full_like(o[:, 0], self.near), torch.full_like(o[:, 0], self.far)
         return Rays(o.float(), d.float(), direction.float(), near.float(), far.float())
@@ -90,13 +110,6 @@ class Space:
         g, c = g_near + (g_far - g_near) * s, c_far + (c_near - c_far) * (1 - s)
         # Both round: the clamp keeps them in order where they meet, since a negative step would be a negative weight.
         return torch.where(g < 0.5, 2 * g, 0.5 / c.clamp(max=0.5))
-
-    @cached_property
-    def warp(self) -> Annotated[Tensor, "7"]:
-        """`locate` and `distance` as compiled kernels take them: 0 contraction, 1 box, 2 open, then the map of the box."""
-        number = {"contraction": 0.0, "box": 1.0, "ndc": 1.0, "open": 2.0}[self.kind]
-        low = torch.tensor(self.low)
-        return torch.cat([torch.tensor([number]), low, 2 / (torch.tensor(self.high) - low)])
 
     def metric(
         self, origin: Annotated[Tensor, "R 3"], direction: Annotated[Tensor, "R 3"], t: Annotated[Tensor, "R"]
@@ -141,24 +154,3 @@ class Space:
         """World rays about the centre, in the space's axes, still in world units."""
         turn = self._constant("rotation", origin)
         return (origin - self._constant("centre", origin)) @ turn.T, direction @ turn.T
-
-    def _device_coordinates(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-        """Rays from the near plane (t = 0) to infinity (t = 1); a ray that looks backwards is bent to a grazing one."""
-        dz = d[:, 2].clamp(max=-1e-6)
-        d = torch.cat([d[:, :2], dz[:, None]], -1)
-        start = o + (-(self.near + o[:, 2]) / dz)[:, None] * d
-        fx, fy = self.focal
-        x, y, z = start.unbind(-1)
-        first = torch.stack([-fx * x / z, -fy * y / z, 1 + 2 * self.near / z], -1)
-        dx, dy, dz = d.unbind(-1)
-        way = torch.stack([-fx * (dx / dz - x / z), -fy * (dy / dz - y / z), -2 * self.near / z], -1)
-        return first, way
-
-    def _slab(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-        """Ray parameters at which rays enter and leave the box; a ray that misses it gets an empty interval."""
-        low, high = self._constant("low", o), self._constant("high", o)
-        safe = torch.where(d.abs() < 1e-12, torch.full_like(d, 1e-12), d)
-        a, b = (low - o) / safe, (high - o) / safe
-        near = torch.minimum(a, b).amax(-1).clamp_min(self.near)
-        far = torch.maximum(a, b).amin(-1)
-        return near, torch.maximum(far, near)

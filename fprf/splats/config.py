@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ..interfaces import Partition, SceneLearner
     from ..training.model import Facts
 
-_CAP = 60_000
+_CAP, _PASSES = 60_000, 280
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,13 +59,13 @@ class GaussiansConfig(RunConfig):
     kind: ClassVar[str] = "gaussians"
     untrained: ClassVar[tuple[str, ...]] = ("semantic", "regions", "semantic_size", "executor")
     former: ClassVar[tuple[str, ...]] = ("rounds",)
-    open: ClassVar[tuple[str, ...]] = ("downscale", "cap")
+    open: ClassVar[tuple[str, ...]] = ("downscale", "cap", "passes")
 
     steps: int = 10_000
-    """Optimiser steps: one view each."""
-    passes: int = 280
+    """Optimiser steps: one view each. With minutes and no steps, as many as there is time for."""
+    passes: int | None = None
     """Passes over the training views at most, whatever `steps` and `minutes` say: more of them learn few photographs by heart.
-    Not in cells."""
+    Not in cells. none = 280, and more for photographs of more than 640 x 360 pixels."""
     parser: DataParserConfig | None = None
     """Format of the scene folder; none = recognised from what lies in it."""
     masks: bool = True
@@ -119,10 +119,11 @@ class GaussiansConfig(RunConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("initial", "passes", "pixels_per_gaussian", "cells", "regions", "relocate_every"):
+        for name in ("initial", "pixels_per_gaussian", "cells", "regions", "relocate_every"):
             at_least(name, getattr(self, name), 1)
-        if self.cap is not None:
-            at_least("cap", self.cap, 1)
+        for name in ("cap", "passes"):
+            if (value := getattr(self, name)) is not None:
+                at_least(name, value, 1)
         at_least("longest", self.longest, 32)
         at_least("surroundings", self.surroundings, 0)
         at_least("semantic_size", self.semantic_size, 32)
@@ -165,6 +166,11 @@ class GaussiansConfig(RunConfig):
         return self.cap or _CAP
 
     @property
+    def most_passes(self) -> int:
+        """`passes`; where neither the user nor a plan has said it, 280."""
+        return self.passes or _PASSES
+
+    @property
     def scene_parser(self) -> DataParserConfig | None:
         return self.parser
 
@@ -174,7 +180,7 @@ class GaussiansConfig(RunConfig):
 
     def limited(self, views: int) -> int:
         """At most so many passes over them."""
-        return min(self.steps, self.passes * views)
+        return min(self.steps, self.most_passes * views)
 
     def described(self) -> str:
         return f", up to {self.most:,} Gaussians"

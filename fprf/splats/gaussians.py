@@ -161,6 +161,7 @@ def bulk_of(points: Annotated[NDArray[Any], "N 3"]) -> Bulk:
     """The bulk of finite points. Up to a tenth of them may lie anywhere on either side without moving it."""
     if not len(points):
         return Bulk(0.0, np.zeros(0))
+    # Of many points a sample says where the middle is.
     low, high = np.percentile(points[:: max(1, len(points) // _SAMPLE)].astype(np.float64), (10, 90), axis=0)
     side = float((high - low).max()) or float(np.ptp(points.astype(np.float64), axis=0).max())
     apart = np.maximum(low - points, points - high).max(1).clip(0)

@@ -1,4 +1,8 @@
-"""Photographs as the rasteriser sees the world: through a pinhole, with what lies beyond a lens's picture left out."""
+"""Photographs as the rasteriser sees the world: through a pinhole, with what lies beyond a lens's picture left out.
+
+Shapes: views of H W pixels, pinholes of h w, which cover what their lenses show. Images are [H W 3], 8 bits, sRGB; masks [H W];
+pixel centres lie at +0.5. Camera axes of the rasteriser are OpenCV's (x right, y down, z forward), those of `Cameras` OpenGL's.
+"""
 
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
@@ -27,10 +31,9 @@ _WIDEST = 4.0
 """Tangent of the widest angle that a pinhole shows: 76 degrees."""
 _SHARPEST = cv2.INTER_LANCZOS4
 """Out of its lens and back into it a photograph of 135 x 240 pixels comes with 43 dB; by cubic interpolation with 40."""
-
-
 _KEPT = 1 << 31
 """Bytes of photographs in the rasteriser's layout, some ten times as large as 8-bit pixels, that are kept between steps."""
+
 Level = Mapping[int, Target]
 """Training views at one scale, by view; their sizes may differ."""
 
@@ -50,6 +53,7 @@ class _Kept(OrderedDict[tuple[int, int], Target]):
     bytes = 0
 
     def add(self, key: tuple[int, int], target: Target) -> None:
+        """Keep a target; where there is no room, those go that were used longest ago."""
         self[key] = target
         self.bytes += _bytes(target)
         while self.bytes > _KEPT and len(self) > 1:
@@ -69,6 +73,7 @@ class _Scaled(Mapping[int, Target]):
         return len(self.views)
 
     def __getitem__(self, view: int) -> Target:
+        # What was used lately is still there.
         key = self.k, view
         if key in self.kept:
             self.kept.move_to_end(key)

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from ..datamanagers.scene import Scene
-
 if TYPE_CHECKING:
+    from ..datamanagers.scene import Scene
     from .config import GaussiansConfig
 
 _PIXEL, _GAUSSIAN = 91e-9, 103e-9
@@ -25,42 +24,59 @@ _START = 6.0
 """Seconds before the first step, at least: reading photographs, first points."""
 _STEPS, _PASSES = 900, 5
 """Steps, and passes over the views, below which photographs are reduced further."""
+_SMALL = 640 * 360
+"""Pixels of photographs that may be passed over `most_passes` times."""
 _LEAST = 400 * 225
 """Pixels below which none is reduced for lack of time."""
 _PATIENCE = 600.0
 """Seconds within which steps have to end where no minutes are given: larger photographs are reduced."""
+_NO_END = 100_000
+"""Steps, at most, where minutes are given and no steps."""
 _FEWEST, _MOST, _GROWTH = 60_000, 1_000_000, 0.6
 """Gaussians of a minute, the most of all, and the power of the time that their number grows with."""
 _PROBE, _REPEATS, _REFERENCE = 1 << 16, 200, 55e-6
 """Numbers whose exponential is taken, how often, and the seconds of the fastest on one of the two cores named above."""
 
 
-def plan(config: "GaussiansConfig", scene: Scene) -> "GaussiansConfig":
-    """Return the config with `downscale` and `cap` decided for a scene at its own size; given ones stay."""
+def plan(config: "GaussiansConfig", scene: "Scene") -> "GaussiansConfig":
+    """Return the config with all decided that it leaves open, for a scene at its own size; what is given stays.
+
+    More minutes never give smaller photographs, fewer Gaussians or fewer steps.
+    """
     sizes = scene.cameras.size[scene.train]
     if not len(sizes):
-        return replace(config, downscale=config.downscale or 1, cap=config.most)
+        return replace(config, downscale=config.downscale or 1, cap=config.most, passes=config.most_passes)
     views, pixels, longest = len(sizes), float(sizes.double().prod(1).mean()), int(sizes.max())
-    speed = machine_speed()
-    budget = None if config.minutes is None else max(1.0, 60 * config.minutes - _START) * speed
-    smallest = max(1, math.ceil(longest / config.longest))
-    size, seconds = config.downscale or smallest, 0.0
+    budget = None
+    if config.minutes is not None:
+        budget = max(1.0, 60 * config.minutes - _START) * machine_speed()
+        config = replace(config, steps=_NO_END if config.steps == type(config).steps else config.steps)
+    # The largest size at which the time is enough for some passes over the photographs.
+    size = config.downscale or max(1, math.ceil(longest / config.longest))
     while True:
-        each = _seconds(config, pixels / size**2, _FEWEST)
-        steps = config.limited(views)
+        found = _of_size(config, pixels / size**2)
+        each, steps = _seconds(found, pixels / size**2, _FEWEST), found.limited(views)
         if budget is None:
-            enough, seconds = steps * each <= _PATIENCE * speed, steps * each
+            enough = steps * each <= _PATIENCE * machine_speed()
         else:
-            enough, seconds = budget / each >= max(_STEPS, _PASSES * views), min(budget, steps * each)
+            enough = budget / each >= max(_STEPS, _PASSES * views)
         if enough or config.downscale is not None or pixels / (size + 1) ** 2 < _LEAST:
             break
         size += 1
+    seconds = steps * each if budget is None else min(budget, steps * each)
     cap = config.cap
     if cap is None:
-        cap = min(_MOST, max(_FEWEST, round(_FEWEST * (seconds / 60) ** _GROWTH, -4)))
+        cap = min(_MOST, max(_FEWEST, 10_000 * round(_FEWEST / 10_000 * (seconds / 60) ** _GROWTH)))
         if config.cells == 1:
             cap = min(cap, max(1, int(views * pixels / size**2) // config.pixels_per_gaussian))
-    return replace(config, downscale=size, cap=cap)
+    return replace(found, downscale=size, cap=cap)
+
+
+def _of_size(config: "GaussiansConfig", pixels: float) -> "GaussiansConfig":
+    """The config for photographs of so many pixels: of large ones there is more to learn before they are known by heart."""
+    if config.passes is not None:
+        return config
+    return replace(config, passes=round(config.most_passes * max(1.0, math.sqrt(pixels / _SMALL))))
 
 
 def machine_speed() -> float:

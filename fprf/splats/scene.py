@@ -134,10 +134,12 @@ class SplatScene(Scene):
     @torch.inference_mode()
     def render(self, cameras: Cameras, view: int, *, resolution: float | None = None) -> View:
         """Draw a view, its lens included. Raises DataError for a panorama."""
+        # At a part of the resolution a smaller view is drawn, and enlarged.
         share = self.resolution if resolution is None else resolution
         if share < 1:
             small = cameras.select(torch.tensor([view])).scaled(1 / share)
             return enlarged(self.render(small, 0, resolution=1.0), cameras.size[view].tolist())
+        # A lens is drawn through a pinhole that covers it, and brought to its pixels in the end.
         camera, place = cover(cameras, view, self.near)
         shown = self.shown if self.merged is None else self._detail.select(camera, self.merged)
         drawn = draw(shown, camera, antialiased=self.antialiased, background=self.background)
@@ -170,6 +172,7 @@ class SplatScene(Scene):
             antialiased=self.antialiased,
             features=values(features[:, : None if semantic else 0].float(), self.gaussians.means),
         )
+        # What is drawn is weighted by opacity; a pixel of a lens takes the nearest one of the pinhole.
         x, y = pixel.long().unbind(1)
         if place is not None:
             x, y = place[y, x].long().unbind(1)
@@ -257,6 +260,7 @@ def look_at_capture(
 
     `camera` is the view that the capture was made from, where it is known. Raises DataError where nothing can be seen.
     """
+    # Mistakes are told before views are sought, which takes seconds.
     up = torch.tensor(config.up or _UP)
     if not bool(up.isfinite().all() & (up.norm() > 0)):
         raise DataError(f"up {config.up}: no direction; give three numbers, not all 0")
@@ -326,6 +330,7 @@ def load_scene(tensors: dict[str, Tensor], gaussians: Gaussians, antialiased: bo
 
 def cache_name(data: Data, encoder: str, config: LookConfig) -> str:
     """A name for what is found out about a file: by its content, the encoder, and how it is looked at."""
+    # The first number counts the versions of what is found.
     digest = hashlib.sha256(data)
     digest.update(f"9 {encoder} {config.up} {config.inside} {config.views} {config.size} {config.regions}".encode())
     return f"{digest.hexdigest()[:32]}.safetensors"

@@ -153,11 +153,21 @@ def find_views(
     made from, it is the first view, and the others stand about it. Gaussians very far from the others play no part. Raises
     DataError where nothing can be seen from anywhere.
     """
-    up = up.double() / up.double().norm()
     near = torch.from_numpy(bulk_of(gaussians.means.numpy()).apart <= OUTLYING)
     gaussians = gaussians if bool(near.all()) else gaussians.select(near)
-    place = None if camera is None else camera.pose[0, :, 3].double()
-    chosen = _views(gaussians, count - (camera is not None), size, up, inside, antialiased, place)
+    search = _Search(gaussians, size, up.double() / up.double().norm(), antialiased)
+    within = search.made_from_within() if inside is None else inside
+    # About where sizes say that photographs were taken; else within what surrounds a free place; else around the object.
+    chosen, others = None, count - (camera is not None)
+    if inside is not False:
+        place = None if camera is None else camera.pose[0, :, 3].double()
+        chosen = search.around_place(others, _SIZED_WITHIN if within else _SIZED, place)
+    if chosen is None:
+        candidates = search.from_free_places(0.0 if inside else _ENCLOSED) if within else None
+        cameras, worth = candidates or search.rings(others)
+        # The best ones, in the order in which they were tried: the nearer ones first.
+        best = worth.topk(min(others, len(worth))).indices.sort().values
+        chosen = cameras.select(best[worth[best] > 0])
     if camera is None:
         if not len(chosen):
             raise DataError("no view shows anything of the capture; give the axis that points up (--up), or clean the file")
@@ -169,89 +179,149 @@ def find_views(
     return Cameras(*(torch.cat([getattr(each, field.name) for each in (first, chosen)]) for field in fields(Cameras)))
 
 
-def _views(
-    gaussians: Gaussians,
-    count: int,
-    size: tuple[int, int],
-    up: Tensor,
-    inside: bool | None,
-    antialiased: bool,
-    place: Annotated[Tensor, "3"] | None,
-) -> Cameras:
-    """The views of `find_views`, about a place where that is known; none where nothing can be seen."""
-    # The box that most opacity lies in, and the Gaussians that show most, of which candidates are drawn.
-    opacity = gaussians.opacities
-    ends = torch.stack([_quantiles(axis, opacity, (0.02, 0.98)) for axis in gaussians.means.T]).double()
-    coarse = gaussians
-    if len(gaussians) > _PROBED:
-        area = gaussians.log_scales.topk(2, dim=1).values.sum(1) + opacity.log()
-        coarse = gaussians.select(area.topk(_PROBED).indices)
-    # About where sizes say that photographs were taken; else within what surrounds a free place; else around the object.
-    within = _from_within(gaussians) if inside is None else inside
-    if inside is not False:
-        chosen = _around_place(gaussians, ends, up, size, count, antialiased, _SIZED_WITHIN if within else _SIZED, place)
-        if chosen is not None:
-            return chosen
-    places = _free_places(gaussians, ends, up) if within else torch.zeros(0, 3, dtype=torch.float64)
-    cameras, worth = _inside(coarse, places, up, size, 0.0 if inside else _ENCLOSED, antialiased)
-    if not len(cameras):
-        cameras, near = _rings(gaussians, ends, up, size, count)
-        worth = _probed(coarse, cameras, near, antialiased)[0]
-    # The best ones, in the order in which they were tried: the nearer ones first.
-    best = worth.topk(min(count, len(worth))).indices.sort().values
-    return cameras.select(best[worth[best] > 0])
+class _Search:
+    """Candidates for views of `size` (width, height) of a capture, and what they are worth; `up` has length 1, float64."""
 
+    def __init__(self, gaussians: Gaussians, size: tuple[int, int], up: Annotated[Tensor, "3"], antialiased: bool) -> None:
+        self.gaussians, self.size, self.up, self.antialiased = gaussians, size, up, antialiased
+        opacity = gaussians.opacities
+        self.ends = torch.stack([_quantiles(axis, opacity, (0.02, 0.98)) for axis in gaussians.means.T]).double()
+        """Lowest and highest corner [3 2] of the box that most opacity lies in."""
+        self.coarse = gaussians
+        """Gaussians that show most: candidates are judged on pictures of these."""
+        if len(gaussians) > _PROBED:
+            area = gaussians.log_scales.topk(2, dim=1).values.sum(1) + opacity.log()
+            self.coarse = gaussians.select(area.topk(_PROBED).indices)
 
-def _around_place(
-    gaussians: Gaussians,
-    ends: Tensor,
-    up: Tensor,
-    size: tuple[int, int],
-    count: int,
-    antialiased: bool,
-    sized: float,
-    known: Annotated[Tensor, "3"] | None,
-) -> Cameras | None:
-    """Views from about where the photographs were taken, if known; None where sizes do not tell as well as `sized`."""
-    # The place from which sizes are most alike, of some solid Gaussians: their size, at their distance the usual one in angle.
-    solid = (gaussians.opacities > 0.2).nonzero()[:, 0]
-    if len(solid) < 100:
-        return None
-    some = solid[:: max(1, len(solid) // _SAMPLE)]
-    points, extent = gaussians.means.double(), gaussians.log_scales.double().topk(2, dim=1).values.mean(1)
-    place, share = _size_centre(points[some], extent[some], ends) if known is None else (known, 0.0)
-    if share > sized:
-        return None
-    away = torch.linalg.vector_norm(points[some] - place, dim=1)
-    middle = float(away.median())
-    usual = float((extent[some] - away.log()).median())
-    # Directions far from each other, of what is not in the far surroundings.
-    ahead = torch.nn.functional.normalize(points[some][away < away.quantile(0.8)] - place, dim=1)
-    mean = torch.nn.functional.normalize(ahead.mean(0), dim=0)
-    picked = [int((ahead @ mean).argmax())]
-    for _ in range(_TARGETS - 1):
-        picked.append(int((ahead @ ahead[picked].T).amax(1).argmin()))
-    # Cameras at that place, a little behind it and to the sides, each looking in all of these directions.
-    ring = _around(up, 4)
-    back = torch.tensor(_BACK, dtype=torch.float64)[:, None] * -mean
-    offsets = middle * torch.cat([back, *(far * ring for far in _AROUND)])
-    eye = (place + offsets).repeat_interleave(_TARGETS, 0)
-    target = (place + middle * ahead[picked]).repeat(len(offsets), 1)
-    cameras = pinhole(look_at(eye, target, up), width=size[0], height=size[1], fov=_NARROW)
-    # Their worth on small pictures of those that show most there: how much is filled, less what is close or looks blurred.
-    seen = 2 * (extent - torch.linalg.vector_norm(points - place, dim=1).clamp_min(0.05 * middle).log())
-    shown = (seen + gaussians.opacities.log()).topk(min(_PROBED, len(seen))).indices
-    coarse, points, extent = gaussians.select(shown), points[shown].float(), extent[shown].float()
-    small, worth, near = cameras.scaled(_PROBE), torch.zeros(len(cameras)), clip_distance(gaussians)
-    for view in range(len(small)):
-        apart = torch.linalg.vector_norm(points - eye[view].float(), dim=1).clamp_min(1e-9)
-        blurred = ((extent - apart.log() - usual) / _BLUR).clamp(0, 1)[:, None]
-        drawn = draw(coarse, camera_of(small, view, near), antialiased=antialiased, features=blurred)
-        close = (drawn.opacity > 0.5) & (drawn.depth < _CLOSE * middle)
-        worth[view] = drawn.opacity.mean() - _NEAR * close.float().mean() - drawn.features.mean()
-    # The best of each direction before the second of any, as long as they are about as good.
-    rank = worth.view(len(offsets), _TARGETS).argsort(0, descending=True).argsort(0).flatten()
-    return cameras.select((worth - 0.05 * rank).topk(min(count, len(worth))).indices.sort().values)
+    def looking(self, eye: Annotated[Tensor, "V 3"], target: Annotated[Tensor, "V 3"], fov: float) -> Cameras:
+        """Cameras at `eye` that look at `target`, with a vertical angle in degrees."""
+        return pinhole(look_at(eye, target, self.up), width=self.size[0], height=self.size[1], fov=fov)
+
+    def made_from_within(self) -> bool:
+        """True where what lies far out is coarser than the rest, or reaches far beyond it."""
+        # Distances from the median, and sizes, of what can be seen.
+        seen = self.gaussians.opacities > 0.3
+        if int(seen.sum()) < 100:
+            return False
+        means = self.gaussians.means[seen]
+        size = self.gaussians.log_scales[seen].topk(2, dim=1).values.mean(1)
+        away = torch.linalg.vector_norm(means - means.median(0).values, dim=1)
+        order = away.argsort()
+        half, fifth, last = (order[round(share * (len(order) - 1))] for share in (0.5, 0.8, 0.999))
+        if away[half] == 0:
+            return False
+        coarser = size[away > away[fifth]].median() - size[away < away[half]].median()
+        return bool(coarser.exp() >= _COARSE) or bool(away[last] >= _TAIL * away[half])
+
+    def around_place(self, count: int, sized: float, known: Annotated[Tensor, "3"] | None) -> Cameras | None:
+        """Views from about where the photographs were taken, if known; None where sizes do not tell as well as `sized`."""
+        # The place from which the sizes of some solid Gaussians are most alike in angle, and that usual angle.
+        gaussians = self.gaussians
+        solid = (gaussians.opacities > 0.2).nonzero()[:, 0]
+        if len(solid) < 100:
+            return None
+        some = solid[:: max(1, len(solid) // _SAMPLE)]
+        points, extent = gaussians.means.double(), gaussians.log_scales.double().topk(2, dim=1).values.mean(1)
+        place, share = _size_centre(points[some], extent[some], self.ends) if known is None else (known, 0.0)
+        if share > sized:
+            return None
+        away = torch.linalg.vector_norm(points[some] - place, dim=1)
+        middle = float(away.median())
+        usual = float((extent[some] - away.log()).median())
+        # Directions far from each other, of what is not in the far surroundings.
+        ahead = torch.nn.functional.normalize(points[some][away < away.quantile(0.8)] - place, dim=1)
+        mean = torch.nn.functional.normalize(ahead.mean(0), dim=0)
+        picked = [int((ahead @ mean).argmax())]
+        for _ in range(_TARGETS - 1):
+            picked.append(int((ahead @ ahead[picked].T).amax(1).argmin()))
+        # Cameras at that place, a little behind it and to the sides, each looking in all of these directions.
+        ring = _around(self.up, 4)
+        back = torch.tensor(_BACK, dtype=torch.float64)[:, None] * -mean
+        offsets = middle * torch.cat([back, *(far * ring for far in _AROUND)])
+        eye = (place + offsets).repeat_interleave(_TARGETS, 0)
+        cameras = self.looking(eye, (place + middle * ahead[picked]).repeat(len(offsets), 1), _NARROW)
+        # Their worth on small pictures of those that show most there: how much is filled, less what is close or looks blurred.
+        seen = 2 * (extent - torch.linalg.vector_norm(points - place, dim=1).clamp_min(0.05 * middle).log())
+        shown = (seen + gaussians.opacities.log()).topk(min(_PROBED, len(seen))).indices
+        coarse, points, extent = gaussians.select(shown), points[shown].float(), extent[shown].float()
+        small, worth, near = cameras.scaled(_PROBE), torch.zeros(len(cameras)), clip_distance(gaussians)
+        for view in range(len(small)):
+            apart = torch.linalg.vector_norm(points - eye[view].float(), dim=1).clamp_min(1e-9)
+            blurred = ((extent - apart.log() - usual) / _BLUR).clamp(0, 1)[:, None]
+            drawn = draw(coarse, camera_of(small, view, near), antialiased=self.antialiased, features=blurred)
+            close = (drawn.opacity > 0.5) & (drawn.depth < _CLOSE * middle)
+            worth[view] = drawn.opacity.mean() - _NEAR * close.float().mean() - drawn.features.mean()
+        # The best of each direction before the second of any, as long as they are about as good.
+        rank = worth.view(len(offsets), _TARGETS).argsort(0, descending=True).argsort(0).flatten()
+        return cameras.select((worth - 0.05 * rank).topk(min(count, len(worth))).indices.sort().values)
+
+    def from_free_places(self, enclosed: float) -> tuple[Cameras, Annotated[Tensor, "V"]] | None:
+        """Views in all directions from free places that are enclosed, with their worth; None where few are."""
+        # Opacity in each cell of a grid; a cell is free where neither it nor a neighbour holds more than next to nothing.
+        gaussians, up, ends = self.gaussians, self.up, self.ends
+        low, span = ends[:, 0], (ends[:, 1] - ends[:, 0]).clamp_min(1e-9)
+        at = ((gaussians.means.double() - low) / span * _CELLS).floor().long()
+        kept = ((at >= 0) & (at < _CELLS)).all(1)
+        flat = at[kept] @ torch.tensor([_CELLS * _CELLS, _CELLS, 1])
+        mass = torch.zeros(_CELLS**3).index_add_(0, flat, gaussians.opacities[kept])
+        full = (mass > _FREE * mass[mass > 0].mean()).float().view(1, 1, _CELLS, _CELLS, _CELLS)
+        clear = torch.nn.functional.max_pool3d(full, 3, 1, 1)[0, 0] == 0
+        # Not at the box's faces, and not in the upper third, where nobody holds a camera.
+        clear[[0, 1, -2, -1]] = clear[:, [0, 1, -2, -1]] = clear[:, :, [0, 1, -2, -1]] = False
+        places = low + (clear.nonzero().double() + 0.5) / _CELLS * span
+        bottom, top = (ends * up[:, None]).amin(1).sum(), (ends * up[:, None]).amax(1).sum()
+        places = places[places @ up <= bottom + 0.67 * (top - bottom)]
+        if not len(places):
+            return None
+        # The one nearest to the middle, then always the one farthest from all that were picked.
+        picked: list[int] = []
+        apart = torch.full((len(places),), math.inf, dtype=torch.float64)
+        for _ in range(min(_PLACES, len(places))):
+            nearest = int(apart.argmax()) if picked else int((places - ends.mean(1)).norm(dim=1).argmin())
+            picked.append(nearest)
+            apart = apart.minimum((places - places[nearest]).norm(dim=1))
+        places = places[picked]
+        # Of the directions half overlap enough to tell: a place is enclosed where something fills the view in most of them.
+        eye, ahead = places.repeat_interleave(_TURNS, 0), _around(up, _TURNS) - 0.1 * up
+        cameras = self.looking(eye, eye + ahead.repeat(len(places), 1), _WIDE)
+        every = torch.arange(0, len(cameras), 2)
+        near = torch.full((len(cameras),), 0.05 * float(self.coarse.means.double().var(0, correction=0).sum().sqrt()))
+        _, filled = self.probed(cameras.select(every), near[every])
+        share = filled.view(len(places), _TURNS // 2).mean(1)
+        if float(share.quantile(0.75)) < enclosed:
+            return None
+        chosen = (share >= enclosed).repeat_interleave(_TURNS)
+        cameras = cameras.select(chosen)
+        return cameras, self.probed(cameras, near[chosen])[0]
+
+    def rings(self, count: int) -> tuple[Cameras, Annotated[Tensor, "V"]]:
+        """Views around the middle, more than are needed, with their worth."""
+        centre, opacities = self.ends.mean(1), self.gaussians.opacities
+        away = torch.linalg.vector_norm(self.gaussians.means.double() - centre, dim=1)
+        # Where all are at one place, their own size is that of the object.
+        away = away.clamp_min(float(_quantiles(self.gaussians.log_scales.amax(1).exp(), opacities, (0.5,))[0]))
+        reach = float(_quantiles(away.float(), opacities, (0.95,))[0]) / math.sin(math.radians(_FOV / 2))
+        # Rings of cameras, each turned against the one before, so that none stands behind another.
+        rings = [(math.radians(height), far) for far in _DISTANCES for height in _LIFTS]
+        each = max(4, round(1.6 * count / len(rings)))
+        eyes = []
+        for ring, (height, far) in enumerate(rings):
+            flat = _around(self.up, each, 0.38 * ring)
+            eyes.append(centre + (math.cos(height) * flat + math.sin(height) * self.up) * far * reach)
+        eye = torch.cat(eyes)
+        cameras = self.looking(eye, centre.expand_as(eye), _FOV)
+        return cameras, self.probed(cameras, 0.3 * torch.linalg.vector_norm(eye - centre, dim=1))[0]
+
+    def probed(self, cameras: Cameras, near: Annotated[Tensor, "V"]) -> tuple[Annotated[Tensor, "V"], Annotated[Tensor, "V"]]:
+        """Worth of views, how much of a small picture is filled less what is nearer than `near`, and the former alone."""
+        small, worth, filled = cameras.scaled(_PROBE), torch.zeros(len(cameras)), torch.zeros(len(cameras))
+        clip = clip_distance(self.coarse)
+        for view in range(len(small)):
+            drawn = draw(self.coarse, camera_of(small, view, clip), antialiased=self.antialiased)
+            close = (drawn.opacity > 0.5) & (drawn.depth < float(near[view]))
+            filled[view] = drawn.opacity.mean()
+            worth[view] = filled[view] - _NEAR * close.float().mean()
+        return worth, filled
 
 
 def _size_centre(
@@ -273,110 +343,6 @@ def _size_centre(
         deviations = torch.cat(each)
         place, deviation = tried[int(deviations.argmin())], float(deviations.min())
     return place, deviation / max(spread, 1e-9)
-
-
-def _rings(
-    gaussians: Gaussians, ends: Tensor, up: Tensor, size: tuple[int, int], count: int
-) -> tuple[Cameras, Annotated[Tensor, "V"]]:
-    """Candidates around the middle, more than are needed, and what is close to each."""
-    centre = ends.mean(1)
-    away = torch.linalg.vector_norm(gaussians.means.double() - centre, dim=1)
-    sizes = gaussians.log_scales.amax(1).exp()
-    # Where all are at one place, their own size is that of the object.
-    away = away.clamp_min(float(_quantiles(sizes, gaussians.opacities, (0.5,))[0]))
-    reach = float(_quantiles(away.float(), gaussians.opacities, (0.95,))[0]) / math.sin(math.radians(_FOV / 2))
-    # Rings of cameras, each turned against the one before, so that none stands behind another.
-    rings = [(math.radians(height), far) for far in _DISTANCES for height in _LIFTS]
-    each = max(4, round(1.6 * count / len(rings)))
-    eyes = []
-    for ring, (height, far) in enumerate(rings):
-        flat = _around(up, each, 0.38 * ring)
-        eyes.append(centre + (math.cos(height) * flat + math.sin(height) * up) * far * reach)
-    eye = torch.cat(eyes)
-    cameras = pinhole(look_at(eye, centre.expand_as(eye), up), width=size[0], height=size[1], fov=_FOV)
-    return cameras, 0.3 * torch.linalg.vector_norm(eye - centre, dim=1)
-
-
-def _from_within(gaussians: Gaussians) -> bool:
-    """True where what lies far out is coarser than the rest, or reaches far beyond it."""
-    # Distances from the median, and sizes, of what can be seen.
-    seen = gaussians.opacities > 0.3
-    if int(seen.sum()) < 100:
-        return False
-    means = gaussians.means[seen]
-    size = gaussians.log_scales[seen].topk(2, dim=1).values.mean(1)
-    away = torch.linalg.vector_norm(means - means.median(0).values, dim=1)
-    order = away.argsort()
-    half, fifth, last = (order[round(share * (len(order) - 1))] for share in (0.5, 0.8, 0.999))
-    if away[half] == 0:
-        return False
-    coarser = size[away > away[fifth]].median() - size[away < away[half]].median()
-    return bool(coarser.exp() >= _COARSE) or bool(away[last] >= _TAIL * away[half])
-
-
-def _free_places(gaussians: Gaussians, ends: Tensor, up: Tensor) -> Annotated[Tensor, "P 3"]:
-    """Middles of cells of the capture's box that hold next to nothing, nor do their neighbours; spread over all such."""
-    # Opacity in each cell of a grid; a cell is free where neither it nor a neighbour holds more than next to nothing.
-    low, span = ends[:, 0], (ends[:, 1] - ends[:, 0]).clamp_min(1e-9)
-    at = ((gaussians.means.double() - low) / span * _CELLS).floor().long()
-    kept = ((at >= 0) & (at < _CELLS)).all(1)
-    flat = at[kept] @ torch.tensor([_CELLS * _CELLS, _CELLS, 1])
-    mass = torch.zeros(_CELLS**3).index_add_(0, flat, gaussians.opacities[kept])
-    full = (mass > _FREE * mass[mass > 0].mean()).float().view(1, 1, _CELLS, _CELLS, _CELLS)
-    clear = torch.nn.functional.max_pool3d(full, 3, 1, 1)[0, 0] == 0
-    # Not at the box's faces, and not in the upper third, where nobody holds a camera.
-    clear[[0, 1, -2, -1]] = clear[:, [0, 1, -2, -1]] = clear[:, :, [0, 1, -2, -1]] = False
-    places = low + (clear.nonzero().double() + 0.5) / _CELLS * span
-    if not len(places):
-        return places
-    height = places @ up
-    bottom, top = (ends * up[:, None]).amin(1).sum(), (ends * up[:, None]).amax(1).sum()
-    places = places[height <= bottom + 0.67 * (top - bottom)]
-    # The one nearest to the middle, then always the one farthest from all that were picked.
-    picked: list[int] = []
-    apart = torch.full((len(places),), math.inf, dtype=torch.float64)
-    for _ in range(min(_PLACES, len(places))):
-        nearest = int(apart.argmax()) if picked else int((places - ends.mean(1)).norm(dim=1).argmin())
-        picked.append(nearest)
-        apart = apart.minimum((places - places[nearest]).norm(dim=1))
-    return places[picked]
-
-
-def _inside(
-    gaussians: Gaussians,
-    places: Annotated[Tensor, "P 3"],
-    up: Tensor,
-    size: tuple[int, int],
-    enclosed: float,
-    antialiased: bool,
-) -> tuple[Cameras, Annotated[Tensor, "V"]]:
-    """Views in all directions from those places that are enclosed, with their worth; none where few are."""
-    ahead = _around(up, _TURNS) - 0.1 * up
-    eye = places.repeat_interleave(_TURNS, 0)
-    cameras = pinhole(look_at(eye, eye + ahead.repeat(len(places), 1), up), width=size[0], height=size[1], fov=_WIDE)
-    every = torch.arange(0, len(cameras), 2)  # half of them overlap enough to tell
-    near = 0.05 * float(gaussians.means.double().var(0, correction=0).sum().sqrt())
-    _, filled = _probed(gaussians, cameras.select(every), torch.full((len(every),), near), antialiased)
-    # A place is enclosed where something fills the view in most directions.
-    share = filled.view(len(places), _TURNS // 2).mean(1)
-    if not len(places) or float(share.quantile(0.75)) < enclosed:
-        return cameras.select(every[:0]), torch.zeros(0)
-    cameras = cameras.select((share >= enclosed).repeat_interleave(_TURNS))
-    return cameras, _probed(gaussians, cameras, torch.full((len(cameras),), near), antialiased)[0]
-
-
-def _probed(
-    gaussians: Gaussians, cameras: Cameras, near: Annotated[Tensor, "V"], antialiased: bool
-) -> tuple[Annotated[Tensor, "V"], Annotated[Tensor, "V"]]:
-    """Worth of views, how much of a small picture is filled less what lies in the way, and the former alone."""
-    small, worth, filled = cameras.scaled(_PROBE), torch.zeros(len(cameras)), torch.zeros(len(cameras))
-    clip = clip_distance(gaussians)
-    for view in range(len(small)):
-        drawn = draw(gaussians, camera_of(small, view, clip), antialiased=antialiased)
-        close = (drawn.opacity > 0.5) & (drawn.depth < float(near[view]))
-        filled[view] = drawn.opacity.mean()
-        worth[view] = filled[view] - _NEAR * close.float().mean()
-    return worth, filled
 
 
 def _around(up: Annotated[Tensor, "3"], count: int, begin: float = 0.0) -> Annotated[Tensor, "count 3"]:

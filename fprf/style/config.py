@@ -1,10 +1,9 @@
 """Everything that makes a style, as one config: the flags of `fprf stylize` and the content of a `style.json`. No torch.
 
-What users write about regions, `REGION`, `REGION=REFERENCE`, `REGION=NUMBER`, as pairs of texts.
-
-A region is named by its number, by its name in a style file, by a pixel of a view (`VIEW:X,Y`) or by a mask over one
-(`VIEW:MASK.png`), and in pins on Gaussians by a place (`parse_place`); a reference by its file or by its number, from 0 in
-the order given. What each text means is found out on a scene (`style.regions`); here is only the grammar.
+What users say of regions is `REGION`, `REGION=REFERENCE` or `REGION=NUMBER`. A region is named by its number, by its name in a
+style file, by a pixel of a view (`VIEW:X,Y`) or by a mask over one (`VIEW:MASK.png`), and in pins on Gaussians by a place
+(`parse_place`); a reference by its file or by its number, from 0 in the order given. What each text means is found out on a
+scene (`style.regions`); here is only the grammar.
 """
 
 import math
@@ -33,13 +32,6 @@ class RegionValue(NamedTuple):
     value: str
 
 
-class Pixel(NamedTuple):
-    """A place in a view: x to the right, y down, in pixels of the rendered view."""
-
-    x: float
-    y: float
-
-
 class Place(NamedTuple):
     """A part of space, in the capture's coordinates: a box, or all that lies near to a path."""
 
@@ -51,12 +43,12 @@ class Place(NamedTuple):
     """Width of the soft border around it; 0 = a sharp one."""
 
     def about(self, origin: "Origin") -> "Place":
-        """The place in the local frame of an origin."""
+        """Move the place into the local frame of an origin."""
         return self._replace(points=tuple(tuple(x - of for x, of in zip(each, origin, strict=True)) for each in self.points))
 
 
 def parse_place(field: str, text: str) -> Place | None:
-    """`box:X,Y,Z:X,Y,Z[:BORDER]`, `path:X,Y,Z:X,Y,Z[...]:WIDTH[,BORDER]` or `everywhere`; None for another region.
+    """Parse `box:X,Y,Z:X,Y,Z[:BORDER]`, `path:X,Y,Z:X,Y,Z[...]:WIDTH[,BORDER]` or `everywhere`; None for another region.
 
     Raises ConfigError naming the field.
     """
@@ -69,6 +61,7 @@ def parse_place(field: str, text: str) -> Place | None:
         numbers = [tuple(map(float, part.split(","))) for part in parts]
     except ValueError:
         numbers = []
+    # Corners have three numbers each; what follows them are the sizes.
     count = next((k for k, each in enumerate(numbers) if len(each) != 3), len(numbers))
     points, sizes = numbers[:count], numbers[count:]
     size = sizes[0] if len(sizes) == 1 else ()
@@ -103,14 +96,14 @@ def parse_strength(field: str, text: str) -> tuple[str, float]:
     return region, strength
 
 
-def pixel_of(text: str) -> Pixel | None:
-    """`X,Y` as a pixel; None where it is something else, such as the name of a mask."""
+def parse_pixel(text: str) -> tuple[float, float] | None:
+    """`X,Y`, x to the right and y down in pixels of the rendered view; None for something else, such as the name of a mask."""
     match = _PIXEL.fullmatch(text)
-    return Pixel(float(match[1]), float(match[2])) if match else None
+    return (float(match[1]), float(match[2])) if match else None
 
 
 def labels(paths: Sequence[Path]) -> tuple[str, ...]:
-    """A name for each reference, all different: the file's, with folders before it or a number behind where files agree."""
+    """Name each reference, all different: by its file, with folders before it or a number behind where files agree."""
     for folders in range(3):
         names = ["/".join([*(f.name for f in p.parents[:folders][::-1] if f.name), p.name]) for p in paths]
         if len(set(names)) == len(names):
@@ -122,6 +115,7 @@ def labels(paths: Sequence[Path]) -> tuple[str, ...]:
 def find_reference(text: str, paths: Sequence[Path]) -> int:
     """Index of a reference: by label, else path or name, else number from 0, else stem. Raises UsageError."""
     names = labels(paths)
+    # What is exact comes first: a number may also be the stem of a file.
     for matches in (
         [i for i, name in enumerate(names) if text == name],
         [i for i, p in enumerate(paths) if text in (str(p), p.name)],
@@ -217,18 +211,18 @@ def with_preset(config: C, name: str) -> C:
     """
     if name not in PRESETS:
         raise UsageError(f"preset {name!r}: no such preset{nearest(name, list(PRESETS))}; there is {', '.join(PRESETS)}")
+
+    def changed(config: Any, path: list[str], value: float) -> Any:
+        first, *rest = path
+        if not hasattr(config, first):
+            return config
+        return replace(config, **{first: changed(getattr(config, first), rest, value) if rest else value})
+
     for path, value in PRESETS[name].items():
-        config = _with(config, path.split("."), value)
+        config = changed(config, path.split("."), value)
     return config
 
 
 def preset_flags(name: str) -> str:
     """Flags that a preset sets."""
     return " ".join(f"--{path.replace('_', '-')} {value:g}" for path, value in PRESETS[name].items())
-
-
-def _with(config: Any, path: list[str], value: float) -> Any:
-    first, *rest = path
-    if not hasattr(config, first):
-        return config
-    return replace(config, **{first: _with(getattr(config, first), rest, value) if rest else value})

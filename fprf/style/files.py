@@ -1,10 +1,19 @@
-"""`style.json`: a style that can be saved, shared, edited by hand and applied to another scene.
+"""Files of styles, without torch: `style.json`, and `keys.json` for styles along a camera path.
+
+`style.json` is a style that can be saved, shared, edited by hand and applied to another scene.
 
     {"format": 1, "style": {the fields of StyleConfig}, "sha256": {path: hash}, "semantic_encoder": identity,
      "regions": {name: [key in the encoder's own channels]}, "made": what a run measured}
 
 Only "format" and "style" must be there. Paths are relative to the file, or absolute. A region that the style names is found
 on another scene by its key, since numbers mean something on one scene alone.
+
+`keys.json` says which frame has which style; between two of them one fades into the other.
+
+    {"format": 1, "keyframes": [{"frame": 0, "style": "day/style.json"}, {"frame": 48, "style": null}]}
+
+Paths are relative to the file, or absolute; null is the scene as it is. The fade is a smoothstep, so it starts and ends without
+a jerk; before the first key and after the last, their styles hold.
 """
 
 import hashlib
@@ -50,7 +59,7 @@ def read_style(path: Path) -> StyleFile:
         if not isinstance(whole, dict) or whole.get("format") != _FORMAT or not isinstance(whole.get("style"), dict):
             raise ConfigError(f'expected an object with "format": {_FORMAT} and "style", as `fprf stylize` writes it')
         for key in whole:
-            if key not in _KEYS:
+            if key not in _KEYS:  # a typing error would otherwise go unnoticed
                 raise ConfigError(f"unknown key {key!r}{nearest(key, list(_KEYS))} (allowed: {', '.join(_KEYS)})")
         fields = whole["style"]
         if "fprf" in whole and "bold" not in fields:  # saved before there was light: all was painted
@@ -65,23 +74,24 @@ def read_style(path: Path) -> StyleFile:
     except ConfigError as fault:
         raise ConfigError(f"{path}: {fault}") from fault
     return StyleFile(
-        _with_paths(style, partial(_found, path)),
+        _with_paths(style, partial(_resolved, path)),
         regions,
         encoder,
-        {_found(path, Path(text)): value for text, value in hashes.items()},
+        {_resolved(path, Path(text)): value for text, value in hashes.items()},
     )
 
 
 def write_style(path: Path, file: StyleFile, made: Mapping[str, Any] | None = None) -> None:
     """Write the style with the hashes of its photographs as they are now; `made` is kept beside it for people to read."""
+    # Paths go relative, so that the folder can be moved; hashes tell when a photograph changes.
     style = file.style
     masks = [p for p in style.masks if p != NO_MASK]
     whole = {
         "format": _FORMAT,
         "fprf": version("fprf"),
         "plugins": packages_of(style),
-        "style": to_json(_with_paths(style, partial(_stored, path))),
-        "sha256": {_stored(path, p).as_posix(): _hash(p) for p in (*style.references, *masks)},
+        "style": to_json(_with_paths(style, partial(_portable, path))),
+        "sha256": {_portable(path, p).as_posix(): _hash(p) for p in (*style.references, *masks)},
         "semantic_encoder": file.semantic_encoder,
         "regions": {name: list(key) for name, key in file.regions.items()},
     }
@@ -110,6 +120,7 @@ def with_folders(style: S, report: Callable[[str], None] = warnings.warn) -> S:
         return style
     from ..datamanagers.images import photographs
 
+    # Each image once, under the weight and mask of what it came with.
     count = len(style.references)
     rows: dict[Path, tuple[float, Path]] = {}
     for path, weight, mask in zip(
@@ -132,15 +143,15 @@ def _with_paths(style: StyleConfig, change: Callable[[Path], Path]) -> StyleConf
     )
 
 
-def _found(file: Path, path: Path) -> Path:
-    """A path of the file as it is found from here: relative to the file, else beside it, where a shared style has it."""
+def _resolved(file: Path, path: Path) -> Path:
+    """Resolve a path of the file: relative to the file, else beside it, where a shared style has it."""
     whole = file.parent / path
     beside = file.parent / path.name
     return beside if not whole.exists() and beside.exists() else whole
 
 
-def _stored(file: Path, path: Path) -> Path:
-    """Relative to the file where it lies in the file's folder or below, so that both can be moved; absolute elsewhere."""
+def _portable(file: Path, path: Path) -> Path:
+    """Make a path relative to a file in whose folder or below it lies, so that both can be moved; else absolute."""
     here, there = Path(os.path.abspath(file.parent)), Path(os.path.abspath(path))
     return there.relative_to(here) if there.is_relative_to(here) else there
 
@@ -166,7 +177,12 @@ def read_keyframes(path: Path) -> tuple[Keyframe, ...]:
         if not isinstance(whole, dict) or whole.keys() != {"format", "keyframes"} or whole["format"] != _FORMAT:
             raise ConfigError(f'expected an object with "format": {_FORMAT} and "keyframes", and nothing else')
         rows = from_json(whole["keyframes"], list[dict[str, int | str | None]])
-        keys = [_keyframe(path, number, row) for number, row in enumerate(rows)]
+        keys = []
+        for number, row in enumerate(rows):
+            frame, style = row.get("frame"), row.get("style")
+            if row.keys() != {"frame", "style"} or not isinstance(frame, int) or frame < 0 or isinstance(style, int):
+                raise ConfigError(f'keyframes.{number}: expected {{"frame": a number from 0, "style": a file or null}}')
+            keys.append(Keyframe(frame, None if style is None else path.parent / style))
         frames = [key.frame for key in keys]
         if not keys or len(set(frames)) < len(frames):
             raise ConfigError("keyframes: at least one is needed, and no two at one frame")
@@ -176,17 +192,10 @@ def read_keyframes(path: Path) -> tuple[Keyframe, ...]:
 
 
 def fade(frames: Sequence[int], at: int) -> tuple[int, int, float]:
-    """The keys before and after a frame, as places in `frames` (sorted), and how far it is from one to the other, in [0, 1]."""
+    """Find the keys before and after a frame, as places in `frames` (sorted), and how far it is between them, in [0, 1]."""
     after = next((i for i, frame in enumerate(frames) if frame > at), len(frames))
     if after == 0 or after == len(frames):
         only = min(after, len(frames) - 1)
         return only, only, 0.0
     way = (at - frames[after - 1]) / (frames[after] - frames[after - 1])
     return after - 1, after, way * way * (3 - 2 * way)
-
-
-def _keyframe(path: Path, number: int, row: dict[str, int | str | None]) -> Keyframe:
-    frame, style = row.get("frame"), row.get("style")
-    if row.keys() != {"frame", "style"} or not isinstance(frame, int) or frame < 0 or isinstance(style, int):
-        raise ConfigError(f'keyframes.{number}: expected {{"frame": a number from 0, "style": a file or null}}')
-    return Keyframe(frame, None if style is None else path.parent / style)

@@ -46,7 +46,7 @@ _RIVALLED = 0.8
 """What a rival takes from confidence at most."""
 _NEAREST = 0.05
 """Share of a reference's pixels that a score is the mean of: less may be the rim of something else."""
-KNOWN = 0.6
+APPLIED = 0.6
 """Share of the estimated exposure of things and of the cast that is applied: both are drawn to no change, since a few matches
 know the light of another place within limits."""
 _SMOOTH, _ROUGH = 0.12, 0.25
@@ -151,6 +151,7 @@ class Light(nn.Module):
         self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
     ) -> Annotated[Tensor, "N 1"]:
         """Share of paint at points, in [0, 1]: the confidence at `bold` 0.5, none at 0, all at 1."""
+        # Linear in `bold` on either side of 0.5, where paint is the confidence itself.
         sure = self.confidence(semantic, belongs)
         return 2 * self.bold * sure if self.bold <= 0.5 else sure + (2 * self.bold - 1) * (1 - sure)
 
@@ -161,6 +162,7 @@ class Light(nn.Module):
         belongs: Annotated[Tensor, "N K"] | None = None,
     ) -> Annotated[Tensor, "N 4 3"]:
         """What is added to colours beside the paint: A and below it b of each point, c' = c + c A + b."""
+        # A and b of the regions, mixed by membership, as far as points are not painted; u is largest half-way.
         belongs = self._belongs(semantic, belongs)
         lit = (belongs @ torch.cat([self.matrix, self.bias[:, None]], 1).flatten(1)).view(-1, 4, 3) * (1 - paint)[..., None]
         lit[:, 3] += 4 * paint * (1 - paint) * (belongs @ self.between)
@@ -230,6 +232,7 @@ def cosines(
     """
 
     def seen(at: Tensor) -> Tensor:
+        # Cosine in all channels from that in the basis: codes are longer by what lies beyond it.
         length = (keys - at).square().sum(1)
         shown = (length / (length + beyond).clamp_min(torch.finfo(length.dtype).tiny)).sqrt()
         return unit(x, at) @ unit(keys, at).T * shown
@@ -239,6 +242,7 @@ def cosines(
 
 def nearest_mean(cosine: Annotated[Tensor, "N T"], share: Annotated[Tensor, "T"]) -> Annotated[Tensor, "N"]:
     """Mean cosine with the nearest twentieth of a reference's pixels."""
+    # Codes from the nearest on, until a twentieth is full; the last counts in part.
     near, order = cosine.sort(1, descending=True)
     size = (share / share.sum())[order]
     taken = (_NEAREST - (size.cumsum(1) - size)).clamp_min(0).minimum(size)
@@ -247,6 +251,7 @@ def nearest_mean(cosine: Annotated[Tensor, "N T"], share: Annotated[Tensor, "T"]
 
 def region_likeness(scene: SceneStyle, dictionary: StyleDictionary, table: Annotated[Tensor, "K T"]) -> Annotated[Tensor, "K"]:
     """Mean cosine of each region with the codes that it takes, float64, in spreads of the scene's own regions."""
+    # Each reference is seen from its own middle; the shares in the table weigh the codes.
     own, keys, centre = double(scene.keys), double(dictionary.keys), double(scene.semantic_mean)
     beyond = double(_beyond(dictionary))
     total = own.new_zeros(len(own))
@@ -315,7 +320,7 @@ def light_maps(
     vote = share if float(vote.sum()) < 1e-3 * float(share.sum()) else vote  # of a scene of nothing but sky, all
     # Exposure e, from the logarithms of luma: things take the median of their changes, sources the change of their match.
     change = (luma(painted)[:, 0] + _BLACK).log() - (own + _BLACK).log()
-    thing = torch.full_like(change, KNOWN * _quantile(change, vote * (sure + _LEAST_VOTE), 0.5))
+    thing = torch.full_like(change, APPLIED * _quantile(change, vote * (sure + _LEAST_VOTE), 0.5))
     gain = torch.lerp(thing, change, source).exp().clamp(*_EXPOSURE)
     # What is nearly white already, as a marble statue is, cannot become brighter without losing its shape.
     gain = gain.minimum((_WHITE / (own + deviation)).clamp_min(1.0))
@@ -328,7 +333,7 @@ def light_maps(
         common = shared(there[:, a], bright)
         # Where the references share nothing, what the scene shares may be its material: a plant is yellowish throughout.
         cast.append(common - shared(here[:, a], share) if common else 0.0)
-    balance = (KNOWN * torch.tensor(cast, dtype=torch.float64).clamp(-_CAST, _CAST) @ axes).exp()
+    balance = (APPLIED * torch.tensor(cast, dtype=torch.float64).clamp(-_CAST, _CAST) @ axes).exp()
     # Saturation s of the references against the scene's, and S = (s I + (1 - s) L) diag(g).
     saturation = (_saturation(codes, odds) / _saturation(mean, share)).clamp(*_SATURATION)
     saturation = (saturation * torch.lerp(torch.ones_like(source), source.new_tensor(_SKY_SATURATION), source))[:, None, None]

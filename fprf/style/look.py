@@ -239,6 +239,7 @@ def regional(
         return config.build(dictionary=dictionary, scene=scene)
     if config.handles_allowed_references:
         return config.build(dictionary=dictionary._replace(allowed=allowed), scene=scene)
+    # One stylizer for each different choice of references.
     rows = [tuple(row) for row in allowed.tolist()]
     choices = sorted(set(rows))
     chosen = [choose(dictionary, torch.tensor(choice)) for choice in choices]
@@ -278,6 +279,7 @@ class RegionStylizer(Stylizer):
         assert semantic is not None, "Want.SEMANTIC was asked for"
         share = self.weight(semantic).to(content)
         out = torch.zeros_like(content)
+        # Points outside of a stylizer's regions are not computed by it.
         for p, column in enumerate(share.T.contiguous()):
             inside = column.nonzero().squeeze(1)
             styled: Tensor = self._stylizer(p)(content.index_select(0, inside), semantic.index_select(0, inside))
@@ -342,6 +344,7 @@ class Restyle:
     @property
     def needs(self) -> Want:
         """Features of points that it reads."""
+        # What is idle needs nothing: semantics of points cost a second field.
         needs = Want.CONTENT
         for part in self.parts:
             if part.share > 0 and part.strength > 0:
@@ -360,6 +363,7 @@ class Restyle:
     def mixed(self, other: "Restyle", at: float) -> "Restyle":
         """The look on the way to another, which lies at 1. Raises ConfigError outside [0, 1]."""
         between("at", at, 0.0, 1.0)
+        # Both mixes become parts of one; a look is its first part, which carries the others.
         first, *rest = (
             *(replace(part, share=part.share * (1 - at)) for part in self.parts),
             *(replace(part, share=part.share * at) for part in other.parts),
@@ -419,6 +423,7 @@ class Restyle:
         What is missing to 1 is what regions keep; the overall strength does not count. Without `points` (world units) neither
         do places.
         """
+        # A place lies over what is below it; what regions keep is taken from all alike.
         taken = []
         for part in self.parts:
             own = part.stylizer.match(semantic)

@@ -1,11 +1,13 @@
 """Matches before any colour is rendered: references and style codes that each pixel takes, and a list of a scene's regions.
 
-The list shows where each region is seen best, how large it is, and what it takes from the references.
+The list shows where each region is seen best, how large it is, and what it takes from the references. Letters: H x W pixels of
+a view, T style codes, K regions.
 """
 
 import io
 import math
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -27,6 +29,10 @@ from .scene_style import Membership
 
 _LISTED = 0.005
 """Codes that less than this share of a view takes are not listed."""
+_VIEWS = 24
+"""Views that are looked through for where each region is largest, evenly over all."""
+_COARSE, _FINE = 32, 160
+"""Longest side of the views that are looked through, and of the thumbnails."""
 
 
 class MatchMap(NamedTuple):
@@ -54,27 +60,30 @@ class MatchMap(NamedTuple):
 
     @property
     def entropy(self) -> Annotated[Tensor, "H W"]:
-        """Of the attention, in bits: 0 = one code, log2(T) = all alike."""
+        """Entropy of the attention, in bits: 0 = one code, log2(T) = all alike."""
         bits: Tensor = torch.special.entr(self.attention.clamp_min(0)).sum(-1) / math.log(2)
         return bits
 
 
 @torch.inference_mode()
-def match_map(here: Scene, styled: Styled, view: int, cameras: Cameras | None = None) -> MatchMap:
-    """Matches of one of the scene's own views, or of `cameras`: geometry and semantics alone are computed."""
-    cameras, scene, look = here.cameras if cameras is None else cameras, styled.scene, styled.restyle
-    device = here.device
-    belongs = Membership(scene).to(device)
-    centre, units, codes = scene.semantic_mean.to(device), styled.codes.units.to(device), len(styled.codes.reference)
+def match_map(scene: Scene, styled: Styled, view: int, cameras: Cameras | None = None) -> MatchMap:
+    """Matches of one of the scene's scene_style views, or of `cameras`: geometry and semantics alone are computed."""
+    cameras, scene_style, look = scene.cameras if cameras is None else cameras, styled.scene_style, styled.restyle
+    device = scene.device
+    belongs = Membership(scene_style).to(device)
+    centre, units, codes = scene_style.semantic_mean.to(device), styled.codes.units.to(device), len(styled.codes.reference)
 
     def values(semantic: Tensor, points: Tensor | None) -> Tensor:
+        # The score is weighted by what is taken, so that its composite is the mean over that.
         taken = look.match(semantic, points)
         near = unit(semantic, centre) @ units.T if belongs.divided else taken.new_zeros(taken.shape)
         sure = look.confidence(semantic, points).to(taken)
         return torch.cat([taken, (taken * near).sum(1, keepdim=True), sure, belongs(semantic)], 1)
 
+    # One pass composites all of them: codes, score, confidence, regions.
     pixel = pixel_grid(cameras, view)
-    shares, opacity = here.paint(cameras, view, pixel, values, semantic=belongs.divided)
+    shares, opacity = scene.paint(cameras, view, pixel, values, semantic=belongs.divided)
+    # Take them apart again.
     width, height = (int(v) for v in cameras.size[view])
     shares = shares.view(height, width, -1)
     taken = shares[..., :codes]
@@ -101,12 +110,13 @@ def match_pictures(matched: MatchMap, codes: Codes) -> dict[str, Picture]:
 
 def summarize(matched: MatchMap, codes: Codes) -> dict[str, Any]:
     """Use of the references and their codes, and its certainty, over the pixels of a view by their opacity."""
+    # Pixels count by their opacity; certainty is that of what is styled at all.
     each, kept = matched.opacity.double(), matched.kept
     total = float(each.sum()) or 1.0
     weight = each * (1 - kept)
     styled = float(weight.sum()) or 1.0
     of_code, of_region = weighted_sum(matched.taken, each) / total, weighted_sum(matched.region, each) / total
-    cluster = clusters(codes)
+    cluster = cluster_numbers(codes)
     return {
         **match_summary(matched.attention, codes.reference, codes.names, weight),
         "score": float((matched.score * weight).sum()) / styled,
@@ -125,11 +135,12 @@ def write_pixels(path: Path, matched: MatchMap, codes: Codes) -> None:
     """Write an .npz: reference, cluster, region (int16, -1 where nothing is), score, confidence, entropy_bits, kept, opacity,
     names.
     """
+    # The one code that a pixel takes most of; -1 where there is nothing, or where nothing is taken.
     code = matched.taken.argmax(-1)
     some, styled = matched.opacity > 0.5, matched.taken.sum(-1) > 0.5
     arrays = {
         "reference": torch.where(some & styled, codes.reference[code], -1).short(),
-        "cluster": torch.where(some & styled, clusters(codes)[code], -1).short(),
+        "cluster": torch.where(some & styled, cluster_numbers(codes)[code], -1).short(),
         "region": torch.where(some, matched.region.argmax(-1), -1).short(),
         "score": matched.score,
         "confidence": matched.confidence,
@@ -137,6 +148,7 @@ def write_pixels(path: Path, matched: MatchMap, codes: Codes) -> None:
         "kept": matched.kept,
         "opacity": matched.opacity,
     }
+    # As np.savez_compressed writes it, but with arrays that hold no pickles, and whole or absent.
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, values in {"names": np.asarray(codes.names), **arrays}.items():
@@ -145,7 +157,7 @@ def write_pixels(path: Path, matched: MatchMap, codes: Codes) -> None:
     write_bytes(path, data.getvalue())
 
 
-def clusters(codes: Codes) -> Annotated[Tensor, "T"]:
+def cluster_numbers(codes: Codes) -> Annotated[Tensor, "T"]:
     """Number of each code within its reference, from 0."""
     number = torch.zeros_like(codes.reference)
     for i in range(len(codes.names)):
@@ -154,14 +166,7 @@ def clusters(codes: Codes) -> Annotated[Tensor, "T"]:
     return number
 
 
-_VIEWS = 24
-"""Views that are looked through for where each region is largest, evenly over all."""
-
-_COARSE, _FINE = 32, 160
-"""Longest side of the views that are looked through, and of the thumbnails."""
-
-
-class Taken(NamedTuple):
+class ReferenceShare(NamedTuple):
     """Share of a region that comes from one reference."""
 
     name: str
@@ -171,8 +176,8 @@ class Taken(NamedTuple):
     """Cosine with the nearest of the reference's codes, in [-1, 1]."""
 
 
-class Region(NamedTuple):
-    """One of the scene's regions."""
+class ExplainedRegion(NamedTuple):
+    """One of the scene's regions, and what it takes."""
 
     number: int
     share: float
@@ -183,7 +188,7 @@ class Region(NamedTuple):
     """A place in that view, in the middle of it: what to point at to mean it."""
     picture: Picture
     """That view with the region highlighted."""
-    taken: tuple[Taken, ...] = ()
+    taken: tuple[ReferenceShare, ...] = ()
     """All references, the most used first."""
     entropy: float = 0.0
     """Bits, over the style codes."""
@@ -196,27 +201,57 @@ class Region(NamedTuple):
 
 
 @torch.inference_mode()
-def explain(regions: Regions, styled: Styled | None = None) -> list[Region]:
+def explain(regions: Regions, styled: Styled | None = None) -> list[ExplainedRegion]:
     """All regions in their order, with what they take where there is a style."""
-    names, count = regions.scene.names, len(regions.style.share)
-    looked = sorted({round(i * (len(names) - 1) / max(1, _VIEWS - 1)) for i in range(_VIEWS)})
-    mass = torch.stack([_mass(regions, view) for view in looked])
-    best = [looked[int(mass[:, k].argmax())] for k in range(count)]
-    seen = {view: _seen(regions, view) for view in sorted(set(best))}
+    scene, style = regions.scene, regions.scene_style
+    # Views evenly over all are looked through, coarsely, for where each region is largest.
+    looked = sorted({round(i * (len(scene.names) - 1) / max(1, _VIEWS - 1)) for i in range(_VIEWS)})
+    mass = []
+    for view in looked:
+        share, opacity = membership_view(regions, view, _COARSE)
+        mass.append((share * opacity[..., None]).mean((0, 1)))
+    best = [looked[int(column.argmax())] for column in torch.stack(mass).T]
+    # Those views are rendered small, as they are, with the places of the regions in them.
+    seen = {}
+    for view in sorted(set(best)):
+        share, opacity = membership_view(regions, view, _FINE)
+        picture = to_uint8(scene.render(shrunk(scene.cameras, view, _FINE), 0).rgb)
+        seen[view] = picture, share * opacity[..., None]
     rows = []
     for k, view in enumerate(best):
-        colour, share = seen[view]
-        width, height = regions.scene.cameras.size[view].tolist()
-        pixel = _middle(share[..., k], (width, height))
-        rows.append(Region(k, float(regions.style.share[k]), names[view], pixel, highlight(colour, share[..., k])))
+        picture, share = seen[view]
+        pixel = _middle(share[..., k], scene.cameras.size[view].tolist())
+        rows.append(ExplainedRegion(k, float(style.share[k]), scene.names[view], pixel, highlight(picture, share[..., k])))
     if styled is None:
         return rows
-    attention = styled.restyle.stylizer.match(regions.style.keys.to(regions.scene.device)).cpu().double()
-    sure = styled.restyle.confidence(regions.style.keys.to(regions.scene.device)).cpu()
-    return [_matched(row, styled, attention[row.number])._replace(confidence=float(sure[row.number])) for row in rows]
+    keys, reference, controls = style.keys.to(scene.device), styled.dictionary.reference, styled.controls
+    attention, sure = styled.restyle.stylizer.match(keys).cpu().double(), styled.restyle.confidence(keys).cpu()
+    for k, row in enumerate(rows):
+        taken = [
+            ReferenceShare(name, float(attention[k][reference == i].sum()), float(controls.score[k][reference == i].max()))
+            for i, name in enumerate(styled.dictionary.names)
+        ]
+        rows[k] = row._replace(
+            taken=tuple(sorted(taken, key=lambda each: (-each.share, -each.score))),
+            entropy=float(torch.special.entr(attention[k]).sum()) / math.log(2),
+            confidence=float(sure[k]),
+            strength=float(controls.strength[k]),
+            restricted=not bool(controls.allowed[k].all()),
+        )
+    return rows
 
 
-def region_row(region: Region) -> dict[str, Any]:
+def _middle(share: Annotated[Tensor, "H W"], size: Sequence[int]) -> tuple[int, int]:
+    """Find the pixel, of the full view, about which most of the region lies."""
+    # Blurred membership is highest in the middle; a pixel that belongs to the region itself comes before one beside it.
+    reach = 2 * (max(share.shape) // 12) + 1
+    smooth = cv2.blur(share.cpu().numpy(), (reach, reach), borderType=cv2.BORDER_CONSTANT)
+    y, x = np.unravel_index(int(np.argmax(smooth * (share.cpu().numpy() > 0.5) + 1e-3 * smooth)), smooth.shape)
+    height, width = share.shape
+    return int((x + 0.5) * size[0] / width), int((y + 0.5) * size[1] / height)
+
+
+def region_row(region: ExplainedRegion) -> dict[str, Any]:
     """A region for JSON."""
     row: dict[str, Any] = {"region": region.number, "share": region.share, "view": region.view, "pixel": list(region.pixel)}
     if region.taken:
@@ -230,52 +265,13 @@ def region_row(region: Region) -> dict[str, Any]:
     return row
 
 
-def region_tile(region: Region, names: tuple[str, ...]) -> Tile:
+def region_tile(region: ExplainedRegion, names: tuple[str, ...]) -> Tile:
     """A region for a sheet; `names` are the references in the order of their colours."""
-    lines = [f"{region.number}: {region.share:.1%} of the scene"]
-    lines.append(f"{region.view}:{region.pixel[0]},{region.pixel[1]}")
+    lines = [f"{region.number}: {region.share:.1%} of the scene", f"{region.view}:{region.pixel[0]},{region.pixel[1]}"]
     if not region.taken:
         return Tile(region.picture, tuple(lines))
     best = region.taken[0]
-    lines.append(
-        "kept as it is"
-        if region.strength == 0
-        else f"{best.name} {best.share:.0%}, score {best.score:.2f}, sure {region.confidence:.0%}"
-    )
+    matched = f"{best.name} {best.share:.0%}, score {best.score:.2f}, sure {region.confidence:.0%}"
+    lines.append("kept as it is" if region.strength == 0 else matched)
     by_name = {taken.name: taken.share * region.strength for taken in region.taken}
     return Tile(region.picture, tuple(lines), tuple(by_name[name] for name in names))
-
-
-def _mass(regions: Regions, view: int) -> Annotated[Tensor, "K"]:
-    """Share of a view's pixels in each region."""
-    share, opacity = membership_view(regions, view, _COARSE)
-    return (share * opacity[..., None]).mean((0, 1))
-
-
-def _seen(regions: Regions, view: int) -> tuple[Picture, Annotated[Tensor, "H W K"]]:
-    """A view as it is, small, and where its regions are."""
-    share, opacity = membership_view(regions, view, _FINE)
-    return to_uint8(regions.scene.render(shrunk(regions.scene.cameras, view, _FINE), 0).rgb), share * opacity[..., None]
-
-
-def _middle(share: Annotated[Tensor, "H W"], size: tuple[int, int]) -> tuple[int, int]:
-    """The pixel, of the full view, about which most of the region lies."""
-    reach = 2 * (max(share.shape) // 12) + 1
-    smooth = cv2.blur(share.cpu().numpy(), (reach, reach), borderType=cv2.BORDER_CONSTANT)
-    y, x = np.unravel_index(int(np.argmax(smooth * (share.cpu().numpy() > 0.5) + 1e-3 * smooth)), smooth.shape)
-    height, width = share.shape
-    return int((x + 0.5) * size[0] / width), int((y + 0.5) * size[1] / height)
-
-
-def _matched(region: Region, styled: Styled, attention: Annotated[Tensor, "T"]) -> Region:
-    reference, score, controls = styled.dictionary.reference, styled.controls.score[region.number], styled.controls
-    rows = [
-        Taken(name, float(attention[reference == i].sum()), float(score[reference == i].max()))
-        for i, name in enumerate(styled.dictionary.names)
-    ]
-    return region._replace(
-        taken=tuple(sorted(rows, key=lambda row: (-row.share, -row.score))),
-        entropy=float(torch.special.entr(attention).sum()) / math.log(2),
-        strength=float(controls.strength[region.number]),
-        restricted=not bool(controls.allowed[region.number].all()),
-    )

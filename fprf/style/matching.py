@@ -28,8 +28,6 @@ import torch
 from torch import Tensor
 
 from ..errors import ConfigError
-from ..ops import mixture
-from ..ops.dense import usable
 from ..ops.precision import double, full_precision
 
 Similarity = Literal["cosine", "dot"]
@@ -101,10 +99,6 @@ def point_shares(
 
     Shares below `faint` of a point's largest become 0. Rows sum to 1. Within 4 (D + 4) u / temperature of the exact shares.
     """
-    # The kernel does in one pass over the points what the lines below do in five.
-    if usable(x) and keys.dtype == torch.float32 and len(x) > 0 and temperature > 0:
-        flat = 0.0 if centre is None else _FLAT * float(torch.linalg.vector_norm(centre))
-        return mixture.attention(x, keys, temperature, centre=centre, flat=flat, prior=prior, faint=faint)
     share = attention(x if centre is None else unit(x, centre), keys, temperature, prior)
     if faint > 0:
         share = torch.where(share < faint * share.amax(1, keepdim=True), 0.0, share)

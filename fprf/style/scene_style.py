@@ -68,6 +68,7 @@ def scene_style(
     if not bool(weights.any()):
         raise DataError("scene statistics: no point has weight; the scene renders empty, train it for longer")
     whole = moments_of(content, weights) if moments is None else moments
+    # Points that render nothing say nothing, whatever they hold.
     keep = weights > 0
     content, weights = content[keep], weights[keep]
     semantic = content.new_zeros(len(content), 0) if semantic is None else semantic[keep]
@@ -176,6 +177,7 @@ def region_smoothing(
     unity = torch.eye(len(scene.share), dtype=torch.float64)
     if smoothness == 0:
         return unity
+    # Regions under different restrictions must not lend each other what one of them may not have.
     contacts = double(scene.contacts).to(unity)
     if allowed is not None:
         contacts = contacts * (allowed[:, None] == allowed[None]).all(-1).to(unity)
@@ -225,6 +227,7 @@ def from_tensors(tensors: Mapping[str, Tensor]) -> SceneStyle:
     if missing:
         raise CheckpointError(f"scene statistics: {', '.join(missing)} missing; compute the statistics again")
     scene = SceneStyle(**{name: tensors[name] for name in SceneStyle._fields})
+    # A checkpoint may be somebody else's: every table must fit the others.
     c, k, d = scene.mean.numel(), scene.share.numel(), scene.semantic_mean.numel()
     shapes = ((c,), (c, c), (k, d), (k, c), (k, c, c), (k,), (d,), (k, k))
     for name, t, shape in zip(SceneStyle._fields, scene, shapes, strict=True):

@@ -79,6 +79,7 @@ def moments(features: Annotated[Tensor, "N C"], weights: Annotated[Tensor, "N"])
 
 def merge(a: Moments, b: Moments) -> Moments:
     """Moments of both inputs together (Chan, Golub, LeVeque 1979). Commutative and associative within 1e-12."""
+    # The mean moves by b's share of the way; the scatter gains what the means lie apart.
     weight = a.weight + b.weight
     share = b.weight / torch.where(weight > 0, weight, 1.0)
     shift = b.mean - a.mean
@@ -105,6 +106,7 @@ def group_moments(
         moments(features[inside.to(features.device)], membership[inside, k])
         for k, inside in enumerate((column > 0).nonzero().squeeze(1) for column in membership.T)
     ]
+    # Shares of all weight; where there is none at all they are 0, not NaN.
     weight = torch.stack([g.weight for g in groups])
     mean = torch.stack([g.mean for g in groups])
     return mean, torch.stack([covariance(g) for g in groups]), weight / weight.sum().clamp_min(torch.finfo().tiny)
@@ -128,19 +130,9 @@ def deviation(mean: Annotated[Tensor, "... C"], variance: Annotated[Tensor, "...
     The floor is relative, so it biases no live channel, whatever the encoder's scale; always above 0.
     """
     sigma = variance.clamp_min(0.0).sqrt()
-    return sigma.maximum(_least(mean, sigma))
-
-
-def dead_channels(mean: Annotated[Tensor, "... C"], variance: Annotated[Tensor, "... C"]) -> Annotated[Tensor, "... C"]:
-    """Channels that hardly vary (bool): those whose deviation is the floor of `deviation`, so that styles leave them quiet."""
-    sigma = variance.clamp_min(0.0).sqrt()
-    return sigma <= _least(mean, sigma)
-
-
-def _least(mean: Tensor, sigma: Tensor) -> Tensor:
     floor = _FLOOR * sigma.median(dim=-1, keepdim=True).values
     rounding = _RESOLUTION * mean.abs().amax(dim=-1, keepdim=True)
-    return floor.maximum(rounding).clamp_min(1e-12)
+    return sigma.maximum(floor.maximum(rounding).clamp_min(1e-12))
 
 
 _RIDGE = 1e-4
@@ -168,16 +160,12 @@ def monge(
     left, value, _ = torch.linalg.svd(style_root @ symmetric_root(_with_ridge(double(content))))
     half = style_root @ (left / value.clamp_min(torch.finfo(value.dtype).tiny).sqrt()[..., None, :])
     product = half @ half.mT
-    return limit_gain((product + product.mT) / 2, gain)
-
-
-def limit_gain(t: Annotated[Tensor, "... C C"], gain: float) -> Annotated[Tensor, "... C C"]:
-    """The symmetric positive map with no direction amplified more than `gain`; untouched, bit for bit, if none is."""
+    t = (product + product.mT) / 2
+    # Cap the eigenvalues; where none is too large the map stays untouched, bit for bit.
     with full_precision(t):
         value, vector = torch.linalg.eigh(t)
         capped = (vector * value.clamp(0.0, gain)[..., None, :]) @ vector.mT
-    capped = (capped + capped.mT) / 2
-    return torch.where((value[..., -1] > gain)[..., None, None], capped, t)
+    return torch.where((value[..., -1] > gain)[..., None, None], (capped + capped.mT) / 2, t)
 
 
 def _with_ridge(c: Tensor) -> Tensor:
@@ -221,6 +209,7 @@ def kmeans(x: Annotated[Tensor, "N D"], k: int, *, seed: int, weights: Annotated
         return Clusters(x[:0], torch.zeros(len(x), dtype=torch.int64, device=x.device))
     if not bool(mass.any()):
         mass = torch.ones_like(mass)
+    # Centred first: what follows compares squared lengths.
     middle = mass @ points / mass.sum()
     points = points - middle
     generator = torch.Generator().manual_seed(seed)
@@ -260,11 +249,13 @@ def _lloyd(points: Tensor, mass: Tensor, centres: Tensor, steps: int) -> tuple[T
 
 def _seed(points: Tensor, mass: Tensor, k: int, generator: torch.Generator) -> Tensor:
     """Draw centres by weight x squared distance to the nearest so far (k-means++); fewer if points run out."""
+    # One number a centre, drawn on the CPU: the same on every device.
     draws = torch.rand(k, generator=generator, dtype=torch.float64).to(points.device)
     chosen = _draw(mass, draws[0])
     centres = [points[chosen]]
     distance = (points - centres[0]).square().sum(1)
     for draw in draws[1:]:
+        # No row is left that is not a centre already: fewer clusters than asked for.
         odds = mass * distance
         if not bool(odds.any()):
             break

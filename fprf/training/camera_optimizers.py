@@ -85,9 +85,9 @@ class Poses(nn.Module):
 
 def moved_cameras(cameras: Cameras, moves: Annotated[Tensor, "V 6"]) -> Cameras:
     """Cameras, each turned about its own centre and shifted."""
-    turn, shift = moves.to(cameras.pose).view(-1, 2, 3).unbind(1)
-    axes = [rotated(cameras.pose[:, :, axis], turn) for axis in range(3)]
-    return replace(cameras, pose=torch.stack([*axes, cameras.pose[:, :, 3] + shift], -1))
+    moves = moves.to(cameras.pose.device).to(cameras.pose.dtype)
+    axes = [rotated(cameras.pose[:, :, axis], moves[:, :3]) for axis in range(3)]
+    return replace(cameras, pose=torch.stack([*axes, cameras.pose[:, :, 3] + moves[:, 3:]], -1))
 
 
 def rotated(x: Annotated[Tensor, "N 3"], turn: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
@@ -101,7 +101,7 @@ def rotated(x: Annotated[Tensor, "N 3"], turn: Annotated[Tensor, "N 3"]) -> Anno
     return turned
 
 
-def moving(rays: Rays) -> Rays:
+def rays_of_moving_cameras(rays: Rays) -> Rays:
     """Rays whose origin and direction alone lead gradients: samples are placed, and looks shaded, as if poses were fixed."""
     return Rays(rays.origin, rays.direction, rays.view.detach(), rays.near.detach(), rays.far.detach())
 

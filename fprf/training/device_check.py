@@ -53,6 +53,7 @@ class Outcome(NamedTuple):
 
 def compare(device: torch.device) -> list[Outcome]:
     """Features, gradients, a render and a restyle on a device, against plain torch on the CPU."""
+    # Plain torch on the CPU is what everything else is measured by.
     with backend.plain():
         expected = _computed(torch.device("cpu"))
     computed = _computed(device)
@@ -70,7 +71,7 @@ def fast_paths(device: torch.device) -> Iterator[tuple[str, str]]:
     with torch.no_grad():
         compiled = dense.usable(probe)
     if compiled:
-        yield "kernels", "numba's: tri-planes, networks, proposals, matching, guided filter"
+        yield "kernels", "numba's: tri-planes, networks, maps of styles, guided filter"
     else:
         yield "kernels", "none: everything by torch"
     if device.type == "cuda":
@@ -110,17 +111,7 @@ def _tiny(encoder: str, channels: int) -> tuple[TrainConfig, Facts]:
     )
     axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     space = Space(kind="contraction", centre=(0.0, 0.0, 0.0), rotation=axes, scale=1.0, near=0.1, far=100.0)
-    facts = Facts(
-        space=space,
-        channels=channels,
-        dim=_DIM,
-        content_encoder=encoder,
-        semantic_encoder="",
-        content_scale=1.0,
-        semantic_scale=1.0,
-        background=None,
-    )
-    return config, facts
+    return config, Facts(space=space, channels=channels, dim=_DIM, content_encoder=encoder)
 
 
 def _camera() -> Cameras:
@@ -139,6 +130,7 @@ def _gradients(model: Model, cameras: Cameras, image: Annotated[Tensor, "3 H W"]
         target = torch.nn.functional.interpolate(image[None], (24, 32))[0].flatten(1).T
         loss = (out.rgb - target).square().mean() + (out.content - 0.1).square().mean() + (out.semantic - 0.1).square().mean()
         gradients = list(torch.autograd.grad(loss, learned, allow_unused=True, materialize_grads=True))
+        # A plain step, so that the second gradient depends on the first one.
         with torch.no_grad():
             for parameter, gradient in zip(learned, gradients, strict=True):
                 parameter.sub_(gradient, alpha=0.1)

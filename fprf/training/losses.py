@@ -93,14 +93,12 @@ def terms(
     if config.distortion > 0:
         result["distortion"] = distortion(sampled.s, weights)
     if config.depth > 0 and ends is not None:
-        loss = ending(sampled.t, weights, ends, ndc=facts.space.kind == "ndc")
-        if loss is not None:
-            result["depth"] = loss
+        result["depth"] = ending(sampled.t, weights, ends, ndc=facts.space.kind == "ndc")
     if config.sky > 0 and batch.sky is not None:
-        loss = emptiness(sampled.t, weights, batch.sky, within=math.inf if facts.space.kind in ("box", "ndc") else SHELL)
-        if loss is not None:
-            result["sky"] = loss
+        within = math.inf if facts.space.kind in ("box", "ndc") else SHELL
+        result["sky"] = emptiness(sampled.t, weights, batch.sky, within=within)
     if config.extra is not None and extra is not None:
+        # A term of a plug-in: what it returns is checked each time, since it depends on the batch.
         result["extra"] = extra(rendered, batch, model.parts, step=step, generator=generator)
         check_term(config.extra, result["extra"], rendered.opacity)
     # Regularisers of all parameters cost as much as a batch, and need not follow every one.
@@ -111,57 +109,45 @@ def terms(
 
 def ending(
     t: Annotated[Tensor, "R E"], weights: Annotated[Tensor, "R S"], ends: Annotated[Tensor, "R"], *, ndc: bool = False
-) -> Tensor | None:
-    """Distance of rays from ending at their known ray parameters (NaN = unknown); None where none is known.
+) -> Tensor:
+    """Distance of rays from ending at their known ray parameters (NaN = unknown); 0 where none is known.
 
-    (1 - weight within NEARBY of the distance)^2 + (weight before)^2, the mean over those rays: both within [0, 1]. On an
-    accelerator it is 0 where none is known: the host would have to wait to find out.
+    (1 - weight within NEARBY of the distance)^2 + (weight before)^2, the mean over those rays: both within [0, 1].
     """
     known = torch.isfinite(ends)
-    if t.device.type == "cpu":
-        index = known.nonzero()[:, 0]
-        if not len(index):
-            return None
-        return _missed(*(x.index_select(0, index) for x in (t, weights, ends)), ndc=ndc).mean()
-    return _mean_of(_missed(t, weights, torch.where(known, ends, 0.5), ndc=ndc), known)
-
-
-def _missed(t: Tensor, weights: Tensor, ends: Tensor, *, ndc: bool) -> Annotated[Tensor, "R"]:
+    ends = torch.where(known, ends, 0.5)
     # In NDC 1 - t is in proportion to 1 / depth.
     low, high = (1 - (1 - ends) / near if ndc else ends * near for near in (1 - NEARBY, 1 + NEARBY))
     start, stop = t[:, :-1], t[:, 1:]
+    # Weight before the point would hide it; what lies behind it is not known.
     before = stop <= low[:, None]
     # An interval that reaches into the range counts: far from the camera intervals are wider than the range.
     there = ~before & (start < high[:, None])
-    return (1 - (weights * there).sum(-1)).square() + (weights * before).sum(-1).square()
+    missed = (1 - (weights * there).sum(-1)).square() + (weights * before).sum(-1).square()
+    return _mean_of(missed, known)
 
 
 def emptiness(
     t: Annotated[Tensor, "R E"], weights: Annotated[Tensor, "R S"], sky: Annotated[Tensor, "R"], *, within: float
-) -> Tensor | None:
-    """Opacity that rays into the sky meet before `within` (space units); None where there are none.
+) -> Tensor:
+    """Opacity that rays into the sky meet before `within` (space units); 0 where there are none.
 
-    Mean over those rays of (weight before)^2, in [0, 1]: the sky itself is learnt beyond the shell. On an accelerator
-    it is 0 where there are none.
+    Mean over those rays of (weight before)^2, in [0, 1]: the sky itself is learnt beyond the shell.
     """
-    if t.device.type == "cpu":
-        chosen = sky.nonzero()[:, 0]
-        if not len(chosen):
-            return None
-        before = midpoints(t.index_select(0, chosen)) < within
-        return (weights.index_select(0, chosen) * before).sum(-1).square().mean()
     return _mean_of((weights * (midpoints(t) < within)).sum(-1).square(), sky)
 
 
 def _mean_of(values: Annotated[Tensor, "R"], mask: Annotated[Tensor, "R"]) -> Tensor:
-    """Mean over the rays of a mask; 0 where it has none."""
+    """Mean over the rays of a mask, whose number the host need not wait for; 0 where it has none."""
     return torch.where(mask, values, 0.0).sum() / mask.sum().clamp_min(1)
 
 
 def total(config: LossConfig, parts: dict[str, Tensor], share: float = 0.0) -> Tensor:
     """Weighted sum, when a share of the training is over."""
     weights = _weights(config)
+    # Points lead while the geometry is found; details of it are left to the photographs.
     weights["depth"] *= FADE**share
+    # A penalty that is computed in one step of so many weighs as many times more.
     every = config.penalty_every
     return torch.stack(
         [(weights[name] if name in weights else _penalty_weight(config, name) * every) * value for name, value in parts.items()]

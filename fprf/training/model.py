@@ -42,22 +42,22 @@ class Facts:
     """Facts of a trained scene: enough to rebuild its model without images or encoders."""
 
     space: Space
-    channels: int
+    channels: int = 0
     """Content channels; 0 = the scene is not of fields."""
-    dim: int
+    dim: int = 0
     """Semantic channels of the field; 0 = no semantics."""
-    content_encoder: str
+    content_encoder: str = ""
     """Identity of the content encoder, to which the decoder belongs."""
-    semantic_encoder: str
+    semantic_encoder: str = ""
     """Identity of the semantic encoder; empty without one."""
-    content_scale: float
+    content_scale: float = 1.0
     """RMS standard deviation of the content targets: the unit of the content loss."""
-    semantic_scale: float
+    semantic_scale: float = 1.0
     """The same for semantics."""
-    background: tuple[float, float, float] | None
+    background: tuple[float, float, float] | None = None
     """Colour behind everything, if anything can be seen through."""
     exposure: tuple[float, ...] = ()
-    """Logarithm of each view's exposure over their mean (see `tones.relative`); empty where tones are not learnt."""
+    """Logarithm of each view's exposure over their mean (see `prepare.exposure_of`); empty where tones are not learnt."""
     held: tuple[int, ...] = ()
     """Views that neither tones nor poses are learnt from."""
     centres: tuple[tuple[float, float, float], ...] = ()
@@ -103,6 +103,7 @@ class Model(nn.Module):
 
     def penalties(self) -> dict[str, Tensor]:
         """Regularisers of all parts by name; those of one name are added up."""
+        # Members of blocks have added theirs up already.
         parts = (self.field, self.sampler, self.semantic)
         return add_penalties(part.penalties() for part in parts if part is not None)
 

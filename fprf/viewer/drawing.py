@@ -14,21 +14,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..errors import UsageError
 from ..io.images import Picture, to_uint8
 from ..io.maps import depth_image, match_image, palette
 from ..ops.harmonics import HARMONIC
 from ..page.pack import Colours, Packed
-from ..rendering.cameras import Cameras
+from ..rendering.cameras import Cameras, ideal_cameras
 from ..splats.scene import SplatScene
 from ..style.look import Restyle
 from ..style.restyle import Styled
 from ..style.scene_style import RegionWeight
 from ..training.loading import Trained
-from ..training.views import Part, view_parts
-from .look import Look
-from .messages import Camera, cameras_of
+from ..training.views import ViewChunk, view_chunks
+from .messages import Camera
 from .render_worker import Steps
-from .restyler import Restyler
+from .restyler import Look, Restyler
 
 Map: TypeAlias = Literal["none", "matches", "regions", "depth"]
 CACHE_BYTES = 128 << 20
@@ -37,6 +37,8 @@ CHUNK = 4096
 """Rays of a step: after each one a newer request may take over."""
 FIRST_SECONDS = 0.1
 """Time for the first picture of a new camera."""
+_MIN_CANVAS, _MAX_CANVAS = 8, 4096
+"""Longer sides of pictures, in pixels."""
 _MIN_SIDE = 16
 """No picture's longer side is smaller."""
 _NO_MATCH = 0.5
@@ -96,7 +98,7 @@ def _mapped(colours: Tensor, memberships: Tensor, opacity: Tensor, shown: Shown)
 
 
 def _memberships(restyler: Restyler, semantic: Tensor) -> Annotated[Tensor, "N K"]:
-    style = restyler.encoders.scene
+    style = restyler.encoders.scene_style
     share: Tensor = RegionWeight(style, torch.eye(len(style.share))).to(semantic.device)(semantic.float())
     return share
 
@@ -134,7 +136,7 @@ class _Kept:
     """A client's last view."""
 
     camera: Camera
-    parts: dict[tuple[int, int], list[Part]] = field(default_factory=dict)
+    parts: dict[tuple[int, int], list[ViewChunk]] = field(default_factory=dict)
 
 
 class FieldPainter:
@@ -162,7 +164,7 @@ class FieldPainter:
             start, again = time.perf_counter(), size in kept.parts
             rows: list[Tensor] = []
             captured: list[Tensor] = []
-            parts: list[Part] = []
+            parts: list[ViewChunk] = []
             for part in kept.parts[size] if again else self._parts(cameras_of([request.camera], size), 0):
                 rows.append(self._colours(part, styled, request.shown))
                 if request.captured:
@@ -186,7 +188,7 @@ class FieldPainter:
             yield
 
     @torch.inference_mode()
-    def _colours(self, part: Part, styled: Styled | None, shown: Shown) -> Annotated[Tensor, "N 3"]:
+    def _colours(self, part: ViewChunk, styled: Styled | None, shown: Shown) -> Annotated[Tensor, "N 3"]:
         """A chunk as it is shown; of the map of depths, depth and opacity."""
         restyle, semantic = None if styled is None else styled.restyle, part.semantic
         if shown.map == "depth":
@@ -201,10 +203,10 @@ class FieldPainter:
             colours = _mapped(colours, memberships, opacity, shown)
         return colours
 
-    def _parts(self, cameras: Cameras, view: int) -> Iterable[Part]:
+    def _parts(self, cameras: Cameras, view: int) -> Iterable[ViewChunk]:
         trained = self._trained
         config = replace(trained.config.render, chunk=min(CHUNK, trained.config.render.chunk))
-        return view_parts(trained.model, trained.known.facts, cameras, view, config)
+        return view_chunks(trained.model, trained.known.facts, cameras, view, config)
 
     def frame(self, cameras: Cameras, view: int, look: Restyle | None) -> Generator[None, None, Picture]:
         """Render one frame of a film, step by step, and return it."""
@@ -223,3 +225,35 @@ def resolutions(size: tuple[int, int]) -> list[tuple[int, int]]:
         sizes.append((max(1, round(size[0] / divisor)), max(1, round(size[1] / divisor))))
         divisor *= 2
     return sizes[::-1]
+
+
+def cameras_of(cameras: "list[Camera]", size: tuple[int, int] | None = None, longest: int = 640) -> Cameras:
+    """Pinhole cameras of one size: `size`, or the shape of the first one's canvas, `longest` pixels at its longer side.
+
+    Each keeps its vertical angle. Raises UsageError for axes that are no rotation.
+    """
+    if size is None:
+        width, height = cameras[0].size
+        by = max(_MIN_CANVAS, min(longest, _MAX_CANVAS)) / max(width, height)
+        size = (max(1, round(width * by)), max(1, round(height * by)))
+    poses, focal, centre = [], [], []
+    for camera in cameras:
+        axes = torch.tensor(camera.axes, dtype=torch.float64)
+        if not torch.allclose(axes @ axes.T, torch.eye(3).double(), atol=1e-3) or float(torch.linalg.det(axes)) < 0:
+            raise UsageError("camera: its axes are no rotation")
+        # Rows right, down, forward; a pose has columns right, up, back.
+        turn = axes.T * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+        poses.append(torch.cat([turn, torch.tensor(camera.place, dtype=torch.float64)[:, None]], 1))
+        by = size[1] / camera.size[1]
+        focal.append([camera.lens[0] * by, camera.lens[1] * by])
+        offset = [(camera.lens[2 + k] - camera.size[k] / 2) * by for k in (0, 1)]
+        centre.append([size[0] / 2 + offset[0], size[1] / 2 + offset[1]])
+    made = ideal_cameras(torch.stack(poses), 1.0, size)
+    return type(made)(
+        made.pose,
+        torch.tensor(focal, dtype=torch.float64),
+        torch.tensor(centre, dtype=torch.float64),
+        made.size,
+        made.distortion,
+        made.lens,
+    )

@@ -25,8 +25,9 @@ from ..style.files import StyleFile, read_keyframes, write_style
 from ..style.look import Restyle
 from ..style.restyle import keyed_looks
 from ..types import Origin
-from .look import Look, style_config
-from .messages import Camera, cameras_of
+from .drawing import cameras_of
+from .messages import Camera
+from .restyler import Look, style_config
 
 Frame: TypeAlias = Callable[[Cameras, int, Restyle | None], Generator[None, None, Picture]]
 """Renders one frame, step by step."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import FprfError
 from ..training.driver import schedule_of, watch
 from ..training.run import Run
-from .scene_files import newest_step
+from .uploads import newest_step
 
 if TYPE_CHECKING:
     from .server import ViewerServer

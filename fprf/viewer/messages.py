@@ -1,13 +1,14 @@
-"""The WebSocket messages that a page may send: small JSON objects of few kinds, with bounded numbers and short texts."""
+"""The messages that a page may send: small JSON objects of few kinds, with bounded numbers and short texts.
 
-from typing import Annotated, Literal, TypeAlias
+Those of an open scene come by its WebSocket, those of the start page as bodies of requests.
+"""
+
+from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
-import torch
 from msgspec import Meta, Struct
 
-from ..errors import DataError, UsageError
-from ..rendering.cameras import Cameras, ideal_cameras
+from ..errors import DataError
 
 Text: TypeAlias = Annotated[str, Meta(max_length=80)]
 Number: TypeAlias = Annotated[float, Meta(ge=-1e9, le=1e9)]  # NaN fails either bound
@@ -16,7 +17,6 @@ Count: TypeAlias = Annotated[int, Meta(ge=0, le=10**9)]
 Vector: TypeAlias = tuple[Number, Number, Number]
 Side: TypeAlias = Annotated[float, Meta(ge=1, le=8192)]
 Positive: TypeAlias = Annotated[float, Meta(gt=0, le=1e6)]
-_MIN_SIDE, _MAX_SIDE = 8, 4096
 
 
 class Camera(Struct, forbid_unknown_fields=True, frozen=True):
@@ -51,7 +51,7 @@ class Set(Message, tag="set"):
 class Preset(Message, tag="preset"):
     """A preset was chosen."""
 
-    name: Text
+    name: Literal["gentle"]
 
 
 class Card(Message, tag="card"):
@@ -113,44 +113,47 @@ class Picture(Message, tag="picture"):
 
 
 AnyMessage: TypeAlias = View | Set | Preset | Card | Pick | Region | Map | Keep | Key | Film | Picture
-_decoder = msgspec.json.Decoder(AnyMessage)
+
+Minutes: TypeAlias = Annotated[float, Meta(ge=0.05, le=600)]
 
 
-def read_message(text: str | bytes) -> AnyMessage:
-    """The message of a JSON text. Raises DataError unless the page could have sent it."""
+class New(Message, tag="new"):
+    """Files of a new scene are coming, under a name like this one."""
+
+    name: Annotated[str, Meta(max_length=1000)] = ""
+
+
+class Make(Message, tag="make"):
+    """A scene is to be made of the files that came."""
+
+    scene: Text
+    minutes: Minutes = 2.0
+
+
+class Open(Message, tag="open"):
+    """A file or folder of this machine is to be opened, or to become a scene."""
+
+    path: Annotated[str, Meta(max_length=4096)]
+    minutes: Minutes = 2.0
+
+
+class Stop(Message, tag="stop"):
+    """What is being made is to be stopped: to show what there is, or to leave it."""
+
+    then: Literal["show", "leave"] = "leave"
+
+
+class Leave(Message, tag="leave"):
+    """The scene that is shown is to be closed."""
+
+
+StartRequest: TypeAlias = New | Make | Open | Stop | Leave
+_decoders: dict[Any, Any] = {kinds: msgspec.json.Decoder(kinds) for kinds in (AnyMessage, StartRequest)}
+
+
+def read_message(text: str | bytes, kinds: Any = AnyMessage) -> Any:
+    """The message of a JSON text, of one of the `kinds`. Raises DataError unless the page could have sent it."""
     try:
-        return _decoder.decode(text)  # type: ignore[no-any-return]  # msgspec is not there where types are checked
+        return _decoders[kinds].decode(text)
     except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
         raise DataError(f"message: {error}") from error
-
-
-def cameras_of(cameras: "list[Camera]", size: tuple[int, int] | None = None, longest: int = 640) -> Cameras:
-    """Pinhole cameras of one size: `size`, or the shape of the first one's canvas, `longest` pixels at its longer side.
-
-    Each keeps its vertical angle. Raises UsageError for axes that are no rotation.
-    """
-    if size is None:
-        width, height = cameras[0].size
-        by = max(_MIN_SIDE, min(longest, _MAX_SIDE)) / max(width, height)
-        size = (max(1, round(width * by)), max(1, round(height * by)))
-    poses, focal, centre = [], [], []
-    for camera in cameras:
-        axes = torch.tensor(camera.axes, dtype=torch.float64)
-        if not torch.allclose(axes @ axes.T, torch.eye(3).double(), atol=1e-3) or float(torch.linalg.det(axes)) < 0:
-            raise UsageError("camera: its axes are no rotation")
-        # Rows right, down, forward; a pose has columns right, up, back.
-        turn = axes.T * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
-        poses.append(torch.cat([turn, torch.tensor(camera.place, dtype=torch.float64)[:, None]], 1))
-        by = size[1] / camera.size[1]
-        focal.append([camera.lens[0] * by, camera.lens[1] * by])
-        offset = [(camera.lens[2 + k] - camera.size[k] / 2) * by for k in (0, 1)]
-        centre.append([size[0] / 2 + offset[0], size[1] / 2 + offset[1]])
-    made = ideal_cameras(torch.stack(poses), 1.0, size)
-    return type(made)(
-        made.pose,
-        torch.tensor(focal, dtype=torch.float64),
-        torch.tensor(centre, dtype=torch.float64),
-        made.size,
-        made.distortion,
-        made.lens,
-    )

@@ -1,31 +1,158 @@
-"""Photographs and looks on one scene. Runs on the render worker alone.
+"""Looks, and photographs, on one scene.
 
-A photograph is encoded when it comes and clustered once for each number of clusters: a slider costs the stylizer alone.
+A look says how a scene is coloured: an immutable value, made by the page's controls, that `style_config` translates into the
+terms of `style.json`. `Restyler` applies looks; it runs on the render worker alone. A photograph is encoded when it comes and
+clustered once for each number of clusters: a slider costs the stylizer alone.
 """
 
 from collections import OrderedDict
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, NamedTuple, TypeVar
+from typing import Annotated, Literal, NamedTuple, TypeAlias, TypeVar
 
 import torch
 from torch import Tensor
 
+from ..checks import at_least, between, positive
 from ..datamanagers.images import load_image
 from ..errors import UsageError
 from ..interfaces import Scene
-from ..io.images import shrink
+from ..io.images import Picture, shrink
 from ..plugins.stylizers.config import RegionToneConfig
 from ..rendering.cameras import Cameras
-from ..style.config import labels
-from ..style.dictionary import Encoders, StyleDictionary, build_dictionary, concatenate, encode_photograph
+from ..style.config import StyleConfig, labels
+from ..style.dictionary import Encoders, Reference, StyleDictionary, build_dictionary, concatenate, encode_photograph
 from ..style.files import StyleFile
 from ..style.look import Restyle
 from ..style.matching import unit
 from ..style.regions import memberships
 from ..style.restyle import Styled, apply_dictionary
 from ..style.scene_style import SceneStyle
-from .look import Look, Photograph, style_config
+
+RegionAction: TypeAlias = Literal["pin", "forbid", "keep"]
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """A photograph on the shelf, encoded once; compared by identity."""
+
+    number: int
+    """Its name in requests of the page."""
+    name: str
+    path: Path
+    thumbnail: Picture
+    reference: Reference
+
+
+class RegionRule(NamedTuple):
+    """A style that a region may take; `photograph` is None where the region is kept as it is."""
+
+    region: int
+    action: RegionAction
+    photograph: Photograph | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Look:
+    """Colours of a scene; equal looks are the same style. Ranges are those of `StyleConfig`."""
+
+    mix: tuple[tuple[Photograph, float], ...] = ()
+    """Photographs with their weights, above 0, in the order of the shelf; none = the scene as it is."""
+    strength: float = 1.0
+    bold: float = StyleConfig.bold
+    """How far paint goes where the match is not sure, in [0, 1]."""
+    luminance: float = 0.0
+    temperature: float = 0.2
+    """Of the matching of regions and codes, relative; low = each region takes from what is most like it."""
+    clusters: int = 20
+    blend: float = 0.1
+    smoothness: float = RegionToneConfig.smoothness
+    """Smoothness of styles between neighbouring regions without an edge between them, at least 0."""
+    rules: frozenset[RegionRule] = frozenset()
+
+    def __post_init__(self) -> None:
+        for name in ("strength", "bold", "blend", "luminance"):
+            between(name, getattr(self, name), 0.0, 1.0)
+        at_least("clusters", self.clusters, 1)
+        positive("temperature", self.temperature)
+        at_least("smoothness", self.smoothness, 0.0)
+        for _, weight in self.mix:
+            positive("weights", weight)
+
+    @property
+    def plain(self) -> bool:
+        """True for the scene as it was captured."""
+        return not self.mix or self.strength == 0
+
+
+def only(look: Look, photograph: Photograph) -> Look:
+    """The look with one photograph alone."""
+    return _valid_rules(replace(look, mix=((photograph, 1.0),)))
+
+
+def set_weight(look: Look, photograph: Photograph, weight: float, shelf: Iterable[Photograph]) -> Look:
+    """The look with another weight of a photograph; 0 removes it together with the rules that name it."""
+    weights = dict(look.mix) | {photograph: weight}
+    mix = tuple((each, weights[each]) for each in shelf if weights.get(each, 0.0) > 0)
+    return _valid_rules(replace(look, mix=mix))
+
+
+def set_rule(look: Look, region: int, action: RegionAction | None, photograph: Photograph | None = None) -> Look:
+    """The look with a rule for a region; None removes its rules. Pinning and keeping replace the rules it had.
+
+    A region for which every photograph would be forbidden loses its rules instead.
+    """
+    mine = {rule for rule in look.rules if rule.region == region}
+    rest = look.rules - mine
+    if action is None:
+        return replace(look, rules=rest)
+    new = {RegionRule(region, action, None if action == "keep" else photograph)}
+    if action == "forbid":
+        new |= {rule for rule in mine if rule.action == "forbid"}
+        if {rule.photograph for rule in new} >= {each for each, _ in look.mix}:
+            return replace(look, rules=rest)
+    return replace(look, rules=rest | new)
+
+
+def renumbered(look: Look, regions: Sequence[int]) -> Look:
+    """The look with region r as regions[r]: regions were measured again."""
+    return replace(look, rules=frozenset(rule._replace(region=regions[rule.region]) for rule in look.rules))
+
+
+def style_config(look: Look, stylizer: RegionToneConfig | None = None) -> StyleConfig:
+    """The look as a style; references in the order of the mix."""
+    number = {photograph: i for i, (photograph, _) in enumerate(look.mix)}
+
+    def order(rule: RegionRule) -> tuple[int, str, int]:
+        return rule.region, rule.action, -1 if rule.photograph is None else number.get(rule.photograph, -1)
+
+    texts: dict[str, list[str]] = {"pin": [], "forbid": [], "keep": []}
+    for rule in sorted(look.rules, key=order):
+        if rule.photograph is None:
+            texts[rule.action].append(str(rule.region))
+        elif rule.photograph in number:
+            texts[rule.action].append(f"{rule.region}={number[rule.photograph]}")
+    return StyleConfig(
+        references=tuple(photograph.path for photograph, _ in look.mix),
+        weights=tuple(weight for _, weight in look.mix),
+        stylizer=replace(stylizer or RegionToneConfig(), temperature=look.temperature, smoothness=look.smoothness),
+        clusters=look.clusters,
+        blend=look.blend,
+        strength=look.strength,
+        bold=look.bold,
+        luminance=look.luminance,
+        pin=tuple(texts["pin"]),
+        forbid=tuple(texts["forbid"]),
+        keep=tuple(texts["keep"]),
+    )
+
+
+def _valid_rules(look: Look) -> Look:
+    """The look without rules for photographs that are not in its mix."""
+    mix = {photograph for photograph, _ in look.mix}
+    return replace(look, rules=frozenset(rule for rule in look.rules if rule.photograph is None or rule.photograph in mix))
+
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
@@ -72,12 +199,12 @@ class Restyler:
         """Replace the scene, and with it its style; return the style from before, if there was one."""
         self.scene, self._stale = scene, True
         self._styles.clear()
-        return None if self._encoders is None else self._encoders.scene
+        return None if self._encoders is None else self._encoders.scene_style
 
     @property
     def regions(self) -> int:
         """Number of regions of the scene."""
-        return len(self.encoders.scene.share)
+        return len(self.encoders.scene_style.share)
 
     def encode(self, path: Path, name: str) -> Photograph:
         """Encode a photograph. Raises DataError for an unreadable one."""
@@ -112,12 +239,12 @@ class Restyler:
         if not (0 <= pixel[0] < width and 0 <= pixel[1] < height):
             raise UsageError(f"pixel {pixel[0]:.0f},{pixel[1]:.0f}: outside of the view of {width}x{height}")
         place = torch.tensor([pixel], dtype=torch.float64)
-        share, opacity = memberships(self.scene, self.encoders.scene, cameras, 0, place)
+        share, opacity = memberships(self.scene, self.encoders.scene_style, cameras, 0, place)
         return int(share[0].argmax()) if float(opacity[0]) >= _SOLID else None
 
     def region_info(self, look: Look, region: int) -> RegionInfo:
         """Return the style that a region takes in a look."""
-        scene, styled = self.encoders.scene, self.styled(look)
+        scene, styled = self.encoders.scene_style, self.styled(look)
         taken: list[tuple[str, float]] = []
         if styled is not None:
             attention = styled.restyle.match(scene.keys[region : region + 1].to(self.scene.device))[0].cpu()

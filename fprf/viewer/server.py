@@ -13,19 +13,19 @@ import logging
 import secrets
 import socket
 import threading
-from collections.abc import Awaitable, Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import parse_qs, quote, urlsplit
+from urllib.parse import quote, urlsplit
 
 import uvicorn
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
-from starlette.requests import Request
-from starlette.responses import JSONResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.requests import HTTPConnection, Request, cookie_parser
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -33,7 +33,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ..errors import DataError, FprfError, UsageError
 from ..page.live import live_page, live_script, live_style
-from .start import Start, integer, start_routes
+from .messages import StartRequest, read_message
+from .start import Start
 
 if TYPE_CHECKING:
     from .session import Session, Viewed
@@ -53,6 +54,8 @@ _UPLOADS = 4
 _MAX_BODY = 20 << 20
 _MAX_MESSAGE = 1 << 16
 """Bytes of a WebSocket message; the page sends a few hundred."""
+_MAX_FIELDS = 16
+"""Fields of an address."""
 _PIECE = 1 << 16
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
@@ -81,14 +84,19 @@ class Access:
     def refusal(self, headers: Mapping[str, str], given: str | None = None) -> str | None:
         """Return why a request is refused, or None. Header names are lower case; `given` is a token in the address."""
         name = headers.get("host", "")
-        if not name or (is_loopback(self.host) and not is_loopback(_host_name(name))):
+        try:
+            host = urlsplit(f"//{name}").hostname or ""
+        except ValueError:
+            host = ""
+        if not name or (is_loopback(self.host) and not is_loopback(host)):
             return f"this viewer does not go by the name {name!r}; open it by the address that it printed"
         origin = headers.get("origin")
         if origin is not None and origin not in (f"http://{name}", f"https://{name}"):
             return "another site may not talk to this viewer"
         if self.token is None:
             return None
-        shown = given or _cookie(headers.get("cookie", "")) or headers.get("authorization", "").removeprefix("Bearer ")
+        kept = cookie_parser(headers.get("cookie", "")).get(COOKIE)
+        shown = given or kept or headers.get("authorization", "").removeprefix("Bearer ")
         if hmac.compare_digest(shown.encode(), self.token.encode()):
             return None
         return "a token is needed; open the whole address that `fprf view` printed"
@@ -113,22 +121,6 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def _host_name(host: str) -> str:
-    """The name in a Host header without its port; empty where it cannot be parsed."""
-    try:
-        return urlsplit(f"//{host}").hostname or ""
-    except ValueError:
-        return ""
-
-
-def _cookie(header: str) -> str:
-    for part in header.split(";"):
-        key, _, value = part.strip().partition("=")
-        if key == COOKIE:
-            return value
-    return ""
-
-
 class _Protocol(H11Protocol):  # type: ignore[misc]  # uvicorn's types are not followed
     """HTTP/1.1 with a time limit for the head of a request, which uvicorn does not have."""
 
@@ -149,34 +141,27 @@ class Guard:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Check a request or a WebSocket's handshake, and pass it on."""
-        headers: dict[str, str] = {}
-        refused: tuple[int, str] | None = None
-        for raw, value in scope["headers"]:
-            name = raw.decode("latin-1")
-            if name in headers and name in ("host", "origin"):
-                refused = (400, f"the header {name} comes twice")
-            headers.setdefault(name, value.decode("latin-1"))
-        try:
-            fields = parse_qs(scope["query_string"].decode("latin-1"), max_num_fields=16)
-        except ValueError:
-            fields, refused = {}, (400, "the address has too many fields")
-        given = fields.get("token", [None])[0]
-        if refused is None and (refusal := self._access.refusal(headers, given)) is not None:
+        connection = HTTPConnection(scope)
+        given, refused = connection.query_params.get("token"), None
+        if any(len(connection.headers.getlist(name)) > 1 for name in ("host", "origin")):
+            refused = (400, "the header host or origin comes twice")
+        elif len(connection.query_params.multi_items()) > _MAX_FIELDS:
+            refused = (400, "the address has too many fields")
+        elif (refusal := self._access.refusal(connection.headers, given)) is not None:
             refused = (403, refusal)
 
         async def patient(message: Message) -> None:
             if message["type"].endswith("response.start"):
                 added = [(name.encode(), value.encode()) for name, value in _HEADERS.items()]
                 kept = [row for row in message["headers"] if row[0].decode().lower() not in _HEADERS]
-                await send({**message, "headers": [*kept, *added]})
-                return
-            # A body in pieces, each of which must be taken in time.
-            body = message.get("body", b"") if message["type"].endswith("response.body") else b""
-            for start in range(0, len(body) - _PIECE, _PIECE):
-                piece = {**message, "body": body[start : start + _PIECE], "more_body": True}
+                message = {**message, "headers": [*kept, *added]}
+            # A body goes in pieces, each of which the client must take in time.
+            body, start = message.get("body", b""), 0
+            while len(body) - start > _PIECE:
+                piece = {"type": message["type"], "body": body[start : start + _PIECE], "more_body": True}
                 await asyncio.wait_for(send(piece), _TIMEOUT)
-            last = (len(body) - 1) // _PIECE * _PIECE if body else 0
-            await asyncio.wait_for(send({**message, "body": body[last:]} if body else message), _TIMEOUT)
+                start += _PIECE
+            await asyncio.wait_for(send({**message, "body": body[start:]} if start else message), _TIMEOUT)
 
         with contextlib.suppress(OSError, TimeoutError):  # the client has gone or is too slow
             if refused is not None:
@@ -229,7 +214,12 @@ class ViewerServer:
         self._numbers = count(1)
         self._uploads = asyncio.Semaphore(_UPLOADS)
         self._loop: asyncio.AbstractEventLoop | None = None
-        listener = _listen(access.host, port)
+        try:
+            address = socket.getaddrinfo(access.host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+            listener = socket.create_server(address[4][:2], family=address[0])
+        except OSError as error:
+            fault = f"--host {access.host} --port {port}: cannot listen there ({error.strerror}); choose another port"
+            raise UsageError(fault) from error
         self.port: int = listener.getsockname()[1]
         config = uvicorn.Config(
             self._make_app(),
@@ -340,16 +330,19 @@ class ViewerServer:
             Route("/film", self._film),
             Route("/picture", self._picture),
             Route("/photograph", self._photograph, methods=["POST"]),
-            *start_routes(lambda: self._start, self.body),
+            Route("/start", self._start_request, methods=["POST"]),
+            Route("/start/piece", self._start_piece, methods=["POST"]),
+            Route("/start/picture", self._start_picture),
         ]
 
     def _make_app(self) -> ASGIApp:
-        handlers: Any = {FprfError: _wrong, HTTPException: _missing}
-        return Starlette(routes=self._routes(), middleware=[Middleware(Guard, access=self.access)], exception_handlers=handlers)
+        async def wrong(request: Request, error: Exception) -> Response:
+            return PlainTextResponse(str(error), 400)
+
+        guard = Middleware(Guard, access=self.access)
+        return Starlette(routes=self._routes(), middleware=[guard], exception_handlers={FprfError: wrong})
 
     async def _live(self, socket: WebSocket) -> None:
-        from .messages import read_message
-
         if len(self._clients) >= _PAGES:
             raise HTTPException(503, "too many pages; close one and try again")
         await socket.accept()
@@ -403,73 +396,83 @@ class ViewerServer:
     async def _card(self, request: Request) -> Response:
         from ..io.images import encode
 
-        photograph = self.session.state.photograph(integer(request.query_params, "card"))
+        photograph = self.session.state.photograph(_integer(request, "card"))
         return Response(encode(photograph.thumbnail, "jpg"), media_type="image/jpeg")
 
     async def _gaussians(self, request: Request) -> Response:
-        data = await asyncio.to_thread(self.session.gaussians)
-        return self._download("application/octet-stream", data, "restyled.ply")
+        return self._download(await asyncio.to_thread(self.session.gaussians), "restyled.ply")
 
     async def _film(self, request: Request) -> Response:
         path = self.session.state.film[2]
         if path is None or not path.is_file():
             raise HTTPException(404, "no film yet")
-        return self._download("video/mp4", path.read_bytes(), f"{path.parent.name}.mp4")
+        return self._download(path, f"{path.parent.name}.mp4")
 
     async def _picture(self, request: Request) -> Response:
-        pictures, number = self.session.state.pictures, integer(request.query_params, "number")
+        pictures, number = self.session.state.pictures, _integer(request, "number")
         if number >= len(pictures):
             raise HTTPException(404, "no such picture")
-        return self._download("image/png", pictures[number].read_bytes(), pictures[number].name)
+        return self._download(pictures[number], pictures[number].name)
+
+    def _download(self, path: Path, name: str) -> Response:
+        """A file to be saved under the scene's name and its own."""
+        return FileResponse(path, filename=f"{self.session.viewed.name}-{name}")
 
     async def _photograph(self, request: Request) -> Response:
         name, data = request.query_params.get("name", "photograph"), await self.body(request)
         photograph = await asyncio.to_thread(self.session.upload, data, name)
         return JSONResponse({"card": photograph.number, "name": photograph.name})
 
-    def _download(self, kind: str, data: bytes, name: str) -> Response:
-        """A file to be saved under the scene's name and its own."""
-        whole = f"{self.session.viewed.name}-{name}"
-        plain = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "_" for c in whole)
-        return Response(data, media_type=kind, headers={"content-disposition": f'attachment; filename="{plain}"'})
+    @property
+    def start(self) -> Start:
+        """The start page. Raises HTTPException where there is none."""
+        if self._start is None:
+            raise HTTPException(404, "no start page here")
+        return self._start
+
+    async def _start_request(self, request: Request) -> Response:
+        asked = read_message(await self.body(request), StartRequest)
+        return JSONResponse(await asyncio.to_thread(self.start.handle, asked))
+
+    async def _start_piece(self, request: Request) -> Response:
+        query, data = request.query_params, await self.body(request)
+        place = (query.get("scene", ""), query.get("name", ""), _integer(request, "at"), _integer(request, "size"))
+        await asyncio.to_thread(self.start.piece, *place, data)
+        return JSONResponse({})
+
+    async def _start_picture(self, request: Request) -> Response:
+        data = await asyncio.to_thread(self.start.picture)
+        if not data:
+            raise HTTPException(404, "no picture yet")
+        return Response(data, media_type="image/jpeg")
 
     async def body(self, request: Request) -> bytes:
         """A body of at most `_MAX_BODY` bytes. A longer one is refused by its header, or as soon as it is."""
-        size = int(request.headers.get("content-length", "0"))  # digits: the parser refuses others
-        body, pieces = bytearray(), request.stream().__aiter__()
+        body = bytearray()
         async with self._uploads:
-            while size <= _MAX_BODY:
-                try:
-                    body += await asyncio.wait_for(anext(pieces), _TIMEOUT)
-                except StopAsyncIteration:
-                    return bytes(body)
-                except TimeoutError:
-                    raise HTTPException(408, "the request came too slowly") from None
-                size = max(size, len(body))
+            try:
+                async with asyncio.timeout(_TIMEOUT) as patience:
+                    size = int(request.headers.get("content-length", "0"))  # digits: the parser refuses others
+                    stream = request.stream()
+                    while size <= _MAX_BODY:
+                        if (piece := await anext(stream, None)) is None:
+                            return bytes(body)
+                        body += piece
+                        size = max(size, len(body))
+                        patience.reschedule(asyncio.get_running_loop().time() + _TIMEOUT)
+            except TimeoutError:
+                raise HTTPException(408, "the request came too slowly") from None
         raise HTTPException(413, f"more than {_MAX_BODY} bytes: make the photograph smaller")
 
 
-def _asset(kind: str, text: Callable[[], str]) -> Callable[[Request], Awaitable[Response]]:
+def _integer(request: Request, name: str) -> int:
+    """A whole number from 0 on, of at most 12 digits, in a query. Raises UsageError for anything else."""
+    text = request.query_params.get(name, "")
+    if not (text.isdigit() and text.isascii() and len(text) <= 12):
+        raise UsageError(f"{name}: {text[:20]!r} is no number from 0")
+    return int(text)
+
+
+def _asset(kind: str, text: Callable[[], str]) -> Callable[[Request], Response]:
     """The handler of a text of the page."""
-
-    async def respond(request: Request) -> Response:
-        return Response(text(), media_type=kind, headers={"content-security-policy": _POLICY})
-
-    return respond
-
-
-async def _wrong(request: Request, error: Exception) -> Response:
-    return PlainTextResponse(f"{error}\n", 400)
-
-
-async def _missing(request: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)
-    return PlainTextResponse(f"{error.detail}\n", error.status_code)
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    try:
-        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-        return socket.create_server(address[:2], family=family)
-    except OSError as error:
-        raise UsageError(f"--host {host} --port {port}: cannot listen there ({error.strerror}); choose another port") from error
+    return lambda request: Response(text(), media_type=kind, headers={"content-security-policy": _POLICY})

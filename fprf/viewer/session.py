@@ -25,15 +25,15 @@ from ..plugins.stylizers.config import RegionToneConfig
 from ..rendering.cameras import Cameras
 from ..splats.files import Capture, write_capture, write_gaussians
 from ..splats.scene import SplatScene
+from ..style.config import PRESETS
 from ..style.look import Restyle
 from ..training.loading import Trained
 from ..training.run import Known, Run
 from . import messages
-from .drawing import FieldPainter, Map, Request, Shown, gaussian_colours
+from .drawing import FieldPainter, Map, Request, Shown, cameras_of, gaussian_colours
 from .film import FilmPlan, Key, film_frames, new_folder, write_film_files
-from .look import Look, Photograph, apply_preset, only, renumbered, set_rule, set_weight
 from .render_worker import RenderWorker, Steps
-from .restyler import RegionInfo, Restyler, matching_regions
+from .restyler import Look, Photograph, RegionInfo, Restyler, matching_regions, only, renumbered, set_rule, set_weight
 from .uploads import Uploads, shown_name
 
 Post: TypeAlias = Callable[[Hashable | None, str, "Mapping[str, Any] | bytes"], None]
@@ -119,7 +119,7 @@ class Session:
         self._requests: dict[Hashable, Request] = {}
         self._photographs: frozenset[Photograph] = frozenset()
         self._painter: FieldPainter | None = None
-        self._worker: RenderWorker[Request] = RenderWorker(self._draw, self._on_error)
+        self._worker: RenderWorker[Request] = RenderWorker(self._render, self._on_error)
         self._version = count(1)
         self._colours: dict[str, tuple[int, bytes]] = {}
         self._coloured: Shown | None = None
@@ -151,14 +151,10 @@ class Session:
         else:
             raise UsageError(f"{self.viewed.name}: the viewer shows runs of fields and Gaussians, not {type(scene).__name__}")
 
-    @property
-    def drawn_there(self) -> bool:
-        """True where browsers draw the scene."""
-        return isinstance(self.viewed.scene, SplatScene)
-
     def hello(self) -> list[tuple[str, dict[str, Any]]]:
         """What a new client has to know."""
-        scene = {"type": "scene", "name": self.viewed.name, "gaussians": self.drawn_there, "step": self.viewed.step}
+        drawn_there, viewed = isinstance(self.viewed.scene, SplatScene), self.viewed
+        scene = {"type": "scene", "name": viewed.name, "gaussians": drawn_there, "step": viewed.step}
         ready = [("colours " + name, self._colours_message(name)) for name in self._colours]
         training = [] if self._progress is None else [("training", self._progress)]
         return [("scene", scene), ("state", self._described()), *ready, *training]
@@ -167,23 +163,32 @@ class Session:
         """Do what a client asks for. Raises FprfError with what is wrong with it."""
         match message:
             case messages.View():
-                self._move(client, Request(message.camera, self.state.shown, self._longest, message.captured))
+                if self._painter is not None:
+                    cameras_of([message.camera])  # refused where it is none
+                    request = Request(message.camera, self.state.shown, self._longest, message.captured)
+                    with self._lock:
+                        self._requests[client] = request
+                    self._worker.request(client, request)
             case messages.Set():
                 value: Any = int(message.value) if message.name == "clusters" else round(message.value, 4)
                 self.apply(lambda state: replace(state, look=replace(state.look, **{message.name: value})))
             case messages.Preset():
-                self.apply(lambda state: replace(state, look=apply_preset(state.look, message.name)))
+                values: dict[str, Any] = {path.rpartition(".")[2]: value for path, value in PRESETS[message.name].items()}
+                self.apply(lambda state: replace(state, look=replace(state.look, **values)))
             case messages.Card():
                 self.apply(lambda state: _carded(state, message))
             case messages.Pick():
-                self._pick(message)
+                cameras = cameras_of([message.camera], longest=1000)
+                width, height = cameras.size[0].tolist()
+                at = (min(message.x * width, width - 1e-3), min(message.y * height, height - 1e-3))
+                self._worker.run("pick", lambda: self._select(self.restyler.region_at(cameras, at)))
             case messages.Region():
                 self.apply(lambda state: _ruled(state, message))
             case messages.Map():
                 self.apply(lambda state: replace(state, map=message.map))
             case messages.Keep():
                 self.apply(lambda state: _kept(state, message))
-                if message.action == "keep" and self.drawn_there:
+                if message.action == "keep" and isinstance(self.viewed.scene, SplatScene):
                     self._worker.run(("kept", message.name), lambda: self._colour(message.name, Shown(self.state.look)))
             case messages.Key():
                 self.apply(lambda state: _keyed(state, message))
@@ -227,7 +232,12 @@ class Session:
             unused = plain if plain not in taken else next(each for n in count(2) if (each := f"{plain} ({n})") not in taken)
             photograph = self.restyler.encode(path, unused)
             self.apply(lambda state: _added(state, photograph))
-            self._delete_unused(photograph)
+            # Photographs that left the shelf and that no look needs go, with what was made of them: some 6 MB each.
+            used = self.state.in_use | frozenset(self.state.shelf)
+            for gone in {*self._photographs, photograph} - used:
+                gone.path.unlink(missing_ok=True)
+            self._photographs = used
+            self.restyler.retain(used)
             return photograph
 
         return self._worker.result(("add", path), add)
@@ -253,7 +263,22 @@ class Session:
 
     def reload(self, viewed: Viewed) -> None:
         """Show another state of the scene, from the next step of the worker on."""
-        self._worker.run("reload", lambda: self._reload(viewed))
+
+        def job() -> None:
+            self.viewed = viewed
+            before = self.restyler.reload(viewed.scene)
+            self._load()
+            self._colours.clear()
+            for kind, message in self.hello():
+                self._post(None, kind, message)
+            # Regions are measured anew, in any order: what is pinned is found again among them.
+            if before is not None and (self.state.look.rules or self.state.picked is not None):
+                regions = matching_regions(before, self.restyler.encoders.scene_style).tolist()
+                self.apply(lambda state: replace(state, look=renumbered(state.look, regions), picked=None))
+            if not self.state.look.plain:
+                self._refresh()
+
+        self._worker.run("reload", job)
 
     def trained(self, progress: Mapping[str, Any]) -> None:
         """Tell all clients how far the scene's training is."""
@@ -266,29 +291,22 @@ class Session:
             raise UsageError(f"{name}: no such colours")
         return self._colours[name][1]
 
-    def gaussians(self) -> bytes:
+    def gaussians(self) -> Path:
         """The Gaussians in the look of now, as a .ply file. Raises UsageError for a scene without any."""
         viewed, scene = self.viewed, self.viewed.scene
         if not isinstance(scene, SplatScene):
             raise UsageError(f"{viewed.name}: no Gaussians; `fprf export` makes some of a field")
 
-        def written() -> bytes:
+        def written() -> Path:
             path = self.uploads.folder / "restyled.ply"
             shown = scene.restyled(self.restyler.restyle(self.state.look)).shown
             if viewed.capture is None:
                 write_gaussians(path, shown, antialiased=scene.antialiased, views=scene.views, plain=True, origin=scene.origin)
             else:
                 write_capture(path, viewed.capture, shown.harmonics)
-            return path.read_bytes()
+            return path
 
         return self._worker.result("gaussians", written)
-
-    def _move(self, client: Hashable, request: Request) -> None:
-        if self._painter is not None:
-            messages.cameras_of([request.camera])  # refused where it is none
-            with self._lock:
-                self._requests[client] = request
-            self._worker.request(client, request)
 
     def _refresh(self) -> None:
         """Show all clients what is shown now."""
@@ -297,12 +315,12 @@ class Session:
             for client, request in self._requests.items():
                 self._requests[client] = request._replace(shown=shown)
                 self._worker.request(client, self._requests[client])
-        if self.drawn_there:
+        if isinstance(self.viewed.scene, SplatScene):
             self._worker.run("colours", lambda: self._colour(NOW, self.state.shown))
 
-    def _draw(self, client: Hashable, request: Request) -> Steps:
-        if self._painter is not None:
-            yield from self._painter.render(client, request)
+    def _render(self, client: Hashable, request: Request) -> Steps:
+        assert self._painter is not None  # others request nothing
+        return self._painter.render(client, request)
 
     def _show(self, client: Hashable, kind: str, picture: Picture, final: bool) -> None:
         """A picture as one byte for its kind, and a JPEG."""
@@ -327,31 +345,6 @@ class Session:
     def _colours_message(self, name: str) -> dict[str, Any]:
         return {"type": "colours", "name": name, "version": self._colours[name][0]}
 
-    def _reload(self, viewed: Viewed) -> None:
-        """Take another state of the scene, between two steps of the worker."""
-        self.viewed = viewed
-        before = self.restyler.reload(viewed.scene)
-        self._load()
-        self._colours.clear()
-        for key, message in self.hello():
-            self._post(None, key, message)
-        if before is not None and (self.state.look.rules or self.state.picked is not None):
-            regions = matching_regions(before, self.restyler.encoders.scene).tolist()
-            self.apply(lambda state: replace(state, look=renumbered(state.look, regions), picked=None))
-        if not self.state.look.plain:
-            self._refresh()
-
-    def _pick(self, message: messages.Pick) -> None:
-        """Select the region at a place of a picture; none where there is nothing."""
-        cameras = messages.cameras_of([message.camera], longest=1000)
-
-        def job() -> None:
-            width, height = cameras.size[0].tolist()
-            at = (min(message.x * width, width - 1e-3), min(message.y * height, height - 1e-3))
-            self._select(self.restyler.region_at(cameras, at))
-
-        self._worker.run("pick", job)
-
     def _select(self, region: int | None) -> None:
         picked = None if region is None else self.restyler.region_info(self.state.look, region)
         self.apply(lambda state: replace(state, picked=picked))
@@ -364,7 +357,7 @@ class Session:
 
     def _save_picture(self, camera: messages.Camera) -> None:
         """Render what a camera sees, as large as it is there, into the scene's folder while no client waits for a picture."""
-        cameras = messages.cameras_of([camera], longest=min(2048, round(max(camera.size))))
+        cameras = cameras_of([camera], longest=min(2048, round(max(camera.size))))
         folder = (self.viewed.root or self.uploads.folder) / "pictures"
 
         def work() -> Steps:
@@ -409,15 +402,6 @@ class Session:
             self.notify(f"film: {folder / 'film.mp4'}")
 
         threading.Thread(target=work, name="fprf-film", daemon=True).start()
-
-    def _delete_unused(self, added: Photograph) -> None:
-        """Delete photographs that left the shelf and that no look needs, with what was made of them: some 6 MB each."""
-        used = self.state.in_use | frozenset(self.state.shelf)
-        for gone in {*self._photographs, added} - used:
-            if gone.path.parent == self.uploads.folder:
-                gone.path.unlink(missing_ok=True)
-        self._photographs = used
-        self.restyler.retain(used)
 
     def _on_error(self, error: Exception) -> None:
         expected = isinstance(error, FprfError)
@@ -522,12 +506,12 @@ def _keyed(state: State, message: messages.Key) -> State:
             raise UsageError("key: a camera is needed")
         if len(keys) >= _MAX_KEYS:
             raise UsageError(f"film: at most {_MAX_KEYS} keys; remove one first")
-        messages.cameras_of([message.camera])
+        cameras_of([message.camera])
         return replace(state, keys=(*keys, Key(message.camera, state.look)))
     if not at < len(keys):
         raise UsageError(f"film: key {at + 1} of {len(keys)}: there is none")
     if message.action == "replace" and message.camera is not None:
-        messages.cameras_of([message.camera])
+        cameras_of([message.camera])
         keys[at] = Key(message.camera, state.look)
     elif message.action in ("earlier", "later"):
         to = min(len(keys) - 1, max(0, at + (1 if message.action == "later" else -1)))

@@ -4,7 +4,6 @@ Poses and training are `fprf process` and `fprf train` in processes of their own
 scene has one folder: its `files`, the `scene` with their poses, and the run folder `run`.
 """
 
-import asyncio
 import contextlib
 import json
 import signal
@@ -12,24 +11,18 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from starlette.exceptions import HTTPException
-from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
-from starlette.routing import Route
-
 from ..errors import DataError, FprfError, UsageError
-from .scene_files import SceneFiles, Source, find_source, is_capture, newest_step
+from .messages import Leave, Make, New, Open, StartRequest, Stop
+from .uploads import SceneFiles, Source, find_source, is_capture, newest_step
 
 METHOD = "fprf-splats"
 _FILES, _SCENE, _RUN = "files", "scene", "run"
-_MAX_JSON = 4096
-"""Bytes of a request that is JSON."""
 _LINES = 40
 """Lines of a process that are kept."""
 _RECENT = 12
@@ -103,30 +96,45 @@ class Start:
 
     def picture(self) -> bytes:
         """A view of the newest checkpoint as a JPEG; empty where there is none."""
-        return self._drawn(self._output / self._progress.name / _RUN)
+        run = self._output / self._progress.name / _RUN
+        with self._drawing:
+            step = newest_step(run)
+            if step > self._picture[0]:
+                with contextlib.suppress(FprfError, OSError):  # while it is saved or replaced the one before is good
+                    self._picture = (step, self._drawn(run))
+            return self._picture[1]
 
-    def new(self, asked: Mapping[str, Any]) -> dict[str, str]:
-        """Begin a scene under a name like the one that is asked for."""
-        name = self._unused(str(asked.get("name", "")))
-        self._uploads[name] = SceneFiles(self._output / name / _FILES)
-        return {"scene": name}
+    def handle(self, asked: StartRequest) -> dict[str, str]:
+        """Do what the page asks for. Raises UsageError or DataError where no scene can be made of what is named."""
+        match asked:
+            case New():
+                name = self._unused(asked.name)
+                self._uploads[name] = SceneFiles(self._output / name / _FILES)
+                return {"scene": name}
+            case Make():
+                folder = self._upload(asked.scene).folder
+                if not folder.is_dir():
+                    raise UsageError("none of these files can become a scene; give photographs, a video or a capture")
+                self._begin(find_source(folder), asked.scene, asked.minutes)
+            case Open():
+                self._open(asked.path.strip().strip("\"'"), asked.minutes)
+            case Stop():
+                busy = self._thread is not None and self._thread.is_alive()  # asked before it ends by this very request
+                self._interrupt(asked.then)
+                if not busy:  # a failure is put away
+                    self._reset()
+            case Leave():
+                if self._progress.stage in ("idle", "open"):
+                    self._progress = Progress()
+                    self._leave()
+        return {}
 
-    def piece(self, query: Mapping[str, str], data: bytes) -> None:
+    def piece(self, scene: str, name: str, at: int, size: int, data: bytes) -> None:
         """Take a piece of a file. Raises as `SceneFiles.add`."""
-        upload = self._upload(query.get("scene"))
-        upload.add(query.get("name", ""), integer(query, "at"), integer(query, "size"), data)
+        self._upload(scene).add(name, at, size, data)
 
-    def make(self, asked: Mapping[str, Any]) -> None:
-        """Make a scene of the files that came. Raises UsageError or DataError where none can be made."""
-        name = str(asked.get("scene"))
-        folder = self._upload(name).folder
-        if not folder.is_dir():
-            raise UsageError("none of these files can become a scene; give photographs, a video or a capture")
-        self._begin(find_source(folder), name, _minutes(asked))
-
-    def open(self, asked: Mapping[str, Any]) -> None:
+    def _open(self, text: str, minutes: float) -> None:
         """Open, or make a scene of, a file or folder of this machine."""
-        text = str(asked.get("path", "")).strip().strip("\"'")
         if not text:
             raise UsageError("name a run folder, a capture, a video or a folder of photographs")
         path = Path(text).expanduser()
@@ -136,20 +144,7 @@ class Start:
         else:
             ours = whole.name == _FILES and whole.parent.parent == self._output
             name = whole.parent.name if ours else self._unused(path.stem)
-        self._begin(source, name, _minutes(asked))
-
-    def stop(self, asked: Mapping[str, Any]) -> None:
-        """Stop what is being made, to show what there is, or to leave it; a failure is put away."""
-        busy = self._thread is not None and self._thread.is_alive()  # asked before it ends by this very request
-        self._interrupt("show" if asked.get("then") == "show" else "leave")
-        if not busy:
-            self._reset()
-
-    def leave(self, asked: Mapping[str, Any]) -> None:
-        """Close the scene that is shown."""
-        if self._progress.stage in ("idle", "open"):
-            self._progress = Progress()
-            self._leave()
+        self._begin(source, name, minutes)
 
     def _begin(self, source: Source, name: str, minutes: float) -> None:
         with self._lock:
@@ -245,11 +240,10 @@ class Start:
         self._progress = Progress()
         self._post(None, "start", self.state())
 
-    def _upload(self, name: str | None) -> SceneFiles:
-        upload = self._uploads.get(name or "")
-        if upload is None:
+    def _upload(self, name: str) -> SceneFiles:
+        if name not in self._uploads:
             raise UsageError("no such scene; begin again by dropping the files")
-        return upload
+        return self._uploads[name]
 
     def _unused(self, asked: str) -> str:
         """A folder's name like the one asked for, that no other scene has."""
@@ -261,108 +255,26 @@ class Start:
     def _recent(self) -> list[dict[str, str]]:
         """Scenes and runs on this machine, the newest first."""
         runs = [(path.parent, path.parent.name) for path in Path("runs").glob("*/config.json") if newest_step(path.parent) >= 0]
-        scenes = [*_scenes(self._output), *runs, (Path("demo/run"), "demo")]
-        dated = [(path.stat().st_mtime, path, name) for path, name in scenes if path.is_dir()]
-        return [
-            {
-                "path": str(path.resolve()),
-                "name": name,
-                "kind": _kind(path),
-                "when": time.strftime("%d %b %H:%M", time.localtime(date)),
-            }
-            for date, path, name in sorted(dated, reverse=True)[:_RECENT]
-        ]
+        found = [*runs, (Path("demo/run"), "demo")]
+        for folder in self._output.glob("*/"):  # a scene's run, or its files where there is none yet
+            found.append((folder / (_RUN if newest_step(folder / _RUN) >= 0 else _FILES), folder.name))
+        dated = [(path.stat().st_mtime, path, name) for path, name in found if path.is_dir()]
+        rows = []
+        for date, path, name in sorted(dated, reverse=True)[:_RECENT]:
+            kind = "trained"
+            if path.name == _FILES:
+                kind = "capture" if any(is_capture(each) for each in (path, *path.iterdir())) else "not trained yet"
+            when = time.strftime("%d %b %H:%M", time.localtime(date))
+            rows.append({"path": str(path.resolve()), "name": name, "kind": kind, "when": when})
+        return rows
 
     def _drawn(self, run: Path) -> bytes:
-        """A view of the newest checkpoint as a JPEG; empty where there is none."""
-        with self._drawing:
-            step = newest_step(run)
-            if step > self._picture[0]:
-                with contextlib.suppress(FprfError, OSError):  # while it is saved or replaced the one before is good
-                    self._picture = (step, _render(run))
-            return self._picture[1]
+        from ..io.images import encode, to_uint8
+        from ..training.loading import open_run
+        from ..training.quality import QualityConfig
 
-
-def _render(run: Path) -> bytes:
-    from ..io.images import encode, to_uint8
-    from ..training.loading import open_run
-    from ..training.quality import QualityConfig
-
-    opened = open_run(run, "cpu", QualityConfig())
-    views = opened.known.test or opened.known.train
-    view = views[len(views) // 2]
-    small = min(1.0, _PICTURE / int(opened.known.cameras.size[view].amax()))
-    return encode(to_uint8(opened.scene.render(opened.known.cameras, view, resolution=small).rgb), "jpg")
-
-
-def _kind(path: Path) -> str:
-    """Kind of a scene on the list: `trained`, a `capture`, or photographs that are `not trained yet`."""
-    if path.name != _FILES:
-        return "trained"
-    return "capture" if any(is_capture(each) for each in (path, *path.iterdir())) else "not trained yet"
-
-
-def _scenes(output: Path) -> Iterator[tuple[Path, str]]:
-    """Path that each scene's folder is opened by: its run, or its files where there is none yet."""
-    for folder in output.glob("*/"):
-        opened = folder / _RUN if newest_step(folder / _RUN) >= 0 else folder / _FILES
-        if opened.is_dir():
-            yield opened, folder.name
-
-
-def _minutes(asked: Mapping[str, Any]) -> float:
-    value = asked.get("minutes", 2)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.05 <= value <= 600:
-        raise UsageError("minutes: must be a number from 0.05 to 600")
-    return float(value)
-
-
-def start_routes(start: "Callable[[], Start | None]", body: Callable[[Request], Awaitable[bytes]]) -> list[Route]:
-    """Requests of the start page; it may be there or not."""
-
-    def found() -> Start:
-        if (each := start()) is None:
-            raise HTTPException(404, "no start page here")
-        return each
-
-    def asked(name: str, act: Callable[[Start, dict[str, Any]], dict[str, str] | None]) -> Route:
-        async def respond(request: Request) -> Response:
-            return JSONResponse(await asyncio.to_thread(act, found(), json_body(await body(request))) or {})
-
-        return Route(f"/start/{name}", respond, methods=["POST"])
-
-    async def piece(request: Request) -> Response:
-        await asyncio.to_thread(found().piece, request.query_params, await body(request))
-        return JSONResponse({})
-
-    async def picture(request: Request) -> Response:
-        data = await asyncio.to_thread(found().picture)
-        if not data:
-            raise HTTPException(404, "no picture yet")
-        return Response(data, media_type="image/jpeg")
-
-    actions = {"new": Start.new, "make": Start.make, "open": Start.open, "stop": Start.stop, "leave": Start.leave}
-    return [
-        Route("/start/piece", piece, methods=["POST"]),
-        Route("/start/picture", picture),
-        *(asked(name, act) for name, act in actions.items()),
-    ]
-
-
-def json_body(body: bytes) -> dict[str, Any]:
-    """The object that a body holds. Raises UsageError where it holds none."""
-    try:
-        asked = json.loads(body) if len(body) <= _MAX_JSON else None
-    except (ValueError, RecursionError):
-        asked = None
-    if not isinstance(asked, dict):
-        raise UsageError("request: no short JSON object")
-    return asked
-
-
-def integer(asked: Mapping[str, Any], name: str) -> int:
-    """A whole number from 0 on, of at most 12 digits, in a query. Raises UsageError for anything else."""
-    text = str(asked.get(name))
-    if not (text.isdigit() and text.isascii() and len(text) <= 12):
-        raise UsageError(f"{name}: {text[:20]!r} is no number from 0")
-    return int(text)
+        opened = open_run(run, "cpu", QualityConfig())
+        views = opened.known.test or opened.known.train
+        view = views[len(views) // 2]
+        small = min(1.0, _PICTURE / int(opened.known.cameras.size[view].amax()))
+        return encode(to_uint8(opened.scene.render(opened.known.cameras, view, resolution=small).rgb), "jpg")

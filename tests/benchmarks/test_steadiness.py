@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.steadiness import steadiness
+from benchmarks.steadiness import published, steadiness
 from benchmarks.town.layout import build_town
 from benchmarks.town.palettes import palette
 from benchmarks.town.render import geometry, render, walk
@@ -92,3 +92,18 @@ def test_what_does_not_fit_is_refused(day: list[Tensor], depths: list[Tensor], p
         steadiness(day, day[:2], depths, path)
     with pytest.raises(NumericsError):
         steadiness(day, [frame * math.nan for frame in day], depths, path)
+
+
+def test_a_camera_at_rest_compares_pixel_with_pixel() -> None:
+    """Brighter by 0.01 with every frame: neighbours differ by that, frames 7 apart by seven times as much."""
+    images, depths = [torch.full((12, 12, 3), 0.2 + 0.01 * t) for t in range(9)], [torch.full((12, 12), 2.0)] * 9
+    still = pinhole(torch.eye(4, dtype=torch.float64)[None, :3].repeat(9, 1, 1), width=12, height=12, fov=53.0)
+    found = published(images, depths, still)
+    assert found["short"]["rmse"] == pytest.approx(0.01, rel=1e-4) and found["short"]["pairs"] == 8
+    assert found["short"]["e_warp"] == pytest.approx(1e-4, rel=1e-4)
+    assert 0 < found["short"]["lpips"] < found["long"]["lpips"] < 0.1
+    assert found["long"]["rmse"] == pytest.approx(0.07, rel=1e-4) and found["long"]["pairs"] == 2
+    nothing = published(images, [torch.zeros(12, 12)] * 9, still)
+    assert nothing["short"] == {"rmse": None, "e_warp": None, "lpips": None, "pairs": 0}
+    with pytest.raises(DataError):
+        published(images[:2], depths, still)

@@ -19,7 +19,6 @@ from tiny_world import World
 import fprf.datamanagers.batches as pixel_file
 from fprf.datamanagers.batches import PixelRuns, RayBatches, allocate_pixels
 from fprf.datamanagers.config import RayBatchesConfig
-from fprf.datamanagers.images import load_mask
 from fprf.datamanagers.scene import Scene
 from fprf.errors import DataError
 from fprf.plugins.encoders.config import RandomConfig
@@ -190,19 +189,6 @@ def test_points_of_a_reconstruction_count_where_two_views_saw_them(world: World,
     )
     assert pairs is not None and wanted is not None and none is None
     torch.testing.assert_close(pairs, wanted, equal_nan=True)
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "kind"), [(0, 255, np.uint8), (0, 1, np.uint8), (20, 200, np.uint8), (0, 65535, np.uint16)]
-)
-@pytest.mark.parametrize("channels", [1, 3, 4])
-def test_bright_is_true(tmp_path: Path, low: int, high: int, kind: type, channels: int) -> None:
-    mask = np.random.default_rng(0).random((9, 7)) > 0.5
-    pixels = np.repeat(np.where(mask, high, low)[..., None], channels, 2).astype(kind)
-    path = write_mask(tmp_path / "m.png", pixels)
-    assert np.array_equal(load_mask(path, (7, 9)), mask)
-    double = load_mask(path, (14, 18))
-    assert np.array_equal(double, mask.repeat(2, 0).repeat(2, 1))
 
 
 def test_pixels_that_are_left_out_are_never_drawn(scene: Scene, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from fprf.errors import DataError, NumericsError
-from fprf.evaluation.consistency import consistency, published, warp
+from fprf.evaluation.consistency import consistency, warp
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
 from fprf.rendering.paths import look_at, pinhole
 
@@ -118,18 +118,3 @@ def test_what_does_not_fit_is_named() -> None:
         warp(image, depth.T, depth, cameras, 0, 1)
     with pytest.raises(NumericsError):
         consistency([image * math.nan] * 2, [depth] * 2, cameras, [(0, 0)])
-
-
-def test_a_camera_at_rest_compares_pixel_with_pixel() -> None:
-    """Brighter by 0.01 with every frame: neighbours differ by that, frames 7 apart by seven times as much."""
-    images, depths = [torch.full((12, 12, 3), 0.2 + 0.01 * t) for t in range(9)], [torch.full((12, 12), 2.0)] * 9
-    still = pinhole(torch.eye(4, dtype=torch.float64)[None, :3].repeat(9, 1, 1), width=12, height=12, fov=53.0)
-    found = published(images, depths, still)
-    assert found["short"]["rmse"] == pytest.approx(0.01, rel=1e-4) and found["short"]["pairs"] == 8
-    assert found["short"]["e_warp"] == pytest.approx(1e-4, rel=1e-4)
-    assert 0 < found["short"]["lpips"] < found["long"]["lpips"] < 0.1
-    assert found["long"]["rmse"] == pytest.approx(0.07, rel=1e-4) and found["long"]["pairs"] == 2
-    nothing = published(images, [torch.zeros(12, 12)] * 9, still)
-    assert nothing["short"] == {"rmse": None, "e_warp": None, "lpips": None, "pairs": 0}
-    with pytest.raises(DataError):
-        published(images[:2], depths, still)

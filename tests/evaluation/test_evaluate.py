@@ -9,8 +9,7 @@ from tiny_world import World
 
 from fprf.datamanagers.images import load_image
 from fprf.errors import DataError
-from fprf.evaluation.evaluate import judge
-from fprf.evaluation.metrics import image_metrics
+from fprf.evaluation.metrics import image_metrics, judge
 from fprf.io.images import to_uint8, write_image
 from fprf.training import views
 from fprf.training.camera_optimizers import moved_cameras, rotated

@@ -9,7 +9,7 @@ from fprf.methods import fprf
 from fprf.plugins.config import PluginConfig
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.plugins.samplers.config import UniformConfig
-from fprf.plugins.slots import resolve, slots, take_flag
+from fprf.plugins.slots import resolve, slots
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,18 +49,10 @@ def test_all_slots_of_the_knob_tree_are_found_outer_first() -> None:
     assert found["datamanager.parser"].value is None
 
 
-@pytest.mark.parametrize("flag", ["--semantic.encoder", "--checkpoint-minutes", "--checkpoint_minutes"])
-def test_take_flag_both_forms_the_last_wins(flag: str) -> None:
-    name = flag[2:].replace("-", "_")
-    assert take_flag(["a", flag, "x", "b"], name) == ("x", ["a", "b"])
-    assert take_flag([f"{flag}=x", "--other", flag, "y"], name) == ("y", ["--other"])
-    assert take_flag(["--other", "z"], name) == (None, ["--other", "z"])
-
-
 @pytest.mark.parametrize("args", [["--sampler"], ["--sampler", "--steps"], ["--sampler="]])
 def test_a_flag_without_a_name_is_a_mistake(args: list[str]) -> None:
     with pytest.raises(UsageError, match="--sampler: needs the name of a plug-in"):
-        take_flag(args, "sampler")
+        resolve(fprf(), args)
 
 
 def test_resolving_in_any_order_keeps_the_field_flags() -> None:
@@ -68,6 +60,7 @@ def test_resolving_in_any_order_keeps_the_field_flags() -> None:
     config, rest = resolve(fprf(), args)
     assert config.semantic.encoder == RandomConfig() and config.sampler == UniformConfig()
     assert rest == ["--semantic.encoder.channels", "4"]
+    assert resolve(fprf(), ["--sampler", "proposal", "--sampler=uniform"])[0].sampler == UniformConfig(), "the last one counts"
 
 
 def test_none_empties_an_optional_slot_only() -> None:

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -37,7 +36,7 @@ def test_content(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     encoder = BundledContentConfig(weights=output).build()
     assert encoder.channels == report["channels"]
     assert encoder(torch.rand(1, 3, 20, 21)).shape == (1, encoder.channels, 10, 11)
-    beside = {"content.safetensors", "content.report.json", "content.samples", "vgg.safetensors"}
+    beside = {"content.safetensors", "content.report.json", "vgg.safetensors"}
     assert {file.name for file in tmp_path.iterdir()} <= beside
     assert "2 steps" in read_weights(output)[1]["made_by"]
 
@@ -103,8 +102,7 @@ def test_a_resumed_run_ends_where_an_unbroken_one_does(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         train(broken, quadratic(broken, broken_at=6), config, output, lambda _: None)
     said: list[str] = []
-    seldom = replace(config, samples=500.0)  # how often samples are made may change
-    assert train(resumed, quadratic(resumed), seldom, output, said.append) == 9
+    assert train(resumed, quadratic(resumed), config, output, said.append) == 9
     assert said[0] == "resumed at step 5"
     assert torch.equal(resumed.weight, whole.weight)
     assert not training_folder(output).exists()

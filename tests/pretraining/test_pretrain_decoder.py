@@ -5,7 +5,6 @@ import shlex
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import pytest
 import torch
 from photo_folder import photo_folder, vgg_file
@@ -16,7 +15,6 @@ from fprf.methods import fprf_lite
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.plugins.weights import read_weights
-from fprf.pretraining.loop import samples_folder
 from fprf.training.model import build_decoder
 
 ENCODER = ["--encoder", "random", "--encoder.channels", "6", "--encoder.stride", "2"]
@@ -36,7 +34,7 @@ def made(photos: Path, output: Path, *more: str) -> dict[str, float]:
 
 def test_the_paper_losses_change_the_decoder_as_they_weigh(vgg: str, tmp_path: Path) -> None:
     photos = photo_folder(tmp_path / "photos", 30)  # two of them are held out: one in the style of the other
-    steps = ["--steps", "300", "--rate", "0.005", "--samples", "0", "--style-weights", vgg, "--every", "1"]
+    steps = ["--steps", "300", "--rate", "0.005", "--style-weights", vgg, "--every", "1"]
     plain = made(photos, tmp_path / "plain.safetensors", *steps)
     styled = made(photos, tmp_path / "styled.safetensors", *steps, "--style", "0.03")
     assert styled["style_loss"] < 0.6 * plain["style_loss"]
@@ -44,26 +42,12 @@ def test_the_paper_losses_change_the_decoder_as_they_weigh(vgg: str, tmp_path: P
 
 
 def test_without_weights_for_it_no_style_is_measured(photos: Path, vgg: str, tmp_path: Path) -> None:
-    steps = ["--steps", "3", "--samples", "0"]
+    steps = ["--steps", "3"]
     assert "style_loss" not in made(photos, tmp_path / "a.safetensors", *steps)
     measured = made(photos, tmp_path / "b.safetensors", *steps, "--style-weights", vgg)
     assert measured["style_loss"] > 0
     first, second = (read_weights(tmp_path / f"{name}.safetensors")[0] for name in "ab")
     assert all(torch.equal(first[name], second[name]) for name in first), "measuring is not training"
-
-
-def test_samples_are_pictures_of_photo_decoded_and_restyled(
-    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("fprf.training.driver.REPORT_SECONDS", 0.0)
-    output = tmp_path / "decoder.safetensors"
-    made(photos, output, "--steps", "3", "--samples", "1e-9")
-    files = sorted(samples_folder(output).iterdir())
-    assert [file.name for file in files] == [f"step-{step:07d}.png" for step in (1, 2, 3)]
-    pictures = [cv2.imread(str(file)) for file in files]
-    assert len({picture.shape for picture in pictures}) == 1
-    assert pictures[0].shape[1] > 3 * 60
-    assert (pictures[0] != pictures[-1]).any()
 
 
 def test_the_line_that_users_are_told_makes_a_decoder_that_fits(photos: Path, tmp_path: Path) -> None:
@@ -72,6 +56,6 @@ def test_the_line_that_users_are_told_makes_a_decoder_that_fits(photos: Path, tm
     with pytest.raises(WeightsError) as raised:
         build_decoder(config, encoder=encoder.build().identity, channels=4)
     line = str(raised.value).split("`")[1].replace("DIR", str(photos)).replace("decoder.safetensors", str(output))
-    assert run([*shlex.split(line)[2:], "--steps", "1", "--pixels", "20", "--samples", "0"]) == 0
+    assert run([*shlex.split(line)[2:], "--steps", "1", "--pixels", "20"]) == 0
     fitting = replace(config, content=replace(config.content, decoder=MlpDecoderConfig(weights=output)))
     build_decoder(fitting, encoder=encoder.build().identity, channels=4)

@@ -6,13 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.reconstruction.colmap import (
-    build_vocabulary,
-    descriptors,
-    sequential_pairs,
-    similar_pairs,
-    vlad_vectors,
-)
+from fprf.reconstruction.colmap import build_vocabulary, descriptors, sequential_pairs, similar_pairs, vlad_vectors
 from fprf.reconstruction.scene_folder import MatchTables, count_rows, report, summary_rows
 
 MOST = 2147483647

@@ -16,7 +16,7 @@ from fprf.errors import DataError
 from fprf.plugins import registry
 from fprf.plugins.captures import CaptureFormat, endings, format_of
 from fprf.splats.files import read_capture, write_gaussians
-from fprf.viewer.scene_files import check_file, find_source
+from fprf.viewer.uploads import check_file, find_source
 
 CODE = '''
 """Means, ln-scales, logits, quaternions and mean colours as rows of float32 behind a word."""

@@ -268,11 +268,9 @@ def test_verbs_of_a_run(run: Path, tmp_path: Path) -> None:
     assert {f"mesh.{ending}" for ending in ("ply", "glb")} <= {path.name for path in (run / "exports").iterdir()}
     capture = read_capture(run / "exports" / "splats.ply")
     assert len(capture.gaussians) == metrics["gaussians"] and capture.antialiased
-    assert main(["export", str(run), "--output", str(tmp_path / "x.spz")]) == 0
     assert main(["export", str(run), "cameras", "ply", "--images", "--output", str(tmp_path / "files")]) == 0
     again = parse_scene(tmp_path / "files", 1, None)
     assert torch.allclose(again.cameras.pose, fprf.load(run).cameras.pose) and (tmp_path / "files" / "splats.ply").is_file()
-    assert main(["export", str(run), "--output", str(tmp_path / "cameras.json")]) == 0
     # A run that is done goes on doing nothing, also where other semantics are asked for.
     before = (run / "checkpoints" / "step-0000040" / "manifest.json").read_bytes()
     assert main(["train", str(run / "config.json")]) == 0
@@ -302,7 +300,7 @@ def test_training_is_watched_and_changes_no_bit(
         driver.watch(tmp_path / "run")
         if index == 30:
             opened = open_run(tmp_path / "run", "cpu")
-            seen.append((opened.step, len(opened.scene.encoders().scene.share)))
+            seen.append((opened.step, len(opened.scene.encoders().scene_style.share)))
         plain(learner, index, share)
 
     monkeypatch.setattr(GaussianLearner, "step", step)

@@ -59,6 +59,8 @@ def test_spread_follows_the_scale_of_the_scores_and_ignores_common_offsets() -> 
     r = (q.double() @ k.double().T).tolist()
     plain = (sum(sum((x - sum(row) / 6) ** 2 for x in row) for row in r) / 42) ** 0.5
     assert spread == pytest.approx(plain, rel=1e-6)
+    near = torch.tensor([[1.0], [1.0 + 1e-9]], dtype=torch.float64)  # within rounding of the largest score
+    assert score_spread(torch.tensor([[1e6], [0.0]]), near) == score_spread(torch.tensor([[-1e6]]), near) == 1.0
 
 
 @pytest.mark.parametrize("wide", [torch.float32, torch.float64])
@@ -158,11 +160,6 @@ def test_rows_are_shares_whatever_comes(k: int, t: int, dims: int, scale: float,
     found = table((here * scale, share), ((there * scale).float(), weight.float()), **frame)
     assert found.shape == (k, t) and found.dtype == torch.float64 and bool((found >= 0).all())
     torch.testing.assert_close(found.sum(1), torch.ones(k, dtype=torch.float64))
-
-
-def test_spread_within_rounding_of_the_largest_score_is_none() -> None:
-    keys = torch.tensor([[1.0], [1.0 + 1e-9]], dtype=torch.float64)
-    assert score_spread(torch.tensor([[1e6], [0.0]]), keys) == score_spread(torch.tensor([[-1e6]]), keys) == 1.0
 
 
 def test_dot_products_know_no_frame_and_weights_count() -> None:

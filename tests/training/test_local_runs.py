@@ -26,8 +26,8 @@ from fprf.training.driver import train
 from fprf.training.loading import load_run, open_run
 from fprf.training.run import Run
 from fprf.viewer.film import FilmPlan, Key, write_film_files
-from fprf.viewer.look import Look
 from fprf.viewer.messages import Camera
+from fprf.viewer.restyler import Look
 
 SPLATS = ["--downscale", "1", "--initial", "300", "--cap", "400", "--steps", "40"]
 

@@ -147,8 +147,7 @@ def spike(*at: float) -> Tensor:
 
 def test_a_ray_that_ends_at_its_point_costs_nothing_before_it_two_behind_it_one() -> None:
     for t, cost in ((5.0, 0.0), (3.0, 2.0), (8.0, 1.0)):
-        found = ending(straight_rays(1), spike(t), torch.tensor([5.0]))
-        assert found is not None and float(found) == cost
+        assert float(ending(straight_rays(1), spike(t), torch.tensor([5.0]))) == cost
 
 
 @given(st.lists(st.floats(0.5, 9.5) | st.just(float("nan")), min_size=1, max_size=6), st.integers(0, 1000))
@@ -158,16 +157,10 @@ def test_only_known_rays_count_and_the_mean_is_theirs(distances: list[float], se
     weights = weights / weights.sum(1, keepdim=True)
     distance = torch.tensor(distances)
     found = ending(straight_rays(count), weights, distance)
-    each = [
-        float(one)
-        for k in range(count)
-        if (one := ending(straight_rays(1), weights[k : k + 1], distance[k : k + 1])) is not None
-    ]
-    if not each:
-        assert found is None
-        return
-    assert found is not None and 0 <= float(found) <= 2
-    torch.testing.assert_close(found, torch.tensor(each).mean(), atol=1e-5, rtol=1e-4)
+    known = [k for k in range(count) if not math.isnan(distances[k])]
+    each = [float(ending(straight_rays(1), weights[k : k + 1], distance[k : k + 1])) for k in known]
+    assert 0 <= float(found) <= 2
+    torch.testing.assert_close(float(found), sum(each) / max(1, len(each)), atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("found", [3.0, 5.0, 8.0])
@@ -175,42 +168,37 @@ def test_in_device_coordinates_it_is_about_depths_too(found: float) -> None:
     """Straight ahead of a near plane at 1, depth z has the ray parameter 1 - 1/z."""
     depths, end = straight_rays(1)[:, 10:], torch.tensor([5.0])
     weights = spike(found)[:, 10:]
-    expected = ending(depths, weights, end)
-    assert expected is not None
-    torch.testing.assert_close(ending(1 - 1 / depths, weights, 1 - 1 / end, ndc=True), expected)
+    torch.testing.assert_close(ending(1 - 1 / depths, weights, 1 - 1 / end, ndc=True), ending(depths, weights, end))
 
 
-def ends_at(t: Tensor, weights: Tensor, kind: Tensor) -> Tensor | None:
+def ends_at(t: Tensor, weights: Tensor, kind: Tensor) -> Tensor:
     return ending(t, weights, torch.where(kind, 1 + torch.arange(len(kind), device=kind.device), NAN))
 
 
-def is_sky(t: Tensor, weights: Tensor, kind: Tensor) -> Tensor | None:
+def is_sky(t: Tensor, weights: Tensor, kind: Tensor) -> Tensor:
     return emptiness(t, weights, kind, within=SHELL)
 
 
 @pytest.mark.parametrize("term", [ends_at, is_sky])
 @pytest.mark.parametrize("kind", [[True, False, True, False], [False] * 4])
 def test_depths_and_sky_on_a_device_are_the_same_without_waiting(
-    term: Callable[[Tensor, Tensor, Tensor], Tensor | None], kind: list[bool]
+    term: Callable[[Tensor, Tensor, Tensor], Tensor], kind: list[bool]
 ) -> None:
-    """But for 0 where nothing is known."""
     weights = torch.rand(4, 100)
     here = weights.clone().requires_grad_()
     expected = term(straight_rays(4), here, torch.tensor(kind))
-    if expected is not None:
-        expected.backward()  # type: ignore[no-untyped-call]
+    expected.backward()  # type: ignore[no-untyped-call]
+    assert bool(expected > 0) == any(kind)
     with pretend_cuda() as seen:
         there, given = weights.to(CUDA).requires_grad_(), torch.tensor(kind).to(CUDA)
         edges = straight_rays(4).to(CUDA)
         seen.syncs.clear()
         found = term(edges, there, given)
-        assert found is not None
         found.backward()  # type: ignore[no-untyped-call]
         assert not seen.syncs
-        gradient = there.grad
-        assert gradient is not None
-        torch.testing.assert_close(found.detach().cpu(), torch.zeros(()) if expected is None else expected.detach())
-        torch.testing.assert_close(gradient.cpu(), torch.zeros_like(weights) if here.grad is None else here.grad)
+        assert there.grad is not None and here.grad is not None
+        torch.testing.assert_close(found.detach().cpu(), expected.detach())
+        torch.testing.assert_close(there.grad.cpu(), here.grad)
 
 
 @pytest.mark.parametrize(("shell", "wanted"), [(4.0, (0.3**2 + 1.0**2) / 2), (math.inf, (0.9**2 + 1.0**2) / 2), (0.5, 0.0)])
@@ -218,6 +206,6 @@ def test_what_sky_rays_meet_before_the_shell(shell: float, wanted: float) -> Non
     t = torch.tensor([[1.0, 3.0, 6.0]]).repeat(3, 1)
     weights = torch.tensor([[0.3, 0.6], [0.5, 0.5], [1.0, 0.0]], requires_grad=True)
     found = emptiness(t, weights, torch.tensor([True, False, True]), within=shell)
-    assert found is not None and found.item() == pytest.approx(wanted)
+    assert found.item() == pytest.approx(wanted)
     found.backward()
     assert weights.grad is not None and not weights.grad[1].any()

@@ -12,8 +12,7 @@ from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.splats.config import LookConfig
 from fprf.splats.scene import look_at_capture
 from fprf.training.loading import load_run
-from fprf.viewer.look import Photograph
-from fprf.viewer.restyler import Restyler
+from fprf.viewer.restyler import Photograph, Restyler
 from fprf.viewer.session import Session, Viewed, view_of_run
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from fprf.interfaces import Scene
 from fprf.splats.photographs import camera_of as pinhole_of
 from fprf.viewer.film import FilmPlan, Key
-from fprf.viewer.look import Look
 from fprf.viewer.messages import Camera
+from fprf.viewer.restyler import Look
 
 
 def camera_of(scene: Scene, view: int) -> Camera:

@@ -19,8 +19,7 @@ from fprf.training.loading import load_run
 from fprf.training.views import render_view
 from fprf.viewer import drawing
 from fprf.viewer.drawing import FieldPainter, Request, Shown, Speed, resolutions
-from fprf.viewer.look import Look, Photograph, set_rule
-from fprf.viewer.restyler import Restyler
+from fprf.viewer.restyler import Look, Photograph, Restyler, set_rule
 
 Pair = tuple[Photograph, Photograph]
 

@@ -11,7 +11,8 @@ from tiny_world import World
 
 from fprf.errors import DataError, UsageError
 from fprf.viewer import messages
-from fprf.viewer.messages import cameras_of, read_message
+from fprf.viewer.drawing import cameras_of
+from fprf.viewer.messages import StartRequest, read_message
 
 CAMERA = {"place": [0, 1, 2.5], "axes": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "lens": [300, 300, 160, 120], "size": [320, 240]}
 MESSAGES: list[dict[str, Any]] = [
@@ -58,6 +59,16 @@ def test_anything_else_does_not() -> None:
     for text in TEXTS:
         with pytest.raises(DataError, match="message"):
             read_message(text)
+
+
+def test_requests_of_the_start_page_are_messages_too() -> None:
+    assert read_message('{"type": "open", "path": "yard", "minutes": 10}', StartRequest) == messages.Open("yard", 10)
+    for text in ('{"type": "open"}', '{"type": "open", "path": "yard", "minutes": "2"}', '{"type": "view"}', *TEXTS):
+        with pytest.raises(DataError, match="message"):
+            read_message(text, StartRequest)
+    for minutes in ("0", "1e9", "true", "NaN"):
+        with pytest.raises(DataError, match="message"):
+            read_message(f'{{"type": "make", "scene": "yard", "minutes": {minutes}}}', StartRequest)
 
 
 values = st.recursive(

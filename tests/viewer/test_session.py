@@ -13,7 +13,7 @@ from tiny_world import World
 from fprf.errors import FprfError, UsageError
 from fprf.splats.files import read_capture
 from fprf.viewer import messages
-from fprf.viewer.messages import cameras_of
+from fprf.viewer.drawing import cameras_of
 from fprf.viewer.render_worker import Steps
 from fprf.viewer.session import SHELF, Session, State
 
@@ -60,9 +60,7 @@ def test_a_photograph_recolours_gaussians_and_they_can_be_saved(splats: Session,
         listener.until(lambda count=count: any(kind == "colours Now" for _, kind, _ in listener.sent[count:]))  # type: ignore[misc]
     with pytest.raises(UsageError, match="no such colours"):
         splats.colours("else")
-    path = splats.uploads.folder / "out.ply"
-    path.write_bytes(splats.gaussians())
-    saved, scene = read_capture(path).gaussians, splats.viewed.scene
+    saved, scene = read_capture(splats.gaussians()).gaussians, splats.viewed.scene
     assert torch.equal(saved.means, scene.gaussians.means) and not torch.equal(saved.harmonics, scene.gaussians.harmonics)
 
 

@@ -10,6 +10,7 @@ from session_helpers import until
 
 from fprf.errors import DataError, FprfError, UsageError
 from fprf.viewer import start as start_module
+from fprf.viewer.messages import Leave, Make, New, Open, Stop
 from fprf.viewer.start import Start
 
 PROGRAM = f"""#!{sys.executable}
@@ -79,61 +80,52 @@ def photographs(tmp_path: Path) -> Path:
 
 
 def test_photographs_are_posed_trained_and_shown(page: Shown, photographs: Path, tmp_path: Path) -> None:
-    page.open({"path": f' "{photographs}" ', "minutes": 1})
+    page.handle(Open(path=f' "{photographs}" ', minutes=1))
     state = page.reached(stage="open")
     assert page.shown == [(tmp_path / "made" / "yard" / "run", "yard")] and state["error"] is None
     assert [each["stage"] for each in page.posted if each["stage"] != "training"][-2:] == ["opening", "open"]
     assert list(state["lines"]) == ["hello from process", "hello from train"]
-    page.leave({})
+    page.handle(Leave())
     recent = page.reached(stage="idle")["recent"]
     assert page.shown == [] and [(row["name"], row["kind"]) for row in recent] == [("yard", "trained")]
-    page.open({"path": recent[0]["path"]})
+    page.handle(Open(path=recent[0]["path"]))
     page.reached(stage="open")
     assert page.shown == [(tmp_path / "made" / "yard" / "run", "yard")]
 
 
 @pytest.mark.parametrize("then", ["show", "leave"])
 def test_training_is_stopped_to_show_what_there_is_or_to_leave_it(page: Shown, photographs: Path, then: str) -> None:
-    page.open({"path": str(photographs), "minutes": 2})
+    page.handle(Open(path=str(photographs)))
     state = page.reached(stage="training", share=0.5)
     assert state["picture"] == 7 and state["detail"] == "step 7 · 20.0 dB · 1:01 left"
     with pytest.raises(UsageError, match="yard is being made"):
-        page.open({"path": str(photographs)})
-    page.stop({"then": then})
+        page.handle(Open(path=str(photographs)))
+    page.handle(Stop(then=then))
     page.reached(stage="open" if then == "show" else "idle")
     assert len(page.shown) == (then == "show")
 
 
 def test_a_failure_is_told_and_nothing_is_lost(page: Shown, photographs: Path, tmp_path: Path) -> None:
     (photographs / "bad.jpg").touch()
-    page.open({"path": str(photographs)})
+    page.handle(Open(path=str(photographs)))
     page.reached(stage="poses", error="3 photographs show nothing in common")
-    page.stop({})
+    page.handle(Stop())
     page.reached(stage="idle", error=None)
-    scene = page.new({"name": "../../x/My capture.ply"})["scene"]
+    scene = page.handle(New(name="../../x/My capture.ply"))["scene"]
     assert scene == "My-capture-ply"
-    page.piece({"scene": scene, "name": "x.ply", "at": "0", "size": "4"}, b"ply\n")
-    page.make({"scene": scene})
+    page.piece(scene, "x.ply", 0, 4, b"ply\n")
+    page.handle(Make(scene=scene))
     page.reached(error="of two dimensions")
     assert (tmp_path / "made" / scene / "files" / "x.ply").read_bytes() == b"ply\n"
-    assert page.new({"name": "My capture.ply"})["scene"] == "My-capture-ply-2"
+    assert page.handle(New(name="My capture.ply"))["scene"] == "My-capture-ply-2"
 
 
-def test_requests_that_make_no_sense_are_refused(page: Shown, photographs: Path) -> None:
-    empty = page.new({"name": ""})["scene"]
-    place = str(photographs)
-    refused: list[tuple[str, dict[str, object]]] = [
-        ("make", {"scene": empty}),
-        ("make", {"scene": "../yard"}),
-        ("open", {}),
-        ("open", {"path": "/no/such"}),
-        ("open", {"path": place, "minutes": "2"}),
-        ("open", {"path": place, "minutes": float("nan")}),
-    ]
-    for path, asked in refused:
+def test_requests_that_make_no_sense_are_refused(page: Shown) -> None:
+    empty = page.handle(New(name=""))["scene"]
+    for asked in (Make(scene=empty), Make(scene="../yard"), Open(path=" "), Open(path="/no/such")):
         with pytest.raises(FprfError):
-            getattr(page, path)(asked)
+            page.handle(asked)
     with pytest.raises(UsageError):
-        page.piece({"scene": empty, "name": "a.ply", "at": "-1", "size": "4"}, b"x")
+        page.piece("../yard", "a.ply", 0, 4, b"x")
     assert page.picture() == b""
     assert page.reached(stage="idle")["folder"] == ""

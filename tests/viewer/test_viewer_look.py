@@ -9,8 +9,8 @@ from fprf.errors import ConfigError, UsageError
 from fprf.style.dictionary import Reference
 from fprf.viewer import messages
 from fprf.viewer.film import Key
-from fprf.viewer.look import Look, Photograph, apply_preset, renumbered, set_rule, style_config
 from fprf.viewer.messages import Camera
+from fprf.viewer.restyler import Look, Photograph, renumbered, set_rule, style_config
 from fprf.viewer.session import SHELF, State, _added, _kept, _keyed, _removed
 
 
@@ -49,11 +49,6 @@ def test_a_look_in_the_terms_of_a_style() -> None:
 def test_an_impossible_look_is_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ConfigError):
         replace(ONE, **wrong)  # type: ignore[arg-type]
-
-
-def test_a_preset_sets_its_values_alone() -> None:
-    gentle = apply_preset(replace(ONE, clusters=7), "gentle")
-    assert gentle.mix == ONE.mix and gentle.clusters == 7 and gentle.strength < 1
 
 
 def test_a_new_photograph_is_the_style_or_joins() -> None:

@@ -92,5 +92,5 @@ def prepared(make: Callable[[], Pair], config: DistilConfig, output: Path) -> Pa
 
 def _crops_key(config: DistilConfig) -> str:
     """What the crops depend on: a run may be made longer without preparing them again."""
-    free = replace(config, output=None, minutes=1.0, steps=None, batch=1, rate=1.0, samples=0.0, device="auto")
+    free = replace(config, output=None, minutes=1.0, steps=None, batch=1, rate=1.0, device="auto")
     return repr(free)

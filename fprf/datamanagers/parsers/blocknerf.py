@@ -140,6 +140,7 @@ def read_records(path: Path) -> Iterator[bytes]:
             where = f"{path}: record {number}"
             if len(head) < 12:
                 raise DataError(f"{where}: the file ends within its head; download it again")
+            # A length that is wrong would make nonsense of everything behind it: it has a checksum of its own.
             length, check = struct.unpack("<QI", head)
             if masked(crc32c(head[:8])) != check:
                 raise DataError(f"{where}: the checksum of its length is wrong; download the file again")
@@ -159,10 +160,20 @@ def read_examples(path: Path) -> Iterator[Example]:
     for number, data in enumerate(read_records(path)):
         where = f"{path}: record {number}"
         try:
-            message = _message_class().FromString(data)
+            message: Any = _message_class().FromString(data)
         except DecodeError as error:
             raise DataError(f"{where}: no tf.train.Example ({error}); convert the capture again") from error
-        yield Example(where, {entry.key: _feature(entry.value) for entry in message.features.feature})
+        # Lists of one of three types, by name.
+        features: dict[str, Feature] = {}
+        for entry in message.features.feature:
+            kind = entry.value.WhichOneof("kind")
+            if kind == "floats":
+                features[entry.key] = np.array(entry.value.floats.value, np.float32)
+            elif kind == "integers":
+                features[entry.key] = np.array(entry.value.integers.value, np.int64)
+            else:
+                features[entry.key] = list(entry.value.bytes.value)
+        yield Example(where, features)
 
 
 @functools.cache
@@ -172,13 +183,6 @@ def _message_class() -> type[Message]:
     pool.AddSerializedFile(text_format.Parse(_SCHEMA, descriptor_pb2.FileDescriptorProto()).SerializeToString())
     message: type[Message] = message_factory.GetMessageClass(pool.FindMessageTypeByName("fprf.Example"))
     return message
-
-
-def _feature(feature: Any) -> Feature:
-    kind = feature.WhichOneof("kind")
-    if kind == "floats":
-        return np.array(feature.floats.value, np.float32)
-    return np.array(feature.integers.value, np.int64) if kind == "integers" else list(feature.bytes.value)
 
 
 Array = NDArray[np.float64]
@@ -201,6 +205,7 @@ class RayCamera(NamedTuple):
 
 def fit_camera(origin: NDArray[np.float32], direction: NDArray[np.float32]) -> RayCamera:
     """The camera of rays [H W 3] through pixel centres. Raises ValueError where they are not those of any lens."""
+    # Unit directions of a lattice of the rays, and their pixels.
     height, width = origin.shape[:2]
     lines = np.unique(np.linspace(0, height - 1, min(_LATTICE, height)).round().astype(np.int64))
     columns = np.unique(np.linspace(0, width - 1, min(_LATTICE, width)).round().astype(np.int64))
@@ -224,6 +229,7 @@ def fit_camera(origin: NDArray[np.float32], direction: NDArray[np.float32]) -> R
     local = ray @ turn.T
     if not (local[:, 2] > 0.02).all():
         raise ValueError("rays that look backwards: more than a half space in one image")
+    # Then the lens as well: eleven numbers that the pinhole starts.
     best, error = _refine(local, pixel, np.array([0.0, 0.0, 0.0, fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0]))
     turned = cv2.Rodrigues(best[:3])[0] @ turn
     place = origin.reshape(-1, 3).mean(0, dtype=np.float64)
@@ -251,6 +257,7 @@ def _refine(local: Array, pixel: Array, value: Array) -> tuple[Array, float]:
 
     damping, (error, slope) = 1e-3, miss(value)
     for _ in range(30):
+        # A step of (J^T J + d diag J^T J) x = -J^T e, kept where it helps; the damping d follows.
         normal = slope.T @ slope
         step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(11), -slope.T @ error)
         tried, slope_tried = miss(value + step)
@@ -282,6 +289,7 @@ class BlockNerfParser(DataParser):
         key = hashlib.sha256(json.dumps([str(data.resolve()), facts]).encode()).hexdigest()[:12]
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         folder = cache / "fprf" / f"blocknerf-{key}"
+        # Images and fitted cameras, taken out once.
         entries = _unpacked(folder)
         if not entries:
             (folder / "images").mkdir(parents=True, exist_ok=True)
@@ -290,6 +298,7 @@ class BlockNerfParser(DataParser):
                 held = re.search("val|test", str(file.relative_to(data)).lower()) is not None
                 entries += [_entry(example, folder, held) for example in read_examples(file)]
             write_json(folder / "views.json", {"format": _FORMAT, "views": entries})
+        # Of the cameras that are asked for, if they are cameras.
         chosen = [e for e in entries if not self.config.cameras or e["camera"] in self.config.cameras]
         if not chosen:
             present = sorted({e["camera"] for e in entries})
@@ -333,6 +342,7 @@ def _entry(example: Example, folder: Path, held: bool) -> dict[str, Any]:
     exposure = float(example.numbers("equivalent_exposure", 1)[0])
     if exposure <= 0:
         raise DataError(f"{example.where}: equivalent_exposure is {exposure}, it must be above 0; leave its file out")
+    # The image under a name that says its camera.
     index = example.integer("cam_idx")
     # Hashes are unsigned: neither a minus nor an order by size belongs in a file's name.
     name = f"cam{index:02d}-{example.integer('image_hash') & 0xFFFFFFFFFFFFFFFF:016x}"

@@ -7,6 +7,7 @@ COLMAP's lenses become ours; its world-to-camera poses in OpenCV axes become cam
 is kept. Each view's depths are the 0.1 and 99.9 percentile of the points that it observes (LLFF's rule).
 """
 
+import contextlib
 import shlex
 import struct
 import zipfile
@@ -93,6 +94,7 @@ def read_model(folder: Path) -> ColmapModel:
         if id_ in cameras:
             raise _bad(folder / f"cameras.{suffix}", place, f"camera {id_} occurs twice")
         cameras[id_] = camera
+    # Points may be absent: some tools write cameras and images alone.
     cloud = folder / f"points3D.{suffix}"
     images = list(images_of(folder / f"images.{suffix}"))
     points = np.fromiter(points_of(cloud) if cloud.is_file() else (), np.dtype([("id", "i8"), ("xyz", "f8", 3)]))
@@ -158,6 +160,7 @@ def _images_bin(path: Path) -> Iterator[ColmapImage]:
     file = _Bytes(path)
     for _ in range(file.count(_IMAGE.size + 1 + _COUNT.size, "images")):
         _, qw, qx, qy, qz, tx, ty, tz, camera = file.take(_IMAGE, "an image")
+        # A name that ends with a zero byte, then the features, of which the points are kept.
         stop = file.data.find(b"\0", file.at)
         if stop < 0:
             raise file.error("the image's name does not end")
@@ -262,6 +265,7 @@ Cloud = tuple[NDArray[np.float64], NDArray[np.int64] | None]
 
 def observed_points(model: ColmapModel, images: Sequence[ColmapImage]) -> list[NDArray[np.int64]]:
     """Rows of the model's points that each image observes; ids that are not in the model are left out."""
+    # By binary search among the sorted ids.
     order = np.argsort(model.point_ids, kind="stable")
     observed = []
     for image in images:
@@ -274,6 +278,7 @@ def observed_points(model: ColmapModel, images: Sequence[ColmapImage]) -> list[N
 
 def cloud_of_images(model: ColmapModel, observed: Sequence[NDArray[np.int64]]) -> Cloud:
     """Finite points of a model, and the pairs of views, in the order of `observed`, and points, each once."""
+    # A view may observe a point with several features.
     views = [np.unique(rows) for rows in observed]
     pairs = np.stack([np.repeat(np.arange(len(views)), [len(rows) for rows in views]), np.concatenate(views)], 1)
     return _finite(model.points, pairs.astype(np.int64))
@@ -293,12 +298,14 @@ def cloud_of_model(
 
     The views may stand as in the model, or moved by `applied` [3 4], which then moves the points too.
     """
+    # The same images, by the names of their files?
     model = read_model(folder)
     images = {PurePosixPath(image.name).name: image for image in model.images}
     files = [PurePosixPath(name).name for name in names]
     if not len(model.points) or len(set(files)) < len(files) or not set(files) <= images.keys():
         return None
     ordered = [images[file] for file in files]
+    # Do their cameras stand where the views do, as they are or moved?
     here = np.stack([pose[:, 3] for pose in poses])
     turn = rotations(torch.tensor([image.quaternion for image in ordered], dtype=torch.float64)).numpy()
     offset = np.array([image.translation for image in ordered])
@@ -337,21 +344,18 @@ def largest_model(data: Path) -> tuple[Path | None, list[str]]:
     folders = model_folders(data)
     if len(folders) < 2:
         return next(iter(folders), None), []
-    counts = {folder: _image_count(folder) for folder in folders}
+    # What the models claim to have; nothing where a file cannot be read.
+    counts = dict.fromkeys(folders, 0)
+    for folder in folders:
+        with contextlib.suppress(OSError, DataError):
+            if (folder / "cameras.bin").is_file():
+                with (folder / "images.bin").open("rb") as file:
+                    counts[folder] = int.from_bytes(file.read(_COUNT.size), "little")
+            else:
+                counts[folder] = sum(1 for _ in _lines(folder / "images.txt")) // 2
     largest = max(folders, key=lambda folder: counts[folder])
     told = ", ".join(f"{folder.relative_to(data)} ({count})" for folder, count in counts.items())
     return largest, [f"of the models {told} that of the most images is read: {largest.relative_to(data)}"]
-
-
-def _image_count(folder: Path) -> int:
-    """Images that a model claims to have; 0 where its file cannot be read."""
-    try:
-        if (folder / "cameras.bin").is_file():
-            with (folder / "images.bin").open("rb") as file:
-                return int.from_bytes(file.read(_COUNT.size), "little")
-        return sum(1 for _ in _lines(folder / "images.txt")) // 2
-    except (OSError, DataError):
-        return 0
 
 
 class ColmapParser(DataParser):
@@ -368,6 +372,7 @@ class ColmapParser(DataParser):
         folder, notes = largest_model(data)
         if folder is None:
             raise DataError(f"{data}: no cameras.bin or cameras.txt in sparse/0, sparse or here; run COLMAP's mapper")
+        # The model, and the files that its images are.
         model = read_model(folder)
         if not model.images:
             raise DataError(f"{folder}: the model has no images; run COLMAP's mapper again")
@@ -387,6 +392,7 @@ class ColmapParser(DataParser):
             camera = model.cameras.get(image.camera)
             if camera is None:
                 raise DataError(f"{where}: its camera {image.camera} is not in the model; export the model again")
+            # World to camera in OpenCV's axes becomes camera to world in OpenGL's: y and z turn round.
             back = quaternion_rotation(where, image.quaternion).T
             # A damaged translation may overflow; `rigid_pose` leaves out what is not finite.
             with np.errstate(over="ignore", invalid="ignore"):
@@ -412,6 +418,7 @@ class ColmapParser(DataParser):
                 depths=_depths(model.points[rows], pose),
             )
 
+        # The points, and which of the views that are left see them.
         views, kept, lost = read_views(data, sorted(named, key=lambda each: each[0]), view)
         points, seen = cloud_of_images(model, [rows for _, _, _, rows in kept])
         notes += lost

@@ -271,6 +271,7 @@ def recognise(data: Path) -> DataParserConfig:
     A parser that raises is skipped, with a warning on standard error. Raises DataError where no parser recognises the folder,
     or where several have the same confidence.
     """
+    # Every installed parser is asked; those of the highest confidence are kept.
     group, best = DataParserConfig.group, 0.0
     surest: dict[str, tuple[DataParserConfig, str]] = {}
     for name, entries in registry.installed(group).items():
@@ -292,6 +293,7 @@ def recognise(data: Path) -> DataParserConfig:
         raise DataError(f"{data}: is recognised by {claims}; choose one with --datamanager.parser NAME")
     for config, _ in surest.values():
         return config
+    # Nobody recognises it: say why.
     if not data.exists():
         raise DataError(f"{data}: no such folder; give a scene folder, or `garden` for the embedded one")
     if not data.is_dir():

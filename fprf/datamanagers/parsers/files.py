@@ -100,6 +100,7 @@ class NamedFiles:
         name, path = path_inside(self.root, where, text)
         if os.path.lexists(path):
             return name, path
+        # A folder is listed once: its files by their spelling, and by that without a suffix.
         if path.parent not in self._listed:
             listed: dict[str, str] = {}
             names = os.listdir(path.parent) if path.parent.is_dir() else []
@@ -149,6 +150,7 @@ def read_npy(where: str, data: bytes) -> NDArray[np.float64]:
         shape, fortran, dtype = read_header(stream)
     except Exception as error:  # the header is a literal of Python, and says so in many ways
         raise DataError(f"{where}: no NumPy array ({' '.join(str(error).split())[:80]}); write it with numpy.save") from error
+    # The header's word must fit the bytes that follow, before anything is made of them.
     count, held = math.prod(shape), len(data) - stream.tell()
     if dtype.kind not in "fiu" or min(shape, default=0) < 0 or count * dtype.itemsize != held:
         raise DataError(
@@ -178,17 +180,14 @@ def read_npz(path: Path, key: str) -> NDArray[np.float64]:
     return read_npy(f"{path}: {key}", data)
 
 
-_Object: TypeAlias = dict[str, Json]
-
-
 @dataclass(frozen=True)
 class Record:
     """One JSON object; what it lacks is looked up in `common`."""
 
     where: str
     """File and place, the start of every message."""
-    own: _Object
-    common: _Object
+    own: dict[str, Json]
+    common: dict[str, Json]
 
     def get(self, key: str) -> Json:
         """The value, or None where it is absent or null."""
@@ -274,7 +273,7 @@ def _numbers(value: Json, count: int) -> list[float] | None:
     return numbers if len(numbers) == len(cells) == count else None
 
 
-def as_record(where: str | Path, value: Json, common: _Object | None = None) -> Record:
+def as_record(where: str | Path, value: Json, common: dict[str, Json] | None = None) -> Record:
     """A record of a JSON value, which must be an object."""
     if not isinstance(value, dict):
         raise DataError(f"{where}: {_short(value)} instead of an object in braces; correct it")

@@ -30,7 +30,16 @@ class LlffParser(DataParser):
         rows = read_npy(str(file), read_bytes(file))
         if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
             raise DataError(f"{file}: an array of shape {rows.shape}; LLFF has one row of 17 numbers an image")
-        folder = _folder(data, self.config.images)
+        # The folder that is named, else the images as they were delivered, else the copies that are reduced least.
+        reduced = [path for path in data.glob("images_*") if re.fullmatch(r"images_[0-9]{1,4}", path.name) and path.is_dir()]
+        if self.config.images:
+            folder = path_inside(data, "parser.images", self.config.images)[1]
+        elif (data / "images").is_dir():
+            folder = data / "images"
+        elif reduced:
+            folder = min(reduced, key=lambda path: int(path.name.removeprefix("images_")))
+        else:
+            raise DataError(f"{data}: poses_bounds.npy, but no folder images or images_N; put the images there")
         names = image_names(folder)
         if len(names) != len(rows):
             raise DataError(
@@ -42,6 +51,7 @@ class LlffParser(DataParser):
             number, name = each
             row = rows[number]
             height, width, focal = row[:15].reshape(3, 5)[:, 4]
+            # From down, right, back to right, up, back.
             matrix = row[:15].reshape(3, 5)[:, :4]
             turned = np.stack([matrix[:, 1], -matrix[:, 0], matrix[:, 2], matrix[:, 3]], 1)
             where = f"{file}: row {number} ({name})"
@@ -60,14 +70,3 @@ class LlffParser(DataParser):
         if names != sorted(names, key=lambda name: (len(name), name)) and all(Path(name).stem.isdecimal() for name in names):
             notes.append(f"rows of poses_bounds.npy are taken in LLFF's order of names: {', '.join(names[:3])}, ...")
         return assemble_scene(data, views, downscale=downscale, reduced=True, notes=notes)
-
-
-def _folder(data: Path, wanted: str) -> Path:
-    if wanted:
-        return path_inside(data, "parser.images", wanted)[1]
-    if (data / "images").is_dir():
-        return data / "images"
-    folders = [path for path in data.glob("images_*") if re.fullmatch(r"images_[0-9]{1,4}", path.name) and path.is_dir()]
-    if not folders:
-        raise DataError(f"{data}: poses_bounds.npy, but no folder images or images_N; put the images there")
-    return min(folders, key=lambda path: int(path.name.removeprefix("images_")))

@@ -28,7 +28,16 @@ class MegaNerfParser(DataParser):
 
     def parse(self, data: Path, downscale: int) -> Scene:
         """The scene at 1/downscale of the delivered size; `val` is held out. Lengths are metres where the capture says."""
-        unit = _unit(data)
+        # Metres of a unit of the poses; 1 where nothing is said.
+        unit, path = 1.0, data / "coordinates.pt"
+        if path.is_file():
+            try:
+                unit = float(_load(path).get("pose_scale_factor", 1.0))
+            except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+                raise DataError(f"{path}: pose_scale_factor is no number ({_first_line(error)}); write it again") from error
+            if not 0 < unit < 1e9:
+                raise DataError(f"{path}: pose_scale_factor is {unit}; it must be above 0: write it again")
+        # Both parts in one order by name.
         files: list[tuple[Path, str]] = []
         for split in ("train", "val"):
             folder = data / split / "metadata"
@@ -41,21 +50,6 @@ class MegaNerfParser(DataParser):
         views, kept, notes = read_views(data, files, lambda each: _view(each[0], data / each[1] / "rgbs", unit))
         parts = split_by([split == "val" for _, split in kept])
         return assemble_scene(data, views, downscale=downscale, split=parts, reduced=True, notes=notes)
-
-
-def _unit(data: Path) -> float:
-    """Metres of a unit of the poses; 1 where nothing is said."""
-    path = data / "coordinates.pt"
-    if not path.is_file():
-        return 1.0
-    value = _load(path).get("pose_scale_factor", 1.0)
-    try:
-        scale = float(value)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise DataError(f"{path}: pose_scale_factor is no number ({_first_line(error)}); write it again") from error
-    if not 0 < scale < 1e9:
-        raise DataError(f"{path}: pose_scale_factor is {scale}; it must be above 0: write it again")
-    return scale
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -76,6 +70,7 @@ def _first_line(error: Exception) -> str:
 
 
 def _view(file: Path, images: Path, unit: float) -> View:
+    # The image may have any ending.
     metadata = _load(file)
     paths = [images / f"{file.stem}{suffix}" for suffix in sorted(IMAGE_SUFFIXES)]
     path = next((path for path in paths if path.is_file()), images / f"{file.stem}.jpg")

@@ -67,6 +67,7 @@ def _reconstruction(file: Path) -> tuple[list[_Shot], NDArray[np.float64]]:
     if largest is None or not _objects(largest, "shots"):
         raise DataError(f"{file}: no list of reconstructions with shots; run ODM again")
     cameras = _objects(largest, "cameras")
+    # A shot's place is -R^T t, of the rotation and the translation that take the world to the camera.
     shots = []
     for name, record in _objects(largest, "shots").items():
         key = record.text("camera") or ""
@@ -81,6 +82,7 @@ def _reconstruction(file: Path) -> tuple[list[_Shot], NDArray[np.float64]]:
 
 def _shots(data: Path, file: Path) -> list[_Shot]:
     """Shots of a report, with the cameras beside it."""
+    # cameras.json is an object of cameras; the report one of features with properties.
     beside = data / "cameras.json"
     cameras = _objects(as_record(beside, {"cameras": read_json(beside)}), "cameras")
     shots = []
@@ -103,6 +105,7 @@ def _view(where: str, name: str, path: Path, shot: _Shot) -> View:
     own = camera.number("width"), camera.number("height")
     if None not in own and abs((own[0] or 0) * height - (own[1] or 0) * width) > 2 * longest:
         raise DataError(f"{path}: {width}x{height} pixels is not the shape of its camera; restore the image")
+    # The lens, and the focal lengths in pixels: OpenSfM's unit is the longer side.
     kind = camera.text("projection_type") or "perspective"
     if kind not in _LENSES:
         raise DataError(f"{camera.where}: projection_type {kind!r} is not read; known are {', '.join(_LENSES)}")

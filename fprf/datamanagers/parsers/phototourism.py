@@ -44,6 +44,7 @@ def read_list(path: Path) -> dict[str, str]:
             rows = list(csv.DictReader(file, delimiter="\t"))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"{path}: cannot be read ({error}); download the table again") from error
+    # Photographs without an id were left out of the split.
     views = {}
     for number, row in enumerate(rows, 2):
         name, split, id_ = row.get("filename"), row.get("split"), row.get("id")

@@ -30,6 +30,7 @@ class PolycamParser(DataParser):
         folders = keyframes(data)
         if not folders:
             raise DataError(f"{data}: no keyframes/images with keyframes/cameras/*.json; export raw data from Polycam")
+        # Corrected frames come first and stay; images that no camera knows are counted.
         frames: dict[str, tuple[Path, Path]] = {}
         alone: set[str] = set()
         for images, cameras in folders:

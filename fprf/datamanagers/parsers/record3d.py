@@ -9,14 +9,13 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...interfaces import DataParser
 from ..images import image_names
 from ..scene import Scene
 from .config import Record3DConfig, recording
-from .files import Record, as_record, read_json
+from .files import as_record, read_json
 from .views import View, assemble_scene, quaternion_rotation, read_views, rigid_pose, stated_size
 
 _NUMBER = re.compile("[0-9]{1,9}")
@@ -35,6 +34,7 @@ class Record3DParser(DataParser):
             raise DataError(f"{data}: no metadata.json with rgb/; export from Record3D as EXR and JPG, or unpack its .r3d")
         file, folder = files
         record = as_record(file, read_json(file))
+        # Numbered images belong to the rows of poses.
         poses = record.table("poses", 7)
         numbered = sorted((int(Path(name).stem), name) for name in image_names(folder) if _NUMBER.fullmatch(Path(name).stem))
         posed = [each for each in numbered if each[0] < len(poses)]
@@ -43,7 +43,13 @@ class Record3DParser(DataParser):
             raise DataError(f"{folder}: {last}, but {file.name} has {len(poses)} poses, from 0 on; export the recording again")
         if len(poses) > 1 and not np.nan_to_num(np.ptp(poses, axis=0), nan=1.0).any():
             raise DataError(f"{file}: all poses are one (front cameras have none); find poses with `fprf process {folder}`")
-        lenses = _lenses(record, len(poses))
+        # fx fy cx cy of each image, or one K for all.
+        lenses = np.zeros((0, 4))
+        if record.get("perFrameIntrinsicCoeffs") is not None:
+            lenses = record.table("perFrameIntrinsicCoeffs", 4)
+        if len(lenses) < len(poses):
+            lenses = np.tile(record.numbers("K", 9)[[0, 4, 6, 7]], (len(poses), 1))
+        # At most so many, evenly through the recording.
         even = np.linspace(0, len(posed) - 1, min(len(posed), self.config.frames)).round().astype(int)
 
         def view(each: tuple[int, str]) -> View:
@@ -64,12 +70,3 @@ class Record3DParser(DataParser):
         if len(posed) < len(numbered):
             notes.append(f"{len(numbered) - len(posed)} of {len(numbered)} images have no pose and are left out")
         return assemble_scene(data, views, downscale=downscale, notes=notes)
-
-
-def _lenses(record: Record, count: int) -> NDArray[np.float64]:
-    """fx fy cx cy of each image."""
-    if record.get("perFrameIntrinsicCoeffs") is not None:
-        rows = record.table("perFrameIntrinsicCoeffs", 4)
-        if len(rows) >= count:
-            return rows
-    return np.tile(record.numbers("K", 9)[[0, 4, 6, 7]], (count, 1))

@@ -49,6 +49,7 @@ class TransformsParser(DataParser):
 
     def parse(self, data: Path, downscale: int) -> Scene:
         """The scene at 1/downscale of the size that the file's intrinsics belong to."""
+        # The frames of all files, by name.
         files = self._files(data)
         tops = [as_record(file, read_json(file)) for file, _ in files]
         entries, inside = [], NamedFiles(data)
@@ -109,6 +110,7 @@ def _cloud(
         seen = seen[seen[:, 0] >= 0]
     if points is None and ply:
         points, notes = read_ply_points(inside.find(f"{top.where}: ply_file_path", ply)[1])
+    # A model also says which views see its points.
     model = largest_model(inside.root)[0]
     if seen is None and model is not None:
         applied = np.eye(3, 4) if top.get("applied_transform") is None else top.matrix("applied_transform")[:3]
@@ -119,6 +121,7 @@ def _cloud(
 
 def _view(entry: _Entry, inside: NamedFiles) -> View:
     record = entry.record
+    # Without a size the intrinsics belong to the image as it is, and the principal point is its middle.
     size = stated_size(record.where, entry.path, record.number("w"), record.number("h"))
     near, far = record.number("near"), record.number("far")
     cx, cy = record.number("cx"), record.number("cy")
@@ -155,6 +158,7 @@ def _focal(record: Record, size: tuple[int, int]) -> tuple[float, float]:
             raise DataError(f"{record.where}: {angle_key} is {angle}; it must lie between 0 and pi")
         return pixels / 2 / math.tan(angle / 2)
 
+    # Either one serves for both.
     fx, fy = one("fl_x", "camera_angle_x", size[0]), one("fl_y", "camera_angle_y", size[1])
     first = fy if fx is None else fx
     if first is None:
@@ -183,6 +187,7 @@ def _split(inside: NamedFiles, tops: list[Record], entries: list[_Entry], kept: 
     train, test = top.texts("train_filenames"), top.texts("test_filenames")
     if train is None and test is None:
         return None
+    # What is listed must be there, and on one side.
     names = {entry.name for entry in entries}
     listed = []
     for key, texts in (("train_filenames", train), ("test_filenames", test)):
@@ -193,6 +198,7 @@ def _split(inside: NamedFiles, tops: list[Record], entries: list[_Entry], kept: 
     both = listed[0] & listed[1]
     if both:
         raise DataError(f"{top.where}: {min(both)!r} is in train_filenames and in test_filenames; remove it from one")
+    # A side without a list has the rest.
     learned = names - listed[1] if train is None else listed[0]
     held = names - listed[0] - set(top.texts("val_filenames") or ()) if test is None else listed[1]
     return index_tensor([e.name in learned for e in kept]), index_tensor([e.name in held for e in kept])

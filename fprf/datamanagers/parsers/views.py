@@ -25,22 +25,6 @@ from ..images import read_header
 from ..scene import Scene
 from .files import name_of
 
-MASKS, SKY_MASKS = "masks", "sky_masks"
-"""Names of the folders."""
-
-
-def _mask(data: Path, image: Path, name: str) -> Path | None:
-    """Beside the image's folder, or beside a folder around that, up to the scene's."""
-    for above in image.parents[1:]:
-        if (above / name).is_dir():
-            inner = (above / name).joinpath(*image.relative_to(above).parts[1:])
-            for path in (inner.with_name(inner.name + ".png"), inner.with_suffix(".png"), inner):
-                if path.is_file():
-                    return path
-        if above == data or not above.is_relative_to(data):
-            return None
-    return None
-
 
 def index_tensor(members: Sequence[bool]) -> Tensor:
     """The int64 positions of the members."""
@@ -108,7 +92,9 @@ def read_views(
     for entry in entries:
         try:
             one = view(entry)
-            _check_camera(one)
+            numbers = (*one.focal, *one.centre, *one.distortion)
+            if not np.isfinite((*numbers, *(one.depths or ()))).all():
+                raise UnusableView(str(one.path))
             if not os.path.isfile(one.path):
                 raise _MissingImage(str(one.path))
         except UnusableView as fault:
@@ -117,6 +103,16 @@ def read_views(
         except _MissingImage as fault:
             missing.append(str(fault))
             continue
+        # What is finite may still be no camera: nothing that would follow from it is worth having.
+        if max(map(abs, numbers)) > 1e9:
+            raise DataError(f"{one.path}: the camera's numbers {numbers} go beyond 1e9; calibrate again")
+        if min(one.focal) <= 0:
+            raise DataError(f"{one.path}: the focal length is {min(one.focal)}, it must be above 0; calibrate again")
+        if one.depths is not None and not 0 < one.depths[0] < one.depths[1]:
+            raise DataError(
+                f"{one.path}: nearest and farthest depth are {one.depths[0]} and {one.depths[1]}, "
+                "0 < near < far is needed; remove or correct them"
+            )
         if one.name in views:
             raise DataError(f"{data}: the image {one.name} occurs twice; remove one of its cameras")
         views[one.name] = one
@@ -177,6 +173,7 @@ def lens_of(
             f"{where}: a panorama ({model}), which `colmap image_undistorter` cannot undistort either; cut the images "
             "into pinhole views, as COLMAP's panorama_sfm.py and `ns-process-data images --camera-type equirectangular` do"
         )
+    # A lens that is close to one of ours would bend rays a little wrong: any term that is left over refuses it.
     fisheye = "FISHEYE" in model
     if any(others) or (fisheye and (p1 or p2)) or (model.endswith("PINHOLE") and any(distortion)):
         known = "no terms" if model.endswith("PINHOLE") else "k1 k2 k3 k4" if fisheye else "k1 k2 k3 k4 p1 p2 in a polynomial"
@@ -213,6 +210,7 @@ def rigid_pose(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
         raise DataError(f"{where}: the pose holds no rotation ({kind}); remove scale and shear from the capture's poses")
     if np.abs(matrix[:3, 3]).max() > _FAR:
         raise DataError(f"{where}: the position {matrix[:3, 3].tolist()} lies beyond {_FAR:g}; run the reconstruction again")
+    # The nearest rotation: what is left of R = U S V^T without its stretching S.
     left, _, right = np.linalg.svd(rotation)
     return np.concatenate([left @ right, matrix[:3, 3:]], 1)
 
@@ -233,6 +231,7 @@ def assemble_scene(
     The files' headers are read: their size must be the camera's, unless `reduced` says that the image folder holds
     smaller copies of the same shape, which the cameras are then scaled to.
     """
+    # Sizes as the files have them, from headers alone.
     alpha = False
     sizes = []
     for view in views:
@@ -247,6 +246,7 @@ def assemble_scene(
             )
         alpha |= header.alpha
         sizes.append(size)
+    # Cameras at the size that the capture states, brought to that of the files.
     delivered = Cameras(
         pose=torch.from_numpy(np.stack([view.pose for view in views])),
         focal=torch.tensor([view.focal for view in views], dtype=torch.float64),
@@ -268,34 +268,31 @@ def assemble_scene(
         points=None if points is None or not len(points) else torch.from_numpy(points),
         seen=None if seen is None or not len(seen) else torch.from_numpy(seen),
         depths=torch.tensor(depths, dtype=torch.float64) if len(depths) == len(views) else None,
-        masks=_masks(data, views, [view.mask for view in views], MASKS),
-        sky_masks=_masks(data, views, [view.sky_mask for view in views], SKY_MASKS),
+        masks=_masks(data, views, [view.mask for view in views], "masks"),
+        sky_masks=_masks(data, views, [view.sky_mask for view in views], "sky_masks"),
         alpha=alpha,
         notes=tuple(notes),
     )
 
 
 def _masks(data: Path, views: Sequence[View], named: Sequence[Path | None], folder: str) -> tuple[Path | None, ...]:
-    """Those that the capture names, or where it names none, those that lie beside the images."""
-    if not any(named):
-        beside = tuple(_mask(data, view.path, folder) for view in views)
-        return beside if any(beside) else ()
-    missing = [path for path in named if path is not None and not os.path.isfile(path)]
-    if missing:
-        raise DataError(f"{data}: {len(missing)} masks are missing, the first is {missing[0]}; copy them there or unname them")
-    return tuple(named)
-
-
-def _check_camera(view: View) -> None:
-    numbers = (*view.focal, *view.centre, *view.distortion)
-    if not np.isfinite((*numbers, *(view.depths or ()))).all():
-        raise UnusableView(str(view.path))
-    if max(map(abs, numbers)) > 1e9:
-        raise DataError(f"{view.path}: the camera's numbers {numbers} go beyond 1e9; calibrate again")
-    if min(view.focal) <= 0:
-        raise DataError(f"{view.path}: the focal length is {min(view.focal)}, it must be above 0; calibrate again")
-    if view.depths is not None and not 0 < view.depths[0] < view.depths[1]:
-        raise DataError(
-            f"{view.path}: nearest and farthest depth are {view.depths[0]} and {view.depths[1]}, "
-            "0 < near < far is needed; remove or correct them"
-        )
+    """Masks of the views: those that the capture names, or where it names none, those that lie beside the images."""
+    if any(named):
+        missing = [path for path in named if path is not None and not os.path.isfile(path)]
+        if missing:
+            told = f"{len(missing)} masks are missing, the first is {missing[0]}"
+            raise DataError(f"{data}: {told}; copy them there or unname them")
+        return tuple(named)
+    found: list[Path | None] = []
+    for view in views:
+        mask = None
+        # Beside the image's folder, or beside a folder around that, up to the scene's.
+        for above in view.path.parents[1:]:
+            if mask is None and (above / folder).is_dir():
+                inner = (above / folder).joinpath(*view.path.relative_to(above).parts[1:])
+                spellings = (inner.with_name(inner.name + ".png"), inner.with_suffix(".png"), inner)
+                mask = next((path for path in spellings if path.is_file()), None)
+            if above == data or not above.is_relative_to(data):
+                break
+        found.append(mask)
+    return tuple(found) if any(found) else ()

@@ -71,6 +71,7 @@ def _chosen(config: PluginConfig, group: str, path: str) -> list[str]:
         plain = {name: value for name, value in json.loads(config.data).items() if not isinstance(value, dict)}
         words = [word for name, value in plain.items() for word in _spelled(f"{path}.{name.replace('_', '-')}", value)]
         return [path, config.name, *words]
+    # Fields that differ from the defaults; a slot brings the fields of what fills it.
     kind = type(config)
     default, hints = kind(), hints_of(kind)
     flags = [path, name_of(group, kind)]

@@ -38,6 +38,7 @@ def load_decoder(path: Path | None, *, encoder: str, channels: int, objective: O
     """
     if path is not None:
         return _loaded(path, *_read(path), encoder=encoder, channels=channels)
+    # The one that ships for this encoder and objective.
     shipped = set()
     for file in sorted(FOLDER.glob("*.safetensors")):
         tensors, metadata = _read(file)
@@ -55,6 +56,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def _loaded(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str], *, encoder: str, channels: int) -> MlpDecoder:
+    # Its first layer says how many features it takes.
     hidden, inputs = tensors["first.weight"].shape
     if metadata["encoder"] != encoder or inputs != channels:
         raise WeightsError(

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ...interfaces import Encoder
-from .frozen import FrozenEncoder, finest, freeze, street
+from .frozen import FrozenEncoder, freeze, street
 
 Cells = Literal["finest", "first"]
 DIGITS = 3
@@ -26,6 +26,7 @@ class ConcatEncoder(FrozenEncoder):
     def __init__(
         self, parts: Sequence[Encoder], weights: Sequence[float], units: Sequence[float], *, cells: Cells = "finest"
     ) -> None:
+        # Weights and units are part of the identity.
         names = [f"{weight!r}/{unit!r}*[{part.identity}]" for weight, unit, part in zip(weights, units, parts, strict=True)]
         kind = "concat:" if cells == "finest" else f"concat:{cells}:"
         super().__init__(kind + "+".join(names), sum(part.channels for part in parts))
@@ -48,12 +49,13 @@ class ConcatEncoder(FrozenEncoder):
         maps = [each * factor for each, factor in zip(maps, self._factors, strict=True)]
         if self._cells == "first":
             size = maps[0].shape[2:]
-            maps = [F.interpolate(F.adaptive_avg_pool2d(each, _least(each, size)), size, mode="bilinear") for each in maps]
-        return torch.cat(finest(maps), dim=1)
-
-
-def _least(features: Annotated[Tensor, "B C h w"], size: Sequence[int]) -> tuple[int, int]:
-    return min(features.shape[2], size[0]), min(features.shape[3], size[1])
+            # Finer maps are averaged over the cells of the first, coarser ones interpolated.
+            least = [(min(each.shape[2], size[0]), min(each.shape[3], size[1])) for each in maps]
+            maps = [F.adaptive_avg_pool2d(each, cells) for each, cells in zip(maps, least, strict=True)]
+            return torch.cat([F.interpolate(each, size, mode="bilinear") for each in maps], dim=1)
+        size = torch.Size(max(each.shape[axis] for each in maps) for axis in (2, 3))
+        fine = (each if each.shape[2:] == size else F.interpolate(each, size, mode="bilinear") for each in maps)
+        return torch.cat(list(fine), dim=1)
 
 
 UNITS: Mapping[str, float] = {
@@ -71,6 +73,7 @@ def build_concat(parts: Sequence[Encoder], weights: Sequence[float], *, cells: C
 
 def unit_of(encoder: Encoder, images: Annotated[Tensor, "B 3 H W"]) -> float:
     """Root mean square length of the encoder's features about their mean, rounded; 1 where they don't change at all."""
+    # Over cells, of the vector of all channels.
     features: Tensor = encoder(images).double()
     length = float((features - features.mean(dim=(0, 2, 3), keepdim=True)).square().sum(dim=1).mean().sqrt())
     return float(f"{length:.{DIGITS}g}") or 1.0

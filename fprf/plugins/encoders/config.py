@@ -122,6 +122,7 @@ def _hub_needs(model: str) -> tuple[Need, ...]:
     if importlib.util.find_spec("transformers") is None:
         ships = "or choose an encoder that ships: --semantic.encoder dinov2"
         needs.append(Need("the package transformers", f"pip install 'fprf[encoders]', {ships}"))
+    # Where the hub's own library caches models.
     home = os.environ.get("HF_HOME") or Path.home() / ".cache" / "huggingface"
     hub = Path(os.environ.get("HF_HUB_CACHE") or Path(home) / "hub")
     cached = any(hub.glob(f"models--{model.replace('/', '--')}/snapshots/*/config.json"))

@@ -71,12 +71,14 @@ class Dinov2(nn.Module):
 
         Only patches that are `shown` (bool, at least one) attend to each other; the others take the features of the nearest.
         """
+        # Tokens are patches with their learned positions, interpolated to this grid.
         patches = self.patch_embed(image)
         shape = patches.shape[-2:]
         positions = F.interpolate(self.pos_embed[None], shape, mode="bicubic", align_corners=False)
         tokens = (patches + positions).flatten(2).transpose(1, 2)
         if shown is not None:
             tokens = tokens[:, shown.flatten()]
+        # The class token attends and is attended to, and is dropped at the end.
         x = torch.cat([self.cls_token.expand(len(image), 1, -1), tokens], 1)
         for index, block in enumerate(self.blocks, start=1):
             x = block(x, keys and index == len(self.blocks))
@@ -106,6 +108,7 @@ class Dinov2Encoder(FrozenEncoder):
     @torch.no_grad()
     def cutout(self, image: Annotated[Tensor, "B 3 H W"], opacity: Annotated[Tensor, "B H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features of the patches that show something, encoded without the others: cheaper, and no backdrop has a say."""
+        # Patches with something in them; what they show only in part lies on grey.
         cover = F.adaptive_avg_pool2d(opacity[:, None], patch_grid(image.shape[-2:], self._stride))[:, 0]
         filled = image + (1 - opacity[:, None]) * GREY
         # One by one: as many tokens as each image shows.
@@ -117,6 +120,7 @@ class Dinov2Encoder(FrozenEncoder):
         )
 
     def _features(self, image: Tensor, shown: Annotated[Tensor, "h w"] | None = None) -> Annotated[Tensor, "B C h w"]:
+        # Resized to whole patches, with ImageNet's mean and deviation.
         size = [PATCH * n for n in patch_grid(image.shape[-2:], self._stride)]
         if size != list(image.shape[-2:]):
             image = F.interpolate(image, size, mode="bicubic", align_corners=False, antialias=True)
@@ -125,7 +129,7 @@ class Dinov2Encoder(FrozenEncoder):
         return features
 
 
-def load_dinov2(*, layer: int, kind: Literal["tokens", "keys"], stride: int | None, path: Path = WEIGHTS) -> Dinov2Encoder:
+def load_dinov2(*, layer: int, kind: Literal["tokens", "keys"], stride: int | None) -> Dinov2Encoder:
     """The encoder up to block `layer` (negative: from the last of 12). Raises WeightsError where the file has no such block."""
     block = layer if layer > 0 else BLOCKS + 1 + layer
     if not 1 <= block <= HELD:
@@ -134,7 +138,7 @@ def load_dinov2(*, layer: int, kind: Literal["tokens", "keys"], stride: int | No
         )
     with torch.device("meta"):  # no memory or time for weights that are replaced
         network = Dinov2(block)
-    tensors = dequantised(read_weights(path)[0])
+    tensors = dequantised(read_weights(WEIGHTS)[0])
     network.load_state_dict({name: tensors[name] for name in network.state_dict()}, assign=True)
     return Dinov2Encoder(network, kind=kind, stride=stride)
 

@@ -1,7 +1,6 @@
 """Parts of frozen encoders: padding that any size survives, tensors that no optimiser sees, pictures to measure them on."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
 from typing import Annotated
@@ -12,18 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ...errors import WeightsError
 from ...interfaces import Encoder
-from ..weights import tensors_hash
-
-
-def finest(maps: Sequence[Annotated[Tensor, "B C h w"]]) -> list[Tensor]:
-    """All at the size of the finest, the others interpolated."""
-    size = tuple(max(int(each.shape[axis]) for each in maps) for axis in (2, 3))
-    return [
-        each if tuple(each.shape[2:]) == size else F.interpolate(each, size, mode="bilinear", align_corners=False)
-        for each in maps
-    ]
 
 
 def freeze(module: nn.Module) -> None:
@@ -32,24 +20,15 @@ def freeze(module: nn.Module) -> None:
     module.requires_grad_(False)
 
 
-def reflect_pad(x: Annotated[Tensor, "B C H W"], margin: int = 1) -> Annotated[Tensor, "B C H+2m W+2m"]:
+def reflect_pad(x: Annotated[Tensor, "B C H W"]) -> Annotated[Tensor, "B C H+2 W+2"]:
     """Mirror at the borders; repeat them where an axis is too short to mirror."""
-    mirrored = min(x.shape[-2:]) > margin
-    return F.pad(x, (margin, margin, margin, margin), mode="reflect" if mirrored else "replicate")
+    return F.pad(x, (1, 1, 1, 1), mode="reflect" if min(x.shape[-2:]) > 1 else "replicate")
 
 
 def replicate_to_multiple(x: Annotated[Tensor, "B C H W"], stride: int) -> Tensor:
     """Repeat the last row and column until both axes are multiples of `stride`."""
     right, below = -x.shape[-1] % stride, -x.shape[-2] % stride
     return F.pad(x, (0, right, 0, below), mode="replicate") if right or below else x
-
-
-def resize_to_multiple(image: Annotated[Tensor, "B 3 H W"], multiple: int) -> Tensor:
-    """Resize so that cells of `multiple` pixels cover the image exactly; the image itself where they do."""
-    height, width = (max(1, round(n / multiple)) * multiple for n in image.shape[-2:])
-    if (height, width) == tuple(image.shape[-2:]):
-        return image
-    return F.interpolate(image, (height, width), mode="bilinear", align_corners=False)
 
 
 CELLS = 22
@@ -60,6 +39,7 @@ def patch_grid(size: Sequence[int], stride: int | None) -> tuple[int, int]:
     """Rows and columns of patches that cover an image of that height and width: one for `stride` pixels; None = `CELLS` along
     its longer side.
     """
+    # At least one each way, however thin the image is.
     height, width = size
     pixels = stride or max(size) / CELLS
     return max(1, round(height / pixels)), max(1, round(width / pixels))
@@ -80,37 +60,6 @@ class FrozenEncoder(Encoder):
     @property
     def channels(self) -> int:
         return self._channels
-
-
-class NetworkEncoder(FrozenEncoder):
-    """A network of one feature per `stride` pixels. `name` says everything that changes the output but the tensors."""
-
-    def __init__(self, name: str, network: nn.Module, *, stride: int) -> None:
-        freeze(network)
-        with torch.no_grad():
-            channels = int(network(torch.zeros(1, 3, stride, stride)).shape[1])
-        super().__init__(f"{name}:{tensors_hash(network.state_dict())}", channels)
-        self._stride = stride
-        self.network = network
-        freeze(self)
-
-    @torch.no_grad()
-    def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
-        """Features, one per `stride` pixels, at least one along each axis."""
-        features: Tensor = self.network(resize_to_multiple(image, self._stride))
-        return features
-
-
-@contextmanager
-def fitting(source: str, what: str, flag: str) -> Iterator[None]:
-    """Building and trying a network on a file's tensors: what is missing or misshapen there is a WeightsError."""
-    try:
-        yield
-    except (KeyError, RuntimeError) as error:
-        reason = f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error).strip().splitlines()[0]
-        raise WeightsError(
-            f"{source}: does not hold {what} ({reason}); choose a layer that it holds, or name another file with {flag} FILE"
-        ) from error
 
 
 @cache

@@ -10,15 +10,16 @@ content encoder, ships with the package.
 import math
 import re
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from ...errors import WeightsError
-from ..weights import find_weights, input_statistics, read_tensors, tensors_hash, torchvision_file
+from ..weights import WeightSource, find_weights, input_statistics, read_tensors, tensors_hash
 from .frozen import FrozenEncoder, freeze, reflect_pad, street
 
 
@@ -46,12 +47,28 @@ class VggEncoder(FrozenEncoder):
         scale: Annotated[Tensor, "C"] | None,
         source: str,
     ) -> None:
+        # Tensors of the convolutions up to the layer, each of which the file must hold.
         every = list(CONVOLUTIONS[network])
         names = every[: every.index(layer[4:]) + 1]
         used = {"mean": mean.float(), "std": std.float()}
+        shown = network.upper().replace("VGG", "VGG-")
         for index, name in enumerate(names):
             for part in ("weight", "bias"):
-                used[f"{part}{index}"] = _tensor(tensors, network, name, part, source)
+                key = f"features.{CONVOLUTIONS[network][name]}.{part}"
+                if key not in tensors:
+                    held = [f"relu{each}" for each in names[:index]]
+                    raise WeightsError(
+                        f"{source}: holds no conv{name} ({key} is missing); its layers are "
+                        f"{', '.join(held) or f'none of {shown}'}; choose one of these, or name a file that reaches further "
+                        "with --content.encoder.weights FILE"
+                    )
+                value = tensors[key].float()
+                odd = value.ndim != 4 or value.shape[2:] != (3, 3) or not math.isfinite(float(value.sum()))
+                if part == "weight" and odd:
+                    found = f"{key} has shape {tuple(value.shape)}"
+                    raise WeightsError(f"{source}: {found}, not that of a 3x3 convolution of {shown}")
+                used[f"{part}{index}"] = value
+        # What divides the features is part of the identity, as the tensors are.
         channels = len(used[f"bias{len(names) - 1}"])
         used["scale"] = torch.ones(channels) if scale is None else scale.float()
         kind = "plain" if scale is None else "normalised"
@@ -65,6 +82,7 @@ class VggEncoder(FrozenEncoder):
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features at stride 1, 2, 4, 8 or 16, by the block of the layer."""
         x = (image - self._column("mean", image)) / self._column("std", image)
+        # A pool before each block but the first, and the last ReLU only if the layer is one.
         for index, name in enumerate(self._names):
             if index and name.endswith("_1"):
                 x = F.max_pool2d(x, 2, ceil_mode=True)
@@ -83,36 +101,13 @@ def vgg_activations(encoder: VggEncoder, images: Annotated[Tensor, "B 3 H W"]) -
     return F.relu(encoder(images)).double().mean(dim=(0, 2, 3))
 
 
-def reaches(tensors: Mapping[str, Tensor], network: str) -> list[str]:
-    """Layers whose convolutions, and all before them, are there."""
-    layers = []
-    for name, place in CONVOLUTIONS[network].items():
-        if f"features.{place}.weight" not in tensors or f"features.{place}.bias" not in tensors:
-            break
-        layers.append(f"relu{name}")
-    return layers
-
-
-def _tensor(tensors: Mapping[str, Tensor], network: str, name: str, part: str, source: str) -> Tensor:
-    key = f"features.{CONVOLUTIONS[network][name]}.{part}"
-    shown = network.upper().replace("VGG", "VGG-")
-    if key not in tensors:
-        held = reaches(tensors, network)
-        raise WeightsError(
-            f"{source}: holds no conv{name} ({key} is missing); its layers are {', '.join(held) or f'none of {shown}'}; "
-            "choose one of these, or name a file that reaches further with --content.encoder.weights FILE"
-        )
-    value = tensors[key].float()
-    if part == "weight" and (value.ndim != 4 or value.shape[2:] != (3, 3) or not math.isfinite(float(value.sum()))):
-        raise WeightsError(f"{source}: {key} has shape {tuple(value.shape)}, not that of a 3x3 convolution of {shown}")
-    return value
-
-
 FLAG = "--content.encoder.weights"
+ORIGIN = "https://download.pytorch.org/models/"
 SOURCES = {
-    "vgg16": torchvision_file("VGG-16", "vgg16-397923af.pth", FLAG),
-    "vgg19": torchvision_file("VGG-19", "vgg19-dcbb9e9d.pth", FLAG),
+    "vgg16": WeightSource("VGG-16", "vgg16-397923af.pth", f"{ORIGIN}vgg16-397923af.pth", FLAG),
+    "vgg19": WeightSource("VGG-19", "vgg19-dcbb9e9d.pth", f"{ORIGIN}vgg19-dcbb9e9d.pth", FLAG),
 }
+"""torchvision's files: their names carry the beginning of their own SHA-256."""
 CAFFE_FILES = r"vgg16-00b39a1b\.pth|vgg19-d01eb7cb\.pth"
 """The original networks under torchvision's names: BGR from 0 to 255 less the mean, which these files do not say."""
 RAREST = 0.05
@@ -123,16 +118,6 @@ BUNDLED_LAYERS = ("1_1", "1_2", "2_1")
 CAFFE_MEAN = (123.68 / 255, 116.779 / 255, 103.939 / 255)
 
 
-class _Held(NamedTuple):
-    """A file's tensors for RGB input under torchvision's names, and what they want of the input."""
-
-    tensors: Mapping[str, Tensor]
-    mean: Annotated[Tensor, "3"]
-    std: Annotated[Tensor, "3"]
-    normalised: bool
-    """Each filter is divided by its mean activation already."""
-
-
 def shipped(network: str, layer: str) -> Path | None:
     """The file of the package that holds the layer; None where none does."""
     return BUNDLED if network == "vgg19" and layer[4:] in BUNDLED_LAYERS else None
@@ -140,39 +125,34 @@ def shipped(network: str, layer: str) -> Path | None:
 
 def build_vgg(network: str, layer: str, *, weights: Path | None, normalise: bool) -> VggEncoder:
     """The encoder from a file, the package, the cache or the download. Raises WeightsError where none of them serves."""
-    weights = weights or shipped(network, layer)
-    path = find_weights(SOURCES[network], weights)
-    held = _read(network, path)
-
-    def encoder(scale: Tensor | None) -> VggEncoder:
-        return VggEncoder(network, layer, held.tensors, mean=held.mean, std=held.std, scale=scale, source=str(path))
-
+    path = find_weights(SOURCES[network], weights or shipped(network, layer))
+    tensors, metadata = read_tensors(path, SOURCES[network])
+    # Whose file it is says what its network wants of the input: AdaIN's RGB as it is, Caffe's BGR less its mean.
+    divided = tensors.get("0.weight", torch.empty(0)).shape == (3, 3, 1, 1)
+    if divided:
+        tensors, mean, std = _from_adain(tensors), torch.zeros(3), torch.ones(3)
+    elif re.search(CAFFE_FILES, path.name) and "features.0.weight" in tensors:
+        tensors = {**tensors, "features.0.weight": tensors["features.0.weight"].flip(1)}
+        mean, std = torch.tensor(CAFFE_MEAN), torch.full((3,), 1 / 255)
+    else:
+        mean, std = input_statistics(metadata, path)
+    encoder = partial(VggEncoder, network, layer, tensors, mean=mean, std=std, source=str(path))
     if not normalise:
-        if held.normalised:
+        if divided:
             raise WeightsError(
                 f"{path}: holds the normalised VGG-19 of AdaIN, which cannot be made plain again; "
                 f"leave normalise on, or name a file of plain weights with {FLAG} FILE"
             )
-        return encoder(None)
-    if held.normalised:
-        return encoder(torch.ones(1))
-    scale = held.tensors.get(f"mean_activation.conv{layer[4:]}")
+        return encoder(scale=None)
+    if divided:
+        return encoder(scale=torch.ones(1))
+    scale = tensors.get(f"mean_activation.conv{layer[4:]}")
     if scale is not None:
-        return encoder(scale.clamp_min(1e-3 * float(scale.mean())))
+        return encoder(scale=scale.clamp_min(1e-3 * float(scale.mean())))
     # Few files bring their own means. On the town each filter's is within a factor of two of that on photographs (VGG-19,
     # standard deviation of the log 0.19 at relu2_1, 0.35 at relu3_1), but for filters that find nothing there to answer to.
-    scale = vgg_activations(encoder(torch.ones(1)), street()).float()
-    return encoder(scale.clamp_min(RAREST * float(scale.mean())))
-
-
-def _read(network: str, path: Path) -> _Held:
-    tensors, metadata = read_tensors(path, SOURCES[network])
-    if tensors.get("0.weight", torch.empty(0)).shape == (3, 3, 1, 1):
-        return _Held(_from_adain(tensors), torch.zeros(3), torch.ones(3), normalised=True)
-    if re.search(CAFFE_FILES, path.name) and "features.0.weight" in tensors:
-        turned = {**tensors, "features.0.weight": tensors["features.0.weight"].flip(1)}
-        return _Held(turned, torch.tensor(CAFFE_MEAN), torch.full((3,), 1 / 255), normalised=False)
-    return _Held(tensors, *input_statistics(metadata, path), normalised=False)
+    scale = vgg_activations(encoder(scale=torch.ones(1)), street()).float()
+    return encoder(scale=scale.clamp_min(RAREST * float(scale.mean())))
 
 
 def _from_adain(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -180,12 +160,14 @@ def _from_adain(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
     The 1x1 convolution at its start turns colours; it goes into the first 3x3 one, which mirrored borders leave exact.
     """
+    # Their places to torchvision's.
     renamed = {}
     for at, (name, place) in enumerate(CONVOLUTIONS["vgg19"].items()):
         theirs = 2 + 3 * at + int(name[0]) - 1
         for part in ("weight", "bias"):
             if f"{theirs}.{part}" in tensors:
                 renamed[f"features.{place}.{part}"] = tensors[f"{theirs}.{part}"]
+    # w3 * (w1 x + b1) + b3 is one convolution: (w3 w1) * x + (sum w3 b1 + b3).
     if {"features.0.weight", "features.0.bias"} <= renamed.keys() and "0.bias" in tensors:
         first = renamed["features.0.weight"].double()
         turn, shift = tensors["0.weight"][:, :, 0, 0].double(), tensors["0.bias"].double()

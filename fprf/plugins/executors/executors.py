@@ -56,6 +56,7 @@ class RayExecutor(Executor):
             keep_memory()
             return function(task)
 
+        # All at once; Ray starts as many as have room.
         remote = ray.remote(**resources(self.config))(work)
         waiting = [remote.remote(task) for task in tasks]
         try:
@@ -64,6 +65,7 @@ class RayExecutor(Executor):
             # Ray aborts this process if it cancels a task whose completion it is just taking in (ray-project/ray#54798).
             for reference in ray.wait(waiting, num_returns=len(waiting), timeout=0)[1]:
                 ray.cancel(reference)
+            # What a task raised reaches the caller as it was raised; what Ray says is told in one line.
             if isinstance(error, ray.exceptions.RayTaskError) and isinstance(error.cause, Exception):
                 raise error.cause from None
             if isinstance(error, ray.exceptions.RayError):
@@ -76,6 +78,7 @@ class RayExecutor(Executor):
     def _join(self, ray: Any) -> None:
         if ray.is_initialized():
             return
+        # A cluster that is named, else one of this machine alone.
         common = {"logging_level": "warning", "log_to_driver": True}
         try:
             if self.config.address:
@@ -93,6 +96,7 @@ class RayExecutor(Executor):
 
 def _ray(*, private: bool) -> Any:
     """The module; it reads the environment when it is imported, so what it shall know is said before."""
+    # Nobody is told that it runs; a cluster of our own listens on the loopback, behind a token.
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     if private:
         # No cluster means the loopback, on Linux too; an address of it given to `init` is replaced by one for others.

@@ -3,17 +3,17 @@
 import torch
 from torch import Tensor, nn
 
-from ...fields.planes import LIMIT, ProposalField
+from ...fields.planes import ProposalField
 from ...interfaces import Sampler
-from ...ops import march
 from ...rendering.space import Space
-from ...rendering.stepfun import midpoints, resample, shifts, transmittance_weights
+from ...rendering.stepfun import midpoints, resample, transmittance_weights
 from ...types import Level, Rays, Sampled
 from .config import ProposalConfig, UniformConfig
 
 
 def even_edges(rays: Rays, samples: int, generator: torch.Generator | None) -> Tensor:
     """Edges s [R samples+1] at even steps; with a generator the inner ones move together by up to half a step a ray."""
+    # The ends stay on near and far.
     s = torch.linspace(0, 1, samples + 1, dtype=rays.origin.dtype, device=rays.origin.device).expand(len(rays.near), -1)
     if generator is None:
         return s
@@ -65,6 +65,7 @@ class ProposalSampler(Sampler):
         generator: torch.Generator | None,
     ) -> Sampled:
         """Edges for the content field, and the levels that proposed them where they learn in this step."""
+        # From even edges, each level's weights say where the next one looks (mip-NeRF 360, section 3).
         learns = step is not None and self.learns(step)
         sharpness = 1.0 if step is None else self.sharpness(step)
         counts = (*self.config.samples[1:], self.config.final)
@@ -72,21 +73,14 @@ class ProposalSampler(Sampler):
         levels = []
         for field, count in zip(self.levels, counts, strict=True):
             with torch.set_grad_enabled(learns):
-                if sharpness == 1 and isinstance(field, ProposalField) and field.kernels_apply(rays.origin, s):
-                    # Nothing is learnt from these edges: the same, ray by ray.
-                    table, weight = field.planes.table, field.to_density.weight[0]
-                    padding, shift = self.config.padding, shifts(s, generator)
-                    size = field.planes.resolutions[0]
-                    s = march.propose(
-                        rays, s, space.warp, table, size, weight, limit=LIMIT, padding=padding, count=count, shift=shift
-                    )
-                    continue
                 t = space.distance(s, rays.near, rays.far)
                 points = rays.origin[:, None] + rays.direction[:, None] * midpoints(t)[..., None]
+                # Density of the proposal at the middles, as weights (Eq. 2).
                 density = field(space.locate(points.view(-1, 3))).view(points.shape[:2])
                 w = transmittance_weights(density, t)
             if learns:
                 levels.append(Level(s, w))
+            # Early proposals are trusted less: weights to a power that rises to 1.
             trusted = w.detach() if sharpness == 1 else w.detach().clamp_min(1e-7) ** sharpness
             s = resample(s, trusted, count, padding=self.config.padding, generator=generator)
         return Sampled(s, space.distance(s, rays.near, rays.far), tuple(levels))

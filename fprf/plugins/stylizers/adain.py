@@ -1,9 +1,13 @@
-"""Local AdaIN (paper, Eq. 5 and 6): each point mixes the style codes that its semantics resemble.
+"""AdaIN of all points, towards one style or each towards its own mixture of style codes.
 
-M_w = R^S M and Sigma_w = R^S Sigma over the codes' means and deviations, then Sigma_w (F - mu_c) / sigma_c + M_w with the
-statistics of the whole scene. With dot products, not centred, at the absolute temperature 1, R^S is the paper's softmax(R).
+Letters: N points, C content channels, D semantic channels, T style codes; F features [N C], mu and sigma their means and
+deviations, c of the whole scene, s of a style.
 
-Global AdaIN (paper, single reference) is sigma_s (F - mu_c) / sigma_c + mu_s.
+Global (paper, single reference):    sigma_s (F - mu_c) / sigma_c + mu_s
+Local (paper, Eq. 5 and 6):          Sigma_w (F - mu_c) / sigma_c + M_w,      M_w = R^S M,  Sigma_w = R^S Sigma
+
+over the codes' means M and deviations Sigma. With dot products, not centred, at the absolute temperature 1, R^S is the paper's
+softmax(R).
 """
 
 from typing import Annotated
@@ -23,97 +27,70 @@ from .config import LocalAdainConfig
 
 
 class AdainStylizer(Stylizer):
-    """One mean and deviation for all references, merged by weight."""
+    """Local AdaIN; global where the config is None, and with one code or without semantics, which mix alike everywhere."""
 
     content_mean: Annotated[Tensor, "C"]
-    style_mean: Annotated[Tensor, "C"]
-    gain: Annotated[Tensor, "C"]
     odds: Annotated[Tensor, "T"]
-
-    def __init__(self, dictionary: StyleDictionary, scene: SceneStyle) -> None:
-        super().__init__()
-        mean, covariance = whole_style(dictionary)
-        scene_mean = double(scene.mean)
-        scene_sigma = deviation(scene_mean, double(scene.covariance).diagonal())
-        self.register_buffer("content_mean", scene.mean.float())
-        self.register_buffer("style_mean", mean.to(scene.mean.device).float())
-        gain = deviation(mean, covariance.diagonal()).to(scene_sigma.device) / scene_sigma
-        self.register_buffer("gain", gain.to(scene.mean.device).float())
-        self.register_buffer("odds", code_odds(dictionary).to(scene.mean.device).float())
-
-    @property
-    def needs(self) -> Want:
-        return Want.CONTENT
-
-    def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
-        """AdaIN; the mean is subtracted first, since a x + b loses digits where the mean is large."""
-        with full_precision(content):
-            return ((content.to(self.gain) - self.content_mean) * self.gain + self.style_mean).to(content)
-
-    def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
-        """Every point alike: the codes' shares of the references."""
-        return self.odds.expand(len(semantic), -1)
-
-
-class LocalAdainStylizer(Stylizer):
-    """AdaIN towards a per-point mixture. With one code, or without semantics, the mixture is the same everywhere."""
-
-    content_mean: Annotated[Tensor, "C"]
+    style_mean: Annotated[Tensor, "T C"]
+    """M of the codes; one row for all of them where nothing is matched, as of `gain`."""
+    gain: Annotated[Tensor, "T C"]
+    """Sigma / sigma_c of each code."""
+    keys: Annotated[Tensor, "T D"]
+    prior: Annotated[Tensor, "T"]
     centre: Annotated[Tensor, "D"] | None
     """Origin of directions; None for dot products."""
     origin: Annotated[Tensor, "D"] | None
     """The encoder's zero, for dot products of features as it gives them."""
-    keys: Annotated[Tensor, "T D"]
-    prior: Annotated[Tensor, "T"]
-    odds: Annotated[Tensor, "T"]
-    style_mean: Annotated[Tensor, "T C"]
-    gain: Annotated[Tensor, "T C"]
 
-    def __init__(self, dictionary: StyleDictionary, scene: SceneStyle, config: LocalAdainConfig) -> None:
+    def __init__(self, dictionary: StyleDictionary, scene: SceneStyle, config: LocalAdainConfig | None) -> None:
         super().__init__()
-        check_fit(dictionary, scene)
-        self.matched = len(dictionary.keys) > 1 and dictionary.keys.shape[1] > 0
-        # Both sides, such that their inner products are the scores R (paper, Eq. 5).
-        theirs = share_mean(dictionary.keys, code_odds(dictionary).to(dictionary.keys))
-        zero = torch.zeros_like(scene.semantic_mean) if dictionary.origin is None else dictionary.origin
-        centre = scene.semantic_mean if config.centred else zero
-        cosine = config.similarity == "cosine"
-        if cosine:
-            queries, keys = unit(scene.keys, centre), unit(dictionary.keys, theirs if config.centred else zero)
-        else:
-            # Softmax does not see what is subtracted from all keys; the smaller numbers round less.
-            queries, keys = scene.keys if config.centred else scene.keys - zero, dictionary.keys - theirs
-        # The only region of an undivided scene lies at its mean, where it says nothing about scores.
-        spread = score_spread(queries if len(queries) > 1 else keys, keys) if config.relative else 1.0
-        self.temperature = config.temperature * spread
+        odds = code_odds(dictionary).to(dictionary.keys)
         mean, covariance = double(dictionary.mean), double(dictionary.covariance)
-        if not self.matched:
+        self.matched = config is not None and len(dictionary.keys) > 1 and dictionary.keys.shape[1] > 0
+        if config is not None:
+            check_fit(dictionary, scene)
+        if config is not None and self.matched:
+            # Both sides, such that their inner products are the scores R (paper, Eq. 5).
+            theirs = share_mean(dictionary.keys, odds)
+            zero = torch.zeros_like(scene.semantic_mean) if dictionary.origin is None else dictionary.origin
+            centre = scene.semantic_mean if config.centred else zero
+            cosine = config.similarity == "cosine"
+            if cosine:
+                queries, keys = unit(scene.keys, centre), unit(dictionary.keys, theirs if config.centred else zero)
+            else:
+                # Softmax does not see what is subtracted from all keys; the smaller numbers round less.
+                queries, keys = scene.keys if config.centred else scene.keys - zero, dictionary.keys - theirs
+            # The only region of an undivided scene lies at its mean, where it says nothing about scores.
+            spread = score_spread(queries if len(queries) > 1 else keys, keys) if config.relative else 1.0
+            self.temperature = config.temperature * spread
+            self.register_buffer("keys", keys.float())
+            self.register_buffer("prior", (dictionary.weight / dictionary.weight.amax()).float())
+            self.register_buffer("centre", centre.float() if cosine else None)
+            self.register_buffer("origin", None if cosine or config.centred else zero.float())
+        else:
             mean, covariance = (part[None] for part in whole_style(dictionary))
         scene_sigma = deviation(double(scene.mean), double(scene.covariance).diagonal())
         gain = deviation(mean, covariance.diagonal(dim1=-2, dim2=-1)) / scene_sigma
         self.register_buffer("content_mean", scene.mean.float())
-        self.register_buffer("centre", centre.float() if cosine else None)
-        self.register_buffer("origin", None if cosine or config.centred else zero.float())
-        self.register_buffer("keys", keys.float())
-        self.register_buffer("prior", (dictionary.weight / dictionary.weight.amax()).float())
-        self.register_buffer("odds", code_odds(dictionary).to(keys.device).float())
-        self.register_buffer("style_mean", mean.to(keys.device).float())
-        self.register_buffer("gain", gain.to(keys.device).float())
+        self.register_buffer("odds", odds.float())
+        self.register_buffer("style_mean", mean.to(scene.mean.device).float())
+        self.register_buffer("gain", gain.to(scene.mean.device).float())
 
     @property
     def needs(self) -> Want:
         return Want.CONTENT | Want.SEMANTIC if self.matched else Want.CONTENT
 
     def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
-        """AdaIN towards each point's own mixture; the mean is subtracted first."""
+        """AdaIN; the mean is subtracted first, since a x + b loses digits where the mean is large."""
         with full_precision(content):
             features = content.to(self.gain)
             if self.matched:
                 assert semantic is not None, "Want.SEMANTIC was asked for"
-                return mixture.scaled(features, self.match(semantic), self.gain, self.style_mean, centre=self.content_mean).to(
-                    content
-                )
-            return ((features - self.content_mean) * self.gain + self.style_mean).to(content)
+                share = self.match(semantic)
+                styled = mixture.scaled(features, share, self.gain, self.style_mean, centre=self.content_mean)
+            else:
+                styled = (features - self.content_mean) * self.gain + self.style_mean
+            return styled.to(content)
 
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
         if not self.matched:

@@ -58,7 +58,7 @@ class AdainConfig(StylizerConfig):
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
         from .adain import AdainStylizer
 
-        return AdainStylizer(dictionary, scene)
+        return AdainStylizer(dictionary, scene, None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,9 +80,9 @@ class LocalAdainConfig(StylizerConfig):
         positive("stylizer.temperature", self.temperature)
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
-        from .adain import LocalAdainStylizer
+        from .adain import AdainStylizer
 
-        return LocalAdainStylizer(dictionary, scene, self)
+        return AdainStylizer(dictionary, scene, self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,11 +127,9 @@ class RegionConfig(StylizerConfig):
         return region_smoothing(scene, self.smoothness, allowed)
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
-        from .region import ChannelMaps, MatrixMaps, TwoSidedStylizer, plan_regions
+        from .region import TwoSidedStylizer
 
-        plan = plan_regions(dictionary, scene, self, self.smoothing(scene, dictionary.allowed))
-        maps = MatrixMaps if self.transport else ChannelMaps
-        return TwoSidedStylizer(plan, scene, maps(plan, scene, self.gain))
+        return TwoSidedStylizer(dictionary, scene, self)
 
 
 @dataclass(frozen=True, kw_only=True)

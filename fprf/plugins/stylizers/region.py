@@ -2,17 +2,19 @@
 
     f'  =  sum_k a_k(point) ((f - centre) A_k + b_k)          a = membership [N K], the same for every style
 
+Letters: N points, C content channels, D semantic channels, T style codes, K regions of the scene. Tables of regions and codes
+are float64, buffers float32.
+
 A_k and b_k carry region k's statistics to those of the codes that it matches, through a [K T] table that a user can read.
 The source statistics are mixed over the scene's own regions just as the target's are over the codes: a dictionary that
 equals the scene gives the identity, and a high temperature gives the global style. `region-tone` and `region-ot` differ in
 A_k: per channel sigma_s / sigma_c (AdaIN), or the optimal transport of all channels at once.
 """
 
-from abc import ABC, abstractmethod
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ...interfaces import Stylizer
 from ...ops import mixture
@@ -35,109 +37,83 @@ def region_table(scene: SceneStyle, dictionary: StyleDictionary, config: RegionC
 
     A region that may not take from all references is matched with the codes of the others as if there were only these.
     """
-    if dictionary.allowed is None:
-        return _matched(scene, dictionary, config)
-    table = torch.zeros(len(scene.share), len(dictionary.share), dtype=torch.float64)
-    for k, chosen in enumerate(dictionary.allowed):
-        part, codes = choose(dictionary, chosen)
-        table[k, codes] = _matched(scene, part, config)[k]
-    return table
+    if dictionary.allowed is not None:
+        table = torch.zeros(len(scene.share), len(dictionary.share), dtype=torch.float64)
+        for k, chosen in enumerate(dictionary.allowed):
+            part, codes = choose(dictionary, chosen)
+            table[k, codes] = region_table(scene, part, config)[k]
+        return table
+    odds = code_odds(dictionary)
+    if len(scene.keys) == 1 or scene.keys.shape[1] == 0:
+        return odds.expand(len(scene.keys), -1)
+    table = match_keys(
+        *(scene.keys, scene.share, dictionary.keys, odds, dictionary.weight),
+        temperature=config.temperature,
+        similarity=config.similarity,
+        whitening=config.whitening,
+        recentred=config.recentred,
+        centred=config.centred,
+        origin=dictionary.origin,
+    )
+    # Rows of regions that are not in the references become those of matched regions of similar content: the softmax gives such
+    # a region whichever code is the least unlike, sky between twigs the colour of a lamp. Whether the references show such a
+    # thing at all is asked from the scene's mean: centred on its own, each side always fits.
+    score = (unit(scene.keys, scene.semantic_mean) @ unit(dictionary.keys, scene.semantic_mean).T).amax(1)
+    trust = ((double(score) - _UNMATCHED) / (_MATCHED - _UNMATCHED)).clamp(0, 1)
+    mean = double(scene.region_mean)
+    distance = torch.cdist(mean, mean).square() / double(scene.covariance).trace().clamp_min(1e-12)
+    weight = torch.exp(-distance / _SIMILAR) * (trust * double(scene.share))
+    total = weight.sum(1, keepdim=True)
+    return torch.where(total > 0, torch.lerp(weight / total.clamp_min(1e-30) @ table, table, trust[:, None]), table)
 
 
-class Side(NamedTuple):
-    """Statistics of one side, region by region, float64."""
-
-    mean: Annotated[Tensor, "K C"]
-    sigma: Annotated[Tensor, "K C"]
-    covariance: Annotated[Tensor, "K C C"]
-
-
-class RegionPlan(NamedTuple):
-    """Statistics of each region, its own and its style's."""
-
-    table: Annotated[Tensor, "K T"]
-    scene: Side
-    style: Side
-
-
-def plan_regions(
-    dictionary: StyleDictionary, scene: SceneStyle, config: RegionConfig, smoothing: Annotated[Tensor, "K K"] | None = None
-) -> RegionPlan:
-    """Match the regions with the codes. The scene's statistics are blended and smoothed as the dictionary's are."""
-    check_fit(dictionary, scene)
-    own = own_style(scene, dictionary.blend)._replace(origin=dictionary.origin)
-    same, table = region_table(scene, own, config), region_table(scene, dictionary, config)
-    if smoothing is not None:
-        same, table = smoothing @ same, smoothing @ table
-    before = _mixed(own, same)
-    if len(table) > 1:
-        return RegionPlan(table, before, _mixed(dictionary, table))
-    # An undivided scene gets the global style: codes taken together, with what lies between them.
-    left = dictionary if dictionary.allowed is None else choose(dictionary, dictionary.allowed[0])[0]
-    mean, covariance = (part[None] for part in whole_style(left))
-    return RegionPlan(table, before, Side(mean, deviation(mean, covariance.diagonal(dim1=-2, dim2=-1)), covariance))
-
-
-class RegionMaps(nn.Module, ABC):
-    """The affine map of each region, applied to features less the scene's mean."""
-
-    @abstractmethod
-    def forward(
-        self, content: Annotated[Tensor, "N C"], share: Annotated[Tensor, "N K"], centre: Annotated[Tensor, "C"]
-    ) -> Annotated[Tensor, "N C"]:
-        """Each point by the maps of its regions."""
-
-
-class ChannelMaps(RegionMaps):
-    """AdaIN: one gain a channel, sigma_s / sigma_c, at most `gain`."""
-
-    gain: Annotated[Tensor, "K C"]
-    bias: Annotated[Tensor, "K C"]
-
-    def __init__(self, plan: RegionPlan, scene: SceneStyle, gain: float) -> None:
-        super().__init__()
-        ratio = (plan.style.sigma / plan.scene.sigma).clamp_max(gain)
-        self.register_buffer("gain", ratio.to(scene.mean))
-        self.register_buffer("bias", (plan.style.mean - (plan.scene.mean - double(scene.mean)) * ratio).to(scene.mean))
-
-    def forward(
-        self, content: Annotated[Tensor, "N C"], share: Annotated[Tensor, "N K"], centre: Annotated[Tensor, "C"]
-    ) -> Annotated[Tensor, "N C"]:
-        """Gains and biases are mixed before they are applied."""
-        return mixture.scaled(content, share, self.gain, self.bias, centre=centre)
-
-
-class MatrixMaps(RegionMaps):
-    """Optimal transport: one matrix a region, no direction amplified more than `gain`."""
-
-    matrix: Annotated[Tensor, "K C C"]
-    bias: Annotated[Tensor, "K C"]
-
-    def __init__(self, plan: RegionPlan, scene: SceneStyle, gain: float) -> None:
-        super().__init__()
-        matrix = monge(plan.scene.covariance, plan.style.covariance, gain=gain)
-        moved = torch.einsum("kc,kcd->kd", plan.scene.mean - double(scene.mean), matrix)
-        self.register_buffer("matrix", matrix.to(scene.mean))
-        self.register_buffer("bias", (plan.style.mean - moved).to(scene.mean))
-
-    def forward(
-        self, content: Annotated[Tensor, "N C"], share: Annotated[Tensor, "N K"], centre: Annotated[Tensor, "C"]
-    ) -> Annotated[Tensor, "N C"]:
-        """Regions that a point does not belong to are not computed."""
-        return mixture.affine(content, share, self.matrix, self.bias, centre=centre)
+def mixed_codes(
+    d: StyleDictionary, table: Annotated[Tensor, "K T"]
+) -> tuple[Annotated[Tensor, "K C"], Annotated[Tensor, "K C"], Annotated[Tensor, "K C C"]]:
+    """Codes mixed by the rows of a table, float64: means and deviations (paper, Eq. 6) and, for transport, covariances."""
+    mean, covariance = double(d.mean), double(d.covariance)
+    sigma = deviation(mean, covariance.diagonal(dim1=-2, dim2=-1))
+    return table @ mean, table @ sigma, torch.einsum("kt,tij->kij", table, covariance)
 
 
 class TwoSidedStylizer(Stylizer):
-    """Membership of points, and the map of each region."""
+    """Membership of points, and the affine map of each region, applied to features less the scene's mean."""
 
     centre: Annotated[Tensor, "C"]
     table: Annotated[Tensor, "K T"]
+    matrix: Annotated[Tensor, "K C C"] | Annotated[Tensor, "K C"]
+    """A of each region; for AdaIN its diagonal."""
+    bias: Annotated[Tensor, "K C"]
 
-    def __init__(self, plan: RegionPlan, scene: SceneStyle, maps: RegionMaps) -> None:
+    def __init__(self, dictionary: StyleDictionary, scene: SceneStyle, config: RegionConfig) -> None:
         super().__init__()
-        self.maps, self.membership = maps, Membership(scene)
+        check_fit(dictionary, scene)
+        # Both sides are matched, blended and smoothed alike: the scene with itself, then with the references.
+        own = own_style(scene, dictionary.blend)._replace(origin=dictionary.origin)
+        same, table = region_table(scene, own, config), region_table(scene, dictionary, config)
+        smoothing = config.smoothing(scene, dictionary.allowed)
+        if smoothing is not None:
+            same, table = smoothing @ same, smoothing @ table
+        mean, sigma, covariance = mixed_codes(own, same)
+        style_mean, style_sigma, style_covariance = mixed_codes(dictionary, table)
+        if len(table) == 1:
+            # An undivided scene gets the global style: codes taken together, with what lies between them.
+            left = dictionary if dictionary.allowed is None else choose(dictionary, dictionary.allowed[0])[0]
+            style_mean, style_covariance = (part[None] for part in whole_style(left))
+            style_sigma = deviation(style_mean, style_covariance.diagonal(dim1=-2, dim2=-1))
+        # A and b: optimal transport of all channels, or AdaIN (paper), sigma_s / sigma_c of each; nothing more than `gain`.
+        away = mean - double(scene.mean)
+        if config.transport:
+            matrix = monge(covariance, style_covariance, gain=config.gain)
+            bias = style_mean - torch.einsum("kc,kcd->kd", away, matrix)
+        else:
+            matrix = (style_sigma / sigma).clamp_max(config.gain)
+            bias = style_mean - away * matrix
+        self.membership = Membership(scene)
         self.register_buffer("centre", scene.mean.float())
-        self.register_buffer("table", plan.table.to(scene.mean))
+        self.register_buffer("table", table.to(scene.mean))
+        self.register_buffer("matrix", matrix.to(scene.mean))
+        self.register_buffer("bias", bias.to(scene.mean))
 
     @property
     def needs(self) -> Want:
@@ -153,8 +129,13 @@ class TwoSidedStylizer(Stylizer):
         """`forward`, and the regions that points belong to."""
         with full_precision(content):
             share = self.membership(content[:, :0] if semantic is None else semantic)
-            moved: Tensor = self.maps(content.to(self.centre), share, self.centre)
-            return moved.to(content), share
+            return self.mapped(content.to(self.centre), share).to(content), share
+
+    def mapped(self, content: Annotated[Tensor, "N C"], share: Annotated[Tensor, "N K"]) -> Annotated[Tensor, "N C"]:
+        """Map points by their shares in the regions."""
+        if self.matrix.ndim == 2:  # gains and biases are mixed before they are applied
+            return mixture.scaled(content, share, self.matrix, self.bias, centre=self.centre)
+        return mixture.affine(content, share, self.matrix, self.bias, centre=self.centre)
 
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
         with full_precision(semantic):
@@ -162,45 +143,5 @@ class TwoSidedStylizer(Stylizer):
             return share @ self.table
 
     def region_match(self, keys: Annotated[Tensor, "K D"]) -> Annotated[Tensor, "K T"]:
-        """The table of the plan."""
+        """The table itself."""
         return self.table
-
-
-def _matched(scene: SceneStyle, dictionary: StyleDictionary, config: RegionConfig) -> Annotated[Tensor, "K T"]:
-    odds = code_odds(dictionary)
-    if len(scene.keys) == 1 or scene.keys.shape[1] == 0:
-        return odds.expand(len(scene.keys), -1)
-    table = match_keys(
-        *(scene.keys, scene.share, dictionary.keys, odds, dictionary.weight),
-        temperature=config.temperature,
-        similarity=config.similarity,
-        whitening=config.whitening,
-        recentred=config.recentred,
-        centred=config.centred,
-        origin=dictionary.origin,
-    )
-    # Whether the references show such a thing at all is asked from the scene's mean: centred on its own, each side always fits.
-    score = (unit(scene.keys, scene.semantic_mean) @ unit(dictionary.keys, scene.semantic_mean).T).amax(1)
-    return _replace_unmatched(table, scene, (double(score) - _UNMATCHED) / (_MATCHED - _UNMATCHED))
-
-
-def _replace_unmatched(
-    table: Annotated[Tensor, "K T"], scene: SceneStyle, trust: Annotated[Tensor, "K"]
-) -> Annotated[Tensor, "K T"]:
-    """Rows of regions that are not in the references, by those of matched regions of similar content.
-
-    The softmax gives such a region whichever code is the least unlike: sky between twigs the colour of a lamp.
-    """
-    trust = trust.clamp(0, 1)
-    mean = double(scene.region_mean)
-    distance = torch.cdist(mean, mean).square() / double(scene.covariance).trace().clamp_min(1e-12)
-    weight = torch.exp(-distance / _SIMILAR) * (trust * double(scene.share))
-    total = weight.sum(1, keepdim=True)
-    return torch.where(total > 0, torch.lerp(weight / total.clamp_min(1e-30) @ table, table, trust[:, None]), table)
-
-
-def _mixed(d: StyleDictionary, table: Tensor) -> Side:
-    """Codes mixed by the rows of a table: means, deviations (paper, Eq. 6) and, for transport, covariances."""
-    mean, covariance = double(d.mean), double(d.covariance)
-    sigma = deviation(mean, covariance.diagonal(dim1=-2, dim2=-1))
-    return Side(table @ mean, table @ sigma, torch.einsum("kt,tij->kij", table, covariance))

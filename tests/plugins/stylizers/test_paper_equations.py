@@ -13,7 +13,7 @@ from torch import Tensor
 from fprf.cli import main as cli
 from fprf.datamanagers.basis import Basis, fit_basis
 from fprf.interfaces import Stylizer
-from fprf.plugins.stylizers.adain import LocalAdainStylizer
+from fprf.plugins.stylizers.adain import AdainStylizer
 from fprf.plugins.stylizers.config import LocalAdainConfig
 from fprf.style.dictionary import Reference, build_dictionary, load_dictionary
 from fprf.style.look import Restyle
@@ -107,7 +107,7 @@ def test_the_encoders_zero_plays_no_part_in_centred_matches(similarity: str) -> 
     y = basis.project(given.semantic)
     one, other = (built(given, basis, config, origin=known)[0] for known in (True, False))
     assert torch.equal(one.match(y), other.match(y)) and torch.equal(one(given.content, y), other(given.content, y))
-    assert isinstance(one, LocalAdainStylizer) and one.origin is None
+    assert isinstance(one, AdainStylizer) and one.origin is None
 
 
 class Transcribed(Stylizer):

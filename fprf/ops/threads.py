@@ -1,0 +1,50 @@
+"""Threads of compiled kernels. Numba's own cost half of the compilation, and split work evenly, which pixels and Gaussians
+are not: here threads take what is to be done one by one.
+"""
+
+# mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg"
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+
+@intrinsic
+def take(typing, counters, k):
+    """counters[k] before 1 is added to it, as one step for all threads."""
+
+    def generate(context, build, sig, args):
+        data = context.make_array(sig.args[0])(context, build, args[0]).data
+        place = build.gep(data, [context.cast(build, args[1], sig.args[1], types.intp)])
+        return build.atomic_rmw("add", place, ir.Constant(ir.IntType(64), 1), "monotonic")
+
+    return types.int64(counters, k), generate
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="fprf-ops")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # a child has none of its parent's threads
+
+
+def on_threads(kernel: Callable[..., Any], *args: Any) -> list[Any]:
+    """kernel(counters, *args) on each of `numba.get_num_threads()` threads; what each returned.
+
+    `counters` are two zeros (int64) for `take`: the first for what is to be done, the second for the number of a thread.
+    """
+    counters, others = np.zeros(2, np.int64), numba.get_num_threads() - 1
+    if others == 0:
+        return [kernel(counters, *args)]
+    running = [_pool(others).submit(kernel, counters, *args) for _ in range(others)]
+    return [kernel(counters, *args), *(each.result() for each in running)]
