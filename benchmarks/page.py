@@ -122,9 +122,9 @@ def film(browser: Any, source: Path, output: Path) -> None:
     for step in range(FRAMES + 1):
         t = 0.5 - 0.5 * np.cos(np.pi * step / FRAMES)  # begins and ends at rest
         drawn = page.evaluate(STEP, [t, WALK, 2 * COLUMN[0], 2 * COLUMN[1]])
-        columns = [cv2.resize(picture_of(url), COLUMN, interpolation=cv2.INTER_AREA) for url in drawn]
+        columns = [np.asarray(cv2.resize(picture_of(url), COLUMN, interpolation=cv2.INTER_AREA), np.uint8) for url in drawn]
         gap = np.full((COLUMN[1], GAP, 3), 255, np.uint8)
-        frames.append(np.hstack([part for column in columns for part in (gap, column)][1:]))
+        frames.append(np.hstack([part for column in columns for part in (gap, column)][1:]).astype(np.uint8))
     write_video(output, iter([*frames, *frames[-2:0:-1]]), fps=10)
 
 

@@ -38,7 +38,7 @@ from ..style.look import Restyle
 from ..style.restyle import Styled, keyed_looks
 from ..style.scene_style import RegionWeight
 from ..training.loading import Trained
-from ..training.views import Part, view_parts
+from ..training.views import ViewChunk, view_chunks
 from ..types import Origin
 from .messages import Camera
 from .render_worker import Steps
@@ -113,7 +113,7 @@ def _mapped(colours: Tensor, memberships: Tensor, opacity: Tensor, shown: Shown)
 
 
 def _memberships(restyler: Restyler, semantic: Tensor) -> Annotated[Tensor, "N K"]:
-    style = restyler.encoders.scene
+    style = restyler.encoders.scene_style
     share: Tensor = RegionWeight(style, torch.eye(len(style.share))).to(semantic.device)(semantic.float())
     return share
 
@@ -152,7 +152,7 @@ class _Kept:
     """A client's last view."""
 
     camera: Camera
-    parts: dict[tuple[int, int], list[Part]] = field(default_factory=dict)
+    parts: dict[tuple[int, int], list[ViewChunk]] = field(default_factory=dict)
 
 
 class FieldPainter:
@@ -181,7 +181,7 @@ class FieldPainter:
             start, again = time.perf_counter(), size in kept.parts
             rows: list[Tensor] = []
             captured: list[Tensor] = []
-            parts: list[Part] = []
+            parts: list[ViewChunk] = []
             # Features are marched once; another look only decodes them again.
             for part in kept.parts[size] if again else self._parts(cameras_of([request.camera], size), 0):
                 rows.append(self._colours(part, styled, request.shown))
@@ -206,7 +206,7 @@ class FieldPainter:
             yield
 
     @torch.inference_mode()
-    def _colours(self, part: Part, styled: Styled | None, shown: Shown) -> Annotated[Tensor, "N 3"]:
+    def _colours(self, part: ViewChunk, styled: Styled | None, shown: Shown) -> Annotated[Tensor, "N 3"]:
         """A chunk as it is shown; of the map of depths, depth and opacity."""
         restyle, semantic = None if styled is None else styled.restyle, part.semantic
         if shown.map == "depth":
@@ -221,10 +221,10 @@ class FieldPainter:
             colours = _mapped(colours, memberships, opacity, shown)
         return colours
 
-    def _parts(self, cameras: Cameras, view: int) -> Iterable[Part]:
+    def _parts(self, cameras: Cameras, view: int) -> Iterable[ViewChunk]:
         trained = self._trained
         config = replace(trained.config.render, chunk=min(CHUNK, trained.config.render.chunk))
-        return view_parts(trained.model, trained.known.facts, cameras, view, config)
+        return view_chunks(trained.model, trained.known.facts, cameras, view, config)
 
     def frame(self, cameras: Cameras, view: int, look: Restyle | None) -> Generator[None, None, Picture]:
         """Render one frame of a film, step by step, and return it."""

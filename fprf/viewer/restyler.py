@@ -201,12 +201,12 @@ class Restyler:
         """Replace the scene, and with it its style; return the style from before, if there was one."""
         self.scene, self._stale = scene, True
         self._styles.clear()
-        return None if self._encoders is None else self._encoders.scene
+        return None if self._encoders is None else self._encoders.scene_style
 
     @property
     def regions(self) -> int:
         """Number of regions of the scene."""
-        return len(self.encoders.scene.share)
+        return len(self.encoders.scene_style.share)
 
     def encode(self, path: Path, name: str) -> Photograph:
         """Encode a photograph. Raises DataError for an unreadable one."""
@@ -243,12 +243,12 @@ class Restyler:
             raise UsageError(f"pixel {pixel[0]:.0f},{pixel[1]:.0f}: outside of the view of {width}x{height}")
         # The region of the pixel's strongest membership, by the features that the ray sees.
         place = torch.tensor([pixel], dtype=torch.float64)
-        share, opacity = memberships(self.scene, self.encoders.scene, cameras, 0, place)
+        share, opacity = memberships(self.scene, self.encoders.scene_style, cameras, 0, place)
         return int(share[0].argmax()) if float(opacity[0]) >= _SOLID else None
 
     def region_info(self, look: Look, region: int) -> RegionInfo:
         """Return the style that a region takes in a look."""
-        scene, styled = self.encoders.scene, self.styled(look)
+        scene, styled = self.encoders.scene_style, self.styled(look)
         taken: list[tuple[str, float]] = []
         if styled is not None:
             # What the region's key takes of each code, summed by photograph.

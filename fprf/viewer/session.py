@@ -288,7 +288,7 @@ class Session:
                 self._post(None, kind, message)
             # Regions are measured anew, in any order: what is pinned is found again among them.
             if before is not None and (self.state.look.rules or self.state.picked is not None):
-                regions = matching_regions(before, self.restyler.encoders.scene).tolist()
+                regions = matching_regions(before, self.restyler.encoders.scene_style).tolist()
                 self.apply(lambda state: replace(state, look=renumbered(state.look, regions), picked=None))
             if not self.state.look.plain:
                 self._refresh()
