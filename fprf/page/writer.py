@@ -105,7 +105,7 @@ def write_page(path: Path, page: Page, *, megabytes: float | None = None) -> int
     """Write the page to `path` (.html), whole or not at all; return how many Gaussians it shows.
 
     With `megabytes` (2^20 bytes), Gaussians that show least are left out until the file is no larger. Raises DataError where
-    pictures do not belong together, or where the page without any Gaussian is larger.
+    the page without any Gaussian is larger.
     """
     text, count = page_html(page, megabytes=megabytes, path=path)
     write_text(path, text)
@@ -114,7 +114,6 @@ def write_page(path: Path, page: Page, *, megabytes: float | None = None) -> int
 
 def page_html(page: Page, *, megabytes: float | None = None, path: Path = Path("page.html")) -> tuple[str, int]:
     """The text of a page that lies at `path`, and how many Gaussians it shows. Raises as `write_page`."""
-    _check(page)
     room = None if megabytes is None else int(megabytes * 2**20)
     film = "" if page.film is None else _film(page.film, path, _SMALL_FILM if room is None else min(_SMALL_FILM, room / 3))
     fixed = _text(page, film, None, {})
@@ -220,22 +219,6 @@ def _depth(scene: SplatScene, view: int) -> float:
     size = torch.tensor([camera.width, camera.height]).double()
     inside = (at[:, 2] > scene.near) & ((middle - size / 2).abs() < size / 3).all(1)
     return float(depth[inside].median()) if bool(inside.any()) else 1.0
-
-
-def _check(page: Page) -> None:
-    known = {reference.name for reference in page.references}
-    if not page.views:
-        raise DataError("page: no views; at least one")
-    for style in page.styles:
-        if not 0 < len(style.stills) <= len(page.views):
-            raise DataError(f"page: style {style.name} has {len(style.stills)} pictures of {len(page.views)} views")
-        if (style.harmonics is None) != (page.scene is None):
-            raise DataError(f"page: style {style.name} has harmonics, or the page a scene, but not both")
-        if style.shares and len(style.shares) != len(style.references):
-            raise DataError(f"page: style {style.name} has {len(style.shares)} shares of {len(style.references)} references")
-        for name in style.references:
-            if name not in known:
-                raise DataError(f"page: style {style.name} names reference {name}; known are {', '.join(sorted(known))}")
 
 
 def _text(page: Page, film: str, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]) -> str:

@@ -12,7 +12,7 @@ these very files, so the same command makes it again, at any size.
 import shutil
 import time
 from collections.abc import Callable, Generator, Hashable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, TypeAlias
 
@@ -131,37 +131,14 @@ def _match_colours(
     return torch.from_numpy(np.ascontiguousarray(picture)).float() / 255
 
 
-class Speed:
-    """Running mean of the seconds that a pixel takes."""
-
-    def __init__(self, guess: float) -> None:
-        self.seconds = guess
-
-    def update(self, pixels: int, seconds: float) -> None:
-        """Learn that a picture of so many pixels took so long."""
-        self.seconds += 0.3 * (seconds / pixels - self.seconds)
-
-    def first(self, sizes: list[tuple[int, int]]) -> int:
-        """Index of the finest of `sizes` (coarse to fine) that should take at most `FIRST_SECONDS`; at least 0."""
-        fits = [i for i, (width, height) in enumerate(sizes) if width * height * self.seconds <= FIRST_SECONDS]
-        return max(fits, default=0)
-
-
-@dataclass
-class _Kept:
-    """A client's last view."""
-
-    camera: Camera
-    parts: dict[tuple[int, int], list[ViewChunk]] = field(default_factory=dict)
-
-
 class FieldPainter:
     """Renders a field for clients; `show` receives a picture, of the look or as captured, and whether it is the last."""
 
     def __init__(self, trained: Trained, restyler: Restyler, show: Callable[[Hashable, str, Picture, bool], None]) -> None:
         self._trained, self._restyler, self._show = trained, restyler, show
-        self._views: dict[Hashable, _Kept] = {}
-        self._speed = Speed(1e-5)  # until something was measured
+        # Of each client's last view: its camera, and the sharpest size whose features were kept, with them.
+        self._views: dict[Hashable, tuple[Camera, tuple[int, int], list[ViewChunk]]] = {}
+        self._pixel_seconds = 1e-5  # a running mean, until something was measured a guess
 
     def forget(self, client: Hashable) -> None:
         """Drop what is kept for a client."""
@@ -169,31 +146,32 @@ class FieldPainter:
 
     def render(self, client: Hashable, request: Request) -> Steps:
         """Show ever sharper pictures, a step each chunk of rays."""
-        kept = self._views.get(client)
-        if kept is None or kept.camera != request.camera:
-            self._views[client] = kept = _Kept(request.camera)
-        # From the sharpest size whose features are kept, else from the finest that comes at once, up to the full one.
+        camera, ready, features = self._views.get(client, (None, None, []))
+        if camera != request.camera:
+            self._views.pop(client, None)
+            ready = None
         styled = self._restyler.styled(request.shown.look)
         full = cameras_of([request.camera], longest=request.longest)
         sizes = resolutions((int(full.size[0, 0]), int(full.size[0, 1])))
-        ready = [size for size in sizes if size in kept.parts]
-        for size in sizes[sizes.index(ready[-1]) if ready else self._speed.first(sizes) :]:
-            start, again = time.perf_counter(), size in kept.parts
+        # From the size whose features are kept, else from the finest that should come at once, up to the full one.
+        quick = [k for k, (width, height) in enumerate(sizes) if width * height * self._pixel_seconds <= FIRST_SECONDS]
+        for size in sizes[sizes.index(ready) if ready in sizes else max(quick, default=0) :]:
+            start, again = time.perf_counter(), size == ready
             rows: list[Tensor] = []
             captured: list[Tensor] = []
             parts: list[ViewChunk] = []
             # Features are marched once; another look only decodes them again.
-            for part in kept.parts[size] if again else self._parts(cameras_of([request.camera], size), 0):
+            for part in features if again else self._parts(cameras_of([request.camera], size), 0):
                 rows.append(self._colours(part, styled, request.shown))
                 if request.captured:
                     captured.append(part.colour(self._trained.model.decoder, None).cpu())
-                if not again:
-                    parts.append(part)
+                parts.append(part)
                 yield
             if not again:
-                self._speed.update(size[0] * size[1], time.perf_counter() - start)
-            if not again and sum(part.bytes for part in parts) <= CACHE_BYTES:
-                kept.parts = {size: parts}  # of the sharpest size that fits
+                seconds = (time.perf_counter() - start) / (size[0] * size[1])
+                self._pixel_seconds += 0.3 * (seconds - self._pixel_seconds)
+                if sum(part.bytes for part in parts) <= CACHE_BYTES:
+                    self._views[client] = (request.camera, size, parts)
             shape = (size[1], size[0])
             if request.shown.map == "depth":
                 depth, opacity = torch.cat(rows).view(*shape, 2).unbind(-1)
