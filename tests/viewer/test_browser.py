@@ -5,7 +5,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.resources import files
@@ -187,11 +186,10 @@ def test_training_is_shown_as_checkpoints_come_and_goes_on_without_its_viewer(
     if method == "fprf-splats":
         few = [*few[:4], "--steps", "1000000", "--passes", "1000000", "--initial", "300", "--cap", "400"]
     command = [sys.executable, "-m", "fprf", "train", method, *few, "--checkpoint-minutes", "0.05", "--view", "0"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        assert process.stdout is not None
         try:
-            address = next(line.split("live at ")[1].strip() for line in process.stderr if "live at" in line)
-            threading.Thread(target=process.stderr.read, daemon=True).start()
+            address = next(line.strip() for line in process.stdout if line.startswith("http://"))
             with front(address) as page:
                 first = page.evaluate("() => fprf.live.scene.step")
                 page.wait_for_function("(first) => fprf.live.scene.step > first", arg=first, timeout=120_000)
