@@ -26,14 +26,17 @@ from .plugins.registry import nearest
 from .plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from .rendering.cameras import Cameras
 from .rendering.paths import look_at, make_path, pinhole, upwards
+from .splats.captures import Captures, light_alone, open_captures
+from .splats.config import LookConfig
+from .splats.files import Capture, write_capture
+from .splats.gaussians import Gaussians
 from .style.config import StyleConfig, with_preset
 from .style.dictionary import Encoders
 from .style.files import StyleFile, check_photographs, read_style, with_folders, write_style
 from .style.look import Restyle
 from .style.match_maps import MatchMap, match_map
 from .style.restyle import Styled, apply_style, mixed
-from .training.loading import LoadedRun, open_run
-from .training.quality import Name, QualityConfig
+from .training.loading import LoadedRun
 
 PathLike = str | Path
 Split = Literal["train", "test", "all"]
@@ -88,7 +91,13 @@ class TrainedScene:
 
     def camera(self, view: int | str) -> Cameras:
         """One captured camera, by number or name. Raises UsageError where there is none."""
-        return self.cameras.select(torch.tensor([self._number(view)]))
+        if isinstance(view, str):
+            if view not in self.names:
+                raise UsageError(f"camera {view!r}: no such view{nearest(view, list(self.names))}; `names` lists them")
+            view = self.names.index(view)
+        if not 0 <= view < len(self.names):
+            raise UsageError(f"camera {view}: no such view; numbers go from 0 to {len(self.names) - 1}")
+        return self.cameras.select(torch.tensor([view]))
 
     def camera_at(
         self, position: Sequence[float], target: Sequence[float], *, fov: float = 60.0, width: int = 640, height: int = 480
@@ -188,6 +197,7 @@ class TrainedScene:
 
     def film(self, cameras: Cameras) -> Iterator[Shot]:
         """Views of many cameras, one after the other, each when it is asked for."""
+        # Cameras are the capture's; the scene is drawn about its origin, where float32 is fine enough.
         scene, cameras = self.trained.scene.restyled(self.restyle), self._local(cameras)
         for view in range(len(cameras)):
             made = scene.render(cameras, view)
@@ -218,17 +228,64 @@ class TrainedScene:
             raise UsageError(f"{what}: {len(one)} cameras; give one, or render them all with `film`")
         return one
 
-    def _number(self, view: int | str) -> int:
-        if isinstance(view, str):
-            if view not in self.names:
-                raise UsageError(f"camera {view!r}: no such view{nearest(view, list(self.names))}; `names` lists them")
-            return self.names.index(view)
-        if not 0 <= view < len(self.names):
-            raise UsageError(f"camera {view}: no such view; numbers go from 0 to {len(self.names) - 1}")
-        return view
 
+@dataclass(frozen=True, eq=False)
+class FinishedCapture:
+    """A finished capture of 3D Gaussians, as it was read or in a style. Make one with `fprf.read`."""
 
-def open_scene(run: PathLike, *, device: str = "auto", quality: Name | None = None) -> TrainedScene:
-    """A run folder as a scene: see `fprf.load`."""
-    trained = open_run(Path(run), device, QualityConfig(quality=quality))
-    return TrainedScene(trained, encoders=cache(trained.scene.encoders))
+    capture: Capture
+    """The file, with what it says beside the Gaussians."""
+    look: LookConfig
+    """How it is looked at before it is restyled."""
+    harmonics: Annotated[Tensor, "N K 3"] | None = None
+    """New ones of all Gaussians that can be drawn, or of all; None = as they were read."""
+    seen: Callable[[], Captures] | None = field(default=None, repr=False)
+    """Views and semantics, found at the first style and kept for the next."""
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The Gaussians as the file has them, about `capture.origin`; `.numpy()` of its tensors is the same memory."""
+        read = self.capture.gaussians
+        if self.harmonics is None:
+            return read
+        finite, new = read.finite, self.harmonics
+        return read.recoloured(new if len(new) == len(read) else read.harmonics.index_copy(0, finite.nonzero()[:, 0], new))
+
+    def restyled(
+        self,
+        references: Sequence[PathLike],
+        *,
+        weights: Sequence[float] = (),
+        strength: float = 1.0,
+        luminance: float = 0.0,
+        match_light: bool = False,
+        stylizer: StylizerConfig | None = None,
+    ) -> "FinishedCapture":
+        """The capture, as it was read, in the style of photographs; arguments as those of `fprf restyle`.
+
+        Raises UsageError for no references, DataError for unreadable photographs and where nothing can be seen.
+        """
+        seen = self.seen or cache(lambda: open_captures([self.capture.path], self.look, first=self.capture))
+        style = StyleConfig(
+            references=tuple(Path(path) for path in references),
+            weights=tuple(weights),
+            strength=strength,
+            luminance=luminance,
+            stylizer=RegionToneConfig(centred=False) if stylizer is None else stylizer,
+        )
+        styled = apply_style(seen().scene, StyleFile(with_folders(style)))
+        styled = light_alone(styled) if match_light else styled
+        return replace(self, harmonics=seen().harmonics(0, self.capture, styled.restyle), seen=seen)
+
+    def recoloured(self, harmonics: Annotated[Tensor, "N K 3"]) -> "FinishedCapture":
+        """The capture with harmonics of your own for all Gaussians. Raises DataError where they are of other shapes."""
+        return replace(self, harmonics=self.capture.gaussians.recoloured(harmonics).harmonics)
+
+    def write(self, path: PathLike) -> list[str]:
+        """Write a file, whole or not at all; its ending says the format. Returns what the format does not hold, as phrases.
+
+        In the format that was read everything but colours stays as it was, bit for bit.
+        """
+        harmonics = self.capture.gaussians.harmonics if self.harmonics is None else self.harmonics
+        views = None if self.seen is None else self.seen().scene.views
+        return write_capture(Path(path), self.capture, harmonics, views).losses()

@@ -19,7 +19,7 @@ class ExportConfig(StyleConfig):
     run: Path = Path()
     """Run folder."""
     kinds: tuple[str, ...] = ()
-    """Kinds of files; the same as words behind the run. None = ply splat glb cameras, and lut where there are styles."""
+    """Kinds of files; none named = ply splat glb cameras, and lut where there are styles."""
     output: Path | None = None
     """A folder, or a single file, whose ending says the kind; by default RUN/exports."""
     style: Path | None = None
@@ -101,7 +101,7 @@ def plan(kinds: Sequence[str], output: Path) -> Plan:
 
     Raises UsageError for what does not fit.
     """
-    formats = [ending[1:] for ending in endings()]
+    formats = [ending[1:] for ending in endings() if ending[1:] not in KINDS]
     wanted: list[str] = []
     for kind in kinds:
         if kind not in (*formats, *KINDS, *_ALSO, "splats"):

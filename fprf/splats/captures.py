@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from ..errors import DataError, UsageError
+from ..interfaces import Scene
 from ..io.images import to_uint8, write_image
 from ..style.look import ColourMaps, Restyle
 from ..style.restyle import Styled
@@ -74,6 +75,7 @@ def open_captures(
     paths: Sequence[Path],
     look: LookConfig,
     *,
+    first: Capture | None = None,
     sample: int = SAMPLE,
     cache: Path | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -81,9 +83,10 @@ def open_captures(
 ) -> Captures:
     """Read captures and see them as one scene; arguments as those of `open_capture`.
 
-    Of several captures each gives a like share of the sample. Raises DataError where nothing can be seen.
+    Of several captures each gives a like share of the sample. `first` is the first one, where it was read already. Raises
+    DataError where nothing can be seen.
     """
-    first = read_capture(paths[0])
+    first = first or read_capture(paths[0])
     if len(paths) == 1 and len(first.gaussians) <= sample:
         scene = open_capture(first, look, cache=cache, progress=progress, say=say)
         return Captures(scene, (slice(0, len(scene.gaussians)),), (torch.zeros(3),), first)
@@ -156,41 +159,38 @@ def _joined(parts: Sequence[Gaussians]) -> Gaussians:
 def light_alone(styled: Styled) -> Styled:
     """A style as its exposure and white balance alone: one gain a channel, in linear light, for the whole scene.
 
-    It is the median over regions, by their share, of what takes their mean colour to that of what they match; what a region is
-    made of plays no part where both sides show the same things. Raises UsageError for stylizers that carry no colours.
+    It takes the scene's mean colour, of logarithms, to that of the references. Of one place, both are of the same materials.
     """
-    look, style = styled.restyle, styled.scene
-    if look.colours is None:
-        raise UsageError("--match-light: needs a stylizer that carries colours, such as --stylizer region-tone")
-    mean = style.region_mean.double()
+    style, dictionary, regions = styled.scene_style, styled.dictionary, len(styled.scene_style.keys)
+    if dictionary.colour_mean is None:
+        raise UsageError("--match-light: the style has no colours of photographs; name references")
     # sRGB is a power of linear light but for the black end: a gain is a factor of colours plus 0.055.
-    matched = mean + mean[:, None].matmul(look.colours.matrix.double())[:, 0] + look.colours.bias.double()
-    ratio = ((matched.clamp(0, 1) + _BLACK) / (mean.clamp(0, 1) + _BLACK)).log()
-    order = ratio.argsort(0)
-    half = style.share.double()[order].cumsum(0) >= 0.5 * float(style.share.sum())
-    gain = ratio.gather(0, order).gather(0, half.long().argmax(0, keepdim=True))[0].exp()
-    matrix = gain.diag().expand(len(mean), 3, 3)
-    maps = ColourMaps(style, matrix, (_BLACK * (gain - 1)).expand(len(mean), 3), 1.0)
-    return styled._replace(restyle=replace(look, colours=maps, light=None, places=()))
+    sides = ((style.region_mean, style.share), (dictionary.colour_mean, dictionary.share))
+    before, after = (
+        (share.double() / share.double().sum()) @ (colour.double().clamp(0, 1) + _BLACK).log() for colour, share in sides
+    )
+    gain = (after - before).exp()
+    maps = ColourMaps(style, gain.diag().expand(regions, 3, 3), (_BLACK * (gain - 1)).expand(regions, 3), 1.0)
+    return styled._replace(restyle=replace(styled.restyle, colours=maps, light=None, places=()))
 
 
 def reference_views(
-    path: Path, look: LookConfig, folder: Path, *, views: int = 12
+    path: Path, look: LookConfig, folder: Path, *, views: int = 16
 ) -> tuple[tuple[Path, ...], tuple[Path, ...], tuple[float, ...]]:
     """Write pictures of views of a capture or of a run into a folder: in the place of photographs, as references.
 
     Returns them, masks of what they show, and the shares of them that show anything. Raises DataError where none does.
     """
     if (path / "config.json").is_file():
-        scene = open_run(path, device="cpu").scene
-        chosen = torch.linspace(0, len(scene.names) - 1, min(views, len(scene.names))).round().long()
-        cameras = scene.cameras.select(chosen)
+        scene: Scene = open_run(path, device="cpu").scene
     else:
         capture, encoder = read_capture(path), look.semantic.encoder.build()
         gaussians = sampled(capture.gaussians.drawable(), SAMPLE)
-        look = replace(look, views=views, size=_VIEW, up=look.up or capture.up)
+        # As many views as a capture that takes the style is looked at from: of one place both show alike shares.
+        look = replace(look, size=_VIEW, up=look.up or capture.up)
         scene = look_at_capture(gaussians, capture.antialiased, encoder, look, camera=capture.camera)
-        cameras = scene.cameras
+    chosen = torch.linspace(0, len(scene.names) - 1, min(views, len(scene.names))).round().long()
+    cameras = scene.cameras.select(chosen)
     pictures, masks, weights = list[Path](), list[Path](), list[float]()
     for view in range(len(cameras)):
         shown = scene.render(cameras, view)

@@ -10,10 +10,11 @@ from pathlib import Path
 
 import cv2
 import pytest
+from splat_ball import ball
 from tiny_world import World
 
 from fprf.methods import fprf_splats
-from fprf.splats.files import read_capture
+from fprf.splats.files import read_capture, write_gaussians
 from fprf.training.driver import train
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -28,6 +29,7 @@ def test_the_page_runs(
     os.symlink(world.run, tmp_path / "runs" / "town-fprf-lite")
     for name, reference in zip(("autumn.jpg", "night.jpg"), world.references, strict=True):
         cv2.imwrite(name, cv2.imread(str(reference)))
+    write_gaussians(Path("scan.ply"), ball(200))
     names: dict[str, object] = {}
     for block in re.findall(r"^```python\n(.*?)^```", PAGE.read_text("utf-8"), re.DOTALL | re.MULTILINE):
         exec(compile(block, str(PAGE), "exec"), names)
@@ -35,6 +37,9 @@ def test_the_page_runs(
     assert "torch.Size([120, 160, 3])" in told and "'autumn.jpg'" in told and "'night.jpg'" in told
     made = {path.name for path in tmp_path.iterdir()}
     assert {"autumn.png", "film.mp4", "mine.json", "between-0.png", "between-2.png"} <= made
+    assert "(200, 3) True" in told
+    scans = [f"scan{name}" for name in ("_autumn.spz", "-0.5.ply", "-1.0.ply", "_night.splat", "_grey.ply", ".glb")]
+    assert all(len(read_capture(Path(name)).gaussians) == 200 for name in scans)
 
 
 def cells(kind: str) -> list[str]:
