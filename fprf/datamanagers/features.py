@@ -206,11 +206,9 @@ class FeatureStore:
             raise DataError(f"feature store: view {int(missing.min())} has no features; {len(self._coefs)} training views have")
         positions, colours = (x.detach().cpu().float().contiguous() for x in (pixel, rgb))
         out = torch.empty(len(view), self.channels)
-        table = (self._address, self._shape, self._scale, self._centre)
-        kernels.gather(
-            slot.numpy(), *(part.numpy() for part in table), self._coefs[0].shape[3],
-            positions.numpy(), (colours - GREY).numpy(), out.numpy(),
-        )  # fmt: skip
+        tensors = slot, self._address, self._shape, self._scale, self._centre, positions, colours - GREY, out
+        slots, address, shape, scale, centre, places, offsets, found = (part.numpy() for part in tensors)
+        kernels.gather(slots, address, shape, scale, centre, self._coefs[0].shape[3], places, offsets, found)
         return out.to(view.device)
 
 
