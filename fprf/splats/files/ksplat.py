@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from ...errors import DataError
 from ...plugins.captures import CaptureFormat, Data
 from ..gaussians import COUNTS
-from .base import Capture, Floats, constants_of, decoded, logit, short
+from . import base
+from .base import Capture, Floats
 
 _HEADER, _SECTION = struct.Struct("<BBxxII4xIHxx12xff"), struct.Struct("<IIIIfHxxI4xIIH")
 _HEADER_SIZE, _SECTION_SIZE = 4096, 1024
@@ -46,7 +47,7 @@ class Ksplat(CaptureFormat):
             raise DataError(f"{path}: a .ksplat of compression {compression}; 0, 1 and 2 can be read")
         start, sections, degrees, total_read = _HEADER_SIZE + most * _SECTION_SIZE, [], set[int](), 0
         if start > len(data):
-            raise short(path, len(data), start, f"{most} headers of sections")
+            raise base.short(path, len(data), start, f"{most} headers of sections")
         decode = partial(_decoded, limits=(low or _LIMITS[0], high or _LIMITS[1]))
         for k in range(most):
             section = _SECTION.unpack_from(data, _HEADER_SIZE + k * _SECTION_SIZE)
@@ -58,7 +59,7 @@ class Ksplat(CaptureFormat):
             shape = [("mean", first, 3), ("deviation", half, 3), ("turn", half, 4), ("rgba", "u1", 4)]
             record = np.dtype([*shape, ("rest", "u1" if compression == 2 else half, 3 * (COUNTS[degree] - 1))])
             if body + record.itemsize * count > len(data):
-                raise short(path, len(data), body + record.itemsize * count, f"section {k} of {count} Gaussians")
+                raise base.short(path, len(data), body + record.itemsize * count, f"section {k} of {count} Gaussians")
             table, centres, factor = np.frombuffer(data, record, count, body), None, 0.0
             if compression and count:
                 # Full buckets come first; the others say how many Gaussians they have.
@@ -79,7 +80,7 @@ class Ksplat(CaptureFormat):
             raise DataError(
                 f"{path}: sections of {total_read} Gaussians and degrees {sorted(degrees)}; the header says {total}"
             )
-        gaussians, shift = decoded(COUNTS[degrees.pop()], *sections)
+        gaussians, shift = base.decoded(COUNTS[degrees.pop()], *sections)
         return Capture(path, gaussians, False, data, lambda harmonics, changed: (), shift=shift)
 
 
@@ -95,6 +96,6 @@ def _decoded(
         rest = limits[0] + rest / 255 * (limits[1] - limits[0])
     # Degree by degree, in each channel by channel.
     bands = [each.reshape(len(some), 3, -1).transpose(0, 2, 1) for each in (rest[:, :9], rest[:, 9:]) if each.shape[1]]
-    harmonics = np.concatenate([constants_of(share[:, :3]), *bands], 1)
+    harmonics = np.concatenate([base.constants_of(share[:, :3]), *bands], 1)
     scales = np.log(np.maximum(some["deviation"].astype(np.float64), _LEAST))
-    return means, some["turn"], scales, logit(share[:, 3]), harmonics
+    return means, some["turn"], scales, base.logit(share[:, 3]), harmonics

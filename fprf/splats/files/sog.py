@@ -30,22 +30,8 @@ from ...io.atomic import write_bytes
 from ...plugins.captures import CaptureFormat, Data
 from ...types import Origin
 from ..gaussians import COUNTS, Gaussians
-from .base import (
-    Bools,
-    Capture,
-    Floats,
-    arrays,
-    decoded,
-    finite,
-    logit,
-    precise,
-    shares,
-    sigmoid,
-    smallest_three,
-    spatial_order,
-    steps,
-    three_to_four,
-)
+from . import base
+from .base import Bools, Capture, Floats
 
 _Bytes: TypeAlias = NDArray[np.uint8]
 _LEVELS = 256
@@ -85,22 +71,22 @@ class Sog(CaptureFormat):
         count = pictures.count
         low, high = (pictures.rows("means", i)[:, :3] for i in (0, 1))
         least, most = pictures.numbers("means", "mins", 3), pictures.numbers("means", "maxs", 3)
-        turn, scale, base = pictures.rows("quats", 0), pictures.rows("scales", 0), pictures.rows("sh0", 0)
+        turn, scale, tint = pictures.rows("quats", 0), pictures.rows("scales", 0), pictures.rows("sh0", 0)
         labels, rest = pictures.palette()
 
         def part(rows: slice) -> tuple[Floats, ...]:
             bent = least + (high[rows].astype(np.int64) << 8 | low[rows]) / 65535 * (most - least)
             tag = turn[rows, 3].astype(np.int64) - 252
-            quaternions = three_to_four(np.clip(tag, 0, 3), turn[rows, :3] / 255 * 2 - 1)
+            quaternions = base.three_to_four(np.clip(tag, 0, 3), turn[rows, :3] / 255 * 2 - 1)
             quaternions[tag < 0] = (1, 0, 0, 0)
             scales = pictures.decoded("scales", scale[rows, :3], 3)
             if flat:
                 scales[:, 2] = -np.inf
             # The alpha of sh0: opacities as they are, or, in version 1, logits of a range of their own.
             if version == 2:
-                constants, logits = pictures.decoded("sh0", base[rows, :3], 3), logit(base[rows, 3] / 255)
+                constants, logits = pictures.decoded("sh0", tint[rows, :3], 3), base.logit(tint[rows, 3] / 255)
             else:
-                constants, logits = np.split(pictures.decoded("sh0", base[rows], 4), [3], 1)
+                constants, logits = np.split(pictures.decoded("sh0", tint[rows], 4), [3], 1)
             harmonics = np.concatenate([constants[:, None], rest[labels[rows]]], 1) if len(rest) else constants[:, None]
             means = np.sign(bent) * np.expm1(np.minimum(np.abs(bent), 80))
             return means, quaternions, scales, logits.reshape(-1), harmonics
@@ -122,7 +108,7 @@ class Sog(CaptureFormat):
             return [bundle(files | {folder + name: content for name, content in new.items()}, like=data)]
 
         antialiased = meta.get("antialias") is True or meta.get("model") == "antialiased"
-        gaussians, shift = decoded(1 + rest.shape[1], (count, part))
+        gaussians, shift = base.decoded(1 + rest.shape[1], (count, part))
         return Capture(path, gaussians, antialiased, data, recolour, shift=shift)
 
     def keeps(self, gaussians: Gaussians) -> Bools:
@@ -132,28 +118,28 @@ class Sog(CaptureFormat):
             ends = [_bent(kept.min(0)), _bent(kept.max(0))]
             return float(((ends[1] - ends[0]) / 65535 * (1 + np.abs(inner).max(0))).max())
 
-        return precise(gaussians.means.numpy().astype(np.float64), step, _PRECISION)
+        return base.precise(gaussians.means.numpy().astype(np.float64), step, _PRECISION)
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
         """A bundled file of version 2. Gaussians are put in spatial order, by which the images shrink."""
-        gaussians = gaussians.select(torch.from_numpy(spatial_order(gaussians.means.numpy())))
-        means, turns, log_scales, logits, harmonics = arrays(gaussians)
+        gaussians = gaussians.select(torch.from_numpy(base.spatial_order(gaussians.means.numpy())))
+        means, turns, log_scales, logits, harmonics = base.arrays(gaussians)
         count = len(means)
         width = -(-int(np.ceil(count**0.5)) // 4) * 4
         shape = (-(-count // max(width, 1)), width)
         bent = _bent(means.astype(np.float64))
         least, most = bent.min(0), bent.max(0)
-        at = steps(shares(bent, least, most), 65535)
-        largest, three = smallest_three(turns)
-        opacity = steps(sigmoid(logits), 255)
+        at = base.steps(base.shares(bent, least, most), 65535)
+        largest, three = base.smallest_three(turns)
+        opacity = base.steps(base.sigmoid(logits), 255)
         scale, scales = _quantized(log_scales.clip(-20, 20), {"files": ["scales.webp"], "codebook": []})
-        base, sh0 = _quantized(harmonics[:, 0], {"files": ["sh0.webp"], "codebook": []})
+        tint, sh0 = _quantized(harmonics[:, 0], {"files": ["sh0.webp"], "codebook": []})
         pictures = {
             "means_l.webp": _picture(at & 255, shape),
             "means_u.webp": _picture(at >> 8, shape),
-            "quats.webp": _picture(np.concatenate([steps(three / 2 + 0.5, 255), largest[:, None] + 252], 1), shape),
+            "quats.webp": _picture(np.concatenate([base.steps(three / 2 + 0.5, 255), largest[:, None] + 252], 1), shape),
             "scales.webp": _picture(scale, shape),
-            "sh0.webp": _picture(np.concatenate([base, opacity[:, None]], 1), shape),
+            "sh0.webp": _picture(np.concatenate([tint, opacity[:, None]], 1), shape),
         }
         meta: dict[str, Any] = {
             "version": 2,
@@ -381,7 +367,7 @@ def _palette_picture(index: NDArray[np.integer[Any]]) -> _Bytes:
 
 def _quantized(values: Floats, about: Mapping[str, Any]) -> tuple[NDArray[np.int64], dict[str, Any]]:
     """Values [... 3] as bytes, and what meta.json says of them: a new codebook, or new ranges (version 1)."""
-    said, values = dict(about), finite(values)
+    said, values = dict(about), base.finite(values)
     if "codebook" in said:
         book = _codebook(values.ravel())
         said["codebook"] = book.tolist()
@@ -389,7 +375,7 @@ def _quantized(values: Floats, about: Mapping[str, Any]) -> tuple[NDArray[np.int
     whole = isinstance(said["mins"], (int, float))
     axes = tuple(range(values.ndim)) if whole else tuple(range(values.ndim - 1))
     low, high = values.min(axes), values.max(axes)
-    index = steps(shares(values, low, high), 255)
+    index = base.steps(base.shares(values, low, high), 255)
     if whole:
         return index, said | {"mins": float(low), "maxs": float(high)}
     return index, said | {"mins": [*low.tolist(), *said["mins"][3:]], "maxs": [*high.tolist(), *said["maxs"][3:]]}
