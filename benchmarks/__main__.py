@@ -68,7 +68,6 @@ BENCHMARKS = {
         "{town}/images --cameras {town}/transforms.json --plain {town}/images --depth {town}/depth --truth {town}/images",
         "a folder of frames and their cameras",
     ),
-    "profiling": Benchmark("where the time of a training step and of a view goes", f"{_RUN} --operators 3", _TRAINED),
     "restyle": Benchmark(
         "every stylizer against the truth: a town in the light of other towns",
         "{run} --views 1 --longest 48 --palettes night --missing sky --clusters 4 --device cpu",

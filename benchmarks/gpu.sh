@@ -79,7 +79,6 @@ step tests 150 "$python" -m pytest "${tests[@]}"
 step train "$whole" "${fprf[@]}" train "$method" "${data[@]}" "${time[@]}" --device "$device" --output "$work/run" "$@"
 step eval 40 "${fprf[@]}" eval "$work/run" --no-images --device "$device"
 step speed 130 "$python" -m benchmarks speed "$work/run" "${size[@]}" "${points[@]}" --device "$device" --output "$work/speed.json"
-step profile 40 "$python" -m benchmarks profiling "$work/run" "${size[@]}" --device "$device" --operators 15 --output "$work/profile.json"
 if [ "$long" != 0 ]; then
     step train-long 7200 "${fprf[@]}" train "$method" "${data[@]}" "${again[@]}" --device "$device" --output "$work/long" "$@"
     step eval-long 60 "${fprf[@]}" eval "$work/long" --no-images --device "$device"

@@ -1,9 +1,9 @@
-"""What `gpu.sh` measured, as one JSON: its steps, rows with their goals, and the profile that explains them.
+"""What `gpu.sh` measured, as one JSON: its steps, and rows with their goals.
 
     python -m benchmarks.gpu_rows WORK --output FILE
 
-WORK holds steps.jsonl, a log of each step and, as far as the steps came, run/metrics.json, speed.json,
-profile.json and long/metrics.json. Rows of what is missing are left out. The exit status is 1 where a step failed.
+WORK holds steps.jsonl, a log of each step and, as far as the steps came, run/metrics.json, speed.json
+and long/metrics.json. Rows of what is missing are left out. The exit status is 1 where a step failed.
 """
 
 import argparse
@@ -92,11 +92,11 @@ def main() -> int:
     parser.add_argument("--output", type=Path, required=True)
     options = parser.parse_args()
     work, gone = options.work, steps(options.work)
-    speed, profile = read(work / "speed.json") or {}, read(work / "profile.json") or {}
+    speed = read(work / "speed.json") or {}
     device = torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
     form = kernels(device)
     found = list(rows(work, form))
-    extra = {"steps": gone, "speed": speed.get("rows"), "counters": speed.get("counters"), "profile": profile.get("parts")}
+    extra = {"steps": gone, "speed": speed.get("rows"), "counters": speed.get("counters")}
     settings = speed.get("settings", {}) | {"tri_planes": form}
     write_json(options.output, document("gpu", found, device=device, settings=settings, extra=extra))
     console = Console(highlight=False, width=120)

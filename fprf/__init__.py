@@ -18,9 +18,15 @@ def load(
     `device` is cpu, cuda, mps or auto; `quality` trades time for error as in `fprf render`. Raises CheckpointError where
     `run` is no run folder or holds no checkpoint.
     """
-    from .api import open_scene  # torch is imported when a scene is
+    # torch is imported when a scene is
+    from functools import cache
 
-    return open_scene(run, device=device, quality=quality)
+    from .api import TrainedScene
+    from .training.loading import open_run
+    from .training.quality import QualityConfig
+
+    trained = open_run(Path(run), device, QualityConfig(quality=quality))
+    return TrainedScene(trained, encoders=cache(trained.scene.encoders))
 
 
 def read(

@@ -36,8 +36,7 @@ from .style.files import StyleFile, check_photographs, read_style, with_folders,
 from .style.look import Restyle
 from .style.match_maps import MatchMap, match_map
 from .style.restyle import Styled, apply_style, mixed
-from .training.loading import LoadedRun, open_run
-from .training.quality import Name, QualityConfig
+from .training.loading import LoadedRun
 
 PathLike = str | Path
 Split = Literal["train", "test", "all"]
@@ -92,7 +91,13 @@ class TrainedScene:
 
     def camera(self, view: int | str) -> Cameras:
         """One captured camera, by number or name. Raises UsageError where there is none."""
-        return self.cameras.select(torch.tensor([self._number(view)]))
+        if isinstance(view, str):
+            if view not in self.names:
+                raise UsageError(f"camera {view!r}: no such view{nearest(view, list(self.names))}; `names` lists them")
+            view = self.names.index(view)
+        if not 0 <= view < len(self.names):
+            raise UsageError(f"camera {view}: no such view; numbers go from 0 to {len(self.names) - 1}")
+        return self.cameras.select(torch.tensor([view]))
 
     def camera_at(
         self, position: Sequence[float], target: Sequence[float], *, fov: float = 60.0, width: int = 640, height: int = 480
@@ -192,6 +197,7 @@ class TrainedScene:
 
     def film(self, cameras: Cameras) -> Iterator[Shot]:
         """Views of many cameras, one after the other, each when it is asked for."""
+        # Cameras are the capture's; the scene is drawn about its origin, where float32 is fine enough.
         scene, cameras = self.trained.scene.restyled(self.restyle), self._local(cameras)
         for view in range(len(cameras)):
             made = scene.render(cameras, view)
@@ -221,21 +227,6 @@ class TrainedScene:
         if len(one) != 1:
             raise UsageError(f"{what}: {len(one)} cameras; give one, or render them all with `film`")
         return one
-
-    def _number(self, view: int | str) -> int:
-        if isinstance(view, str):
-            if view not in self.names:
-                raise UsageError(f"camera {view!r}: no such view{nearest(view, list(self.names))}; `names` lists them")
-            return self.names.index(view)
-        if not 0 <= view < len(self.names):
-            raise UsageError(f"camera {view}: no such view; numbers go from 0 to {len(self.names) - 1}")
-        return view
-
-
-def open_scene(run: PathLike, *, device: str = "auto", quality: Name | None = None) -> TrainedScene:
-    """A run folder as a scene: see `fprf.load`."""
-    trained = open_run(Path(run), device, QualityConfig(quality=quality))
-    return TrainedScene(trained, encoders=cache(trained.scene.encoders))
 
 
 @dataclass(frozen=True, eq=False)

@@ -92,18 +92,28 @@ def free_memory(device: "torch.device") -> int | None:
 
 def shortage(what: str, error: BaseException, remedy: str) -> OutOfMemoryError:
     """One line: what was going on, what it took, what there is, and what to do."""
-    more, card = wanted(error), _GPU.search(str(error))
+    more, held, card = wanted(error), peak(), _GPU.search(str(error))
     if card is not None:  # what the process and the machine have says nothing of it
-        asked = "" if more is None else f", {_told(more)} more were wanted"
+        asked = "" if more is None else f", {more / _GIB:.2f} GiB more were wanted"
         return OutOfMemoryError(f"{what}: not enough memory{asked} ({card[0]}); {remedy}")
-    asked = "" if more is None else f" and wanted {_told(more)} more"
-    held = peak()
-    took = "" if held is None else f"; the process held up to {_told(held)}{asked}"
-    return OutOfMemoryError(f"{what}: not enough memory{took}{_limits()}; {remedy}")
+    asked = "" if more is None else f" and wanted {more / _GIB:.2f} GiB more"
+    took = "" if held is None else f"; the process held up to {held / _GIB:.2f} GiB{asked}"
+    # Free memory and the process's limit, as far as the system tells.
+    limits = []
+    try:
+        available = re.search(r"MemAvailable:\s+(\d+)", Path("/proc/meminfo").read_text())
+        if available:
+            limits.append(f"{int(available[1]) * 1024 / _GIB:.2f} GiB are free on this machine")
+    except OSError:
+        pass
+    if os.name == "posix":
+        import resource
 
-
-def _told(count: float) -> str:
-    return f"{count / _GIB:.2f} GiB"
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit != resource.RLIM_INFINITY:
+            limits.append(f"{limit / _GIB:.2f} GiB of addresses are allowed")
+    known = f" ({', '.join(limits)})" if limits else ""
+    return OutOfMemoryError(f"{what}: not enough memory{took}{known}; {remedy}")
 
 
 def peak() -> int | None:
@@ -114,21 +124,3 @@ def peak() -> int | None:
         return None
     kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return kib if sys.platform == "darwin" else kib * 1024
-
-
-def _limits() -> str:
-    """Free memory and the process's limit, as far as the system tells."""
-    parts = []
-    try:
-        available = re.search(r"MemAvailable:\s+(\d+)", Path("/proc/meminfo").read_text())
-        if available:
-            parts.append(f"{_told(int(available[1]) * 1024)} are free on this machine")
-    except OSError:
-        pass
-    if os.name == "posix":
-        import resource
-
-        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-        if limit != resource.RLIM_INFINITY:
-            parts.append(f"{_told(limit)} of addresses are allowed")
-    return f" ({', '.join(parts)})" if parts else ""

@@ -24,14 +24,14 @@ LEAD = (
     "Trained on a CPU from 25 photographs. Each look is then taken from one picture, without training, and is the same "
     "from every viewpoint."
 )
+_NICE = 10
+"""Lowered priority of what compiles beside the training."""
 LOOKS = ("winter", "night", "sunset", "autumn")
 """References, in the order in which they are shown."""
 CREDITS = (
     "Photographs of the garden: The SfM Tool Authors (sfmtool/sfmtool, test-data), Apache-2.0; reduced and re-encoded.",
     "Autumn and sunset: Aitzol Berasategi, CC BY 4.0; reduced. Winter and night: pictures of fprf's own towns.",
 )
-_NICE = 10
-"""Added to the niceness of the process that compiles beside training."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +78,8 @@ def run(args: list[str]) -> int:
     garden = Path(str(files("fprf") / "garden"))
     output = config.output / "run"
     training = replace(fprf_splats(), data=garden, downscale=config.downscale, output=output, minutes=config.minutes)
-    with compiling():  # waited for at the end
+    # Training ends with its minutes, whoever else computes; a style is then timed without the compilation.
+    with compiling():
         root = train(training, "fprf-splats")
         metrics = evaluate(EvalConfig(run=root, images=False))
     opened = open_gaussians(Run(root), training, "cpu", QualityConfig())
@@ -105,6 +106,7 @@ def run(args: list[str]) -> int:
         film = film.with_suffix(".webp")
         write_video(film, frames, fps=12)
     figures: list[dict[str, Any]] = [dict(style.metrics) for style, _ in styles]
+    # Of the single styles: the one of all together encodes nothing anew.
     metrics |= {
         "looked_seconds": looked,
         "new_style_seconds": fmean(each["new_style_seconds"] for each in figures[: len(LOOKS)]),

@@ -14,16 +14,13 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
-
-from rich.console import Console
-from rich.markup import escape
 
 from .. import __version__
 from ..errors import CheckpointError, ConfigError
 from ..plugins import registry
 from ..plugins.codec import Missing
 from ..plugins.slots import slots
+from .findings import Finding, show
 from .parsing import parse
 
 _MIB = 1 << 20
@@ -37,17 +34,6 @@ _CACHES = (
     (".cache/huggingface/hub", "models--facebook--dino*"),
 )
 """Folders in the user's home, and files in them, where downloaded weights lie."""
-
-
-class Finding(NamedTuple):
-    """One line of the report."""
-
-    what: str
-    found: str
-    remedy: str = ""
-    """The one command or act that mends it; empty where nothing is wrong."""
-    optional: bool = False
-    """Everything else works without it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,14 +82,7 @@ def run(args: list[str]) -> int:
         from .doctor_scene import scene_folder
 
         findings = scene_folder(target)
-    console, bad = Console(highlight=False), False
-    for finding in findings:
-        mark = "[green]ok[/]      " if not finding.remedy else "[yellow]optional[/]" if finding.optional else "[red]problem[/] "
-        bad |= bool(finding.remedy) and not finding.optional
-        console.print(f"{mark}  [bold]{escape(finding.what):<14}[/] {escape(finding.found)}", soft_wrap=True)
-        if finding.remedy:
-            console.print(f"{'':<26} → {escape(finding.remedy)}", soft_wrap=True)
-    return int(bad)
+    return int(show(findings))
 
 
 def machine() -> Iterator[Finding]:

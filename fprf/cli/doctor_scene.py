@@ -21,7 +21,7 @@ from ..datamanagers.parsers.config import DataParserConfig, parse_scene, recogni
 from ..datamanagers.scene import Scene, exposures_differ, find_sightings, sparser, with_exposure
 from ..errors import DataError
 from ..plugins import registry
-from .doctor import Finding
+from .findings import Finding
 
 LOOKED = 48
 """Views whose files are opened."""

@@ -86,6 +86,7 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
     captured = replace(captured, cameras=captured.cameras.scaled(longest / wanted) if wanted < longest else captured.cameras)
     known = replace(known, cameras=known.cameras.resized(captured.cameras.size))
     views, fitted = known.views(config.split), {}
+    # Poses of held-out views were never refined with the scene: they may be fitted to it, which changes no colour of it.
     with Display() as display:
         if config.fit_poses:
             moves = scene.fit_poses(captured, views, display.count)
@@ -129,6 +130,7 @@ def write_scalars(folder: Path, histories: "Sequence[History]") -> int:
         place = folder / (history.name or "training")
         shutil.rmtree(place, ignore_errors=True)
         writer = SummaryWriter(str(place))
+        # A figure that a step did not measure leaves a gap in its curve.
         try:
             for name, values in history.values.items():
                 for step, seconds, value in zip(history.step, history.seconds, values, strict=True):

@@ -44,6 +44,7 @@ def run(args: list[str]) -> int:
     for name in names:
         if names.count(name) > 1:
             raise UsageError(f"--styles {name}: two styles of this name; give each its own")
+    # Tables are a way into a style; where nobody asked for them they are left out without a word.
     if "lut" in what.kinds and not styles and (config.kinds or what.single):
         raise UsageError("fprf export: a lut is the way into a style; name one with --references, --style or --styles")
     if what.single is not None and len(styles) > 1:
@@ -124,6 +125,7 @@ class _Export:
         from ..splats.files import Written, write_gaussians, write_ply_parts
         from ..training.checkpoint import digest
 
+        # The key names what a file was made from: the checkpoint, the style, the frame.
         config, scene, paths, losses, count = self.config, self.opened.scene, [], dict[str, None](), 0
         own = scene.gaussian_rows() is not None
         if not self.what.formats:
@@ -206,6 +208,7 @@ class _Export:
         for view, file in enumerate(files if self.config.images else ()):
             self.display.count(view, len(files), "rendering views")
             write_image(self.what.folder / file, to_uint8(scene.render(scene.cameras, view).rgb))
+        # Poses in the capture's coordinates, or about the origin with an offset file beside them.
         added, beside = added_and_beside(scene.origin, self.config.local)
         path = self.what.single or self.what.folder / "transforms.json"
         write_json(path, transforms(scene.cameras.shifted(added), files, train=known.train, test=known.test))

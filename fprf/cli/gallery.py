@@ -100,6 +100,7 @@ def run(args: list[str]) -> int:
             film = output.with_suffix(".mp4")
             flight = make_path(known.cameras, known.split("all"), config.path, config.frames, scene.origin)
             write_video(film, fading([styles[-1][1]], flight, display), fps=24)
+    # Figures of `fprf eval`, where it has run, without those of single views.
     measured: Any = {}
     if (path := config.run / "metrics.json").is_file():
         measured = read_json(path, "the metrics.json of `fprf eval`")
@@ -210,6 +211,7 @@ def page_styles(
     from ..style.match_maps import match_map, match_picture, summarize
     from ..style.restyle import apply_style
 
+    # Encoders are loaded once, and photographs encoded once, for all styles.
     encoders, made = scene.encoders(), []
     encoded: dict[tuple[Path, Path], Reference] = {}
     reduced = scene.cameras.scaled(_REDUCED)

@@ -82,14 +82,14 @@ def spell(args: Sequence[str], flags: dict[str, Flag]) -> list[str]:
         flag = flags.get(_dashed(key))
         opposite = flags.get(re.sub(r"(^--|\.)no-(?=[^.]*$)", r"\1", _dashed(arg)))
         before = flags.get(_dashed(args[at - 1])) if at else None
-        if flag and equals:
+        if flag and equals:  # --field=VALUE
             spelled.append(f"{key}={_literal(inline, flag)}")
-        elif flag and bool in flag.kinds:
+        elif flag and bool in flag.kinds:  # --switch, --switch true
             values = (*_TRUTHS, *_NONES) if type(None) in flag.kinds else _TRUTHS
             spelled += [arg] if args[at + 1 : at + 2] in values else [arg, "True"]
-        elif not flag and opposite and bool in opposite.kinds:
+        elif not flag and opposite and bool in opposite.kinds:  # --no-switch
             spelled += [opposite.text, "False"]
-        elif before and not arg.startswith("--"):
+        elif before and not arg.startswith("--"):  # the value of the flag before it
             spelled.append(_literal(arg, before))
         else:
             spelled.append(arg)
@@ -99,6 +99,7 @@ def spell(args: Sequence[str], flags: dict[str, Flag]) -> list[str]:
 def explain(refusal: str, config: Any, args: Sequence[str], *, positional: Sequence[str], prog: str) -> str:
     """One line for what tyro refused: an unknown flag, a value that does not fit, a value too many or too few."""
     flags = flags_of(config)
+    # An unknown flag first: it is named whatever else is wrong.
     for arg in args:
         key = arg.partition("=")[0]
         if re.match(r"--[a-zA-Z]", key) and _dashed(key) not in flags:
@@ -238,6 +239,7 @@ def _tyro(config: C, args: list[str], *, prog: str, description: str, positional
     }
     markers = (tyro.conf.AvoidSubcommands, tyro.conf.FlagConversionOff)
     parsed = tyro.cli(main, args=args, prog=prog, description=description, config=markers)
+    # Back to the config's own class, which checks the ranges.
     values = {field.name: getattr(parsed, field.name) for field in dataclasses.fields(parsed)}
     return type(config)(**values)
 
@@ -327,7 +329,7 @@ def describe(config: Any, *, prog: str, description: str, positional: Sequence[s
 def meanings(kind: type) -> dict[str, str]:
     """The docstring below each field of a dataclass, those of its bases included; of a class without source, none."""
     texts: dict[str, str] = {}
-    for base in reversed(kind.__mro__):
+    for base in reversed(kind.__mro__):  # a derived class may document a field anew
         if not dataclasses.is_dataclass(base):
             continue
         try:

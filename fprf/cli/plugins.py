@@ -63,6 +63,7 @@ class PluginsConfig:
 def run(args: list[str]) -> int:
     """List, and with `--check` load, every installed plug-in."""
     config = parse(PluginsConfig(), args, prog="fprf plugins", description="List the installed plug-ins.")
+    # Listing reads metadata alone; --check imports everything.
     checked = dict(faults()) if config.check else {}
     table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
     for title in ("group", "name", "object", "package", *(["state"] if config.check else [])):

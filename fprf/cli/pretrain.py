@@ -12,8 +12,6 @@ from ..pretraining.config import PretrainConfig, PretrainDecoderConfig
 from .parsing import parse
 from .style_flags import say
 
-_MOVED = ("content", "semantic")
-"""Encoders that ship: the repository distils them, not the installed package."""
 Report = dict[str, float | int | str]
 C = TypeVar("C", bound=PretrainConfig)
 
@@ -24,12 +22,10 @@ def run(args: list[str]) -> int:
     if kind in ("-h", "--help"):
         print("usage: fprf pretrain decoder --images DIR... --output FILE [--help]")
         return 0
-    if kind in _MOVED:
-        raise UsageError(
-            f"fprf pretrain {kind}: not in the installed package; run `python -m tools.distil {kind}` in a clone of fprf"
-        )
     if kind != "decoder":
-        raise UsageError(f"fprf pretrain: {kind or 'nothing'!r} to train; allowed is decoder")
+        raise UsageError(
+            f"fprf pretrain: {kind or 'nothing'!r} to train; allowed is decoder (encoders: `python -m tools.distil` in a clone)"
+        )
     from ..pretraining.decoder import pretrain_decoder
 
     about = "The colour decoder D_VGG of one encoder, trained for identity."

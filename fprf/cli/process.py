@@ -53,6 +53,7 @@ def run(args: list[str]) -> int:
         lost = lost_files(state)
         if lost:
             display.say(lost)
+        # Each step is skipped where `state` says that it was done for the same files and settings.
         find_features(place, state, config, display.count)
         matching = find_matches(place, state, config, display.count)
         try:

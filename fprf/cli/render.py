@@ -197,10 +197,10 @@ def _key(opened: "LoadedRun[Scene]", config: RenderVerbConfig, cameras: "Cameras
 
 def _takes(scene: "Scene", config: RenderVerbConfig, file: "StyleFile") -> "list[Take]":
     """The looks of a film, at least one. Raises UsageError for a match map without a style to match."""
+    from ..style.restyle import keyed_looks
+
     takes = []
     if config.keyframes is not None:
-        from ..style.restyle import keyed_looks
-
         look = keyed_looks(scene, read_keyframes(config.keyframes))
         takes.append(Take("keyframes", lambda frame: scene.restyled(look(frame))))
     elif config.references:

@@ -79,9 +79,7 @@ class _Restyled(NamedTuple):
 
 def run(args: list[str]) -> int:
     """Look at the captures, or take what the cache knows of them; build each style; write files, sheet and page."""
-    config, file = read_flags(
-        RestyleConfig(), _captures_as_flag(args), prog="fprf restyle", description=_DESCRIPTION, positional=()
-    )
+    config, file = read_flags(RestyleConfig(), args, prog="fprf restyle", description=_DESCRIPTION, positional=("captures",))
     outputs = _outputs(config)
     from ..memory import peak
     from ..splats.captures import light_alone, open_captures
@@ -98,7 +96,7 @@ def run(args: list[str]) -> int:
         for note in seen.first.notes:
             display.say(f"{seen.first.path}: {note}")
         scene = seen.scene
-        scene.found()
+        scene.found()  # views are encoded now, or read from the cache: the time is reported apart from that of styles
         looked = time.perf_counter() - begun
         named, made, encoders = _styles(config, file), list[_Restyled](), scene.encoders()
         for name, each in named:
@@ -115,15 +113,14 @@ def run(args: list[str]) -> int:
             for i, one in enumerate(made if outputs else ()):
                 display.count(k * len(named) + i, steps, "restyling")
                 start = time.perf_counter()
-                folder = outputs[k].name.lower() == "meta.json"  # SOG: what lies beside a file lies within
-                stem, dot, ending = outputs[k].name.partition(".")
+                # The style's name goes before the ending; a SOG folder gets a folder of that name, and holds its style.json.
                 output = outputs[k]
-                if one.name:
-                    output = (
-                        output.parent / one.name / output.name
-                        if folder
-                        else output.with_name(f"{stem}-{one.name}{dot}{ending}")
-                    )
+                folder = output.name.lower() == "meta.json"
+                stem, dot, ending = output.name.partition(".")
+                if one.name and folder:
+                    output = output.parent / one.name / output.name
+                elif one.name:
+                    output = output.with_name(f"{stem}-{one.name}{dot}{ending}")
                 harmonics = seen.harmonics(k, capture, one.styled.restyle)
                 written = write_capture(output, capture, harmonics, scene.views)
                 beside = "style.json" if folder else f"{output.name.partition('.')[0]}.style.json"
@@ -149,12 +146,6 @@ def run(args: list[str]) -> int:
         f"at most {(peak() or 0) / 1e9:.1f} GB"
     )
     return 0
-
-
-def _captures_as_flag(args: list[str]) -> list[str]:
-    """Words before the first flag name captures: A B --output ... is --captures A B --output ..."""
-    end = next((i for i, arg in enumerate(args) if arg.startswith("-")), len(args))
-    return ["--captures", *args[:end], *args[end:]] if end else args
 
 
 def _outputs(config: RestyleConfig) -> list[Path]:
@@ -251,6 +242,7 @@ def _show(config: RestyleConfig, scene: "SplatScene", made: Sequence[_Restyled])
     from ..page.writer import Page, PageView, Reference, Style, write_page
     from ..style.config import labels
 
+    # Views lie on rings around the scene or within it, the nearer ones first: from these the things can be told.
     nearer = max(min(config.shown, len(scene.names)), len(scene.names) // 2)
     most = min(config.shown, nearer)
     views = sorted({round((k + 0.5) * nearer / most - 0.5) for k in range(most)})

@@ -28,6 +28,7 @@ def read_flags(
     the references stand for the images in them. Raises what `parse`, `with_folders` and `read_style` raise, and DataError
     where a photograph of the file is no longer the one it was.
     """
+    # Defaults from the style file, then from the preset, then every flag over both.
     path = _style_flag(args)
     file = read_style(path) if path is not None else StyleFile(StyleConfig())
     if path is not None:
@@ -42,6 +43,7 @@ def read_flags(
     config = parse(default, _joined(args, default), prog=prog, description=about, positional=positional)
     config = with_folders(config, say)
     file = file._replace(style=StyleConfig(**_styles(config)))
+    # Who names photographs takes them as they are now.
     given = {arg.partition("=")[0] for arg in args}
     if path is not None and not given & {"--references", "--masks"}:
         check_photographs(path, file)

@@ -74,9 +74,10 @@ def run(args: list[str]) -> int:
     scene = opened.scene
     views = opened.known.views(config.split, config.views)
     output = config.output or config.run / "styles" / _name(config)
-    if config.explain and not config.references:
+    if config.explain and not config.references:  # regions alone: no style is built
         print_explained(output, Regions(scene, *scene.measured()), None)
         return 0
+    # The whole style: references encoded and clustered, matched with the scene's regions. Views come after, each on its own.
     start = time.perf_counter()
     styled = apply_style(scene, file)
     seconds, own = time.perf_counter() - start, styled.scene
@@ -113,6 +114,7 @@ def _make(scene: "Scene", output: Path, styled: "Styled", views: list[int], conf
                 picture = restyled.render(scene.cameras, view)
                 rendering += time.perf_counter() - start
                 write_image(output / f"{name}.png", to_uint8(picture.rgb))
+            # Matches are those of the points that the view sees, found apart from its colours.
             if maps or config.pixels:
                 start = time.perf_counter()
                 matched = match_map(scene, styled, view)

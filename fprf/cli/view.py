@@ -71,6 +71,7 @@ def run(args: list[str]) -> int:
 
     access = make_access(config.host, config.token)
     with contextlib.ExitStack() as stack:
+        # The address is taken first: while torch is imported the browser already has a page.
         server = stack.enter_context(ViewerServer(access, config.port))
         from ..viewer.uploads import is_capture
 
@@ -94,6 +95,7 @@ def run(args: list[str]) -> int:
             if not is_capture(path):
                 from ..viewer.live import TrainingFollower
 
+                # A run that is in training: the scene is loaded anew with each checkpoint.
                 stack.enter_context(TrainingFollower(server, path, load, session, config.pixels))
         try:
             threading.Event().wait()

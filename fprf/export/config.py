@@ -19,7 +19,7 @@ class ExportConfig(StyleConfig):
     run: Path = Path()
     """Run folder."""
     kinds: tuple[str, ...] = ()
-    """Kinds of files; the same as words behind the run. None = ply splat glb cameras, and lut where there are styles."""
+    """Kinds of files; none named = ply splat glb cameras, and lut where there are styles."""
     output: Path | None = None
     """A folder, or a single file, whose ending says the kind; by default RUN/exports."""
     style: Path | None = None

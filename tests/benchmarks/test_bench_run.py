@@ -1,18 +1,14 @@
 """Benchmarks on the tiny run, and the list of all of them."""
 
 import json
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from tiny_world import World
 
 from benchmarks import stress_operators
 from benchmarks.__main__ import BENCHMARKS, main
-from benchmarks.profiling import Range, exclusive
 from benchmarks.stress import invariants
 from benchmarks.styles import false_edges
 
@@ -24,7 +20,7 @@ def bench(world: World, name: str, output: Path, *more: str) -> dict[str, object
     args = [name, str(world.run), "--references", *references, *SMALL, "--output", str(output), *more]
     assert main(args) == 0
     document = json.loads(output.read_text())
-    assert document["benchmark"] == {"profiling": "profile"}.get(name, name) and document["settings"]["without"] == ""
+    assert document["benchmark"] == name and document["settings"]["without"] == ""
     return document
 
 
@@ -42,20 +38,6 @@ def test_pareto(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     for name, front in document["fronts"].items():
         assert front and {*front} <= {point["name"] for point in document["points"][name]}
     assert "time against error, plain" in capsys.readouterr().out
-
-
-def test_profile(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    document = bench(world, "profiling", tmp_path / "profile.json", "--operators", "3")
-    step, plain, styled = document["parts"].values()
-    for taken in (step, plain, styled):
-        shares = {name: part["share"] for name, part in taken["parts"].items()}
-        assert sum(shares.values()) == pytest.approx(1) and all(share > -1e-6 for share in shares.values())
-        assert taken["low"] <= taken["milliseconds"] <= taken["high"] and len(taken["operators"]) == 3
-    assert step["parts"].keys() >= {
-        "batch", "sampler", "density", "content", "semantic", "decoder", "losses", "backward", "optimizer", "rest",
-    }  # fmt: skip
-    assert "stylizer" in styled["parts"] and "stylizer" not in plain["parts"] and "backward" not in plain["parts"]
-    assert "training step" in capsys.readouterr().out
 
 
 def test_every_benchmark_is_listed_and_says_what_it_needs(
@@ -116,41 +98,3 @@ def test_whole_renders(world: World) -> None:
     assert {"world 1e6 m away", "rays in another order", "references in another order", "1 and 2 threads"} <= names
     without = invariants(trained, None, cameras, world.references)
     assert {row.input for row in without} < names
-
-
-@dataclass
-class Node:
-    """A tree of calls, as ranges lie in one another."""
-
-    name: str
-    own: float
-    inner: list["Node"] = field(default_factory=list)
-
-
-TREES = st.recursive(
-    st.builds(Node, st.sampled_from("abc"), st.floats(0.5, 9)),
-    lambda inner: st.builds(Node, st.sampled_from("abc"), st.floats(0.5, 9), st.lists(inner, max_size=3)),
-    max_leaves=9,
-)
-
-
-def lay(node: Node, start: float, ranges: list[Range], own: dict[str, float]) -> float:
-    """Own time before each inner call and after the last; the answer is the end."""
-    pieces = len(node.inner) + 1
-    at = start
-    for inner in node.inner:
-        at = lay(inner, at + node.own / pieces, ranges, own)
-    end = at + node.own / pieces
-    ranges.append(Range(node.name, start, end))
-    own[node.name] = own.get(node.name, 0.0) + node.own
-    return end
-
-
-@given(st.lists(TREES, max_size=3))
-def test_each_range_keeps_what_none_within_it_takes(trees: list[Node]) -> None:
-    ranges: list[Range] = []
-    own: dict[str, float] = {}
-    at = 0.0
-    for tree in trees:
-        at = lay(tree, at + 1, ranges, own)
-    assert exclusive(ranges) == pytest.approx(own)

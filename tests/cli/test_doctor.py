@@ -6,8 +6,9 @@ import pytest
 from fake_packages import packages_in
 from tiny_world import World
 
-from fprf.cli.doctor import Finding, machine, method_needs, run, run_folder
+from fprf.cli.doctor import machine, method_needs, run, run_folder
 from fprf.cli.doctor_scene import scene_folder
+from fprf.cli.findings import Finding
 from fprf.methods import fprf_lite
 from fprf.plugins.codec import save_config
 

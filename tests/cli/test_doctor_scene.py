@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageCms
 
-from fprf.cli.doctor import Finding
 from fprf.cli.doctor_scene import scene_folder
+from fprf.cli.findings import Finding
 
 VIEWS = 12
 

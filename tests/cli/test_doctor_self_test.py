@@ -9,7 +9,8 @@ import torch
 from pretend_cuda import CUDA, pretend_cuda
 
 from fprf.cli import main as cli
-from fprf.cli.doctor import Finding, self_test
+from fprf.cli.doctor import self_test
+from fprf.cli.findings import Finding
 from fprf.ops import dense
 from fprf.rendering import renderer
 from fprf.style.look import Restyle

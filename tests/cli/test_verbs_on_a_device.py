@@ -95,17 +95,3 @@ def test_eval_copies_each_frame_once(world: World, tmp_path: Path) -> None:
     same(tmp_path / "cpu" / "renders", tmp_path / DEVICE / "renders")
     here, there = (content(tmp_path / device / "metrics.json") for device in ("cpu", DEVICE))
     assert here == there
-
-
-def test_poses_are_fitted_on_the_device(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fprf.training.views.FIT_STEPS", 2)
-    monkeypatch.setattr("fprf.training.views._FIT_RAYS", 32)
-    found = []
-    for device in ("cpu", DEVICE):
-        shutil.copytree(world.run, tmp_path / device)
-        ran(["eval", str(tmp_path / device), "--fit-poses", "--images", "false"], device)
-        found.append(content(tmp_path / device / "metrics.json"))
-    assert found[0] == found[1]
-    assert found[0]["fitted_poses"].keys() == {"0000", "0008"}
-    for move in found[0]["fitted_poses"].values():
-        assert move.keys() == {"turn_degrees", "shift"} and move["turn_degrees"] > 0
