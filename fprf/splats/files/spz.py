@@ -13,7 +13,6 @@ table. All are kept.
 import itertools
 import struct
 import zlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -85,8 +84,8 @@ class Spz(CaptureFormat):
             streams = [unpacked[start:stop] for start, stop in itertools.pairwise(ends)]
             extensions = unpacked[ends[-1] :]
         else:
-            streams = _frames(path, data, header)
-            extensions = data[header.size : _WIDE_HEADER.unpack_from(data)[-1]]
+            streams, frames, table = _frames(path, data, header)
+            extensions = data[header.size : table]
         axes = _axes(path, extensions if header.flags & 2 else b"", header.degree)
         means, opacity, tint, scales, turns, rest = (np.frombuffer(each, np.uint8) for each in streams)
         count, bands = header.number, COUNTS[header.degree]
@@ -123,8 +122,14 @@ class Spz(CaptureFormat):
             for stream, bytes_ in zip(colours, new_bytes, strict=True):
                 stream[changed] = bytes_
             new = dict(zip((2, 5), (stream.tobytes() for stream in colours), strict=True))
-            if header.version > 3:
-                return [_framed(path, data, header, new)]
+            if header.version > 3:  # the other streams stay as they are packed
+                import zstandard
+
+                pack = zstandard.ZstdCompressor().compress
+                again = [pack(new[k]) if k in new else frame for k, frame in enumerate(frames)]
+                entries = [_ENTRY.pack(len(frame), len(each)) for frame, each in zip(again, streams, strict=False)]
+                end = table + sum(map(len, frames)) + len(b"".join(entries))
+                return [data[:table], *entries, *again, data[end:]]
             parts = [new.get(i, each) for i, each in enumerate(streams)]
             whole = b"".join([unpacked[: header.size], *parts, extensions])
             return [zlib.compress(whole, 6, wbits=31), after] if packed else [whole]
@@ -283,57 +288,40 @@ def _unzip(path: Path, data: Data) -> tuple[bytes, bytes]:
     return content, left
 
 
-def _frames(path: Path, data: Data, header: _Header) -> list[bytes]:
-    """The streams of version 4; harmonics of degree 0 have none."""
-    from_, sizes = _toc(path, data, header)
+def _frames(path: Path, data: Data, header: _Header) -> tuple[list[bytes], list[bytes], int]:
+    """The streams of version 4, unpacked and packed, and where their table begins; harmonics of degree 0 have none."""
+    if len(data) < _WIDE_HEADER.size:
+        raise base.short(path, len(data), _WIDE_HEADER.size, "the header")
+    *_, count, at = _WIDE_HEADER.unpack_from(data)
+    wanted = 5 if header.degree == 0 else 6
+    if count != wanted or at < _WIDE_HEADER.size:
+        raise DataError(f"{path}: version 4 with {count} streams from byte {at}; there are {wanted}")
+    start = at + count * _ENTRY.size
+    if start > len(data):
+        raise base.short(path, len(data), start, "the table of streams")
+    sizes = [*_ENTRY.iter_unpack(data[at:start])]
+    end = start + sum(size for size, _ in sizes)
+    if end > len(data):
+        raise base.short(path, len(data), end, "the streams")
+    # A zstd frame may unpack to anything: positions of captures hardly shrink, so they bound the rest.
+    if sizes[0][1] > 64 * sizes[0][0] + (1 << 16):
+        raise base.short(path, sizes[0][0], sizes[0][1] // 64, f"{header.number} positions")
     try:
         import zstandard as zstd
     except ImportError:
         raise DataError(
             f"{path}: .spz of version 4 is read with zstandard; pip install zstandard, or save as version 3"
         ) from None
-    streams = []
-    for (size, raw), wanted in zip(sizes, header.sizes, strict=False):
-        if raw != wanted:
-            raise DataError(f"{path}: a stream of {raw} bytes where {header.number} Gaussians have {wanted}; copy it again")
+    streams, frames = [], []
+    for (size, raw), needed in zip(sizes, header.sizes, strict=False):
+        if raw != needed:
+            raise DataError(f"{path}: a stream of {raw} bytes where {header.number} Gaussians have {needed}; copy it again")
+        frames.append(data[start : start + size])
         try:
-            streams.append(zstd.ZstdDecompressor().decompress(data[from_ : from_ + size], max_output_size=wanted))
+            streams.append(zstd.ZstdDecompressor().decompress(frames[-1], max_output_size=needed))
         except zstd.ZstdError as error:
             raise DataError(f"{path}: a stream that zstd cannot read ({error}); copy the file again") from error
-        if len(streams[-1]) != wanted:
-            raise base.short(path, len(streams[-1]), wanted, "a stream unpacked")
-        from_ += size
-    return [*streams, b""] if header.degree == 0 else streams
-
-
-def _toc(path: Path, data: Data, header: _Header) -> tuple[int, list[tuple[int, int]]]:
-    """Return the starts of the streams, and their packed and raw sizes."""
-    if len(data) < _WIDE_HEADER.size:
-        raise base.short(path, len(data), _WIDE_HEADER.size, "the header")
-    *_, count, at = _WIDE_HEADER.unpack_from(data)
-    wanted = 5 if header.degree == 0 else 6
-    if header.version != 4 or count != wanted or at < _WIDE_HEADER.size:
-        raise DataError(f"{path}: version {header.version} with {count} streams from byte {at}; version 4 has {wanted}")
-    end = at + count * _ENTRY.size
-    if end > len(data):
-        raise base.short(path, len(data), end, "the table of streams")
-    sizes = [_ENTRY.unpack_from(data, at + k * _ENTRY.size) for k in range(count)]
-    if end + sum(size for size, _ in sizes) > len(data):
-        raise base.short(path, len(data), end + sum(size for size, _ in sizes), "the streams")
-    # A zstd frame may unpack to anything: positions of captures hardly shrink, so they bound the rest.
-    if sizes[0][1] > 64 * sizes[0][0] + (1 << 16):
-        raise base.short(path, sizes[0][0], sizes[0][1] // 64, f"{header.number} positions")
-    return end, sizes
-
-
-def _framed(path: Path, data: Data, header: _Header, new: Mapping[int, bytes]) -> bytes:
-    """A file of version 4 with new streams; the others stay as they are packed."""
-    import zstandard
-
-    start, sizes = _toc(path, data, header)
-    head, frames = data[: start - len(sizes) * _ENTRY.size], []
-    for k, (size, _) in enumerate(sizes):
-        frames.append(zstandard.ZstdCompressor().compress(new[k]) if k in new else data[start : start + size])
+        if len(streams[-1]) != needed:
+            raise base.short(path, len(streams[-1]), needed, "a stream unpacked")
         start += size
-    table = b"".join(_ENTRY.pack(len(frame), raw) for frame, (_, raw) in zip(frames, sizes, strict=True))
-    return b"".join([head, table, *frames, data[start:]])
+    return ([*streams, b""] if header.degree == 0 else streams), frames, at
