@@ -50,9 +50,9 @@ class Written(NamedTuple):
 
 
 def read_capture(path: Path) -> Capture:
-    """Read a file of Gaussians, or a SOG folder. Raises DataError for another ending, or a file that is not what it says."""
+    """Read a file of Gaussians, or a folder of SOG. Raises DataError for another ending, or a file that is not what it says."""
     if path.is_dir():
-        path = path / "meta.json"
+        path = path / ("lod-meta.json" if (path / "lod-meta.json").is_file() else "meta.json")
     form = format_of(path)
     try:
         # Large files are mapped: what was decoded need not stay in memory beside the Gaussians.

@@ -57,6 +57,7 @@ class _Part(NamedTuple):
 
     def decoded(self, rows: slice, names: list[str]) -> tuple[Floats, ...]:
         """Means, quaternions, ln-scales, logits and harmonics of some rows."""
+        # Attributes may be whole numbers that stand for shares, except of harmonics.
         points, turns, scale, opacity = (_values(self.columns[name][rows]) for name in _SHAPE)
         # The quaternion product of the node's rotation and the Gaussians' own.
         a, b, c, d = quaternions(torch.from_numpy(self.rotation)[None])[0].tolist()
@@ -82,6 +83,7 @@ class Gltf(CaptureFormat):
     def read(self, path: Path, data: Data) -> Capture:
         """All primitives of Gaussians of the file's scene. Raises DataError where there is none."""
         try:
+            # Both kinds are handled as a .glb: a .gltf is packed into one first.
             data = data if data[:4] == b"glTF" else _binary(path, json.loads(bytes(data)))
             document, start = _document(data)
             parts = _parts(path, document, data, start)
@@ -97,6 +99,7 @@ class Gltf(CaptureFormat):
             raise DataError(f"{path}: a glTF without {_NAME} in its scene; it holds no 3D Gaussians")
 
         def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
+            # The document stays byte for byte; columns of colours are overwritten in a copy of the buffer.
             out, begin = bytearray(data), 0
             for part in _parts(path, document, out, start):
                 back = base.turned_harmonics(part.rotation, len(names)).T
@@ -112,6 +115,7 @@ class Gltf(CaptureFormat):
                 begin += len(part.columns["POSITION"])
             return [bytes(out)]
 
+        # One section a primitive: each has its own node, and so its own axes.
         sections = [(len(part.columns["POSITION"]), lambda rows, part=part: part.decoded(rows, names)) for part in parts]
         gaussians, shift = base.decoded(len(names), *sections)
         kind = "logarithms, as in the review draft" if parts[0].logarithmic else "linear, as in the final text"
@@ -122,16 +126,19 @@ class Gltf(CaptureFormat):
         """A .glb of one node; harmonics of degree 4 are left out."""
         means, turns, scales, logits, harmonics = base.arrays(gaussians)
         opacity = base.sigmoid(logits)[:, None]
+        # Columns lie one after the other in the buffer; quaternions have w last.
         shape = (means, np.roll(base.unit_quaternions(turns), -1, 1), np.exp(scales.clip(-80, 80)), opacity)
         columns: dict[str, Floats] = dict(zip((*_SHAPE, *_HARMONICS), (*shape, *harmonics.transpose(1, 0, 2)), strict=False))
         columns = {name: values.astype("<f4") for name, values in columns.items()}
         columns["COLOR_0"] = base.steps(np.concatenate([base.colours_of(harmonics), opacity], 1), 255).astype(np.uint8)
+        # Each column has a view of the buffer and an accessor of that view.
         views, accessors, size = [], [], 0
         for k, values in enumerate(columns.values()):
             kind, code = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]], 5126 if values.dtype == "<f4" else 5121
             views.append({"buffer": 0, "byteOffset": size, "byteLength": values.nbytes, "target": 34962})
             accessors.append({"bufferView": k, "componentType": code, "count": len(values), "type": kind})
             size += values.nbytes
+        # The specification demands the bounds of positions; bytes of colours stand for shares.
         accessors[0] |= {"min": means.min(0).tolist(), "max": means.max(0).tolist()}
         accessors[-1]["normalized"] = True
         extension: dict[str, Any] = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
@@ -199,6 +206,7 @@ def _binary(path: Path, document: dict[str, Any]) -> bytes:
                 raise DataError(f"{path}: {uri} beside it cannot be read; copy the whole folder") from error
         starts.append(len(body))
         body += content + bytes(-len(content) % 4)
+    # Views keep their order; where each begins counts from the start of the joined buffer.
     for view in document["bufferViews"]:
         view["byteOffset"] = view.get("byteOffset", 0) + starts[view["buffer"]]
         view["buffer"] = 0
@@ -210,6 +218,7 @@ def _parts(path: Path, document: dict[str, Any], data: Data | bytearray, start: 
     """The primitives of Gaussians that nodes of the scene show; `data` has the buffer from `start` on."""
     nodes, found, seen = document.get("nodes", []), list[_Part](), set[int]()
     scene = document.get("scenes", [{"nodes": range(len(nodes))}])[document.get("scene", 0)]
+    # From right up back, in which a scene is, to right down front.
     waiting = [(index, np.diag([1.0, -1.0, -1.0, 1.0])) for index in scene.get("nodes", [])]
     for index, above in waiting:
         if index in seen:
@@ -230,9 +239,11 @@ def _parts(path: Path, document: dict[str, Any], data: Data | bytearray, start: 
             sound = {*_SHAPE, _HARMONICS[0]} <= {*columns} and all(wanted[name] == width for name, width in widths.items())
             if not sound or len({len(column) for column in columns.values()}) > 1:
                 raise DataError(f"{path}: Gaussians without one of {', '.join(_SHAPE)}, or of unequal shapes; export it again")
+            # Gaussians stay Gaussians of the same kind under turns, shifts and one scale for all axes.
             linear, scale = matrix[:3, :3], float(np.cbrt(np.linalg.det(matrix[:3, :3])))
             if not scale > 0 or not np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() < 1e-3:
                 raise DataError(f"{path}: a node shears, mirrors or stretches its Gaussians; apply its transform first")
+            # A size is never negative; its logarithm is where anything is smaller than the unit.
             sizes = columns[_SHAPE[2]]
             logarithmic = any(bool((_values(sizes[rows]) < 0).any()) for rows in base.pieces(len(sizes)))
             found.append(_Part(columns, linear / scale, scale, matrix[:3, 3], extension, logarithmic))

@@ -42,6 +42,7 @@ class Ksplat(CaptureFormat):
     def read(self, path: Path, data: Data) -> Capture:
         if not self.recognises(data[:2], len(data)):
             raise DataError(f"{path}: no .ksplat of version 0.1 or later; it is damaged or of another kind")
+        # Headers of all sections follow that of the file; then come their bodies, in the same order.
         _, _, most, _, total, compression, low, high = _HEADER.unpack_from(data)
         if compression > 2:
             raise DataError(f"{path}: a .ksplat of compression {compression}; 0, 1 and 2 can be read")
@@ -54,6 +55,7 @@ class Ksplat(CaptureFormat):
             count, room, of_bucket, buckets, side, stored, reach, full, others, degree = section
             if degree > 2 or (compression and buckets and stored < 12) or count > room:
                 raise DataError(f"{path}: section {k} of degree {degree} with {count} of {room} Gaussians; it is damaged")
+            # A body: sizes of buckets that are not full, centres of all buckets, Gaussians.
             body = start + 4 * others + stored * buckets
             first, half = ("<f4", "<f4") if compression == 0 else ("<u2", "<f2")
             shape = [("mean", first, 3), ("deviation", half, 3), ("turn", half, 4), ("rgba", "u1", 4)]
@@ -67,6 +69,7 @@ class Ksplat(CaptureFormat):
                 bucket = np.searchsorted(np.cumsum(sizes), np.arange(count), side="right")
                 if bucket[-1] >= buckets:
                     raise DataError(f"{path}: section {k} has {count} Gaussians in {buckets} buckets; it is damaged")
+                # Positions are steps from a corner of their bucket, `reach` to its centre.
                 reach = reach or _REACH
                 places = np.ndarray((buckets, 3), "<f4", data, start + 4 * others, (stored, 4))
                 factor = side / 2 / reach

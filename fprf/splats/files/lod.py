@@ -36,6 +36,7 @@ class StreamedSog(CaptureFormat):
             index = json.loads(bytes(data))
             if index.get("version", 1) != 1:
                 raise ValueError(f"version {index['version']!r}; version 1 is read")
+            # Of each leaf the rows of its finest level, by the file that has them.
             wanted: dict[str, list[slice]] = {}
             for leaf in _leaves(index["tree"]):
                 level = leaf["lods"][min(leaf["lods"], key=int)]
@@ -51,6 +52,7 @@ class StreamedSog(CaptureFormat):
                 raise ValueError("a file outside of its folder")
         except _UNSOUND as error:
             raise DataError(f"{path}: no sound lod-meta.json ({error!r}); not a streamed SOG, or it is damaged") from error
+        # Files are read one by one; the cache knows the capture by the content of all.
         parts, archives, antialiased = [], {path.name: bytes(data)}, True
         for name, (file, rows) in files.items():
             try:

@@ -117,6 +117,7 @@ class CompressedPly(Ply):
 
         No chunk holds both the bulk and what is far from it: before the latter transparent Gaussians fill up the last one.
         """
+        # Neighbours share a chunk; what is far from the bulk begins a chunk of its own.
         order, level = base.spatial_order(gaussians.means.numpy()), base.levels_of(gaussians.means.numpy())
         parts = [order[level[order] == k] for k in range(int(level.max(initial=0)) + 1)]
         parts = [np.append(part, np.full(-len(part) % _CHUNK, part[-1])) for part in parts[:-1]] + parts[-1:]
@@ -137,6 +138,7 @@ class CompressedPly(Ply):
         opacity[1:][filled] = 0
         words[:, 3] = _pack(np.concatenate([share, opacity[:, None]], 1), (8, 8, 8, 8))
         bounds += [low, high]
+        # Three tables: bounds of chunks, words of Gaussians and bytes of harmonics.
         names = [name for pair in (_POSITION, _SCALE, _COLOUR) for of in pair for name in of]
         chunk = np.concatenate(bounds, 1).astype("<f4").view([(name, "<f4") for name in names])[:, 0]
         tables = {"chunk": chunk, "vertex": words.astype("<u4").view([(name, "<u4") for name in _PACKED])[:, 0]}
@@ -296,6 +298,7 @@ def _read_compressed(path: Path, data: Data, elements: Mapping[str, _Element]) -
         rgba = _unpack(colour, (8, 8, 8, 8))
         harmonics = base.constants_of(unpacked(rgba[:, :3], _COLOUR) if tinted else rgba[:, :3])
         if sh is not None:
+            # The two outermost bytes stand for the very ends of the range.
             raw = np.stack([sh[name][rows] for name in rest], 1)
             share = np.where(raw == 0, 0.0, np.where(raw == 255, 1.0, (raw + 0.5) / 256))
             bands = ((share - 0.5) * _SPAN).reshape(len(raw), 3, -1).transpose(0, 2, 1)
@@ -351,6 +354,7 @@ def _elements(path: Path, data: Data, header: _Header) -> dict[str, _Element]:
     form, ascii_rows = header.form, header.form == ["ascii", "1.0"]
     if form not in (["binary_little_endian", "1.0"], ["binary_big_endian", "1.0"]) and not ascii_rows:
         raise DataError(f"{path}: a PLY of format {' '.join(form) or 'unknown'}; export it again as ascii or binary 1.0")
+    # Elements lie one after the other: each is passed over to find the next.
     types = {name: kind.replace("<", ">") if "big" in form[0] else kind for name, kind in _TYPES.items()}
     lines = [words for words in header.lines if words[0] in ("element", "property")]
     starts, offset, elements = [i for i, words in enumerate(lines) if words[0] == "element"], header.size, {}
@@ -388,6 +392,7 @@ def _from_ascii(path: Path, data: Data, header: _Header, elements: Mapping[str, 
     for name, element in elements.items():
         try:
             if element.names() and element.rows:
+                # A row is a line; numbers are read as float64 and then rounded to their own type.
                 numbers = np.loadtxt(lines, np.float64, comments=None, max_rows=element.rows, ndmin=2)
                 table = np.empty(element.rows, element.kind)
                 for field, column in zip(element.names(), numbers.T, strict=True):
@@ -398,6 +403,7 @@ def _from_ascii(path: Path, data: Data, header: _Header, elements: Mapping[str, 
                     next(lines)
         except (ValueError, StopIteration) as error:
             raise DataError(f"{path}: the rows of element {name} are no numbers for its properties ({error})") from error
+    # Comments go along, which may say what points up.
     head, newline = ply_head(tables, False), b"\n"
     said = [" ".join(words).encode("latin-1") for words in header.lines if words[0] in ("comment", "obj_info")]
     head = head.replace(b" 1.0\n", newline.join([b" 1.0", *said, b""]), 1)
@@ -454,6 +460,7 @@ def _camera(data: Data, elements: Mapping[str, _Element]) -> Cameras | None:
         if name in elements:
             table = elements[name].table(data)
             numbers[name] = np.stack([table[each].astype(np.float64) for each in elements[name].names()], 1).ravel()
+    # Without a pose the camera is at the origin and looks along z.
     matrix, lens = numbers.get("extrinsic", np.eye(4).ravel()), numbers.get("intrinsic", np.zeros(0))
     size = numbers.get("image_size", lens[2:4] if len(lens) == 4 else np.zeros(0))
     if len(matrix) not in (12, 16) or len(lens) not in (4, 9) or len(size) != 2:
@@ -467,6 +474,7 @@ def _camera(data: Data, elements: Mapping[str, _Element]) -> Cameras | None:
         return None
     if focal.min() <= 0 or size.min() < 1 or size.max() > 1 << 16:
         return None
+    # The file has world to camera; ours is the inverse.
     pose = np.concatenate([rotation * [1.0, -1.0, -1.0], -rotation @ world[:, 3:]], 1)  # OpenGL axes
     cameras = ideal_cameras(torch.from_numpy(pose)[None], 1.0, (int(size[0]), int(size[1])))
     return replace(cameras, focal=torch.from_numpy(focal)[None], centre=torch.from_numpy(centre)[None])

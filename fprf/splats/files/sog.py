@@ -63,6 +63,7 @@ class Sog(CaptureFormat):
         folder = folder_of(path, files)
         parts = {name.removeprefix(folder): content for name, content in files.items() if name.startswith(folder)}
         meta = _json(path, parts["meta.json"])
+        # Version 1 has no such entry.
         version = meta.get("version", 1)
         if version not in (1, 2):
             raise DataError(f"{path}: SOG of version {version!r}; versions 1 and 2 are read")
@@ -75,6 +76,7 @@ class Sog(CaptureFormat):
         labels, rest = pictures.palette()
 
         def part(rows: slice) -> tuple[Floats, ...]:
+            # Positions are 16 bits of a logarithm, low bytes in one image and high bytes in the other.
             bent = least + (high[rows].astype(np.int64) << 8 | low[rows]) / 65535 * (most - least)
             tag = turn[rows, 3].astype(np.int64) - 252
             quaternions = base.three_to_four(np.clip(tag, 0, 3), turn[rows, :3] / 255 * 2 - 1)
@@ -92,6 +94,7 @@ class Sog(CaptureFormat):
             return means, quaternions, scales, logits.reshape(-1), harmonics
 
         def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
+            # Constants are quantised anew, with a codebook or a range of their own.
             new, said = {}, json.loads(parts["meta.json"])
             name = said["sh0"]["files"][0]
             index, said["sh0"] = _quantized(harmonics[:, 0], said["sh0"])
@@ -99,6 +102,7 @@ class Sog(CaptureFormat):
             picture.reshape(-1, 4)[:count, :3] = index
             new[name] = _webp(picture)
             if len(rest):
+                # Labels stay: an entry of the palette becomes the mean of what its Gaussians became.
                 mixed = _means(harmonics[:, 1:].reshape(count, -1), labels, len(rest)).reshape(rest.shape)
                 seen = np.bincount(labels, minlength=len(rest)) > 0
                 name = said["shN"]["files"][0]
@@ -125,11 +129,13 @@ class Sog(CaptureFormat):
         gaussians = gaussians.select(torch.from_numpy(base.spatial_order(gaussians.means.numpy())))
         means, turns, log_scales, logits, harmonics = base.arrays(gaussians)
         count = len(means)
+        # Images are about square, with a width that WebP likes.
         width = -(-int(np.ceil(count**0.5)) // 4) * 4
         shape = (-(-count // max(width, 1)), width)
         bent = _bent(means.astype(np.float64))
         least, most = bent.min(0), bent.max(0)
         at = base.steps(base.shares(bent, least, most), 65535)
+        # Rotations and opacities take 8 bits a number; sizes and constants share codebooks of 256.
         largest, three = base.smallest_three(turns)
         opacity = base.steps(base.sigmoid(logits), 255)
         scale, scales = _quantized(log_scales.clip(-20, 20), {"files": ["scales.webp"], "codebook": []})
@@ -383,6 +389,7 @@ def _quantized(values: Floats, about: Mapping[str, Any]) -> tuple[NDArray[np.int
 
 def _codebook(values: Floats) -> Floats:
     """256 increasing numbers near to all values (Lloyd's algorithm on a line), float32 in float64."""
+    # Sums of sorted values give the mean of any stretch of them at once.
     ordered = np.sort(values)
     total = np.concatenate([[0.0], np.cumsum(ordered)])
     ranks = np.rint(np.linspace(0, len(ordered) - 1, _LEVELS)).astype(np.int64)
@@ -407,6 +414,7 @@ def _labels(rows: Floats) -> NDArray[np.int64]:
     labels = np.zeros(len(rows), np.int64)
     for level in range(16):
         groups = 1 << level
+        # The variance of each column within each group.
         spread = _means(rows**2, labels, groups) - _means(rows, labels, groups) ** 2
         order = np.lexsort((rows[np.arange(len(rows)), spread.argmax(1)[labels]], labels))
         starts = np.searchsorted(labels[order], np.arange(groups))

@@ -37,6 +37,7 @@ class Splat(CaptureFormat):
 
         def part(rows: slice) -> tuple[Floats, ...]:
             table = whole[rows]
+            # Bytes stand for shares; opacities of 0 and 1 keep a finite logit.
             share = table["rgba"] / 255
             turns = (table["turn"].astype(np.float32) - 128) / 128
             scales = np.log(np.maximum(table["deviation"], _LEAST))
@@ -57,5 +58,6 @@ class Splat(CaptureFormat):
         table["mean"], table["deviation"] = means, np.exp(scales)
         table["rgba"][:, :3] = base.steps(base.colours_of(harmonics), 255)
         table["rgba"][:, 3] = base.steps(base.sigmoid(logits), 255)
+        # 128 is 0: a component of 1 does not fit by half a step.
         table["turn"] = np.clip(np.rint(base.unit_quaternions(turns) * 128 + 128), 0, 255)
         return [table.tobytes()]

@@ -95,6 +95,7 @@ class Spz(CaptureFormat):
             if header.version == 1:
                 points: Floats = means.view("<f2").reshape(count, 3)[rows].astype(np.float64)
             else:
+                # 24 bits, the lowest byte first; the highest bit is the sign.
                 low, middle, high = means.reshape(count, 3, 3)[rows].astype(np.int32).transpose(2, 0, 1)
                 points = (((low | middle << 8 | high << 16) ^ 0x800000) - 0x800000) / 2.0**header.fraction
             if header.version < 3:
@@ -117,6 +118,7 @@ class Spz(CaptureFormat):
             )
 
         def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
+            # Bytes of Gaussians that did not change stay as they are.
             colours = (tint.reshape(count, 3).copy(), rest.reshape(count, bands - 1, 3).copy())
             new_bytes = _colour_bytes(axes.harmonics(base.finite(harmonics[changed]), back=True))
             for stream, bytes_ in zip(colours, new_bytes, strict=True):
@@ -144,6 +146,7 @@ class Spz(CaptureFormat):
         points = axes.points(means.astype(np.float64)) * 2.0**fraction
         at = np.clip(np.rint(points), -(2**23), 2**23 - 1).astype(np.int64) & 0xFFFFFF
         most, three = base.smallest_three(axes.quaternions(turns.astype(np.float64))[:, _TURN])
+        # Two bits say which component is left out; each other one has a sign and 9 bits.
         word = most.astype(np.uint32)
         for column in three.T:
             word = word << 10 | (column < 0).astype(np.uint32) << 9 | base.steps(np.abs(column), 511).astype(np.uint32)
