@@ -7,6 +7,10 @@ frames    seconds a frame at 1280 x 720, as for a moving camera at full resoluti
 million   a page of a million Gaussians: milliseconds of a sort, memory of the page
 drop      `fprf view RUN`: seconds from a dropped photograph to its colours on the page, the third of three
 
+    python -m benchmarks page --film docs/garden.html docs/images/garden.webp
+
+films a page instead: a walk through its cameras and back, a column for each of its first five styles.
+
 Needs playwright and a Chromium. Times want free
 cores: the load average is written down.
 """
@@ -27,6 +31,7 @@ import numpy as np
 import torch
 
 from fprf.errors import UsageError
+from fprf.io.video import write_video
 from fprf.page.writer import Page, PageView, write_page
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.rendering.cameras import Cameras
@@ -59,6 +64,24 @@ DRAW = """async ([view, lens, width, height, options]) => {
   return { seconds, sort: splats.sortMilliseconds, picture: options.timed ? null : canvas.toDataURL("image/png") };
 }"""
 
+WALK = (2, 13)
+"""Cameras of a page, in its order, between which the film walks."""
+FRAMES, COLUMN, GAP = 18, (200, 356), 6
+"""Frames one way, size of a column and room between columns, in pixels."""
+STEP = """async ([t, [from, to], width, height]) => {
+  const { place, stage } = fprf, { splats, scene, canvas } = place;
+  place.lost = true;
+  while (place.sorting) await new Promise((done) => setTimeout(done, 5));
+  const keys = scene.cameras.slice(from, to + 1).map((each) => new Camera(each)), at = t * (keys.length - 1);
+  const key = Math.min(Math.floor(at), keys.length - 2), camera = keys[key].towards(keys[key + 1], at - key);
+  [canvas.width, canvas.height] = [width, height];
+  await splats.sort(camera.view, scene.near);
+  return stage.styles.slice(0, 5).map(({ name }) => {
+    splats.draw(camera.view, camera.fitted(width, height), { first: name }, scene);
+    return canvas.toDataURL("image/png");
+  });
+}"""
+
 
 def opened(browser: Any, scene: SplatScene, folder: Path) -> Any:
     """The page of a scene, as soon as all of it is there."""
@@ -85,11 +108,31 @@ def view_of(cameras: Cameras, view: int, near: float, size: tuple[int, int] | No
     return [camera.world_to_camera.T.flatten().tolist(), lens, width, height]
 
 
+def picture_of(url: str) -> np.ndarray:
+    """The RGB picture of a canvas's data URL."""
+    return np.asarray(cv2.imdecode(np.frombuffer(base64.b64decode(url.split(",")[1]), np.uint8), 1))[..., ::-1]
+
+
+def film(browser: Any, source: Path, output: Path) -> None:
+    """Film a page in its first styles: there by frames of the browser, and back by the same ones."""
+    page = browser.new_page(viewport={"width": 1280, "height": 800})
+    page.goto(source.resolve().as_uri())
+    page.wait_for_selector(".place.ready", timeout=120_000)
+    frames = []
+    for step in range(FRAMES + 1):
+        t = 0.5 - 0.5 * np.cos(np.pi * step / FRAMES)  # begins and ends at rest
+        drawn = page.evaluate(STEP, [t, WALK, 2 * COLUMN[0], 2 * COLUMN[1]])
+        columns = [np.asarray(cv2.resize(picture_of(url), COLUMN, interpolation=cv2.INTER_AREA), np.uint8) for url in drawn]
+        gap = np.full((COLUMN[1], GAP, 3), 255, np.uint8)
+        frames.append(np.hstack([part for column in columns for part in (gap, column)][1:]).astype(np.uint8))
+    write_video(output, iter([*frames, *frames[-2:0:-1]]), fps=10)
+
+
 def pictures(page: Any, scene: SplatScene, count: int) -> dict[str, float]:
     found = []
     for view in sorted({*torch.linspace(0, len(scene.views) - 1, count).round().long().tolist()}):
         drawn = page.evaluate(DRAW, [*view_of(scene.views, view, scene.near), {}])["picture"]
-        mine = np.asarray(cv2.imdecode(np.frombuffer(base64.b64decode(drawn.split(",")[1]), np.uint8), 1))[..., ::-1] / 255
+        mine = picture_of(drawn) / 255
         camera = camera_of(scene.views, view, scene.near)
         theirs = (
             draw(scene.gaussians, camera, antialiased=scene.antialiased, background=scene.background).image.clamp(0, 1).numpy()
@@ -157,9 +200,14 @@ def main(argv: list[str]) -> None:
     parser.add_argument("runs", type=Path, nargs="*")
     parser.add_argument("--reference", type=Path)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--film", type=Path, nargs=2, metavar=("PAGE", "OUTPUT"))
     parser.add_argument("--few", action="store_true", help="few views, frames and Gaussians")
     parser.add_argument("--output", type=Path, help="JSON to write; parts that are not run keep what is there")
     args = parser.parse_args(argv)
+    if args.film:
+        with chromium() as browser:
+            film(browser, *args.film)
+        return
     found: dict[str, Any] = json.loads(args.output.read_text()) if args.output and args.output.is_file() else {}
     found |= {"format": 1, "targets": TARGETS}
     few = 2 if args.few else 5

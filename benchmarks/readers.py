@@ -256,7 +256,7 @@ def _config(folder: Path) -> Target:
 def _tensors(folder: Path) -> list[Target]:
     folder.mkdir()
     sealed, codes = folder / "style.safetensors", folder / "dictionary.safetensors"
-    tensorfiles.save_sealed(sealed, {"mean": torch.arange(6.0), "keys": torch.ones(3, 4)})
+    tensorfiles.save(sealed, {"mean": torch.arange(6.0), "keys": torch.ones(3, 4)}, sealed=True)
     save_dictionary(codes, cases.dictionary(3, 4, 2))
     return [
         Target("sealed tensors", sealed, lambda: tensorfiles.load_sealed(sealed)),

@@ -201,7 +201,7 @@ def one_by_one(
     scene: Scene, plain: Sequence[Image], config: StylizerConfig, dictionary: StyleDictionary, encoders: Encoders
 ) -> Shown:
     """The stylizer on each picture as a photograph of its own: its own statistics and regions, the same dictionary."""
-    guided, decoder, regions, seed = encoders.guided, scene.decoder, len(encoders.scene.share), encoders.seed
+    guided, decoder, regions, seed = encoders.guided, scene.decoder, len(encoders.scene_style.share), encoders.seed
     taken = []
 
     def restyled(view: Image) -> Image:
@@ -285,7 +285,7 @@ def restyle(config: RestyleConfig, root: Path, folder: Path, progress: Progress)
             "view_size": [int(side) for side in stage.views.size[0]],
             "clusters": config.clusters,
             "blend": config.blend,
-            "regions": len(encoders.scene.share),
+            "regions": len(encoders.scene_style.share),
             "semantic_encoder": scene.semantic_encoder,
         },
         "recommended": best,

@@ -110,7 +110,7 @@ def damage(folder: Path, flips: int, seed: int) -> list[Check]:
     folder.mkdir(parents=True, exist_ok=True)
     path, draw = folder / "sealed.safetensors", random.Random(seed)  # nosec B311  # no secrets
     made = {"planes": cases.normal(16, 64, seed=28), "mean": cases.normal(64, seed=29), "step": torch.tensor([7])}
-    tensorfiles.save_sealed(path, made)
+    tensorfiles.save(path, made, sealed=True)
     whole = path.read_bytes()
     found = wrong = 0
     for _ in range(flips):

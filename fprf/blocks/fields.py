@@ -47,7 +47,7 @@ class Members(ABC):
         """One of them."""
 
 
-class Held(Members):
+class ResidentMembers(Members):
     """Members that are all in memory."""
 
     def __init__(self, members: Sequence[Member]) -> None:
@@ -230,10 +230,10 @@ def inherit(member: Member, around: Member) -> None:
         for mine, theirs in zip(own.modules(), other.modules(), strict=True):
             if isinstance(mine, Planes) and isinstance(theirs, Planes):
                 with torch.no_grad():
-                    mine.table.copy_(relay(theirs, member.chart, around.chart))
+                    mine.table.copy_(resample_planes(theirs, member.chart, around.chart))
 
 
-def relay(planes: Planes, chart: Chart, old: Chart) -> Annotated[Tensor, "rows F"]:
+def resample_planes(planes: Planes, chart: Chart, old: Chart) -> Annotated[Tensor, "rows F"]:
     """The table of planes over `chart` that say what `planes` say over `old`, exact at the nodes."""
     middle, half = (chart.low + chart.high) / 2, (chart.high - chart.low) / 2
     parts = []

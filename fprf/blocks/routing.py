@@ -1,9 +1,9 @@
 """Routing of points to their blocks. Points are handed out in groups: all points of a group have the same members.
 
-`Everywhere` sends all points to one member. `Inset` is for training a block: inside its reach the block, outside of it the
-surroundings. `Blend` is for rendering: weights of `windows`, whose smooth change from block to block leaves no seam. It looks
-points up in a table of the ground plan, so its cost does not grow with the number of blocks, and names only the blocks that
-the points need: the others are never loaded.
+`SingleRouter` sends all points to one member. `InsetRouter` is for training a block: inside its reach the block, outside of it
+the surroundings. `BlendRouter` is for rendering: weights of `windows`, whose smooth change from block to block leaves no seam.
+It looks points up in a table of the ground plan, so its cost does not grow with the number of blocks, and names only the blocks
+that the points need: the others are never loaded.
 
 Windows: A block reaches a border b beyond its cell. Along each axis its window rises by a smoothstep from 0 at the end of
 that reach to 1 two borders inside, so it is 1/2 on the cell's face; neighbours that share a face have windows S and 1 - S
@@ -118,14 +118,14 @@ class Router(ABC):
         """The groups of points of the space."""
 
 
-class Everywhere(Router):
+class SingleRouter(Router):
     """One member over everything."""
 
     def __call__(self, points: Annotated[Tensor, "N 3"]) -> list[Group]:
         return [Group((0,), torch.arange(len(points), device=points.device), None)]
 
 
-class Inset(Router):
+class InsetRouter(Router):
     """Member 0 inside of a chart's box, member 1 outside.
 
     On an accelerator both members are evaluated at all points, one of them with weight 0: the host would have to wait for the
@@ -144,7 +144,7 @@ class Inset(Router):
         return [part for part in parts if len(part.at)]
 
 
-class Blend(Router):
+class BlendRouter(Router):
     """Member z is block z, the last one the surroundings."""
 
     def __init__(self, cells: Sequence[Cell]) -> None:
@@ -190,6 +190,7 @@ class Blend(Router):
         named = (*blocks, len(self.cells))
         if not blocks:
             return [Group(named, index, None)]
+        # Only the blocks near these points are weighed, and only those with a say are ever fetched.
         weight = shares(points[index], [self.cells[block] for block in blocks])
         weight = torch.where(weight > SLIGHT, weight, torch.zeros_like(weight))
         most, best = weight.max(-1)
@@ -199,6 +200,7 @@ class Blend(Router):
             mine = index[alone & (best == place)]
             if len(mine):
                 groups.append(Group((member,), mine, None))
+        # In borders several have a say: their weights are scaled to 1 once the slight ones are left out.
         shared = (~alone).nonzero()[:, 0]
         if len(shared):
             own = weight[shared]

@@ -74,6 +74,7 @@ def open_space(scene: Scene, sightings: Sightings | None) -> Space:
         unit = SPACINGS * float(apart.topk(2, largest=False).values[:, 1].median()) if len(position) > 1 else 0.0
     if unit <= ROUNDING * max(1.0, float(position.abs().amax())):
         raise DataError(f"{scene.name}: all cameras stand in one place and there are no points; capture from several places")
+    # Nothing nearer than half of the nearest point is looked at.
     near = NEAR if nearest is None else min(NEAR, max(1e-3, 0.5 * nearest / unit))
     first, second, third = ((float(row[0]), float(row[1]), float(row[2])) for row in turn)
     middle = (float(centre[0]), float(centre[1]), float(centre[2]))
@@ -183,6 +184,7 @@ class Plan:
 
 def make_plan(scene: Scene, layout: LayoutConfig) -> Plan:
     """Cut the scene and find out who sees what. Raises ConfigError where a block would have nothing to learn from."""
+    # Geometry alone: no image is decoded to find out who sees what.
     sightings = find_sightings(scene)
     space = open_space(scene, sightings)
     cells = layout.build().cut(site_of(scene, space))
@@ -191,6 +193,7 @@ def make_plan(scene: Scene, layout: LayoutConfig) -> Plan:
         tiles = tile_rays(scene, space, views, sightings)
         parts.append((torch.stack([meets(tiles, cell) for cell in cells], 1), tiles.pixels))
     seen, pixels = (torch.cat(column) for column in zip(*parts, strict=True))
+    # A block that no pixel sees would learn nothing: it is part of the surroundings.
     used = [block for block in range(len(cells)) if int((seen[:, block] * pixels).sum())]
     if not used:
         raise ConfigError(f"{scene.name}: no training view sees any block of this layout; choose another --blocks")

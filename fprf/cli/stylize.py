@@ -67,7 +67,6 @@ def run(args: list[str]) -> int:
     from ..style.dictionary import save_dictionary
     from ..style.regions import Regions
     from ..style.restyle import apply_style
-    from ..style.statistics import dead_channels
     from ..training.loading import open_run
 
     opened = open_run(config.run, config.device, config)
@@ -80,11 +79,10 @@ def run(args: list[str]) -> int:
     # The whole style: references encoded and clustered, matched with the scene's regions. Views come after, each on its own.
     start = time.perf_counter()
     styled = apply_style(scene, file)
-    seconds, own = time.perf_counter() - start, styled.scene
+    seconds = time.perf_counter() - start
     made: dict[str, Any] = {
         "dictionary_seconds": seconds,
         "codes": len(styled.codes.reference),
-        "dead_channels": dead_channels(own.mean, own.covariance.diagonal()).nonzero().flatten().tolist(),
     }
     for note in styled.controls.notes:
         print(note)

@@ -144,8 +144,6 @@ class FeatureStore:
     """Targets of some views of a scene; see `extract`."""
 
     def __init__(self, entries: Mapping[int, Entry], basis: Basis | None = None) -> None:
-        from ..ops.guided_kernels import ViewTable
-
         if not entries:
             raise DataError("feature store: no views; a scene needs at least one training view")
         self.basis = basis
@@ -171,8 +169,8 @@ class FeatureStore:
         self.scale = self.std if self.std > 1e-6 * float(self._centre.abs().max()) else 1.0
         """The unit of losses: `std`, or 1 where the features do not change but for rounding."""
         # Kernels read the coefficients where they lie, in mapped files.
-        bits = [coefs.view(torch.uint16).numpy() for coefs in self._coefs]
-        self._table = ViewTable(bits, self._size.numpy(), self._scale.numpy(), self._centre.numpy())
+        self._address = torch.tensor([coefs.data_ptr() for coefs in self._coefs])
+        self._shape = torch.cat([torch.tensor([coefs.shape[:2] for coefs in self._coefs]), self._size], 1)
         self._packed: tuple[guided.Packed, Tensor] | None = None
 
     def to(self, device: torch.device) -> "FeatureStore":
@@ -198,6 +196,8 @@ class FeatureStore:
         if self._packed is not None and view.device == self._packed[1].device:
             packed, numbers = self._packed
             return guided.apply_packed(packed, numbers[view], pixel, rgb, grey=GREY)
+        from ..ops import guided_kernels as kernels
+
         # Entries of the views, and a clear word for those that have none.
         asked = view.detach().cpu()
         slot = self._numbers[asked.clamp(0, len(self._numbers) - 1)]
@@ -206,7 +206,9 @@ class FeatureStore:
             raise DataError(f"feature store: view {int(missing.min())} has no features; {len(self._coefs)} training views have")
         positions, colours = (x.detach().cpu().float().contiguous() for x in (pixel, rgb))
         out = torch.empty(len(view), self.channels)
-        self._table.gather(slot.numpy(), positions.numpy(), (colours - GREY).numpy(), out.numpy())
+        tensors = slot, self._address, self._shape, self._scale, self._centre, positions, colours - GREY, out
+        slots, address, shape, scale, centre, places, offsets, found = (part.numpy() for part in tensors)
+        kernels.gather(slots, address, shape, scale, centre, self._coefs[0].shape[3], places, offsets, found)
         return out.to(view.device)
 
 

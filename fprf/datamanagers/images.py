@@ -115,6 +115,7 @@ def header_of(file: IO[bytes], name: object) -> ImageHeader:
 
 def open_image(file: IO[bytes], name: object) -> tuple[str, ImageFile]:
     """The format of an open file and its first image, of which only the header was read. Raises DataError as `header_of`."""
+    # The first bytes say the format, whatever the name says.
     file.seek(0)
     head = file.read(64)
     if not head:

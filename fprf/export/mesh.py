@@ -12,7 +12,7 @@ distances along the unit ray through a pixel's centre.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -249,19 +249,15 @@ def surface_nets(
     vertex = torch.full((len(cell),), -1)
     vertex[crossed] = torch.arange(int(crossed.sum()))
     corner = value[find(cell[crossed][:, None] + _CORNERS)]
+    # On each of the 12 edges of a cell the zero lies where the values say, if their signs differ.
     (first, second), place = torch.tensor(_EDGES).T, _CORNERS.double()
     crosses = (corner[:, first] < 0) != (corner[:, second] < 0)
     part = corner[:, first] / torch.where(crosses, corner[:, first] - corner[:, second], 1.0)
     along = place[first] + part[..., None] * (place[second] - place[first])
     mean = (along * crosses[..., None]).sum(1) / crosses.sum(1, keepdim=True)
     at = cell[crossed].double() + mean
-    return at, torch.cat([*_quads(cell, inside, vertex, at, find)])
-
-
-def _quads(
-    cell: Tensor, inside: Tensor, vertex: Tensor, at: Tensor, find: Callable[[Tensor], Tensor]
-) -> Iterator[Annotated[Tensor, "F 3"]]:
-    """Two triangles for each lattice edge that crosses zero, split along the shorter diagonal; one axis after the other."""
+    # Two triangles for each lattice edge that crosses zero, split along the shorter diagonal; one axis after the other.
+    faces = []
     for step in torch.eye(3, dtype=torch.int64):
         b, c = step.roll(1), step.roll(2)
         ahead = find(cell + step)
@@ -274,7 +270,8 @@ def _quads(
         corner = torch.where(outwards[:, None], corner, corner.flip(1))
         one, other = ((at[corner[:, k]] - at[corner[:, k + 2]]).norm(dim=-1) for k in (0, 1))
         corner = torch.where((one <= other)[:, None], corner, corner.roll(-1, 1))
-        yield from (corner[:, [0, 1, 2]], corner[:, [0, 2, 3]])
+        faces += [corner[:, [0, 1, 2]], corner[:, [0, 2, 3]]]
+    return at, torch.cat(faces)
 
 
 def _keys(cell: Annotated[Tensor, "... 3"]) -> Annotated[Tensor, "..."]:

@@ -85,6 +85,7 @@ class SemanticPlanesConfig(SemanticFieldConfig):
 def _check(name: str, config: PlanesConfig | SemanticPlanesConfig) -> None:
     if not config.resolutions:
         raise ConfigError(f"{name}.resolutions: none given; name at least one")
+    # Bilinear samples need two nodes along each side.
     for r in config.resolutions:
         at_least(f"{name}.resolutions", r, 2)
     at_least(f"{name}.channels", config.channels, 1)

@@ -49,6 +49,7 @@ def density(raw: Annotated[Tensor, "N"]) -> Annotated[Tensor, "N"]:
 def linear(inputs: int, outputs: int, *, generator: torch.Generator) -> nn.Linear:
     """A linear map without bias, uniform in +-sqrt(3 / inputs): unit variance out for unit variance in."""
     layer = nn.Linear(inputs, outputs, bias=False)
+    # A uniform draw within +-b has the variance b^2 / 3.
     bound = math.sqrt(3 / inputs)
     with torch.no_grad():
         layer.weight.uniform_(-bound, bound, generator=generator)
@@ -61,6 +62,7 @@ def mlp(inputs: int, hidden: int, layers: int, outputs: int, *, generator: torch
     for _ in range(layers):
         layer = linear(inputs, hidden, generator=generator)
         with torch.no_grad():
+            # ReLU passes half of the variance (He et al. 2015).
             layer.weight.mul_(math.sqrt(2))
         parts += [layer, nn.ReLU(inplace=True)]
         inputs = hidden
@@ -92,6 +94,7 @@ class Planes(nn.Module):
         self, points: Annotated[Tensor, "N 3"], weight: Annotated[Tensor, "out"]
     ) -> tuple[Annotated[Tensor, "N"], Annotated[Tensor, "N out"]]:
         """`fields.density` of the features' product with the weight, and the features."""
+        # One linear map decides what is solid: cheap enough for every sample of every ray.
         latent = self(points)
         return density(latent @ weight), latent
 

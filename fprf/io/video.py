@@ -144,6 +144,7 @@ def missing_frames(folder: Path, key: str, paths: Sequence[Path]) -> list[Path]:
     The key is written down at once, so that what is rendered from now on counts. Frames are whole or absent.
     Raises DataError where the system refuses to write there.
     """
+    # What the folder was rendered from, if that can be read.
     record = folder / _RECORD
     try:
         known = parse_json(record.read_text("utf-8")).get("key")

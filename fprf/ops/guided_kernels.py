@@ -7,9 +7,6 @@ rounded up to whole vectors of NARROW.
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg"
 
-from collections.abc import Sequence
-from typing import TypeAlias
-
 import numba
 import numpy as np
 
@@ -17,25 +14,6 @@ from .simd import NARROW, load, load_halves, narrow, store, traced
 
 PIXELS = 64
 """Pixels of a task."""
-
-Floats: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
-Halves: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.uint16]]
-Integers: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
-
-
-class ViewTable:
-    """Views side by side, F = scale (A I + b) + centre: where each one's coefficients lie, and what else is known of it."""
-
-    def __init__(self, bits: Sequence[Halves], size: Integers, scale: Floats, centre: Floats) -> None:
-        """Bits [rows columns 4 P], contiguous, height and width [V 2], scale and centre [V C]."""
-        self._kept = bits  # the addresses below must stay good
-        self._address = np.array([each.ctypes.data for each in bits], dtype=np.int64)
-        self._shape = np.concatenate([np.array([each.shape[:2] for each in bits], dtype=np.int64), size], 1)
-        self._scale, self._centre, self._run = scale, centre, bits[0].shape[3]
-
-    def gather(self, slot: Integers, pixel: Floats, rgb: Floats, out: Floats) -> None:
-        """out[i] = F at pixel[i] [R 2] with colour rgb[i] [R 3] of the view slot[i]."""
-        _gather(slot, self._address, self._shape, self._scale, self._centre, self._run, pixel, rgb, out)
 
 
 @traced
@@ -54,7 +32,12 @@ def _corner(position, cells):
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, fastmath={"contract"})
-def _gather(slot, address, shape, scale, centre, run, pixel, rgb, out):
+def gather(slot, address, shape, scale, centre, run, pixel, rgb, out):
+    """out[i] [R C] = F = scale (A I + b) + centre at pixel[i] [R 2] with the colour I = rgb[i] [R 3] of the view slot[i].
+
+    Of V views: `address` of their coefficients [rows columns 4 P] and `shape` [V 4], which is rows, columns, height and width;
+    scale and centre [V C]; run = P.
+    """
     channels = scale.shape[1]
     exponent = np.float32(2.0**112)
     for task in numba.prange((len(slot) + PIXELS - 1) // PIXELS):
@@ -63,6 +46,7 @@ def _gather(slot, address, shape, scale, centre, run, pixel, rgb, out):
             view = slot[i]
             rows, columns = shape[view, 0], shape[view, 1]
             vertical, horizontal = np.float32(rows / shape[view, 2]), np.float32(columns / shape[view, 3])
+            # The four cells around the pixel.
             top, bottom, v = _corner(pixel[i, 1] * vertical, rows)
             left, right, u = _corner(pixel[i, 0] * horizontal, columns)
             total[:] = np.float32(0)

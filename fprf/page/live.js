@@ -82,10 +82,13 @@ class Live {
       return;
     }
     this.place = new Place(at("canvas"), head, splats, splats ? null : () => this.paintField());
-    this.place.listeners.pick = (x, y) => this.pick(x, y);
+    this.place.listeners.pick = (x, y) => {
+      const box = at("canvas").getBoundingClientRect();
+      if (this.state?.shelf.length) this.tell("pick", { camera: this.camera(), x: (x - box.left) / box.width, y: (y - box.top) / box.height });
+    };
     this.place.listeners.drawn = () => at("place").classList.add("drawn");
     this.stage = new Stage(this.place, [{ name: "Captured" }]);
-    this.stage.listeners.chosen = (name) => this.chosen(name);
+    this.stage.listeners.chosen = (name) => { if (this.state?.kept.includes(name)) this.tell("keep", { name, action: "restore" }); };
     window.fprf = { place: this.place, stage: this.stage, live: this };
   }
 
@@ -136,15 +139,6 @@ class Live {
   camera() {
     const { camera, canvas, lens } = this.place;
     return { place: camera.place, axes: camera.axes, lens, size: [canvas.width, canvas.height] };
-  }
-
-  pick(x, y) {
-    const box = at("canvas").getBoundingClientRect();
-    if (this.state?.shelf.length) this.tell("pick", { camera: this.camera(), x: (x - box.left) / box.width, y: (y - box.top) / box.height });
-  }
-
-  chosen(name) {
-    if (this.state?.kept.includes(name)) this.tell("keep", { name, action: "restore" });
   }
 
   // The state of the server

@@ -73,11 +73,13 @@ class Packed:
 
         `rounds` of fitting its maps: fewer for one that is shown at once, and soon replaced.
         """
+        # Means between the least and the most of the style, 8 bits a channel.
         styled = harmonics[self.order, :_HARMONICS]
         mean = (0.5 + HARMONIC * styled[:, 0]).clamp(-1, 2).numpy()
         low, high = mean.min(0), mean.max(0)
         rows = np.zeros((len(mean), 4), np.uint8)
         rows[:, :3] = steps((mean - low) / np.maximum(high - low, 1e-6), 255)
+        # Harmonics above: none, as captured, or as captured through the map that fits best.
         maps = np.eye(3, dtype=np.float32).reshape(1, 9)
         if styled.shape[1] < self.harmonics.shape[1]:
             maps = np.zeros((1, 9), np.float32)
@@ -100,6 +102,7 @@ def pack(gaussians: Gaussians, entries: int = 4096) -> Packed:
     for rows, (low, high), most in zip((means, log_scales), ranges, (65535, 255), strict=True):
         width = np.where(high > low, high - low, 1.0)
         parts.append(steps((rows - low[chunk]) / width[chunk], most))
+    # Words of 32 bits: two axes of the place; its third axis and the entry; the rotation; the size and the opacity.
     place, size = parts
     left_out, three = smallest_three(gaussians.quaternions.numpy())
     turn = steps(three / 2 + 0.5, 1023)
@@ -151,6 +154,7 @@ def _clustered(rows: Annotated[Tensor, "N D"], count: int) -> tuple[Annotated[Te
     book = sample[torch.linspace(0, len(sample) - 1, min(count, len(sample))).long()]
     for _ in range(_LLOYD):
         nearest = _nearest(sample, book)
+        # An entry that nothing is nearest to stays where it is.
         inside = torch.bincount(nearest, minlength=len(book))
         moved = torch.zeros_like(book).index_add_(0, nearest, sample) / inside.clamp_min(1)[:, None]
         book = torch.where(inside[:, None] > 0, moved, book)
@@ -181,12 +185,14 @@ def fit_maps(
     maps = torch.linalg.solve(grams[some].view(-1, 3, 3) + ridge, crosses[some].view(-1, 3, 3) + ridge)
     maps = torch.cat([torch.eye(3)[None], maps])
     for step in range(rounds + 1):
+        # Assign each row to the map of the least error, then solve each map's normal equations over its rows.
         book = torch.cat([(maps @ maps.transpose(1, 2)).flatten(1), maps.flatten(1)], 1)
         label = torch.cat([(part @ book.T).argmin(1) for part in torch.split(rows, _BLOCK)])
         if step == rounds:
             break
         gram = torch.zeros(len(maps), 9).index_add_(0, label, grams).view(-1, 3, 3)
         cross = torch.zeros(len(maps), 9).index_add_(0, label, crosses).view(-1, 3, 3)
+        # The ridge draws a map that few rows determine to what it was.
         ridge = (1e-4 * gram.diagonal(dim1=1, dim2=2).sum(1) + 1e-8)[:, None, None] * torch.eye(3)
         maps = torch.linalg.solve(gram + ridge, cross + ridge @ maps)
     return label.to(torch.uint8).numpy(), maps.flatten(1).float().numpy()

@@ -5,11 +5,6 @@ const make = (tag, props = {}, ...inside) => {
   return node;
 };
 const at = (id) => document.getElementById(id);
-const bytes = (base64) => {
-  const text = atob(base64), data = new Uint8Array(text.length);
-  for (let i = 0; i < text.length; i++) data[i] = text.charCodeAt(i);
-  return data;
-};
 
 // Pictures in the place of a scene: views by styles, one over the other.
 class Pictures {
@@ -42,14 +37,7 @@ class Pictures {
 // The controls of a stage: which style, from which other one, how far, or a line between both.
 class Stage {
   constructor(place, styles) {
-    this.place = place;
-    this.styles = [];
-    this.from = this.to = null;
-    this.wiping = false;
-    this.amount = 1;
-    this.line = 0.5;
-    this.root = at("place");
-    this.listeners = { chosen: null };
+    Object.assign(this, { place, root: at("place"), styles: [], from: null, to: null, amount: 1, wiping: false, line: 0.5, listeners: {} });
     at("mix").oninput = () => this.set({ amount: at("mix").value / 100 });
     at("from").onchange = () => this.set({ from: at("from").value });
     at("wiping").onclick = () => this.set({ wiping: !this.wiping, ...(this.wiping ? {} : { line: 0.5 }) });
@@ -77,8 +65,7 @@ class Stage {
   add(style) {
     if (this.styles.some((each) => each.name === style.name)) return;
     const card = make("button", { type: "button", className: "look", title: style.name, onclick: () => this.choose(style.name) },
-      style.thumb ? make("img", { src: style.thumb, alt: "", draggable: false }) : make("i"), make("span", { textContent: style.name }));
-    card.style.setProperty("--hue", String((47 * this.styles.length) % 360));
+      ...(style.thumb ? [make("img", { src: style.thumb, alt: "", draggable: false })] : []), make("span", { textContent: style.name }));
     this.styles.push({ ...style, card });
     at("looks").insertBefore(card, at("add"));
     at("from").append(make("option", { value: style.name, textContent: style.name }));
@@ -149,7 +136,11 @@ const open = async (data) => {
     for (const id of ["back", "next"]) at(id).hidden = count < 2;
     return new Pictures(root, data.stills);
   };
-  const section = (name) => bytes(at(`data-${name}`).textContent.trim());
+  const section = (name) => {
+    const text = atob(at(`data-${name}`).textContent.trim()), data = new Uint8Array(text.length);
+    for (let i = 0; i < text.length; i++) data[i] = text.charCodeAt(i);
+    return data;
+  };
   let place = null;
   if (data.scene) {
     try {

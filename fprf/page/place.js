@@ -74,7 +74,7 @@ class Place {
     this.keys = new Set();
     this.still = 0;
     this.flight = null;
-    this.listeners = { pick: null, moved: null, drawn: null };
+    this.listeners = { pick: null, drawn: null };
     this.controls();
     new ResizeObserver(() => this.resize()).observe(canvas);
     if (splats) {
@@ -101,7 +101,6 @@ class Place {
     this.changed = true;
     this.moved ||= moved;
     this.still = performance.now();
-    if (moved) this.listeners.moved?.();
   }
 
   show(changes) {

@@ -87,8 +87,7 @@ void main() {
   if (m > 0.) shown = mix(shown, shaded(texelFetch(second, texel(int(index)), 0), range1, maps1, rest), m);
   look = uvec4(packHalf2x16(shown.rg), packHalf2x16(vec2(shown.b, alpha)), wide, 0u);
 }`;
-const NOTHING = `${COMMON}
-void main() {}`;
+const NOTHING = `${COMMON}void main() {}`;
 const QUAD = `${COMMON}
 uniform vec2 size; uniform usampler2D projected; uniform int kept;
 out vec2 at; flat out vec4 colour;
@@ -113,8 +112,7 @@ void main() {
   if (a < 1. / 255.) discard;
   o = vec4(colour.rgb * a, a);
 }`;
-const FULL = `${COMMON}
-void main() { gl_Position = vec4(float(gl_VertexID & 1) * 4. - 1., float(gl_VertexID >> 1) * 4. - 1., -1., 1.); }`;
+const FULL = `${COMMON}void main() { gl_Position = vec4(float(gl_VertexID & 1) * 4. - 1., float(gl_VertexID >> 1) * 4. - 1., -1., 1.); }`;
 const SHOW = `${COMMON}
 uniform sampler2D picture; uniform vec2 scale; uniform float height; uniform vec3 background; out vec4 o;
 void main() {

@@ -121,6 +121,7 @@ def page_html(page: Page, *, megabytes: float | None = None, path: Path = Path("
     if (scene := page.scene) is None:
         return fixed, 0
     harmonics = [scene.shown.harmonics, *(style.harmonics for style in page.styles if style.harmonics is not None)]
+    # Pack all, and while it is too large keep the share that would fit, of the Gaussians that weigh most in the views.
     empty, kept, weight = len(fixed.encode()), None, None
     for _ in range(4):
         head, parts = packed_scene(scene, harmonics, kept, page.start)
@@ -173,10 +174,12 @@ def packed_scene(
 
 def about(cameras: Cameras, start: int, depth: Callable[[int], float]) -> dict[str, Any]:
     """Cameras of a scene, that at `start` first, and where one may go; `depth` is the distance that a camera turns about."""
+    # Evenly chosen cameras in their order, rotated so that the one to start from comes first.
     others = sorted({*torch.linspace(0, len(cameras) - 1, min(_CAMERAS, len(cameras))).round().long().tolist()})
     chosen = [start, *(view for view in others if view > start), *(view for view in others if view < start)]
     depths = [depth(view) for view in chosen]
     up = torch.nn.functional.normalize(upwards(cameras).double(), dim=0)
+    # One may go beyond the outermost camera, and half as far again as what is looked at: then nothing is left to see.
     place = cameras.pose[:, :, 3].double()
     centre = place.mean(0)
     radius = _ROOM * float((place - centre).norm(dim=1).max()) + 0.5 * sorted(depths)[len(depths) // 2]
@@ -210,8 +213,9 @@ def _camera(cameras: Cameras, view: int, depth: float) -> dict[str, Any]:
 
 
 def _depth(scene: SplatScene, view: int) -> float:
-    """Distance along a camera's axis of the middle of what its picture shows: weighted median of the Gaussians in it."""
+    """Distance along a camera's axis of the middle of what its picture shows: median of the Gaussians in it."""
     camera = camera_of(scene.views, view)
+    # Of the Gaussians whose centres lie in the middle two thirds of the picture.
     at = scene.gaussians.means.double() @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     depth = at[:, 2].clamp_min(1e-9)
     middle = camera.intrinsics[:2, 2] + at[:, :2] / depth[:, None] * camera.intrinsics.diagonal()[:2]
@@ -253,6 +257,7 @@ def _text(page: Page, film: str, head: Mapping[str, Any] | None, parts: Mapping[
     known = {reference.name: reference for reference in page.references}
     blocks = "\n".join(_style(style, page.views, known) for style in page.styles)
     maps = "".join(_figure(view.depth, view.name, _MAP) for view in page.views if view.depth is not None)
+    # Sections below the stage; those without content are left out, of the navigation too.
     below = [
         ("Film", film),
         ("Views", _views(page.views) if any(view.photograph is not None for view in page.views) else ""),

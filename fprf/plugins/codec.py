@@ -126,6 +126,7 @@ def read_json(path: Path, name: str = "a config.json") -> Any:
 
 
 def _check(whole: Any) -> None:
+    # The format first: what another one holds is not ours to judge.
     if not isinstance(whole, dict) or "format" not in whole:
         raise ConfigError('expected an object with "format": 1, as `fprf train` writes it')
     if whole["format"] != _FORMAT or type(whole["format"]) is not int:
@@ -139,6 +140,7 @@ def _check(whole: Any) -> None:
     for key in whole:
         if key not in _KEYS:
             raise ConfigError(f"unknown key {key!r}{registry.nearest(key, list(_KEYS))} (allowed: {', '.join(_KEYS)})")
+    # What is read before the config itself.
     if not isinstance(whole["method"], str):
         raise ConfigError(f"method: expected a name, found {whole['method']!r}")
     plugins = whole["plugins"]

@@ -133,6 +133,7 @@ def make(group: str, name: str, kind: type[T]) -> T:
 
 def name_of(group: str, cls: type) -> str:
     """The name that a plug-in is saved under: the inverse of `load`. Imports nothing."""
+    # By what metadata say, or by the object itself where a class is re-exported.
     value = f"{cls.__module__}:{cls.__qualname__}"
     for name, entries in installed(group).items():
         if any(each.point.value == value or _imported(each.point) is cls for each in entries):
@@ -151,6 +152,7 @@ def nearest(name: str, allowed: Mapping[str, object] | list[str]) -> str:
 
 def _imported(point: EntryPoint) -> object | None:
     """The object of an entry point, from the modules that are imported already: a class may be re-exported."""
+    # `package.module:Class.attribute`, of which the module may not be imported yet.
     module, _, attributes = point.value.partition(":")
     value: object | None = sys.modules.get(module.strip())
     for attribute in attributes.strip().split("."):

@@ -69,6 +69,7 @@ def slots(config: Any, prefix: str = "") -> Iterator[Slot]:
 
 def replace(config: C, path: str, value: object) -> C:
     """`dataclasses.replace` along a dotted path."""
+    # From the inside out, each level as a copy.
     head, _, rest = path.partition(".")
     inner = replace(getattr(config, head), rest, value) if rest else value
     changed: C = dataclasses.replace(config, **{head: inner})  # type: ignore[type-var]  # C is a dataclass by contract
@@ -79,6 +80,7 @@ def take_flag(args: Sequence[str], flag: str) -> tuple[str | None, list[str]]:
     """Value of `--flag V` or `--flag=V` (the last one wins), and the other arguments. '-' and '_' are one letter."""
     value: str | None = None
     rest: list[str] = []
+    # Flags of other slots and of fields are left for whoever knows them.
     waiting = iter(args)
     for arg in waiting:
         key, equals, inline = arg.partition("=")

@@ -41,6 +41,7 @@ def write_weights(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
 
 def tensors_hash(tensors: Mapping[str, Tensor]) -> str:
     """First 12 hex digits of the SHA-256 over names, shapes and float32 values, in the order of the names."""
+    # Values as float32, so that a file in half precision and its copy in full have one hash.
     digest = hashlib.sha256()
     for name in sorted(tensors):
         value = tensors[name].detach().to("cpu", torch.float32).contiguous()
@@ -122,6 +123,7 @@ def read_tensors(path: Path, source: WeightSource) -> tuple[dict[str, Tensor], d
         return read_weights(path)
     if not path.is_file():
         raise WeightsError(f"{path}: no such weights file; {source.network}'s is {source.origin}")
+    # A name with a hash is a promise that is kept before anything is unpacked.
     _check_hash(path, path.name, source)
     try:
         tensors = torch.load(path, map_location="cpu", weights_only=True)

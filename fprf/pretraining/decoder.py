@@ -147,15 +147,18 @@ def prepare_crops(
     loaded = [load_photo(path, longest).to(device) for path in photos]
     side = min(side, *(min(photo.shape[:2]) for photo in loaded))
     made = [filtered_crop(encoder, photo, side, generator_of(seed, i)) for i, photo in enumerate(loaded)]
+    # Units first: activations below are divided by them.
     images = [rgb.view(side, side, 3).permute(2, 0, 1) for _, rgb in made]
     if measure:
         network.measure(images)
+    # The content's structure is its normalised activations: they take the deviation of any style later (AdaIN).
     seen = [network(image[None]) for image in images]
     structure = []
     for each in seen:
         mean, std = (half[:, :, None, None] for half in style_statistics([each[CONTENT]])[0].chunk(2, 1))
         structure.append(((each[CONTENT] - mean) / std).half())
     statistics = [style_statistics(each) for each in seen]
+    # Moments of features in float64; the features themselves are kept in half precision, since there are many.
     wide = [double(features) for features, _ in made]
     own = [(each.mean(0), each.var(0, correction=0)) for each in wide]
     return Crops(
@@ -176,12 +179,14 @@ def restyling_losses(
     style: Annotated[Tensor, "B"],
 ) -> tuple[Annotated[Tensor, ""], Annotated[Tensor, ""]]:
     """Content loss and style loss (paper, L_c and L_s) of crops `content` in the styles of crops `style`."""
+    # The paper's training pair: content features with the moments of the style, decoded to a picture (t, and g(t)).
     features = adain(
         crops.features[content].float(), (crops.mean[content], crops.std[content]), (crops.mean[style], crops.std[style])
     )
     colour = decode(features.flatten(0, 1)).view(len(content), crops.side, crops.side, 3)
     activations = network(colour.permute(0, 3, 1, 2))
     wanted = [layer[style] for layer in crops.style]
+    # L_c compares with AdaIN in VGG's own space, L_s with the style's moments layer by layer.
     mean, std = (half[:, :, None, None] for half in wanted[CONTENT].chunk(2, 1))
     structure = F.mse_loss(activations[CONTENT], crops.structure[content].float() * std + mean)
     return structure, style_distance(style_statistics(activations), wanted)

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from ..interfaces import Figures, Learner, State
 from ..training import checkpoint
 from ..training.driver import Report, Schedule, learn
-from ..training.run import Run, held
+from ..training.run import Run, lock_folder
 from ..training.tasks import begin
 from .config import PretrainConfig
 
@@ -50,12 +50,14 @@ class NetworkLearner(Learner):
         return next(self.network.parameters()).device
 
     def step(self, index: int, share: float) -> None:
+        # Linear warm-up, then one cosine to zero over the whole schedule.
         warm = min(1.0, share / WARM_UP + 0.01)
         self.optimizer.param_groups[0]["lr"] = self.config.rate * warm * 0.5 * (1 + math.cos(math.pi * share))
         value = self.loss(generator_of(self.config.seed, index))
         self.optimizer.zero_grad(set_to_none=True)
         value.backward()  # type: ignore[no-untyped-call]
         self.value, self.seen = value.detach(), self.seen + self.config.batch
+        # A loss that is not finite changes nothing.
         finite = bool(torch.isfinite(self.value))
         self.skipped, self.failed = self.skipped + (not finite), 0 if finite else self.failed + 1
         if finite:
@@ -96,7 +98,7 @@ def train(
     # The folder is a run's, as far as the driver needs one; it goes when the weights are there.
     run = Run(training_folder(output))
     schedule = Schedule(config.steps, None if config.steps is not None else config.minutes, _SAVED / 60)
-    with held(run.root):
+    with lock_folder(run.root):
         begin(run.root, repr(replace(config, device="auto")))
         if steps := checkpoint.steps(run.checkpoints):
             say(f"resumed at step {steps[-1]}")

@@ -49,6 +49,7 @@ def load_photo(path: Path, longest: int | None = None) -> Annotated[Tensor, "H W
     side = max(pixels.shape[:2])
     if longest is None or side <= longest:
         return pixels
+    # Area means: a smaller photograph must not alias.
     size = [max(1, round(n * longest / side)) for n in pixels.shape[:2]]
     smaller = F.interpolate(pixels.permute(2, 0, 1)[None], size, mode="area")[0]
     return smaller.permute(1, 2, 0).contiguous()
@@ -69,6 +70,7 @@ def filtered_at(
     height, width = photo.shape[:2]
     pixels = pixels.to(photo.device)
     features = encoder(photo.permute(2, 0, 1)[None])[0]
+    # Features are filtered along the photograph's edges, as those of a scene are (guided filter).
     coefs = coefficients(features, photo, radius=_radius(photo), eps=GUIDED.eps, stride=GUIDED.stride)
     rgb = photo[pixels[:, 0], pixels[:, 1]]
     return apply(coefs, pixels.flip(1) + 0.5, rgb, (height, width)), rgb
@@ -79,6 +81,7 @@ def filtered_crop(
     encoder: Encoder, photo: Annotated[Tensor, "H W 3"], side: int, generator: torch.Generator
 ) -> tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N 3"]]:
     """Features and colours of a random square of the photograph, row by row; the whole of it was encoded."""
+    # The whole photograph is encoded, so that a crop's features know what lies around it.
     top, left = (int(torch.randint(0, size - side + 1, (), generator=generator)) for size in photo.shape[:2])
     rows, columns = torch.meshgrid(top + torch.arange(side), left + torch.arange(side), indexing="ij")
     return filtered_at(encoder, photo, torch.stack([rows.flatten(), columns.flatten()], 1))

@@ -168,6 +168,7 @@ def find_matches(place: SceneFolder, state: State, config: SfmConfig, progress: 
     key = step_key(state.done["features"], kind, config.overlap, config.neighbours)
     if state.done.get("matches") == key and place.database.is_file():
         return kind
+    # Pairs of numbers of images, each pair once.
     if kind == "exhaustive":
         chosen = list(itertools.combinations(range(len(names)), 2))
     elif kind == "sequential":

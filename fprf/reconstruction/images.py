@@ -62,6 +62,7 @@ def choose_frames(scores: Sequence[float], count: int, least: float) -> tuple[li
     A window whose best frame has less than `least` times the median sharpness of the windows around it gives none: all of
     it is blurred, as in a quick turn. `least` lies in [0, 1). With `count` frames or fewer every frame is a window.
     """
+    # Windows of equal length, but for rounding, and the sharpest frame of each.
     windows = min(count, len(scores))
     edges = [round(k * len(scores) / windows) for k in range(windows + 1)] if windows else [0]
     best = [max(range(low, high), key=lambda i: (scores[i], -i)) for low, high in pairwise(edges)]
@@ -206,6 +207,7 @@ def lost_files(state: State) -> str:
     """The files of a folder that could not be decoded, in one clause; empty where all could be, and of a video."""
     if not state.dropped or "frames" in state.done:
         return ""
+    # Files with the same reason are named together.
     alike: dict[str, list[str]] = {}
     for name, reason in state.dropped.items():
         alike.setdefault(reason, []).append(name)
@@ -236,6 +238,7 @@ def _from_folder(source: Path, place: SceneFolder, state: State, progress: Progr
     Formats that COLMAP does not read become JPEGs, whatever the name says: IMG_1.heic is IMG_1.heic.jpg in the scene. All
     others are copied: COLMAP and `load_image` see the same pixels in them.
     """
+    # Images may lie in the scene already; hidden folders are those of other programs.
     inplace = place.images.resolve() == source.resolve()
     files = sorted(path for path in source.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
     files = [path for path in files if not any(part.startswith(".") for part in path.relative_to(source).parts)]
@@ -276,6 +279,7 @@ def _from_video(
     source: Path, place: SceneFolder, state: State, config: SfmConfig, progress: Progress
 ) -> dict[str, dict[str, Any]]:
     """Sharp frames, evenly over time."""
+    # A video is told by its size and time: hashing gigabytes takes longer than is worth it.
     about = source.stat()
     key = step_key("frames", about.st_size, about.st_mtime_ns, config.frames, config.blurred)
     if state.done.get("frames") == key and all((place.images / name).is_file() for name in state.images):
@@ -293,6 +297,7 @@ def _from_video(
 
 def _write_jpeg(path: Path, target: Path) -> None:
     """The image as JPEG, upright, with what the file says of its camera. Raises DataError where it cannot be decoded."""
+    # The pixels are turned here, so that nothing may turn them again.
     pixels, exif, data = load_image(path, upright=True), _exif(path), BytesIO()
     exif.pop(Tag.Orientation, None)
     try:

@@ -62,6 +62,7 @@ class State:
     def load(cls, place: SceneFolder) -> "State":
         """The state of a folder; a new one where nothing was done. Raises UsageError for a folder of something else."""
         path = place.work / "state.json"
+        # Only a folder that is new, or holds no more than images, is begun in.
         if not path.is_file():
             here = [entry.name for entry in place.root.iterdir()] if place.root.is_dir() else []
             if (place.root.exists() and not place.root.is_dir()) or set(here) - {"images", "sfm"}:
@@ -139,6 +140,7 @@ def report(
     for number, model in enumerate(models, 1):
         part_of = dict.fromkeys(model["images"], number) | part_of
     lost: dict[str, list[tuple[str, str]]] = {"choosing": [*unused.items()], "features": [], "matching": [], "mapping": []}
+    # The first step that an image did not pass is where it was lost.
     for name in images:
         features, partners, part = matches.features.get(name), matches.partners[name], part_of.get(name)
         if name in posed:
@@ -176,6 +178,7 @@ def summary_rows(content: Mapping[str, Any], most: int = 12) -> list[tuple[str, 
     rows: list[tuple[str, str, str]] = []
     many = Counter(drop["step"] for drop in content["dropped"])
     told = set()
+    # A step that lost many is one row, with an example.
     for drop in content["dropped"]:
         step = drop["step"]
         if many[step] <= most:

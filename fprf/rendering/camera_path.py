@@ -68,6 +68,7 @@ def read_camera_path(path: Path, origin: Origin = (0.0, 0.0, 0.0)) -> tuple[Came
     except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError) as error:
         raise DataError(f"{path}: cannot be read ({error}); export the camera path again") from error
     width, height = int(content.render_width), int(content.render_height)
+    # Pixels are square: the vertical field of view decides both focal lengths.
     focals = [height / 2 / math.tan(math.radians(frame.fov) / 2) for frame in content.camera_path]
     frames = ideal_cameras(torch.stack(poses), torch.tensor(focals, dtype=torch.float64), (width, height))
     return frames.shifted([-x for x in origin]), content.fps
@@ -94,6 +95,7 @@ def write_camera_path(path: Path, cameras: Cameras, fps: float, origin: Origin =
     if not len(cameras):
         raise DataError(f"{path}: a camera path of no frames cannot be written")
     width, height = (int(side) for side in cameras.size[0])
+    # Files are in the capture's coordinates, cameras about the local origin.
     cameras, frames = cameras.shifted(origin), []
     for view in range(len(cameras)):
         matrix = [*cameras.pose[view].flatten().tolist(), 0.0, 0.0, 0.0, 1.0]

@@ -107,6 +107,7 @@ def rays_through(
     A pixel that the lens maps nothing to gets the outermost direction on its side.
     """
     plane = _plane(cameras, view, pixel)
+    # From pixels to the plane at depth 1, through the lens, into the world.
     local = unbend(cameras.distortion[view], cameras.lens[view], cameras.reach[view], plane)
     pose = cameras.pose[view]
     # OpenCV's lens axes to OpenGL's camera axes: y and z turn round.
@@ -156,6 +157,7 @@ class PixelRays:
     def __init__(self, cameras: Cameras, *, limit: int = LIMIT) -> None:
         self.cameras = cameras
         self.pinholes = bool((cameras.lens == PINHOLE).all())
+        # Views with one lens share a table: most captures have one camera.
         described = torch.cat(
             [cameras.focal, cameras.centre, cameras.distortion, cameras.size.double(), cameras.lens[:, None].double()], -1
         )

@@ -92,12 +92,14 @@ def _brown_newton(distortion: Tensor, xy: Tensor, target: Tensor, reach: Tensor)
     keep = torch.ones_like(live, dtype=torch.bool)
     for _ in range(_STEPS):
         error = _brown(distortion, xy) - target
+        # Solved pixels leave: most need few steps, and stragglers shall not pay for all.
         size = error.norm(dim=-1)
         keep &= size > _TOLERANCE * (1 + target.norm(dim=-1))
         if not bool(keep.any()):
             break
         live, xy, target, reach, distortion = live[keep], xy[keep], target[keep], reach[keep], distortion[keep]
         size = size[keep]
+        # Far from the axis a whole step may overshoot the fold: halve it until the residual shrinks.
         trial = xy - _brown_step(distortion, xy, error[keep])
         for _ in range(8):
             worse = (_brown(distortion, trial) - target).norm(dim=-1) >= size
@@ -168,22 +170,22 @@ def unbend(
         level = latitude.cos()
         turned = torch.stack([longitude.sin() * level, latitude.sin(), longitude.cos() * level], -1)
         ideal = torch.where(around[:, None], turned, ideal)
+    # Only lenses that bend are solved; pinholes and panoramas are closed forms.
     bent = (lens == OPENCV) | (lens == FISHEYE)
     if bool(bent.any()):
         index = bent.nonzero()[:, 0]
-        ideal[index] = _unbend_bent(distortion[index], lens[index], reach[index], plane[index])
+        distortion, lens, reach, plane = distortion[index], lens[index], reach[index], plane[index]
+        # Radial terms keep the direction around the axis: one number a pixel is solved for.
+        radius = plane.norm(dim=-1)
+        rho = _radial_inverse(distortion[:, :4], radius, reach)
+        outward = plane / radius.clamp_min(1e-300)[:, None]
+        fisheye = torch.cat([outward * rho.sin()[:, None], rho.cos()[:, None]], -1)
+        xy = outward * rho[:, None]
+        # Tangential terms do not: Newton in two dimensions starts from the radial solution.
+        tangential = (lens == OPENCV) & (distortion[:, 4:] != 0).any(-1)
+        if bool(tangential.any()):
+            own = tangential.nonzero()[:, 0]
+            xy[own] = _brown_newton(distortion[own], xy[own], plane[own], reach[own])
+        brown = torch.cat([xy, torch.ones_like(radius)[:, None]], -1)
+        ideal[index] = torch.where((lens == FISHEYE)[:, None], fisheye, brown)
     return torch.nn.functional.normalize(ideal, dim=-1)
-
-
-def _unbend_bent(distortion: Tensor, lens: Tensor, reach: Tensor, plane: Tensor) -> Tensor:
-    radius = plane.norm(dim=-1)
-    rho = _radial_inverse(distortion[:, :4], radius, reach)
-    outward = plane / radius.clamp_min(1e-300)[:, None]
-    fisheye = torch.cat([outward * rho.sin()[:, None], rho.cos()[:, None]], -1)
-    xy = outward * rho[:, None]
-    tangential = (lens == OPENCV) & (distortion[:, 4:] != 0).any(-1)
-    if bool(tangential.any()):
-        index = tangential.nonzero()[:, 0]
-        xy[index] = _brown_newton(distortion[index], xy[index], plane[index], reach[index])
-    brown = torch.cat([xy, torch.ones_like(radius)[:, None]], -1)
-    return torch.where((lens == FISHEYE)[:, None], fisheye, brown)

@@ -121,12 +121,14 @@ def interpolate(cameras: Cameras, order: Annotated[Tensor, "M"], frames_between:
     """
     _at_least("frames_between", frames_between, 0)
     _at_least("the number of views", len(order), 1)
+    # Intrinsics of all views in pixels of the first one: captures mix sizes.
     keys = cameras.select(order)
     keys = keys.resized(keys.size[:1].expand(len(keys), 2))
     frame = torch.arange((len(keys) - 1) * (frames_between + 1) + 1, device=keys.pose.device)
     gap, u = frame // (frames_between + 1), (frame % (frames_between + 1)) / keys.pose.new_tensor(frames_between + 1)
     after = (gap + 1).clamp(max=len(keys) - 1)
     turn = quaternions(keys.pose[:, :, :3])
+    # Rotations the short way round, positions along a spline that visits every key.
     rotation = rotations(slerp(turn[gap], turn[after], u))
     position = catmull_rom(keys.pose[:, :, 3], gap, u)
     return Cameras(
@@ -183,6 +185,7 @@ def _meeting(pose: Annotated[Tensor, "V 3 4"]) -> Annotated[Tensor, "3"] | None:
     less than half of its distance.
     """
     forward = -pose[:, :, 2]
+    # Least squares: the sum of squared distances to the axes has the normal matrix of projections across them.
     across = torch.eye(3, dtype=pose.dtype, device=pose.device) - forward[:, :, None] * forward[:, None, :]
     system = across.mean(dim=0)
     values = torch.linalg.eigvalsh(system)
@@ -284,6 +287,7 @@ def coverage(cameras: Cameras, train: Sequence[int], space: Space) -> Annotated[
     pixels = torch.cartesian_prod(*centres).double()
     others = torch.tensor(_thinned(train, _MOST))
     score = torch.zeros(len(cameras), dtype=torch.float64)
+    # Points along a few rays of each view, looked at by all others: in their image, and from about its direction?
     for views in torch.split(torch.tensor(_thinned(range(len(cameras)), _MOST)), _CHUNK):
         view = views.repeat_interleave(len(pixels))
         origin, direction = rays_through(cameras, view, pixels.repeat(len(views), 1) * cameras.size[view])

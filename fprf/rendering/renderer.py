@@ -79,52 +79,48 @@ def march(
     In full precision under autocast too: a density is an exponential.
     """
     with full_precision(rays.origin):
-        return _march(rays, parts, budget, step, generator)
-
-
-def _march(rays: Rays, parts: Parts, budget: float, step: int | None, generator: torch.Generator | None) -> March:
-    space = parts.space
-    sampled = parts.sampler(_detached(rays), space=space, step=step, generator=generator)
-    # A camera samples what is near it far more densely than any other camera does, and could explain its own image by a
-    # veil there. Scaling gradients by the square of the distance makes every piece of space count alike (Philip and
-    # Deschaintre 2023); beyond a few times the nearest distance that is no longer needed.
-    scaled = step is not None and space.kind in ("contraction", "open")
-    # Densities at the middle of each step, in the unit cube, where the fields live.
-    middle = midpoints(sampled.t)
-    points = rays.origin[:, None] + rays.direction[:, None] * middle[..., None]
-    located = space.locate(points.view(-1, 3))
-    sample = parts.field.density(located)
-    density = sample.density.view(middle.shape)
-    scale = (middle / (_NEAR_CAMERA * rays.near[:, None])).square().clamp(max=1) if scaled else None
-    if scale is not None:
-        density = scale_gradient(density, scale)
-    # Weights and transmittance of Eq. 2; what is only shown needs no gradient.
-    weights = transmittance_weights(density, sampled.t)
-    optical = (density * (sampled.t[:, 1:] - sampled.t[:, :-1])).sum(-1)
-    transmittance = torch.exp(-optical)  # 1 - sum of weights would cancel where the ray is opaque
-    with torch.no_grad():
-        opacity = -torch.expm1(-optical)
-        depth = (weights * middle).sum(-1) / weights.sum(-1).clamp_min(1e-10)
-        keep = keep_heaviest(weights, budget)
-    if step is not None and rays.origin.device.type != "cpu":
-        # All samples, the light ones with weight 0: shapes that the host knows without waiting.
-        ray = torch.arange(len(weights), device=weights.device)[:, None].expand(weights.shape).reshape(-1)
-        heavy = torch.where(keep, weights, 0.0).view(-1)
-        flat = None if scale is None else scale.view(-1)
-        kept = PackedSamples(ray, heavy, located, sample.latent, rays.view.index_select(0, ray), flat, whole=True)
+        space = parts.space
+        sampled = parts.sampler(_detached(rays), space=space, step=step, generator=generator)
+        # A camera samples what is near it far more densely than any other camera does, and could explain its own image by a
+        # veil there. Scaling gradients by the square of the distance makes every piece of space count alike (Philip and
+        # Deschaintre 2023); beyond a few times the nearest distance that is no longer needed.
+        scaled = step is not None and space.kind in ("contraction", "open")
+        # Densities at the middle of each step, in the unit cube, where the fields live.
+        middle = midpoints(sampled.t)
+        points = rays.origin[:, None] + rays.direction[:, None] * middle[..., None]
+        located = space.locate(points.view(-1, 3))
+        sample = parts.field.density(located)
+        density = sample.density.view(middle.shape)
+        scale = (middle / (_NEAR_CAMERA * rays.near[:, None])).square().clamp(max=1) if scaled else None
+        if scale is not None:
+            density = scale_gradient(density, scale)
+        # Weights and transmittance of Eq. 2; what is only shown needs no gradient.
+        weights = transmittance_weights(density, sampled.t)
+        optical = (density * (sampled.t[:, 1:] - sampled.t[:, :-1])).sum(-1)
+        transmittance = torch.exp(-optical)  # 1 - sum of weights would cancel where the ray is opaque
+        with torch.no_grad():
+            opacity = -torch.expm1(-optical)
+            depth = (weights * middle).sum(-1) / weights.sum(-1).clamp_min(1e-10)
+            keep = keep_heaviest(weights, budget)
+        if step is not None and rays.origin.device.type != "cpu":
+            # All samples, the light ones with weight 0: shapes that the host knows without waiting.
+            ray = torch.arange(len(weights), device=weights.device)[:, None].expand(weights.shape).reshape(-1)
+            heavy = torch.where(keep, weights, 0.0).view(-1)
+            flat = None if scale is None else scale.view(-1)
+            kept = PackedSamples(ray, heavy, located, sample.latent, rays.view.index_select(0, ray), flat, whole=True)
+            return March(sampled, weights, depth, opacity, transmittance, kept)
+        # Elsewhere the kept ones alone, gathered.
+        index = keep.view(-1).nonzero()[:, 0]
+        ray = index // max(1, middle.shape[1])
+        kept = PackedSamples(
+            ray,
+            weights.view(-1).index_select(0, index),
+            located.index_select(0, index),
+            sample.latent.index_select(0, index),
+            rays.view.index_select(0, ray),
+            None if scale is None else scale.view(-1).index_select(0, index),
+        )
         return March(sampled, weights, depth, opacity, transmittance, kept)
-    # Elsewhere the kept ones alone, gathered.
-    index = keep.view(-1).nonzero()[:, 0]
-    ray = index // max(1, middle.shape[1])
-    kept = PackedSamples(
-        ray,
-        weights.view(-1).index_select(0, index),
-        located.index_select(0, index),
-        sample.latent.index_select(0, index),
-        rays.view.index_select(0, ray),
-        None if scale is None else scale.view(-1).index_select(0, index),
-    )
-    return March(sampled, weights, depth, opacity, transmittance, kept)
 
 
 def _detached(rays: Rays) -> Rays:
@@ -205,6 +201,7 @@ def render_rays(
             semantics = parts.semantic(kept.point) if styled and parts.semantic is not None else None
             rgb = composite(kept, shade(parts.decoder, features, semantics, restyle), count) + backdrop
     if Want.SEMANTIC in want and parts.semantic is not None:
+        # Semantics follow the geometry and never move it (paper, semantic field).
         semantic = _semantics(
             marched, _detached(rays), parts, count if semantic_rays is None else semantic_rays, semantic_samples
         )
@@ -218,6 +215,7 @@ def _semantics(marched: March, rays: Rays, parts: Parts, count: int, samples: in
     weights = marched.weights[:count].detach()
     s = min(samples or weights.shape[1], weights.shape[1])
     heaviest, index = weights.topk(s, dim=-1, sorted=False)
+    # What the other samples would add is given to these, so that nothing is dimmer for being cheaper.
     scale = marched.opacity[:count, None] / heaviest.sum(-1, keepdim=True).clamp_min(1e-10)
     t = midpoints(marched.sampled.t[:count]).gather(1, index)
     points = rays.origin[:count, None] + rays.direction[:count, None] * t[..., None]

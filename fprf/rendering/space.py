@@ -68,7 +68,15 @@ class Space:
         """World rays (float64, unit directions) as float32 rays of this space."""
         o, d = self._recentred(origin, direction)
         if self.kind == "ndc":
-            o, d = self._device_coordinates(o, d)
+            # From the near plane (t = 0) to infinity (t = 1); a ray that looks backwards is bent to a grazing one.
+            dz = d[:, 2].clamp(max=-1e-6)
+            slopes = d[:, :2] / dz[:, None]
+            start = o + (-(self.near + o[:, 2]) / dz)[:, None] * torch.cat([d[:, :2], dz[:, None]], -1)
+            fx, fy = self.focal
+            x, y, z = start.unbind(-1)
+            # NeRF, appendix C: the projection of the start, and its change along the ray.
+            o = torch.stack([-fx * x / z, -fy * y / z, 1 + 2 * self.near / z], -1)
+            d = torch.stack([-fx * (slopes[:, 0] - x / z), -fy * (slopes[:, 1] - y / z), -2 * self.near / z], -1)
             near, far = torch.zeros_like(o[:, 0]), torch.ones_like(o[:, 0])
         else:
             o = o * self.scale
@@ -146,15 +154,3 @@ class Space:
         """World rays about the centre, in the space's axes, still in world units."""
         turn = self._constant("rotation", origin)
         return (origin - self._constant("centre", origin)) @ turn.T, direction @ turn.T
-
-    def _device_coordinates(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-        """Rays from the near plane (t = 0) to infinity (t = 1); a ray that looks backwards is bent to a grazing one."""
-        dz = d[:, 2].clamp(max=-1e-6)
-        d = torch.cat([d[:, :2], dz[:, None]], -1)
-        start = o + (-(self.near + o[:, 2]) / dz)[:, None] * d
-        fx, fy = self.focal
-        x, y, z = start.unbind(-1)
-        first = torch.stack([-fx * x / z, -fy * y / z, 1 + 2 * self.near / z], -1)
-        dx, dy, dz = d.unbind(-1)
-        way = torch.stack([-fx * (dx / dz - x / z), -fy * (dy / dz - y / z), -2 * self.near / z], -1)
-        return first, way

@@ -93,6 +93,7 @@ def resample(
     cdf = w.cumsum(-1)
     cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf / cdf[:, -1:]], -1)
     step = 1 / (count + 1)
+    # Stratified: one even comb a ray through the inverse of the distribution, not independent draws.
     u = torch.linspace(0, 1 - step, count + 1, dtype=s.dtype, device=s.device) + shifts(s, generator) * step
     at = torch.searchsorted(cdf, u.contiguous(), right=True)
     low, high = (at - 1).clamp(0, s.shape[1] - 1), at.clamp(0, s.shape[1] - 1)
@@ -116,6 +117,7 @@ def interlevel(
     total = torch.cat([torch.zeros_like(proposal_w[:, :1]), proposal_w.cumsum(-1)], -1)
     edges = proposal_s.contiguous()
     last = edges.shape[1] - 1
+    # The proposal's weight over all its steps that touch a step of w bounds it from above.
     low = (torch.searchsorted(edges, s[:, :-1].contiguous(), right=True) - 1).clamp(0, last)
     high = torch.searchsorted(edges, s[:, 1:].contiguous()).clamp(0, last)
     bound = total.gather(1, high) - total.gather(1, low)
@@ -125,6 +127,7 @@ def interlevel(
 
 def distortion(s: Annotated[Tensor, "R E"], w: Annotated[Tensor, "R S"]) -> Tensor:
     """Mean over rays of sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 (s_i+1 - s_i) / 3 (mip-NeRF 360, Eq. 15), in O(S)."""
+    # Sorted middles: sums over pairs are prefix sums, since m_i >= m_j for all j < i.
     middle, width = midpoints(s), s[:, 1:] - s[:, :-1]
     before_w = w.cumsum(-1) - w
     before_m = (w * middle).cumsum(-1) - w * middle

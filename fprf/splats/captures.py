@@ -164,7 +164,7 @@ def light_alone(styled: Styled) -> Styled:
 
     It takes the scene's mean colour, of logarithms, to that of the references. Of one place, both are of the same materials.
     """
-    style, dictionary, regions = styled.scene, styled.dictionary, len(styled.scene.keys)
+    style, dictionary, regions = styled.scene_style, styled.dictionary, len(styled.scene_style.keys)
     if dictionary.colour_mean is None:
         raise UsageError("--match-light: the style has no colours of photographs; name references")
     # sRGB is a power of linear light but for the black end: a gain is a factor of colours plus 0.055.

@@ -36,11 +36,11 @@ from ..training.driver import Schedule
 from ..training.model import Facts
 from ..training.prepare import read_scene
 from ..training.run import Run, known_of
-from ..training.tasks import WHOLE, Part, Task, digest_of, read_done, run_task, train_all
+from ..training.tasks import WHOLE, Part, Task, digest_of, read_done, train_all
 from ..types import Cell
 from .config import GaussiansConfig
 from .gaussians import Gaussians, from_tensors, tensors_of
-from .initial import spatial_order
+from .initial import curve_order
 from .learner import MOVES, GaussianLearner, Stage
 from .levels import in_view
 from .loading import refined
@@ -97,7 +97,7 @@ class Cells(Partition):
         display.say(f"{len(cells)} cells, whose windows are {share:.2f} times the photographs")
         order = sorted(range(len(cells)), key=lambda cell: -pixels[cell])
         executor = config.executor.on("cpu").build()
-        train_all(config, run, executor, run_cell, order, whole_share=config.overview, spent=spent, quiet=display.quiet)
+        train_all(config, run, executor, open_cell, order, whole_share=config.overview, spent=spent, quiet=display.quiet)
         display.say(f"{unite(run.root, cells)} Gaussians")
 
     def write(self, run: Run) -> list[Cell]:
@@ -260,11 +260,6 @@ def overview_config(config: GaussiansConfig, scene: Scene) -> tuple[GaussiansCon
     return own, every
 
 
-def run_cell(task: Task) -> None:
-    """Train the whole scene or a cell, here or on a worker."""
-    run_task(task, open_cell)
-
-
 def other_views(scene: Scene, views: Iterable[int]) -> tuple[int, ...]:
     """Numbers of the views that are not among some."""
     return tuple(sorted(set(range(len(scene.paths))) - set(views)))
@@ -298,7 +293,7 @@ def shown_in_windows(cameras: Cameras, cell: Cell, gaussians: Gaussians, near: f
     visible = cell.around(gaussians.means)
     # Runs [B R] of Gaussians near to each other, the last one repeated, with balls around what they show: most windows
     # show few of them.
-    order = torch.from_numpy(spatial_order(gaussians.means.double().numpy()))
+    order = torch.from_numpy(curve_order(gaussians.means.double().numpy()))
     order = torch.nn.functional.pad(order[None], (0, -len(order) % _RUN), mode="replicate").view(-1, _RUN)
     means, quaternions, log_scales = (x[order] for x in (gaussians.means, gaussians.quaternions, gaussians.log_scales))
     centre = (means.double().amin(1) + means.double().amax(1)) / 2

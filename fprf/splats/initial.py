@@ -91,7 +91,7 @@ def spacing(position: Annotated[Doubles, "P 3"]) -> Annotated[Doubles, "P"]:
     if count < 4:
         return np.ones(count)
     # Of each point the three least distances so far, to those that lie so many places apart on the curve, on either side.
-    order = spatial_order(position)
+    order = curve_order(position)
     sorted_, near = position[order], np.full((3, count), np.inf)
     for step in range(1, min(_WINDOW, count - 1) + 1):
         apart = np.linalg.norm(sorted_[step:] - sorted_[:-step], axis=1)
@@ -105,7 +105,7 @@ def spacing(position: Annotated[Doubles, "P 3"]) -> Annotated[Doubles, "P"]:
     return np.clip(mean, 1e-6 * widest, widest)  # points in one place have a logarithm, too
 
 
-def spatial_order(position: Annotated[NDArray[np.floating], "P 3"]) -> NDArray[np.int64]:
+def curve_order(position: Annotated[NDArray[np.floating], "P 3"]) -> NDArray[np.int64]:
     """Indices along a Morton curve: what is near in space is then near in memory."""
     low, high = np.percentile(position, 2, axis=0), np.percentile(position, 98, axis=0)
     cell = np.clip((position - low) / np.maximum(high - low, _TINY) * 1023, 0, 1023).astype(np.int64)

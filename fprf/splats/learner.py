@@ -50,7 +50,7 @@ from ..training.model import Facts
 from ..training.run import Known, Run
 from .config import GaussiansConfig
 from .gaussians import Gaussians, from_arrays, from_rows, from_tensors, tensors_of
-from .initial import Points, spacing, spatial_order
+from .initial import Points, curve_order, spacing
 from .photographs import Level
 from .scene import SplatScene, run_scene
 
@@ -148,7 +148,7 @@ class GaussianLearner(SceneLearner):
     def begin_at(self, points: Points, rng: np.random.Generator, surroundings: Points | None = None) -> None:
         """Put a Gaussian at each point: as wide as the points lie apart, in any direction; those of surroundings are opaque."""
         # Neighbours in space follow each other, so that tiles find what they show close together.
-        order = spatial_order(points.position)
+        order = curve_order(points.position)
         position, colour = points.position[order], points.colour[order]
         size, opacity = spacing(position) * _START_SCALE, np.full(len(position), _START_OPACITY)
         if surroundings is not None:
@@ -275,7 +275,7 @@ class GaussianLearner(SceneLearner):
             model.split(picked, to, *halves(model.read(index=picked), opacity[picked]))
         # Neighbours in space drift apart in memory, and tiles slow down.
         if (step + 1) % (_SORT_EVERY * self.config.relocate_every) == 0 or more > 0.3 * model.count:
-            model.reorder(spatial_order(model.read(MEANS)))
+            model.reorder(curve_order(model.read(MEANS)))
 
     def figures(self) -> Figures:
         means = self.means | {"gaussians": float(self.model.count)}

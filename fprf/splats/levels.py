@@ -25,7 +25,7 @@ from ..io.atomic import atomic_path
 from ..ops.rasterise import Pinhole
 from ..rendering.splines import quaternions, rotations
 from .gaussians import Gaussians, from_rows
-from .initial import spatial_order
+from .initial import curve_order
 
 _CHUNK, _GROUP, _LEVELS = 512, 4, 4
 """Gaussians of a chunk; those merged into one of the next level; levels, the finest included."""
@@ -255,7 +255,7 @@ def open_levels(folder: Path, key: str) -> Levels | None:
 def _chunks(position: Annotated[NDArray[np.float64], "N 3"], index: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     """Indices in chunks, all but the last one full: halved across the longest side, then along a Morton curve."""
     if len(index) <= _CHUNK:
-        return [index[spatial_order(position[index])]] if len(index) else []
+        return [index[curve_order(position[index])]] if len(index) else []
     own = position[index]
     axis = int((np.quantile(own, 1 - _TAIL, axis=0) - np.quantile(own, _TAIL, axis=0)).argmax())
     half = max(1, len(index) // (2 * _CHUNK)) * _CHUNK

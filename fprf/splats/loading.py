@@ -21,7 +21,7 @@ from ..training.model import Facts, tones_of
 from ..training.prepare import cache_folder, reach_of
 from ..training.quality import PRESETS, QualityConfig, mixed_tone
 from ..training.run import Run, in_training
-from ..training.tensorfiles import load_sealed, save_sealed
+from ..training.tensorfiles import load_sealed, save
 from .config import GaussiansConfig, LookConfig
 from .files import Capture
 from .gaussians import from_tensors
@@ -164,7 +164,7 @@ def open_capture(
 
     def found() -> Semantics:
         semantics = scene.found()
-        save_sealed(path, scene_tensors(scene))
+        save(path, scene_tensors(scene), sealed=True)
         for old in sorted(folder.glob("*.safetensors"), key=lambda each: each.stat().st_mtime)[:-_CACHED]:
             old.unlink(missing_ok=True)
         return semantics

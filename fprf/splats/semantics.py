@@ -206,6 +206,9 @@ def _in_threads(function: Callable[[int], _Result], count: int) -> Iterator[_Res
     """
     before = torch.get_num_threads()
     threads = min(before, _VIEWS_AT_ONCE)
+    if threads == 1:
+        yield from map(function, range(count))
+        return
 
     def begin() -> None:
         torch.set_num_threads(1)

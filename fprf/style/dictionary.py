@@ -43,9 +43,11 @@ ends further from the truth where that is known (docs/evidence)."""
 CLUSTERS = 20
 """Local codes a reference: with ten, as the paper suggests, trees and houses share some (docs/evidence)."""
 
+_FEW_MEMBERS = 32
+"""Pixels of a code below which its own statistics say little."""
 _SAMPLES = 20_000
 """Pixels of a photograph that are looked at, about, on a regular grid."""
-SHORTEST_REFERENCE = 128
+_SHORTEST_LONG_SIDE = 128
 """References are encoded at the scene's size, but not below this: clusters would have too few pixels."""
 _SHORTEST = 64
 """No side is encoded smaller: deep encoders have nothing to pad with on a photograph of a few pixels."""
@@ -68,7 +70,7 @@ class Encoders(NamedTuple):
     content: Encoder
     semantic: Encoder | None
     basis: "Basis | None"
-    scene: "SceneStyle"
+    scene_style: "SceneStyle"
     device: torch.device = torch.device("cpu")
     """Device of the encoders."""
     longest: int = 512
@@ -95,7 +97,7 @@ class Reference(NamedTuple):
 
 
 @torch.inference_mode()
-def encode_photograph(path: Path, encoders: Encoders, *, name: str, weight: float = 1.0, mask: Path | None = None) -> Reference:
+def encode_photograph(path: Path, encoders: Encoders, *, name: str, mask: Path | None = None) -> Reference:
     """Encode one photograph to samples in the scene's terms: D is 0 without a semantic encoder or basis.
 
     Of a photograph with a `mask`, a picture of the same shape, only what is white there is sampled; the encoders see all of
@@ -104,7 +106,7 @@ def encode_photograph(path: Path, encoders: Encoders, *, name: str, weight: floa
     photo = load_image(path, upright=True)
     # Reduced to the size of the scene's views where the shape allows, and enlarged only where an encoder could not take it.
     height, width = photo.shape[:2]
-    scale = min(1.0, max(encoders.longest, SHORTEST_REFERENCE) / max(height, width))
+    scale = min(1.0, max(encoders.longest, _SHORTEST_LONG_SIDE) / max(height, width))
     width, height = max(_SHORTEST, round(width * scale)), max(_SHORTEST, round(height * scale))
     reduced = np.asarray(cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
     image = torch.from_numpy(reduced).to(encoders.device).float() / 255
@@ -121,9 +123,9 @@ def encode_photograph(path: Path, encoders: Encoders, *, name: str, weight: floa
     content = _filtered(_encode(encoders.content, image), image, pixel, encoders.guided)
     colour = image[pixel[:, 1], pixel[:, 0]]
     if encoders.semantic is None or encoders.basis is None:
-        return Reference(name, content, content.new_zeros(len(content), 0), weight, colour)
+        return Reference(name, content, content.new_zeros(len(content), 0), colour=colour)
     semantic, beyond = semantic_samples(image, pixel, encoders.semantic, encoders.basis, encoders.guided)
-    return Reference(name, content, semantic, weight, colour, beyond)
+    return Reference(name, content, semantic, colour=colour, beyond=beyond)
 
 
 def semantic_samples(
@@ -206,18 +208,16 @@ def build_dictionary(
     clusters: int = CLUSTERS,
     blend: float = BLEND,
     seed: int = 0,
-    min_members: int = 32,
 ) -> StyleDictionary:
     """Cluster each reference by its semantics; a code is the mean and covariance of the content inside, float32.
 
-    A code takes `blend` of its whole image's statistics, and more the further its members fall short of `min_members`. The
+    A code takes `blend` of its whole image's statistics, and more the further its members fall short of 32. The
     order of the references plays no part: they are sorted by what they hold. Statistics are computed on the samples' device;
     the tables, a few kB, are on the CPU, where stylizers are built. Raises DataError for no references, one
     without pixels, sizes that differ, or values that are not finite.
     """
     at_least("clusters", clusters, 1)
     between("blend", blend, 0.0, 1.0)
-    at_least("min_members", min_members, 1)
     _check_references(references)
 
     def content_hash(r: Reference) -> str:
@@ -229,7 +229,7 @@ def build_dictionary(
 
     # By content, so that the order in which they were named does not show even in the rounding of sums.
     ordered = sorted(references, key=lambda r: (content_hash(r), r.name, r.weight))
-    parts = [_codes_of(r, clusters, blend, seed, min_members) for r in ordered]
+    parts = [_codes_of(r, clusters, blend, seed) for r in ordered]
     return concatenate(parts, [r.name for r in ordered], [r.weight for r in ordered])
 
 
@@ -243,7 +243,7 @@ def concatenate(parts: Sequence[StyleDictionary], names: Sequence[str], weights:
     return StyleDictionary(**tables, reference=reference, names=tuple(names), blend=parts[0].blend)
 
 
-def _codes_of(r: Reference, clusters: int, blend: float, seed: int, min_members: int) -> StyleDictionary:
+def _codes_of(r: Reference, clusters: int, blend: float, seed: int) -> StyleDictionary:
     """Build the codes of one reference, float32, those of colours where it has some."""
     # Local codes are clusters of the semantics; without semantics there is one.
     label, keys = r.semantic.new_zeros(len(r.semantic), dtype=torch.int64), r.semantic[:1].float()
@@ -252,7 +252,7 @@ def _codes_of(r: Reference, clusters: int, blend: float, seed: int, min_members:
     # Codes with few members say little: the fewer, the more of the whole image they take.
     member = double(torch.nn.functional.one_hot(label, len(keys)))
     share = member.sum(0) / len(label)
-    at = 1 - (1 - blend) * (share * len(label) / min_members).clamp_max(1.0)
+    at = 1 - (1 - blend) * (share * len(label) / _FEW_MEMBERS).clamp_max(1.0)
 
     def statistics(features: Annotated[Tensor, "N C"]) -> tuple[Annotated[Tensor, "T C"], Annotated[Tensor, "T C C"]]:
         whole = moments(features, features.new_ones(len(features)))
@@ -290,7 +290,7 @@ def whole_style(d: StyleDictionary) -> tuple[Annotated[Tensor, "C"], Annotated[T
 
     Blending draws the codes' means together and thereby takes b (1 - b) of the scatter between them out of the total
     covariance, for blend b; it is given back, reference by reference, so that clusters and blend don't matter here (but
-    for clusters below `min_members`, which hold too few pixels to show).
+    for clusters of less than 32 members, which hold too few pixels to show).
     """
     means, covariances, weights = [], [], []
     for i in range(len(d.names)):

@@ -66,12 +66,12 @@ class MatchMap(NamedTuple):
 
 
 @torch.inference_mode()
-def match_map(here: Scene, styled: Styled, view: int, cameras: Cameras | None = None) -> MatchMap:
-    """Matches of one of the scene's own views, or of `cameras`: geometry and semantics alone are computed."""
-    cameras, scene, look = here.cameras if cameras is None else cameras, styled.scene, styled.restyle
-    device = here.device
-    belongs = Membership(scene).to(device)
-    centre, units, codes = scene.semantic_mean.to(device), styled.codes.units.to(device), len(styled.codes.reference)
+def match_map(scene: Scene, styled: Styled, view: int, cameras: Cameras | None = None) -> MatchMap:
+    """Matches of one of the scene's scene_style views, or of `cameras`: geometry and semantics alone are computed."""
+    cameras, scene_style, look = scene.cameras if cameras is None else cameras, styled.scene_style, styled.restyle
+    device = scene.device
+    belongs = Membership(scene_style).to(device)
+    centre, units, codes = scene_style.semantic_mean.to(device), styled.codes.units.to(device), len(styled.codes.reference)
 
     def values(semantic: Tensor, points: Tensor | None) -> Tensor:
         # The score is weighted by what is taken, so that its composite is the mean over that.
@@ -82,7 +82,7 @@ def match_map(here: Scene, styled: Styled, view: int, cameras: Cameras | None = 
 
     # One pass composites all of them: codes, score, confidence, regions.
     pixel = pixel_grid(cameras, view)
-    shares, opacity = here.paint(cameras, view, pixel, values, semantic=belongs.divided)
+    shares, opacity = scene.paint(cameras, view, pixel, values, semantic=belongs.divided)
     # Take them apart again.
     width, height = (int(v) for v in cameras.size[view])
     shares = shares.view(height, width, -1)
@@ -203,7 +203,7 @@ class ExplainedRegion(NamedTuple):
 @torch.inference_mode()
 def explain(regions: Regions, styled: Styled | None = None) -> list[ExplainedRegion]:
     """All regions in their order, with what they take where there is a style."""
-    scene, style = regions.scene, regions.style
+    scene, style = regions.scene, regions.scene_style
     # Views evenly over all are looked through, coarsely, for where each region is largest.
     looked = sorted({round(i * (len(scene.names) - 1) / max(1, _VIEWS - 1)) for i in range(_VIEWS)})
     mass = []

@@ -43,7 +43,7 @@ class Regions(NamedTuple):
     """A scene's regions, and what is needed to find them."""
 
     scene: Scene
-    style: SceneStyle
+    scene_style: SceneStyle
     basis: Basis | None
     keys: Mapping[str, RegionKey] = {}
     """Regions that a style file names."""
@@ -65,7 +65,7 @@ def key_of(regions: Regions, number: int) -> RegionKey:
     """The semantics of a region in the encoder's own channels, to six digits: what it can be found by on another scene."""
     if regions.basis is None:
         return ()
-    return tuple(float(f"{x:.6g}") for x in regions.basis.lift(regions.style.keys[number]).tolist())
+    return tuple(float(f"{x:.6g}") for x in regions.basis.lift(regions.scene_style.keys[number]).tolist())
 
 
 def find_regions(regions: Regions, text: str) -> list[RegionMatch]:
@@ -73,7 +73,7 @@ def find_regions(regions: Regions, text: str) -> list[RegionMatch]:
 
     Raises UsageError for what names nothing on this scene, DataError for an unreadable mask.
     """
-    count, names = len(regions.style.share), regions.scene.names
+    count, names = len(regions.scene_style.share), regions.scene.names
     if text.isascii() and text.isdigit():
         if int(text) >= count:
             raise UsageError(f"region {text}: regions go from 0 to {count - 1}; --explain lists them")
@@ -96,7 +96,7 @@ def find_regions(regions: Regions, text: str) -> list[RegionMatch]:
 
 def _alike(regions: Regions, name: str) -> list[RegionMatch]:
     """Find the regions that, of all that the style file knows, are most like the one of that name, and really like it."""
-    encoder, style, lengths = regions.scene.semantic_encoder, regions.style, {*map(len, regions.keys.values())}
+    encoder, style, lengths = regions.scene.semantic_encoder, regions.scene_style, {*map(len, regions.keys.values())}
     if regions.basis is None or lengths != {len(regions.basis.mean)} or regions.encoder not in ("", encoder):
         raise UsageError(
             f"region {name!r}: the style file knows it by the semantic encoder {regions.encoder or '(unnamed)'}, the scene has "
@@ -119,7 +119,7 @@ def _at_pixel(regions: Regions, view: int, x: float, y: float) -> int:
     if not (0 <= x < width and 0 <= y < height):
         raise UsageError(f"{name}:{x:g},{y:g}: outside of the view; x goes from 0 to {width - 1}, y from 0 to {height - 1}")
     centre = torch.tensor([[int(x) + 0.5, int(y) + 0.5]], dtype=torch.float64)
-    share, opacity = memberships(regions.scene, regions.style, cameras, view, centre)
+    share, opacity = memberships(regions.scene, regions.scene_style, cameras, view, centre)
     if float(opacity[0]) < _SOLID:
         raise UsageError(f"{name}:{x:g},{y:g}: there is nothing at that pixel; choose another")
     return int(share[0].argmax())
@@ -151,7 +151,7 @@ def memberships(
 def membership_view(regions: Regions, view: int, size: int) -> tuple[Annotated[Tensor, "H W K"], Annotated[Tensor, "H W"]]:
     """Share of each pixel that belongs to each region, and its opacity, with the longest side at most `size` pixels."""
     cameras = shrunk(regions.scene.cameras, view, size)
-    share, opacity = memberships(regions.scene, regions.style, cameras, 0, pixel_grid(cameras, 0))
+    share, opacity = memberships(regions.scene, regions.scene_style, cameras, 0, pixel_grid(cameras, 0))
     width, height = (int(v) for v in cameras.size[0])
     return share.view(height, width, -1), opacity.view(height, width)
 
@@ -224,7 +224,7 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
     for match, i in pins:
         pinned.setdefault(match.number, set()).add(names.order[i])
     allowed = allowed_references(
-        len(regions.style.share), len(dictionary.names), pin=pinned, forbid=[(f.number, names.order[i]) for f, i in bans]
+        len(regions.scene_style.share), len(dictionary.names), pin=pinned, forbid=[(f.number, names.order[i]) for f, i in bans]
     )
     for match in kept:
         if match.number in pinned or match.number in {f.number for f, _ in strengths}:
@@ -232,8 +232,8 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
     # Scores say whether the references show such a thing at all, so both sides are seen from the scene's mean. Matching, which
     # only has to choose, centres each side on its own: there a rose's petals are as far from its leaves as the sky from the
     # road, and something would always fit.
-    centre = regions.style.semantic_mean
-    score = scores(unit(regions.style.keys, centre), unit(dictionary.keys, centre))
+    centre = regions.scene_style.semantic_mean
+    score = scores(unit(regions.scene_style.keys, centre), unit(dictionary.keys, centre))
     strength = torch.ones(len(allowed))
     for match, value in strengths:
         strength[match.number] = value
@@ -276,7 +276,7 @@ class _StyleNames:
         self.labels = labels(references)
         self.order = [dictionary.names.index(label) for label in self.labels]
         # All regions, not only those that are named: on another scene each must find its like among all of them.
-        every = {f"region{k}": key_of(regions, k) for k in range(len(regions.style.share)) if regions.basis is not None}
+        every = {f"region{k}": key_of(regions, k) for k in range(len(regions.scene_style.share)) if regions.basis is not None}
         self.keys = dict(regions.keys) if regions.keys else every
         self.notes: list[str] = []
 

@@ -35,14 +35,14 @@ class Styled(NamedTuple):
 
     restyle: Restyle
     dictionary: StyleDictionary
-    scene: SceneStyle
+    scene_style: SceneStyle
     codes: Codes
     controls: RegionControls
 
 
 @torch.inference_mode()
 def apply_style(
-    here: Scene,
+    scene: Scene,
     file: StyleFile,
     encoders: Encoders | None = None,
     trail: tuple[Path, ...] = (),
@@ -58,7 +58,7 @@ def apply_style(
     if not style.references:
         raise UsageError("--references: at least one photograph is needed, for example --references autumn.jpg night.jpg")
     # Photographs are encoded once, whatever name, weight or style they are used under.
-    encoders = here.encoders() if encoders is None else encoders
+    encoders = scene.encoders() if encoders is None else encoders
     encoded = {} if encoded is None else encoded
     references = []
     for i, (path, name) in enumerate(zip(style.references, labels(style.references), strict=True)):
@@ -67,7 +67,7 @@ def apply_style(
             encoded[path, mask] = encode_photograph(path, encoders, name=name, mask=None if mask == NO_MASK else mask)
         references.append(encoded[path, mask]._replace(name=name, weight=weight))
     dictionary = build_dictionary(references, clusters=style.clusters, blend=style.blend, seed=encoders.seed)
-    styled = apply_dictionary(here, file, encoders, dictionary)
+    styled = apply_dictionary(scene, file, encoders, dictionary)
     if style.between is None or style.at == 0:
         return styled
     # The other style is built alike, and so is the one that it goes towards itself.
@@ -76,36 +76,36 @@ def apply_style(
         raise ConfigError(f"{style.between}: lies between styles that lead back to it; end the circle")
     other = read_style(style.between)
     check_photographs(style.between, other)
-    return mixed(styled, apply_style(here, other, encoders, (*trail, path)), style.at)
+    return mixed(styled, apply_style(scene, other, encoders, (*trail, path)), style.at)
 
 
 @torch.inference_mode()
-def apply_dictionary(here: Scene, file: StyleFile, encoders: Encoders, dictionary: StyleDictionary) -> Styled:
+def apply_dictionary(scene: Scene, file: StyleFile, encoders: Encoders, dictionary: StyleDictionary) -> Styled:
     """Build the look of a style whose dictionary is built already. `between` is not heeded.
 
     The dictionary's names are the labels of the style's references. Raises UsageError for regions that the scene does not have.
     """
-    style, scene, basis = file.style, encoders.scene, encoders.basis
+    style, scene_style, basis = file.style, encoders.scene_style, encoders.basis
     # Cosines that are not centred start from the encoder's zero, which the basis knows.
     if basis is not None:
         dictionary = dictionary._replace(origin=basis.origin().to(dictionary.keys))
-    controls = region_controls(Regions(here, scene, basis, file.regions, file.semantic_encoder), dictionary, style)
-    if controls.places and here.decoder is not None:
+    controls = region_controls(Regions(scene, scene_style, basis, file.regions, file.semantic_encoder), dictionary, style)
+    if controls.places and scene.decoder is not None:
         raise UsageError("--pin: places are for Gaussians; for a run of fields pin regions, such as --pin 3=autumn.jpg")
-    config, device = style.stylizer, here.device
+    config, device = style.stylizer, scene.device
     partly = bool((controls.strength != 1).any())
-    weight = RegionWeight(scene, controls.strength[:, None]).to(device) if partly else None
+    weight = RegionWeight(scene_style, controls.strength[:, None]).to(device) if partly else None
 
     def look(allowed: Annotated[Tensor, "K references"]) -> Restyle:
         """The look of one choice of references: stylizer, colours behind the decoder, and light where matches are not sure."""
-        stylizer = regional(dictionary, scene, allowed, config)
-        check_stylizer(config, stylizer, dictionary, scene, affine=here.decoder is None and config.colours <= 0)
+        stylizer = regional(dictionary, scene_style, allowed, config)
+        check_stylizer(config, stylizer, dictionary, scene_style, affine=scene.decoder is None and config.colours <= 0)
         stylizer = stylizer.to(device)
-        colours = here.colour_maps(stylizer, dictionary, scene, config, allowed)
+        colours = scene.colour_maps(stylizer, dictionary, scene_style, config, allowed)
         light = None
         if config.light and style.bold < 1:
-            own = own_colours(stylizer, scene, here.decoder)
-            light = light_of(scene, dictionary, config, own, bold=style.bold, allowed=allowed)
+            colours_before = own_colours(stylizer, scene_style, scene.decoder)
+            light = light_of(scene_style, dictionary, config, colours_before, bold=style.bold, allowed=allowed)
         return Restyle(
             stylizer,
             strength=style.strength,
@@ -116,9 +116,9 @@ def apply_dictionary(here: Scene, file: StyleFile, encoders: Encoders, dictionar
             light=None if light is None else light.to(device),
         )
 
-    places = tuple((place.about(here.origin), look(allowed)) for place, allowed in controls.places)
-    codes = Codes(dictionary.reference, dictionary.names, unit(dictionary.keys, scene.semantic_mean))
-    return Styled(replace(look(controls.allowed), places=places), dictionary, scene, codes, controls)
+    places = tuple((place.about(scene.origin), look(allowed)) for place, allowed in controls.places)
+    codes = Codes(dictionary.reference, dictionary.names, unit(dictionary.keys, scene_style.semantic_mean))
+    return Styled(replace(look(controls.allowed), places=places), dictionary, scene_style, codes, controls)
 
 
 def mixed(a: Styled, b: Styled, at: float) -> Styled:

@@ -130,19 +130,9 @@ def deviation(mean: Annotated[Tensor, "... C"], variance: Annotated[Tensor, "...
     The floor is relative, so it biases no live channel, whatever the encoder's scale; always above 0.
     """
     sigma = variance.clamp_min(0.0).sqrt()
-    return sigma.maximum(_least(mean, sigma))
-
-
-def dead_channels(mean: Annotated[Tensor, "... C"], variance: Annotated[Tensor, "... C"]) -> Annotated[Tensor, "... C"]:
-    """Channels that hardly vary (bool): those whose deviation is the floor of `deviation`, so that styles leave them quiet."""
-    sigma = variance.clamp_min(0.0).sqrt()
-    return sigma <= _least(mean, sigma)
-
-
-def _least(mean: Tensor, sigma: Tensor) -> Tensor:
     floor = _FLOOR * sigma.median(dim=-1, keepdim=True).values
     rounding = _RESOLUTION * mean.abs().amax(dim=-1, keepdim=True)
-    return floor.maximum(rounding).clamp_min(1e-12)
+    return sigma.maximum(floor.maximum(rounding).clamp_min(1e-12))
 
 
 _RIDGE = 1e-4
@@ -170,16 +160,12 @@ def monge(
     left, value, _ = torch.linalg.svd(style_root @ symmetric_root(_with_ridge(double(content))))
     half = style_root @ (left / value.clamp_min(torch.finfo(value.dtype).tiny).sqrt()[..., None, :])
     product = half @ half.mT
-    return limit_gain((product + product.mT) / 2, gain)
-
-
-def limit_gain(t: Annotated[Tensor, "... C C"], gain: float) -> Annotated[Tensor, "... C C"]:
-    """The symmetric positive map with no direction amplified more than `gain`; untouched, bit for bit, if none is."""
+    t = (product + product.mT) / 2
+    # Cap the eigenvalues; where none is too large the map stays untouched, bit for bit.
     with full_precision(t):
         value, vector = torch.linalg.eigh(t)
         capped = (vector * value.clamp(0.0, gain)[..., None, :]) @ vector.mT
-    capped = (capped + capped.mT) / 2
-    return torch.where((value[..., -1] > gain)[..., None, None], capped, t)
+    return torch.where((value[..., -1] > gain)[..., None, None], (capped + capped.mT) / 2, t)
 
 
 def _with_ridge(c: Tensor) -> Tensor:

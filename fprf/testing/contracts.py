@@ -106,6 +106,7 @@ def check_encoder(config: EncoderConfig) -> None:
     require(not encoder.training, f"{name}: must be in evaluation mode")
     require(not any(p.requires_grad for p in encoder.parameters()), f"{name}: its parameters must not want gradients")
     require(config.build().identity == encoder.identity, f"{name}: identity must be the same for the same config")
+    # Sizes that strides divide, and some that they do not; both ways round.
     for height, width in ((64, 96), (49, 37), (96, 64)):
         image = cases.uniform(2, 3, height, width, seed=18)
         features = encoder(image)
@@ -123,11 +124,13 @@ def check_encoder(config: EncoderConfig) -> None:
         for opacity in ((torch.arange(width) < width // 2).float() * opaque, 0 * opaque):
             shown = encoder.cutout(image * opacity[:, None], opacity)
             tensor(shown, tuple(features.shape), f"{name} of a picture that is transparent in places")
+    # Photographs of a pixel, and slivers: nothing may be smaller than a kernel allows.
     for height, width in ((1, 1), (2, 90), (90, 2)):
         features = encoder(cases.uniform(1, 3, height, width, seed=19))
         tensor(features, (1, encoder.channels, None, None), f"{name} of {height} x {width} pixels")
     for level in (0.0, 1.0):
         tensor(encoder(torch.full((1, 3, 40, 40), level)), (1, encoder.channels, None, None), f"{name} of a flat image")
+    # In float64 a tensor that it makes for itself shows, if it does not follow the inputs.
     image = cases.uniform(1, 3, 40, 40, seed=20).double()
     encoder.double()
     follows(lambda: encoder(image), image, name)
@@ -154,16 +157,19 @@ def check_stylizer(config: StylizerConfig) -> None:
         dictionary, scene = cases.dictionary(codes, 8, dims), cases.scene(regions, 8, dims)
         stylizer = _built(config, Stylizer, lambda: config.build(dictionary=dictionary, scene=scene))[0]
         check_needs(stylizer, f"{name}: needs")
+        # Features on which nothing was fitted; semantics only where it says that it reads them.
         content, semantic = cases.normal(11, 8, seed=22), cases.normal(11, dims, seed=13)
         given = semantic if Want.SEMANTIC in stylizer.needs else None
         styled = stylizer(content, given)
         tensor(styled, (11, 8), name)
         same(stylizer(content, given), styled, 0.0, f"{name}: must be deterministic")
+        # Views are restyled in chunks of any size, and none may show.
         for some in (slice(0, 4), slice(0, 0)):
             part = stylizer(content[some], None if given is None else given[some])
             same(part, styled[some], 1e-4, f"{name}: a point must not depend on the others")
         if config.colours <= 0:
             check_affine(stylizer, content, given, name)
+        # Match maps and regions are drawn from shares of the style codes.
         shares(stylizer.match(semantic), (11, codes), f"{name}.match")
         shares(stylizer.region_match(scene.keys), (regions, codes), f"{name}.region_match")
         stylizer.double()
@@ -171,9 +177,11 @@ def check_stylizer(config: StylizerConfig) -> None:
         follows(lambda: stylizer(content.double(), wide), content.double(), name)
         follows(lambda: stylizer.match(semantic.double()), content.double(), f"{name}.match")
 
+    # Several references, one flat picture, and a scene without semantics.
     for codes, regions, dims in ((5, 3, 4), (1, 1, 4), (2, 1, 0)):
         check(codes, regions, dims)
     if config.handles_allowed_references:
+        # Two references, of which every region may take from the first alone.
         both = cases.dictionary(4, 8, 4)._replace(reference=torch.tensor([0, 0, 1, 1]), names=("one", "other"))
         pinned = both._replace(allowed=torch.tensor([[True, False]] * 3))
         match = config.build(dictionary=pinned, scene=cases.scene(3, 8, 4)).match(cases.normal(11, 4, seed=23))
@@ -190,6 +198,7 @@ def check_sampler(config: SamplerConfig) -> None:
         found: Sampled = sampler(rays, space=cases.space(), step=None if seed is None else 10, generator=generator)
         return found
 
+    # Views sample without a generator, training with one; a chunk may hold any number of rays.
     for count in (6, 1, 0):
         rays = cases.rays(count)
         for seed in (None, 3):
@@ -198,6 +207,7 @@ def check_sampler(config: SamplerConfig) -> None:
             tensor(sampled.s, tuple(sampled.t.shape), f"{name}: s")
             tensor(sampled.t, tuple(sampled.s.shape), f"{name}: t")
             same(again.t, sampled.t, 0.0, f"{name}: must be a function of the rays, the step and the generator")
+            # Weights are of the steps between edges: one that is out of order would be negative.
             for edges, low, high in ((sampled.s, torch.zeros(count), torch.ones(count)), (sampled.t, rays.near, rays.far)):
                 require(bool((edges.diff(dim=1) >= 0).all()), f"{name}: edges must be sorted")
                 slack = 1e-4 * (high - low)[:, None]
@@ -216,6 +226,7 @@ def check_content_field(config: ContentFieldConfig) -> None:
     """Density at least 0, content of so many channels, a function of its seed, trainable in every parameter."""
     field, name = _built(config, ContentField, lambda: config.build(channels=7, seed=0))
     points, view = cases.points(13), nn.functional.normalize(cases.normal(13, 3, seed=14), dim=1)
+    # Density everywhere, content only of some points, by their latents: the parts that the renderer asks for.
     sample = field.density(points)
     tensor(sample.density, (13,), f"{name}: density", low=0.0)
     content = field.content(sample.latent, view)
@@ -250,6 +261,7 @@ def check_semantic_field(config: SemanticFieldConfig) -> None:
 def check_layout(config: LayoutConfig) -> None:
     """Cells with room in them and one border, from any site, and weights of them that sum to 1 everywhere."""
     layout, name = _built(config, BlockLayout, config.build)
+    # A capture with a reconstruction, few views without one, and a single view.
     for site in (cases.site(40, 200), cases.site(3, 0), cases.site(1, 0)):
         cells, again = layout.cut(site), layout.cut(site)
         require(len(cells) > 0, f"{name}: at least one block is needed")
@@ -261,6 +273,7 @@ def check_layout(config: LayoutConfig) -> None:
             same = torch.equal(cell.low, other.low) and torch.equal(cell.high, other.high)
             require(same, f"{name}: must be deterministic")
         require(bool((cells[0].border > 0).all()) or len(cells) == 1, f"{name}: blocks need a border above 0 to blend in")
+        # Blocks and surroundings together must explain every place, also far outside.
         weight = routing.shares(4 * cases.points(64), cells).float()
         shares(weight, (64, len(cells) + 1), f"{name}: weights of cells and surroundings")
 
@@ -272,15 +285,18 @@ def check_parser(config: DataParserConfig, data: Path) -> None:
     count, cameras = len(scene.paths), scene.cameras
     require(count > 0 and len(cameras) == count, f"{name}: {count} paths but {len(cameras)} cameras")
     require(cameras.pose.dtype == torch.float64 and tuple(cameras.pose.shape) == (count, 3, 4), f"{name}: pose [V 3 4] fp64")
+    # Poses are rotations and positions: a scale or a mirroring would go unnoticed until the renders are wrong.
     turn = cameras.pose[:, :, :3]
     rigid = close(turn @ turn.mT, torch.eye(3).double().expand(count, 3, 3), 1e-3)
     require(rigid and bool((torch.linalg.det(turn) > 0).all()), f"{name}: poses must be rotations, right-handed")
     require(bool((cameras.focal > 0).all() and (cameras.size > 0).all()), f"{name}: focal lengths and sizes must be above 0")
+    # Held-out views must not be learnt from, and the same folder must give the same numbers each time.
     views = torch.cat([scene.train, scene.test])
     require(len(set(views.tolist())) == len(views), f"{name}: a view must not be in train and test")
     require(len(scene.train) > 0 and 0 <= int(views.min()) <= int(views.max()) < count, f"{name}: splits must index views")
     require(bool((half.cameras.size - scene.cameras.size / 2).abs().max() <= 1), f"{name}: downscale=2 must halve the size")
     require(parser.parse(data, 1).paths == scene.paths, f"{name}: the order of the views must be the same each time")
+    # Recognition looks at every folder that a user names: it must not claim what it cannot read.
     known = config.recognises(data)
     require(known is None or 0 < known.confidence <= 1, f"{name}: its confidence must lie in (0, 1], or None be given")
     require(config.recognises(data / "no-such-folder") is None, f"{name}: must not recognise a folder that is absent")
@@ -305,6 +321,7 @@ def check_data_manager(config: DataManagerConfig) -> None:
 
         manager, again, plain = build(), build(), build(features=False)
         require(isinstance(manager, DataManager), f"{name}: build() gives {type(manager).__name__}, not a DataManager")
+        # A resumed run draws the batches of the one that was interrupted.
         batch, later = manager.batch(3), manager.batch(4)
         for other in (manager, again, manager.to(torch.device("cpu"), room=0)):
             for mine, theirs in zip(other.batch(3), batch, strict=True):
@@ -318,6 +335,7 @@ def check_data_manager(config: DataManagerConfig) -> None:
         tensor(batch.rgb, (count, 3), f"{name}: rgb")
         require(batch.view.dtype == torch.int64 and batch.view.shape == (count,), f"{name}: view must be int64 [R]")
         require(bool(torch.isin(batch.view, scene.train).all()), f"{name}: batches must be of training views alone")
+        # Colours and pixels belong together: each is looked up in the view that it names.
         corner = batch.pixel - 0.5
         inside = (corner == corner.floor()) & (corner >= 0) & (corner < scene.cameras.size[batch.view])
         require(bool(inside.all()), f"{name}: pixels must be centres, at +0.5, within their image")
@@ -326,6 +344,7 @@ def check_data_manager(config: DataManagerConfig) -> None:
             tensor(image, (height, width, 3), f"{name}: image", low=0.0, high=1.0)
         shown = torch.stack([images[v][y, x] for v, (x, y) in zip(batch.view.tolist(), corner.long().tolist(), strict=True)])
         same(batch.rgb, shown, 1e-6, f"{name}: rgb must be the colour of the pixel, as image() gives it")
+        # Stores say what units and how many channels the fields are built with.
         content, semantic = manager.content_store, manager.semantic_store
         require(content is not None and semantic is not None, f"{name}: must have stores where encoders are given")
         assert content is not None and semantic is not None
@@ -368,6 +387,7 @@ def check_loss_term(config: LossTermConfig) -> None:
         loss, [p for m in parts if isinstance(m, nn.Module) for p in m.parameters()], allow_unused=True
     ):
         require(gradient is None or bool(gradient.isfinite().all()), f"{name}: its gradient is not finite")
+    # At the beginning rays may meet nothing, or a wall at once: no term may divide by what is not there.
     nothing = torch.zeros_like(rendered.weights)
     for weights, kind in ((nothing, "that meet nothing"), (nothing.index_fill(1, torch.tensor([2]), 1.0), "that end at once")):
         weights.requires_grad_()
@@ -424,12 +444,14 @@ def check_capture_format(form: CaptureFormat) -> None:
     same(found.means[order], made.means, 0.02, f"{name}: positions must come back")
     same(found.colours[order], made.colours, 0.05, f"{name}: colours must come back")
     require(read.data == data, f"{name}: Capture.data must be the file")
+    # Every second colour is changed; geometry and the other colours stay bit for bit.
     changed = np.arange(len(found)) % 2 == 0
     new = torch.where(torch.from_numpy(changed)[:, None, None], 0.5 * found.harmonics, found.harmonics)
     again = form.read(path, b"".join(read.recolour(new.numpy(), changed))).gaussians
     for part in ("means", "quaternions", "log_scales", "logits"):
         same(getattr(again, part), getattr(found, part), 0.0, f"{name}.recolour: {part} must stay as they are")
     same(again.colours, 0.5 + HARMONIC * new[:, 0], 0.05, f"{name}.recolour: the new colours must be there")
+    # Files are cut short by full disks and broken downloads.
     for wrong in (b"", data[: len(data) // 2]):
         try:
             shorter = len(form.read(path, wrong).gaussians)

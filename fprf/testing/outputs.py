@@ -96,6 +96,7 @@ def follows(call: Callable[[], Tensor], like: Tensor, name: str) -> None:
 
     Called with float64 on the CPU, while new tensors that name no device are put elsewhere: those cannot be computed with.
     """
+    # Results first: then a tensor made without a device, which would land elsewhere on an accelerator.
     plain = call()
     kind_found, kind = f"{plain.dtype} on {plain.device}", f"{like.dtype} on {like.device}"
     require(kind_found == kind, f"{name}: expected {kind} for inputs of that kind, found {kind_found}")
@@ -162,7 +163,7 @@ def asked(what: str, function: Callable[[Tensor], Answer], given: Tensor) -> Ans
 
 
 @contextmanager
-def told_of(config: PluginConfig) -> Iterator[None]:
+def naming_plugin(config: PluginConfig) -> Iterator[None]:
     """Raise PluginError with the plug-in's name and package for a requirement within that does not hold."""
     try:
         yield
@@ -180,21 +181,22 @@ def check_parts(config: "TrainConfig", parts: "Parts", channels: int, dim: int) 
     """Fields, decoder and sampler of a model on the CPU, at some points of the unit cube. Raises PluginError."""
     points = 0.9 * torch.sin(torch.arange(3.0 * POINTS).view(POINTS, 3))
     view = torch.nn.functional.normalize(points + 2, dim=1)
-    with told_of(config.content.field):
+    # Each part is fed what the one before it returned, as in a render, so the first breach names its maker.
+    with naming_plugin(config.content.field):
         sample = asked("density", parts.field.density, points)
         tensor(sample.density, (POINTS,), "density", low=0.0, slack=_SLACK)
         tensor(sample.latent, (POINTS, None), "the latent")
         features = asked("content", lambda some: parts.field.content(sample.latent, some), view)
         tensor(features, (POINTS, channels), "content")
-    with told_of(config.content.decoder):
+    with naming_plugin(config.content.decoder):
         tensor(asked("colours", parts.decoder, features), (POINTS, 3), "colours", low=0.0, high=1.0, slack=_SLACK)
     if parts.semantic is not None:
-        with told_of(config.semantic.field):
+        with naming_plugin(config.semantic.field):
             tensor(asked("semantics", parts.semantic, points), (POINTS, dim), "semantics")
     # In NDC near is a depth in the world, and rays go from 0 to 1.
     near, far = (0.0, 1.0) if parts.space.kind == "ndc" else (parts.space.near, parts.space.far)
     rays = Rays(torch.zeros(POINTS, 3), view, view, torch.full((POINTS,), near), torch.full((POINTS,), far))
-    with told_of(config.sampler):
+    with naming_plugin(config.sampler):
         sampler, space = parts.sampler, parts.space
         sampled = asked(
             "edges", lambda origin: sampler(rays._replace(origin=origin), space=space, step=None, generator=None), rays.origin
@@ -220,7 +222,7 @@ def check_stylizer(
         return middle.float().cpu() + 0.1 * torch.cos(torch.arange(float(POINTS * channels)).view(POINTS, channels))
 
     content, semantic = spread(scene.mean), spread(scene.semantic_mean)
-    with told_of(config):
+    with naming_plugin(config):
         check_needs(stylizer, "needs")
         given = semantic if Want.SEMANTIC in stylizer.needs else None
         styled = asked("features", lambda some: stylizer(some, given), content)
@@ -247,6 +249,6 @@ def check_affine(stylizer: Stylizer, content: Tensor, semantic: Tensor | None, w
 def check_term(config: LossTermConfig, term: Tensor, like: Tensor) -> None:
     """Raise PluginError unless a training term is a scalar of the kind of another tensor. Reads no number of it."""
     expected = kind_of(like.new_empty(()))
-    with told_of(config):
+    with naming_plugin(config):
         require(isinstance(term, Tensor), f"the term: expected {expected}, found {type(term).__name__}")
         require(kind_of(term) == expected, f"the term: expected {expected}, found {kind_of(term)}")

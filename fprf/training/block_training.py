@@ -25,18 +25,16 @@ from ..datamanagers.scene import Scene
 from ..errors import ConfigError
 from ..interfaces import Learner, Partition
 from ..progress import Display
-from ..style.scene_style import to_tensors
 from ..types import Cell
 from . import tensorfiles
-from .blocks import FILE, Built, folder_of, inset, load_blocks, load_finished, surroundings
+from .blocks import FILE, Built, block_in_surroundings, folder_of, load_blocks, load_finished, surroundings
 from .driver import Schedule
-from .learner import FieldLearner, outcome
+from .learner import FieldLearner, finish
 from .loading import load_run
 from .model import Facts, build_decoder
-from .prepare import Prepared, behind, build_encoders, cache_folder, device_of, exposure_of, field_facts, read_scene
+from .prepare import Prepared, build_encoders, cache_folder, device_of, exposure_of, field_facts, read_scene, scene_background
 from .run import Run
-from .style_pass import measure_style
-from .tasks import WHOLE, Part, Task, digest_of, renumber, run_task, task_of, train_all
+from .tasks import WHOLE, Part, Task, digest_of, renumber, task_of, train_all
 
 RAYS = "rays.safetensors"
 """In a block's folder: `views` [M] and their tiles `seen` [M TILES TILES] that it learns from."""
@@ -62,7 +60,8 @@ def cut(
     # Features of all training views, into the cache that all blocks read.
     content, semantic = build_encoders(config)
     build_decoder(config, encoder=content.identity, channels=content.channels)  # refused now, not after all the features
-    background, cache, views = behind(config, scene), cache_folder() / "features", scene.train.tolist()
+    # One store for all blocks: one basis and one unit of the losses, so that features mean the same in each.
+    background, cache, views = scene_background(config, scene), cache_folder() / "features", scene.train.tolist()
 
     def image(view: int) -> Tensor:
         width, height = scene.cameras.size[view].tolist()
@@ -74,6 +73,7 @@ def cut(
     if semantic is not None:
         dim = config.semantic.dim
         semantic_store = extract(cache / "semantic", views, image, semantic, guided, dim=dim, progress=progress)
+    # Exposures are relative to all views, not to those that a block sees.
     exposure = exposure_of(config.tones, scene, lambda view: image(view).float() / 255, saved)
     facts = field_facts(config, scene, plan.space, exposure, (content, semantic), (content_store, semantic_store))
     return Blocks(config, scene, plan, facts, None if semantic_store is None else semantic_store.basis)
@@ -97,11 +97,8 @@ class Blocks(Partition):
         display.say(f"{len(self.plan.cells)} blocks and their surroundings")
         executor = config.executor.on(device_of(config.device).type).build()
         order = self.plan.rays.argsort(descending=True).tolist()
-        train_all(config, run, executor, run_block, order, whole_share=SHARE, spent=spent, quiet=display.quiet)
-        display.say("measuring the scene's own style")
-        trained = load_run(run.root, config.device)
-        run.save_tensors("style", to_tensors(measure_style(config, trained.model, scene.cameras, scene.train)))
-        display.say(outcome(run, config, scene))
+        train_all(config, run, executor, open_block, order, whole_share=SHARE, spent=spent, quiet=display.quiet)
+        finish(run, display, config, load_run(run.root, config.device).model, scene)
 
     def write(self, run: Run) -> None:
         """Write all that tasks read. Blocks that were trained as what another number is now are moved there."""
@@ -118,7 +115,7 @@ class Blocks(Partition):
         folder = folder_of(run.root, 0).parent
         if any(task_of(part) for part in folder.glob("*")):  # digests read all images
             blocks = range(len(plan.cells))
-            asked = {z: asked_of(self.config, self.facts, self.scene, plan.cells, z, rays[z])["task"] for z in blocks}
+            asked = {z: block_task(self.config, self.facts, self.scene, plan.cells, z, rays[z])["task"] for z in blocks}
             renumber(folder, asked)
         for block, own in rays.items():
             folder_of(run.root, block).mkdir(parents=True, exist_ok=True)
@@ -126,7 +123,7 @@ class Blocks(Partition):
         write_cells(run.root / "blocks.json", plan.cells)
 
 
-def asked_of(
+def block_task(
     config: TrainConfig, facts: Facts, scene: Scene, cells: Sequence[Cell], block: int, rays: dict[str, Tensor]
 ) -> dict[str, Any]:
     """What a block is trained as (`Part.asked`). `rays` is its rays.safetensors.
@@ -143,6 +140,7 @@ def asked_of(
         "views": views,
         "facts": [facts.channels, facts.dim, facts.content_encoder, facts.semantic_encoder, facts.background, facts.exposure],
     }
+    # Tiles count as bytes: another layout around a block leaves its rays, and so its task, as they are.
     task = digest_of(config, FREE_IN_BLOCKS, scene, views, parts, rays["seen"].numpy().tobytes())
     return {"task": task, "steps": config.steps, "minutes": config.minutes}
 
@@ -166,7 +164,7 @@ class Block(Part):
             done, tensors = load_finished(folder_of(self.run.root, WHOLE))
             built.restore({name: tensor.clone() for name, tensor in tensors.items()})  # training writes to them
             built.member.requires_grad_(True)
-            built = inset(config, facts, load_blocks(self.run.root)[self.block], built, self.rays["views"])
+            built = block_in_surroundings(config, facts, load_blocks(self.run.root)[self.block], built, self.rays["views"])
             # Its sampler goes on where that of the surroundings stopped.
             lead = done.step
             config = replace(config, optimizer=replace(config.optimizer, warm_up=min(config.optimizer.warm_up, WARM_UP)))
@@ -204,13 +202,14 @@ def open_block(task: Task) -> Block:
     root, block = Path(task.root), task.part
     run, folder = Run(root), folder_of(root, block)
     config, facts = fields_only(run.load_config()[0], root), run.load_known().facts
+    # A worker may see the scene at another path; views are numbers, so it must be the same scene.
     scene, rays = read_scene(replace(config, data=Path(task.data)), facts), tensorfiles.read(folder / RAYS)
     if len(rays["views"]) and int(rays["views"].max()) >= len(scene.paths):
         raise ConfigError(f"{folder}: its views are not those of {scene.name}; train with the scene that the run was cut from")
     return Block(
         name="surroundings" if block == WHOLE else f"block {block:02d}",
         folder=folder,
-        asked=asked_of(config, facts, scene, load_blocks(root), block, rays),
+        asked=block_task(config, facts, scene, load_blocks(root), block, rays),
         schedule=Schedule(config.steps, task.minutes, config.checkpoint_minutes),
         run=run,
         block=block,
@@ -219,8 +218,3 @@ def open_block(task: Task) -> Block:
         facts=facts,
         rays=rays,
     )
-
-
-def run_block(task: Task) -> None:
-    """Train a block, here or on a worker."""
-    run_task(task, open_block)

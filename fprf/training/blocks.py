@@ -18,9 +18,9 @@ from typing import Annotated, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..blocks.fields import BlockedField, BlockedSampler, BlockedSemantic, Held, Member, Members, inherit
+from ..blocks.fields import BlockedField, BlockedSampler, BlockedSemantic, Member, Members, ResidentMembers, inherit
 from ..blocks.partition import read_cells
-from ..blocks.routing import Blend, Everywhere, Inset, Router, chart_of, surroundings_of
+from ..blocks.routing import BlendRouter, InsetRouter, Router, SingleRouter, chart_of, surroundings_of
 from ..config import TrainConfig
 from ..errors import CheckpointError
 from ..interfaces import Decoder
@@ -84,18 +84,20 @@ def surroundings(config: TrainConfig, facts: Facts, cells: Sequence[Cell]) -> Bu
     """The coarse scene that everything starts from. Raises PluginError where a part breaks its contract at once."""
     decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
     member = Member(surroundings_of(cells), *build_fields(config, facts))
-    model = assemble(config, facts, Held([member]), Everywhere(), decoder, tones_of(facts), poses_of(facts, config.poses))
+    tones, poses = tones_of(facts), poses_of(facts, config.poses)
+    model = assemble(config, facts, ResidentMembers([member]), SingleRouter(), decoder, tones, poses)
     check_parts(config, model.parts, facts.channels, facts.dim)
     return Built(model, member)
 
 
-def inset(config: TrainConfig, facts: Facts, cell: Cell, around: Built, views: Annotated[Tensor, "M"]) -> Built:
+def block_in_surroundings(config: TrainConfig, facts: Facts, cell: Cell, around: Built, views: Annotated[Tensor, "M"]) -> Built:
     """A block inside of a copy of its surroundings; decoder and tones are theirs, as they learnt them.
 
     Poses start as theirs too, and are refined further from the `views` that the block learns from.
     """
     chart = chart_of(cell)
     member = Member(chart, *build_fields(config, facts))
+    # What the surroundings have learnt of this place is not learnt again.
     inherit(member, around.member)
     # Decoder and tones stay as they are, so that all blocks mean the same by a colour; the surroundings go on learning.
     decoder = copy.deepcopy(around.model.decoder).requires_grad_(False)
@@ -105,8 +107,8 @@ def inset(config: TrainConfig, facts: Facts, cell: Cell, around: Built, views: A
     if poses is not None:
         others = set(range(len(facts.centres))) - set(views.tolist())
         poses = poses.going_on(torch.tensor(facts.centres, dtype=torch.float64), tuple(sorted(others)))
-    members = Held([member, copy.deepcopy(around.member)])
-    return Built(assemble(config, facts, members, Inset(chart), decoder, tones, poses), member)
+    members = ResidentMembers([member, copy.deepcopy(around.member)])
+    return Built(assemble(config, facts, members, InsetRouter(chart), decoder, tones, poses), member)
 
 
 def load_finished(folder: Path, *, verify: bool = True) -> tuple[Done, dict[str, Tensor]]:
@@ -128,7 +130,7 @@ def restore(module: nn.Module, kind: str, tensors: dict[str, Tensor]) -> None:
     module.load_state_dict(own, assign=True)
 
 
-class Shelf(Members):
+class BlockCache(Members):
     """Blocks of a run, fetched as they are asked for, the last used first; the surroundings always at hand.
 
     At most `limit` bytes of them stay, one at least.
@@ -180,8 +182,8 @@ def load_blocked(
     around.restore(tensors)
     # Blocks are fetched when a ray meets them.
     limit = None if max_memory is None else int(max_memory * _MIB)
-    shelf = Shelf(root, cells, around.member.to(device), device=device, limit=limit)
-    model = assemble(config, facts, shelf, Blend(cells), around.model.decoder, around.model.tones, around.model.poses)
+    cache = BlockCache(root, cells, around.member.to(device), device=device, limit=limit)
+    model = assemble(config, facts, cache, BlendRouter(cells), around.model.decoder, around.model.tones, around.model.poses)
     model.requires_grad_(False)
     done = [load_finished(folder_of(root, block), verify=False)[0] for block in range(len(cells))]
     return model.to(device).eval(), min(each.step for each in done), whole.seconds + sum(each.seconds for each in done)

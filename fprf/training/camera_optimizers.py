@@ -101,7 +101,7 @@ def rotated(x: Annotated[Tensor, "N 3"], turn: Annotated[Tensor, "N 3"]) -> Anno
     return turned
 
 
-def moving(rays: Rays) -> Rays:
+def rays_of_moving_cameras(rays: Rays) -> Rays:
     """Rays whose origin and direction alone lead gradients: samples are placed, and looks shaded, as if poses were fixed."""
     return Rays(rays.origin, rays.direction, rays.view.detach(), rays.near.detach(), rays.far.detach())
 

@@ -159,6 +159,7 @@ def restore(state: State, model: nn.Module, optimizer: torch.optim.Optimizer | N
     model.load_state_dict(state.model)
     if optimizer is None:
         return
+    # Files name moments by their parameter's number, as torch's own state does.
     moments: dict[int, dict[str, Tensor]] = {}
     for name, tensor in state.optimizer.items():
         index, key = name.split(".", 1)

@@ -53,6 +53,7 @@ class Outcome(NamedTuple):
 
 def compare(device: torch.device) -> list[Outcome]:
     """Features, gradients, a render and a restyle on a device, against plain torch on the CPU."""
+    # Plain torch on the CPU is what everything else is measured by.
     with backend.plain():
         expected = _computed(torch.device("cpu"))
     computed = _computed(device)
@@ -129,6 +130,7 @@ def _gradients(model: Model, cameras: Cameras, image: Annotated[Tensor, "3 H W"]
         target = torch.nn.functional.interpolate(image[None], (24, 32))[0].flatten(1).T
         loss = (out.rgb - target).square().mean() + (out.content - 0.1).square().mean() + (out.semantic - 0.1).square().mean()
         gradients = list(torch.autograd.grad(loss, learned, allow_unused=True, materialize_grads=True))
+        # A plain step, so that the second gradient depends on the first one.
         with torch.no_grad():
             for parameter, gradient in zip(learned, gradients, strict=True):
                 parameter.sub_(gradient, alpha=0.1)

@@ -30,7 +30,7 @@ from ..plugins.typed_json import leaves
 from ..progress import LINE_SECONDS, Display
 from . import checkpoint
 from .prepare import device_of, planned, read_scene, scene_needs
-from .run import Run, check_images, held, image_hashes, save_image_hashes
+from .run import Run, check_images, image_hashes, lock_folder, save_image_hashes
 
 REPORT_SECONDS = 0.5
 """Time between reports."""
@@ -103,7 +103,7 @@ def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images
     # What is missing is said before there is a folder.
     with Display(quiet=quiet) as display:
         _check_needs(config, method, display)
-    with held(output), Display(quiet=quiet) as display:
+    with lock_folder(output), Display(quiet=quiet) as display:
         display.say(f"{method} on {config.data}, run folder {output}")
         # An existing run goes on with its own config and images; what was cut short there is removed.
         config = _sized(run, config, display)
@@ -206,12 +206,14 @@ def learn(
                 due = now - last_report > REPORT_SECONDS
                 # An accelerator works ahead of the host, which waits for it only twice a second and at the end.
                 if due or learner.device.type == "cpu" or schedule.share(step + 1, before + now - begun) >= 1:
+                    # The only place where the host waits; faults of all steps since the last look come with it.
                     figures = learner.figures()
                     if figures.fault and run is not None:
                         run.log({"step": step, "skipped": figures.fault})
                     if figures.failed >= PATIENCE:
                         went_back = step = _go_back(learner, run, figures, step, went_back)
                         continue
+                # The clock goes on from that of earlier starts, so that a time limit holds for all of them.
                 step, clock = step + 1, before + now - begun
                 if due and figures is not None:
                     last_report = now
@@ -230,10 +232,12 @@ def learn(
         except Exception as error:
             if not out_of_memory(error):
                 raise
+            # The step is lost, the last checkpoint is not.
             steps = [] if run is None else checkpoint.steps(run.checkpoints)
             kept = f"the checkpoint of step {steps[-1]} is kept" if steps else "there is no checkpoint yet"
             remedy = f"lower --datamanager.rays (of fields), or begin anew with a larger --downscale ({kept})"
             raise shortage(f"training step {step}", error, remedy) from error
+    # A run without steps is saved as well: it can be opened.
     if saved is None or step > saved.step:
         save()
     if step > first and figures is not None:
@@ -317,6 +321,7 @@ def reporter(display: Display, run: Run, name: str = "training") -> Callable[[Re
     def report(event: Report) -> None:
         nonlocal last
         display.training(event, name)
+        # events.jsonl grows by a line every few seconds, whatever the pace of reports; the last one always counts.
         now = time.perf_counter()
         if now - last < LINE_SECONDS and event.share < 1:
             return
@@ -392,6 +397,7 @@ def _check_same(run: Run, config: RunConfig) -> None:
         return
     old, _ = run.load_config()
     free = config.changeable(old)
+    # Whole branches of the config may be free: what is compared are its leaves, by their paths.
     mine, theirs = leaves(config), leaves(old)
     changed = [path for path in theirs | mine if path.partition(".")[0] not in free and mine.get(path) != theirs.get(path)]
     if changed:

@@ -32,7 +32,7 @@ from ..rendering.renderer import render_rays
 from ..style.scene_style import SceneStyle, to_tensors
 from ..types import Batch, Rays
 from . import checkpoint
-from .camera_optimizers import moving
+from .camera_optimizers import rays_of_moving_cameras
 from .loading import Trained
 from .losses import check_penalties, extra_term, terms, total, wanted
 from .model import Facts, Model, background_of, build_model
@@ -78,14 +78,17 @@ class FieldLearner(SceneLearner):
         adam = config.optimizer
         betas = 0.9, adam.beta2
         self.optimizer = torch.optim.Adam(self.model.learned(), lr=adam.rate, betas=betas, eps=adam.eps, fused=True)
+        # On CUDA the host runs ahead of the device: what it must know of a step is read with the figures.
         self.deferred = device.type == "cuda"
         """True where the host reads faults only with the figures."""
         self.tf32 = config.precision == "tf32" and device.type == "cuda"
         self.half = config.precision == "bfloat16" and device.type != "cpu"
+        # A mistake in the config is told before features are moved and steps are taken.
         check_penalties(config.loss, self.model)
         self.extra = extra_term(config.loss)
         self.manager = prepared.manager
         if device.type != "cpu":
+            # Data lie on the device where they fit: then batches are drawn there, without copies.
             free = free_memory(device) if device.type == "cuda" else None
             self.manager = prepared.manager.to(device, room=int(config.device_memory * (free or 0)))
         self.batches = Batches(self.manager, device)
@@ -215,11 +218,7 @@ class FieldLearner(SceneLearner):
         return f", space {facts.space.kind}, {facts.channels} content{semantics} channels{', tones' * bool(facts.exposure)}"
 
     def finish(self, run: Run, display: Display) -> None:
-        """Measure the scene's own style, and say what quality training reached."""
-        display.say("measuring the scene's own style")
-        style = measure_style(self.config, self.model, self.prepared.scene.cameras, self.prepared.scene.train)
-        run.save_tensors("style", to_tensors(style))
-        display.say(outcome(run, self.config, self.prepared.scene))
+        finish(run, display, self.config, self.model, self.prepared.scene)
 
     def _rays(self, batch: Batch) -> tuple[Rays, Tensor | None]:
         """The rays of a batch, and their parameters at its known distances."""
@@ -229,7 +228,7 @@ class FieldLearner(SceneLearner):
         if batch.distance is not None:
             ends = space.parameter(origin, direction, batch.distance.to(there)).to(self.device)
         if self.model.poses is not None:
-            rays = moving(space.rays(*self.model.poses(batch.view, origin, direction)))
+            rays = rays_of_moving_cameras(space.rays(*self.model.poses(batch.view, origin, direction)))
         else:
             rays = space.rays(origin, direction)
         return Rays(*(x.to(self.device) for x in rays)), ends
@@ -289,6 +288,7 @@ def name_fault(loss: Tensor, parts: Mapping[str, Tensor], parameters: Iterable[t
 @torch.no_grad()
 def unfit_step(loss: Tensor, parameters: Iterable[nn.Parameter]) -> Tensor:
     """1 where the loss or a gradient is not finite, or too large to be squared, else 0: float32, on the loss's device."""
+    # Any number that is not finite makes the norm so, and the device needs one comparison.
     norm = torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
     return (~(torch.isfinite(loss) & (norm < LARGEST))).float()
 
@@ -318,6 +318,7 @@ class StepStatistics:
             marks = [torch.full_like(self.none, float(name in values)) for name in self.names]
             self._present[given] = torch.stack(marks).to(self.rows.dtype)
         row = torch.stack([values.get(name, self.none) for name in self.names]).to(self.rows.dtype)
+        # Where a value is not finite neither its sum nor its weight moves: the mean stays what it was.
         fit = torch.isfinite(row)
         means = SMOOTHING * self.rows[:2] + (1 - SMOOTHING) * torch.stack([row, self._present[given]])
         bad = self.rows[2] + self._present[given] * ~fit
@@ -329,6 +330,7 @@ class StepStatistics:
 
     def means(self) -> dict[str, float]:
         """The means, corrected for their start; names that never had a finite number are left out. The host waits."""
+        # Both sums began at 0: their quotient is the mean over what was seen.
         value, weight, _ = self.rows.tolist()
         return {name: v / w for name, v, w in zip(self.names, value, weight, strict=True) if w > 0}
 
@@ -349,7 +351,14 @@ def clear_denormals(optimizer: torch.optim.Optimizer) -> None:
             torch.threshold_(second, FAINT_SECOND, 0.0)
 
 
-def outcome(run: Run, config: TrainConfig, scene: ParsedScene) -> str:
+def finish(run: Run, display: Display, config: TrainConfig, model: Model, scene: ParsedScene) -> None:
+    """Measure and keep the scene's own style, and say what quality training reached."""
+    display.say("measuring the scene's own style")
+    run.save_tensors("style", to_tensors(measure_style(config, model, scene.cameras, scene.train)))
+    display.say(training_summary(run, config, scene))
+
+
+def training_summary(run: Run, config: TrainConfig, scene: ParsedScene) -> str:
     """One line on what a training reached, by its events.jsonl or those of its blocks, and the command that raises it."""
     try:
         trained = [history for history in read_history(run.root) if history.values.get("psnr", [None])[-1] is not None]
@@ -357,12 +366,15 @@ def outcome(run: Run, config: TrainConfig, scene: ParsedScene) -> str:
         trained = []
     if not trained:
         return "no step was made"
+    # Of a run in blocks the whole is as good as its blocks; its steps are those of the one trained least.
     blocks = [history for history in trained if history.name] or trained
     steps = min(history.step[-1] for history in blocks)
     psnr = sum(history.values["psnr"][-1] or 0.0 for history in blocks) / len(blocks)
     rays = sum(history.step[-1] for history in trained) * config.datamanager.batch_rays()
+    # How often each training pixel was seen tells whether more steps or finer images would help.
     passes = rays / int(scene.cameras.size[scene.train].prod(1).sum())
     reached = f"{steps:,} steps, {passes:.2g} rays for each pixel, {psnr:.1f} dB on the training views"
+    # The next try is advised in the unit that ended this one.
     timed = config.minutes is not None and steps < config.steps
     again = f"fprf train {shlex.quote(str(run.root / 'config.json'))}"
     longer = f"--minutes {2 * (config.minutes or 0):g}" if timed else f"--steps {max(2 * config.steps, _FEW_STEPS)}"

@@ -140,6 +140,7 @@ class Trained(Scene):
         if self.style is not None:
             return self.style()
         if in_training(self.run.root) or not (self.run.root / "style.safetensors").is_file():
+            # What changes soon need not be measured exactly.
             few = replace(self.config.statistics, rays=min(_FEW_RAYS, self.config.statistics.rays))
             style = measure_style(
                 replace(self.config, statistics=few), self.model, self.known.cameras, torch.tensor(self.known.train)
@@ -209,6 +210,7 @@ def load_run(root: Path, device: str = "auto", max_memory: float | None = None) 
     saved_config, method = run.load_config()
     config = fields_only(saved_config, root)
     known = run.load_known()
+    # Fields of a method that is not installed render by their plug-ins alone; another kind of scene cannot.
     if isinstance(config, IncompleteConfig) and not known.facts.channels:
         package = json.loads(config.packages)["method"]
         raise PluginError(f"{root}: {config.reason}; to open a scene of its kind install {package}")

@@ -98,6 +98,7 @@ def terms(
         within = math.inf if facts.space.kind in ("box", "ndc") else SHELL
         result["sky"] = emptiness(sampled.t, weights, batch.sky, within=within)
     if config.extra is not None and extra is not None:
+        # A term of a plug-in: what it returns is checked each time, since it depends on the batch.
         result["extra"] = extra(rendered, batch, model.parts, step=step, generator=generator)
         check_term(config.extra, result["extra"], rendered.opacity)
     # Regularisers of all parameters cost as much as a batch, and need not follow every one.
@@ -118,6 +119,7 @@ def ending(
     # In NDC 1 - t is in proportion to 1 / depth.
     low, high = (1 - (1 - ends) / near if ndc else ends * near for near in (1 - NEARBY, 1 + NEARBY))
     start, stop = t[:, :-1], t[:, 1:]
+    # Weight before the point would hide it; what lies behind it is not known.
     before = stop <= low[:, None]
     # An interval that reaches into the range counts: far from the camera intervals are wider than the range.
     there = ~before & (start < high[:, None])
@@ -143,7 +145,9 @@ def _mean_of(values: Annotated[Tensor, "R"], mask: Annotated[Tensor, "R"]) -> Te
 def total(config: LossConfig, parts: dict[str, Tensor], share: float = 0.0) -> Tensor:
     """Weighted sum, when a share of the training is over."""
     weights = _weights(config)
+    # Points lead while the geometry is found; details of it are left to the photographs.
     weights["depth"] *= FADE**share
+    # A penalty that is computed in one step of so many weighs as many times more.
     every = config.penalty_every
     return torch.stack(
         [(weights[name] if name in weights else _penalty_weight(config, name) * every) * value for name, value in parts.items()]

@@ -103,6 +103,7 @@ class Model(nn.Module):
 
     def penalties(self) -> dict[str, Tensor]:
         """Regularisers of all parts by name; those of one name are added up."""
+        # Members of blocks have added theirs up already.
         parts = (self.field, self.sampler, self.semantic)
         return add_penalties(part.penalties() for part in parts if part is not None)
 

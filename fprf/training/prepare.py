@@ -79,6 +79,7 @@ def prepare(
     """Everything of a scene of fields but the model; arguments as of `RunConfig.build`."""
     content, semantic = build_encoders(config)
     build_decoder(config, encoder=content.identity, channels=content.channels)  # refused now, not after all the features
+    # Decodes all images and extracts their features, or finds both in the cache.
     manager = config.datamanager.build(
         scene=scene,
         content=content,
@@ -87,7 +88,7 @@ def prepare(
         cache=cache_folder() / "features",
         seed=config.seed,
         progress=progress,
-        background=behind(config, scene),
+        background=scene_background(config, scene),
     )
     stores = manager.content_store, manager.semantic_store
     exposure = exposure_of(config.tones, scene, manager.image, saved)
@@ -100,6 +101,7 @@ def build_encoders(config: TrainConfig) -> tuple[Encoder, Encoder | None]:
 
     Raises WeightsError with what both of them lack.
     """
+    # Both are tried, so that one message names all files that are missing.
     device = device_of(config.device)
     built: list[Encoder | None] = []
     faults: list[WeightsError] = []
@@ -126,9 +128,10 @@ def field_facts(
     stores: tuple[FeatureStore | None, FeatureStore | None],
 ) -> Facts:
     """Facts of a scene of fields: encoders and stores of content and semantics."""
+    # Scales are the spread of the targets: losses in their units weigh the same with any encoder.
     (content, semantic), (content_store, semantic_store) = encoders, stores
     return replace(
-        facts_of(scene, behind(config, scene), space=space, exposure=exposure, poses=config.poses > 0),
+        facts_of(scene, scene_background(config, scene), space=space, exposure=exposure, poses=config.poses > 0),
         channels=content.channels,
         dim=semantic_store.channels if semantic_store is not None else 0,
         content_encoder=content.identity,
@@ -148,6 +151,7 @@ def facts_of(
 ) -> Facts:
     """Facts of a scene without fields; `space` is found where none is given, `poses` says whether cameras are refined."""
     space = find_space(scene) if space is None else space
+    # Corrections of views that nothing is learnt from stay at none.
     others = tuple(sorted(set(range(len(scene.paths))) - set(scene.train.tolist())))
     return Facts(
         space=space,
@@ -167,6 +171,7 @@ def exposure_of(
 
     `tones` None = learn them where exposures differ. `image(view)` is a training view, in [0, 1].
     """
+    # A run goes on with what was measured when it was begun: gains were learnt relative to that.
     if saved is not None:
         return saved.exposure
     if tones is False:
@@ -188,7 +193,7 @@ def reach_of(scene: Scene, space: Space) -> float:
     return space.near if space.kind == "ndc" else 1 / space.scale
 
 
-def behind(config: TrainConfig, scene: Scene) -> tuple[float, float, float] | None:
+def scene_background(config: TrainConfig, scene: Scene) -> tuple[float, float, float] | None:
     """Colour behind everything: images and renders show the same. None where nothing is assumed."""
     return config.render.background or (WHITE if scene.alpha else None)
 

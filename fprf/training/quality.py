@@ -85,6 +85,7 @@ def at_quality(trained: "Trained", quality: QualityConfig) -> "Trained":
     render = trained.config.render
     if preset is not None:
         render = replace(render, budget=preset.budget, resolution=preset.resolution)
+    # What is asked for one by one goes before the preset.
     given = {name: value for name in ("budget", "resolution", "chunk") if (value := getattr(quality, name)) is not None}
     render = replace(render, **given)
     if quality.tone:
@@ -104,6 +105,7 @@ def mixed_tone(tones: "Tones | None", known: "Known", texts: tuple[str, ...]) ->
         # A name may hold an equals sign itself.
         name, _, share = text.rpartition("=") if text not in known.names else (text, "", "1")
         name, share = (text, "1") if not name else (name, share)
+        # Views go by name, or by number where no name is alike.
         try:
             weight = float(share)
             view = known.names.index(name) if name in known.names else int(name)
@@ -117,6 +119,7 @@ def mixed_tone(tones: "Tones | None", known: "Known", texts: tuple[str, ...]) ->
         weights.append(weight)
     if not sum(weights):
         raise UsageError("tone: all weights are 0; give at least one view a weight")
+    # Tones are mixed as logarithms: halfway between two exposures is their geometric mean.
     shares = tuple(weight / sum(weights) for weight in weights)
     red, green, blue = tones.mixed(tuple(views), shares).tolist()
     return red, green, blue
@@ -132,6 +135,7 @@ def _resampled(trained: "Trained", samples: float) -> "Trained":
         scaled = trained.config.sampler.scaled(samples)
     except NotImplementedError:  # a plug-in that does not say
         raise PluginError(f"samples: {type(trained.config.sampler).__name__} does not scale; leave --samples at 1") from None
+    # The same parameters with other numbers of samples; a sampler whose parameters depend on these cannot.
     sampler = scaled.build(seed=trained.config.seed)
     if isinstance(old, BlockedSampler):  # what proposes lies in the blocks
         sampler = BlockedSampler(sampler, old.members, old.router)

@@ -137,6 +137,7 @@ class Run:
             if not all(0 <= view < len(names) for view in (*train, *test)):
                 raise ValueError(f"train or test numbers a view beyond its {len(names)}")
             cameras = {}
+            # Shapes are those of the numbers of names, whatever the file says.
             for key, shape in _CAMERA.items():
                 numbers = torch.tensor(document["cameras"][key], dtype=torch.int64 if key in _INTEGERS else torch.float64)
                 cameras[key] = numbers.reshape(len(names), *shape)
@@ -156,7 +157,7 @@ class Run:
 
     def save_tensors(self, name: str, tensors: dict[str, Tensor]) -> None:
         """Write NAME.safetensors, with a checksum for each tensor."""
-        tensorfiles.save_sealed(self.root / f"{name}.safetensors", tensors)
+        tensorfiles.save(self.root / f"{name}.safetensors", tensors, sealed=True)
 
     def load_tensors(self, name: str) -> dict[str, Tensor]:
         """Read NAME.safetensors. Raises CheckpointError where training did not get that far, or the file is damaged."""
@@ -188,6 +189,7 @@ def known_of(scene: Scene, data: Path | None, facts: Facts) -> Known:
 
 def view_names(paths: Sequence[Path]) -> list[str]:
     """The stems of images; where two agree (a folder per camera), with one or two folders above, else a number, before them."""
+    # As few folders as tell all images apart: names are shown and typed.
     for folders in range(3):
         names = ["-".join([*(f.name for f in p.parents[:folders][::-1]), p.stem]) for p in paths]
         if len(set(names)) == len(names):
@@ -205,11 +207,12 @@ _NOTE = 200
 
 
 @contextmanager
-def held(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path) -> Iterator[None]:
     """Hold a folder for the length of the block; it is made if need be, and removed again if it stays empty.
 
     Raises DataError where another process holds it, naming that, and where nothing can be written: before any work is done.
     """
+    # The holder before may remove the file between opening and locking it: then a new one is opened.
     while (handle := _locked(folder)) is None:
         pass
     try:
@@ -307,6 +310,7 @@ def check_images(root: Path, scene: Scene, hashes: Mapping[str, str]) -> None:
         return
     with open_json(path, "remove it, and the images are taken as they are") as document:
         before = from_json(document["images"], dict[str, str], path="images")
+    # By name, not by order: an image that was added moves all numbers behind it.
     files = dict(zip(view_names(scene.paths), scene.paths, strict=True))
     changed = [f"{files[name]} is another" for name in hashes if name in before and before[name] != hashes[name]]
     changed += [f"{files[name]} is new" for name in hashes if name not in before]
@@ -366,6 +370,7 @@ def _history(name: str, file: Path) -> History:
             lines.append(event)
         else:
             notes.append(", ".join(f"{key.replace('_', ' ')}: {value}" for key, value in event.items()))
+    # Losses stand beside the other figures of their line; what a line does not say is None.
     flat = [{**event, **(event["losses"] if isinstance(event.get("losses"), dict) else {})} for event in lines]
     known = dict.fromkeys(key for event in flat for key in event if key not in ("step", "seconds", "losses"))
     values = {key: [_number(event.get(key)) for event in flat] for key in known}

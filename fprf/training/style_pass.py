@@ -33,6 +33,7 @@ def lattice(cameras: Cameras, views: Annotated[Tensor, "V"], rays: int) -> tuple
     area = cameras.size[views].prod(-1)
     ends = area.cumsum(0)
     count = min(rays, int(ends[-1]))
+    # Even steps through the pixels of all views, laid end to end: no draw, so a pass can be repeated.
     at = (torch.arange(count, dtype=torch.float64) + 0.5) * (float(ends[-1]) / count)
     at = at.long()
     which = torch.searchsorted(ends, at, right=True)
@@ -48,6 +49,7 @@ def neighbours(cameras: Cameras, views: Annotated[Tensor, "V"], pairs: int) -> t
     size = cameras.size[view]
     step = (size.amin(1) // _REACH).clamp_min(1)[:, None] * F.one_hot(torch.arange(len(view)) % 2, 2)
     there = pixel + step
+    # At the right or lower edge the neighbour is the one before.
     there = torch.where(there < size, there, (pixel - step).clamp_min(0.5))
     return view, torch.stack([pixel, there], 1)
 

@@ -19,6 +19,7 @@ import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from ..io.strict_json import open_json
 from ..plugins.codec import from_json, to_json
 from ..progress import Display
 from .driver import Report, Schedule, learn, reporter
-from .run import Run, held
+from .run import Run, lock_folder
 
 WHOLE = -1
 """The number of the whole scene among the parts."""
@@ -98,7 +99,8 @@ def train_part(part: Part, report: Callable[[Report], None]) -> bool:
 
     A folder that was trained as something else is started anew. Raises DataError where another process trains there.
     """
-    with held(part.folder):
+    with lock_folder(part.folder):
+        # Whoever runs a task again, on whichever machine, finds out here that nothing is left to do.
         done = read_done(part.folder)
         if done is not None and done.asked == part.asked and part.is_intact():
             return False
@@ -122,7 +124,7 @@ def train_all(
     config: RunConfig,
     run: Run,
     executor: Executor,
-    work: Callable[[Task], None],
+    open_part: Callable[[Task], Part],
     order: Sequence[int],
     *,
     whole_share: float,
@@ -143,6 +145,7 @@ def train_all(
         if config.minutes is not None:
             left = config.minutes - (time.perf_counter() - begun) / 60
             minutes = share * max(left, 0.05 * config.minutes)
+        work = partial(run_task, open_part=open_part)  # which other processes can be sent
         executor.map(work, [Task(root=root, data=data, part=part, minutes=minutes, quiet=quiet) for part in parts])
 
 
@@ -155,6 +158,7 @@ def digest_of(
     content: bytes = b"",
 ) -> str:
     """Digest of what a part is trained as: the config but for fields that are `free`, its views, and whatever else decides."""
+    # Poses and intrinsics, as floats in full; images as checksums of their files.
     tree = to_json(config)
     assert isinstance(tree, dict)
     document = {
@@ -178,6 +182,7 @@ def task_of(folder: Path) -> str | None:
 
 def begin(folder: Path, task: str) -> None:
     """Begin a part as a task, or resume it: what was trained there as another one is removed."""
+    # First of all: a part that is trained further is not finished, even if this is cut short.
     (folder / _DONE).unlink(missing_ok=True)
     if task_of(folder) == task:
         return

@@ -32,6 +32,7 @@ def save(path: Path, tensors: Mapping[str, Tensor], *, sealed: bool = False) -> 
 
     Raises DataError, with what is needed and what is free, where the system refuses.
     """
+    # Checksums are of the bytes that a reader will map: contiguous, on the CPU.
     plain = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
     entries = {
         name: {"crc32": _checksum(t), "finite": bool(torch.isfinite(t).all()) if t.is_floating_point() else True}
@@ -41,17 +42,13 @@ def save(path: Path, tensors: Mapping[str, Tensor], *, sealed: bool = False) -> 
         try:
             safetensors.torch.save_file(plain, temporary, {_MANIFEST: json.dumps(entries)} if sealed else None)
         except SafetensorError as error:
+            # safetensors wraps errors of the system in its own: their number says what the disk refused.
             match = _SYSTEM.search(str(error))
             if match is None:
                 raise
             needed = sum(t.nbytes for t in plain.values())
             raise unwritable(path, OSError(int(match[1]), str(error)), needed) from error
     return entries
-
-
-def save_sealed(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Write the tensors with their own manifest inside. Raises DataError where the system refuses."""
-    save(path, tensors, sealed=True)
 
 
 def load_sealed(path: Path) -> dict[str, Tensor]:

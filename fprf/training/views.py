@@ -16,7 +16,7 @@ from ..rendering.cameras import Cameras, PixelRays, grid_rays, rays_through
 from ..rendering.renderer import PackedSamples, composite, composite_mean, enlarged, march, march_features, render_rays, shade
 from ..style.look import Restyle
 from ..types import Rays, View, Want
-from .camera_optimizers import moving, rotated
+from .camera_optimizers import rays_of_moving_cameras, rotated
 from .model import Facts, Model, background_of
 
 
@@ -37,7 +37,7 @@ def view_rays(
 
 
 @dataclass(frozen=True)
-class Part:
+class ViewChunk:
     """A chunk of rays, row after row of a view, on the device of its model; it knows no style."""
 
     kept: PackedSamples
@@ -73,9 +73,9 @@ class Part:
 
 
 @torch.inference_mode()
-def view_parts(
+def view_chunks(
     model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig, *, semantic: bool = True
-) -> Iterator[Part]:
+) -> Iterator[ViewChunk]:
     """Geometry and features of a view, chunk by chunk of its rays (see `memory.chunk_size`), for any style.
 
     For those who may stop half-way or keep none. Without `semantic` the semantic field is not evaluated.
@@ -83,7 +83,7 @@ def view_parts(
     rays, origin, direction = view_rays(model, cameras, view)
     background = background_of(facts, rays.origin.device)
 
-    def part(here: slice) -> Part:
+    def rendered(here: slice) -> ViewChunk:
         chunk = Rays(*(x[here] for x in rays))
         marched, content, semantics = march_features(chunk, model.parts, budget=config.budget, semantic=semantic)
         kept = marched.kept
@@ -93,20 +93,20 @@ def view_parts(
         # Depths along the world's ray, whatever space the field lives in.
         metric = model.space.metric(origin[here], direction[here], marched.depth.to(origin.device)).to(chunk.near.device)
         samples, tone = marched.weights.numel(), config.tone or (1.0, 1.0, 1.0)
-        return Part(bare, content, semantics, behind, len(chunk.near), metric, marched.opacity, samples, tone)
+        return ViewChunk(bare, content, semantics, behind, len(chunk.near), metric, marched.opacity, samples, tone)
 
-    yield from in_parts(len(rays.near), chunk_size(config.chunk, rays.near.device), part)
+    yield from in_parts(len(rays.near), chunk_size(config.chunk, rays.near.device), rendered)
 
 
 @torch.inference_mode()
-def _view_of(parts: Iterable[Part], decoder: Decoder, restyle: Restyle | None, size: tuple[int, int]) -> View:
-    """The parts of a view of (height, width) pixels in a style, still on their device."""
+def _view_of(chunks: Iterable[ViewChunk], decoder: Decoder, restyle: Restyle | None, size: tuple[int, int]) -> View:
+    """The chunks of a view of (height, width) pixels in a style, still on their device."""
     rgb, depth, opacity, kept, samples = [], [], [], 0, 0
-    for part in parts:
-        rgb.append(part.colour(decoder, restyle))
-        depth.append(part.depth)
-        opacity.append(part.opacity)
-        kept, samples = kept + len(part.kept.ray), samples + part.samples
+    for chunk in chunks:
+        rgb.append(chunk.colour(decoder, restyle))
+        depth.append(chunk.depth)
+        opacity.append(chunk.opacity)
+        kept, samples = kept + len(chunk.kept.ray), samples + chunk.samples
     share = kept / max(1, samples)
     return View(torch.cat(rgb).view(*size, 3), torch.cat(depth).view(size), torch.cat(opacity).view(size), share)
 
@@ -133,8 +133,8 @@ def render_view(
     width, height = cameras.size[view].tolist()
     # Semantics are evaluated only where the style tells places apart by them.
     semantic = restyle is not None and not restyle.idle and Want.SEMANTIC in restyle.needs
-    parts = view_parts(model, facts, cameras, view, config, semantic=semantic)
-    shown = _view_of(parts, model.decoder, restyle, (height, width))
+    chunks = view_chunks(model, facts, cameras, view, config, semantic=semantic)
+    shown = _view_of(chunks, model.decoder, restyle, (height, width))
     return _on_host(enlarged(shown, whole) if config.resolution < 1 else shown)
 
 
@@ -143,24 +143,24 @@ class CachedView(SceneView):
     """One view of one model, with its geometry and features."""
 
     decoder: Decoder
-    parts: tuple[Part, ...]
+    chunks: tuple[ViewChunk, ...]
     size: tuple[int, int]
     """Height, width."""
 
     def restyled(self, restyle: Restyle | None = None) -> View:
-        return _on_host(_view_of(self.parts, self.decoder, restyle, self.size))
+        return _on_host(_view_of(self.chunks, self.decoder, restyle, self.size))
 
     @torch.inference_mode()
     def match(self, restyle: Restyle) -> Annotated[Tensor, "N T"]:
         # Where the scene has no semantics all points are alike: features without channels.
-        semantics = [part.content[:, :0] if part.semantic is None else part.semantic for part in self.parts]
-        return torch.cat([part.mean(restyle.match(at)).cpu() for part, at in zip(self.parts, semantics, strict=True)])
+        semantics = [chunk.content[:, :0] if chunk.semantic is None else chunk.semantic for chunk in self.chunks]
+        return torch.cat([chunk.mean(restyle.match(at)).cpu() for chunk, at in zip(self.chunks, semantics, strict=True)])
 
 
 def cache_view(model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig) -> CachedView:
-    """Render everything but a style (see `view_parts`)."""
+    """Render everything but a style (see `view_chunks`)."""
     width, height = cameras.size[view].tolist()
-    return CachedView(model.decoder, tuple(view_parts(model, facts, cameras, view, config)), (height, width))
+    return CachedView(model.decoder, tuple(view_chunks(model, facts, cameras, view, config)), (height, width))
 
 
 @torch.inference_mode()
@@ -179,6 +179,7 @@ def paint_pixels(
     Pixels that see nothing get 0. `values` is given features without channels where the scene has no semantics or
     `semantic` is false. Neither content nor colour is computed.
     """
+    # Geometry and semantics alone; content, the widest network, is not needed.
     rays, _, _ = view_rays(model, cameras, view, pixel)
 
     def paint(here: slice) -> tuple[Tensor, Tensor]:
@@ -216,19 +217,22 @@ def fit_pose(
     """
     device, tones = model.device, model.tones
     through, background = PixelRays(cameras.select(torch.tensor([view]))), background_of(facts, device)
+    # Photographs are compared as the view took them: a held-out view by what its exposure says.
     factor = torch.ones(3) if tones is None else tones(torch.tensor([view]))[0].detach().cpu()
     pixels, generator = truth.reshape(-1, 3), torch.Generator().manual_seed(view)
     used = None if where is None or not bool(where.any()) else where.reshape(-1).nonzero()[:, 0]
     move = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     optimizer = torch.optim.Adam([move], lr=_FIT_RATE, betas=(0.9, 0.95))
+    # A few random pixels a step are enough for six numbers.
     for step in range(FIT_STEPS):
         optimizer.param_groups[0]["lr"] = 0.5 * _FIT_RATE * (1 + math.cos(math.pi * step / FIT_STEPS))
         at = torch.randint(len(pixels) if used is None else len(used), (_FIT_RAYS,), generator=generator)
         at = at if used is None else used[at]
         pixel = torch.stack([at % truth.shape[1], at // truth.shape[1]], -1) + 0.5
         origin, direction = through(torch.zeros_like(at), pixel)
+        # Only the move has a gradient: samples are placed as if the pose were fixed (see `rays_of_moving_cameras`).
         turned = rotated(direction, move[:3].expand_as(direction))
-        rays = moving(model.space.rays(origin + reach * move[3:], turned))
+        rays = rays_of_moving_cameras(model.space.rays(origin + reach * move[3:], turned))
         rays = Rays(*(x.to(device) for x in rays))
         rendered = render_rays(rays, model.parts, want=Want.COLOUR, budget=budget, background=background)
         assert rendered.rgb is not None

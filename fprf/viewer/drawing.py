@@ -25,7 +25,7 @@ from ..style.look import Restyle
 from ..style.restyle import Styled
 from ..style.scene_style import RegionWeight
 from ..training.loading import Trained
-from ..training.views import Part, view_parts
+from ..training.views import ViewChunk, view_chunks
 from .messages import Camera
 from .render_worker import Steps
 from .restyler import Look, Restyler
@@ -75,6 +75,7 @@ def gaussian_colours(scene: SplatScene, packed: Packed, restyler: Restyler, show
     harmonics = scene.restyled(None if styled is None else styled.restyle).shown.harmonics
     if shown.map in ("none", "depth") and shown.region is None:
         return packed.colours(harmonics, rounds=2)
+    # Maps are flat colours in the place of harmonics: what each Gaussian's features match.
     features, solid = scene.found().features, torch.ones(len(scene.gaussians))
     colours = 0.5 + HARMONIC * harmonics[:, 0]
     if shown.map == "matches":
@@ -98,7 +99,7 @@ def _mapped(colours: Tensor, memberships: Tensor, opacity: Tensor, shown: Shown)
 
 
 def _memberships(restyler: Restyler, semantic: Tensor) -> Annotated[Tensor, "N K"]:
-    style = restyler.encoders.scene
+    style = restyler.encoders.scene_style
     share: Tensor = RegionWeight(style, torch.eye(len(style.share))).to(semantic.device)(semantic.float())
     return share
 
@@ -109,6 +110,7 @@ def _match_colours(
     """Colours of the references that each point takes its style from, by what it takes of each code; grey without a style."""
     if styled is None or taken is None:
         return torch.full((len(opacity), 3), _NO_MATCH)
+    # The rest of what is taken is what the look leaves as it is.
     total = taken.sum(-1, keepdim=True)
     attention, kept, codes = taken / total.clamp_min(1e-10), (1 - total[:, 0]).clamp(0, 1), styled.codes
     picture = match_image(attention[None], codes.reference, codes.names, opacity[None], kept[None])[0]
@@ -136,7 +138,7 @@ class _Kept:
     """A client's last view."""
 
     camera: Camera
-    parts: dict[tuple[int, int], list[Part]] = field(default_factory=dict)
+    parts: dict[tuple[int, int], list[ViewChunk]] = field(default_factory=dict)
 
 
 class FieldPainter:
@@ -156,6 +158,7 @@ class FieldPainter:
         kept = self._views.get(client)
         if kept is None or kept.camera != request.camera:
             self._views[client] = kept = _Kept(request.camera)
+        # From the sharpest size whose features are kept, else from the finest that comes at once, up to the full one.
         styled = self._restyler.styled(request.shown.look)
         full = cameras_of([request.camera], longest=request.longest)
         sizes = resolutions((int(full.size[0, 0]), int(full.size[0, 1])))
@@ -164,7 +167,8 @@ class FieldPainter:
             start, again = time.perf_counter(), size in kept.parts
             rows: list[Tensor] = []
             captured: list[Tensor] = []
-            parts: list[Part] = []
+            parts: list[ViewChunk] = []
+            # Features are marched once; another look only decodes them again.
             for part in kept.parts[size] if again else self._parts(cameras_of([request.camera], size), 0):
                 rows.append(self._colours(part, styled, request.shown))
                 if request.captured:
@@ -188,7 +192,7 @@ class FieldPainter:
             yield
 
     @torch.inference_mode()
-    def _colours(self, part: Part, styled: Styled | None, shown: Shown) -> Annotated[Tensor, "N 3"]:
+    def _colours(self, part: ViewChunk, styled: Styled | None, shown: Shown) -> Annotated[Tensor, "N 3"]:
         """A chunk as it is shown; of the map of depths, depth and opacity."""
         restyle, semantic = None if styled is None else styled.restyle, part.semantic
         if shown.map == "depth":
@@ -203,10 +207,10 @@ class FieldPainter:
             colours = _mapped(colours, memberships, opacity, shown)
         return colours
 
-    def _parts(self, cameras: Cameras, view: int) -> Iterable[Part]:
+    def _parts(self, cameras: Cameras, view: int) -> Iterable[ViewChunk]:
         trained = self._trained
         config = replace(trained.config.render, chunk=min(CHUNK, trained.config.render.chunk))
-        return view_parts(trained.model, trained.known.facts, cameras, view, config)
+        return view_chunks(trained.model, trained.known.facts, cameras, view, config)
 
     def frame(self, cameras: Cameras, view: int, look: Restyle | None) -> Generator[None, None, Picture]:
         """Render one frame of a film, step by step, and return it."""
@@ -244,6 +248,7 @@ def cameras_of(cameras: "list[Camera]", size: tuple[int, int] | None = None, lon
         # Rows right, down, forward; a pose has columns right, up, back.
         turn = axes.T * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
         poses.append(torch.cat([turn, torch.tensor(camera.place, dtype=torch.float64)[:, None]], 1))
+        # The same vertical angle in another size; the principal point keeps its offset from the middle.
         by = size[1] / camera.size[1]
         focal.append([camera.lens[0] * by, camera.lens[1] * by])
         offset = [(camera.lens[2 + k] - camera.size[k] / 2) * by for k in (0, 1)]

@@ -102,12 +102,14 @@ def write_film_files(
     The path is in the capture's coordinates; `origin` is that of the scene.
     """
     write_camera_path(folder / "path.json", film_cameras(plan), plan.fps, origin)
+    # Keys with equal looks share a style, so that nothing is restyled between them.
     looks: dict[Look, Path] = {}
     rows: list[dict[str, object]] = []
     for i, key in enumerate(plan.keys):
         if not key.look.plain and key.look not in looks:
             path = folder / f"style-{len(looks) + 1}" / "style.json"
             path.parent.mkdir()
+            # Copies of the photographs, for uploads go with the viewer; the style names them beside itself.
             references = []
             for k, (photograph, _) in enumerate(key.look.mix):
                 stem = photograph.name.rsplit(".", 1)[0]
@@ -117,6 +119,7 @@ def write_film_files(
             style_of_look = replace(style_config(key.look, stylizer), references=tuple(references))
             write_style(path, StyleFile(style_of_look, {}, encoder))
             looks[key.look] = path
+        # A key without a look is the scene as captured.
         style = looks.get(key.look)
         rows.append({"frame": i * plan.gap, "style": None if style is None else str(style.relative_to(folder))})
     write_json(folder / "keys.json", {"format": 1, "keyframes": rows})

@@ -79,9 +79,11 @@ def training_progress(root: Path) -> dict[str, Any] | None:
     try:
         with (root / "events.jsonl").open("rb") as file:
             file.seek(max(0, file.seek(0, 2) - _TAIL))
+            # The first line of the tail may be cut off; events without a step tell nothing of progress.
             lines = [json.loads(line) for line in file.read().decode(errors="replace").splitlines()[1:]]
         last = next(line for line in reversed(lines) if "psnr" in line)
         share = schedule_of(run.load_config()[0], len(run.load_known().train)).share(last["step"], last["seconds"])
+        # As long again for each share that is left, at the speed so far.
         left = last["seconds"] * (1 - share) / max(share, 1e-3)
         return {"step": int(last["step"]), "share": share, "psnr": float(last["psnr"]), "seconds_left": round(left)}
     except (OSError, ValueError, KeyError, StopIteration):

@@ -120,6 +120,7 @@ class RenderWorker(Generic[Request]):
                     self._change.wait()
                 if self._closed:
                     break
+                # Take everything that came since the last step, at once, so that older requests of a client never start.
                 job = self._jobs.popitem(last=False)[1] if self._jobs else None
                 fresh, self._fresh = self._fresh, {}
                 left, self._left = self._left, set()
@@ -136,6 +137,7 @@ class RenderWorker(Generic[Request]):
     def _advance(self) -> None:
         """Make one step for the next client in turn, else one of the work for idle times."""
         if self._active:
+            # The client in front makes one step and goes to the back.
             client, work = self._active.popitem(last=False)
             if self._call(lambda: next(work)):
                 self._active[client] = work

@@ -108,6 +108,7 @@ def set_rule(look: Look, region: int, action: RegionAction | None, photograph: P
     if action is None:
         return replace(look, rules=rest)
     new = {RegionRule(region, action, None if action == "keep" else photograph)}
+    # Forbidden photographs add up; every other rule takes the place of those before it.
     if action == "forbid":
         new |= {rule for rule in mine if rule.action == "forbid"}
         if {rule.photograph for rule in new} >= {each for each, _ in look.mix}:
@@ -127,6 +128,7 @@ def style_config(look: Look, stylizer: RegionToneConfig | None = None) -> StyleC
     def order(rule: RegionRule) -> tuple[int, str, int]:
         return rule.region, rule.action, -1 if rule.photograph is None else number.get(rule.photograph, -1)
 
+    # REGION=REFERENCE, by the reference's place in the mix, as `--pin` and `--forbid` take them; `--keep` takes regions.
     texts: dict[str, list[str]] = {"pin": [], "forbid": [], "keep": []}
     for rule in sorted(look.rules, key=order):
         if rule.photograph is None:
@@ -199,12 +201,12 @@ class Restyler:
         """Replace the scene, and with it its style; return the style from before, if there was one."""
         self.scene, self._stale = scene, True
         self._styles.clear()
-        return None if self._encoders is None else self._encoders.scene
+        return None if self._encoders is None else self._encoders.scene_style
 
     @property
     def regions(self) -> int:
         """Number of regions of the scene."""
-        return len(self.encoders.scene.share)
+        return len(self.encoders.scene_style.share)
 
     def encode(self, path: Path, name: str) -> Photograph:
         """Encode a photograph. Raises DataError for an unreadable one."""
@@ -217,6 +219,7 @@ class Restyler:
         if look.plain:
             return None
         if look not in self._styles:
+            # Each photograph is clustered once; a mix is their dictionaries side by side under the mix's weights.
             parts = [self._dictionary(photograph, look.clusters, look.blend) for photograph, _ in look.mix]
             style = style_config(look, self._stylizer)
             dictionary = concatenate(parts, labels(style.references), [weight for _, weight in look.mix])
@@ -238,15 +241,17 @@ class Restyler:
         width, height = cameras.size[0].tolist()
         if not (0 <= pixel[0] < width and 0 <= pixel[1] < height):
             raise UsageError(f"pixel {pixel[0]:.0f},{pixel[1]:.0f}: outside of the view of {width}x{height}")
+        # The region of the pixel's strongest membership, by the features that the ray sees.
         place = torch.tensor([pixel], dtype=torch.float64)
-        share, opacity = memberships(self.scene, self.encoders.scene, cameras, 0, place)
+        share, opacity = memberships(self.scene, self.encoders.scene_style, cameras, 0, place)
         return int(share[0].argmax()) if float(opacity[0]) >= _SOLID else None
 
     def region_info(self, look: Look, region: int) -> RegionInfo:
         """Return the style that a region takes in a look."""
-        scene, styled = self.encoders.scene, self.styled(look)
+        scene, styled = self.encoders.scene_style, self.styled(look)
         taken: list[tuple[str, float]] = []
         if styled is not None:
+            # What the region's key takes of each code, summed by photograph.
             attention = styled.restyle.match(scene.keys[region : region + 1].to(self.scene.device))[0].cpu()
             shares = torch.zeros(len(styled.codes.names)).index_add_(0, styled.codes.reference, attention.float())
             names = [photograph.name for photograph, _ in look.mix]
@@ -273,5 +278,6 @@ def matching_regions(before: SceneStyle, now: SceneStyle) -> Annotated[Tensor, "
     """For each region of `before` the most similar one of `now`: regions are measured anew, in any order."""
     if before.keys.shape[1] == 0:
         return torch.zeros(len(before.keys), dtype=torch.int64)
+    # Cosines about the mean of the features before, as regions are matched to codes.
     scores = unit(before.keys, before.semantic_mean) @ unit(now.keys, now.semantic_mean).T
     return scores.argmax(-1)

@@ -280,7 +280,7 @@ class ViewerServer:
         unreadable photograph."""
         from .session import Session
 
-        viewed = load()
+        viewed = load()  # while what was open stays open
         self._close_session()
         made = Session(viewed, self.post, longest=longest, together=len(references) > 1)
         session = self._opened.enter_context(made)
@@ -365,6 +365,7 @@ class ViewerServer:
                     except FprfError as error:
                         client.put("said", json.dumps({"type": "said", "text": str(error), "bad": True}))
 
+        # Whichever ends first, a client that leaves or one that does not read, ends the other.
         ways = [asyncio.create_task(receive()), asyncio.create_task(client.send(socket))]
         try:
             await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
@@ -375,6 +376,7 @@ class ViewerServer:
             outcomes = await asyncio.gather(*ways, return_exceptions=True)
             if (session := self._session) is not None:
                 session.disconnect(number)
+        # A message that our page does not send: close as a violation of policy (RFC 6455, 7.4.1).
         if any(isinstance(outcome, DataError) for outcome in outcomes):
             with contextlib.suppress(OSError, RuntimeError, WebSocketDisconnect):
                 await socket.close(1008)

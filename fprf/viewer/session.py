@@ -138,6 +138,7 @@ class Session:
         """Prepare what browsers are sent of the scene, or the painter of a field."""
         scene, home = self.viewed.scene, self.viewed.home
         if isinstance(scene, SplatScene):
+            # Shapes and captured colours go to browsers once, deflated at the fastest level: somebody is waiting.
             self.packed = pack(scene.gaussians)
             captured = self.packed.colours(scene.gaussians.harmonics)
             head = {**header(self.packed), **about_gaussians(scene, home), "styles": [colour_header(captured)]}
@@ -145,6 +146,7 @@ class Session:
             self.geometry, self._coloured = container(head, parts), None
         elif isinstance(scene, Trained):
             self._painter = FieldPainter(scene, self.restyler, self._show)
+            # A camera of a field turns about a point as far away as most cameras are from their middle.
             place = scene.cameras.pose[:, :, 3]
             spread = float((place - place.median(dim=0).values).norm(dim=1).quantile(0.9)) or 1.0
             self.geometry = container(about(scene.cameras, home, lambda view: 1.5 * spread), {})
@@ -217,6 +219,7 @@ class Session:
         if now.picked is not None and now.look != before.look:
             region = now.picked.region  # what it takes has changed
             self._worker.run("select", lambda: self._select(region))
+        # What is seen is drawn again only where it is another; names and lists of the page cost a message alone.
         if now.shown != before.shown:
             self._refresh()
         if now != before:
@@ -249,6 +252,7 @@ class Session:
         def work() -> Steps:
             self.restyler.encoders  # noqa: B018  they are opened by asking for them
             yield
+            # A gradient in the place of a photograph: all that a drop runs is loaded and compiled by it.
             path = self.uploads.folder / "warm-up.png"
             path.write_bytes(encode(np.linspace(0, 255, 96 * 128 * 3).reshape(96, 128, 3).astype(np.uint8), "png"))
             photograph = self.restyler.encode(path, "warm-up")
@@ -273,7 +277,7 @@ class Session:
                 self._post(None, kind, message)
             # Regions are measured anew, in any order: what is pinned is found again among them.
             if before is not None and (self.state.look.rules or self.state.picked is not None):
-                regions = matching_regions(before, self.restyler.encoders.scene).tolist()
+                regions = matching_regions(before, self.restyler.encoders.scene_style).tolist()
                 self.apply(lambda state: replace(state, look=renumbered(state.look, regions), picked=None))
             if not self.state.look.plain:
                 self._refresh()
@@ -298,7 +302,10 @@ class Session:
             raise UsageError(f"{viewed.name}: no Gaussians; `fprf export` makes some of a field")
 
         def written() -> Path:
-            path = self.uploads.folder / "restyled.ply"
+            # Under a name of its own: another page may still be reading the one before, which its open file keeps.
+            for before in self.uploads.folder.glob("restyled-*.ply"):
+                before.unlink()
+            path = self.uploads.folder / f"restyled-{next(self._version)}.ply"
             shown = scene.restyled(self.restyler.restyle(self.state.look)).shown
             if viewed.capture is None:
                 write_gaussians(path, shown, antialiased=scene.antialiased, views=scene.views, plain=True, origin=scene.origin)
@@ -334,7 +341,7 @@ class Session:
         """Make colours for browsers, of what is shown now or of a look that is kept."""
         scene = self.viewed.scene
         assert isinstance(scene, SplatScene)
-        if name == NOW and shown == self._coloured:
+        if name == NOW and shown == self._coloured:  # a slider went there and back
             return
         colours = gaussian_colours(scene, self.packed, self.restyler, shown)
         if name == NOW:

@@ -160,6 +160,7 @@ class Start:
     def _make(self, source: Source, name: str, minutes: float) -> None:
         """Find poses, train, and open the viewer, as far as the source needs it."""
         root, path = self._output / name, source.path
+        # Each stage works on the folder that the one before made, and a source enters where it has what is needed.
         try:
             if source.kind in ("photographs", "video"):
                 self._set(stage="poses", what="looking at the photographs")
@@ -197,6 +198,7 @@ class Start:
                     last = line.strip()
                     self._follow(last)
         self._process = None
+        # An interrupted training has saved what there was, if there was anything.
         if self._stopped == "leave" or (self._stopped and newest_step(self._output / self._progress.name / _RUN) < 0):
             raise _Left
         if process.returncode and not self._stopped:
@@ -212,6 +214,7 @@ class Start:
             self._set(lines=(*self._progress.lines, line)[-_LINES:])
             return
         what = str(event["event"])
+        # Training tells its step and clock, other verbs how much of something is done; anything else is a line to read.
         if "step" in event:
             clock = f"{event['seconds_left'] // 60}:{event['seconds_left'] % 60:02d} left"
             self._set(what=what, share=event["share"], detail=f"step {event['step']} · {event['psnr']:.1f} dB · {clock}")
@@ -249,6 +252,7 @@ class Start:
         """A folder's name like the one asked for, that no other scene has."""
         last = asked.replace("\\", "/").rstrip("/").rsplit("/", 1)[-1]
         plain = "".join(c if c.isalnum() or c in "-_" else "-" for c in last)[:40].strip("-") or "scene"
+        # A number is added until no folder and no upload has the name.
         names = (plain if k == 1 else f"{plain}-{k}" for k in count(1))
         return next(name for name in names if name not in self._uploads and not (self._output / name).exists())
 

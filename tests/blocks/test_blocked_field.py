@@ -8,8 +8,8 @@ import torch
 from block_scenes import points_around, row
 from torch import Tensor, nn
 
-from fprf.blocks.fields import BlockedField, BlockedSampler, BlockedSemantic, Held, Member, emission, inherit
-from fprf.blocks.routing import Blend, Chart, Everywhere, Inset, chart_of, shares, surroundings_of
+from fprf.blocks.fields import BlockedField, BlockedSampler, BlockedSemantic, Member, ResidentMembers, emission, inherit
+from fprf.blocks.routing import BlendRouter, Chart, InsetRouter, SingleRouter, chart_of, shares, surroundings_of
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.fields.planes import Planes
 from fprf.plugins.samplers.config import ProposalConfig
@@ -41,7 +41,7 @@ def members(cells: list[Cell], spread: float = 3.0) -> list[Member]:
     return made
 
 
-class Counting(Held):
+class Counting(ResidentMembers):
     """Members that remember who was asked for."""
 
     asked: set[int]
@@ -77,7 +77,7 @@ def test_against_a_loop() -> None:
     parts = members(cells)
     points = points_around(cells, 150)
     view = torch.nn.functional.normalize(torch.randn(150, 3), dim=1)
-    held, router = Held(parts), Blend(cells)
+    held, router = ResidentMembers(parts), BlendRouter(cells)
     field, semantic = BlockedField(held, router), BlockedSemantic(held, router)
     sample = field.density(points)
     density, content, semantics = plain(cells, parts, points, view)
@@ -91,7 +91,7 @@ def test_only_the_blocks_that_points_meet_are_asked() -> None:
     cells = row(6)
     counting = Counting(members(cells))
     counting.asked = set()
-    field, semantic = BlockedField(counting, Blend(cells)), BlockedSemantic(counting, Blend(cells))
+    field, semantic = BlockedField(counting, BlendRouter(cells)), BlockedSemantic(counting, BlendRouter(cells))
     points = torch.tensor([[3.0, 0.0, 0.7], [3.9, 0.1, 0.7]])
     field.content(field.density(points).latent, torch.eye(3)[:2])
     semantic(points)
@@ -101,7 +101,7 @@ def test_only_the_blocks_that_points_meet_are_asked() -> None:
 @torch.no_grad()
 def jumps(cells: list[Cell], x: float, apart: float) -> list[float]:
     """Of log density, content and semantics between points `apart` on both sides of a plane; blocks that agree on nothing."""
-    held, router = Held(members(cells, spread=1.0)), Blend(cells)
+    held, router = ResidentMembers(members(cells, spread=1.0)), BlendRouter(cells)
     field, semantic = BlockedField(held, router), BlockedSemantic(held, router)
     draw = torch.Generator().manual_seed(0)
     y, z = torch.rand(400, generator=draw) * 1.2 - 0.6, torch.rand(400, generator=draw) * 0.7 + 0.4
@@ -138,7 +138,7 @@ def test_an_inset_block_learns_inside_and_its_surroundings_outside() -> None:
     cells = row(2)
     parts = members(cells)
     chart = chart_of(cells[0])
-    field = BlockedField(Held([parts[0], parts[2]]), Inset(chart))
+    field = BlockedField(ResidentMembers([parts[0], parts[2]]), InsetRouter(chart))
     points = points_around(cells, 200)
     inside = chart.inside(points)
     view = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)
@@ -177,11 +177,13 @@ def test_the_sampler_asks_the_blocks_where_to_look() -> None:
     for level in range(2):
         itself.fields[level] = Charted(parts[1].sampler.fields[level])
     r = rays()
-    lone = BlockedSampler(SAMPLER.build(seed=9), Held([parts[1]]), Everywhere())
+    lone = BlockedSampler(SAMPLER.build(seed=9), ResidentMembers([parts[1]]), SingleRouter())
     found = lone(r, space=SPACE, step=0, generator=None)
     wanted = itself(r, space=SPACE, step=0, generator=None)
     assert torch.equal(found.t, wanted.t) and len(found.levels) == len(wanted.levels) == 2
-    blended = BlockedSampler(SAMPLER.build(seed=9), Held(parts), Blend(cells))(r, space=SPACE, step=0, generator=None)
+    blended = BlockedSampler(SAMPLER.build(seed=9), ResidentMembers(parts), BlendRouter(cells))(
+        r, space=SPACE, step=0, generator=None
+    )
     assert not torch.equal(blended.t, wanted.t) and bool((blended.t[:, 1:] >= blended.t[:, :-1]).all())
 
 

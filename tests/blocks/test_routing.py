@@ -8,7 +8,7 @@ from block_scenes import cell, grid, points_around, row
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.blocks.routing import Blend, Group, chart_of, shares, surroundings_of, window
+from fprf.blocks.routing import BlendRouter, Group, chart_of, shares, surroundings_of, window
 from fprf.types import Cell
 
 UNEVEN = [cell((0, 0, 0), (2, 3, 1), 0.25), cell((2, 0, 0), (5, 1, 1), 0.25), cell((2, 1, 0), (5, 3, 1), 0.25)]
@@ -29,7 +29,7 @@ def dense(groups: list[Group], points: int, members: int) -> torch.Tensor:
 @given(st.sampled_from([row(1), row(4), row(3, 0.9), grid(3, 3), UNEVEN]), st.integers(0, 2**31 - 1))
 def test_blending_is_what_the_windows_say(cells: list[Cell], seed: int) -> None:
     points = points_around(cells, 400, seed)
-    groups = Blend(cells)(points)
+    groups = BlendRouter(cells)(points)
     assert sorted(torch.cat([g.at for g in groups]).tolist()) == list(range(400)), "each point in one group"
     found, wanted = dense(groups, 400, len(cells) + 1), shares(points, cells).double()
     # What is left out is slight, and float32 windows round by 1e-6 or so of a margin.
@@ -41,7 +41,7 @@ def test_blending_is_what_the_windows_say(cells: list[Cell], seed: int) -> None:
 
 
 def test_blocks_that_no_point_needs_are_not_named() -> None:
-    blend = Blend(row(5))
+    blend = BlendRouter(row(5))
     named = {m for g in blend(torch.tensor([[3.0, 0.0, 0.5], [3.2, 0.3, 0.9], [3.1, 50.0, 0.0]])) for m in g.members}
     assert named == {1, 5}, "the second block, and the surroundings"
     far = blend(torch.tensor([[1e9, 0.0, 0.0], [-1e30, 1e30, 0.0], [float("nan"), 0.0, 0.0]]))

@@ -12,9 +12,8 @@ from fprf.cli import main as cli
 from fprf.cli.doctor import self_test
 from fprf.cli.findings import Finding
 from fprf.ops import dense
-from fprf.rendering import renderer
 from fprf.style.look import Restyle
-from fprf.training import device_check
+from fprf.training import device_check, views
 from fprf.training.device_check import compare
 
 
@@ -51,7 +50,7 @@ def test_a_planted_fault_is_found(what: str, monkeypatch: pytest.MonkeyPatch) ->
     if what == "restyle":
         monkeypatch.setattr(Restyle, "colour", off(Restyle.colour, lambda args: args[2]))
     elif what == "render":
-        monkeypatch.setattr(renderer, "composite", off(renderer.composite, lambda args: args[1]))
+        monkeypatch.setattr(views, "composite", off(views.composite, lambda args: args[1]))
     else:
         grad = torch.autograd.grad
         skewed = lambda *a, **k: [g * 1.01 if g.device == CUDA else g for g in grad(*a, **k)]  # noqa: E731

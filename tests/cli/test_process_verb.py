@@ -125,7 +125,7 @@ def test_nothing_fits_together_and_what_the_decoder_lost_is_told(photos: Path, c
     (photos / "empty [1].jpg").write_bytes(b"")
     assert process(photos, plan={"nothing": True}) == 2
     told = capsys.readouterr().err
-    assert "no two images fit together; take more views" in told
+    assert "no two of the other images fit together" in told
     assert "could not be decoded: empty [1].jpg (the file is empty)" in told
     assert report(photos)["images"]["posed"] == 0, "the report is written all the same"
 

@@ -12,7 +12,7 @@ from tiny_world import World
 from fprf.cli import main as cli
 from fprf.style.dictionary import load_dictionary
 
-MADE = {"dictionary_seconds", "seconds_per_view", "match_seconds_per_view", "codes", "dead_channels", "matches"}
+MADE = {"dictionary_seconds", "seconds_per_view", "match_seconds_per_view", "codes", "matches"}
 
 
 def stylize(run: Path, world: World, output: Path, *words: str) -> dict[str, Any]:

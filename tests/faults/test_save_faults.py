@@ -17,7 +17,7 @@ from tiny_world import World, after_one_step, save_checkpoint
 from fprf.errors import CheckpointError, DataError
 from fprf.training import checkpoint
 from fprf.training.model import Model
-from fprf.training.run import held
+from fprf.training.run import lock_folder
 
 Trainer = tuple[Model, torch.optim.Optimizer]
 
@@ -133,7 +133,7 @@ def test_a_folder_that_cannot_be_written_to_is_told_before_any_work(monkeypatch:
     place = Path("/proc/fprf-run")
     if not place.parent.is_dir():
         pytest.skip("no folder that refuses everybody")
-    with pytest.raises(DataError, match="cannot be written"), held(place):
+    with pytest.raises(DataError, match="cannot be written"), lock_folder(place):
         pass
 
 

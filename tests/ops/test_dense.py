@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from plain_forms import plainly
 from torch import Tensor
 
-from fprf.ops import dense
 from fprf.ops.dense import network, runs
 
 QUICK = settings(max_examples=25, deadline=None)
@@ -94,18 +93,6 @@ def test_one_thread_and_two_give_the_same_bits() -> None:
         numba.set_num_threads(count)
         results.append(network(x, weights, biases))
     assert torch.equal(*results)
-
-
-def test_other_types_take_the_plain_form() -> None:
-    weights, biases = layers_of((6, 9, 2))
-    x = draw(10, 6)
-    assert not dense.usable(x)
-    with torch.no_grad():
-        assert dense.usable(x) and not dense.usable(x.double())
-    found = network(x.double(), [w.double() for w in weights], [None if b is None else b.double() for b in biases])
-    assert found.dtype == torch.float64
-    double = [w.double().requires_grad_(True) for w in weights]
-    assert torch.autograd.gradcheck(lambda a, b: network(x[:3].double(), [a, b], [None, None]), tuple(double))
 
 
 @QUICK

@@ -45,18 +45,6 @@ def test_affine_maps_stay_within_the_bound(channels: int, regions: int, count: i
 
 
 @torch.no_grad()
-def test_other_types_and_no_points_take_the_plain_form() -> None:
-    x, share, centre = draw(7, 16).double(), shares(7, 3).double(), draw(16).double()
-    matrix, bias = draw(3, 16, 16).double(), draw(3, 16).double()
-    plain = plainly(affine)(x, share, matrix, bias, centre=centre), plainly(scaled)(x, share, bias, bias, centre=centre)
-    fast = affine(x, share, matrix, bias, centre=centre), scaled(x, share, bias, bias, centre=centre)
-    assert all(torch.equal(a, b) and a.dtype == torch.float64 for a, b in zip(plain, fast, strict=True))
-    x, share, centre, matrix, bias = (each.float() for each in (x[:0], share[:0], centre, matrix, bias))
-    assert affine(x, share, matrix, bias, centre=centre).shape == (0, 16)
-    assert scaled(x, share, bias, bias, centre=centre).shape == (0, 16)
-
-
-@torch.no_grad()
 @pytest.mark.parametrize(("channels", "regions"), [(48, 8), (5, 4), (16, 1)])
 @pytest.mark.parametrize("count", [1, 3 * BLOCK + 5])
 def test_gains_and_biases_stay_within_the_bound(channels: int, regions: int, count: int) -> None:

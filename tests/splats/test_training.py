@@ -300,7 +300,7 @@ def test_training_is_watched_and_changes_no_bit(
         driver.watch(tmp_path / "run")
         if index == 30:
             opened = open_run(tmp_path / "run", "cpu")
-            seen.append((opened.step, len(opened.scene.encoders().scene.share)))
+            seen.append((opened.step, len(opened.scene.encoders().scene_style.share)))
         plain(learner, index, share)
 
     monkeypatch.setattr(GaussianLearner, "step", step)

@@ -47,7 +47,7 @@ def test_kept_regions_take_nothing(world: World) -> None:
 def test_the_score_is_the_mean_cosine_with_what_is_taken(world: World) -> None:
     trained, styled = styled_by(world, keep=("0",))
     found = match_map(trained, styled, 0)
-    centre, keys = styled.scene.semantic_mean.double(), styled.dictionary.keys.double()
+    centre, keys = styled.scene_style.semantic_mean.double(), styled.dictionary.keys.double()
     there = torch.nn.functional.normalize(keys - centre, dim=1)
 
     def of_points(semantic: torch.Tensor, points: torch.Tensor | None) -> torch.Tensor:

@@ -59,10 +59,10 @@ def test_a_mask_means_what_it_covers(world: World, tmp_path: Path) -> None:
 def test_keys_find_their_own_regions_and_those_like_them(world: World) -> None:
     regions = regions_of(world)
     assert regions.basis is not None
-    count, middle = len(regions.style.share), regions.style.semantic_mean
+    count, middle = len(regions.scene_style.share), regions.scene_style.semantic_mean
     keys = {f"r{k}": key_of(regions, k) for k in range(count)}
     assert {len(key) for key in keys.values()} == {len(regions.basis.mean)}, "in the encoder's own channels"
-    weaker = middle + 0.4 * (regions.style.keys - middle)
+    weaker = middle + 0.4 * (regions.scene_style.keys - middle)
     for given in (keys, {f"r{k}": tuple(regions.basis.lift(weaker[k]).tolist()) for k in range(count)}):
         for k, name in enumerate(given):
             (found,) = find_regions(regions._replace(keys=given), name)
@@ -81,7 +81,7 @@ def style_of(references: Sequence[Path]) -> StyleConfig:
 def controls_of(world: World, styled: Styled, file: StyleFile | None = None, **wishes: object) -> RegionControls:
     style = replace(style_of(world.references), **wishes)  # type: ignore[arg-type]
     old = styled.controls.regions
-    regions = Regions(old.scene, old.style, old.basis, {} if file is None else file.regions)
+    regions = Regions(old.scene, old.scene_style, old.basis, {} if file is None else file.regions)
     return region_controls(regions, styled.dictionary, style)
 
 
@@ -127,12 +127,16 @@ def test_contradictions_and_unknown_names(world: World, styled: Styled, wishes: 
 
 def test_what_is_saved_means_the_same_on_the_same_scene(world: World, styled: Styled) -> None:
     controls = controls_of(
-        world, styled, pin=("0=snow.png", "0002:15,20=1"), forbid=("1=0",), keep=("2",) if len(styled.scene.share) > 2 else ()
+        world,
+        styled,
+        pin=("0=snow.png", "0002:15,20=1"),
+        forbid=("1=0",),
+        keep=("2",) if len(styled.scene_style.share) > 2 else (),
     )
     saved = controls.saved
     assert all(text.partition("=")[0] in saved.regions for text in (*saved.style.pin, *saved.style.forbid, *saved.style.keep))
     old = styled.controls.regions
-    again = region_controls(Regions(old.scene, old.style, old.basis, saved.regions), styled.dictionary, saved.style)
+    again = region_controls(Regions(old.scene, old.scene_style, old.basis, saved.regions), styled.dictionary, saved.style)
     assert torch.equal(again.allowed, controls.allowed) and torch.equal(again.strength, controls.strength)
     assert again.saved == saved, "names and keys stay as they are, however often it is saved"
     named = {text.partition("=")[0] for text in (*saved.style.pin, *saved.style.forbid, *saved.style.keep)}
@@ -159,7 +163,7 @@ def test_what_regions_take_is_the_stylizers_match_at_their_keys(world: World, st
     style = StyleConfig(references=world.references, clusters=3, keep=("1",), forbid=("0=0",))
     styled = apply_style(trained, StyleFile(replace(style, stylizer=stylizer)))  # type: ignore[arg-type]
     found = explain(styled.controls.regions, styled)
-    match = styled.restyle.stylizer.match(styled.scene.keys)
+    match = styled.restyle.stylizer.match(styled.scene_style.keys)
     for each in found:
         for taken in each.taken:
             own = styled.dictionary.reference == styled.dictionary.names.index(taken.name)

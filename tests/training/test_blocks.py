@@ -14,8 +14,8 @@ from fprf.blocks.fields import Member
 from fprf.blocks.visibility import make_plan
 from fprf.errors import CheckpointError
 from fprf.training import tensorfiles
-from fprf.training.block_training import RAYS, asked_of
-from fprf.training.blocks import Built, Shelf, folder_of, load_blocks, load_finished, restore, surroundings
+from fprf.training.block_training import RAYS, block_task
+from fprf.training.blocks import BlockCache, Built, folder_of, load_blocks, load_finished, restore, surroundings
 from fprf.training.driver import train
 from fprf.training.loading import load_run
 from fprf.training.prepare import read_scene
@@ -50,7 +50,7 @@ def asked(world: BlockWorld, block: int, **change: Any) -> str:
     config = replace(world.config, **change)
     scene, rays = read_scene(config), tensorfiles.read(folder_of(world.root, block) / RAYS)
     cells, facts = make_plan(scene, config.blocks).cells, Run(world.root).load_known().facts
-    digest: str = asked_of(config, facts, scene, cells, block, rays)["task"]
+    digest: str = block_task(config, facts, scene, cells, block, rays)["task"]
     return digest
 
 
@@ -88,7 +88,7 @@ def test_the_least_recently_used_goes_first(block_world: BlockWorld) -> None:
     room, around = 2, around_of(block_world).member
     restore(around, "member", load_finished(folder_of(block_world.root, WHOLE))[1])
     limit = (room + 1) * size_of(block_world)
-    shelf = Shelf(block_world.root, load_blocks(block_world.root), around, device=torch.device("cpu"), limit=limit)
+    shelf = BlockCache(block_world.root, load_blocks(block_world.root), around, device=torch.device("cpu"), limit=limit)
     kept: dict[int, Member] = {}
     for block in (0, 1, 0, 2, 1, 0, 0, 2, 1, 2):
         old, found = kept.pop(block, None), shelf.member(block)

@@ -13,7 +13,7 @@ from tiny_world import World, prepared_for
 from fprf.errors import PluginError, UsageError
 from fprf.methods import fprf_lite
 from fprf.training.driver import Report, forecast
-from fprf.training.learner import outcome
+from fprf.training.learner import training_summary
 from fprf.training.model import build_model
 from fprf.training.prepare import device_of, exposure_of, planned, read_scene
 from fprf.training.run import Run
@@ -91,13 +91,13 @@ def test_a_config_gets_the_size_of_its_scene(world: World) -> None:
 
 def test_what_training_came_to(world: World, tmp_path: Path) -> None:
     config, scene = world.config, world.prepared.scene
-    told = outcome(Run(world.run), config, scene)
+    told = training_summary(Run(world.run), config, scene)
     assert told.startswith(f"warning: too few steps to judge the scene by: 15 steps, {15 * 256 / (8 * 32 * 24):.2g} rays")
     assert f"fprf train {world.run}/config.json --steps 600" in told
-    assert outcome(Run(tmp_path), config, scene) == "no step was made"
+    assert training_summary(Run(tmp_path), config, scene) == "no step was made"
     Run(tmp_path).log({"step": 4000, "seconds": 9.0, "psnr": 24.5})
     timed, reduced = (
-        outcome(Run(tmp_path), replace(fprf_lite(), **field), scene) for field in ({"minutes": 8.0}, {"downscale": 5})
+        training_summary(Run(tmp_path), replace(fprf_lite(), **field), scene) for field in ({"minutes": 8.0}, {"downscale": 5})
     )
     assert "--minutes 16" in timed and "--downscale" not in timed
     assert "--steps 24000" in reduced and "--downscale 4" in reduced

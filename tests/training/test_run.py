@@ -22,7 +22,17 @@ from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import CheckpointError, DataError, UsageError
 from fprf.training import checkpoint
 from fprf.training.driver import train
-from fprf.training.run import IMAGES, LOCK, Run, check_images, held, image_hashes, read_history, save_image_hashes, view_names
+from fprf.training.run import (
+    IMAGES,
+    LOCK,
+    Run,
+    check_images,
+    image_hashes,
+    lock_folder,
+    read_history,
+    save_image_hashes,
+    view_names,
+)
 
 
 @pytest.fixture
@@ -55,7 +65,7 @@ def _without(key: str) -> Any:
         lambda d: d | {"facts": 3},
         lambda d: d | {"facts": d["facts"] | {"space": "box"}},
         lambda d: d | {"facts": d["facts"] | {"more": 1}},
-        lambda d: d | {"facts": _without("channels")(d["facts"])},
+        lambda d: d | {"facts": _without("space")(d["facts"])},
         lambda d: d | {"cameras": d["cameras"] | {"pose": [[1.0], [1.0, 2.0]]}},
         lambda d: d | {"cameras": d["cameras"] | {"size": [[10**30, 1]]}},
         lambda d: None,
@@ -109,8 +119,8 @@ def test_training_goes_on_with_the_same_images_and_with_others_when_asked(world:
 HOLDER = """
 import sys, time
 from pathlib import Path
-from fprf.training.run import held
-with held(Path(sys.argv[1])):
+from fprf.training.run import lock_folder
+with lock_folder(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(60)
 """
@@ -121,31 +131,34 @@ def test_a_second_process_is_told_who_is_there_until_that_is_killed(tmp_path: Pa
     process = subprocess.Popen([sys.executable, "-c", HOLDER, str(folder)], stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None and process.stdout.readline() == "held\n"
-        with pytest.raises(DataError, match=rf"run: process {process.pid} on .+ is training here; wait") as told, held(folder):
+        with (
+            pytest.raises(DataError, match=rf"run: process {process.pid} on .+ is training here; wait") as told,
+            lock_folder(folder),
+        ):
             pytest.fail("two hold it")
         assert "\n" not in str(told.value)
     finally:
         process.send_signal(signal.SIGKILL)
         process.communicate()
     assert (folder / LOCK).exists()
-    with held(folder):
+    with lock_folder(folder):
         assert str(os.getpid()) in (folder / LOCK).read_text()
     assert not (folder / LOCK).exists()
 
 
 def test_who_is_refused_changes_nothing_and_an_empty_folder_is_not_left_behind(tmp_path: Path) -> None:
     folder = tmp_path / "a" / "b"
-    with held(folder):
-        with pytest.raises(DataError, match=f"process {os.getpid()}"), held(folder):
+    with lock_folder(folder):
+        with pytest.raises(DataError, match=f"process {os.getpid()}"), lock_folder(folder):
             pytest.fail("two hold it")
         assert (folder / LOCK).exists(), "the holder's file stays"
     assert not folder.exists()
-    with pytest.raises(ValueError, match="x"), held(folder):
+    with pytest.raises(ValueError, match="x"), lock_folder(folder):
         (folder / "file").touch()
         raise ValueError("x")
     assert [p.name for p in folder.iterdir()] == ["file"]
     for place in (folder / "file", folder / "file" / "run"):
-        with pytest.raises(DataError), held(place):
+        with pytest.raises(DataError), lock_folder(place):
             pass
 
 
@@ -154,7 +167,7 @@ def _count(folder: Path, rounds: int) -> None:
     done = 0
     while done < rounds:
         try:
-            with held(folder):
+            with lock_folder(folder):
                 counter = folder / "counter"
                 value = int(counter.read_text())
                 time.sleep(0.001)

@@ -25,7 +25,7 @@ from fprf.splats.cells import Cells, load_cells
 from fprf.splats.config import GaussiansConfig
 from fprf.training import blocks, checkpoint, tensorfiles
 from fprf.training.blocks import load_blocks, load_finished
-from fprf.training.learner import outcome
+from fprf.training.learner import training_summary
 from fprf.training.model import Facts
 from fprf.training.run import Run, check_images, image_hashes, read_history, save_image_hashes
 from fprf.training.tasks import WHOLE, begin, read_done, renumber, task_of
@@ -70,7 +70,7 @@ class Example:
         yield Run(root).load_known
         yield lambda: check_images(root, self.scene, image_hashes(self.scene))
         yield lambda: read_history(root)
-        yield lambda: outcome(Run(root), fprf_lite(), self.scene)
+        yield lambda: training_summary(Run(root), fprf_lite(), self.scene)
         yield lambda: load_blocks(root)
         yield lambda: load_finished(self.parts[0])
         yield lambda: renumber(root / "blocks", {1: "other"})

@@ -160,7 +160,7 @@ def test_a_time_limit_is_shared_between_the_whole_scene_and_its_parts(
     monkeypatch.setattr("fprf.training.tasks.time", SimpleNamespace(perf_counter=lambda: clock[0]))
     executor = Remembering(clock)
     config = GaussiansConfig(data=tmp_path, minutes=10.0)
-    train_all(config, Run(tmp_path), executor, print, [2, 0, 1], whole_share=0.2, spent=spent, quiet=True)
+    train_all(config, Run(tmp_path), executor, pytest.fail, [2, 0, 1], whole_share=0.2, spent=spent, quiet=True)
     (whole,), parts = executor.given
     assert (whole.part, [task.part for task in parts]) == (WHOLE, [2, 0, 1])
     assert whole.minutes == pytest.approx(0.2 * left)

@@ -21,7 +21,7 @@ def test_any_tensor_comes_back_bit_for_bit(tmp_path: Path, kind: torch.dtype, sh
     path, made = tmp_path / "x.safetensors", (torch.randn(shape, generator=torch.Generator().manual_seed(seed)) * 9).to(kind)
     entry = tensorfiles.save(path, {"t": made})
     found = [tensorfiles.load(path, entry)["t"]]
-    tensorfiles.save_sealed(path, {"t": made})
+    tensorfiles.save(path, {"t": made}, sealed=True)
     found.append(tensorfiles.load_sealed(path)["t"])
     for each in found:
         assert each.dtype == kind and each.shape == made.shape and torch.equal(each, made)
@@ -65,7 +65,7 @@ def test_nothing_is_left_where_writing_failed(tmp_path: Path) -> None:
 def test_a_flipped_bit_of_a_sealed_file_is_found_or_harmless(tmp_path: Path, data: st.DataObject) -> None:
     torch.manual_seed(1)
     path, made = tmp_path / "x.safetensors", tensors()
-    tensorfiles.save_sealed(path, made)
+    tensorfiles.save(path, made, sealed=True)
     raw = bytearray(path.read_bytes())
     at = data.draw(st.integers(0, len(raw) - 1))
     raw[at] ^= 1 << data.draw(st.integers(0, 7))

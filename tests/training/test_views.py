@@ -21,7 +21,7 @@ from fprf.style.look import Restyle
 from fprf.style.restyle import apply_style
 from fprf.style.scene_style import own_style
 from fprf.training.loading import Trained, load_style
-from fprf.training.views import view_parts
+from fprf.training.views import view_chunks
 
 STYLIZERS = (AdainConfig(), LocalAdainConfig(), region_adain(), RegionOtConfig())
 
@@ -73,10 +73,10 @@ def test_budget_and_background_hold(world: World, budget: float) -> None:
     trained = replace(trained, known=replace(trained.known, facts=facts))
     cached = trained.cached(trained.cameras, 1)
     assert torch.equal(cached.restyled().rgb, trained.render(trained.cameras, 1).rgb)
-    assert sum(part.rays for part in cached.parts) == 32 * 24
+    assert sum(part.rays for part in cached.chunks) == 32 * 24
     per_sample = 4 * (1 + 48 + trained.known.facts.dim) + 8
-    kept = sum(len(part.kept.ray) for part in cached.parts)
-    assert kept * per_sample <= sum(part.bytes for part in cached.parts) <= kept * per_sample + 16 * 32 * 24 + 8
+    kept = sum(len(part.kept.ray) for part in cached.chunks)
+    assert kept * per_sample <= sum(part.bytes for part in cached.chunks) <= kept * per_sample + 16 * 32 * 24 + 8
 
 
 def test_chunk_by_chunk_nothing_is_computed_ahead_and_means_are_those_of_match_maps(world: World) -> None:
@@ -85,7 +85,7 @@ def test_chunk_by_chunk_nothing_is_computed_ahead_and_means_are_those_of_match_m
     stylizer = apply_style(
         trained, StyleFile(StyleConfig(references=world.references, stylizer=RegionOtConfig(), clusters=3))
     ).restyle.stylizer
-    parts = view_parts(trained.model, known.facts, known.cameras, 2, trained.config.render)
+    parts = view_chunks(trained.model, known.facts, known.cameras, 2, trained.config.render)
     first = next(parts)
     assert first.rays == 100 and first.semantic is not None
     wanted, _ = trained.paint(known.cameras, 2, pixel_grid(known.cameras, 2)[:100], lambda y, _: stylizer.match(y))

@@ -39,7 +39,7 @@ def test_styles_are_kept_and_bounded(restyler: Restyler, encoded: tuple[Photogra
 
 def test_a_pixel_finds_the_region_that_is_there(restyler: Restyler) -> None:
     cameras = restyler.scene.cameras.select(torch.tensor([2]))
-    share, _ = membership_view(Regions(restyler.scene, restyler.encoders.scene, restyler.encoders.basis), 2, 1000)
+    share, _ = membership_view(Regions(restyler.scene, restyler.encoders.scene_style, restyler.encoders.basis), 2, 1000)
     for x, y in ((3, 4), (20, 18), (31, 23)):
         assert restyler.region_at(cameras, (x + 0.5, y + 0.5)) == int(share[y, x].argmax())
     with pytest.raises(UsageError, match="outside"):
@@ -49,7 +49,7 @@ def test_a_pixel_finds_the_region_that_is_there(restyler: Restyler) -> None:
 def test_regions_are_matched_whatever_their_order(restyler: Restyler) -> None:
     generator = torch.Generator().manual_seed(0)
     keys, noise = torch.randn(2, 6, 8, generator=generator)
-    style = restyler.encoders.scene._replace(keys=keys, semantic_mean=torch.randn(8, generator=generator))
+    style = restyler.encoders.scene_style._replace(keys=keys, semantic_mean=torch.randn(8, generator=generator))
     order = torch.randperm(6, generator=generator)
     moved = style._replace(keys=keys[order] + 0.01 * noise)
     assert torch.equal(order[matching_regions(style, moved)], torch.arange(6))

@@ -140,6 +140,7 @@ def read_records(path: Path) -> Iterator[bytes]:
             where = f"{path}: record {number}"
             if len(head) < 12:
                 raise DataError(f"{where}: the file ends within its head; download it again")
+            # A length that is wrong would make nonsense of everything behind it: it has a checksum of its own.
             length, check = struct.unpack("<QI", head)
             if masked(crc32c(head[:8])) != check:
                 raise DataError(f"{where}: the checksum of its length is wrong; download the file again")
@@ -162,6 +163,7 @@ def read_examples(path: Path) -> Iterator[Example]:
             message: Any = _message_class().FromString(data)
         except DecodeError as error:
             raise DataError(f"{where}: no tf.train.Example ({error}); convert the capture again") from error
+        # Lists of one of three types, by name.
         features: dict[str, Feature] = {}
         for entry in message.features.feature:
             kind = entry.value.WhichOneof("kind")

@@ -94,6 +94,7 @@ def read_model(folder: Path) -> ColmapModel:
         if id_ in cameras:
             raise _bad(folder / f"cameras.{suffix}", place, f"camera {id_} occurs twice")
         cameras[id_] = camera
+    # Points may be absent: some tools write cameras and images alone.
     cloud = folder / f"points3D.{suffix}"
     images = list(images_of(folder / f"images.{suffix}"))
     points = np.fromiter(points_of(cloud) if cloud.is_file() else (), np.dtype([("id", "i8"), ("xyz", "f8", 3)]))
@@ -159,6 +160,7 @@ def _images_bin(path: Path) -> Iterator[ColmapImage]:
     file = _Bytes(path)
     for _ in range(file.count(_IMAGE.size + 1 + _COUNT.size, "images")):
         _, qw, qx, qy, qz, tx, ty, tz, camera = file.take(_IMAGE, "an image")
+        # A name that ends with a zero byte, then the features, of which the points are kept.
         stop = file.data.find(b"\0", file.at)
         if stop < 0:
             raise file.error("the image's name does not end")

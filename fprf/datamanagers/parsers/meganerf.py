@@ -70,6 +70,7 @@ def _first_line(error: Exception) -> str:
 
 
 def _view(file: Path, images: Path, unit: float) -> View:
+    # The image may have any ending.
     metadata = _load(file)
     paths = [images / f"{file.stem}{suffix}" for suffix in sorted(IMAGE_SUFFIXES)]
     path = next((path for path in paths if path.is_file()), images / f"{file.stem}.jpg")

@@ -121,6 +121,7 @@ def _cloud(
 
 def _view(entry: _Entry, inside: NamedFiles) -> View:
     record = entry.record
+    # Without a size the intrinsics belong to the image as it is, and the principal point is its middle.
     size = stated_size(record.where, entry.path, record.number("w"), record.number("h"))
     near, far = record.number("near"), record.number("far")
     cx, cy = record.number("cx"), record.number("cy")
@@ -157,6 +158,7 @@ def _focal(record: Record, size: tuple[int, int]) -> tuple[float, float]:
             raise DataError(f"{record.where}: {angle_key} is {angle}; it must lie between 0 and pi")
         return pixels / 2 / math.tan(angle / 2)
 
+    # Either one serves for both.
     fx, fy = one("fl_x", "camera_angle_x", size[0]), one("fl_y", "camera_angle_y", size[1])
     first = fy if fx is None else fx
     if first is None:

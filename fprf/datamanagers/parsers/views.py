@@ -173,6 +173,7 @@ def lens_of(
             f"{where}: a panorama ({model}), which `colmap image_undistorter` cannot undistort either; cut the images "
             "into pinhole views, as COLMAP's panorama_sfm.py and `ns-process-data images --camera-type equirectangular` do"
         )
+    # A lens that is close to one of ours would bend rays a little wrong: any term that is left over refuses it.
     fisheye = "FISHEYE" in model
     if any(others) or (fisheye and (p1 or p2)) or (model.endswith("PINHOLE") and any(distortion)):
         known = "no terms" if model.endswith("PINHOLE") else "k1 k2 k3 k4" if fisheye else "k1 k2 k3 k4 p1 p2 in a polynomial"

@@ -56,6 +56,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def _loaded(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str], *, encoder: str, channels: int) -> MlpDecoder:
+    # Its first layer says how many features it takes.
     hidden, inputs = tensors["first.weight"].shape
     if metadata["encoder"] != encoder or inputs != channels:
         raise WeightsError(

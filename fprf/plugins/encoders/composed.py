@@ -73,6 +73,7 @@ def build_concat(parts: Sequence[Encoder], weights: Sequence[float], *, cells: C
 
 def unit_of(encoder: Encoder, images: Annotated[Tensor, "B 3 H W"]) -> float:
     """Root mean square length of the encoder's features about their mean, rounded; 1 where they don't change at all."""
+    # Over cells, of the vector of all channels.
     features: Tensor = encoder(images).double()
     length = float((features - features.mean(dim=(0, 2, 3), keepdim=True)).square().sum(dim=1).mean().sqrt())
     return float(f"{length:.{DIGITS}g}") or 1.0

@@ -108,6 +108,7 @@ class Dinov2Encoder(FrozenEncoder):
     @torch.no_grad()
     def cutout(self, image: Annotated[Tensor, "B 3 H W"], opacity: Annotated[Tensor, "B H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features of the patches that show something, encoded without the others: cheaper, and no backdrop has a say."""
+        # Patches with something in them; what they show only in part lies on grey.
         cover = F.adaptive_avg_pool2d(opacity[:, None], patch_grid(image.shape[-2:], self._stride))[:, 0]
         filled = image + (1 - opacity[:, None]) * GREY
         # One by one: as many tokens as each image shows.
@@ -119,6 +120,7 @@ class Dinov2Encoder(FrozenEncoder):
         )
 
     def _features(self, image: Tensor, shown: Annotated[Tensor, "h w"] | None = None) -> Annotated[Tensor, "B C h w"]:
+        # Resized to whole patches, with ImageNet's mean and deviation.
         size = [PATCH * n for n in patch_grid(image.shape[-2:], self._stride)]
         if size != list(image.shape[-2:]):
             image = F.interpolate(image, size, mode="bicubic", align_corners=False, antialias=True)

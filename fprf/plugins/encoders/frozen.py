@@ -39,6 +39,7 @@ def patch_grid(size: Sequence[int], stride: int | None) -> tuple[int, int]:
     """Rows and columns of patches that cover an image of that height and width: one for `stride` pixels; None = `CELLS` along
     its longer side.
     """
+    # At least one each way, however thin the image is.
     height, width = size
     pixels = stride or max(size) / CELLS
     return max(1, round(height / pixels)), max(1, round(width / pixels))

@@ -160,12 +160,14 @@ def _from_adain(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
     The 1x1 convolution at its start turns colours; it goes into the first 3x3 one, which mirrored borders leave exact.
     """
+    # Their places to torchvision's.
     renamed = {}
     for at, (name, place) in enumerate(CONVOLUTIONS["vgg19"].items()):
         theirs = 2 + 3 * at + int(name[0]) - 1
         for part in ("weight", "bias"):
             if f"{theirs}.{part}" in tensors:
                 renamed[f"features.{place}.{part}"] = tensors[f"{theirs}.{part}"]
+    # w3 * (w1 x + b1) + b3 is one convolution: (w3 w1) * x + (sum w3 b1 + b3).
     if {"features.0.weight", "features.0.bias"} <= renamed.keys() and "0.bias" in tensors:
         first = renamed["features.0.weight"].double()
         turn, shift = tensors["0.weight"][:, :, 0, 0].double(), tensors["0.bias"].double()

@@ -40,6 +40,7 @@ class VitEncoder(FrozenEncoder):
         """Features, one per `stride` pixels, cells covering the whole image evenly."""
         height, width = patch_grid(image.shape[-2:], self._stride)
         size = (height * self._patch, width * self._patch)
+        # A patch of the model for every cell.
         if size != tuple(image.shape[-2:]):
             image = F.interpolate(image, size, mode="bilinear", align_corners=False, antialias=True)
         mean, std = (image.new_tensor(each).view(1, 3, 1, 1) for each in (IMAGENET_MEAN, IMAGENET_STD))

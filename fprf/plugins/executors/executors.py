@@ -96,6 +96,7 @@ class RayExecutor(Executor):
 
 def _ray(*, private: bool) -> Any:
     """The module; it reads the environment when it is imported, so what it shall know is said before."""
+    # Nobody is told that it runs; a cluster of our own listens on the loopback, behind a token.
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     if private:
         # No cluster means the loopback, on Linux too; an address of it given to `init` is replaced by one for others.

@@ -79,6 +79,7 @@ class ProposalConfig(SamplerConfig):
         at_least("sampler.warm_up", self.warm_up, 0)
         positive("sampler.anneal_slope", self.anneal_slope)
         at_least("sampler.update_every", self.update_every, 1)
+        # A level is a pair of samples and a resolution.
         for n in (*self.samples, *self.resolutions):
             at_least("sampler.samples and resolutions", n, 2)
         if not 1 <= len(self.samples) == len(self.resolutions):

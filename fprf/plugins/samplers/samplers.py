@@ -13,6 +13,7 @@ from .config import ProposalConfig, UniformConfig
 
 def even_edges(rays: Rays, samples: int, generator: torch.Generator | None) -> Tensor:
     """Edges s [R samples+1] at even steps; with a generator the inner ones move together by up to half a step a ray."""
+    # The ends stay on near and far.
     s = torch.linspace(0, 1, samples + 1, dtype=rays.origin.dtype, device=rays.origin.device).expand(len(rays.near), -1)
     if generator is None:
         return s

@@ -19,7 +19,7 @@ from ...io.atomic import unwritable
 from ...plugins.captures import Data, format_of
 from ...rendering.cameras import Cameras
 from ...rendering.local_frame import added_and_beside, read_offset, write_offset
-from ...training.run import held
+from ...training.run import lock_folder
 from ...types import Origin
 from ..gaussians import Gaussians, bulk_of
 from ..views import seen_means
@@ -153,9 +153,9 @@ def write_ply_parts(
     unfinished = path.with_name(f".{path.stem[:40]}.{key[:16]}")
     for other in path.parent.glob(f".{glob.escape(path.stem[:40])}.{'[0-9a-f]' * 16}"):
         if other != unfinished:
-            with suppress(DataError), held(other):
+            with suppress(DataError), lock_folder(other):
                 shutil.rmtree(other)
-    with held(unfinished):
+    with lock_folder(unfinished):
         rows = unfinished / "rows"
         try:
             with rows.open("r+b" if rows.is_file() else "w+b") as file:
