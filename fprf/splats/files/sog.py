@@ -235,15 +235,15 @@ class _Pictures:
 
     def numbers(self, group: str, name: str, length: int, least: int | None = None) -> Floats:
         """A list of so many finite numbers, or from `least` on."""
-        value = self.meta[group].get(name) if isinstance(self.meta.get(group), dict) else None
-        # Exporters write null in the place of the first number of a codebook that is not finite.
-        if name == "codebook" and isinstance(value, list) and value[:1] == [None]:
-            value = value[1:2] + value[1:]
-        try:
-            values = np.array(value if isinstance(value, list) else None, dtype=np.float64)
-        except (TypeError, ValueError, OverflowError):
-            values = np.array([np.nan])
         least = length if least is None else least
+        try:
+            value = self.meta[group][name]
+            # Exporters write null in the place of the first number of a codebook that is not finite.
+            if name == "codebook" and value[:1] == [None]:
+                value = value[1:2] + value[1:]
+            values = np.array(value, dtype=np.float64)
+        except (LookupError, TypeError, ValueError, OverflowError):
+            values = np.zeros(0)
         if values.ndim != 1 or not least <= len(values) <= length or not np.isfinite(values).all():
             many = length if least == length else f"{least} to {length}"
             raise self._wrong(f"{group}.{name} is no list of {many} numbers")
@@ -311,11 +311,14 @@ class _Pictures:
         return labels, rest
 
     def _name(self, group: str, which: int) -> str:
-        about = self.meta.get(group)
-        files = about.get("files") if isinstance(about, dict) else None
-        if not isinstance(files, list) or len(files) <= which or files[which] not in self.parts:
+        """Name of an image that the archive holds."""
+        try:
+            name = str(self.meta[group]["files"][which])
+        except (LookupError, TypeError):
+            name = ""
+        if name not in self.parts:
             raise self._wrong(f"no image {which + 1} of {group}")
-        return str(files[which])
+        return name
 
     def _wrong(self, what: str) -> DataError:
         return DataError(f"{self.path}: {what}; not a SOG file, or it is damaged")
