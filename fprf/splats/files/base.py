@@ -109,7 +109,7 @@ def steps(values: Floats, most: int) -> NDArray[np.int64]:
 
 def shares(values: Floats, low: Floats, high: Floats) -> Floats:
     """Where values lie between bounds: 0 to 1, and 0 where the bounds are one."""
-    span = np.asarray(high, np.float64) - low
+    span = np.asarray(high - low, np.float64)  # as exact as the bounds are stored
     return np.where(span > 0, (values - low) / np.where(span > 0, span, 1.0), 0.0)
 
 
