@@ -87,7 +87,7 @@ class Gaussians:
         parts = (self.means, self.quaternions, self.harmonics.flatten(1))
         # A million rows at a time: magnitudes of all harmonics would take as much memory as these.
         small = torch.stack([
-            torch.cat([(rows.abs() < _LARGEST).all(1) for rows in part.split(1 << 20)]) for part in parts
+            torch.cat([(rows.abs() < _LARGEST).all(1) for rows in torch.split(part, 1 << 20)]) for part in parts
         ]).all(0)  # fmt: skip
         sized = (self.log_scales <= _WIDEST).all(1)  # False for NaN
         return small & sized & ~self.logits.isnan(), (self.quaternions.abs() >= 1e-12).any(1)
