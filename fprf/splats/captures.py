@@ -22,7 +22,7 @@ from ..style.look import ColourMaps, Restyle
 from ..style.restyle import Styled
 from ..training.loading import open_run
 from .config import LookConfig
-from .files import Capture, read_capture
+from .files import Capture, read_capture, release
 from .files.base import pieces
 from .gaussians import Gaussians, bulk_of
 from .loading import open_capture
@@ -95,6 +95,7 @@ def open_captures(
     for path in paths:
         capture = first if path == paths[0] else read_capture(path)
         key.update(hashlib.sha256(capture.data).digest())
+        release(capture.data)
         here = torch.tensor([a - b for a, b in zip(capture.origin, first.origin, strict=True)])
         part = sampled(capture.gaussians.drawable(), max(1, sample // len(paths)))
         parts.append(replace(part, means=part.means + here) if bool(here.any()) else part)

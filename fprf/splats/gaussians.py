@@ -85,7 +85,10 @@ class Gaussians:
     def _sound(self) -> tuple[Annotated[Tensor, "N"], Annotated[Tensor, "N"]]:
         """Masks of the Gaussians whose numbers are within bounds, and of those that have a rotation."""
         parts = (self.means, self.quaternions, self.harmonics.flatten(1))
-        small = torch.stack([(part.abs() < _LARGEST).all(1) for part in parts]).all(0)
+        # A million rows at a time: magnitudes of all harmonics would take as much memory as these.
+        small = torch.stack([
+            torch.cat([(rows.abs() < _LARGEST).all(1) for rows in torch.split(part, 1 << 20)]) for part in parts
+        ]).all(0)  # fmt: skip
         sized = (self.log_scales <= _WIDEST).all(1)  # False for NaN
         return small & sized & ~self.logits.isnan(), (self.quaternions.abs() >= 1e-12).any(1)
 

@@ -23,10 +23,10 @@ from ...training.run import lock_folder
 from ...types import Origin
 from ..gaussians import Gaussians, bulk_of
 from ..views import seen_means
-from .base import ROWS, Capture, pieces
+from .base import ROWS, Capture, pieces, release
 from .ply import ply_head, ply_rows
 
-__all__ = ["Capture", "Written", "read_capture", "write_capture", "write_gaussians", "write_ply_parts"]
+__all__ = ["Capture", "Written", "read_capture", "release", "write_capture", "write_gaussians", "write_ply_parts"]
 
 _MAPPED = 1 << 28
 """Bytes from which on files are mapped."""
@@ -65,8 +65,7 @@ def read_capture(path: Path) -> Capture:
         raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
     with np.errstate(over="ignore", invalid="ignore"):  # damaged files hold numbers of any kind
         capture = form.read(path, data)
-    if isinstance(data, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
-        data.madvise(mmap.MADV_DONTNEED)
+    release(data)
     if not len(capture.gaussians):
         raise DataError(f"{path}: holds no Gaussian")
     parts = (capture.gaussians.select(slice(start, start + _TESTED)) for start in range(0, len(capture.gaussians), _TESTED))

@@ -3,6 +3,7 @@
 Arrays are NumPy's. A reader never allocates on a file's word: what a header claims is held against the size of the file.
 """
 
+import mmap
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -89,6 +90,12 @@ def decoded(bands: int, *sections: tuple[int, Callable[[slice], tuple[Floats, ..
     shift = local_origin(torch.from_numpy(parts[0]))
     parts[0] -= shift
     return from_arrays(parts[0], parts[1], parts[2], parts[3], parts[4]), shift
+
+
+def release(data: Data) -> None:
+    """Let go of the memory of a mapped file that was read through; it is read again where it is asked for."""
+    if isinstance(data, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+        data.madvise(mmap.MADV_DONTNEED)
 
 
 def arrays(gaussians: Gaussians) -> tuple[Floats, Floats, Floats, Floats, Floats]:

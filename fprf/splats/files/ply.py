@@ -265,6 +265,7 @@ def _read_inria(path: Path, data: Data, elements: Mapping[str, _Element]) -> Cap
                     column = base.steps(base.colours_of(new[here]), 255)[:, channel]
                 table[name][here] = column
             yield table.tobytes()
+            base.release(data)
         yield data[vertex.offset + vertex.rows * vertex.kind.itemsize :]
 
     gaussians, shift = base.decoded(count, (vertex.rows, part))
