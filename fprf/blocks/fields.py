@@ -40,7 +40,7 @@ class Members(ABC):
     """Members by number: in memory, or fetched when they are asked for."""
 
     held: Sequence[Member]
-    """Those that live as long as the model, whose parameters are its own."""
+    """Members that live as long as the model, whose parameters are its own."""
 
     @abstractmethod
     def member(self, number: int) -> Member:
@@ -108,7 +108,7 @@ class BlockedField(ContentField):
         return _joined([group.at for group in groups], contents)
 
     def penalties(self) -> dict[str, Tensor]:
-        """Those of the members that are held, added up: each is regularised as if alone."""
+        """Penalties of the members in memory, added up: each is regularised as if alone."""
         return add_penalties(member.field.penalties() for member in self.members.held)
 
 
@@ -135,7 +135,7 @@ class BlockedSemantic(SemanticField):
         return _joined([group.at for group in groups], outputs)
 
     def penalties(self) -> dict[str, Tensor]:
-        """Those of the members that are held, added up."""
+        """Penalties of the members in memory, added up."""
         return add_penalties(member.semantic.penalties() for member in self.members.held if member.semantic is not None)
 
 
@@ -209,7 +209,7 @@ class BlockedSampler(Sampler):
         return outputs
 
     def penalties(self) -> dict[str, Tensor]:
-        """Those of the samplers of the members that are held, added up."""
+        """Penalties of the samplers of the members in memory, added up."""
         return add_penalties(member.sampler.penalties() for member in self.members.held)
 
 

@@ -39,7 +39,7 @@ FEW = 16
 PADDING = 0.05
 """Bounds found from points are this much wider (share of their size): surfaces must not lie on the border."""
 BORDER = 0.05
-"""Of a cell of Gaussians: its border as a share of its width."""
+"""Border of a cell of Gaussians as a share of its width."""
 SEEN = 8
 """Points of a cell that a view shows, at least, where the cell learns from it."""
 OWN = 0.15

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import UsageError
 from ..export.config import FIT_MINUTES, KINDS, ExportConfig, Plan, plan
-from ..plugins.captures import endings
+from ..plugins.captures import endings, format_name
 from ..progress import Display
 from .style_flags import named_styles, read_flags, tidy
 
@@ -122,7 +122,7 @@ class _Export:
 
     def gaussians(self) -> dict[str, Any]:
         """Gaussians as they are, or fitted to the scene's own renders; the same in each look, but for their colours."""
-        from ..splats.files import write_rows
+        from ..splats.files import Written, write_gaussians, write_ply_parts
         from ..training.checkpoint import digest
 
         # The key names what a file was made from: the checkpoint, the style, the frame.
@@ -139,15 +139,27 @@ class _Export:
             state = f"{digest(self.opened.run.checkpoints)} {style}{' local' * config.local}" if own else ""
             key = hashlib.sha256(state.encode()).hexdigest() if own else ""
             for path in self.what.paths("splats", look.name, *(f".{each}" for each in self.what.formats)):
-                written = write_rows(
-                    path,
-                    gaussians,
-                    key=key,
-                    views=scene.cameras if own else self.views,
-                    plain=config.plain,
-                    origin=scene.origin,
-                    local=config.local,
-                )
+                if key and not config.plain and format_name(path) == "ply":  # in parts: what was cut off goes on
+                    written = Written()
+                    write_ply_parts(
+                        path,
+                        gaussians.part,
+                        count,
+                        key,
+                        antialiased=gaussians.antialiased,
+                        origin=scene.origin,
+                        local=config.local,
+                    )
+                else:
+                    written = write_gaussians(
+                        path,
+                        gaussians.part(slice(0, count)),
+                        antialiased=gaussians.antialiased,
+                        views=scene.cameras if own else self.views,
+                        plain=config.plain,
+                        origin=scene.origin,
+                        local=config.local,
+                    )
                 paths.append(path)
                 losses |= dict.fromkeys(f"{path.name}: {loss}" for loss in written.losses())
         return {"gaussians": count, "losses": [*losses]}

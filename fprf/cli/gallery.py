@@ -104,7 +104,7 @@ def run(args: list[str]) -> int:
     measured: Any = {}
     if (path := config.run / "metrics.json").is_file():
         measured = read_json(path, "the metrics.json of `fprf eval`")
-    left_out = ("per_view", "method", "scene")
+    figures = measured if isinstance(measured, dict) else {}
     width, height = known.cameras.size[views[0]].tolist()
     page = Page(
         title=config.title or known.name,
@@ -120,7 +120,7 @@ def run(args: list[str]) -> int:
         references=[Reference(name, load_image(path, upright=True)) for path, name in called.items()],
         scene=scene if isinstance(scene, SplatScene) else None,
         start=views[0],
-        metrics={name: value for name, value in measured.items() if name not in left_out} if isinstance(measured, dict) else {},
+        metrics={name: value for name, value in figures.items() if name not in ("per_view", "method", "scene")},
         film=film,
     )
     write_page(output, page, megabytes=config.megabytes)
@@ -234,15 +234,16 @@ def page_styles(
         # Each view against the next one, warped onto it.
         pairs = [(k, k + 1) for k in range(len(views) - 1)]
         warped = consistency([each.rgb for each in drawn], [each.depth for each in drawn], shown_cameras, pairs)
+        # Of a style on the way to another, the page names its own photographs alone.
         paths = dict(zip(labels(file.style.references), file.style.references, strict=True))
+        names = [label for label in styled.codes.names if label in paths]
+        shares = [fmean(row["references"][k]["share"] for row in summaries) for k in range(len(styled.codes.names))]
         style = Style(
             name,
             [to_uint8(each.rgb) for each in drawn],
             look.shown.harmonics if isinstance(look, SplatScene) else None,
-            references=[called[paths[label]] for label in styled.codes.names],
-            shares=[
-                fmean(row["references"][k]["share"] for row in summaries) for k in range(len(styled.codes.names)) if several
-            ],
+            references=[called[paths[label]] for label in names],
+            shares=shares if several and len(shares) == len(names) else [],
             matches=maps,
             metrics={
                 "match_score": fmean(row["score"] for row in summaries),

@@ -71,7 +71,7 @@ def mlp(inputs: int, hidden: int, layers: int, outputs: int, *, generator: torch
 
 
 def weights(network: nn.Sequential) -> list[Tensor]:
-    """Of each linear map, [outputs, inputs]."""
+    """Weights of each linear map, [outputs, inputs]."""
     return [layer.weight for layer in network if isinstance(layer, nn.Linear)]
 
 

@@ -26,11 +26,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..ops.harmonics import HARMONIC
-from ..ops.rasterise import lift
-from ..rendering.cameras import Cameras
 from ..splats.files.base import smallest_three, spatial_order, steps
 from ..splats.gaussians import Gaussians
-from ..splats.photographs import camera_of
 
 CHUNK = 256
 """Gaussians of a chunk; the last one is filled up with its last Gaussian."""
@@ -196,19 +193,6 @@ def fit_maps(
         ridge = (1e-4 * gram.diagonal(dim1=1, dim2=2).sum(1) + 1e-8)[:, None, None] * torch.eye(3)
         maps = torch.linalg.solve(gram + ridge, cross + ridge @ maps)
     return label.to(torch.uint8).numpy(), maps.flatten(1).float().numpy()
-
-
-@torch.inference_mode()
-def importance(
-    gaussians: Gaussians, cameras: Cameras, *, antialiased: bool, near: float, most: int = 32
-) -> Annotated[Tensor, "N"]:
-    """Weight of each Gaussian in the pixels of at most so many views: those of the least weight show least."""
-    shape = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)
-    weight = torch.zeros(len(gaussians))
-    for view in sorted({*torch.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().long().tolist()}):
-        camera = camera_of(cameras, view, near)
-        weight += lift(*shape, camera, torch.ones(camera.height, camera.width, 1), antialiased=antialiased)[:, 0]
-    return weight
 
 
 def sections(packed: Packed, level: int = 9) -> dict[str, bytes]:

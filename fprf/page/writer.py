@@ -32,7 +32,7 @@ from ..splats.photographs import camera_of
 from ..splats.scene import SplatScene
 from ..style.look import Restyle
 from .live import read, script
-from .pack import colour_header, colour_section, header, importance, pack, sections
+from .pack import colour_header, colour_section, header, pack, sections
 
 CAPTURED = "Captured"
 _STILL, _VIEW, _MAP, _REFERENCE = 800, 512, 320, 320
@@ -105,7 +105,7 @@ def write_page(path: Path, page: Page, *, megabytes: float | None = None) -> int
     """Write the page to `path` (.html), whole or not at all; return how many Gaussians it shows.
 
     With `megabytes` (2^20 bytes), Gaussians that show least are left out until the file is no larger. Raises DataError where
-    pictures do not belong together, or where the page without any Gaussian is larger.
+    the page without any Gaussian is larger.
     """
     text, count = page_html(page, megabytes=megabytes, path=path)
     write_text(path, text)
@@ -114,7 +114,6 @@ def write_page(path: Path, page: Page, *, megabytes: float | None = None) -> int
 
 def page_html(page: Page, *, megabytes: float | None = None, path: Path = Path("page.html")) -> tuple[str, int]:
     """The text of a page that lies at `path`, and how many Gaussians it shows. Raises as `write_page`."""
-    _check(page)
     room = None if megabytes is None else int(megabytes * 2**20)
     film = "" if page.film is None else _film(page.film, path, _SMALL_FILM if room is None else min(_SMALL_FILM, room / 3))
     fixed = _text(page, film, None, {})
@@ -122,7 +121,7 @@ def page_html(page: Page, *, megabytes: float | None = None, path: Path = Path("
         return fixed, 0
     harmonics = [scene.shown.harmonics, *(style.harmonics for style in page.styles if style.harmonics is not None)]
     # Pack all, and while it is too large keep the share that would fit, of the Gaussians that weigh most in the views.
-    empty, kept, weight = len(fixed.encode()), None, None
+    empty, kept = len(fixed.encode()), None
     for _ in range(4):
         head, parts = packed_scene(scene, harmonics, kept, page.start)
         text = _text(page, film, head, parts)
@@ -132,10 +131,8 @@ def page_html(page: Page, *, megabytes: float | None = None, path: Path = Path("
         share = (room - empty) / max(1, size - empty)
         if share <= 0.02:
             break
-        if weight is None:
-            weight = importance(scene.gaussians, scene.views, antialiased=scene.antialiased, near=scene.near)
         # A little less than would fit by the mean: what shows most compresses least.
-        kept = weight.topk(max(1, int(0.98 * share * count))).indices.sort().values
+        kept = scene.seen.weights.topk(max(1, int(0.98 * share * count))).indices.sort().values
     raise DataError(f"{path}: {empty / 2**20:.1f} MiB without any Gaussian; allow more than {megabytes:g} MiB")
 
 
@@ -222,22 +219,6 @@ def _depth(scene: SplatScene, view: int) -> float:
     size = torch.tensor([camera.width, camera.height]).double()
     inside = (at[:, 2] > scene.near) & ((middle - size / 2).abs() < size / 3).all(1)
     return float(depth[inside].median()) if bool(inside.any()) else 1.0
-
-
-def _check(page: Page) -> None:
-    known = {reference.name for reference in page.references}
-    if not page.views:
-        raise DataError("page: no views; at least one")
-    for style in page.styles:
-        if not 0 < len(style.stills) <= len(page.views):
-            raise DataError(f"page: style {style.name} has {len(style.stills)} pictures of {len(page.views)} views")
-        if (style.harmonics is None) != (page.scene is None):
-            raise DataError(f"page: style {style.name} has harmonics, or the page a scene, but not both")
-        if style.shares and len(style.shares) != len(style.references):
-            raise DataError(f"page: style {style.name} has {len(style.shares)} shares of {len(style.references)} references")
-        for name in style.references:
-            if name not in known:
-                raise DataError(f"page: style {style.name} names reference {name}; known are {', '.join(sorted(known))}")
 
 
 def _text(page: Page, film: str, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]) -> str:

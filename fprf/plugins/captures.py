@@ -76,8 +76,8 @@ class CaptureFormat(PluginConfig):
 
 
 def endings() -> tuple[str, ...]:
-    """Endings of the files that installed formats read and write, with their dot."""
-    return tuple(f".{name}" for name in registry.installed(CaptureFormat.group))
+    """Endings of the files of installed formats, with their dot; an index of a folder (lod-meta.json) has none of its own."""
+    return tuple(f".{name}" for name in registry.installed(CaptureFormat.group) if not name.endswith(".json"))
 
 
 def format_name(path: Path) -> str | None:

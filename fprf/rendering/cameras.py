@@ -256,7 +256,7 @@ def normals(cameras: Cameras, view: int, depth: Annotated[Tensor, "H W"]) -> Ann
 
 
 def _step(points: Tensor, solid: Tensor, axis: int) -> Tensor:
-    """From each point to the next one along an axis, or from the one before, whichever is shorter; 0 where there is none."""
+    """Steps to each point's next one along an axis, or from the one before, whichever is shorter; 0 where there is none."""
     count = points.shape[axis]
     both = (solid.narrow(axis, 1, count - 1) & solid.narrow(axis, 0, count - 1))[..., None]
     gaps = points.narrow(axis, 1, count - 1) - points.narrow(axis, 0, count - 1)

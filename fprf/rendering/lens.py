@@ -15,7 +15,7 @@ from torch import Tensor
 
 PINHOLE, OPENCV, FISHEYE, PANORAMA = 0, 1, 2, 3
 _TOLERANCE = 1e-14
-"""In focal lengths; pixels are some 1e3 to 1e4 times smaller, which leaves 1e-10 px."""
+"""Error of the inverse in focal lengths; pixels are some 1e3 to 1e4 times smaller, which leaves 1e-10 px."""
 _STEPS = 60
 """Bisection alone halves a bracket to rounding in that many; Newton mostly needs five."""
 

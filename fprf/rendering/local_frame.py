@@ -56,7 +56,7 @@ def _some(place: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "M 3"]:
 
 
 def added_and_beside(origin: Origin, local: bool) -> tuple[Origin, Origin]:
-    """What is added to local coordinates in a file that holds float64, and what its offset file says."""
+    """The offset that is added to local coordinates in a file of float64, and the one that its offset file says."""
     none = (0.0, 0.0, 0.0)
     return (none, origin) if local else (origin, none)
 
@@ -75,7 +75,7 @@ def write_offset(path: Path, offset: Origin) -> None:
 
 
 def read_offset(path: Path) -> Origin:
-    """What is to be added to the coordinates of a file; 0 without an offset file. Raises DataError."""
+    """The offset of the coordinates of a file; 0 without an offset file. Raises DataError."""
     file = offset_file(path)
     if not file.is_file():
         return (0.0, 0.0, 0.0)

@@ -50,7 +50,7 @@ class PackedSamples(NamedTuple):
     """int64 index of the ray of each."""
     weight: Annotated[Tensor, "M"]
     point: Annotated[Tensor, "M 3"]
-    """In the unit cube."""
+    """Places in the unit cube."""
     latent: Annotated[Tensor, "M L"]
     view: Annotated[Tensor, "M 3"]
     gradient_scale: Annotated[Tensor, "M"] | None = None
@@ -67,7 +67,7 @@ class March(NamedTuple):
     depth: Annotated[Tensor, "R"]
     opacity: Annotated[Tensor, "R"]
     transmittance: Annotated[Tensor, "R"]
-    """Of the whole ray: the share of the background that is seen. Density learns from it."""
+    """Transmittance of the whole ray: the share of the background that is seen. Density learns from it."""
     kept: PackedSamples
 
 

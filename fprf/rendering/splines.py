@@ -42,7 +42,7 @@ def rotations(quaternion: Annotated[Tensor, "F 4"]) -> Annotated[Tensor, "F 3 3"
 def slerp(
     start: Annotated[Tensor, "F 4"], end: Annotated[Tensor, "F 4"], u: Annotated[Tensor, "F"]
 ) -> Annotated[Tensor, "F 4"]:
-    """From `start` (u = 0) to `end` (u = 1) the short way round, at constant speed."""
+    """Rotations from `start` (u = 0) to `end` (u = 1) the short way round, at constant speed."""
     cosine = (start * end).sum(-1, keepdim=True)
     # q and -q are the same rotation: take the nearer one.
     end = torch.where(cosine < 0, -end, end)

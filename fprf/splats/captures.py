@@ -64,6 +64,7 @@ class Captures:
         features = self.scene.found().features[rows]
         if len(features) == len(gaussians):
             return restyled_harmonics(gaussians.harmonics, means, features, look)
+        # The sample stands where its own capture was moved to: back in its place.
         near = Neighbours(self.scene.gaussians.means[rows] - self.moved[index], features)
         out = torch.empty_like(gaussians.harmonics)
         for some in pieces(len(out)):
@@ -129,6 +130,7 @@ def _apart(parts: Sequence[Gaussians]) -> list[Annotated[Tensor, "3"]]:
     """What takes captures apart, in a row along x, where some lie in one place; nothing where they are neighbours."""
     boxes = []
     for part in parts:
+        # Stray Gaussians do not make neighbours of captures that are apart.
         inner = part.means[torch.from_numpy(bulk_of(part.means.numpy()).apart <= 0.5)]
         boxes.append((inner.amin(0), inner.amax(0)))
     overlap = False
@@ -151,6 +153,7 @@ def _joined(parts: Sequence[Gaussians]) -> Gaussians:
     bands = max(part.harmonics.shape[1] for part in parts)
     same = []
     for part in parts:
+        # Harmonics of a higher degree are 0 where a file has none.
         missing = part.harmonics.new_zeros(len(part), bands - part.harmonics.shape[1], 3)
         same.append(part.recoloured(torch.cat([part.harmonics, missing], 1)))
     return Gaussians(*(torch.cat(each) for each in zip(*(vars(part).values() for part in same), strict=True)))
@@ -215,6 +218,7 @@ class Neighbours:
         self.levels = []
         for level in range(_LEVELS):
             keys, cell = torch.unique(self._cells(points, level), return_inverse=True)
+            # A level has the means of its cells, by the sorted numbers of these.
             sums = torch.zeros(len(keys), features.shape[1]).index_add_(0, cell, features.float())
             self.levels.append((keys, (sums / cell.bincount()[:, None]).half()))
 
@@ -224,6 +228,7 @@ class Neighbours:
         left = torch.arange(len(places))
         for level, (keys, means) in enumerate(self.levels):
             cells = self._cells(places[left], level)
+            # Those without a cell at this level ask the next, where cells are twice as wide.
             at = torch.searchsorted(keys, cells).clamp_max(len(keys) - 1)
             found = keys[at] == cells
             out[left[found]] = means[at[found]]

@@ -98,6 +98,8 @@ class SeenMeans(NamedTuple):
     functions: Annotated[Tensor, "N K"]
     """Means of the functions of the harmonics, at most those of degree 3."""
     opacities: Annotated[Tensor, "N"]
+    weights: Annotated[Tensor, "N"]
+    """Of each Gaussian in the pixels of the views: those of the least weight show least."""
 
     def plain(self, gaussians: Gaussians) -> Gaussians:
         """The Gaussians with mean opacities."""
@@ -133,7 +135,7 @@ def seen_means(gaussians: Gaussians, cameras: Cameras, *, antialiased: bool) -> 
     constant = torch.zeros(bands**2)
     constant[0] = HARMONIC
     functions, finite = functions / weights, functions.isfinite().all(1, keepdim=True)
-    return SeenMeans(torch.where(finite, functions, constant), (opacities / weights)[:, 0])
+    return SeenMeans(torch.where(finite, functions, constant), (opacities / weights)[:, 0], weights[:, 0])
 
 
 @torch.inference_mode()

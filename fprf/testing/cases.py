@@ -20,7 +20,7 @@ from ..types import Batch, Rays, Site
 
 
 def uniform(*shape: int, seed: int) -> Tensor:
-    """In [0, 1]. Every call in this package has a seed of its own, so that swapped arguments are seen."""
+    """Uniform draws in [0, 1]. Every call in this package has a seed of its own, so that swapped arguments are seen."""
     return torch.rand(shape, generator=torch.Generator().manual_seed(seed))
 
 
@@ -30,13 +30,13 @@ def normal(*shape: int, seed: int) -> Tensor:
 
 
 def points(count: int) -> Annotated[Tensor, "N 3"]:
-    """In the unit cube, among them its centre and two of its corners."""
+    """Points in the unit cube, among them its centre and two of its corners."""
     inner = 2 * uniform(count - 3, 3, seed=1) - 1
     return torch.cat([inner, torch.zeros(1, 3), torch.ones(1, 3), -torch.ones(1, 3)])
 
 
 def rays(count: int) -> Rays:
-    """From outside the unit cube through it."""
+    """Rays from outside the unit cube through it."""
     direction = torch.nn.functional.normalize(normal(count, 3, seed=2), dim=1)
     near, far = torch.full((count,), 0.5), torch.full((count,), 3.5)
     return Rays(origin=-2 * direction, direction=direction, view=direction, near=near, far=far)

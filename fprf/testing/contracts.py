@@ -411,7 +411,7 @@ def check_executor(config: ExecutorConfig) -> None:
 
 
 def check_capture_format(form: CaptureFormat) -> None:
-    """What it writes it reads again, as many Gaussians of the same places and colours; recolouring changes nothing else.
+    """A format reads what it writes: as many Gaussians of the same places and colours; recolouring changes nothing else.
 
     Damaged files end in DataError.
     """

@@ -126,7 +126,7 @@ class Blocks(Partition):
 def block_task(
     config: TrainConfig, facts: Facts, scene: Scene, cells: Sequence[Cell], block: int, rays: dict[str, Tensor]
 ) -> dict[str, Any]:
-    """What a block is trained as (`Part.asked`). `rays` is its rays.safetensors.
+    """The task of a block, and how long it is trained (`Part.asked`). `rays` is its rays.safetensors.
 
     A block is decided by its bounds and rays, its images, and the config but for what may change, not by its surroundings:
     they are only its frame.

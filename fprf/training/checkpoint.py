@@ -36,7 +36,7 @@ class Saved(NamedTuple):
 
     @property
     def state(self) -> State:
-        """As a learner takes it."""
+        """The tensors for `Learner.load`."""
         return State(self.model, self.optimizer)
 
 

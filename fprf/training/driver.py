@@ -55,9 +55,9 @@ class Schedule(NamedTuple):
     """How long to train, and how often to save."""
 
     steps: int | None
-    """None = until the minutes are over."""
+    """Number of steps; None = until the minutes are over."""
     minutes: float | None = None
-    """None = until all steps are made."""
+    """Time limit; None = until all steps are made."""
     checkpoint_minutes: float = 5.0
 
     def share(self, step: int, seconds: float) -> float:
@@ -82,7 +82,7 @@ class Report(NamedTuple):
     seconds: float
     """Training time, that of earlier starts included."""
     psnr: float
-    """Of the training rays in dB, smoothed."""
+    """PSNR of the training rays in dB, smoothed."""
     rays_per_second: float
     kept: float
     """Share of the samples that met the content network."""
@@ -292,9 +292,9 @@ class _SignalHandler:
 
     def __init__(self) -> None:
         self.asked = False
-        """Once: end when the step is done."""
+        """True after the first signal: training ends when the step is done."""
         self.hurried = False
-        """Twice: ended within a step, so that what is in memory is of no use."""
+        """True after the second: a step was cut in half, so what is in memory is not saved."""
         self.before: dict[int, Any] = {}
 
     def __enter__(self) -> "_SignalHandler":

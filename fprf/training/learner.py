@@ -47,7 +47,7 @@ CLEAR_EVERY = 100
 FAINT_FIRST = 1e-33
 """First moments below are cleared: after CLEAR_EVERY more steps they would be denormal (below 1.2e-38)."""
 FAINT_SECOND = 1e-36
-"""The same for second moments. Their root, 1e-18, is far below any useful eps."""
+"""Second moments below are cleared. Their root, 1e-18, is far below any useful eps."""
 LARGEST = 1.8e19
 """Norm of a gradient that Adam can square in float32 (3.4e38)."""
 _NAMED = 3

@@ -72,7 +72,7 @@ class Trained(Scene):
 
     @property
     def cameras(self) -> Cameras:
-        """Of the captured views, where training has put them."""
+        """Cameras of the captured views, where training has put them."""
         return self.known.cameras
 
     @property

@@ -53,7 +53,7 @@ class Facts:
     content_scale: float = 1.0
     """RMS standard deviation of the content targets: the unit of the content loss."""
     semantic_scale: float = 1.0
-    """The same for semantics."""
+    """RMS standard deviation of the semantic targets: the unit of the semantic loss."""
     background: tuple[float, float, float] | None = None
     """Colour behind everything, if anything can be seen through."""
     exposure: tuple[float, ...] = ()
@@ -61,11 +61,11 @@ class Facts:
     held: tuple[int, ...] = ()
     """Views that neither tones nor poses are learnt from."""
     centres: tuple[tuple[float, float, float], ...] = ()
-    """Of the cameras, in the world, as the capture says; empty where poses are not refined."""
+    """Centres of the cameras, in the world, as the capture says; empty where poses are not refined."""
     reach: float = 1.0
     """World distance that views commonly see: the unit in which cameras are shifted."""
     origin: Origin = (0.0, 0.0, 0.0)
-    """Of the local frame that all of the run is in (see `rendering.local_frame`)."""
+    """Origin of the local frame that all of the run is in (see `rendering.local_frame`)."""
 
     def __post_init__(self) -> None:
         for name in ("channels", "dim"):
@@ -89,7 +89,7 @@ class Model(nn.Module):
 
     @property
     def parts(self) -> Parts:
-        """For the renderer."""
+        """The modules that the renderer needs."""
         return Parts(self.space, self.sampler, self.field, self.semantic, self.decoder)
 
     @property

@@ -57,7 +57,7 @@ class Known:
     data: str
     """Folder of the images when it was trained: a hint for `eval`, not a need."""
     names: tuple[str, ...]
-    """Of each view: the stem of its image (see `view_names`)."""
+    """Names of the views: the stems of their images (see `view_names`)."""
     cameras: Cameras
     train: tuple[int, ...]
     test: tuple[int, ...]
@@ -277,7 +277,7 @@ def in_training(folder: Path) -> bool:
 
 IMAGES = "images.json"
 CHANGED_IMAGES = "--changed-images"
-"""Of `fprf train`: go on nevertheless."""
+"""Flag of `fprf train` that goes on with images that have changed."""
 _IMAGES_FORMAT = 1
 _NAMED = 3
 

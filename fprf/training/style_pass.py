@@ -101,7 +101,7 @@ def measure_style(config: TrainConfig, model: Model, cameras: Cameras, views: An
 def _contacts(
     config: TrainConfig, model: Model, cameras: Cameras, views: Annotated[Tensor, "V"], scene: SceneStyle
 ) -> Annotated[Tensor, "K K"]:
-    """Of rendered pixels: what is behind an edge in the picture is behind one here."""
+    """How much regions touch without an edge of colour between them, from pairs of rendered pixels."""
     view, pixel = neighbours(cameras, views, max(1, config.statistics.rays // _PAIRS))
     view, pixel = view.repeat_interleave(2), pixel.flatten(0, 1)
 

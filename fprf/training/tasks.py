@@ -62,7 +62,7 @@ class Done:
 
     format: int
     asked: dict[str, Any]
-    """See `Part.asked`."""
+    """`Part.asked` of the part when it was trained."""
     step: int = 0
     seconds: float = 0.0
     """Training time."""
@@ -75,7 +75,7 @@ class Part(ABC):
     """A part of a scene, ready to be trained."""
 
     name: str
-    """As it is shown."""
+    """Name in messages."""
     folder: Path
     asked: dict[str, Any]
     """`task`, the digest of what it is trained as, and how long it is to be trained: it is finished where done.json says so."""
@@ -83,7 +83,7 @@ class Part(ABC):
 
     @abstractmethod
     def build(self) -> Learner:
-        """What learns it, at its start."""
+        """The learner of the part, at its start."""
 
     def keep(self, learner: Learner) -> dict[str, Any]:
         """Write what is kept of a finished part beside its checkpoints; its manifest."""
@@ -172,7 +172,7 @@ def digest_of(
 
 
 def task_of(folder: Path) -> str | None:
-    """What a part was begun as; None where its task.json is absent or damaged, which is as good as not begun."""
+    """The digest of the task that a part was begun as; None where task.json is absent or damaged, which counts as not begun."""
     try:
         with open_json(folder / _TASK, "") as document:
             return from_json(document["task"], str, path="task")

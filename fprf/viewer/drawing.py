@@ -3,32 +3,46 @@
 A moving camera must see something at once, a camera at rest everything: the first picture of a field is the finest one that can
 be had within `FIRST_SECONDS`, as fast as this machine has been so far, and each next one has four times the pixels. What a
 client's last view holds is kept, so that a slider that is moved while the camera rests costs decoding alone.
+
+Films: keyframes that were set on the page become an mp4 in the run's folder. A film's folder holds what `fprf render` takes:
+`path.json` (a camera path), `keys.json` (styles by frame) and the styles with their photographs. The film is rendered from
+these very files, so the same command makes it again, at any size.
 """
 
+import shutil
 import time
 from collections.abc import Callable, Generator, Hashable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ..checks import between
 from ..errors import UsageError
+from ..interfaces import Scene
+from ..io.atomic import write_json
 from ..io.images import Picture, to_uint8
 from ..io.maps import depth_image, match_image, palette
 from ..ops.harmonics import HARMONIC
 from ..page.pack import Colours, Packed
+from ..plugins.stylizers.config import RegionToneConfig
+from ..rendering.camera_path import read_camera_path, write_camera_path
 from ..rendering.cameras import Cameras, ideal_cameras
+from ..rendering.paths import interpolate
 from ..splats.scene import SplatScene
+from ..style.files import StyleFile, read_keyframes, write_style
 from ..style.look import Restyle
-from ..style.restyle import Styled
+from ..style.restyle import Styled, keyed_looks
 from ..style.scene_style import RegionWeight
 from ..training.loading import Trained
 from ..training.views import ViewChunk, view_chunks
+from ..types import Origin
 from .messages import Camera
 from .render_worker import Steps
-from .restyler import Look, Restyler
+from .restyler import Look, Restyler, style_config
 
 Map: TypeAlias = Literal["none", "matches", "regions", "depth"]
 CACHE_BYTES = 128 << 20
@@ -117,37 +131,14 @@ def _match_colours(
     return torch.from_numpy(np.ascontiguousarray(picture)).float() / 255
 
 
-class Speed:
-    """Running mean of the seconds that a pixel takes."""
-
-    def __init__(self, guess: float) -> None:
-        self.seconds = guess
-
-    def update(self, pixels: int, seconds: float) -> None:
-        """Learn that a picture of so many pixels took so long."""
-        self.seconds += 0.3 * (seconds / pixels - self.seconds)
-
-    def first(self, sizes: list[tuple[int, int]]) -> int:
-        """Index of the finest of `sizes` (coarse to fine) that should take at most `FIRST_SECONDS`; at least 0."""
-        fits = [i for i, (width, height) in enumerate(sizes) if width * height * self.seconds <= FIRST_SECONDS]
-        return max(fits, default=0)
-
-
-@dataclass
-class _Kept:
-    """A client's last view."""
-
-    camera: Camera
-    parts: dict[tuple[int, int], list[ViewChunk]] = field(default_factory=dict)
-
-
 class FieldPainter:
     """Renders a field for clients; `show` receives a picture, of the look or as captured, and whether it is the last."""
 
     def __init__(self, trained: Trained, restyler: Restyler, show: Callable[[Hashable, str, Picture, bool], None]) -> None:
         self._trained, self._restyler, self._show = trained, restyler, show
-        self._views: dict[Hashable, _Kept] = {}
-        self._speed = Speed(1e-5)  # until something was measured
+        # Of each client's last view: its camera, and the sharpest size whose features were kept, with them.
+        self._views: dict[Hashable, tuple[Camera, tuple[int, int], list[ViewChunk]]] = {}
+        self._pixel_seconds = 1e-5  # a running mean, until something was measured a guess
 
     def forget(self, client: Hashable) -> None:
         """Drop what is kept for a client."""
@@ -155,31 +146,32 @@ class FieldPainter:
 
     def render(self, client: Hashable, request: Request) -> Steps:
         """Show ever sharper pictures, a step each chunk of rays."""
-        kept = self._views.get(client)
-        if kept is None or kept.camera != request.camera:
-            self._views[client] = kept = _Kept(request.camera)
-        # From the sharpest size whose features are kept, else from the finest that comes at once, up to the full one.
+        camera, ready, features = self._views.get(client, (None, None, []))
+        if camera != request.camera:
+            self._views.pop(client, None)
+            ready = None
         styled = self._restyler.styled(request.shown.look)
         full = cameras_of([request.camera], longest=request.longest)
         sizes = resolutions((int(full.size[0, 0]), int(full.size[0, 1])))
-        ready = [size for size in sizes if size in kept.parts]
-        for size in sizes[sizes.index(ready[-1]) if ready else self._speed.first(sizes) :]:
-            start, again = time.perf_counter(), size in kept.parts
+        # From the size whose features are kept, else from the finest that should come at once, up to the full one.
+        quick = [k for k, (width, height) in enumerate(sizes) if width * height * self._pixel_seconds <= FIRST_SECONDS]
+        for size in sizes[sizes.index(ready) if ready in sizes else max(quick, default=0) :]:
+            start, again = time.perf_counter(), size == ready
             rows: list[Tensor] = []
             captured: list[Tensor] = []
             parts: list[ViewChunk] = []
             # Features are marched once; another look only decodes them again.
-            for part in kept.parts[size] if again else self._parts(cameras_of([request.camera], size), 0):
+            for part in features if again else self._parts(cameras_of([request.camera], size), 0):
                 rows.append(self._colours(part, styled, request.shown))
                 if request.captured:
                     captured.append(part.colour(self._trained.model.decoder, None).cpu())
-                if not again:
-                    parts.append(part)
+                parts.append(part)
                 yield
             if not again:
-                self._speed.update(size[0] * size[1], time.perf_counter() - start)
-            if not again and sum(part.bytes for part in parts) <= CACHE_BYTES:
-                kept.parts = {size: parts}  # of the sharpest size that fits
+                seconds = (time.perf_counter() - start) / (size[0] * size[1])
+                self._pixel_seconds += 0.3 * (seconds - self._pixel_seconds)
+                if sum(part.bytes for part in parts) <= CACHE_BYTES:
+                    self._views[client] = (request.camera, size, parts)
             shape = (size[1], size[0])
             if request.shown.map == "depth":
                 depth, opacity = torch.cat(rows).view(*shape, 2).unbind(-1)
@@ -262,3 +254,110 @@ def cameras_of(cameras: "list[Camera]", size: tuple[int, int] | None = None, lon
         made.distortion,
         made.lens,
     )
+
+
+Frame: TypeAlias = Callable[[Cameras, int, Restyle | None], Generator[None, None, Picture]]
+"""Renders one frame, step by step."""
+_MAX_SECONDS = 600.0
+
+
+class Key(NamedTuple):
+    """A keyframe of a film."""
+
+    camera: Camera
+    look: Look
+
+
+class FilmPlan(NamedTuple):
+    """Keyframes and timing of a film."""
+
+    keys: tuple[Key, ...]
+    seconds: float
+    """Between keys."""
+    fps: float
+    side: int
+    """Longest side, in pixels."""
+
+    @property
+    def gap(self) -> int:
+        """Frames from one key to the next."""
+        return max(1, round(self.seconds * self.fps))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Even width and height, in the shape of the first key's canvas."""
+        width, height = self.keys[0].camera.size
+        by = self.side / max(width, height) / 2
+        return max(2, 2 * round(width * by)), max(2, 2 * round(height * by))
+
+
+def film_cameras(plan: FilmPlan) -> Cameras:
+    """A camera each frame; a single key is one frame. Raises UsageError for no keys or a film that is too long."""
+    if not plan.keys:
+        raise UsageError("film: no keys yet; go somewhere and add one")
+    between("fps", plan.fps, 1.0, 120.0)
+    between("seconds", plan.seconds, 0.1, _MAX_SECONDS)
+    seconds = plan.seconds * (len(plan.keys) - 1)
+    if seconds > _MAX_SECONDS:
+        raise UsageError(f"film: {seconds:.0f} s; at most {_MAX_SECONDS:.0f} s are filmed from the page")
+    keys = cameras_of([key.camera for key in plan.keys], plan.size)
+    return interpolate(keys, torch.arange(len(plan.keys)), plan.gap - 1)
+
+
+def new_folder(root: Path) -> Path:
+    """Make a folder for the next film of a run: RUN/films/0001 and so on."""
+    number = 1
+    while True:
+        folder = root / "films" / f"{number:04d}"
+        try:
+            folder.mkdir(parents=True)
+            return folder
+        except FileExistsError:
+            number += 1
+
+
+def write_film_files(
+    folder: Path,
+    plan: FilmPlan,
+    encoder: str,
+    stylizer: RegionToneConfig | None = None,
+    origin: Origin = (0.0, 0.0, 0.0),
+) -> None:
+    """Write path.json, keys.json, and a folder a look with style.json and its photographs.
+
+    `encoder` is the identity of the scene's semantic encoder, `stylizer` what its looks are based on; None = the default.
+    The path is in the capture's coordinates; `origin` is that of the scene.
+    """
+    write_camera_path(folder / "path.json", film_cameras(plan), plan.fps, origin)
+    # Keys with equal looks share a style, so that nothing is restyled between them.
+    looks: dict[Look, Path] = {}
+    rows: list[dict[str, object]] = []
+    for i, key in enumerate(plan.keys):
+        if not key.look.plain and key.look not in looks:
+            path = folder / f"style-{len(looks) + 1}" / "style.json"
+            path.parent.mkdir()
+            # Copies of the photographs, for uploads go with the viewer; the style names them beside itself.
+            references = []
+            for k, (photograph, _) in enumerate(key.look.mix):
+                stem = photograph.name.rsplit(".", 1)[0]
+                plain = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stem)
+                references.append(path.with_name(f"{k + 1}-{plain or 'photograph'}.png"))
+                shutil.copyfile(photograph.path, references[-1])
+            style_of_look = replace(style_config(key.look, stylizer), references=tuple(references))
+            write_style(path, StyleFile(style_of_look, {}, encoder))
+            looks[key.look] = path
+        # A key without a look is the scene as captured.
+        style = looks.get(key.look)
+        rows.append({"frame": i * plan.gap, "style": None if style is None else str(style.relative_to(folder))})
+    write_json(folder / "keys.json", {"format": 1, "keyframes": rows})
+
+
+def film_frames(folder: Path, scene: Scene, frame: Frame) -> list[Generator[None, None, Picture]]:
+    """The frames of a film's folder, each to be rendered step by step."""
+    cameras, _ = read_camera_path(folder / "path.json", scene.origin)
+    looks = keyed_looks(scene, read_keyframes(folder / "keys.json"))
+
+    def rendered(number: int) -> Generator[None, None, Picture]:
+        return (yield from frame(cameras, number, looks(number)))
+
+    return [rendered(number) for number in range(len(cameras))]

@@ -30,8 +30,19 @@ from ..style.look import Restyle
 from ..training.loading import Trained
 from ..training.run import Known, Run
 from . import messages
-from .drawing import FieldPainter, Map, Request, Shown, cameras_of, gaussian_colours
-from .film import FilmPlan, Key, film_frames, new_folder, write_film_files
+from .drawing import (
+    FieldPainter,
+    FilmPlan,
+    Key,
+    Map,
+    Request,
+    Shown,
+    cameras_of,
+    film_frames,
+    gaussian_colours,
+    new_folder,
+    write_film_files,
+)
 from .render_worker import RenderWorker, Steps
 from .restyler import Look, Photograph, RegionInfo, Restyler, matching_regions, only, renumbered, set_rule, set_weight
 from .uploads import Uploads, shown_name

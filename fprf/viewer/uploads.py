@@ -185,18 +185,13 @@ class Source(NamedTuple):
     path: Path
 
 
-def capture_suffixes() -> frozenset[str]:
-    """Last endings of files of 3D Gaussians, in lower case: .ply of .compressed.ply too."""
-    return frozenset(f".{ending.rpartition('.')[2]}" for ending in endings())
-
-
 def _kinds() -> str:
-    return f"photographs, a video, or a capture of 3D Gaussians ({' '.join(sorted(capture_suffixes()))})"
+    return f"photographs, a video, or a capture of 3D Gaussians ({' '.join(sorted(f'.{each}' for each in endings()))})"
 
 
 def is_capture(path: Path) -> bool:
     """True for a path that is named like a capture of 3D Gaussians."""
-    return format_name(path) is not None or (path / "meta.json").is_file()
+    return format_name(path) is not None or any((path / name).is_file() for name in ("meta.json", "lod-meta.json"))
 
 
 def newest_step(run: Path) -> int:
@@ -226,9 +221,11 @@ def find_source(path: Path) -> Source:
     photographs = [each for each in files if each.suffix.lower() in IMAGE_SUFFIXES]
     if len(photographs) >= _FEWEST:
         return Source("photographs", path)
-    singles: tuple[tuple[SourceKind, frozenset[str]], ...] = (("capture", capture_suffixes()), ("video", VIDEO_SUFFIXES))
-    for kind, suffixes in singles:
-        single = [each for each in files if each.suffix.lower() in suffixes]
+    kinds: tuple[tuple[SourceKind, list[Path]], ...] = (
+        ("capture", [each for each in files if format_name(each) is not None]),
+        ("video", [each for each in files if each.suffix.lower() in VIDEO_SUFFIXES]),
+    )
+    for kind, single in kinds:
         if len(single) == 1 and not photographs:
             return Source(kind, single[0])
         if len(single) > 1:
@@ -246,8 +243,10 @@ def check_file(name: str, head: bytes, size: int) -> None:
     if suffix in IMAGE_SUFFIXES:
         check_photograph(head, name)
         return
+    # Poses and descriptions of captures in parts are JSON alike; any other capture is known by its format.
+    capture = suffix != ".json" and format_name(Path(name)) is not None
     whole = {
-        **({suffix: format_of(Path(name)).recognises(head, size)} if suffix in capture_suffixes() else {}),
+        **({suffix: format_of(Path(name)).recognises(head, size)} if capture else {}),
         ".npz": head.startswith(b"PK"),
         ".npy": head.startswith(b"\x93NUMPY"),
         ".json": head.lstrip()[:1] in (b"{", b"["),

@@ -63,3 +63,5 @@ def test_style_files_and_a_flight(run: Path, world: World) -> None:
     page = gallery(run, "--styles", str(style), "--views", "0000", "--frames", "2", "--path", "orbit")
     assert [style["name"] for style in data_of(page)["styles"]] == ["Captured", "mine"]
     assert (run / "gallery.mp4").stat().st_size > 100 and 'class="flight"' in page
+    page = gallery(run, "--references", references[0], "--between", str(style), "--views", "0000")
+    assert [style["name"] for style in data_of(page)["styles"]] == ["Captured", "dusk"], "on the way to another style"

@@ -6,11 +6,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from tiny_world import World
 
 from fprf.cli import main as cli
 from fprf.style.dictionary import load_dictionary
+from fprf.training import tensorfiles
 
 MADE = {"dictionary_seconds", "seconds_per_view", "match_seconds_per_view", "codes", "matches"}
 
@@ -76,7 +77,7 @@ def test_a_style_of_another_scene_finds_its_regions_by_their_keys(run: Path, wor
     other = shutil.copytree(run, tmp_path / "other")
     tensors = load_file(other / "style.safetensors")
     turned = {k: v.flip(0) if k in ("keys", "region_mean", "region_covariance", "share") else v for k, v in tensors.items()}
-    save_file({k: v.contiguous() for k, v in turned.items()}, other / "style.safetensors")
+    tensorfiles.save(other / "style.safetensors", turned, sealed=True)
     file = ["--style", str(tmp_path / "a" / "style.json"), "--no-matches"]
     assert cli.main(["stylize", str(other), *file, "--output", str(tmp_path / "b")]) == 0
     a, b = (cv2.imread(str(tmp_path / folder / "0000.png")).astype(int) for folder in "ab")

@@ -9,10 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
+from fprf.fields.config import PlanesConfig
 from fprf.fields.planes import LIMIT, PlanesField, density
 from fprf.ops.harmonics import spherical_harmonics as harmonics
-from fprf.testing import check_content_field, check_semantic_field
 
 SMALL = PlanesConfig(resolutions=(4, 9), channels=8, hidden=16)
 
@@ -21,18 +20,6 @@ def cloud(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
     draw = torch.Generator().manual_seed(seed)
     view = torch.nn.functional.normalize(torch.randn(count, 3, generator=draw), dim=-1)
     return torch.empty(count, 3).uniform_(-1, 1, generator=draw), view
-
-
-@pytest.mark.parametrize(
-    "config",
-    [
-        SMALL,
-        PlanesConfig(resolutions=(5,), channels=3, hidden=4, layers=0, degree=1),
-        PlanesConfig(resolutions=(3, 4, 6), channels=24, hidden=8, layers=3, degree=2),
-    ],
-)
-def test_the_contract_of_content(config: PlanesConfig) -> None:
-    check_content_field(config)
 
 
 def test_kernels_and_plain_form_agree() -> None:
@@ -61,14 +48,6 @@ def test_density_does_not_meet_the_network() -> None:
     field.density(cloud(30)[0]).density.sum().backward()
     assert all(p.grad is None for p in field.to_content.parameters()) and field.offset.grad is None
     assert field.planes.table.grad is not None and field.to_density.weight.grad is not None
-
-
-SMALL_SEMANTIC = SemanticPlanesConfig(resolutions=(4, 9), channels=8, hidden=16)
-
-
-@pytest.mark.parametrize("config", [SMALL_SEMANTIC, SemanticPlanesConfig(resolutions=(3,), channels=5, hidden=4, layers=0)])
-def test_the_contract_of_semantics(config: SemanticPlanesConfig) -> None:
-    check_semantic_field(config)
 
 
 U = 2.0**-24

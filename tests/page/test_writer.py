@@ -11,7 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import torch
 from pages import page_of, seen, written
 from splat_ball import ball
 
@@ -145,18 +144,3 @@ def test_films_are_embedded_linked_or_named(tmp_path: Path) -> None:
     film.write_bytes(b"mp4v")
     read = Read(written(tmp_path / "c.html", scene, film=film))
     assert not read.all("video") and read.all("a", href="a%20film.mp4")
-
-
-@pytest.mark.parametrize(
-    ("change", "told"),
-    [
-        ({"views": []}, "no views"),
-        ({"references": []}, "names reference city"),
-        ({"scene": None}, "not both"),
-        ({"styles": [Style("x", [], torch.zeros(50, 1, 3))]}, "0 pictures"),
-    ],
-)
-def test_what_does_not_belong_together_is_refused(tmp_path: Path, change: dict[str, Any], told: str) -> None:
-    with pytest.raises(DataError, match=told):
-        write_page(tmp_path / "x.html", replace(page_of(seen(ball(50))), **change))
-    assert not (tmp_path / "x.html").exists()

@@ -69,7 +69,7 @@ def toy(tmp_path: Path) -> Iterator[None]:
         yield
 
 
-@pytest.mark.parametrize("name", ["ply", "compressed.ply", "splat", "spz", "sog"])
+@pytest.mark.parametrize("name", ["ply", "compressed.ply", "splat", "spz", "sog", "glb", "gltf", "ksplat", "lod-meta.json"])
 def test_built_in_formats_keep_to_the_contract(name: str) -> None:
     testing.check_capture_format(registry.make("fprf.captures", name, CaptureFormat))
 

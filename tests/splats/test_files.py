@@ -15,7 +15,7 @@ import torch
 from splat_ball import ball
 
 from fprf.errors import DataError
-from fprf.plugins.captures import endings
+from fprf.plugins.captures import endings, format_of
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import look_at, pinhole
 from fprf.splats.files import Capture, read_capture, write_capture, write_gaussians, write_ply_parts
@@ -25,6 +25,7 @@ from fprf.splats.gaussians import Gaussians
 from fprf.splats.photographs import camera_of
 from fprf.splats.views import draw
 
+WRITTEN = [ending for ending in endings() if format_of(Path(f"x{ending}")).writes]
 SHAPE = ("means", "quaternions", "log_scales", "logits")
 COUNT = 600
 STEP = {  # most that positions in [-2, 2], ln-scales, opacities, mean colours and harmonics change by: half a step
@@ -33,6 +34,8 @@ STEP = {  # most that positions in [-2, 2], ln-scales, opacities, mean colours a
     ".splat": (0.0, 4e-7, 0.5 / 255, 0.5 / 255, 0.0),
     ".spz": (2**-20, 0.5 / 16, 0.5 / 255, 0.5 / 255 * 0.282 / 0.15, 0.5 / 128),
     ".sog": (1.6e-4, 0.5 / 16, 0.5 / 255, 0.02, 0.01),
+    ".glb": (0.0, 1e-6, 1e-7, 0.0, 0.0),
+    ".gltf": (0.0, 1e-6, 1e-7, 0.0, 0.0),
 }
 
 
@@ -67,7 +70,7 @@ def from_the_front(side: int, fov: float) -> Cameras:
 
 
 @pytest.fixture(
-    params=[(e, d) for e in (*endings(), "meta.json") for d in (0, 2) if e != ".splat" or d == 0],
+    params=[(e, d) for e in (*WRITTEN, "meta.json") for d in (0, 2) if e != ".splat" or d == 0],
     ids=lambda p: f"{p[0]}-{p[1]}",
 )
 def capture(request: pytest.FixtureRequest, tmp_path: Path) -> Capture:

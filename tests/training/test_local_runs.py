@@ -25,7 +25,7 @@ from fprf.splats.scene import SplatScene
 from fprf.training.driver import train
 from fprf.training.loading import load_run, open_run
 from fprf.training.run import Run
-from fprf.viewer.film import FilmPlan, Key, write_film_files
+from fprf.viewer.drawing import FilmPlan, Key, write_film_files
 from fprf.viewer.messages import Camera
 from fprf.viewer.restyler import Look
 

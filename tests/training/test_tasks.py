@@ -125,21 +125,6 @@ def test_more_steps_go_on_from_where_it_stopped(task_world: TaskWorld, tmp_path:
         assert made == sorted(made) and made[-1] == after["step"] and before["step"] in made, "the log goes on"
 
 
-@pytest.mark.parametrize("text", ["{", '{"format": 1, "step": 6}', None])
-def test_a_damaged_done_json_is_named_or_the_part_trained_again(
-    task_world: TaskWorld, tmp_path: Path, text: str | None
-) -> None:
-    root = task_world.copy(tmp_path)
-    file = task_world.folder_of(root, 0) / "done.json"
-    file.unlink()
-    if text is not None:
-        file.write_text(text)
-        with pytest.raises(CheckpointError, match=r"done\.json"):
-            task_world.train(root, 0)
-    else:
-        assert task_world.train(root, 0) and same(task_world.tensors(root, 0), task_world.tensors(task_world.root, 0))
-
-
 class Remembering(Executor):
     """Takes a minute for each task, and remembers them."""
 

@@ -12,10 +12,9 @@ import torch
 from block_world import BlockWorld, tensors_of, unfinish
 from pretend_cuda import CUDA, pretend_cuda
 from task_world import world_of_blocks
-from tiny_world import Altered, Change, World, events, parameters, prepared_for, spoilt, stopping, taught
+from tiny_world import Altered, Change, World, events, parameters, prepared_for, spoilt, taught
 
 from fprf.config import TrainConfig
-from fprf.errors import NumericsError
 from fprf.interfaces import DataManager
 from fprf.methods import fprf
 from fprf.plugins.samplers.config import UniformConfig
@@ -143,16 +142,6 @@ def test_a_step_that_is_not_finite_changes_nothing(world: World, tmp_path: Path,
     assert reports[-1].skipped == expected.skipped == 2
     assert reports[-1].losses == pytest.approx(expected.losses, rel=1e-5, abs=1e-9)
     assert [event["skipped"] for event in events(run, "skipped")] == ["rgb"]
-
-
-def test_faults_that_go_on_lead_back_and_then_end_it(world: World, tmp_path: Path) -> None:
-    config, folder = replace(world.config, steps=9), tmp_path / "run"
-    with pytest.raises(KeyboardInterrupt):
-        on_device(config, folder, change=stopping(2))
-    with pytest.raises(NumericsError, match=r"rgb is not finite for 3 steps in a row, again after going back to step 2; lower"):
-        on_device(config, folder, change=spoilt(NAN, *range(3, 9)))
-    assert len(events(Run(folder), "gone_back_to")) == 1
-    assert checkpoint.steps(Run(folder).checkpoints) == [2]
 
 
 def test_apple_s_device_needs_no_float64(world: World, tmp_path: Path) -> None:

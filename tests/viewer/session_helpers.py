@@ -10,7 +10,7 @@ import numpy as np
 
 from fprf.interfaces import Scene
 from fprf.splats.photographs import camera_of as pinhole_of
-from fprf.viewer.film import FilmPlan, Key
+from fprf.viewer.drawing import FilmPlan, Key
 from fprf.viewer.messages import Camera
 from fprf.viewer.restyler import Look
 

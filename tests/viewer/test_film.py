@@ -14,8 +14,7 @@ from fprf.errors import ConfigError, UsageError
 from fprf.io.images import Picture
 from fprf.viewer import messages
 from fprf.viewer import session as viewer_session
-from fprf.viewer.drawing import FieldPainter
-from fprf.viewer.film import film_cameras, film_frames, new_folder, write_film_files
+from fprf.viewer.drawing import FieldPainter, film_cameras, film_frames, new_folder, write_film_files
 from fprf.viewer.restyler import Look, Photograph, Restyler, set_rule
 from fprf.viewer.session import Session
 

@@ -19,6 +19,7 @@ HEADS = {
     "a.mp4": b"\0\0\0\x20ftypisom",
     "a.webm": b"\x1aE\xdf\xa3" + bytes(8),
     "transforms.json": b' {"frames": []}',
+    "lod-meta.json": b'{"lodLevels": 1}',
     "poses_bounds.npy": b"\x93NUMPY",
     "points.npz": b"PK\x03\x04",
 }
@@ -77,6 +78,7 @@ def test_a_full_disk_and_too_many_files_are_one_line(tmp_path: Path, monkeypatch
 @pytest.mark.parametrize(
     ("names", "kind", "last"),
     [
+        ("lod-meta.json", "capture", ""),
         ("config.json", "run", ""),
         ("x.spz", "capture", "x.spz"),
         ("meta.json", "capture", ""),

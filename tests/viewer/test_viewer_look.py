@@ -8,7 +8,7 @@ import torch
 from fprf.errors import ConfigError, UsageError
 from fprf.style.dictionary import Reference
 from fprf.viewer import messages
-from fprf.viewer.film import Key
+from fprf.viewer.drawing import Key
 from fprf.viewer.messages import Camera
 from fprf.viewer.restyler import Look, Photograph, renumbered, set_rule, style_config
 from fprf.viewer.session import SHELF, State, _added, _kept, _keyed, _removed

@@ -16,17 +16,17 @@ from torch import Tensor
 
 from ...errors import DataError
 from ...io.atomic import unwritable
-from ...plugins.captures import Data, format_name, format_of
+from ...plugins.captures import Data, format_of
 from ...rendering.cameras import Cameras
 from ...rendering.local_frame import added_and_beside, read_offset, write_offset
 from ...training.run import lock_folder
 from ...types import Origin
-from ..gaussians import GaussianRows, Gaussians, bulk_of
+from ..gaussians import Gaussians, bulk_of
 from ..views import seen_means
-from .base import ROWS, Capture
+from .base import ROWS, Capture, pieces
 from .ply import ply_head, ply_rows
 
-__all__ = ["Capture", "Written", "read_capture", "write_capture", "write_gaussians", "write_ply_parts", "write_rows"]
+__all__ = ["Capture", "Written", "read_capture", "write_capture", "write_gaussians", "write_ply_parts"]
 
 _MAPPED = 1 << 28
 """Bytes from which on files are mapped."""
@@ -50,9 +50,9 @@ class Written(NamedTuple):
 
 
 def read_capture(path: Path) -> Capture:
-    """Read a file of Gaussians, or a SOG folder. Raises DataError for another ending, or a file that is not what it says."""
+    """Read a file of Gaussians, or a folder of SOG. Raises DataError for another ending, or a file that is not what it says."""
     if path.is_dir():
-        path = path / "meta.json"
+        path = path / ("lod-meta.json" if (path / "lod-meta.json").is_file() else "meta.json")
     form = format_of(path)
     try:
         # Large files are mapped: what was decoded need not stay in memory beside the Gaussians.
@@ -73,24 +73,20 @@ def read_capture(path: Path) -> Capture:
     if not any(bool(part.finite.any()) for part in parts):  # mostly the first part tells
         reasons = " and ".join(capture.gaussians.faults())
         raise DataError(f"{path}: holds no Gaussian that can be drawn, but {reasons}; export the capture again")
-    _check_shape(capture)
-    x, y, z = capture.shift
-    camera = None if capture.camera is None else capture.camera.shifted((-x, -y, -z))
-    return replace(capture, camera=camera, offset=read_offset(path))
-
-
-def _check_shape(capture: Capture) -> None:
-    """Raise DataError where float32 has rounded a capture far from 0 to a few places along an axis."""
+    # Far from 0, float32 rounds a capture to a few places along an axis; positions that were float64 have further digits.
     local = capture.gaussians.means[capture.gaussians.finite].numpy()
     for axis, away in zip(local.T, np.abs(capture.shift), strict=True):
         step = float(np.spacing(np.float32(away)))
         if not away or step <= 0.05 * bulk_of(local).side or bool((axis == axis[0]).all()):
             continue
-        if not (axis % np.float32(step)).any():  # positions that were float64 have further digits
+        if not (axis % np.float32(step)).any():
             raise DataError(
-                f"{capture.path}: lies {away:.2g} from 0, where float32 has steps of {step:.2g}, too coarse for its "
-                "shape; export it closer to the origin, or with float64 positions"
+                f"{path}: lies {away:.2g} from 0, where float32 has steps of {step:.2g}, too coarse for its shape; "
+                "export it closer to the origin, or with float64 positions"
             )
+    x, y, z = capture.shift
+    camera = None if capture.camera is None else capture.camera.shifted((-x, -y, -z))
+    return replace(capture, camera=camera, offset=read_offset(path))
 
 
 def write_gaussians(
@@ -134,24 +130,6 @@ def write_gaussians(
     write_offset(path, beside)
     form.write(path, data)
     return Written(faulty, far, tuple(form.notes(gaussians)))
-
-
-def write_rows(
-    path: Path,
-    rows: GaussianRows,
-    *,
-    key: str = "",
-    views: Cameras | None = None,
-    plain: bool = False,
-    origin: Origin = (0.0, 0.0, 0.0),
-    local: bool = False,
-) -> Written:
-    """`write_gaussians` of rows. A .ply is written in parts where `key` is given, which says what its Gaussians are."""
-    if key and not plain and format_name(path) == "ply":
-        write_ply_parts(path, rows.part, rows.count, key, antialiased=rows.antialiased, origin=origin, local=local)
-        return Written()
-    whole = rows.part(slice(0, rows.count))
-    return write_gaussians(path, whole, antialiased=rows.antialiased, views=views, plain=plain, origin=origin, local=local)
 
 
 def write_ply_parts(
@@ -211,7 +189,10 @@ def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N 
         drawn = capture.gaussians.recoloured(harmonics).select(finite)
         written = write_gaussians(path, drawn, antialiased=capture.antialiased, views=views, origin=capture.origin)
         return written._replace(faulty=not bool(finite.all()))
-    changed = (harmonics != before).flatten(1).any(1) & harmonics.isfinite().flatten(1).all(1)
+    changed = torch.cat([
+        (harmonics[rows] != before[rows]).flatten(1).any(1) & harmonics[rows].isfinite().flatten(1).all(1)
+        for rows in pieces(len(before))
+    ])  # fmt: skip
     write_offset(path, capture.offset)
     if bool(changed.any()):
         form.write(path, capture.recolour(harmonics.numpy(), np.asarray(changed)))

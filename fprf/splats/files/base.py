@@ -85,6 +85,7 @@ def decoded(bands: int, *sections: tuple[int, Callable[[slice], tuple[Floats, ..
             for whole, some in zip(parts, part(rows), strict=True):
                 whole[start + rows.start : start + rows.stop] = some
         start += number
+    # Positions are float64 until their origin is taken off: float32 would round those far from 0.
     shift = local_origin(torch.from_numpy(parts[0]))
     parts[0] -= shift
     return from_arrays(parts[0], parts[1], parts[2], parts[3], parts[4]), shift
@@ -108,7 +109,7 @@ def steps(values: Floats, most: int) -> NDArray[np.int64]:
 
 def shares(values: Floats, low: Floats, high: Floats) -> Floats:
     """Where values lie between bounds: 0 to 1, and 0 where the bounds are one."""
-    span = np.asarray(high, np.float64) - low
+    span = np.asarray(high - low, np.float64)  # as exact as the bounds are stored
     return np.where(span > 0, (values - low) / np.where(span > 0, span, 1.0), 0.0)
 
 
@@ -152,6 +153,7 @@ def smallest_three(quaternions: Floats) -> tuple[NDArray[np.int64], Floats]:
     unit = unit_quaternions(quaternions)
     largest = np.abs(unit).argmax(1)
     rows = np.arange(len(unit))
+    # q and -q are one rotation: the component that is left out is made positive.
     unit = unit * np.where(unit[rows, largest] < 0, -1.0, 1.0)[:, None]
     return largest, unit[rows[:, None], _OTHERS[largest]] * 2**0.5
 
@@ -181,6 +183,7 @@ def turned_harmonics(rotation: Floats, bands: int) -> Floats:
 def levels_of(means: Floats) -> NDArray[np.int64]:
     """0 for the bulk of means [N 3], 1 for the bulk of those far from it, and so on."""
     level, rest = np.zeros(len(means), np.int64), np.arange(len(means))
+    # What is far from the bulk of the rest may have a bulk of its own, and so on.
     while len(rest := rest[bulk_of(means[rest]).apart > _APART]):
         level[rest] += 1
     return level
@@ -191,6 +194,7 @@ def spatial_order(means: Floats) -> NDArray[np.int64]:
     level, order = levels_of(means), []
     for k in range(int(level.max(initial=-1)) + 1):
         at = np.flatnonzero(level == k)
+        # A grid of each level: one outlier would leave all others in one cell.
         points = means[at].astype(np.float64)
         low, high = points.min(0), points.max(0)
         cells = ((points - low) / np.maximum(high - low, np.finfo(np.float32).tiny) * 1023).astype(np.int64)

@@ -24,22 +24,8 @@ from ...plugins.captures import CaptureFormat, Data
 from ...rendering.splines import quaternions, rotations
 from ...types import Origin
 from ..gaussians import COUNTS, Gaussians
-from .base import (
-    Bools,
-    Capture,
-    Floats,
-    arrays,
-    colours_of,
-    constants_of,
-    decoded,
-    finite,
-    logit,
-    pieces,
-    sigmoid,
-    steps,
-    turned_harmonics,
-    unit_quaternions,
-)
+from . import base
+from .base import Bools, Capture, Floats
 
 _NAME = "KHR_gaussian_splatting"
 _HARMONICS = [f"{_NAME}:SH_DEGREE_{degree}_COEF_{k}" for degree in range(4) for k in range(2 * degree + 1)]
@@ -71,6 +57,7 @@ class _Part(NamedTuple):
 
     def decoded(self, rows: slice, names: list[str]) -> tuple[Floats, ...]:
         """Means, quaternions, ln-scales, logits and harmonics of some rows."""
+        # Attributes may be whole numbers that stand for shares, except of harmonics.
         points, turns, scale, opacity = (_values(self.columns[name][rows]) for name in _SHAPE)
         # The quaternion product of the node's rotation and the Gaussians' own.
         a, b, c, d = quaternions(torch.from_numpy(self.rotation)[None])[0].tolist()
@@ -81,8 +68,8 @@ class _Part(NamedTuple):
             self.scale * points @ self.rotation.T + self.translation,
             np.roll(turns, 1, 1) @ product.T,
             (scale if self.logarithmic else np.log(np.maximum(scale, _LEAST))) + np.log(self.scale),
-            logit(opacity[:, 0]),
-            np.matmul(turned_harmonics(self.rotation, len(names)), harmonics),
+            base.logit(opacity[:, 0]),
+            np.matmul(base.turned_harmonics(self.rotation, len(names)), harmonics),
         )
 
 
@@ -96,6 +83,7 @@ class Gltf(CaptureFormat):
     def read(self, path: Path, data: Data) -> Capture:
         """All primitives of Gaussians of the file's scene. Raises DataError where there is none."""
         try:
+            # Both kinds are handled as a .glb: a .gltf is packed into one first.
             data = data if data[:4] == b"glTF" else _binary(path, json.loads(bytes(data)))
             document, start = _document(data)
             parts = _parts(path, document, data, start)
@@ -111,41 +99,46 @@ class Gltf(CaptureFormat):
             raise DataError(f"{path}: a glTF without {_NAME} in its scene; it holds no 3D Gaussians")
 
         def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
+            # The document stays byte for byte; columns of colours are overwritten in a copy of the buffer.
             out, begin = bytearray(data), 0
             for part in _parts(path, document, out, start):
-                back = turned_harmonics(part.rotation, len(names)).T
-                for rows in pieces(len(part.columns["POSITION"])):
+                back = base.turned_harmonics(part.rotation, len(names)).T
+                for rows in base.pieces(len(part.columns["POSITION"])):
                     here = slice(begin + rows.start, begin + rows.stop)
-                    which, new = changed[here], np.matmul(back, finite(harmonics[here]))
+                    which, new = changed[here], np.matmul(back, base.finite(harmonics[here]))
                     new = _in_other_light(new, to_linear=True) if part.linear else new
                     for name, column in zip(names, new.transpose(1, 0, 2), strict=True):
                         part.columns[name][rows][which] = column[which]
                     colour = part.columns.get("COLOR_0")
                     if colour is not None and colour.dtype == np.uint8:  # what programs without the extension show
-                        colour[rows, :3][which] = steps(colours_of(new), 255)[which]
+                        colour[rows, :3][which] = base.steps(base.colours_of(new), 255)[which]
                 begin += len(part.columns["POSITION"])
             return [bytes(out)]
 
+        # One section a primitive: each has its own node, and so its own axes.
         sections = [(len(part.columns["POSITION"]), lambda rows, part=part: part.decoded(rows, names)) for part in parts]
-        gaussians, shift = decoded(len(names), *sections)
+        gaussians, shift = base.decoded(len(names), *sections)
         kind = "logarithms, as in the review draft" if parts[0].logarithmic else "linear, as in the final text"
         compensated = parts[0].extension.get("extras") == {"antialiased": True}
         return Capture(path, gaussians, compensated, data, recolour, shift=shift, notes=(f"sizes are {kind} of {_NAME}",))
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
         """A .glb of one node; harmonics of degree 4 are left out."""
-        means, turns, scales, logits, harmonics = arrays(gaussians)
-        opacity = sigmoid(logits)[:, None]
-        shape = (means, np.roll(unit_quaternions(turns), -1, 1), np.exp(scales.clip(-80, 80)), opacity)
+        means, turns, scales, logits, harmonics = base.arrays(gaussians)
+        opacity = base.sigmoid(logits)[:, None]
+        # Columns lie one after the other in the buffer; quaternions have w last.
+        shape = (means, np.roll(base.unit_quaternions(turns), -1, 1), np.exp(scales.clip(-80, 80)), opacity)
         columns: dict[str, Floats] = dict(zip((*_SHAPE, *_HARMONICS), (*shape, *harmonics.transpose(1, 0, 2)), strict=False))
         columns = {name: values.astype("<f4") for name, values in columns.items()}
-        columns["COLOR_0"] = steps(np.concatenate([colours_of(harmonics), opacity], 1), 255).astype(np.uint8)
+        columns["COLOR_0"] = base.steps(np.concatenate([base.colours_of(harmonics), opacity], 1), 255).astype(np.uint8)
+        # Each column has a view of the buffer and an accessor of that view.
         views, accessors, size = [], [], 0
         for k, values in enumerate(columns.values()):
             kind, code = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]], 5126 if values.dtype == "<f4" else 5121
             views.append({"buffer": 0, "byteOffset": size, "byteLength": values.nbytes, "target": 34962})
             accessors.append({"bufferView": k, "componentType": code, "count": len(values), "type": kind})
             size += values.nbytes
+        # The specification demands the bounds of positions; bytes of colours stand for shares.
         accessors[0] |= {"min": means.min(0).tolist(), "max": means.max(0).tolist()}
         accessors[-1]["normalized"] = True
         extension: dict[str, Any] = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
@@ -213,6 +206,7 @@ def _binary(path: Path, document: dict[str, Any]) -> bytes:
                 raise DataError(f"{path}: {uri} beside it cannot be read; copy the whole folder") from error
         starts.append(len(body))
         body += content + bytes(-len(content) % 4)
+    # Views keep their order; where each begins counts from the start of the joined buffer.
     for view in document["bufferViews"]:
         view["byteOffset"] = view.get("byteOffset", 0) + starts[view["buffer"]]
         view["buffer"] = 0
@@ -224,6 +218,7 @@ def _parts(path: Path, document: dict[str, Any], data: Data | bytearray, start: 
     """The primitives of Gaussians that nodes of the scene show; `data` has the buffer from `start` on."""
     nodes, found, seen = document.get("nodes", []), list[_Part](), set[int]()
     scene = document.get("scenes", [{"nodes": range(len(nodes))}])[document.get("scene", 0)]
+    # From right up back, in which a scene is, to right down front.
     waiting = [(index, np.diag([1.0, -1.0, -1.0, 1.0])) for index in scene.get("nodes", [])]
     for index, above in waiting:
         if index in seen:
@@ -244,11 +239,13 @@ def _parts(path: Path, document: dict[str, Any], data: Data | bytearray, start: 
             sound = {*_SHAPE, _HARMONICS[0]} <= {*columns} and all(wanted[name] == width for name, width in widths.items())
             if not sound or len({len(column) for column in columns.values()}) > 1:
                 raise DataError(f"{path}: Gaussians without one of {', '.join(_SHAPE)}, or of unequal shapes; export it again")
+            # Gaussians stay Gaussians of the same kind under turns, shifts and one scale for all axes.
             linear, scale = matrix[:3, :3], float(np.cbrt(np.linalg.det(matrix[:3, :3])))
             if not scale > 0 or not np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() < 1e-3:
                 raise DataError(f"{path}: a node shears, mirrors or stretches its Gaussians; apply its transform first")
+            # A size is never negative; its logarithm is where anything is smaller than the unit.
             sizes = columns[_SHAPE[2]]
-            logarithmic = any(bool((_values(sizes[rows]) < 0).any()) for rows in pieces(len(sizes)))
+            logarithmic = any(bool((_values(sizes[rows]) < 0).any()) for rows in base.pieces(len(sizes)))
             found.append(_Part(columns, linear / scale, scale, matrix[:3, 3], extension, logarithmic))
     return found
 
@@ -282,8 +279,8 @@ def _values(column: NDArray[Any]) -> NDArray[np.float64]:
 
 def _in_other_light(harmonics: Floats, to_linear: bool) -> Floats:
     """Harmonics of sRGB as those of linear light, or back: the mean colour by the curve, what depends on views by its slope."""
-    mean = np.maximum(colours_of(harmonics), 0)
+    mean = np.maximum(base.colours_of(harmonics), 0)
     shown = mean if to_linear else np.where(mean <= 0.0031308, 12.92 * mean, 1.055 * mean ** (1 / 2.4) - 0.055)
     slope = np.where(shown <= 0.04045, 1 / 12.92, 2.4 / 1.055 * ((shown + 0.055) / 1.055) ** 1.4)[:, None]
     rest = harmonics[:, 1:] * slope if to_linear else harmonics[:, 1:] / slope
-    return np.concatenate([constants_of(srgb_to_linear(shown) if to_linear else shown), rest], 1)
+    return np.concatenate([base.constants_of(srgb_to_linear(shown) if to_linear else shown), rest], 1)

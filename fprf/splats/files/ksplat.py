@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from ...errors import DataError
 from ...plugins.captures import CaptureFormat, Data
 from ..gaussians import COUNTS
-from .base import Capture, Floats, constants_of, decoded, logit, short
+from . import base
+from .base import Capture, Floats
 
 _HEADER, _SECTION = struct.Struct("<BBxxII4xIHxx12xff"), struct.Struct("<IIIIfHxxI4xIIH")
 _HEADER_SIZE, _SECTION_SIZE = 4096, 1024
@@ -41,24 +42,26 @@ class Ksplat(CaptureFormat):
     def read(self, path: Path, data: Data) -> Capture:
         if not self.recognises(data[:2], len(data)):
             raise DataError(f"{path}: no .ksplat of version 0.1 or later; it is damaged or of another kind")
+        # Headers of all sections follow that of the file; then come their bodies, in the same order.
         _, _, most, _, total, compression, low, high = _HEADER.unpack_from(data)
         if compression > 2:
             raise DataError(f"{path}: a .ksplat of compression {compression}; 0, 1 and 2 can be read")
         start, sections, degrees, total_read = _HEADER_SIZE + most * _SECTION_SIZE, [], set[int](), 0
         if start > len(data):
-            raise short(path, len(data), start, f"{most} headers of sections")
+            raise base.short(path, len(data), start, f"{most} headers of sections")
         decode = partial(_decoded, limits=(low or _LIMITS[0], high or _LIMITS[1]))
         for k in range(most):
             section = _SECTION.unpack_from(data, _HEADER_SIZE + k * _SECTION_SIZE)
             count, room, of_bucket, buckets, side, stored, reach, full, others, degree = section
             if degree > 2 or (compression and buckets and stored < 12) or count > room:
                 raise DataError(f"{path}: section {k} of degree {degree} with {count} of {room} Gaussians; it is damaged")
+            # A body: sizes of buckets that are not full, centres of all buckets, Gaussians.
             body = start + 4 * others + stored * buckets
             first, half = ("<f4", "<f4") if compression == 0 else ("<u2", "<f2")
             shape = [("mean", first, 3), ("deviation", half, 3), ("turn", half, 4), ("rgba", "u1", 4)]
             record = np.dtype([*shape, ("rest", "u1" if compression == 2 else half, 3 * (COUNTS[degree] - 1))])
             if body + record.itemsize * count > len(data):
-                raise short(path, len(data), body + record.itemsize * count, f"section {k} of {count} Gaussians")
+                raise base.short(path, len(data), body + record.itemsize * count, f"section {k} of {count} Gaussians")
             table, centres, factor = np.frombuffer(data, record, count, body), None, 0.0
             if compression and count:
                 # Full buckets come first; the others say how many Gaussians they have.
@@ -66,6 +69,7 @@ class Ksplat(CaptureFormat):
                 bucket = np.searchsorted(np.cumsum(sizes), np.arange(count), side="right")
                 if bucket[-1] >= buckets:
                     raise DataError(f"{path}: section {k} has {count} Gaussians in {buckets} buckets; it is damaged")
+                # Positions are steps from a corner of their bucket, `reach` to its centre.
                 reach = reach or _REACH
                 places = np.ndarray((buckets, 3), "<f4", data, start + 4 * others, (stored, 4))
                 factor = side / 2 / reach
@@ -79,7 +83,7 @@ class Ksplat(CaptureFormat):
             raise DataError(
                 f"{path}: sections of {total_read} Gaussians and degrees {sorted(degrees)}; the header says {total}"
             )
-        gaussians, shift = decoded(COUNTS[degrees.pop()], *sections)
+        gaussians, shift = base.decoded(COUNTS[degrees.pop()], *sections)
         return Capture(path, gaussians, False, data, lambda harmonics, changed: (), shift=shift)
 
 
@@ -95,6 +99,6 @@ def _decoded(
         rest = limits[0] + rest / 255 * (limits[1] - limits[0])
     # Degree by degree, in each channel by channel.
     bands = [each.reshape(len(some), 3, -1).transpose(0, 2, 1) for each in (rest[:, :9], rest[:, 9:]) if each.shape[1]]
-    harmonics = np.concatenate([constants_of(share[:, :3]), *bands], 1)
+    harmonics = np.concatenate([base.constants_of(share[:, :3]), *bands], 1)
     scales = np.log(np.maximum(some["deviation"].astype(np.float64), _LEAST))
-    return means, some["turn"], scales, logit(share[:, 3]), harmonics
+    return means, some["turn"], scales, base.logit(share[:, 3]), harmonics

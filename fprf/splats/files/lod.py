@@ -14,7 +14,8 @@ import numpy as np
 
 from ...errors import DataError
 from ...plugins.captures import CaptureFormat, Data
-from .base import Capture, arrays, decoded
+from . import base
+from .base import Capture
 from .sog import Sog, bundle
 
 _UNSOUND = (LookupError, TypeError, ValueError, AttributeError, RecursionError)
@@ -35,6 +36,7 @@ class StreamedSog(CaptureFormat):
             index = json.loads(bytes(data))
             if index.get("version", 1) != 1:
                 raise ValueError(f"version {index['version']!r}; version 1 is read")
+            # Of each leaf the rows of its finest level, by the file that has them.
             wanted: dict[str, list[slice]] = {}
             for leaf in _leaves(index["tree"]):
                 level = leaf["lods"][min(leaf["lods"], key=int)]
@@ -50,6 +52,7 @@ class StreamedSog(CaptureFormat):
                 raise ValueError("a file outside of its folder")
         except _UNSOUND as error:
             raise DataError(f"{path}: no sound lod-meta.json ({error!r}); not a streamed SOG, or it is damaged") from error
+        # Files are read one by one; the cache knows the capture by the content of all.
         parts, archives, antialiased = [], {path.name: bytes(data)}, True
         for name, (file, rows) in files.items():
             try:
@@ -61,7 +64,7 @@ class StreamedSog(CaptureFormat):
             if most > len(chunk.gaussians):
                 raise DataError(f"{path}: {name} has {len(chunk.gaussians)} Gaussians, not {most}; copy the folder again")
             for each in rows:
-                means, *others = arrays(chunk.gaussians.select(each))
+                means, *others = base.arrays(chunk.gaussians.select(each))
                 parts.append((means + np.array(chunk.shift), *others))
             archives[name], antialiased = bytes(chunk.data), antialiased and chunk.antialiased
         if len({part[-1].shape[1] for part in parts}) > 1:
@@ -69,7 +72,7 @@ class StreamedSog(CaptureFormat):
         if not parts:
             raise DataError(f"{path}: holds no Gaussian")
         sections = [(len(part[0]), lambda rows, part=part: tuple(each[rows] for each in part)) for part in parts]
-        gaussians, shift = decoded(parts[0][-1].shape[1], *sections)
+        gaussians, shift = base.decoded(parts[0][-1].shape[1], *sections)
         return Capture(path, gaussians, antialiased, bundle(archives), lambda harmonics, changed: (), shift=shift)
 
 

@@ -24,26 +24,8 @@ from ...plugins.captures import CaptureFormat, Data
 from ...rendering.cameras import Cameras, ideal_cameras
 from ...types import Origin
 from ..gaussians import COUNTS, Gaussians
-from .base import (
-    Bools,
-    Capture,
-    Floats,
-    arrays,
-    colours_of,
-    constants_of,
-    decoded,
-    finite,
-    levels_of,
-    logit,
-    pieces,
-    shares,
-    short,
-    sigmoid,
-    smallest_three,
-    spatial_order,
-    steps,
-    three_to_four,
-)
+from . import base
+from .base import Bools, Capture, Floats
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
@@ -116,7 +98,7 @@ class Ply(CaptureFormat):
         """Exact; with an origin positions are in the world, float64."""
         first = ply_rows(gaussians.select(slice(0, 1)), origin)
         yield ply_head({"vertex": first}, antialiased, len(gaussians))
-        for rows in pieces(len(gaussians)):
+        for rows in base.pieces(len(gaussians)):
             yield ply_rows(gaussians.select(rows), origin).tobytes()
 
     def holds(self, capture: Capture, read_as: CaptureFormat) -> bool:
@@ -135,12 +117,13 @@ class CompressedPly(Ply):
 
         No chunk holds both the bulk and what is far from it: before the latter transparent Gaussians fill up the last one.
         """
-        order, level = spatial_order(gaussians.means.numpy()), levels_of(gaussians.means.numpy())
+        # Neighbours share a chunk; what is far from the bulk begins a chunk of its own.
+        order, level = base.spatial_order(gaussians.means.numpy()), base.levels_of(gaussians.means.numpy())
         parts = [order[level[order] == k] for k in range(int(level.max(initial=0)) + 1)]
         parts = [np.append(part, np.full(-len(part) % _CHUNK, part[-1])) for part in parts[:-1]] + parts[-1:]
         index = np.concatenate(parts)
         filled = index[1:] == index[:-1]
-        means, turns, scales, logits, harmonics = arrays(gaussians.select(torch.from_numpy(index)))
+        means, turns, scales, logits, harmonics = base.arrays(gaussians.select(torch.from_numpy(index)))
         # Each property as shares of the bounds of its chunk, several in one word.
         bounds: list[Floats] = []
         words = np.zeros((len(means), 4), np.uint32)
@@ -148,13 +131,14 @@ class CompressedPly(Ply):
             share, low, high = _in_chunks(values)
             words[:, column] = _pack(share, (11, 10, 11))
             bounds += [low, high]
-        largest, three = smallest_three(turns)
+        largest, three = base.smallest_three(turns)
         words[:, 1] = largest << 30 | _pack(three / 2 + 0.5, (10, 10, 10))
-        share, low, high = _in_chunks(colours_of(harmonics).clip(*_COLOURS))
-        opacity = sigmoid(logits)
+        share, low, high = _in_chunks(base.colours_of(harmonics).clip(*_COLOURS))
+        opacity = base.sigmoid(logits)
         opacity[1:][filled] = 0
         words[:, 3] = _pack(np.concatenate([share, opacity[:, None]], 1), (8, 8, 8, 8))
         bounds += [low, high]
+        # Three tables: bounds of chunks, words of Gaussians and bytes of harmonics.
         names = [name for pair in (_POSITION, _SCALE, _COLOUR) for of in pair for name in of]
         chunk = np.concatenate(bounds, 1).astype("<f4").view([(name, "<f4") for name in names])[:, 0]
         tables = {"chunk": chunk, "vertex": words.astype("<u4").view([(name, "<u4") for name in _PACKED])[:, 0]}
@@ -165,7 +149,7 @@ class CompressedPly(Ply):
 
     def keeps(self, gaussians: Gaussians) -> Bools:
         """All but a few outliers, which would need chunks of their own."""
-        level = levels_of(gaussians.means.numpy())
+        level = base.levels_of(gaussians.means.numpy())
         beyond = len(level) - np.cumsum(np.bincount(level, minlength=1))
         return level <= int((beyond <= _FEW).argmax())
 
@@ -176,7 +160,7 @@ class CompressedPly(Ply):
 
 def ply_rows(gaussians: Gaussians, origin: Origin) -> NDArray[np.void]:
     """Rows of the INRIA file. Normals, which nobody reads and some demand, are 0."""
-    means, turns, scales, logits, harmonics = arrays(gaussians)
+    means, turns, scales, logits, harmonics = base.arrays(gaussians)
     names = [*"xyz", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
     names += [f"f_rest_{i}" for i in range(3 * harmonics.shape[1] - 3)]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
@@ -264,7 +248,7 @@ def _read_inria(path: Path, data: Data, elements: Mapping[str, _Element]) -> Cap
         for name, (band, channel) in places.items():
             harmonics[:, band, channel] = table[name]
         if byte_colours:
-            harmonics[:, :1] = constants_of(harmonics[:, 0] / 255)
+            harmonics[:, :1] = base.constants_of(harmonics[:, 0] / 255)
         for axis, name in enumerate(sizes):
             scales[:, axis] = table[name]
         # Positions may be of any type; far from 0 they lose nothing by their local origin.
@@ -273,17 +257,17 @@ def _read_inria(path: Path, data: Data, elements: Mapping[str, _Element]) -> Cap
 
     def recolour(harmonics: Floats, changed: Bools) -> Iterator[bytes]:
         yield data[: vertex.offset]
-        for rows in pieces(vertex.rows):
+        for rows in base.pieces(vertex.rows):
             table, here, new = whole[rows].copy(), changed[rows], harmonics[rows]
             for name, (band, channel) in places.items():
                 column = new[here, band, channel]
                 if byte_colours and band == 0:
-                    column = steps(colours_of(new[here]), 255)[:, channel]
+                    column = base.steps(base.colours_of(new[here]), 255)[:, channel]
                 table[name][here] = column
             yield table.tobytes()
         yield data[vertex.offset + vertex.rows * vertex.kind.itemsize :]
 
-    gaussians, shift = decoded(count, (vertex.rows, part))
+    gaussians, shift = base.decoded(count, (vertex.rows, part))
     return Capture(path, gaussians, False, data, recolour, shift=shift)
 
 
@@ -312,23 +296,27 @@ def _read_compressed(path: Path, data: Data, elements: Mapping[str, _Element]) -
 
         position, turned, scale, colour = (vertex[name][rows] for name in _PACKED)
         rgba = _unpack(colour, (8, 8, 8, 8))
-        harmonics = constants_of(unpacked(rgba[:, :3], _COLOUR) if tinted else rgba[:, :3])
+        harmonics = base.constants_of(unpacked(rgba[:, :3], _COLOUR) if tinted else rgba[:, :3])
         if sh is not None:
+            # The two outermost bytes stand for the very ends of the range.
             raw = np.stack([sh[name][rows] for name in rest], 1)
             share = np.where(raw == 0, 0.0, np.where(raw == 255, 1.0, (raw + 0.5) / 256))
             bands = ((share - 0.5) * _SPAN).reshape(len(raw), 3, -1).transpose(0, 2, 1)
             harmonics = np.concatenate([harmonics, bands], 1)
         return (
             unpacked(_unpack(position, (11, 10, 11)), _POSITION),
-            three_to_four((turned >> 30).astype(np.int64), 2 * _unpack(turned, (10, 10, 10)) - 1),
+            base.three_to_four((turned >> 30).astype(np.int64), 2 * _unpack(turned, (10, 10, 10)) - 1),
             unpacked(_unpack(scale, (11, 10, 11)), _SCALE),
-            logit(rgba[:, 3]),
+            base.logit(rgba[:, 3]),
             harmonics,
         )
 
     def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
         out = bytearray(data)
-        target, share = {name: element.table(out) for name, element in elements.items()}, colours_of(finite(harmonics))
+        target, share = (
+            {name: element.table(out) for name, element in elements.items()},
+            base.colours_of(base.finite(harmonics)),
+        )
         changed_here = changed
         if tinted:  # a chunk in which anything changes gets new bounds, and all of its colours are rounded again
             share, *limits = _in_chunks(share.clip(*_COLOURS))
@@ -343,7 +331,7 @@ def _read_compressed(path: Path, data: Data, elements: Mapping[str, _Element]) -
             target["sh"][name][changed] = column[changed]
         return [bytes(out)]
 
-    gaussians, shift = decoded(1 + len(rest) // 3, (count, part))
+    gaussians, shift = base.decoded(1 + len(rest) // 3, (count, part))
     return Capture(path, gaussians, False, data, recolour, shift=shift)
 
 
@@ -366,6 +354,7 @@ def _elements(path: Path, data: Data, header: _Header) -> dict[str, _Element]:
     form, ascii_rows = header.form, header.form == ["ascii", "1.0"]
     if form not in (["binary_little_endian", "1.0"], ["binary_big_endian", "1.0"]) and not ascii_rows:
         raise DataError(f"{path}: a PLY of format {' '.join(form) or 'unknown'}; export it again as ascii or binary 1.0")
+    # Elements lie one after the other: each is passed over to find the next.
     types = {name: kind.replace("<", ">") if "big" in form[0] else kind for name, kind in _TYPES.items()}
     lines = [words for words in header.lines if words[0] in ("element", "property")]
     starts, offset, elements = [i for i, words in enumerate(lines) if words[0] == "element"], header.size, {}
@@ -390,7 +379,7 @@ def _elements(path: Path, data: Data, header: _Header) -> dict[str, _Element]:
         # A number of ASCII takes two bytes at least.
         end = offset + count * (2 * len(kinds) if ascii_rows else table.itemsize)
         if end > len(data) + ascii_rows:
-            raise short(path, len(data), end, what)
+            raise base.short(path, len(data), end, what)
         elements[words[1]] = _Element(table, count, offset)
         offset = end
     return elements
@@ -403,6 +392,7 @@ def _from_ascii(path: Path, data: Data, header: _Header, elements: Mapping[str, 
     for name, element in elements.items():
         try:
             if element.names() and element.rows:
+                # A row is a line; numbers are read as float64 and then rounded to their own type.
                 numbers = np.loadtxt(lines, np.float64, comments=None, max_rows=element.rows, ndmin=2)
                 table = np.empty(element.rows, element.kind)
                 for field, column in zip(element.names(), numbers.T, strict=True):
@@ -413,6 +403,7 @@ def _from_ascii(path: Path, data: Data, header: _Header, elements: Mapping[str, 
                     next(lines)
         except (ValueError, StopIteration) as error:
             raise DataError(f"{path}: the rows of element {name} are no numbers for its properties ({error})") from error
+    # Comments go along, which may say what points up.
     head, newline = ply_head(tables, False), b"\n"
     said = [" ".join(words).encode("latin-1") for words in header.lines if words[0] in ("comment", "obj_info")]
     head = head.replace(b" 1.0\n", newline.join([b" 1.0", *said, b""]), 1)
@@ -469,6 +460,7 @@ def _camera(data: Data, elements: Mapping[str, _Element]) -> Cameras | None:
         if name in elements:
             table = elements[name].table(data)
             numbers[name] = np.stack([table[each].astype(np.float64) for each in elements[name].names()], 1).ravel()
+    # Without a pose the camera is at the origin and looks along z.
     matrix, lens = numbers.get("extrinsic", np.eye(4).ravel()), numbers.get("intrinsic", np.zeros(0))
     size = numbers.get("image_size", lens[2:4] if len(lens) == 4 else np.zeros(0))
     if len(matrix) not in (12, 16) or len(lens) not in (4, 9) or len(size) != 2:
@@ -482,6 +474,7 @@ def _camera(data: Data, elements: Mapping[str, _Element]) -> Cameras | None:
         return None
     if focal.min() <= 0 or size.min() < 1 or size.max() > 1 << 16:
         return None
+    # The file has world to camera; ours is the inverse.
     pose = np.concatenate([rotation * [1.0, -1.0, -1.0], -rotation @ world[:, 3:]], 1)  # OpenGL axes
     cameras = ideal_cameras(torch.from_numpy(pose)[None], 1.0, (int(size[0]), int(size[1])))
     return replace(cameras, focal=torch.from_numpy(focal)[None], centre=torch.from_numpy(centre)[None])
@@ -496,7 +489,7 @@ def _flat(harmonics: Floats) -> Floats:
 def _rest_bytes(harmonics: Floats) -> NDArray[np.uint8]:
     """All but the constants as compressed files have them."""
     rest = _flat(harmonics)[:, 3:]
-    return np.asarray(np.clip(np.floor((finite(rest) / _SPAN + 0.5) * 256), 0, 255), np.uint8)
+    return np.asarray(np.clip(np.floor((base.finite(rest) / _SPAN + 0.5) * 256), 0, 255), np.uint8)
 
 
 def _in_chunks(values: Floats) -> tuple[Floats, Floats, Floats]:
@@ -504,14 +497,14 @@ def _in_chunks(values: Floats) -> tuple[Floats, Floats, Floats]:
     starts = np.arange(0, len(values), _CHUNK)
     low, high = (what.reduceat(values, starts, axis=0).astype(np.float32) for what in (np.minimum, np.maximum))
     at = np.arange(len(values)) // _CHUNK
-    return shares(values, low[at], high[at]), low, high
+    return base.shares(values, low[at], high[at]), low, high
 
 
 def _pack(shares: Floats, bits: Sequence[int]) -> NDArray[np.int64]:
     """Columns in [0, 1] in one word each row, the first one highest."""
     word = np.zeros(len(shares), np.int64)
     for column, width in zip(shares.T, bits, strict=True):
-        word = word << width | steps(column, (1 << width) - 1)
+        word = word << width | base.steps(column, (1 << width) - 1)
     return word
 
 

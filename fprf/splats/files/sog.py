@@ -30,22 +30,8 @@ from ...io.atomic import write_bytes
 from ...plugins.captures import CaptureFormat, Data
 from ...types import Origin
 from ..gaussians import COUNTS, Gaussians
-from .base import (
-    Bools,
-    Capture,
-    Floats,
-    arrays,
-    decoded,
-    finite,
-    logit,
-    precise,
-    shares,
-    sigmoid,
-    smallest_three,
-    spatial_order,
-    steps,
-    three_to_four,
-)
+from . import base
+from .base import Bools, Capture, Floats
 
 _Bytes: TypeAlias = NDArray[np.uint8]
 _LEVELS = 256
@@ -77,6 +63,7 @@ class Sog(CaptureFormat):
         folder = folder_of(path, files)
         parts = {name.removeprefix(folder): content for name, content in files.items() if name.startswith(folder)}
         meta = _json(path, parts["meta.json"])
+        # Version 1 has no such entry.
         version = meta.get("version", 1)
         if version not in (1, 2):
             raise DataError(f"{path}: SOG of version {version!r}; versions 1 and 2 are read")
@@ -85,27 +72,29 @@ class Sog(CaptureFormat):
         count = pictures.count
         low, high = (pictures.rows("means", i)[:, :3] for i in (0, 1))
         least, most = pictures.numbers("means", "mins", 3), pictures.numbers("means", "maxs", 3)
-        turn, scale, base = pictures.rows("quats", 0), pictures.rows("scales", 0), pictures.rows("sh0", 0)
+        turn, scale, tint = pictures.rows("quats", 0), pictures.rows("scales", 0), pictures.rows("sh0", 0)
         labels, rest = pictures.palette()
 
         def part(rows: slice) -> tuple[Floats, ...]:
+            # Positions are 16 bits of a logarithm, low bytes in one image and high bytes in the other.
             bent = least + (high[rows].astype(np.int64) << 8 | low[rows]) / 65535 * (most - least)
             tag = turn[rows, 3].astype(np.int64) - 252
-            quaternions = three_to_four(np.clip(tag, 0, 3), turn[rows, :3] / 255 * 2 - 1)
+            quaternions = base.three_to_four(np.clip(tag, 0, 3), turn[rows, :3] / 255 * 2 - 1)
             quaternions[tag < 0] = (1, 0, 0, 0)
             scales = pictures.decoded("scales", scale[rows, :3], 3)
             if flat:
                 scales[:, 2] = -np.inf
             # The alpha of sh0: opacities as they are, or, in version 1, logits of a range of their own.
             if version == 2:
-                constants, logits = pictures.decoded("sh0", base[rows, :3], 3), logit(base[rows, 3] / 255)
+                constants, logits = pictures.decoded("sh0", tint[rows, :3], 3), base.logit(tint[rows, 3] / 255)
             else:
-                constants, logits = np.split(pictures.decoded("sh0", base[rows], 4), [3], 1)
+                constants, logits = np.split(pictures.decoded("sh0", tint[rows], 4), [3], 1)
             harmonics = np.concatenate([constants[:, None], rest[labels[rows]]], 1) if len(rest) else constants[:, None]
             means = np.sign(bent) * np.expm1(np.minimum(np.abs(bent), 80))
             return means, quaternions, scales, logits.reshape(-1), harmonics
 
         def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
+            # Constants are quantised anew, with a codebook or a range of their own.
             new, said = {}, json.loads(parts["meta.json"])
             name = said["sh0"]["files"][0]
             index, said["sh0"] = _quantized(harmonics[:, 0], said["sh0"])
@@ -113,6 +102,7 @@ class Sog(CaptureFormat):
             picture.reshape(-1, 4)[:count, :3] = index
             new[name] = _webp(picture)
             if len(rest):
+                # Labels stay: an entry of the palette becomes the mean of what its Gaussians became.
                 mixed = _means(harmonics[:, 1:].reshape(count, -1), labels, len(rest)).reshape(rest.shape)
                 seen = np.bincount(labels, minlength=len(rest)) > 0
                 name = said["shN"]["files"][0]
@@ -122,7 +112,7 @@ class Sog(CaptureFormat):
             return [bundle(files | {folder + name: content for name, content in new.items()}, like=data)]
 
         antialiased = meta.get("antialias") is True or meta.get("model") == "antialiased"
-        gaussians, shift = decoded(1 + rest.shape[1], (count, part))
+        gaussians, shift = base.decoded(1 + rest.shape[1], (count, part))
         return Capture(path, gaussians, antialiased, data, recolour, shift=shift)
 
     def keeps(self, gaussians: Gaussians) -> Bools:
@@ -132,28 +122,30 @@ class Sog(CaptureFormat):
             ends = [_bent(kept.min(0)), _bent(kept.max(0))]
             return float(((ends[1] - ends[0]) / 65535 * (1 + np.abs(inner).max(0))).max())
 
-        return precise(gaussians.means.numpy().astype(np.float64), step, _PRECISION)
+        return base.precise(gaussians.means.numpy().astype(np.float64), step, _PRECISION)
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
         """A bundled file of version 2. Gaussians are put in spatial order, by which the images shrink."""
-        gaussians = gaussians.select(torch.from_numpy(spatial_order(gaussians.means.numpy())))
-        means, turns, log_scales, logits, harmonics = arrays(gaussians)
+        gaussians = gaussians.select(torch.from_numpy(base.spatial_order(gaussians.means.numpy())))
+        means, turns, log_scales, logits, harmonics = base.arrays(gaussians)
         count = len(means)
+        # Images are about square, with a width that WebP likes.
         width = -(-int(np.ceil(count**0.5)) // 4) * 4
         shape = (-(-count // max(width, 1)), width)
         bent = _bent(means.astype(np.float64))
         least, most = bent.min(0), bent.max(0)
-        at = steps(shares(bent, least, most), 65535)
-        largest, three = smallest_three(turns)
-        opacity = steps(sigmoid(logits), 255)
+        at = base.steps(base.shares(bent, least, most), 65535)
+        # Rotations and opacities take 8 bits a number; sizes and constants share codebooks of 256.
+        largest, three = base.smallest_three(turns)
+        opacity = base.steps(base.sigmoid(logits), 255)
         scale, scales = _quantized(log_scales.clip(-20, 20), {"files": ["scales.webp"], "codebook": []})
-        base, sh0 = _quantized(harmonics[:, 0], {"files": ["sh0.webp"], "codebook": []})
+        tint, sh0 = _quantized(harmonics[:, 0], {"files": ["sh0.webp"], "codebook": []})
         pictures = {
             "means_l.webp": _picture(at & 255, shape),
             "means_u.webp": _picture(at >> 8, shape),
-            "quats.webp": _picture(np.concatenate([steps(three / 2 + 0.5, 255), largest[:, None] + 252], 1), shape),
+            "quats.webp": _picture(np.concatenate([base.steps(three / 2 + 0.5, 255), largest[:, None] + 252], 1), shape),
             "scales.webp": _picture(scale, shape),
-            "sh0.webp": _picture(np.concatenate([base, opacity[:, None]], 1), shape),
+            "sh0.webp": _picture(np.concatenate([tint, opacity[:, None]], 1), shape),
         }
         meta: dict[str, Any] = {
             "version": 2,
@@ -243,15 +235,15 @@ class _Pictures:
 
     def numbers(self, group: str, name: str, length: int, least: int | None = None) -> Floats:
         """A list of so many finite numbers, or from `least` on."""
-        value = self.meta[group].get(name) if isinstance(self.meta.get(group), dict) else None
-        # Exporters write null in the place of the first number of a codebook that is not finite.
-        if name == "codebook" and isinstance(value, list) and value[:1] == [None]:
-            value = value[1:2] + value[1:]
-        try:
-            values = np.array(value if isinstance(value, list) else None, dtype=np.float64)
-        except (TypeError, ValueError, OverflowError):
-            values = np.array([np.nan])
         least = length if least is None else least
+        try:
+            value = self.meta[group][name]
+            # Exporters write null in the place of the first number of a codebook that is not finite.
+            if name == "codebook" and value[:1] == [None]:
+                value = value[1:2] + value[1:]
+            values = np.array(value, dtype=np.float64)
+        except (LookupError, TypeError, ValueError, OverflowError):
+            values = np.zeros(0)
         if values.ndim != 1 or not least <= len(values) <= length or not np.isfinite(values).all():
             many = length if least == length else f"{least} to {length}"
             raise self._wrong(f"{group}.{name} is no list of {many} numbers")
@@ -319,11 +311,14 @@ class _Pictures:
         return labels, rest
 
     def _name(self, group: str, which: int) -> str:
-        about = self.meta.get(group)
-        files = about.get("files") if isinstance(about, dict) else None
-        if not isinstance(files, list) or len(files) <= which or files[which] not in self.parts:
+        """Name of an image that the archive holds."""
+        try:
+            name = str(self.meta[group]["files"][which])
+        except (LookupError, TypeError):
+            name = ""
+        if name not in self.parts:
             raise self._wrong(f"no image {which + 1} of {group}")
-        return str(files[which])
+        return name
 
     def _wrong(self, what: str) -> DataError:
         return DataError(f"{self.path}: {what}; not a SOG file, or it is damaged")
@@ -381,7 +376,7 @@ def _palette_picture(index: NDArray[np.integer[Any]]) -> _Bytes:
 
 def _quantized(values: Floats, about: Mapping[str, Any]) -> tuple[NDArray[np.int64], dict[str, Any]]:
     """Values [... 3] as bytes, and what meta.json says of them: a new codebook, or new ranges (version 1)."""
-    said, values = dict(about), finite(values)
+    said, values = dict(about), base.finite(values)
     if "codebook" in said:
         book = _codebook(values.ravel())
         said["codebook"] = book.tolist()
@@ -389,7 +384,7 @@ def _quantized(values: Floats, about: Mapping[str, Any]) -> tuple[NDArray[np.int
     whole = isinstance(said["mins"], (int, float))
     axes = tuple(range(values.ndim)) if whole else tuple(range(values.ndim - 1))
     low, high = values.min(axes), values.max(axes)
-    index = steps(shares(values, low, high), 255)
+    index = base.steps(base.shares(values, low, high), 255)
     if whole:
         return index, said | {"mins": float(low), "maxs": float(high)}
     return index, said | {"mins": [*low.tolist(), *said["mins"][3:]], "maxs": [*high.tolist(), *said["maxs"][3:]]}
@@ -397,6 +392,7 @@ def _quantized(values: Floats, about: Mapping[str, Any]) -> tuple[NDArray[np.int
 
 def _codebook(values: Floats) -> Floats:
     """256 increasing numbers near to all values (Lloyd's algorithm on a line), float32 in float64."""
+    # Sums of sorted values give the mean of any stretch of them at once.
     ordered = np.sort(values)
     total = np.concatenate([[0.0], np.cumsum(ordered)])
     ranks = np.rint(np.linspace(0, len(ordered) - 1, _LEVELS)).astype(np.int64)
@@ -421,6 +417,7 @@ def _labels(rows: Floats) -> NDArray[np.int64]:
     labels = np.zeros(len(rows), np.int64)
     for level in range(16):
         groups = 1 << level
+        # The variance of each column within each group.
         spread = _means(rows**2, labels, groups) - _means(rows, labels, groups) ** 2
         order = np.lexsort((rows[np.arange(len(rows)), spread.argmax(1)[labels]], labels))
         starts = np.searchsorted(labels[order], np.arange(groups))

@@ -13,7 +13,8 @@ from ...errors import DataError
 from ...plugins.captures import CaptureFormat, Data
 from ...types import Origin
 from ..gaussians import Gaussians
-from .base import Bools, Capture, Floats, arrays, colours_of, constants_of, decoded, logit, sigmoid, steps, unit_quaternions
+from . import base
+from .base import Bools, Capture, Floats
 
 _RECORD = np.dtype([("mean", "<f4", 3), ("deviation", "<f4", 3), ("rgba", "u1", 4), ("turn", "u1", 4)])
 _LEAST = 1e-12
@@ -36,25 +37,27 @@ class Splat(CaptureFormat):
 
         def part(rows: slice) -> tuple[Floats, ...]:
             table = whole[rows]
+            # Bytes stand for shares; opacities of 0 and 1 keep a finite logit.
             share = table["rgba"] / 255
             turns = (table["turn"].astype(np.float32) - 128) / 128
             scales = np.log(np.maximum(table["deviation"], _LEAST))
-            return table["mean"], turns, scales, logit(share[:, 3]), constants_of(share[:, :3])
+            return table["mean"], turns, scales, base.logit(share[:, 3]), base.constants_of(share[:, :3])
 
         def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
             out = whole.copy()
-            out["rgba"][changed, :3] = steps(colours_of(harmonics[changed]), 255)
+            out["rgba"][changed, :3] = base.steps(base.colours_of(harmonics[changed]), 255)
             return [out.tobytes()]
 
-        gaussians, shift = decoded(1, (len(whole), part))
+        gaussians, shift = base.decoded(1, (len(whole), part))
         return Capture(path, gaussians, False, data, recolour, shift=shift)
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
         """In the order of the Gaussians. The file cannot say that they are antialiased."""
-        means, turns, scales, logits, harmonics = arrays(gaussians)
+        means, turns, scales, logits, harmonics = base.arrays(gaussians)
         table = np.empty(len(gaussians), _RECORD)
         table["mean"], table["deviation"] = means, np.exp(scales)
-        table["rgba"][:, :3] = steps(colours_of(harmonics), 255)
-        table["rgba"][:, 3] = steps(sigmoid(logits), 255)
-        table["turn"] = np.clip(np.rint(unit_quaternions(turns) * 128 + 128), 0, 255)
+        table["rgba"][:, :3] = base.steps(base.colours_of(harmonics), 255)
+        table["rgba"][:, 3] = base.steps(base.sigmoid(logits), 255)
+        # 128 is 0: a component of 1 does not fit by half a step.
+        table["turn"] = np.clip(np.rint(base.unit_quaternions(turns) * 128 + 128), 0, 255)
         return [table.tobytes()]

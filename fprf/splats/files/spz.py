@@ -13,7 +13,6 @@ table. All are kept.
 import itertools
 import struct
 import zlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -25,22 +24,8 @@ from ...errors import DataError
 from ...plugins.captures import CaptureFormat, Data
 from ...types import Origin
 from ..gaussians import COUNTS, Gaussians, bulk_of
-from .base import (
-    Bools,
-    Capture,
-    Floats,
-    arrays,
-    decoded,
-    finite,
-    logit,
-    precise,
-    short,
-    sigmoid,
-    smallest_three,
-    steps,
-    three_to_four,
-    turned_harmonics,
-)
+from . import base
+from .base import Bools, Capture, Floats
 
 _MAGIC = 0x5053474E
 _HEADER, _WIDE_HEADER = struct.Struct("<IIIBBBB"), struct.Struct("<IIIBBBBI12x")
@@ -57,7 +42,7 @@ _TRAILER = 1 << 20
 """Bytes behind the streams (extensions) that are kept."""
 _TINT = 0.15
 _COORDINATES = 0xADBE0003
-"""Type of the extension that says which axes a file has; its payload is a number of `_axes`."""
+"""Type of the extension that says which axes a file has; its payload is their number."""
 _RUB = 4
 _TURN = (1, 2, 3, 0)
 """Where the components x y z w of a file lie in w x y z."""
@@ -95,13 +80,13 @@ class Spz(CaptureFormat):
         if header.version < 4:
             ends = np.cumsum([header.size, *header.sizes]).tolist()
             if ends[-1] > len(unpacked):
-                raise short(path, len(unpacked), ends[-1], f"{header.number} Gaussians{' unpacked' * packed}")
+                raise base.short(path, len(unpacked), ends[-1], f"{header.number} Gaussians{' unpacked' * packed}")
             streams = [unpacked[start:stop] for start, stop in itertools.pairwise(ends)]
             extensions = unpacked[ends[-1] :]
         else:
-            streams = _frames(path, data, header)
-            extensions = data[header.size : _WIDE_HEADER.unpack_from(data)[-1]]
-        axes = _axes(path, _coordinates(extensions) if header.flags & 2 else _RUB, header.degree)
+            streams, frames, table = _frames(path, data, header)
+            extensions = data[header.size : table]
+        axes = _axes(path, extensions if header.flags & 2 else b"", header.degree)
         means, opacity, tint, scales, turns, rest = (np.frombuffer(each, np.uint8) for each in streams)
         count, bands = header.number, COUNTS[header.degree]
 
@@ -110,6 +95,7 @@ class Spz(CaptureFormat):
             if header.version == 1:
                 points: Floats = means.view("<f2").reshape(count, 3)[rows].astype(np.float64)
             else:
+                # 24 bits, the lowest byte first; the highest bit is the sign.
                 low, middle, high = means.reshape(count, 3, 3)[rows].astype(np.int32).transpose(2, 0, 1)
                 points = (((low | middle << 8 | high << 16) ^ 0x800000) - 0x800000) / 2.0**header.fraction
             if header.version < 3:
@@ -118,7 +104,7 @@ class Spz(CaptureFormat):
             else:
                 word = turns.view("<u4")[rows]
                 parts = np.stack([word >> shift & 1023 for shift in (20, 10, 0)], 1).astype(np.int64)
-                found = three_to_four((word >> 30).astype(np.int64), (parts & 511) / 511 * np.where(parts >> 9, -1.0, 1.0))
+                found = base.three_to_four((word >> 30).astype(np.int64), (parts & 511) / 511 * np.where(parts >> 9, -1.0, 1.0))
                 quaternions = np.empty_like(found)
                 quaternions[:, _TURN] = found
             constants = (tint.reshape(count, 1, 3)[rows] / 255 - 0.5) / _TINT
@@ -127,51 +113,59 @@ class Spz(CaptureFormat):
                 axes.points(points),
                 axes.quaternions(quaternions),
                 scales.reshape(count, 3)[rows] / 16 - 10,
-                logit(opacity[rows] / 255),
+                base.logit(opacity[rows] / 255),
                 axes.harmonics(np.concatenate([constants, (bits - 128) / 128], 1)),
             )
 
         def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
+            # Bytes of Gaussians that did not change stay as they are.
             colours = (tint.reshape(count, 3).copy(), rest.reshape(count, bands - 1, 3).copy())
-            new_bytes = _colour_bytes(axes.harmonics(finite(harmonics[changed]), back=True))
+            new_bytes = _colour_bytes(axes.harmonics(base.finite(harmonics[changed]), back=True))
             for stream, bytes_ in zip(colours, new_bytes, strict=True):
                 stream[changed] = bytes_
             new = dict(zip((2, 5), (stream.tobytes() for stream in colours), strict=True))
-            if header.version > 3:
-                return [_framed(path, data, header, new)]
+            if header.version > 3:  # the other streams stay as they are packed
+                import zstandard
+
+                pack = zstandard.ZstdCompressor().compress
+                again = [pack(new[k]) if k in new else frame for k, frame in enumerate(frames)]
+                entries = [_ENTRY.pack(len(frame), len(each)) for frame, each in zip(again, streams, strict=False)]
+                end = table + sum(map(len, frames)) + len(b"".join(entries))
+                return [data[:table], *entries, *again, data[end:]]
             parts = [new.get(i, each) for i, each in enumerate(streams)]
             whole = b"".join([unpacked[: header.size], *parts, extensions])
-            return [_zipped(whole), after] if packed else [whole]
+            return [zlib.compress(whole, 6, wbits=31), after] if packed else [whole]
 
-        gaussians, shift = decoded(bands, (count, part))
+        gaussians, shift = base.decoded(bands, (count, part))
         return Capture(path, gaussians, bool(header.flags & 1), data, recolour, shift=shift)
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
         """Version 3, with as many fractional bits as the largest coordinate leaves."""
-        means, turns, scales, logits, harmonics = arrays(gaussians)
+        means, turns, scales, logits, harmonics = base.arrays(gaussians)
         axes, fraction = _Axes(False, (1.0, -1.0, -1.0)), -int(np.log2(_step(means)))
         points = axes.points(means.astype(np.float64)) * 2.0**fraction
         at = np.clip(np.rint(points), -(2**23), 2**23 - 1).astype(np.int64) & 0xFFFFFF
-        most, three = smallest_three(axes.quaternions(turns.astype(np.float64))[:, _TURN])
+        most, three = base.smallest_three(axes.quaternions(turns.astype(np.float64))[:, _TURN])
+        # Two bits say which component is left out; each other one has a sign and 9 bits.
         word = most.astype(np.uint32)
         for column in three.T:
-            word = word << 10 | (column < 0).astype(np.uint32) << 9 | steps(np.abs(column), 511).astype(np.uint32)
-        tint, rest = _colour_bytes(axes.harmonics(finite(harmonics)))
+            word = word << 10 | (column < 0).astype(np.uint32) << 9 | base.steps(np.abs(column), 511).astype(np.uint32)
+        tint, rest = _colour_bytes(axes.harmonics(base.finite(harmonics)))
         parts = [
             _HEADER.pack(_MAGIC, 3, len(gaussians), gaussians.degree, fraction, int(antialiased), 0),
             np.stack([at & 255, at >> 8 & 255, at >> 16], -1).astype(np.uint8).tobytes(),
-            steps(sigmoid(logits), 255).astype(np.uint8).tobytes(),
+            base.steps(base.sigmoid(logits), 255).astype(np.uint8).tobytes(),
             tint.tobytes(),
-            np.clip(np.rint((finite(scales) + 10) * 16), 0, 255).astype(np.uint8).tobytes(),
+            np.clip(np.rint((base.finite(scales) + 10) * 16), 0, 255).astype(np.uint8).tobytes(),
             word.astype("<u4").tobytes(),
             rest.tobytes(),
         ]
-        return [_zipped(b"".join(parts))]
+        return [zlib.compress(b"".join(parts), 6, wbits=31)]
 
     def keeps(self, gaussians: Gaussians) -> Bools:
         """Those within the reach of 24 bits whose steps suit the bulk."""
         means = gaussians.means.numpy()
-        return np.asarray(precise(means, lambda kept, _: _step(kept), _PRECISION) & (np.abs(means) <= 2**23 - 1).all(1))
+        return np.asarray(base.precise(means, lambda kept, _: _step(kept), _PRECISION) & (np.abs(means) <= 2**23 - 1).all(1))
 
     def notes(self, gaussians: Gaussians) -> list[str]:
         means, largest = gaussians.means.numpy(), gaussians.log_scales.amax(1).numpy()
@@ -223,17 +217,24 @@ class _Axes(NamedTuple):
         parity = np.prod([flip if sign < 0 else np.ones(bands) for flip, sign in zip(flips, self.signs, strict=True)], 0)
         if not self.turned:
             return np.asarray(harmonics * parity[:, None])
-        turn = turned_harmonics(np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]), bands)
+        turn = base.turned_harmonics(np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]), bands)
         matrix = parity[:, None] * turn
         return np.asarray(np.matmul(matrix.T if back else matrix, harmonics))
 
 
-def _axes(path: Path, number: int, degree: int) -> _Axes:
-    """Axes by their number in `SPZ_ADOBE_coordinate_system`: right, up and front are bits, another one swaps y and z."""
-    if not 0 <= number <= 16:
+def _axes(path: Path, extensions: bytes, degree: int) -> _Axes:
+    """The axes that a record `SPZ_ADOBE_coordinate_system` names by its number, else right up back."""
+    number, at = _RUB, 0
+    while at + 12 <= len(extensions):
+        kind, size, value = struct.unpack_from("<III", extensions, at)
+        if kind == _COORDINATES and size == 4:
+            number = value or _RUB
+            break
+        at += 8 + size
+    if number > 16:
         raise DataError(f"{path}: axes of number {number} (SPZ_ADOBE_coordinate_system); 1 to 16 are known")
-    bits = (number or _RUB) - 1
-    right, up, front, turned = (bits >> k & 1 for k in range(4))
+    # Right, up and front are bits, another one swaps y and z.
+    right, up, front, turned = (number - 1 >> k & 1 for k in range(4))
     if turned and degree > 3:
         raise DataError(f"{path}: harmonics of degree 4 with z up or down; save the file with y up, or with degree 3")
     x, down, ahead = 2.0 * right - 1, 1 - 2.0 * up, 2.0 * front - 1
@@ -241,26 +242,15 @@ def _axes(path: Path, number: int, degree: int) -> _Axes:
     return _Axes(True, (x, down, -ahead)) if turned else _Axes(False, (x, down, ahead))
 
 
-def _coordinates(extensions: bytes) -> int:
-    """The number of the axes that extension records name; right up back where none does."""
-    at = 0
-    while at + 8 <= len(extensions):
-        kind, size = struct.unpack_from("<II", extensions, at)
-        if kind == _COORDINATES and size == 4 and at + 12 <= len(extensions):
-            return int(struct.unpack_from("<I", extensions, at + 8)[0])
-        at += 8 + size
-    return _RUB
-
-
 def _colour_bytes(harmonics: Floats) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Constants [N 3] and the other harmonics [N K-1 3] of a file, as it has them."""
-    tint = steps(harmonics[:, 0] * _TINT + 0.5, 255).astype(np.uint8)
+    tint = base.steps(harmonics[:, 0] * _TINT + 0.5, 255).astype(np.uint8)
     return tint, np.clip(np.rint(harmonics[:, 1:] * 128) + 128, 0, 255).astype(np.uint8)
 
 
 def _header(path: Path, data: Data) -> _Header:
     if len(data) < _HEADER.size:
-        raise short(path, len(data), _HEADER.size, "the header")
+        raise base.short(path, len(data), _HEADER.size, "the header")
     magic, version, count, degree, fraction, flags, _ = _HEADER.unpack_from(data)
     if magic != _MAGIC:
         raise DataError(f"{path}: does not begin as a .spz file does; it is damaged or of another kind")
@@ -284,7 +274,12 @@ def _unzip(path: Path, data: Data) -> tuple[bytes, bytes]:
                 got, piece = packer.decompress(piece, most - len(content)), packer.unconsumed_tail
                 content += got
                 if len(content) == most == _HEADER.size:  # the header bounds the rest
-                    most += _announced(path, content, len(data)) + _TRAILER
+                    header = _header(path, content)
+                    if header.version > 3:
+                        raise DataError(f"{path}: .spz of version 4 within gzip; unpack it first (gunzip)")
+                    most += sum(header.sizes) + _TRAILER
+                    if sum(header.sizes) > _RATIO * len(data):
+                        raise base.short(path, len(data), sum(header.sizes) // _RATIO, f"{header.number} Gaussians")
                 if not got and not piece and not packer.eof:
                     return content, b""
             if not packer.eof:
@@ -296,73 +291,40 @@ def _unzip(path: Path, data: Data) -> tuple[bytes, bytes]:
     return content, left
 
 
-def _announced(path: Path, head: bytes, size: int) -> int:
-    """Bytes of the streams that the header of a gzip file of `size` bytes announces."""
-    header = _header(path, head)
-    if header.version > 3:
-        raise DataError(f"{path}: .spz of version 4 within gzip; unpack it first (gunzip)")
-    needs = sum(header.sizes)
-    if needs > _RATIO * size:
-        raise short(path, size, needs // _RATIO, f"{header.number} Gaussians")
-    return needs
-
-
-def _zipped(data: bytes) -> bytes:
-    packer = zlib.compressobj(6, wbits=31)
-    return packer.compress(data) + packer.flush()
-
-
-def _frames(path: Path, data: Data, header: _Header) -> list[bytes]:
-    """The streams of version 4; harmonics of degree 0 have none."""
-    from_, sizes = _toc(path, data, header)
+def _frames(path: Path, data: Data, header: _Header) -> tuple[list[bytes], list[bytes], int]:
+    """The streams of version 4, unpacked and packed, and where their table begins; harmonics of degree 0 have none."""
+    if len(data) < _WIDE_HEADER.size:
+        raise base.short(path, len(data), _WIDE_HEADER.size, "the header")
+    *_, count, at = _WIDE_HEADER.unpack_from(data)
+    wanted = 5 if header.degree == 0 else 6
+    if count != wanted or at < _WIDE_HEADER.size:
+        raise DataError(f"{path}: version 4 with {count} streams from byte {at}; there are {wanted}")
+    start = at + count * _ENTRY.size
+    if start > len(data):
+        raise base.short(path, len(data), start, "the table of streams")
+    sizes = [*_ENTRY.iter_unpack(data[at:start])]
+    end = start + sum(size for size, _ in sizes)
+    if end > len(data):
+        raise base.short(path, len(data), end, "the streams")
+    # A zstd frame may unpack to anything: positions of captures hardly shrink, so they bound the rest.
+    if sizes[0][1] > 64 * sizes[0][0] + (1 << 16):
+        raise base.short(path, sizes[0][0], sizes[0][1] // 64, f"{header.number} positions")
     try:
         import zstandard as zstd
     except ImportError:
         raise DataError(
             f"{path}: .spz of version 4 is read with zstandard; pip install zstandard, or save as version 3"
         ) from None
-    streams = []
-    for (size, raw), wanted in zip(sizes, header.sizes, strict=False):
-        if raw != wanted:
-            raise DataError(f"{path}: a stream of {raw} bytes where {header.number} Gaussians have {wanted}; copy it again")
+    streams, frames = [], []
+    for (size, raw), needed in zip(sizes, header.sizes, strict=False):
+        if raw != needed:
+            raise DataError(f"{path}: a stream of {raw} bytes where {header.number} Gaussians have {needed}; copy it again")
+        frames.append(data[start : start + size])
         try:
-            streams.append(zstd.ZstdDecompressor().decompress(data[from_ : from_ + size], max_output_size=wanted))
+            streams.append(zstd.ZstdDecompressor().decompress(frames[-1], max_output_size=needed))
         except zstd.ZstdError as error:
             raise DataError(f"{path}: a stream that zstd cannot read ({error}); copy the file again") from error
-        if len(streams[-1]) != wanted:
-            raise short(path, len(streams[-1]), wanted, "a stream unpacked")
-        from_ += size
-    return [*streams, b""] if header.degree == 0 else streams
-
-
-def _toc(path: Path, data: Data, header: _Header) -> tuple[int, list[tuple[int, int]]]:
-    """Return the starts of the streams, and their packed and raw sizes."""
-    if len(data) < _WIDE_HEADER.size:
-        raise short(path, len(data), _WIDE_HEADER.size, "the header")
-    *_, count, at = _WIDE_HEADER.unpack_from(data)
-    wanted = 5 if header.degree == 0 else 6
-    if header.version != 4 or count != wanted or at < _WIDE_HEADER.size:
-        raise DataError(f"{path}: version {header.version} with {count} streams from byte {at}; version 4 has {wanted}")
-    end = at + count * _ENTRY.size
-    if end > len(data):
-        raise short(path, len(data), end, "the table of streams")
-    sizes = [_ENTRY.unpack_from(data, at + k * _ENTRY.size) for k in range(count)]
-    if end + sum(size for size, _ in sizes) > len(data):
-        raise short(path, len(data), end + sum(size for size, _ in sizes), "the streams")
-    # A zstd frame may unpack to anything: positions of captures hardly shrink, so they bound the rest.
-    if sizes[0][1] > 64 * sizes[0][0] + (1 << 16):
-        raise short(path, sizes[0][0], sizes[0][1] // 64, f"{header.number} positions")
-    return end, sizes
-
-
-def _framed(path: Path, data: Data, header: _Header, new: Mapping[int, bytes]) -> bytes:
-    """A file of version 4 with new streams; the others stay as they are packed."""
-    import zstandard
-
-    start, sizes = _toc(path, data, header)
-    head, frames = data[: start - len(sizes) * _ENTRY.size], []
-    for k, (size, _) in enumerate(sizes):
-        frames.append(zstandard.ZstdCompressor().compress(new[k]) if k in new else data[start : start + size])
+        if len(streams[-1]) != needed:
+            raise base.short(path, len(streams[-1]), needed, "a stream unpacked")
         start += size
-    table = b"".join(_ENTRY.pack(len(frame), raw) for frame, (_, raw) in zip(frames, sizes, strict=True))
-    return b"".join([head, table, *frames, data[start:]])
+    return ([*streams, b""] if header.degree == 0 else streams), frames, at
