@@ -35,7 +35,7 @@ def colour_pairs(
     small = chosen.scaled(max(1.0, float(chosen.size.double().prod(1).sum() / _PIXELS) ** 0.5))
     shown, shares = [list[Tensor]() for _ in looks], []
     for view in range(len(small)):
-        share, opacity = scene.paint(small, view, pixel_grid(small, view), lambda semantic, _: weight(semantic))
+        share, opacity = scene.paint(small, view, pixel_grid(small, view), lambda semantic, _: weight.to(semantic.device)(semantic))
         solid = opacity > 0.5
         shares.append(share[solid])
         for rows, look in zip(shown, looks, strict=True):

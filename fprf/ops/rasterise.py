@@ -114,9 +114,14 @@ def lift(
     shape = (means.detach(), quaternions.detach(), log_scales.detach(), logits.detach())
     if not _fits(*shape, pixels):
         # Rendering is linear in the values, so their gradient for given pixels is its transpose.
-        with torch.enable_grad():
-            values = means.new_zeros(len(means), channels, requires_grad=True)
-            image, _ = rasterise_reference(*shape, values, camera, pixels.new_zeros(channels), antialiased=antialiased)
+        with torch.inference_mode(False), torch.enable_grad():
+            # Tensors of inference can't take part in a gradient: copies can.
+            pixels = pixels.clone()
+            centres, turns, sizes, densities = (each.clone() for each in shape)
+            values = centres.new_zeros(len(centres), channels, requires_grad=True)
+            image, _ = rasterise_reference(
+                centres, turns, sizes, densities, values, camera, pixels.new_zeros(channels), antialiased=antialiased
+            )
             (lifted,) = torch.autograd.grad((image[..., :-1] * pixels).sum(), values)
         return lifted
     from . import rasterise_gradient_kernels as kernels

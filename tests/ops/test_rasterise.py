@@ -112,6 +112,8 @@ def test_lifting_is_the_transpose_of_rendering_features() -> None:
     theirs = rasterise.lift(*(x.double() for x in given[:4]), view, pixels.double())
     for a, b in ((ours[:, :11], theirs[:, :11]), (ours[:, 11], theirs[:, 11])):
         assert (a.double() - b).norm() < 4 * ROUGH * b.norm()
+    with torch.inference_mode():
+        assert torch.equal(rasterise.lift(*(x.double() for x in given[:4]), view, pixels.double()), theirs)
     # <render(v), p> = <v, lift(p)>, and the weights of all Gaussians are all the opacity.
     found = render(given, view)
     assert float((found.features * pixels[..., :11]).sum()) == pytest.approx(float((given[5] * ours[:, :11]).sum()), rel=1e-3)
