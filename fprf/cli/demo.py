@@ -40,7 +40,7 @@ class DemoConfig:
 
     output: Path = Path("demo")
     """Folder for everything that the demo makes."""
-    minutes: float = 1.2
+    minutes: float = 1.15
     """Training time."""
     frames: int = 60
     """Frames of the film, about."""
