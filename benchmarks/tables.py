@@ -30,7 +30,7 @@ def splat_training(found: Any) -> Rows:
             str(row["gaussians"]),
             f"{row['psnr']:.2f} dB",
             f"{row['ssim']:.3f}",
-            f"{row['peak_rss_mib']:.0f} MiB",
+            "not measured" if row["peak_rss_mib"] is None else f"{row['peak_rss_mib']:.0f} MiB",
         )
 
 
