@@ -34,8 +34,13 @@ def colour_pairs(
     weight, chosen = Membership(scene.measured()[0]), scene.cameras.select(torch.tensor(list(views)))
     small = chosen.scaled(max(1.0, float(chosen.size.double().prod(1).sum() / _PIXELS) ** 0.5))
     shown, shares = [list[Tensor]() for _ in looks], []
+
+    def regions(semantic: Tensor, position: Tensor | None) -> Tensor:
+        shares: Tensor = weight.to(semantic.device)(semantic)
+        return shares
+
     for view in range(len(small)):
-        share, opacity = scene.paint(small, view, pixel_grid(small, view), lambda semantic, _: weight.to(semantic.device)(semantic))
+        share, opacity = scene.paint(small, view, pixel_grid(small, view), regions)
         solid = opacity > 0.5
         shares.append(share[solid])
         for rows, look in zip(shown, looks, strict=True):
