@@ -396,7 +396,8 @@ def _check_same(run: Run, config: RunConfig) -> None:
     if not run.exists:
         return
     old, _ = run.load_config()
-    free = config.changeable(old)
+    # What the run itself left open was never decided there.
+    free = (*config.changeable(old), *(name for name in config.open if getattr(old, name, None) is None))
     # Whole branches of the config may be free: what is compared are its leaves, by their paths.
     mine, theirs = leaves(config), leaves(old)
     changed = [path for path in theirs | mine if path.partition(".")[0] not in free and mine.get(path) != theirs.get(path)]

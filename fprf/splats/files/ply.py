@@ -196,7 +196,7 @@ def ply_head(tables: Mapping[str, NDArray[np.void]], antialiased: bool, count: i
             kind = table.dtype[field]
             of = [kind] if kind.names is None else [kind[part].base for part in kind.names]
             lines.append(f"property {'list ' * (len(of) > 1)}{' '.join(_NAMES[each.str[1:]] for each in of)} {field}")
-    return "\n".join([*lines, "end_header", ""]).encode("ascii")
+    return "\n".join([*lines, "end_header", ""]).encode("latin-1")  # as headers are read
 
 
 class _Header(NamedTuple):
