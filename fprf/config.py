@@ -273,7 +273,7 @@ class RunConfig:
         return self if self.downscale is not None else replace(self, downscale=self.find_downscale(scene, device))
 
     def described(self) -> str:
-        """What a plan says beside views and their size, to be shown before training begins."""
+        """Describe the plan beyond the views and their size, for the line that is shown before training."""
         return ""
 
     def changeable(self, before: "RunConfig") -> tuple[str, ...]:

@@ -3,8 +3,8 @@
 P pixels of a photograph, V training views, N Gaussians, T seconds on the machine that the constants were measured on. A step
 takes A s P + B N, where s is the share of the full size's pixels that a step sees on average: the first steps see reduced ones.
 
-Size counts first, the number of Gaussians second: llff_flower at 1008 x 756 is better after one minute of that size (26.4 dB)
-than after five at 504 x 378 (26.8 dB with 60 000 Gaussians); then 27.7 dB after five minutes and 28.1 after fifteen with more.
+Size counts first, the number of Gaussians second. Five minutes of llff_flower at 1008 x 756 come to 28.0 dB with 160 000
+Gaussians, 27.9 with 120 000 (benchmarks/results/splat_training.json).
 """
 
 import math
@@ -47,19 +47,16 @@ def plan(config: "GaussiansConfig", scene: "Scene") -> "GaussiansConfig":
     if not len(sizes):
         return replace(config, downscale=config.downscale or 1, cap=config.most, passes=config.most_passes)
     views, pixels, longest = len(sizes), float(sizes.double().prod(1).mean()), int(sizes.max())
-    budget = None
+    speed, budget = machine_speed(), None
     if config.minutes is not None:
-        budget = max(1.0, 60 * config.minutes - _START) * machine_speed()
+        budget = max(1.0, 60 * config.minutes - _START) * speed
         config = replace(config, steps=_NO_END if config.steps == type(config).steps else config.steps)
     # The largest size at which the time is enough for some passes over the photographs.
     size = config.downscale or max(1, math.ceil(longest / config.longest))
     while True:
         found = _of_size(config, pixels / size**2)
         each, steps = _seconds(found, pixels / size**2, _FEWEST), found.limited(views)
-        if budget is None:
-            enough = steps * each <= _PATIENCE * machine_speed()
-        else:
-            enough = budget / each >= max(_STEPS, _PASSES * views)
+        enough = steps * each <= _PATIENCE * speed if budget is None else budget / each >= max(_STEPS, _PASSES * views)
         if enough or config.downscale is not None or pixels / (size + 1) ** 2 < _LEAST:
             break
         size += 1
