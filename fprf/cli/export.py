@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import UsageError
 from ..export.config import FIT_MINUTES, KINDS, ExportConfig, Plan, plan
-from ..plugins.captures import endings, format_name
 from ..progress import Display
+from ..splats.config import endings, format_name
 from .style_flags import named_styles, read_flags, tidy
 
 if TYPE_CHECKING:

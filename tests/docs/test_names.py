@@ -15,6 +15,8 @@ from fprf.cli.main import VERBS
 
 ROOT = DOCS.parent
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+LEGENDS = [ROOT / "fprf/interfaces.py", ROOT / "pyproject.toml"]
+"""Files beside the documents that say where a newcomer adds what."""
 FILE = re.compile(r"`((?:fprf|tests|benchmarks|tools|examples)/[\w./+-]+)`")
 BELOW = re.compile(
     r"`((?:blocks|cli|datamanagers|evaluation|export|fields|io|ops|page|plugins|rendering|splats|style|training|viewer)/[\w/]+\.py)`"
@@ -30,7 +32,7 @@ def anchor(title: str) -> str:
     return "#" + re.sub(r"[^\w -]", "", title.lower()).strip().replace(" ", "-")
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", [*PAGES, *LEGENDS], ids=lambda page: page.stem)
 def test_paths_modules_and_anchors_exist(page: Path) -> None:
     text = page.read_text("utf-8")
     missing = [name for name in FILE.findall(text) if not (ROOT / name).exists()]

@@ -15,11 +15,11 @@ import torch
 from splat_ball import ball
 
 from fprf.errors import DataError
-from fprf.plugins.captures import endings, format_of
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import look_at, pinhole
+from fprf.splats.config import endings
 from fprf.splats.files import Capture, read_capture, write_capture, write_gaussians, write_ply_parts
-from fprf.splats.files.base import spatial_order
+from fprf.splats.files.base import format_of, spatial_order
 from fprf.splats.files.sog import bundle, unbundle
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.photographs import camera_of

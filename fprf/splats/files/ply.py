@@ -20,12 +20,11 @@ import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ...plugins.captures import CaptureFormat, Data
 from ...rendering.cameras import Cameras, ideal_cameras
 from ...types import Origin
 from ..gaussians import COUNTS, Gaussians
 from . import base
-from .base import Bools, Capture, Floats
+from .base import Bools, Capture, CaptureFormat, Data, Floats
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
