@@ -39,7 +39,7 @@ KINDS: dict[str, tuple[type[PluginConfig], ...]] = {
     "fprf.losses": (LossTermConfig,),
     "fprf.commands": (CommandConfig,),
 }
-"""The groups of configs, and what a plug-in of each must derive from. Formats of captures import torch: they are checked apart."""
+"""The groups of configs, and what a plug-in of each must derive from. Formats of captures, which import torch, stand apart."""
 
 
 class Row(NamedTuple):

@@ -8,7 +8,7 @@ A reader never allocates on a file's word: what a header claims is held against 
 """
 
 import mmap
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
@@ -156,6 +156,17 @@ def decoded(bands: int, *sections: tuple[int, Callable[[slice], tuple[Floats, ..
     return from_arrays(parts[0], parts[1], parts[2], parts[3], parts[4]), shift
 
 
+def in_world(table: NDArray[np.void], local: Floats, origin: Origin) -> NDArray[np.void]:
+    """Rows with local x y z [N 3] about an origin as float64 of the world; as they are where the origin is 0."""
+    if not any(origin):
+        return table
+    kinds = {name: "<f8" if name in ("x", "y", "z") else table.dtype[name] for name in table.dtype.names or ()}
+    out = table.astype([*kinds.items()])
+    for name, column, of in zip("xyz", local.astype(np.float64).T, origin, strict=True):
+        out[name] = column + of
+    return out
+
+
 def release(data: Data) -> None:
     """Let go of the memory of a mapped file that was read through; it is read again where it is asked for."""
     if isinstance(data, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
@@ -176,6 +187,24 @@ def short(path: Path, has: int, needs: int, what: str) -> DataError:
 def steps(values: Floats, most: int) -> NDArray[np.int64]:
     """Values in [0, 1] as integers 0 to `most`, rounded; what lies outside is clipped, NaN becomes 0."""
     return np.rint(np.clip(np.nan_to_num(values.astype(np.float64), nan=0.0), 0, 1) * most).astype(np.int64)
+
+
+def pack_bits(shares: Floats, bits: Sequence[int]) -> NDArray[np.int64]:
+    """Columns in [0, 1] in one word each row, the first one highest."""
+    word = np.zeros(len(shares), np.int64)
+    for column, width in zip(shares.T, bits, strict=True):
+        word = word << width | steps(column, (1 << width) - 1)
+    return word
+
+
+def unpack_bits(word: NDArray[np.uint32], bits: Sequence[int]) -> Floats:
+    """The columns of `pack_bits`, in [0, 1]."""
+    columns, shift = [], 0
+    for width in reversed(bits):
+        most = (1 << width) - 1
+        columns.append((word >> shift & most) / most)
+        shift += width
+    return np.stack(columns[::-1], 1)
 
 
 def shares(values: Floats, low: Floats, high: Floats) -> Floats:
