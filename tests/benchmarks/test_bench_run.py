@@ -1,6 +1,5 @@
 """Benchmarks on the tiny run, and the list of all of them."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -11,33 +10,6 @@ from benchmarks import stress_operators
 from benchmarks.__main__ import BENCHMARKS, main
 from benchmarks.stress import invariants
 from benchmarks.styles import false_edges
-
-SMALL = ["--repeats", "2", "--rays", "64", "--device", "cpu"]
-
-
-def bench(world: World, name: str, output: Path, *more: str) -> dict[str, object]:
-    references = [str(path) for path in world.references]
-    args = [name, str(world.run), "--references", *references, *SMALL, "--output", str(output), *more]
-    assert main(args) == 0
-    document = json.loads(output.read_text())
-    assert document["benchmark"] == name and document["settings"]["without"] == ""
-    return document
-
-
-def test_pareto(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    document = bench(world, "pareto", tmp_path / "pareto.json")
-    plain, styled = ({point["name"]: point for point in points} for points in document["points"].values())
-    assert {"run", "quality", "budget", "samples", "chunk", "resolution", "kernels"} == {name.split()[0] for name in styled}
-    assert plain["budget 0"]["largest_error"] < 1e-4
-    for text, budget in (("1/64", 1 / 64), ("1/16", 1 / 16)):
-        assert plain[f"budget {text}"]["largest_error"] <= budget + 1e-5
-    assert plain["quality standard"]["rms_error"] == plain["budget 1/512"]["rms_error"]
-    assert plain["style at strength 0"]["rms_error"] == plain["run as trained"]["rms_error"]
-    kept = [counters["kept_samples_share"] for counters in document["counters_by_budget"].values()]
-    assert kept[-1] > 0 and kept == sorted(kept, reverse=True)
-    for name, front in document["fronts"].items():
-        assert front and {*front} <= {point["name"] for point in document["points"][name]}
-    assert "time against error, plain" in capsys.readouterr().out
 
 
 def test_every_benchmark_is_listed_and_says_what_it_needs(
@@ -53,6 +25,22 @@ def test_every_benchmark_is_listed_and_says_what_it_needs(
     assert needs.startswith("fuzz_guided needs the package atheris") and "no_such_package not installed" in error
     assert main([]) == 2 and main(["--help"]) == 0 and all(f"  {name} " in capsys.readouterr().out for name in ("paper",))
     assert main(["papers"]) == 2 and capsys.readouterr().err.startswith("error: papers: no such benchmark")
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("speed nowhere", "nowhere: no config.json"),
+        ("restyle RUN --device cpu --seeds 0 1 2", "is the town of the run itself"),
+        ("restyle RUN --device cpu --palettes noon", "noon"),
+        ("restyle --frames 7", "--frames"),
+    ],
+)
+def test_a_mistake_is_one_line(line: str, told: str, world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(line.replace("RUN", str(world.run)).split()) == 2
+    lines = [each for each in capsys.readouterr().err.splitlines() if not each.startswith("{")]
+    assert len(lines) == 2 and " needs " in lines[0], "needs are said first"
+    assert lines[1].startswith("error: ") and told in lines[1]
 
 
 H, W, REACH = 36, 48, 3

@@ -4,12 +4,10 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import pytest
 import torch
-from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import World, stage_of
 from torch import Tensor
 
@@ -22,17 +20,12 @@ from benchmarks.restyle import (
     MATCHED,
     PLAIN,
     STYLIZERS,
-    dictionary_of,
-    in_scene,
-    nothing,
-    one_by_one,
     verdict,
 )
 from benchmarks.single_image import encoded
 from benchmarks.town.surface import SKY
 from benchmarks.town.truth import (
     PARTS,
-    Reference,
     Row,
     best_class_maps,
     code_classes,
@@ -44,14 +37,10 @@ from benchmarks.town.truth import (
     true_views,
 )
 from benchmarks.town.write import read_truth
-from fprf.datamanagers.images import load_image
 from fprf.errors import DataError, UsageError
 from fprf.evaluation.metrics import psnr
-from fprf.ops import backend
-from fprf.plugins.stylizers.config import LocalAdainConfig, RegionToneConfig
 from fprf.style.dictionary import Reference as Samples
 from fprf.style.dictionary import build_dictionary
-from fprf.training.loading import load_run
 
 
 def test_the_truth_is_the_town_itself(world: World) -> None:
@@ -147,30 +136,6 @@ def test_every_goal_is_judged_on_its_own() -> None:
     assert found["best_global"] == "adain" and found["goals"].keys() == GOALS.keys()
     assert found["reached"] == dict(zip(GOALS, (4.0, 2.0, 0.5, 0.95, 0.01), strict=True))
     assert found["met"] == dict(zip(GOALS, (True, True, False, True, True), strict=True))
-
-
-def measured(world: World, device: str) -> list[Any]:
-    """Pictures and matches in the scene and one by one, and whose class codes are."""
-    trained = load_run(world.run, device)
-    encoders, paths = trained.encoders(), world.references[:1]
-    views = stage_of(trained, views=1, frames=8, longest=32).shown
-    dictionary = dictionary_of(paths, encoders, clusters=3, blend=0.1)[0]
-    image = torch.from_numpy(load_image(paths[0])).float() / 255
-    shown = Reference(paths[0].name, image, torch.arange(image[..., 0].numel()).view(image.shape[:2]) % 3)
-    plain = nothing(views).pictures
-    there = in_scene(trained, views, LocalAdainConfig(), dictionary, encoders, paths)
-    alone = one_by_one(trained, plain, RegionToneConfig(), dictionary, encoders)
-    classes = code_classes(dictionary, {shown.name: shown}, encoders, trained.config.datamanager.guided)
-    return [*plain, *(x for each in (there, alone) for x in (*each.pictures, *(each.taken or []))), classes]
-
-
-def test_ways_to_restyle(world: World) -> None:
-    with backend.plain():
-        expected = measured(world, "cpu")
-    with pretend_cuda() as seen:
-        found = measured(world, str(CUDA))
-    assert seen.uploads and len(found) == len(expected)
-    assert all(a.device.type == "cpu" and torch.equal(a, b) for a, b in zip(found, expected, strict=True))
 
 
 SMALL = ["--palettes", "night", "--views", "1", "--longest", "24", "--clusters", "4", "--device", "cpu"]

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import World
 
-from benchmarks.report import Row, Watch, ratio
+from benchmarks.report import ratio
 from benchmarks.speed import SpeedConfig, grid_sample_lookup, plain_planes
 from benchmarks.subject import (
     attempt,
@@ -101,21 +101,3 @@ def test_load_that_both_meet_in_a_round_cancels(loads: list[float], faster: floa
     found = ratio([faster * load for load in loads], loads)
     for value in found[:3]:
         assert value == pytest.approx(faster)
-
-
-def test_rounds_run_everything_in_turn_after_one_that_does_not_count() -> None:
-    heard: list[str] = []
-    told: list[tuple[int, int]] = []
-    calls = {name: lambda name=name: heard.append(name) for name in "abc"}
-    taken = Watch(4, torch.device("cpu")).in_turn(calls, lambda done, total: told.append((done, total)))
-    assert "".join(heard) == "abc" + "abc" + "bca" + "cab" + "abc"
-    assert {name: len(seconds) for name, seconds in taken.items()} == {"a": 4, "b": 4, "c": 4}
-    assert told == [(0, 4), (1, 4), (2, 4), (3, 4), (4, 4)]
-
-
-@pytest.mark.parametrize(
-    ("goal", "more", "met"),
-    [(None, False, True), (3.0, False, True), (2.0, False, True), (1.9, False, False), (2.0, True, True), (2.1, True, False)],
-)
-def test_a_goal_is_met_at_its_edge(goal: float | None, more: bool, met: bool) -> None:
-    assert Row(name="x", figure=2.0, unit="s", goal=goal, more_is_better=more).met is met

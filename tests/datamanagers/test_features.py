@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
-from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor
 
 from fprf.datamanagers import features as store_files
@@ -126,20 +125,6 @@ def test_the_store_answers_what_the_filter_says(tmp_path: Path, channels: int) -
     for view in (7, 10, -1):
         with pytest.raises(DataError, match=f"view {view} has no features"):
             store.at(torch.tensor([0, view]), torch.zeros(2, 2), torch.zeros(2, 3))
-
-
-def test_coefficients_on_a_device_answer_as_those_of_the_host(tmp_path: Path) -> None:
-    store, where = build(tmp_path, Counting(11)), draw()
-    where[1][:4] = torch.tensor([[0.0, 0.0], [1e3, 1e3], [-5.0, 3.0], [3.0, -5.0]])
-    expected = store.at(*where)
-    with pretend_cuda() as seen:
-        there, given = store.to(CUDA), [x.to(CUDA) for x in where]
-        seen.syncs.clear()
-        seen.uploads.clear()
-        found = there.at(*given)
-        assert not seen.syncs and not seen.uploads and found.device == CUDA
-        assert (found.cpu() - expected).abs().max() <= 1e-5 * expected.abs().max()
-        assert torch.equal(there.at(*where), expected), "what is asked in host memory is answered there"
 
 
 def test_the_spread_is_that_of_the_targets(tmp_path: Path) -> None:

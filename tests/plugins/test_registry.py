@@ -30,15 +30,6 @@ def test_a_strangers_plugin_is_listed_without_being_imported(packages: Packages)
     assert registry.entry(GROUP, "acme").origin == "acme_a:ClipConfig from acme-clip 1"
 
 
-def test_two_packages_of_one_name_are_named_and_hurt_only_that_name(packages: Packages) -> None:
-    for name in ("acme-one", "acme-two"):
-        module = name.replace("-", "_")
-        packages.install(name, {GROUP: {"twice": f"{module}:AConfig"}}, code={module: ENCODER.format(name="A")})
-    with pytest.raises(PluginError, match=r"several packages provide 'twice': .*acme-one 1.*acme-two 1; uninstall"):
-        registry.load(GROUP, "twice", EncoderConfig)
-    assert registry.load(GROUP, "vgg19", EncoderConfig) is Vgg19Config
-
-
 @pytest.mark.parametrize(
     ("source", "shown"),
     [

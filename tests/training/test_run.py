@@ -20,8 +20,6 @@ from tiny_world import World
 
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import CheckpointError, DataError, UsageError
-from fprf.training import checkpoint
-from fprf.training.driver import train
 from fprf.training.run import (
     IMAGES,
     LOCK,
@@ -96,24 +94,6 @@ def test_names_are_never_alike(paths: list[list[str]]) -> None:
 def town(world: World, tmp_path: Path) -> Path:
     shutil.copytree(world.town, tmp_path / "town")
     return tmp_path / "town"
-
-
-def test_training_goes_on_with_the_same_images_and_with_others_when_asked(world: World, town: Path, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(world.run, run)
-    config = replace(world.config, data=town, output=run, steps=16)
-    image = sorted((town / "images").iterdir())[3]
-    image.write_bytes(sorted((town / "images").iterdir())[4].read_bytes())
-    before = json.loads((run / IMAGES).read_text())
-    with pytest.raises(UsageError, match=f"{image.name} is another"):
-        train(config, "fprf-lite", quiet=True)
-    assert json.loads((run / IMAGES).read_text()) == before and checkpoint.steps(run / "checkpoints")[-1] == 15
-    train(config, "fprf-lite", quiet=True, changed_images=True)
-    after = json.loads((run / IMAGES).read_text())
-    assert [name for name in before["images"] if before["images"][name] != after["images"][name]] == [image.stem]
-    assert checkpoint.steps(run / "checkpoints")[-1] == 16
-    train(replace(config, steps=17), "fprf-lite", quiet=True)
-    assert checkpoint.steps(run / "checkpoints")[-1] == 17
 
 
 HOLDER = """
