@@ -1,7 +1,6 @@
 """`python -m benchmarks peer` on frames that another system might have written."""
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -45,19 +44,6 @@ def test_all_that_can_be_known(world: World, night: Path, tmp_path: Path, capsys
     assert document["steadiness"]["sharpness"] > 0.5
     assert document["style"]["style_distance"] > 0 and 0 < document["style"]["structure"] < 1
     assert page.read_text() in capsys.readouterr().out
-
-
-def test_a_run_gives_what_the_peer_did_not_write(world: World, tmp_path: Path) -> None:
-    document = peer(world, world.town / "images", tmp_path / "a.json", "--run", str(world.run))
-    assert document["published"]["short"]["pairs"] > 0 and "steadiness" not in document["missing"]
-
-
-def test_unlike_sizes_are_one_line(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for path in (world.town / "images").iterdir():
-        shutil.copy(world.references[0], tmp_path / path.name)
-    cameras = ["--cameras", str(world.town / "transforms.json"), "--device", "cpu"]
-    assert main(["peer", str(world.town / "images"), *cameras, "--plain", str(tmp_path)]) == 2
-    assert "the stylised frame 32x24; both must agree" in capsys.readouterr().err
 
 
 def test_a_scene_folder_is_read_as_its_parser_reads_it(world: World) -> None:

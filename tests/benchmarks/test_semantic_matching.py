@@ -5,31 +5,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Tensor
 
-from benchmarks.semantic_matching import Triplet, matching_rate, semantic_matching
+from benchmarks.semantic_matching import matching_rate
 from benchmarks.style_metrics import MIXED, whole_cells
-from fprf.errors import DataError
-from fprf.interfaces import Encoder
-
-
-class Shades(Encoder):
-    """The image itself, a cell for every `stride` pixels."""
-
-    def __init__(self, stride: int) -> None:
-        super().__init__()
-        self.stride = stride
-
-    @property
-    def identity(self) -> str:
-        return "shades"
-
-    @property
-    def channels(self) -> int:
-        return 3
-
-    def forward(self, image: Tensor) -> Tensor:
-        return torch.nn.functional.avg_pool2d(image, self.stride)
 
 
 def rate_oracle(a: np.ndarray, b: np.ndarray, la: np.ndarray, lb: np.ndarray, regions: list[int]) -> float:
@@ -70,16 +48,3 @@ def test_a_whole_cell_holds_nothing_else(seed: int, height: int, width: int, h: 
             columns = slice(j * width // w, math.ceil((j + 1) * width / w))
             kinds = regions[rows, columns].unique()
             assert int(cells[i, j]) == (int(kinds[0]) if len(kinds) == 1 else MIXED)
-
-
-def test_colours_that_tell_the_parts_match_and_swapped_ones_do_not() -> None:
-    regions = (torch.arange(96) >= 48).long().expand(64, 96)
-    image = torch.tensor([[0.9, 0.2, 0.1], [0.1, 0.2, 0.9]])[regions]
-    alike = Triplet("alike", image, image * 0.7 + 0.1, regions, regions)
-    swapped = Triplet("swapped", image, image, regions, 1 - regions)
-    single = Triplet("single", image, image, torch.zeros_like(regions), torch.zeros_like(regions))
-    found = semantic_matching(Shades(8), [alike, swapped, single])
-    assert found["per_triplet"] == {"alike": 1.0, "swapped": 0.0}
-    assert (found["triplets"], found["matching"], found["chance"]) == (2, 0.5, 0.5)
-    with pytest.raises(DataError, match="nothing to tell apart"):
-        semantic_matching(Shades(8), [single])

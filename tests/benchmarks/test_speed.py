@@ -1,8 +1,6 @@
 """`bench speed`: what is compared is the same, what is counted is there, rounds and goals."""
 
-import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -11,14 +9,12 @@ from hypothesis import strategies as st
 from tiny_world import World
 
 from benchmarks.report import ratio
-from benchmarks.speed import SpeedConfig, grid_sample_lookup, plain_planes
+from benchmarks.speed import grid_sample_lookup, plain_planes
 from benchmarks.subject import (
-    attempt,
     batch_rays,
     colour_gradient,
     difference,
     exact,
-    find,
     fresh_model,
     plainly,
     view_rays,
@@ -67,17 +63,6 @@ def test_grid_sample_is_the_same_lookup(resolutions: list[int], channels: int, s
     assert torch.allclose(*values, rtol=1e-10, atol=1e-10)
     gradients = [torch.autograd.grad(v.square().sum(), leaf)[0] for v, leaf in zip(values, leaves, strict=True)]
     assert torch.allclose(*gradients, rtol=1e-9, atol=1e-9)
-
-
-def test_a_run_without_images_can_be_measured_but_for_training(world: World, tmp_path: Path) -> None:
-    shutil.copytree(world.run, tmp_path / "run")
-    config = tmp_path / "run" / "config.json"
-    config.write_text(config.read_text().replace(str(world.town), str(tmp_path / "gone")))
-    asked = SpeedConfig(references=world.references, device="cpu")
-    prepared, missing = attempt(find(tmp_path / "run", asked, tmp_path))
-    assert prepared is None and f"{tmp_path / 'gone'}: no such folder" in missing
-    prepared, missing = attempt(find(tmp_path / "run", replace(asked, data=world.town), tmp_path))
-    assert prepared is not None and missing == ""
 
 
 def test_skipping_moves_the_gradient_and_exactness_does_not(world: World) -> None:

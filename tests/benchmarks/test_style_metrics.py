@@ -12,9 +12,7 @@ from ssim_oracle import noise, ssim_oracle
 from torch import Tensor
 
 from benchmarks.style_metrics import (
-    Contrast,
     RegionStatistics,
-    contrast_kept,
     delta_e_2000,
     gaussian_distance,
     matched_regions,
@@ -24,17 +22,7 @@ from benchmarks.style_metrics import (
     structure,
     style_distances,
 )
-from fprf.errors import DataError
 from fprf.interfaces import Encoder
-
-
-@pytest.mark.parametrize("shape", [(14, 15, 3), (15, 14, 4), (14, 15), (0, 14, 3)])
-def test_unlike_shapes_are_refused(shape: tuple[int, ...]) -> None:
-    with pytest.raises(DataError):
-        structure(torch.zeros(shape), torch.zeros(15, 14, 3))
-    with pytest.raises(DataError):
-        structure(torch.zeros(10, 30, 3), torch.zeros(10, 30, 3))
-
 
 # Sharma, Wu, Dalal 2005, table 1: two colours in Lab and their difference, two pairs a line.
 PUBLISHED = """
@@ -203,13 +191,3 @@ def test_contrast_follows_an_affine_change_of_light_and_not_the_borders() -> Non
         assert after[kind].gradient == pytest.approx(0.5 * before[kind].gradient, rel=1e-4)
         assert after[kind].black == pytest.approx(0.5 * before[kind].black + 0.1, abs=1e-5)
         assert after[kind].range == pytest.approx(0.5 * before[kind].range, rel=1e-4)
-
-
-def test_contrast_counts_where_the_style_has_as_much() -> None:
-    plain = {0: Contrast(30, 0.1, 0.2, 0.6), 1: Contrast(10, 0.2, 0.0, 0.5), 2: Contrast(99, 0.1, 0.0, 1.0)}
-    styled = {0: Contrast(30, 0.05, 0.2, 0.4), 1: Contrast(10, 0.2, 0.1, 0.6), 2: Contrast(99, 0.0, 0.0, 0.1)}
-    style = {0: Contrast(5, 0.0, 0.1, 0.6), 1: Contrast(5, 0.0, 0.0, 0.5), 2: Contrast(5, 0.0, 0.5, 0.6)}
-    kept = contrast_kept(plain, styled, style)
-    assert kept["gradient_kept"] == pytest.approx((30 * 0.5 + 10 * 1.0) / 40)
-    assert kept["range_kept"] == pytest.approx((30 * 0.5 + 10 * 1.0) / 40)
-    assert contrast_kept(plain, styled, {})["range_kept"] is None

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from fprf.errors import UsageError
 from fprf.export.config import plan
 
 
@@ -29,11 +28,3 @@ def test_a_folder_takes_the_usual_kinds_or_those_that_are_named(tmp_path: Path) 
 def test_a_file_holds_what_its_ending_says(kinds: list[str], name: str, kind: str) -> None:
     assert plan(kinds, Path("to") / name) == ((kind,), Path("to"), Path("to") / name)
     assert plan(kinds, Path("to") / name).paths("splats", "dusk", ".x") == [Path("to") / name]
-
-
-@pytest.mark.parametrize(
-    ("kinds", "output"), [(["spalt"], "out"), (["points"], "out"), (["cameras"], "a.ply"), (["ply", "splat"], "a.ply")]
-)
-def test_what_does_not_fit_is_refused(kinds: list[str], output: str) -> None:
-    with pytest.raises(UsageError):
-        plan(kinds, Path(output))

@@ -11,9 +11,8 @@ from photo_folder import photo_folder
 from fprf.errors import DataError
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.pretraining.photos import filtered_at, filtered_whole, find_photos, load_photo, random_pixels, split
-from tools.distil.config import DistilConfig
 from tools.distil.content import fit_basis
-from tools.distil.examples import crop, nightfall, prepared, prepared_path, toned
+from tools.distil.examples import crop
 
 
 @pytest.fixture(scope="module")
@@ -48,19 +47,6 @@ def test_crops_are_squares_of_the_photo(height: int, width: int, size: int, seed
     torch.testing.assert_close(flat, torch.full_like(flat, 0.25))
 
 
-@settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 999))
-def test_light_stays_in_range_and_is_a_function_of_the_generator(seed: int) -> None:
-    image = torch.rand(3, 8, 9, generator=generator(seed))
-    for change in (toned, nightfall):
-        changed = change(image, generator(seed))
-        assert changed.shape == image.shape
-        assert 0 <= changed.min() <= changed.max() <= 1
-        assert torch.isfinite(changed).all()
-        assert torch.equal(changed, change(image, generator(seed)))
-    assert nightfall(image, generator(seed)).mean() < image.mean()
-
-
 @settings(max_examples=10, deadline=None)
 @given(features=st.integers(3, 8), seed=st.integers(0, 99))
 def test_a_basis_is_orthonormal_and_keeps_what_it_says(features: int, seed: int) -> None:
@@ -84,25 +70,6 @@ def test_filtered_pixels_are_those_of_the_whole_image(folder: Path) -> None:
     assert torch.equal(rgb, photo[pixels[:, 0], pixels[:, 1]])
     all_of_them = filtered_whole(encoder, photo).view(*photo.shape[:2], 3)
     torch.testing.assert_close(features, all_of_them[pixels[:, 0], pixels[:, 1]], rtol=1e-4, atol=1e-5)
-
-
-def test_crops_are_prepared_once_per_config(tmp_path: Path) -> None:
-    output, made = tmp_path / "out.safetensors", []
-
-    def make() -> tuple[torch.Tensor, torch.Tensor]:
-        made.append(1)
-        return torch.arange(4, dtype=torch.uint8), torch.rand(4).half()
-
-    config = DistilConfig()
-    first, second = (prepared(make, config, output) for _ in range(2))
-    assert len(made) == 1
-    assert torch.equal(first[0], second[0])
-    assert torch.equal(first[1].float(), second[1].float())
-    prepared(make, DistilConfig(steps=7, batch=1), output)
-    assert len(made) == 1
-    prepared(make, DistilConfig(seed=1), output)
-    assert len(made) == 2
-    assert prepared_path(output).is_file()
 
 
 def test_missing_folders_and_photographs_are_named(tmp_path: Path) -> None:

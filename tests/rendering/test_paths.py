@@ -199,15 +199,3 @@ def test_the_middle_of_a_row_is_covered_better_than_its_ends_and_strays_least(ki
     assert len(shown) == 4 and shown == sorted(set(shown)) and set(shown) <= set(range(3, 18)), "strays and ends are left out"
     assert max(shown) - min(shown) >= 6, "and they are spread"
     assert bool((coverage(cameras, range(0, 23, 5), space) <= score).all()), "fewer cameras cover less"
-
-
-def test_wrong_requests() -> None:
-    cameras = forward_facing()
-    for wrong in (
-        lambda: spiral(cameras, 0),
-        lambda: orbit(cameras, 0),
-        lambda: interpolate(cameras, torch.tensor([0, 1]), -1),
-        lambda: interpolate(cameras, torch.tensor([], dtype=torch.int64), 3),
-    ):
-        with pytest.raises(UsageError):
-            wrong()

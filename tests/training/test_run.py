@@ -1,13 +1,11 @@
 """Run folders: what they keep, one process at a time, the images that a run was begun with, its history."""
 
 import json
-import multiprocessing
 import os
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -140,31 +138,6 @@ def test_who_is_refused_changes_nothing_and_an_empty_folder_is_not_left_behind(t
     for place in (folder / "file", folder / "file" / "run"):
         with pytest.raises(DataError), lock_folder(place):
             pass
-
-
-def _count(folder: Path, rounds: int) -> None:
-    """Add to a number that only one may touch at a time."""
-    done = 0
-    while done < rounds:
-        try:
-            with lock_folder(folder):
-                counter = folder / "counter"
-                value = int(counter.read_text())
-                time.sleep(0.001)
-                counter.write_text(str(value + 1))
-                done += 1
-        except DataError:
-            time.sleep(0.0005)
-
-
-def test_never_two_at_a_time(tmp_path: Path) -> None:
-    (tmp_path / "counter").write_text("0")
-    workers = [multiprocessing.get_context("fork").Process(target=_count, args=(tmp_path, 15)) for _ in range(3)]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join(60)
-    assert (tmp_path / "counter").read_text() == "45"
 
 
 def write(folder: Path, *events: dict[str, Any] | str) -> Path:

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from town_views import project, world
 
-from benchmarks.town.layout import ROAD_HALF, build_town
-from benchmarks.town.render import geometry, is_test, walk
+from benchmarks.town.layout import build_town
+from benchmarks.town.render import geometry, walk
 from benchmarks.town.surface import CLASSES
 
 
@@ -26,33 +25,3 @@ def test_every_town_shows_every_class(seed):
     seen = sum(np.bincount(geometry(town, view)[1].ravel(), minlength=len(CLASSES)) for view in views[::3])
     assert len(seen) == len(CLASSES) <= 12
     assert (seen > 14 * 1200 * 0.001).all(), dict(zip(CLASSES, seen, strict=True))
-
-
-def test_cameras_are_rigid_upright_and_at_eye_level():
-    views = walk(seed=3, views=40, width=160, height=120)
-    for view in views:
-        r = view.pose[:, :3]
-        np.testing.assert_allclose(r.T @ r, np.eye(3), atol=1e-12)
-        assert np.linalg.det(r) == pytest.approx(1)
-        assert r[2, 0] == pytest.approx(0, abs=1e-12), "no roll"
-        assert r[2, 1] > 0.9, "up is up"
-        assert 1.5 <= view.pose[2, 3] <= 2.5
-        assert abs(view.pose[1, 3]) < ROAD_HALF
-    centres = np.stack([view.pose[:, 3] for view in views])
-    assert np.ptp(centres[:, 0]) > 20
-    assert np.ptp(centres[:, 1]) > 3
-    assert [k for k in range(40) if is_test(k)] == [0, 8, 16, 24, 32]
-
-
-def test_held_out_views_are_seen_by_three_training_views():
-    town, views = build_town(0), walk(seed=0, views=40, width=64, height=48)
-    depths = [geometry(town, view)[0] for view in views]
-    counts = []
-    for k in filter(is_test, range(40)):
-        points, _ = world(views[k], depths[k])
-        count = np.zeros(len(points), int)
-        for j in (j for j in range(40) if not is_test(j)):
-            row, column, distance = project(views[j], points)
-            count += (row >= 0) & (np.abs(depths[j][row, column] - distance) < 0.1 + 0.05 * distance)
-        counts.append(count)
-    assert (np.concatenate(counts) >= 3).mean() >= 0.95

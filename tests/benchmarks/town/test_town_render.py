@@ -2,14 +2,11 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from town_views import project, world
 
 from benchmarks.town.layout import build_town
 from benchmarks.town.palettes import PALETTES, palette
-from benchmarks.town.render import cast, colours, directions, geometry, render, shade, walk
-from benchmarks.town.surface import hashed, noise2, noise3
+from benchmarks.town.render import colours, geometry, render, walk
 from fprf.plugins.encoders.frozen import street
 
 TOWN = build_town(0)
@@ -30,19 +27,6 @@ def test_palettes_change_colours_only(pictures):
             assert (difference == 0) if name == "day" else (difference > 8)
 
 
-def test_colour_is_a_function_of_the_point():
-    """Points seen from one camera, shaded one by one and in another order, keep their colour."""
-    view = VIEWS[3]
-    hits = cast(TOWN, view, directions(view, 1), 1)
-    points, seen = world(view, hits.distance)
-    face = hits.face[seen]
-    together = shade(TOWN, palette("sunset"), face, points)
-    assert np.isfinite(together).all() and together.min() >= 0 and together.max() <= 1
-    order = np.random.default_rng(0).permutation(len(face))[:200]
-    apart = shade(TOWN, palette("sunset"), face[order], points[order])
-    np.testing.assert_allclose(apart, together[order], atol=2e-4)
-
-
 def test_views_agree_on_colours():
     """What two cameras both see has the same colour in both, up to the pixels' footprints."""
     big = walk(seed=0, views=40, width=120, height=90)
@@ -55,22 +39,6 @@ def test_views_agree_on_colours():
     assert both.sum() > 1000
     difference = np.abs(one[seen] - two[row, column])[both].mean(1)
     assert np.median(difference) < 0.02 and difference.mean() < 0.05
-
-
-@settings(max_examples=25, deadline=None)
-@given(st.integers(0, 2**31), st.integers(0, 500))
-def test_noise_is_continuous_and_in_range(state, seed):
-    p = np.random.default_rng(state).uniform(-60, 60, (64, 3))
-    x, y, z = p.T
-    for value, near in (
-        (noise2(x, y, seed), noise2(x + 1e-4, y - 1e-4, seed)),
-        (noise3(x, y, z, seed), noise3(x + 1e-4, y, z - 1e-4, seed)),
-    ):
-        assert value.dtype == np.float32
-        assert ((value >= 0) & (value <= 1)).all()
-        assert np.abs(value - near).max() < 2e-3
-    i, j = np.round(p[:, :2]).astype(np.int64).T
-    np.testing.assert_array_equal(noise2(i.astype(float), j.astype(float), seed), hashed(seed, i, j))
 
 
 def test_the_pictures_that_encoders_are_measured_on_are_the_towns():

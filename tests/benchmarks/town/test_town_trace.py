@@ -64,14 +64,6 @@ def test_depth_and_face_are_those_of_a_plain_loop():
         assert (within > -1e-9).all() and (within < town.faces.extent[face[flat]] + 1e-9).all()
 
 
-def test_finer_grids_and_smaller_windows_change_no_ray():
-    view = walk(seed=0, views=5, width=30, height=20)[1]
-    triple = cast(TOWN, view, directions(view, 3), 3)
-    single = cast(TOWN, view, directions(view, 1), 1)
-    np.testing.assert_allclose(triple.distance[1::3, 1::3], single.distance, rtol=1e-12)
-    assert (triple.face[1::3, 1::3] == single.face).mean() > 0.999
-
-
 def test_shadows_are_those_of_a_plain_loop():
     rng = np.random.default_rng(5)
     points = np.column_stack([rng.uniform(-5, 40, 150), rng.uniform(-8, 8, 150), rng.uniform(0, 3, 150)])
