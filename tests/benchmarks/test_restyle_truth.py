@@ -21,22 +21,14 @@ from benchmarks.restyle import (
     PLAIN,
     STYLIZERS,
 )
-from benchmarks.single_image import encoded
-from benchmarks.town.surface import SKY
 from benchmarks.town.truth import (
     best_class_maps,
-    code_classes,
-    photograph,
-    places,
     town_settings,
-    true_class_maps,
     true_views,
 )
 from benchmarks.town.write import read_truth
 from fprf.errors import DataError, UsageError
 from fprf.evaluation.metrics import psnr
-from fprf.style.dictionary import Reference as Samples
-from fprf.style.dictionary import build_dictionary
 
 
 def test_the_truth_is_the_town_itself(world: World) -> None:
@@ -69,22 +61,6 @@ def test_runs_of_other_scenes_are_refused(world: World, tmp_path: Path) -> None:
         town_settings(moved.config)
 
 
-def test_codes_are_of_the_class_that_they_were_made_of(world: World) -> None:
-    trained = world.load()
-    encoders = trained.encoders()
-    assert encoders.semantic is not None
-    guided = trained.config.datamanager.guided
-    shown = photograph(places((7, 11, 13), (96, 72))["one"][0], "autumn")
-    semantic = encoded(shown.image, encoders.semantic, guided, encoders.basis)
-    dictionary = build_dictionary([Samples("street", semantic, semantic)], clusters=8, seed=0)
-    classes = code_classes(dictionary, {"street": shown}, encoders, guided)
-    nearest = torch.cdist(semantic, dictionary.keys).argmin(1)
-    right = (classes[nearest] == shown.classes.flatten()).double().mean()
-    assert SKY in classes.tolist() and float(right) > 0.5, "chance is a twelfth, one class alone a third"
-    with pytest.raises(DataError, match="no semantics"):
-        code_classes(dictionary, {"street": shown}, encoders._replace(semantic=None), guided)
-
-
 def picture(seed: int) -> Tensor:
     return 0.2 + 0.6 * torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(seed))
 
@@ -99,20 +75,6 @@ def test_the_best_maps_find_any_map_of_classes() -> None:
         truth[grid == kind] = plain[grid == kind] @ matrix + 0.1 * (kind == 1) + 0.3 * (kind == 2)
     (found,) = best_class_maps([(plain, grid)], [truth])
     assert psnr(found, truth) > 45
-
-
-def test_true_classes_get_the_references_colours() -> None:
-    plain, style = picture(5), 0.3 + 0.4 * picture(6)
-    style[grid == 2] = style[grid == 2] * 0.5
-    (found,) = true_class_maps([(plain, grid)], [(style, grid)])
-    for kind in range(3):
-        here, there = found[grid == kind], style[grid == kind]
-        assert torch.allclose(here.mean(0), there.mean(0), atol=0.01)
-        assert torch.allclose(here.std(0), there.std(0), atol=0.02)
-    other = torch.full_like(grid, 7)
-    (found,) = true_class_maps([(plain, grid)], [(style, other)])
-    for kind in range(3):
-        assert torch.allclose(found[grid == kind].mean(0), style.reshape(-1, 3).mean(0), atol=0.01)
 
 
 SMALL = ["--palettes", "night", "--views", "1", "--longest", "24", "--clusters", "4", "--device", "cpu"]

@@ -11,11 +11,8 @@ from tiny_world import World
 from benchmarks.report import ratio
 from benchmarks.speed import grid_sample_lookup, plain_planes
 from benchmarks.subject import (
-    batch_rays,
-    colour_gradient,
     difference,
     exact,
-    fresh_model,
     plainly,
     view_rays,
 )
@@ -63,22 +60,6 @@ def test_grid_sample_is_the_same_lookup(resolutions: list[int], channels: int, s
     assert torch.allclose(*values, rtol=1e-10, atol=1e-10)
     gradients = [torch.autograd.grad(v.square().sum(), leaf)[0] for v, leaf in zip(values, leaves, strict=True)]
     assert torch.allclose(*gradients, rtol=1e-9, atol=1e-9)
-
-
-def test_skipping_moves_the_gradient_and_exactness_does_not(world: World) -> None:
-    trained, prepared = world.load(), world.prepared
-    batch = prepared.manager.batch(3)
-
-    def gradient(budget: float, dtype: torch.dtype) -> torch.Tensor:
-        model = fresh_model(trained).to(dtype)
-        config = replace(trained.config, render=replace(trained.config.render, train_budget=budget))
-        rays = batch_rays(model, prepared, batch)
-        rays = type(rays)(*(x.to(dtype) for x in rays))
-        return colour_gradient(model, prepared, config, batch, rays, 3).double()
-
-    truth = gradient(0.0, torch.float64)
-    errors = [float((gradient(b, torch.float32) - truth).norm() / truth.norm()) for b in (0.0, 0.2, 0.45)]
-    assert errors[0] < 1e-4 < errors[1] < errors[2]
 
 
 @given(st.lists(st.floats(1e-6, 1e3), min_size=1, max_size=9), st.floats(0.1, 50))

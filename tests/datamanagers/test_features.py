@@ -17,23 +17,6 @@ from fprf.interfaces import Encoder
 from fprf.ops import guided
 
 
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.999])
-def test_tensors_come_back_whole_or_not_at_all(tmp_path: Path, share: float) -> None:
-    """After a flipped bit or a lost end."""
-    given = {"coefs": torch.randn(3, 4, 5, 4).half(), "size": torch.tensor([30, 40])}
-    key = store_files.digest("some", "inputs")
-    store_files.write_tensors(tmp_path, key, given)
-    (path,) = tmp_path.iterdir()
-    data = path.read_bytes()
-    at = int(share * len(data))
-    for damaged in (data[:at] + bytes([data[at] ^ 16]) + data[at + 1 :], data[:at]):
-        path.write_bytes(damaged)
-        assert store_files.read_tensors(tmp_path, key) is None
-    path.write_bytes(data)
-    again = store_files.read_tensors(tmp_path, key)
-    assert again is not None and all(torch.equal(given[name], again[name]) for name in given)
-
-
 def test_what_was_used_longest_ago_goes_first_and_what_is_in_use_stays(tmp_path: Path) -> None:
     keys = [store_files.digest(str(k)) for k in range(5)]
     for age, key in enumerate(keys):

@@ -8,7 +8,6 @@ import torch
 from tiny_world import World
 
 from fprf.datamanagers.images import load_image
-from fprf.errors import DataError
 from fprf.evaluation.metrics import image_metrics, judge
 from fprf.io.images import to_uint8, write_image
 from fprf.training import views
@@ -32,11 +31,6 @@ def test_metrics_are_those_of_the_renders(world: World) -> None:
     assert metrics["seconds_per_view"] == pytest.approx(metrics["render_seconds"] / 2)
     assert 0 < metrics["lpips"] < 2
     assert metrics["consistency"]["pairs"] == 1 and 0 < metrics["kept_samples_share"] <= 1
-
-
-def test_no_views_is_told(world: World) -> None:
-    with pytest.raises(DataError, match="no views"):
-        judge(trained := world.load(), trained.known, world.prepared.scene, (), lambda *of: None)
 
 
 def test_a_turned_view_comes_back(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -88,12 +88,6 @@ def test_names_are_never_alike(paths: list[list[str]]) -> None:
     assert len(set(names)) == len(paths) and not any("/" in name for name in names)
 
 
-@pytest.fixture
-def town(world: World, tmp_path: Path) -> Path:
-    shutil.copytree(world.town, tmp_path / "town")
-    return tmp_path / "town"
-
-
 HOLDER = """
 import sys, time
 from pathlib import Path
