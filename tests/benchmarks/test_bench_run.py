@@ -8,8 +8,6 @@ from tiny_world import World
 
 from benchmarks import stress_operators
 from benchmarks.__main__ import BENCHMARKS, main
-from benchmarks.stress import invariants
-from benchmarks.styles import false_edges
 
 
 def test_every_benchmark_is_listed_and_says_what_it_needs(
@@ -43,28 +41,6 @@ def test_a_mistake_is_one_line(line: str, told: str, world: World, capsys: pytes
     assert lines[1].startswith("error: ") and told in lines[1]
 
 
-H, W, REACH = 36, 48, 3
-
-
-def wall() -> torch.Tensor:
-    """Even, with a quiet ramp of light."""
-    return 0.4 + 0.1 * torch.linspace(0, 1, W).expand(H, W)[..., None].repeat(1, 1, 3)
-
-
-def test_one_map_for_all_is_no_cut() -> None:
-    plain = wall()
-    for styled in (plain, 1 - plain, plain * 1.8, plain * torch.tensor([0.9, 0.2, 0.1]) + 0.1):
-        assert false_edges(plain, styled) == 0
-
-
-def test_a_style_that_ends_on_a_wall_cuts_the_pairs_across() -> None:
-    plain, styled = wall(), wall()
-    styled[:, : W // 2, 0] += 0.5
-    pairs = H * (W - REACH) + (H - REACH) * W
-    # Both pictures are blurred by a pixel, so that pairs which only touch the border count as well.
-    assert false_edges(plain, styled) == pytest.approx(H * (REACH + 1) / pairs, rel=0.3)
-
-
 def test_a_worse_formula_breaks_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     """1 - exp(-x) loses thin media: the report must see it."""
 
@@ -75,14 +51,3 @@ def test_a_worse_formula_breaks_the_bound(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(stress_operators, "transmittance_weights", naive)
     broken = {row.input for row in stress_operators.weights() if not row.passed}
     assert "fog of 1e-9 a step, N = 256" in broken
-
-
-def test_whole_renders(world: World) -> None:
-    trained = world.load()
-    cameras = trained.known.cameras.select(torch.tensor([3]))
-    rows = invariants(trained, world.prepared.scene, cameras, world.references)
-    assert not [row for row in rows if not row.passed]
-    names = {row.input for row in rows}
-    assert {"world 1e6 m away", "rays in another order", "references in another order", "1 and 2 threads"} <= names
-    without = invariants(trained, None, cameras, world.references)
-    assert {row.input for row in without} < names

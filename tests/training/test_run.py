@@ -49,31 +49,6 @@ def test_scene_json_gives_the_scene_back(world: World) -> None:
     assert known.split("all") == tuple(sorted(known.train + known.test)) == tuple(range(10))
 
 
-def _without(key: str) -> Any:
-    return lambda d: {k: v for k, v in d.items() if k != key}
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        *(_without(key) for key in ("format", "cameras", "facts")),
-        lambda d: d | {"format": 99},
-        lambda d: d | {"facts": 3},
-        lambda d: d | {"facts": d["facts"] | {"space": "box"}},
-        lambda d: d | {"facts": d["facts"] | {"more": 1}},
-        lambda d: d | {"facts": _without("space")(d["facts"])},
-        lambda d: d | {"cameras": d["cameras"] | {"pose": [[1.0], [1.0, 2.0]]}},
-        lambda d: d | {"cameras": d["cameras"] | {"size": [[10**30, 1]]}},
-        lambda d: None,
-    ],
-)
-def test_a_spoilt_scene_json_is_named(run: Run, change: Any) -> None:
-    path = run.root / "scene.json"
-    path.write_text(json.dumps(change(json.loads(path.read_text()))))
-    with pytest.raises(CheckpointError):
-        run.load_known()
-
-
 def test_an_event_after_a_torn_line_has_a_line_of_its_own(tmp_path: Path) -> None:
     torn = '{"step": 2, "los'
     (tmp_path / "events.jsonl").write_text(torn)

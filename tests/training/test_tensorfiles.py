@@ -44,12 +44,6 @@ def test_a_seal_of_nonsense_is_damage(tmp_path: Path, seal: str | None) -> None:
         tensorfiles.load_sealed(tmp_path / "x")
 
 
-def test_nothing_is_left_where_writing_failed(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError, match="memory format"):
-        tensorfiles.save(tmp_path / "x", {"t": torch.zeros(2).to_sparse()})
-    assert list(tmp_path.iterdir()) == []
-
-
 @settings(max_examples=200)
 @given(st.data())
 def test_a_flipped_bit_of_a_sealed_file_is_found_or_harmless(tmp_path: Path, data: st.DataObject) -> None:
