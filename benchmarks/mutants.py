@@ -202,7 +202,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "fprf/rendering/renderer.py": ("rendering/test_renderer.py",),
     "fprf/rendering/cameras.py": ("rendering/test_cameras.py",),
     "fprf/rendering/lens.py": ("rendering/test_cameras.py",),
-    "fprf/rendering/splines.py": ("rendering/test_splines.py",),
+    "fprf/rendering/splines.py": ("rendering/test_paths.py",),
 }
 """Each numerics module and its tests."""
 COMPILED = ("_kernels.py", "simd.py")

@@ -1,4 +1,4 @@
-"""Differences of style against their definitions."""
+"""Scores of styles, matches, transfers and films against their definitions."""
 
 import math
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""Fields of blocks against a plain loop in float64, seams, gradients; blocks that start as their surroundings are."""
+"""Fields of blocks against a plain loop, seams, gradients; routers and weights: a partition of unity, continuous, local."""
 
 import math
 from collections.abc import Sequence

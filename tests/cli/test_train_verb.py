@@ -1,3 +1,5 @@
+"""`fprf train`: refused, interrupted, watched, in blocks."""
+
 import json
 import shutil
 from dataclasses import dataclass, replace

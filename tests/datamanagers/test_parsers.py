@@ -1,4 +1,4 @@
-"""One capture is one scene in every format; what each may say besides: lenses, splits, masks, points, images left out."""
+"""One capture is one scene in every format, also far from 0; what each may say besides: lenses, splits, masks, points."""
 
 import json
 import math

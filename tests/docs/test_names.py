@@ -1,7 +1,10 @@
-"""What the documents name exists: files, modules, anchors and flags; their tables are those of the results."""
+"""What the documents name exists: files, modules, anchors and flags; tables are those of the results; the site builds."""
 
 import importlib.util
+import os
 import re
+import subprocess
+import sys
 from dataclasses import fields as dataclass_fields
 from dataclasses import is_dataclass
 from importlib.metadata import entry_points
@@ -86,3 +89,20 @@ def test_flags_exist(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=lambda page: page.stem)
 def test_tables_are_those_of_the_results(page: Path) -> None:
     assert filled(page.read_text("utf-8")) == page.read_text("utf-8"), "python -m benchmarks tables"
+
+
+MISSING = "the extra `docs` is not installed: pip install -e '.[docs]'"
+
+
+def test_it_builds_without_a_warning(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs", reason=MISSING)
+    pytest.importorskip("material", reason=MISSING)
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-f", str(ROOT / "mkdocs.yml"), "-d", str(tmp_path)]
+    quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    made = subprocess.run(command, capture_output=True, text=True, check=False, env=quiet)
+    assert made.returncode == 0 and "WARNING" not in made.stderr, made.stderr
+    assert {path.stem for path in (tmp_path / "verbs").glob("*.html")} == set(VERBS)
+    for page in [tmp_path / "index.html", tmp_path / "verbs" / "export.html"]:
+        text = page.read_text()
+        assert not re.search(r'<(?:script|img)[^>]+src="https?:|<link[^>]+rel="stylesheet"[^>]+href="https?:', text)
+    assert "restyle" in (tmp_path / "search" / "search_index.json").read_text()

@@ -1,4 +1,4 @@
-"""What `fprf export` writes, opened again by other programs' readers: counts, places and colours agree."""
+"""What `fprf export` writes, opened again by other programs' readers and our own."""
 
 import json
 from dataclasses import replace

@@ -1,3 +1,5 @@
+"""Pictures and maps in files."""
+
 import math
 from pathlib import Path
 

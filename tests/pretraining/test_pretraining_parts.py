@@ -1,4 +1,4 @@
-"""Photographs, crops, light, principal components, prepared crops."""
+"""Photographs, crops, principal components, and the features of the teachers."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Rendered views, plain and restyled, and views that are cached for any style."""
+"""Rendered views, plain, restyled and cached, and the statistics of a scene that styles build on."""
 
 from dataclasses import replace
 

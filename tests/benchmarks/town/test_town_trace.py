@@ -1,4 +1,4 @@
-"""The vectorised tracer against one ray at a time, written from the definitions of the solids."""
+"""The town: its tracer against one ray at a time, and colours that views agree on."""
 
 import math
 

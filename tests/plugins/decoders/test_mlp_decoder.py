@@ -1,4 +1,4 @@
-"""D_VGG: the formula, and never with another encoder's features."""
+"""D_VGG: the formula, never another encoder's features, and the line that makes the decoder that fits."""
 
 import shlex
 from dataclasses import replace
