@@ -1,6 +1,5 @@
 """`fprf plugins` lists and checks what is installed; verbs that packages add are parsed and called like built-in ones."""
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,7 +8,7 @@ from fake_packages import ENCODER, Packages, packages_in
 
 from fprf.cli import main as cli
 from fprf.cli.config import CommandConfig
-from fprf.cli.plugins import faults, rows, run
+from fprf.cli.plugins import faults, run
 
 
 @pytest.fixture
@@ -83,13 +82,6 @@ def counting(tmp_path: Path) -> Iterator[Packages]:
         point = {CommandConfig.group: {"count": "acme_count:CountConfig"}}
         found.install("acme-count", point, code={"acme_count": COUNT}, version="0.2")
         yield found
-
-
-def test_a_packaged_verb_is_listed_without_being_imported(counting: Packages, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["--help"]) == 0
-    assert ["count", "of", "acme-count", "0.2"] in [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert ("count", "acme-count 0.2") in {(row.name, row.package) for row in rows()}
-    assert "acme_count" not in sys.modules
 
 
 def test_it_is_parsed_and_called_like_a_built_in_one(counting: Packages, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,16 +4,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from network_files import mobilenet_tensors
 from photo_folder import photo_folder
 
 from fprf.errors import DataError
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.pretraining.photos import filtered_at, filtered_whole, find_photos, load_photo, random_pixels, split
-from tools.distil.content import fit_basis
-from tools.distil.examples import crop
 from tools.distil.mobilenet import CLASSIFIER, DEEPLAB, MobileNetV2, fold
 
 
@@ -35,34 +31,6 @@ def test_photos_are_found_at_every_depth_in_an_order_of_their_own(folder: Path, 
     assert len(held) == 1
     assert not set(learn) & set(held)
     assert len(learn) + len(held) == 13
-
-
-@settings(max_examples=25, deadline=None)
-@given(height=st.integers(2, 50), width=st.integers(2, 50), size=st.integers(2, 24), seed=st.integers(0, 99))
-def test_crops_are_squares_of_the_photo(height: int, width: int, size: int, seed: int) -> None:
-    photo = torch.rand(height, width, 3)
-    piece = crop(photo, size, (0.5, 2.0), generator(seed))
-    assert piece.shape == (3, size, size)
-    assert 0 <= piece.min() <= piece.max() <= 1
-    assert torch.equal(piece, crop(photo, size, (0.5, 2.0), generator(seed)))
-    flat = crop(torch.full((height, width, 3), 0.25), size, (0.5, 2.0), generator(seed))
-    torch.testing.assert_close(flat, torch.full_like(flat, 0.25))
-
-
-@settings(max_examples=10, deadline=None)
-@given(features=st.integers(3, 8), seed=st.integers(0, 99))
-def test_a_basis_is_orthonormal_and_keeps_what_it_says(features: int, seed: int) -> None:
-    samples = torch.randn(400, features, generator=generator(seed)) @ torch.randn(features, features) + 3
-    basis = fit_basis(samples, (1, 2, features), 0.8)
-    channels = len(basis.axes)
-    assert channels in (1, 2, features)
-    torch.testing.assert_close(basis.axes @ basis.axes.T, torch.eye(channels), rtol=0, atol=1e-5)
-    projected = basis.project(samples.T[None, :, :, None])[0, :, :, 0].double()
-    assert abs(float(projected.mean())) < 1e-4
-    assert float(projected.square().mean()) == pytest.approx(1, rel=1e-3)
-    energy = (samples - samples.mean(0)).double().square().sum()
-    assert float(projected.square().sum() * basis.scale**2 / energy) == pytest.approx(basis.kept, rel=1e-3)
-    assert basis.kept >= 0.8 or channels == features
 
 
 def test_filtered_pixels_are_those_of_the_whole_image(folder: Path) -> None:

@@ -65,21 +65,6 @@ def test_a_damaged_folder_is_rendered_again(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["town"]
 
 
-def test_a_failure_leaves_nothing_behind(tmp_path, monkeypatch):
-    calls = []
-
-    def failing(path, image):
-        calls.append(path)
-        if len(calls) == 3:
-            raise OSError("No space left on device")
-        path.write_bytes(b"")
-
-    monkeypatch.setattr(write, "_save_image", failing)
-    with pytest.raises(DataError, match="No space left"):
-        write_town(tmp_path / "town", **SMALL)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_somebody_elses_folder_is_left_alone(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(DataError, match="not a town"):
