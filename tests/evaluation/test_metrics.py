@@ -12,8 +12,7 @@ from torch import Tensor
 
 from fprf.datamanagers.images import load_image
 from fprf.errors import DataError, NumericsError
-from fprf.evaluation.lpips import lpips
-from fprf.evaluation.metrics import PSNR_CAP, image_metrics, judge, psnr, ssim
+from fprf.evaluation.metrics import PSNR_CAP, image_metrics, judge, lpips, psnr, ssim
 from fprf.io.images import to_uint8, write_image
 from fprf.training import views
 from fprf.training.camera_optimizers import moved_cameras, rotated
