@@ -31,7 +31,7 @@ from ..rendering.paths import upwards
 from ..splats.photographs import camera_of
 from ..splats.scene import SplatScene
 from ..style.look import Restyle
-from .live import read, script
+from . import read_asset, script
 from .pack import colour_header, colour_section, header, pack, sections
 
 CAPTURED = "Captured"
@@ -248,13 +248,13 @@ def _text(page: Page, film: str, head: Mapping[str, Any] | None, parts: Mapping[
     ]
     present = [(name, part) for name, part in below if part]
     code = f"{script()}\nopen(JSON.parse(at('data').textContent));\n"
-    return Template(read("page.html")).substitute(
+    return Template(read_asset("page.html")).substitute(
         title=escape(page.title),
         lead=f'<p class="lead">{escape(page.lead)}</p>' if page.lead else "",
-        css=read("page.css"),
+        css=read_asset("page.css"),
         hash=f"'sha256-{base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()}'",
         nav="\n".join(f'<a href="#{name.lower()}">{name}</a>' for name, _ in present),
-        stage=Template(read("stage.html")).substitute(
+        stage=Template(read_asset("stage.html")).substitute(
             still=f'src="{stills[0][0]}"', ratio=f'style="--ratio:{width / height:.4f}"', facts=_facts(page.facts)
         ),
         body="\n".join(f'<section id="{name.lower()}"><h2>{name}</h2>\n{part}\n</section>' for name, part in present),

@@ -17,7 +17,7 @@ ROOT = DOCS.parent
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
 FILE = re.compile(r"`((?:fprf|tests|benchmarks|tools|examples)/[\w./+-]+)`")
 BELOW = re.compile(
-    r"`((?:blocks|cli|datamanagers|evaluation|export|fields|io|ops|page|plugins|rendering|splats|style|training|viewer)/[\w/]+\.py)`"
+    r"`((?:blocks|cli|datamanagers|evaluation|export|fields|io|ops|page|plugins|rendering|splats|style|training)/[\w/]+\.py)`"
 )
 MODULE = re.compile(r"`(fprf(?:\.\w+)+)`")
 LINK = re.compile(r"\]\((?!https?:)([^)#\s]*)(#[\w-]*)?\)")

@@ -13,10 +13,10 @@ from splat_ball import ball
 from fprf import testing
 from fprf.cli import main as cli
 from fprf.errors import DataError
+from fprf.page.uploads import check_file, find_source
 from fprf.plugins import registry
 from fprf.plugins.captures import CaptureFormat, endings, format_of
 from fprf.splats.files import read_capture, write_gaussians
-from fprf.viewer.uploads import check_file, find_source
 
 CODE = '''
 """Means, ln-scales, logits, quaternions and mean colours as rows of float32 behind a word."""

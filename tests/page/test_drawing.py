@@ -14,12 +14,12 @@ from tiny_world import World
 from fprf.io.images import Picture, to_uint8
 from fprf.io.maps import depth_image, match_image
 from fprf.ops import backend
+from fprf.page import drawing
+from fprf.page.drawing import FieldPainter, Request, Shown, resolutions
+from fprf.page.restyler import Look, Photograph, Restyler, set_rule
 from fprf.style.match_maps import match_map
 from fprf.training.loading import load_run
 from fprf.training.views import render_view
-from fprf.viewer import drawing
-from fprf.viewer.drawing import FieldPainter, Request, Shown, resolutions
-from fprf.viewer.restyler import Look, Photograph, Restyler, set_rule
 
 Pair = tuple[Photograph, Photograph]
 

@@ -11,11 +11,11 @@ from session_helpers import Listener, camera_of, until
 from tiny_world import World
 
 from fprf.errors import FprfError, UsageError
+from fprf.page import messages
+from fprf.page.drawing import cameras_of
+from fprf.page.render_worker import Steps
+from fprf.page.session import SHELF, Session, State
 from fprf.splats.files import read_capture
-from fprf.viewer import messages
-from fprf.viewer.drawing import cameras_of
-from fprf.viewer.render_worker import Steps
-from fprf.viewer.session import SHELF, Session, State
 
 
 def unpacked(body: bytes) -> tuple[dict[str, object], dict[str, bytes]]:

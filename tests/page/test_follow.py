@@ -4,11 +4,11 @@ from pathlib import Path
 import pytest
 
 from fprf.errors import CheckpointError
+from fprf.page.follow import TrainingFollower, training_progress
+from fprf.page.server import Access, ViewerServer
+from fprf.page.session import Viewed, view_of_run
 from fprf.training.driver import is_watched
 from fprf.training.loading import load_run
-from fprf.viewer.live import TrainingFollower, training_progress
-from fprf.viewer.server import Access, ViewerServer
-from fprf.viewer.session import Viewed, view_of_run
 
 
 def test_a_run_is_opened_at_its_first_checkpoint_and_followed(run: Path) -> None:

@@ -27,7 +27,6 @@ from ..io.atomic import write_json
 from ..io.images import Picture, to_uint8
 from ..io.maps import depth_image, match_image, palette
 from ..ops.harmonics import HARMONIC
-from ..page.pack import Colours, Packed
 from ..plugins.stylizers.config import RegionToneConfig
 from ..rendering.camera_path import read_camera_path, write_camera_path
 from ..rendering.cameras import Cameras, ideal_cameras
@@ -41,6 +40,7 @@ from ..training.loading import Trained
 from ..training.views import ViewChunk, view_chunks
 from ..types import Origin
 from .messages import Camera
+from .pack import Colours, Packed
 from .render_worker import Steps
 from .restyler import Look, Restyler, style_config
 

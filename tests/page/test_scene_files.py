@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fprf.errors import DataError, UsageError
-from fprf.viewer.uploads import SceneFiles, find_source
+from fprf.page.uploads import SceneFiles, find_source
 
 PICTURE = cv2.imencode(".png", np.zeros((6, 8, 3), np.uint8))[1].tobytes()
 HEADS = {

@@ -4,12 +4,12 @@ import pytest
 import torch
 
 from fprf.errors import UsageError
+from fprf.page.restyler import Look, Photograph, Restyler, matching_regions, set_rule, style_config
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
 from fprf.style.regions import Regions, membership_view
 from fprf.style.restyle import apply_style
 from fprf.training.views import render_view
-from fprf.viewer.restyler import Look, Photograph, Restyler, matching_regions, set_rule, style_config
 
 
 def rendered(restyler: Restyler, restyle: Restyle | None) -> torch.Tensor:

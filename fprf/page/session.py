@@ -19,8 +19,6 @@ from ..interfaces import Scene
 from ..io.images import Picture, encode, to_uint8, write_image
 from ..io.maps import palette
 from ..io.video import write_video
-from ..page.pack import colour_header, colour_section, container, header, pack, sections
-from ..page.writer import about, about_gaussians
 from ..plugins.stylizers.config import RegionToneConfig
 from ..rendering.cameras import Cameras
 from ..splats.files import Capture, write_capture, write_gaussians
@@ -43,9 +41,11 @@ from .drawing import (
     new_folder,
     write_film_files,
 )
+from .pack import colour_header, colour_section, container, header, pack, sections
 from .render_worker import RenderWorker, Steps
 from .restyler import Look, Photograph, RegionInfo, Restyler, matching_regions, only, renumbered, set_rule, set_weight
 from .uploads import Uploads, shown_name
+from .writer import about, about_gaussians
 
 Post: TypeAlias = Callable[[Hashable | None, str, "Mapping[str, Any] | bytes"], None]
 """Sends a client, or all (None), a message under the name of its kind."""

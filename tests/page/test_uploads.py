@@ -13,7 +13,7 @@ import pytest
 from photo_files import HEIC, turned_jpeg
 
 from fprf.errors import DataError
-from fprf.viewer.uploads import MAX_BYTES, MAX_SIDE, Uploads, check_photograph, shown_name
+from fprf.page.uploads import MAX_BYTES, MAX_SIDE, Uploads, check_photograph, shown_name
 
 
 def png(width: int, height: int) -> bytes:
@@ -87,7 +87,7 @@ def test_one_that_takes_too_long_is_ended() -> None:
 
 @pytest.mark.skipif(os.name != "posix", reason="limits are a matter of Unix")
 def test_memory_beyond_the_room_is_refused() -> None:
-    greedy = "import numpy; from fprf.viewer import uploads; uploads.limit_memory(64 << 20); numpy.ones(256 << 20, numpy.uint8)"
+    greedy = "import numpy; from fprf.page import uploads; uploads.limit_memory(64 << 20); numpy.ones(256 << 20, numpy.uint8)"
     ended = subprocess.run([sys.executable, "-c", greedy], capture_output=True, text=True, timeout=120)
     assert ended.returncode == 1 and "MemoryError" in ended.stderr
 

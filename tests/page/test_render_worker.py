@@ -4,7 +4,7 @@ from collections.abc import Hashable, Iterator
 import pytest
 from session_helpers import until
 
-from fprf.viewer.render_worker import RenderWorker, Steps
+from fprf.page.render_worker import RenderWorker, Steps
 
 
 class Workplace:

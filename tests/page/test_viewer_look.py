@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from fprf.errors import ConfigError, UsageError
+from fprf.page import messages
+from fprf.page.drawing import Key
+from fprf.page.messages import Camera
+from fprf.page.restyler import Look, Photograph, renumbered, set_rule, style_config
+from fprf.page.session import SHELF, State, _added, _kept, _keyed, _removed
 from fprf.style.dictionary import Reference
-from fprf.viewer import messages
-from fprf.viewer.drawing import Key
-from fprf.viewer.messages import Camera
-from fprf.viewer.restyler import Look, Photograph, renumbered, set_rule, style_config
-from fprf.viewer.session import SHELF, State, _added, _kept, _keyed, _removed
 
 
 def card(number: int) -> Photograph:

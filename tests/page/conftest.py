@@ -8,12 +8,12 @@ from session_helpers import Listener
 from splat_ball import ball
 from tiny_world import World
 
+from fprf.page.restyler import Photograph, Restyler
+from fprf.page.session import Session, Viewed, view_of_run
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.splats.config import LookConfig
 from fprf.splats.scene import look_at_capture
 from fprf.training.loading import load_run
-from fprf.viewer.restyler import Photograph, Restyler
-from fprf.viewer.session import Session, Viewed, view_of_run
 
 
 @pytest.fixture

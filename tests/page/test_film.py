@@ -12,11 +12,11 @@ from tiny_world import World
 from fprf.cli import main as cli
 from fprf.errors import ConfigError, UsageError
 from fprf.io.images import Picture
-from fprf.viewer import messages
-from fprf.viewer import session as viewer_session
-from fprf.viewer.drawing import FieldPainter, film_cameras, film_frames, new_folder, write_film_files
-from fprf.viewer.restyler import Look, Photograph, Restyler, set_rule
-from fprf.viewer.session import Session
+from fprf.page import messages
+from fprf.page import session as viewer_session
+from fprf.page.drawing import FieldPainter, film_cameras, film_frames, new_folder, write_film_files
+from fprf.page.restyler import Look, Photograph, Restyler, set_rule
+from fprf.page.session import Session
 
 
 def rendered(frame: Generator[None, None, Picture]) -> Picture:

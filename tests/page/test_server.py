@@ -15,8 +15,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from fprf.errors import UsageError
-from fprf.viewer import server
-from fprf.viewer.server import COOKIE, Access, Client, ViewerServer, make_access
+from fprf.page import server
+from fprf.page.server import COOKIE, Access, Client, ViewerServer, make_access
 
 HERE = Access("127.0.0.1", None)
 TOKEN = "a-token-of-sixteen-characters"
