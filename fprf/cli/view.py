@@ -130,8 +130,7 @@ def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[st
     if not is_capture(path):
         from ..training.loading import open_run
 
-        run = open_run(path, config.device, config)
-        viewed = view_of_run(run.scene, run.run, run.known, run.step)
+        viewed = view_of_run(open_run(path, config.device, config))
         return viewed if name is None else replace(viewed, name=name)
     from ..plugins.stylizers.config import RegionToneConfig
     from ..splats.config import LookConfig

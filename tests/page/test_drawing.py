@@ -97,7 +97,10 @@ def test_maps_are_what_the_command_line_renders(watched: Watched, restyler: Rest
 
 def test_a_picked_region_stands_out(watched: Watched, restyler: Restyler) -> None:
     whole = watched.look()[-1][1].astype(int)
-    shown = [watched.look(Shown(Look(), region=region))[-1][1].astype(int) for region in range(restyler.regions)]
+    shown = [
+        watched.look(Shown(Look(), region=region))[-1][1].astype(int)
+        for region in range(len(restyler.encoders.scene_style.share))
+    ]
     # Each is grey but for its region's share, and the shares of all regions are the whole.
     grey = 0.45 * whole.mean(-1, keepdims=True)
     assert np.abs(sum(each - grey for each in shown) - (whole - grey)).max() <= len(shown)

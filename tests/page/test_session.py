@@ -139,7 +139,7 @@ def test_the_warm_up_leaves_nothing_behind(session: Session, listener: Listener)
     session.warm_up()
     done = threading.Event()
 
-    def last() -> Steps:
+    def last() -> Steps[None]:
         yield
         done.set()
 
