@@ -138,8 +138,3 @@ def test_resolutions_double_up_to_the_very_size(width: int, height: int) -> None
     for small, large in itertools.pairwise(found):
         assert abs(small[0] - large[0] / 2) <= 1 and abs(small[1] - large[1] / 2) <= 1
     assert max(found[0]) < 33 or len(found) == 1
-
-
-def test_a_fast_machine_begins_sharp(watched: Watched) -> None:
-    watched._pixel_seconds = 1e-9
-    assert [final for _, _, final in watched.look()] == [True]
