@@ -40,11 +40,11 @@ from .drawing import (
     new_folder,
     write_film_files,
 )
-from .pack import colour_header, colour_section, container, header, pack, sections
+from .pack import colour_header, colour_section, container
 from .render_worker import RenderWorker, Steps
 from .restyler import Look, Photograph, RegionInfo, Restyler, matching_regions, only, renumbered, set_rule, set_weight
 from .uploads import Uploads, shown_name
-from .writer import about, about_gaussians
+from .writer import about, packed_scene
 
 Post: TypeAlias = Callable[[Hashable | None, str, "Mapping[str, Any] | bytes"], None]
 """Sends a client, or all (None), a message under the name of its kind."""
@@ -147,11 +147,8 @@ class Session:
         """Prepare what browsers are sent of the scene, or the painter of a field."""
         scene, home = self.viewed.scene, self.viewed.home
         if isinstance(scene, SplatScene):
-            # Shapes and captured colours go to browsers once, deflated at the fastest level: somebody is waiting.
-            self.packed = pack(scene.gaussians)
-            captured = self.packed.colours(scene.gaussians.harmonics)
-            head = {**header(self.packed), **about_gaussians(scene, home), "styles": [colour_header(captured)]}
-            parts = {**sections(self.packed, 1), "style-0": colour_section(captured, 1)}
+            # Shapes and captured colours go to browsers once.
+            self.packed, head, parts = packed_scene(scene, [scene.gaussians.harmonics], home, level=1)
             self.geometry = container(head, parts)
         elif isinstance(scene, Trained):
             self._painter = FieldPainter(scene, self.restyler, self._show)
