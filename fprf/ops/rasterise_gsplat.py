@@ -20,6 +20,7 @@ from .rasterise_blocks import FIXED
 from .rasterise_kernels import SIDE
 from .rasterise_reference import BLUR, Pinhole
 from .rasterise_training import LOG_SCALES, Floats, Learnt, Target, TrainableGaussians
+from .simd import LANES
 
 _MOST_LOG, _LARGE = 30.0, 1e15
 """Bounds of logarithms and logits, and of means and quaternions, as in `rasterise_reference`."""
@@ -130,8 +131,7 @@ def _render(
 class GsplatGaussians:
     """`TrainableGaussians` on a device, drawn by gsplat: the same methods, parameters, loss and optimiser.
 
-    A step moves the Gaussians that lie in view, where the kernels of the CPU also count the others of their block of sixteen.
-    Whoever calls gives and gets arrays of host memory; a step waits for the device once, for its figures.
+    Whoever calls gives and gets arrays of host memory. A step waits for the device where gsplat does, and once for its figures.
     """
 
     def __init__(self, room: int, bands: int, device: torch.device) -> None:
@@ -238,8 +238,11 @@ class GsplatGaussians:
         return Learnt(float(found[0]), float(found[1]), float(found[2]), of_exposure, found[6:].astype(np.float64))
 
     def _adam(self, gradient: Annotated[Tensor, "N R"], seen: Annotated[Tensor, "N"], rates: Annotated[Tensor, "R"]) -> None:
-        """Move what was seen (`rasterise_gradient_kernels.adam`); moments of the others stay. No mask is waited for."""
+        """Move all of a block of LANES where one was seen, as `rasterise_gradient_kernels.adam`; moments of others stay."""
         values, first, second, weight = (part[: self.count] for part in (self._values, self._first, self._second, self._weight))
+        # Masks that are multiplied with, not indexed by: the host need not know how many there are.
+        blocks = torch.nn.functional.pad(seen, (0, -len(seen) % LANES)).view(-1, LANES)
+        seen = blocks.any(1).repeat_interleave(LANES)[: len(seen)]
         seen = (seen & gradient.isfinite().all(1))[:, None]
         gradient = torch.where(seen, gradient, 0.0)
         share = seen.to(values.dtype)

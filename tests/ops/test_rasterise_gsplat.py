@@ -164,9 +164,8 @@ def both(bands: int, antialiased: bool = True) -> tuple[Any, TrainableGaussians,
 def test_a_step_is_that_of_the_cpu(
     drawing: None, bands: int, antialiased: bool, factors: tuple[float, float, float] | None
 ) -> None:
-    """Moments hold the gradients: 4 ROUGH, and 8 ROUGH of their squares (tests/ops/test_rasterise.py). Of Gaussians in view:
-    the kernels take all of a block of sixteen as seen where one is. A step of Adam is the gradient by its own size, so that
-    what is nearly 0 may go either way."""
+    """Moments hold the gradients: 4 ROUGH, and 8 ROUGH of their squares (tests/ops/test_rasterise.py). A step of Adam is the
+    gradient by its own size, so that what is nearly 0 may go either way."""
     target, ours, theirs = both(bands, antialiased)
     rates = np.full(ours.rows, 1e-3, np.float32)
     exposure = None if factors is None else np.array(factors, np.float32)
@@ -176,10 +175,8 @@ def test_a_step_is_that_of_the_cpu(
     assert found[:3] == pytest.approx(wanted[:3], rel=STOP)
     for a, b in ((found.pull, wanted.pull), (found.of_camera, wanted.of_camera)):
         assert np.linalg.norm(a - b) <= 4 * ROUGH * np.linalg.norm(b)
-    seen = ours.moments()[1].any(1)
-    assert seen.sum() > 40
     for a, b in zip(theirs.moments(), ours.moments(), strict=True):
-        assert np.linalg.norm(a[seen] - b[seen]) <= 8 * ROUGH * np.linalg.norm(b[seen])
+        assert np.linalg.norm(a - b) <= 8 * ROUGH * np.linalg.norm(b)
     moved, way = theirs.read() - before, ours.read() - before
     assert np.linalg.norm(moved - way) < 0.02 * np.linalg.norm(way) and np.linalg.norm(way) > 0
     a, b = (each.errors(target, (0.2, 0.5, 0.1), exposure) for each in (theirs, ours))

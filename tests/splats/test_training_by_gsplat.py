@@ -1,6 +1,7 @@
 """Gaussians trained by gsplat: on the CPU and on the pretended device, through a stand-in (tests/gsplat_stand_in.py)."""
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -67,7 +68,7 @@ def quality(found: Gaussians, scene: Scene) -> float:
 
 
 def test_it_learns_what_the_kernels_of_the_cpu_learn(config: GaussiansConfig, scene: Scene) -> None:
-    """Rounding grows over steps of Adam and splits by chance: alike to within 0.5 dB, which is a quarter of what is learnt."""
+    """Rounding grows over steps of Adam and splits by chance: over three seeds they came out 0.12 dB apart at most."""
     asked = replace(config, tones=True, poses=1e-4)
     start = build(asked, scene)
     before = quality(start.gaussians(), scene)
@@ -75,45 +76,49 @@ def test_it_learns_what_the_kernels_of_the_cpu_learn(config: GaussiansConfig, sc
     with stand_in():
         learner = learnt(by_gsplat(build(asked, scene)))
     assert 590 <= len(learner.gaussians()) <= 600 and ours > before + 2
-    assert quality(learner.gaussians(), scene) == pytest.approx(ours, abs=0.5)
+    assert quality(learner.gaussians(), scene) == pytest.approx(ours, abs=0.3)
 
 
 def test_the_device_gives_what_the_cpu_gives_with_one_wait_a_step(config: GaussiansConfig, scene: Scene) -> None:
     """Bit for bit: both are torch here. Widths are limited every tenth step, and Gaussians moved every twentieth."""
-    asked, waits, uploads = replace(config, tones=True, poses=1e-4), [], []
+    asked, waits, uploads = replace(config, tones=True, poses=1e-4), {}, {}
+    part, end = (205, 225), 230
     with stand_in():
-        wanted = learnt(by_gsplat(build(asked, scene)), 0, 225)
+        wanted = learnt(by_gsplat(build(asked, scene)), *part)
         with pretend_cuda() as seen:
             learner = build(asked, scene, device=CUDA)
             assert learner.device == CUDA and isinstance(learner.model, GsplatGaussians)
-            for step in range(225):
+            for step in range(*part):
                 before = seen.syncs.total(), seen.uploads.total()
                 learnt(learner, step, step + 1)
-                waits.append(seen.syncs.total() - before[0])
-                uploads.append(seen.uploads.total() - before[1])
+                waits[step] = seen.syncs.total() - before[0]
+                uploads[step] = seen.uploads.total() - before[1]
             half = learner.state()
             again = build(asked, scene, device=CUDA)
             again.load(half)
             assert equal(again.gaussians(), learner.gaussians())
-            found, other = (learnt(each, 225, 245).gaussians() for each in (learner, again))
+            found, other = (learnt(each, part[1], end).gaussians() for each in (learner, again))
             assert equal(found, other)
-    assert equal(learnt(wanted, 225, 245).gaussians(), found)
-    assert {waits[step] for step in range(225) if step % 10 and (step + 1) % 20} == {1}
-    assert {uploads[step] for step in range(225) if step % 10 and (step + 1) % 20} == {2}, "the photograph, and all numbers"
+        assert equal(learnt(wanted, part[1], end).gaussians(), found)
+    plain = [step for step in range(*part) if step % 10 and (step + 1) % 20]
+    assert {waits[step] for step in plain} == {1}
+    assert {uploads[step] for step in plain} == {2}, "the photograph, and all numbers"
 
 
 @pytest.mark.parametrize("installed", [True, False])
 def test_auto_trains_where_gsplat_draws(
-    config: GaussiansConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str], installed: bool
+    config: GaussiansConfig,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    installed: bool,
 ) -> None:
     flags = [word for name, value in SIZES.items() for word in (f"--{name.replace('_', '-')}", str(value))]
     words = ["train", "fprf-splats", "--data", str(config.data), *flags, "--steps", "12", "--output", str(tmp_path / "run")]
-    with pretend_cuda():
-        if installed:
-            with stand_in():
-                assert main(words) == 0
-        else:
-            assert main(words) == 0
+    with pretend_cuda(), stand_in(), monkeypatch.context() as patched:
+        if not installed:
+            patched.setitem(sys.modules, "gsplat", None)
+        assert main(words) == 0
     said = capsys.readouterr()
     events = [json.loads(line)["event"] for line in (said.out + said.err).splitlines() if '"event"' in line]
     assert sum("on cuda:0 by gsplat" in each for each in events) == installed
