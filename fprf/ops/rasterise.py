@@ -218,22 +218,6 @@ def _check(
         )
 
 
-def camera_array(camera: Pinhole, antialiased: bool) -> _Array:
-    """A camera as the kernels take it (see `rasterise_kernels`)."""
-    fx, fy, cx, cy = (float(camera.intrinsics[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    pose = camera.world_to_camera.double().cpu()
-    turn, shift = pose[:3, :3], pose[:3, 3]
-    # J is taken at most 15 % of the image beyond its edges: further out the linear projection stretches without bound.
-    limits = [
-        -cx / fx - 0.15 * camera.width / fx,
-        (camera.width - cx) / fx + 0.15 * camera.width / fx,
-        -cy / fy - 0.15 * camera.height / fy,
-        (camera.height - cy) / fy + 0.15 * camera.height / fy,
-    ]
-    place = [*turn.flatten().tolist(), *shift.tolist(), fx, fy, cx, cy, *(-turn.T @ shift).tolist()]
-    return np.array([*place, *limits, camera.near, float(antialiased)], np.float32)
-
-
 class _View(NamedTuple):
     """A camera and the Gaussians it sees, as the kernels take them."""
 
@@ -255,6 +239,7 @@ def _view(
 ) -> _View:
     from . import rasterise_kernels as kernels
     from .rasterise_blocks import FIXED, pack
+    from .rasterise_training import camera_array
     from .simd import LANES, aligned
 
     bands, seen, whole = harmonics.shape[1], camera_array(camera, antialiased), -(-len(means) // LANES) * LANES

@@ -330,7 +330,7 @@ def photometric_loss(
 
 
 def _camera(target: Target, numbers: Annotated[Tensor, "25"]) -> Pinhole:
-    """A photograph's camera on the device, from its numbers there (see `rasterise.camera_array`)."""
+    """A photograph's camera on the device, from its numbers there (see `camera_array`)."""
     turn, shift, focal, centre = numbers[:9].view(3, 3), numbers[9:12, None], numbers[12:14], numbers[14:16]
     last = torch.eye(4, dtype=numbers.dtype, device=numbers.device)[3:]
     pose = torch.cat([torch.cat([turn, shift], 1), last])
