@@ -1,13 +1,11 @@
 """gsplat's `rasterization` without a GPU: the parameters of it that fprf names, in plain torch, strict about what it is given.
 
-Every Gaussian is composited in every pixel, on any device and in any float type, with gradients by autograd. The parts that
-gsplat has in torch as well (projection, harmonics, alphas with their sums) can be replaced by gsplat's own.
+Every Gaussian is composited in every pixel, on any device and in any float type, with gradients by autograd.
 """
 
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any, Literal, NamedTuple
@@ -97,8 +95,6 @@ def rasterization(
     backgrounds: Tensor | None = None,
     render_mode: Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"] = "RGB",
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
-    *,
-    parts: tuple[Callable[..., Any], ...] = (project, harmonics, composite),
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     count, channels = len(means), colors.shape[-1]
     given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
@@ -118,16 +114,15 @@ def rasterization(
         assert bool((scales > 0).all() & (opacities > 0).all() & (opacities < 1).all() & (quats.norm(dim=1) > 0).all())
         assert viewmats[0, 3].tolist() == [0, 0, 0, 1] and Ks[0, 2].tolist() == [0, 0, 1]
 
-    projected, lit, composited = parts
-    splats = projected(means, quats, scales, viewmats[0], Ks[0], width, height, eps2d, near_plane)
+    splats = project(means, quats, scales, viewmats[0], Ks[0], width, height, eps2d, near_plane)
     if sh_degree is not None:
         centre = -viewmats[0, :3, :3].T @ viewmats[0, :3, 3]
-        colors = (lit(sh_degree, means - centre, colors) + 0.5).clamp_min(0)
+        colors = (harmonics(sh_degree, means - centre, colors) + 0.5).clamp_min(0)
     if render_mode == "RGB+D":
         colors = torch.cat([colors, splats.depths[:, None]], 1)
     if rasterize_mode == "antialiased":
         opacities = opacities * splats.compensations
-    image, alpha = composited(splats, opacities, colors, width, height)
+    image, alpha = composite(splats, opacities, colors, width, height)
     if backgrounds is not None:
         behind = backgrounds[0] if render_mode == "RGB" else torch.cat([backgrounds[0], torch.zeros_like(backgrounds[0, :1])])
         image = image + (1 - alpha)[..., None] * behind
@@ -135,11 +130,11 @@ def rasterization(
 
 
 @contextmanager
-def stand_in(*parts: Callable[..., Any]) -> Iterator[None]:
-    """Within it, `import gsplat` gives this one, with other parts where they are given."""
+def stand_in(drawing: Callable[..., Any] | None = None) -> Iterator[None]:
+    """Within it, `import gsplat` gives a module of this `rasterization`, or of another."""
     module = ModuleType("gsplat")
     module.__spec__ = ModuleSpec("gsplat", None)
-    module.rasterization = partial(rasterization, parts=parts) if parts else rasterization  # type: ignore[attr-defined]
+    module.rasterization = drawing or rasterization  # type: ignore[attr-defined]
     before = sys.modules.get("gsplat")
     sys.modules["gsplat"] = module
     rasterise_gsplat.obstacle.cache_clear()

@@ -14,7 +14,7 @@ import gsplat_stand_in
 import numpy as np
 import pytest
 import torch
-from gsplat_stand_in import Splats, stand_in
+from gsplat_stand_in import stand_in
 from pretend_cuda import CUDA, pretend_cuda
 from test_rasterise import ROUGH, STOP, Tensors, camera, cloud, exact
 from torch import Tensor
@@ -26,28 +26,45 @@ from fprf.ops.rasterise_training import TrainableGaussians, target_of
 CPU = torch.device("cpu")
 
 
-def own_parts(monkeypatch: pytest.MonkeyPatch) -> tuple[Callable[..., Any], ...]:
-    """Projection, harmonics and compositing by gsplat's torch code. For the last one gsplat takes two functions of nerfacc,
-    products and sums along a ray, and the pairs of Gaussians and pixels from a kernel: both are given here."""
-    gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed")
+def without_kernels(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    """gsplat's own `rasterization` on its torch code: projection, harmonics, and alphas with their sums. Of kernels that have
+    no such form, the lists of tiles are left out and all pairs of Gaussians and pixels are composited; two functions of nerfacc
+    that gsplat's torch code asks for, products and sums along a ray, are given here."""
+    pytest.importorskip("gsplat", reason="gsplat is not installed")
+    from gsplat import rendering
     from gsplat.cuda import _torch_impl as own
 
-    def project(
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        viewmat: Tensor,
-        K: Tensor,
-        width: int,
-        height: int,
-        eps: float,
-        near: float,
-    ) -> Splats:
+    drawn: list[Tensor] = []
+    depths: list[Tensor] = []
+
+    def project(means: Tensor, covars: None, quats: Tensor, scales: Tensor, *where: Any, **how: Any) -> Any:
         covariances, _ = own._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
-        found = own._fully_fused_projection(
-            means, covariances, viewmat[None], K[None], width, height, eps, near, calc_compensations=True
-        )
-        return Splats(*(each[0] for each in found))
+        known = {name: how[name] for name in ("eps2d", "near_plane", "far_plane", "calc_compensations", "camera_model")}
+        radii, *found = own._fully_fused_projection(means, covariances, *where, **known)
+        drawn[:] = [(radii[0] > 0).all(1)]
+        return radii, *found[:3], found[3] if how["calc_compensations"] else None
+
+    def composite(
+        means: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, width: int, height: int, *tiles: Any, **how: Any
+    ) -> tuple[Tensor, Tensor]:
+        # All pairs, pixel by pixel and front to back; where the kernel makes none of a pair, its opacity is 0.
+        order = depths[0].argsort(stable=True)
+        pixels = torch.arange(width * height).repeat_interleave(len(order))
+        which = order.repeat(width * height)
+        apart = torch.stack([pixels % width, pixels // width], 1) + 0.5 - means[0, which].detach()
+        xx, xy, yy = conics[0, which].detach().unbind(1)
+        shape = (-0.5 * (xx * apart[:, 0] ** 2 + yy * apart[:, 1] ** 2) - xy * apart[:, 0] * apart[:, 1]).exp()
+        visible = drawn[0][which] & (opacities[0, which] * shape >= 1 / 255)
+        # One entry a pair: a Gaussian of that pixel alone.
+        image, alpha = own.accumulate(
+            means[:, which], conics[:, which], torch.where(visible, opacities[:, which], 0.0), colors[:, which],
+            torch.arange(len(which)), pixels, torch.zeros_like(pixels), width, height,
+        )  # fmt: skip
+        return image + (1 - alpha) * how["backgrounds"][:, None, None], alpha
+
+    def tiles(means: Tensor, radii: Tensor, depth: Tensor, *sizes: Any, **how: Any) -> tuple[None, None, None]:
+        depths[:] = [depth[0].detach()]
+        return None, None, None
 
     def weights(alphas: Tensor, *, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
         by_ray = alphas.view(n_rays, -1)
@@ -61,32 +78,19 @@ def own_parts(monkeypatch: pytest.MonkeyPatch) -> tuple[Callable[..., Any], ...]
     nerfacc = ModuleType("nerfacc")
     nerfacc.render_weight_from_alpha, nerfacc.accumulate_along_rays = weights, along  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "nerfacc", nerfacc)
-
-    def composite(splats: Splats, opacities: Tensor, values: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-        # All pairs, pixel by pixel and front to back; where the kernel makes none of a pair, its opacity is 0.
-        order = splats.depths.detach().argsort(stable=True)
-        pixels = torch.arange(width * height).repeat_interleave(len(order))
-        which = order.repeat(width * height)
-        apart = torch.stack([pixels % width, pixels // width], 1) + 0.5 - splats.means[which].detach()
-        xx, xy, yy = splats.conics[which].detach().unbind(1)
-        shape = (-0.5 * (xx * apart[:, 0] ** 2 + yy * apart[:, 1] ** 2) - xy * apart[:, 0] * apart[:, 1]).exp()
-        drawn = (splats.radii > 0).all(1)[which] & (opacities[which] * shape >= 1 / 255)
-        # One entry a pair: a Gaussian of that pixel alone.
-        image, alpha = own.accumulate(
-            splats.means[which], splats.conics[which], torch.where(drawn, opacities[which], 0.0), values[which],
-            torch.arange(len(which)), pixels, torch.zeros_like(pixels), width, height,
-        )  # fmt: skip
-        return image, alpha[..., 0]
-
-    assert gsplat.rasterization is not gsplat_stand_in.rasterization
-    return project, own._spherical_harmonics, composite
+    monkeypatch.setattr(rendering, "fully_fused_projection", project)
+    monkeypatch.setattr(rendering, "spherical_harmonics", lambda *of, masks: own._spherical_harmonics(*of))
+    monkeypatch.setattr(rendering, "isect_tiles", tiles)
+    monkeypatch.setattr(rendering, "isect_offset_encode", lambda ids, images, wide, tall: torch.zeros(images, tall, wide))
+    monkeypatch.setattr(rendering, "rasterize_to_pixels", composite)
+    return rendering.rasterization
 
 
 @pytest.fixture(params=["stand-in", "gsplat's torch code", pytest.param("card", marks=pytest.mark.gpu)])
 def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
     """Where gsplat draws."""
     if request.param != "card":
-        with stand_in(*(() if request.param == "stand-in" else own_parts(monkeypatch))):
+        with stand_in(gsplat_stand_in.rasterization if request.param == "stand-in" else without_kernels(monkeypatch)):
             yield CPU
     elif torch.cuda.is_available():
         assert rasterise_gsplat.obstacle(CUDA) is None
@@ -99,7 +103,7 @@ def test_the_stand_in_has_the_signature_of_gsplat() -> None:
     gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed")
     real = inspect.signature(gsplat.rasterization).parameters
     for name, own in inspect.signature(gsplat_stand_in.rasterization).parameters.items():
-        assert name == "parts" or (real[name].default, real[name].kind) == (own.default, own.kind), name
+        assert (real[name].default, real[name].kind) == (own.default, own.kind), name
 
 
 @pytest.mark.parametrize(("channels", "antialiased"), [(3, False), (3, True), (9, True)])
