@@ -70,12 +70,9 @@ def rasterise_gsplat(
     antialiased: bool,
 ) -> tuple[Annotated[Tensor, "H W C+1"], Annotated[Tensor, "H W"]]:
     """Composited values, the composited depth behind them, and the transmittance left, float32: as `rasterise_reference`."""
-    placed = camera._replace(
-        intrinsics=camera.intrinsics.to(means), world_to_camera=camera.world_to_camera.to(means)
-    )  # fmt: skip
-    image, opacity, _ = _render(
-        (means, log_scales, quaternions, logits[:, None]), values, placed, background, antialiased=antialiased, mode="RGB+D"
-    )
+    camera = camera._replace(intrinsics=camera.intrinsics.to(means), world_to_camera=camera.world_to_camera.to(means))
+    shape = means, log_scales, quaternions, logits[:, None]
+    image, opacity, _ = _render(shape, values, camera, background, antialiased=antialiased, mode="RGB+D")
     return image, 1 - opacity
 
 
@@ -97,10 +94,8 @@ def _render(
     means, log_scales, quaternions, logits = shape
     # Harmless numbers take the place of what is not drawn: at the origin, and transparent.
     size = quaternions.detach().norm(dim=1, keepdim=True)
-    fine = (
-        (means.abs() < _LARGE).all(1, keepdim=True) & (size < _LARGE) & ~torch.cat([log_scales, logits], 1).isnan().any(1, True)
-    )
-    fine = fine & values.isfinite().flatten(1).all(1, keepdim=True)
+    fine = (means.abs() < _LARGE).all(1, keepdim=True) & (size < _LARGE) & values.isfinite().flatten(1).all(1, keepdim=True)
+    fine = fine & ~torch.cat([log_scales, logits], 1).isnan().any(1, keepdim=True)
     means = torch.where(fine, means, 0.0)
     upright = torch.eye(4, dtype=means.dtype, device=means.device)[:1]  # also where a quaternion has no length
     quaternions = torch.where(fine & (size > 0), quaternions, upright)
@@ -286,7 +281,9 @@ class GsplatGaussians:
 
     def _image(self, target: Target, planes: Floats) -> Annotated[Tensor, "C H W"]:
         """Planes of whole tiles, as the kernels of the CPU take them, as an image on the device."""
-        padded = planes[: len(planes) // target.area * target.area].reshape(-1, *_whole(target))
+        wide = -(-target.width // SIDE) * SIDE
+        # What lies behind the last plane, for the vectors of the CPU, is less than a plane.
+        padded = planes[: len(planes) // target.area * target.area].reshape(-1, target.area // wide, wide)
         return self._there(padded)[:, : target.height, : target.width]
 
     def _there(self, values: NDArray[np.float32 | np.int64]) -> Tensor:
@@ -336,11 +333,6 @@ def _camera(target: Target, numbers: Annotated[Tensor, "25"]) -> Pinhole:
     pose = torch.cat([torch.cat([turn, shift], 1), last])
     intrinsics = torch.cat([torch.cat([focal.diag(), centre[:, None]], 1), last[:, 1:]])
     return Pinhole(intrinsics, pose, target.width, target.height, float(target.camera[23]))
-
-
-def _whole(target: Target) -> tuple[int, int]:
-    """Height and width of a photograph in whole tiles."""
-    return -(-target.height // SIDE) * SIDE, -(-target.width // SIDE) * SIDE
 
 
 def _here(values: Tensor) -> Floats:
