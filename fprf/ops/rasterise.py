@@ -3,7 +3,8 @@
 N Gaussians, K harmonics of a colour channel (1, 4, 9 or 16), C feature channels, H W pixels; H16 W16 whole tiles of them.
 
 `rasterise_reference` defines what is computed, in plain torch, for every device and dtype. On the CPU in float32 compiled
-kernels do (`rasterise_blocks`, `rasterise_kernels`, `rasterise_gradient_kernels`), by these steps:
+kernels do (`rasterise_blocks`, `rasterise_kernels`, `rasterise_gradient_kernels`), by the steps below; on CUDA in
+float32 gsplat does, where it is installed (`rasterise_gsplat`).
 
     project     mean -> image position and depth, Sigma' = J W Sigma W^T J^T + 0.3 I, colour from its harmonics
     bin         every Gaussian into the tiles of 16 x 16 pixels that it reaches, each tile sorted by depth
@@ -18,7 +19,7 @@ light passes (an error of at most 1/1000 of the largest value). Their exponentia
 # The checker takes compiled functions to have one argument.
 # mypy: disable-error-code="call-arg, attr-defined"
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -78,7 +79,7 @@ def rasterise(
         colours, fine = view_colours(means, harmonics, camera)
         logits = torch.where(fine, logits, torch.nan)  # what is not finite is not drawn
         behind = torch.cat([background, features.new_zeros(features.shape[1])])
-        planes, passing = rasterise_reference(
+        planes, passing = _form(*given)(
             *shape, logits, torch.cat([colours, features], -1), camera, behind, antialiased=antialiased
         )
         # In the kernels' order: colour, depth, features.
@@ -119,7 +120,7 @@ def lift(
             pixels = pixels.clone()
             centres, turns, sizes, densities = (each.clone() for each in shape)
             values = centres.new_zeros(len(centres), channels, requires_grad=True)
-            image, _ = rasterise_reference(
+            image, _ = _form(*shape, pixels)(
                 centres, turns, sizes, densities, values, camera, pixels.new_zeros(channels), antialiased=antialiased
             )
             (lifted,) = torch.autograd.grad((image[..., :-1] * pixels).sum(), values)
@@ -193,6 +194,17 @@ def _fits(*tensors: Tensor) -> bool:
     return compiled() and all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
 
 
+def _form(*tensors: Tensor) -> Callable[..., tuple[Tensor, Tensor]]:
+    """What draws where the kernels of the CPU don't: gsplat for float32 on a device where it works, else the plain form."""
+    device = tensors[0].device
+    if compiled() and device.type == "cuda" and all(x.dtype == torch.float32 for x in tensors):
+        from .rasterise_gsplat import rasterise_gsplat, usable
+
+        if usable(device):
+            return rasterise_gsplat
+    return rasterise_reference
+
+
 def _check(
     means: Tensor, quaternions: Tensor, log_scales: Tensor, logits: Tensor, harmonics: Tensor, features: Tensor | None
 ) -> None:
@@ -204,22 +216,6 @@ def _check(
         raise FprfError(
             f"Gaussians of shapes {given}: [N 3], [N 4], [N 3], [N], [N K 3] with K 1, 4, 9 or 16 and features [N C] fit"
         )
-
-
-def camera_array(camera: Pinhole, antialiased: bool) -> _Array:
-    """A camera as the kernels take it (see `rasterise_kernels`)."""
-    fx, fy, cx, cy = (float(camera.intrinsics[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    pose = camera.world_to_camera.double().cpu()
-    turn, shift = pose[:3, :3], pose[:3, 3]
-    # J is taken at most 15 % of the image beyond its edges: further out the linear projection stretches without bound.
-    limits = [
-        -cx / fx - 0.15 * camera.width / fx,
-        (camera.width - cx) / fx + 0.15 * camera.width / fx,
-        -cy / fy - 0.15 * camera.height / fy,
-        (camera.height - cy) / fy + 0.15 * camera.height / fy,
-    ]
-    place = [*turn.flatten().tolist(), *shift.tolist(), fx, fy, cx, cy, *(-turn.T @ shift).tolist()]
-    return np.array([*place, *limits, camera.near, float(antialiased)], np.float32)
 
 
 class _View(NamedTuple):
@@ -243,6 +239,7 @@ def _view(
 ) -> _View:
     from . import rasterise_kernels as kernels
     from .rasterise_blocks import FIXED, pack
+    from .rasterise_training import camera_array
     from .simd import LANES, aligned
 
     # The kernels read blocks of LANES Gaussians, property by property; the last block is padded.

@@ -58,13 +58,15 @@ class LookConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class GaussiansConfig(RunConfig):
-    """3D Gaussians, trained from photographs on the CPU."""
+    """3D Gaussians, trained from photographs."""
 
     kind: ClassVar[str] = "gaussians"
     untrained: ClassVar[tuple[str, ...]] = ("semantic", "regions", "semantic_size", "executor")
     former: ClassVar[tuple[str, ...]] = ("rounds",)
     open: ClassVar[tuple[str, ...]] = ("downscale", "cap", "passes")
 
+    device: str = "auto"
+    """cpu, cuda, or auto. On CUDA they are trained where gsplat is installed (`pip install 'fprf[cuda]'`), else on the CPU."""
     steps: int = 10_000
     """Optimiser steps: one view each. With minutes and no steps, as many as there is time for."""
     passes: int | None = None
@@ -153,10 +155,10 @@ class GaussiansConfig(RunConfig):
         if self.cells > 1:
             from .cells import Cells
 
-            return Cells(self, scene, saved)
+            return Cells(self, scene, saved, device=device)
         from .training import build
 
-        return build(self, scene, saved, progress)
+        return build(self, scene, saved, progress, device=device)
 
     def planned(self, scene: "Scene", device: str) -> "GaussiansConfig":
         """Size and number of Gaussians, as `splats.plan` finds them."""
@@ -173,6 +175,10 @@ class GaussiansConfig(RunConfig):
     def most_passes(self) -> int:
         """`passes`; where neither the user nor a plan has said it, 280."""
         return self.passes or _PASSES
+
+    @property
+    def trained_on(self) -> str:
+        return self.device
 
     @property
     def scene_parser(self) -> DataParserConfig | None:

@@ -1,4 +1,4 @@
-"""3D Gaussians in training, on the CPU (Kerbl et al. 2023): one view a step, Adam, splits where views err.
+"""3D Gaussians in training (Kerbl et al. 2023): one view a step, Adam, splits where views err.
 
 A step renders a training view and moves what it shows against the gradient of
 
@@ -34,6 +34,7 @@ from torch import Tensor
 
 from ..interfaces import Figures, SceneLearner, State
 from ..ops.harmonics import HARMONIC
+from ..ops.rasterise_gsplat import GsplatGaussians, Trainable, obstacle, trainable
 from ..ops.rasterise_training import (
     HARMONICS,
     LOG_SCALES,
@@ -43,7 +44,6 @@ from ..ops.rasterise_training import (
     Floats,
     Learnt,
     Target,
-    TrainableGaussians,
 )
 from ..rendering.splines import rotations
 from ..training.camera_optimizers import Poses, Tones, rotated
@@ -81,12 +81,13 @@ _SPLIT_SIZE, _SPLIT_DISTANCE, _SPLIT_OPACITY = 0.6, 0.5, 0.85
 """Halves: size and distance from the middle along the longest axis, as shares of its size; share of the opacity."""
 _SMOOTHING = 0.95
 """Decay of running means."""
+CPU = torch.device("cpu")
 MOVES = "poses.moves"
 """Name in checkpoints of where views were moved: `Poses.moved_by`."""
 _KEPT = "value", "first", "second", "steps"
 """Names in checkpoints of the parameter of a correction, its moments, and the steps of each view."""
 
-LimitWidths = Callable[[TrainableGaussians, int], None]
+LimitWidths = Callable[[Trainable, int], None]
 """Cuts standard deviations in place after a step."""
 
 
@@ -107,7 +108,8 @@ class GaussianLearner(SceneLearner):
     `limit_widths` may cut the standard deviations; None = none is limited. Nothing nearer to a camera than `near` is drawn.
     With `tones` each view's factors are learnt as well, with `poses` where each view was taken. `only` colours learns harmonics
     alone, `only` poses neither Gaussians nor factors. `known` is what scene.json will hold, for learners of a run; `origin`
-    says where the first Gaussians come from.
+    says where the first Gaussians come from. On a CUDA `device` they are drawn and moved there, where gsplat can; what is
+    decided every tenth step or more rarely (widths, splits) is decided on the CPU.
     """
 
     def __init__(
@@ -126,11 +128,13 @@ class GaussianLearner(SceneLearner):
         stage: Stage | None = None,
         known: Known | None = None,
         origin: str = "",
+        device: torch.device = CPU,
     ) -> None:
         self.inside, self.limit_widths, self.near, self.known, self.origin = inside, limit_widths, near, known, origin
         self.config, self.levels, self.scene_scale, self.stage = config, levels, scene_scale, stage or Stage()
         self.bands = (config.degree + 1) ** 2
-        self.model = TrainableGaussians(room, self.bands)
+        self.model: Trainable = trainable(room, self.bands, device)
+        self.asked = device
         self.begun = self.pixels = self.skipped = self.failed = 0
         self.means: dict[str, float] = {}
         self.tones, self.poses, self.only = tones, poses, only
@@ -143,8 +147,8 @@ class GaussianLearner(SceneLearner):
 
     @property
     def device(self) -> torch.device:
-        """The CPU."""
-        return torch.device("cpu")
+        """Where the Gaussians are."""
+        return self.model.device if isinstance(self.model, GsplatGaussians) else CPU
 
     @property
     def facts(self) -> Facts:
@@ -339,7 +343,17 @@ class GaussianLearner(SceneLearner):
         few = ", ".join(Path(names[view]).name for view in dull[:_NAMED]) + (", ..." if len(dull) > _NAMED else "")
         blur = f"; blurred, and so shown rarely: {len(dull)} of {len(self.levels[0])} ({few})" if dull else ""
         light = ", tones" if self.tones is not None else ""
-        return f", {self.model.count} Gaussians at {self.origin}{light}{blur}{passes if most < self.config.steps else ''}"
+        where = "" if self.device == CPU else f", on {self.device} by gsplat"
+        return (
+            f", {self.model.count} Gaussians at {self.origin}{light}{where}{blur}{passes if most < self.config.steps else ''}"
+            f"{left_out(self.asked)}"
+        )
+
+
+def left_out(device: torch.device) -> str:
+    """A line that says why Gaussians are not trained on a CUDA device; empty where they are."""
+    why = obstacle(device) if device.type == "cuda" else None
+    return "" if why is None else f"\nnote: Gaussians are trained on the CPU, not on {device}: {why}"
 
 
 def halves(
