@@ -37,7 +37,6 @@ from .drawing import (
     cameras_of,
     film_frames,
     gaussian_colours,
-    new_folder,
     write_film_files,
 )
 from .pack import colour_header, colour_section, container
@@ -369,7 +368,7 @@ class Session:
         def work() -> Steps[None]:
             try:
                 picture = yield from self._frame(cameras, 0, self.restyler.restyle(self.state.look))
-                path = next(each for n in count(1) if not (each := folder / f"{n:04d}.png").exists())
+                path = _unused(folder, ".png")
                 folder.mkdir(parents=True, exist_ok=True)
                 write_image(path, picture)
             except FprfError as error:
@@ -386,7 +385,8 @@ class Session:
                 raise UsageError("film: one is being made; wait for it")
             if self.viewed.root is None:
                 raise UsageError("this scene has no folder to put a film in")
-            folder, scene = new_folder(self.viewed.root), self.viewed.scene
+            folder, scene = _unused(self.viewed.root / "films"), self.viewed.scene
+            folder.mkdir(parents=True)
             write_film_files(folder, plan, scene.semantic_encoder, self.viewed.stylizer, scene.origin)
             self.apply(lambda state: replace(state, film=(0, 1, None)))
 
@@ -446,6 +446,11 @@ class Session:
             "film": {"done": state.film[0], "total": state.film[1], "ready": state.film[2] is not None},
             "pictures": len(state.pictures),
         }
+
+
+def _unused(folder: Path, ending: str = "") -> Path:
+    """The next film or picture: 0001 and so on."""
+    return next(each for number in count(1) if not (each := folder / f"{number:04d}{ending}").exists())
 
 
 def _added(state: State, photograph: Photograph) -> State:
