@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Measure a machine with a GPU in about ten minutes: the tests of devices, a scene trained for a given time, restyled frames
-# a second, a new style to its first frame. Writes one JSON with rows and goals.
+# a second, a new style to its first frame, and 3D Gaussians of the same scene trained in as much time (by gsplat where it is
+# installed, which compiles its kernels at the first use). Writes one JSON with rows and goals.
 #
 #   benchmarks/gpu.sh --scene DIR [--images images_4] [--minutes 3] [--method fprf] [--long STEPS] [--output FILE]
 #                     [-- FLAGS OF fprf train]
@@ -46,6 +47,7 @@ if [ "$dry" = 1 ]; then
     data=(--data garden --downscale 8)
     time=(--steps 20) again=(--steps 40)
     size=(--rays 500 --repeats 2) points=(--points 2000)
+    photographs=("${data[@]}")
     tests+=(-k "pretended and views" "$root/tests/test_gpu.py")
     [ "$long" = 0 ] || long=40
     export OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1
@@ -59,7 +61,8 @@ else
     data=(--data "$scene" --datamanager.parser llff --datamanager.parser.images "$images")
     time=(--minutes "$minutes") again=(--steps "$long")
     size=(--rays 762048 --repeats 5) points=(--points 262144)
-    tests+=(-k "not pretended" "$root/tests/test_gpu.py")
+    photographs=(--data "$scene" --parser llff --parser.images "$images")
+    tests+=(-k "not pretended" "$root/tests/test_gpu.py" "$root/tests/ops/test_rasterise_gsplat.py")
 fi
 
 # step NAME SECONDS COMMAND...: run it, note its exit status, print the end of its log where it failed.
@@ -79,6 +82,9 @@ step tests 150 "$python" -m pytest "${tests[@]}"
 step train "$whole" "${fprf[@]}" train "$method" "${data[@]}" "${time[@]}" --device "$device" --output "$work/run" "$@"
 step eval 40 "${fprf[@]}" eval "$work/run" --no-images --device "$device"
 step speed 130 "$python" -m benchmarks speed "$work/run" "${size[@]}" "${points[@]}" --device "$device" --output "$work/speed.json"
+step gaussians "$((whole + 600))" "${fprf[@]}" train fprf-splats "${photographs[@]}" "${time[@]}" --device "$device" \
+    --output "$work/gaussians"
+step eval-gaussians 60 "${fprf[@]}" eval "$work/gaussians" --no-images --device "$device"
 if [ "$long" != 0 ]; then
     step train-long 7200 "${fprf[@]}" train "$method" "${data[@]}" "${again[@]}" --device "$device" --output "$work/long" "$@"
     step eval-long 60 "${fprf[@]}" eval "$work/long" --no-images --device "$device"

@@ -2,8 +2,8 @@
 
     python -m benchmarks.gpu_rows WORK --output FILE
 
-WORK holds steps.jsonl, a log of each step and, as far as the steps came, run/metrics.json, speed.json
-and long/metrics.json. Rows of what is missing are left out. The exit status is 1 where a step failed.
+WORK holds steps.jsonl, a log of each step and, as far as the steps came, speed.json and the metrics.json of run, gaussians
+and long. Rows of what is missing are left out. The exit status is 1 where a step failed.
 """
 
 import argparse
@@ -45,6 +45,11 @@ def rows(work: Path, form: str) -> Iterator[Row]:
         about = f"{run['method']} on {run['scene']}, {run['train_steps']} steps, {run['views']} views judged"
         yield Row(name="training, features included", figure=run["train_seconds"] / 60, unit="min", note=about)
         yield Row(name="held-out PSNR", figure=run["psnr"], unit="dB", more_is_better=True, goal=26.0)
+    splats, log = read(work / "gaussians" / "metrics.json"), work / "gaussians.log"
+    if splats is not None:
+        by = "gsplat" if log.is_file() and "by gsplat" in log.read_text(errors="replace") else "the CPU's kernels"
+        note = f"by {by}, {splats['train_steps']} steps, {splats['train_seconds'] / 60:.1f} min"
+        yield Row(name="held-out PSNR of 3D Gaussians", figure=splats["psnr"], unit="dB", note=note, more_is_better=True)
     far = read(work / "long" / "metrics.json")
     if far is not None:
         note = f"{far['train_steps']} steps, {far['train_seconds'] / 60:.1f} min"

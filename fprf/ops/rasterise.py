@@ -3,7 +3,8 @@
 N Gaussians, K harmonics of a colour channel (1, 4, 9 or 16), C feature channels, H W pixels; H16 W16 whole tiles of them.
 
 `rasterise_reference` defines what is computed, in plain torch, for every device and dtype. On the CPU in float32 compiled
-kernels do (`rasterise_blocks`, `rasterise_kernels`, `rasterise_gradient_kernels`), by these steps:
+kernels do (`rasterise_blocks`, `rasterise_kernels`, `rasterise_gradient_kernels`), by the steps below; on CUDA in
+float32 gsplat does, where it is installed (`rasterise_gsplat`).
 
     project     mean -> image position and depth, Sigma' = J W Sigma W^T J^T + 0.3 I, colour from its harmonics
     bin         every Gaussian into the tiles of 16 x 16 pixels that it reaches, each tile sorted by depth
@@ -18,7 +19,7 @@ light passes (an error of at most 1/1000 of the largest value). Their exponentia
 # The checker takes compiled functions to have one argument.
 # mypy: disable-error-code="call-arg, attr-defined"
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -78,7 +79,7 @@ def rasterise(
         colours, fine = view_colours(means, harmonics, camera)
         logits = torch.where(fine, logits, torch.nan)  # what is not finite is not drawn
         behind = torch.cat([background, features.new_zeros(features.shape[1])])
-        planes, passing = rasterise_reference(
+        planes, passing = _form(*given)(
             *shape, logits, torch.cat([colours, features], -1), camera, behind, antialiased=antialiased
         )
         # In the kernels' order: colour, depth, features.
@@ -119,7 +120,7 @@ def lift(
             pixels = pixels.clone()
             centres, turns, sizes, densities = (each.clone() for each in shape)
             values = centres.new_zeros(len(centres), channels, requires_grad=True)
-            image, _ = rasterise_reference(
+            image, _ = _form(*shape, pixels)(
                 centres, turns, sizes, densities, values, camera, pixels.new_zeros(channels), antialiased=antialiased
             )
             (lifted,) = torch.autograd.grad((image[..., :-1] * pixels).sum(), values)
@@ -193,6 +194,17 @@ def _fits(*tensors: Tensor) -> bool:
     return compiled() and all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
 
 
+def _form(*tensors: Tensor) -> Callable[..., tuple[Tensor, Tensor]]:
+    """What draws where the kernels of the CPU don't: gsplat for float32 on a device where it works, else the plain form."""
+    device = tensors[0].device
+    if compiled() and device.type == "cuda" and all(x.dtype == torch.float32 for x in tensors):
+        from .rasterise_gsplat import rasterise_gsplat, usable
+
+        if usable(device):
+            return rasterise_gsplat
+    return rasterise_reference
+
+
 def _check(
     means: Tensor, quaternions: Tensor, log_scales: Tensor, logits: Tensor, harmonics: Tensor, features: Tensor | None
 ) -> None:
@@ -204,22 +216,6 @@ def _check(
         raise FprfError(
             f"Gaussians of shapes {given}: [N 3], [N 4], [N 3], [N], [N K 3] with K 1, 4, 9 or 16 and features [N C] fit"
         )
-
-
-def camera_array(camera: Pinhole, antialiased: bool) -> _Array:
-    """A camera as the kernels take it (see `rasterise_kernels`)."""
-    fx, fy, cx, cy = (float(camera.intrinsics[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    pose = camera.world_to_camera.double().cpu()
-    turn, shift = pose[:3, :3], pose[:3, 3]
-    # J is taken at most 15 % of the image beyond its edges: further out the linear projection stretches without bound.
-    limits = [
-        -cx / fx - 0.15 * camera.width / fx,
-        (camera.width - cx) / fx + 0.15 * camera.width / fx,
-        -cy / fy - 0.15 * camera.height / fy,
-        (camera.height - cy) / fy + 0.15 * camera.height / fy,
-    ]
-    place = [*turn.flatten().tolist(), *shift.tolist(), fx, fy, cx, cy, *(-turn.T @ shift).tolist()]
-    return np.array([*place, *limits, camera.near, float(antialiased)], np.float32)
 
 
 class _View(NamedTuple):
@@ -243,11 +239,14 @@ def _view(
 ) -> _View:
     from . import rasterise_kernels as kernels
     from .rasterise_blocks import FIXED, pack
+    from .rasterise_training import camera_array
     from .simd import LANES, aligned
 
+    # The kernels read blocks of LANES Gaussians, property by property; the last block is padded.
     bands, seen, whole = harmonics.shape[1], camera_array(camera, antialiased), -(-len(means) // LANES) * LANES
     blocks, splats = aligned(whole * (FIXED + 3 * bands)), aligned(whole * kernels.SLOTS)
     pack(*(x.detach().contiguous().numpy() for x in (means, quaternions, log_scales, logits, harmonics)), blocks)
+    # Project all Gaussians, leave out what cannot be seen, and list for each tile of 16 x 16 pixels those on it by depth.
     tiles = kernels.see(blocks, len(means), bands, seen, camera.width, camera.height, splats)
     counts = dict(zip(_SKIPPED, tiles.skipped.tolist(), strict=True)) | {"entries": len(tiles.ids), "saturated": 0}
     return _View(tiles, blocks, bands, seen, counts)
@@ -269,16 +268,19 @@ def _composite(
     """Channels last: colour, depth, features; the transmittance left; counts; and planes and transmittance of each group."""
     from . import rasterise_kernels as kernels
 
+    # One pass over the sorted lists of Gaussians for each group of channels: a kernel composites 4 or 8 at a time, and the
+    # transmittance is the same in all.
     tiles = view.tiles
     made: list[tuple[_Array, _Array]] = []
     saturated = 0
     for channels, values, stride, first in _groups(view, features):
         out, left = np.empty((channels, *_padded(tiles)), np.float32), np.empty(_padded(tiles), np.float32)
         behind = np.zeros(channels, np.float32)
-        if not made:
+        if not made:  # colour and depth come first; only colour has a background
             behind[:3] = background.detach().numpy()
         saturated = kernels.composite(tiles, channels, values, stride, first, behind, out.reshape(-1), left.reshape(-1))
         made.append((out, left))
+    # Off with the margin of whole tiles and the padding of the last group; the arrays in `made` keep both for gradients.
     planes = torch.cat([torch.from_numpy(out[:, : tiles.height, : tiles.width]) for out, _ in made])
     planes = planes[: 4 + features.shape[1]].permute(1, 2, 0)
     passing = torch.from_numpy(made[0][1][: tiles.height, : tiles.width].copy())

@@ -25,8 +25,8 @@ from .rasterise_blocks import FIXED
 from .rasterise_kernels import SIDE, SLOTS
 from .simd import LANES, aligned
 
-if TYPE_CHECKING:
-    from .rasterise import Pinhole
+if TYPE_CHECKING:  # it imports torch, which compilation need not wait for
+    from .rasterise_reference import Pinhole
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 
@@ -81,14 +81,28 @@ def target_of(
     antialiased: bool = True,
 ) -> Target:
     """A photograph in [0, 1] with its camera; pixels that are not valid do not count. None = all are, no sky is known."""
-    from .rasterise import camera_array  # here, as it imports torch, which compilation need not wait for
-
     width, height = camera.width, camera.height
     planes = _planes(colours, photometric.slack(width + -width % SIDE))
     used = None if valid is None or valid.all() else _planes(np.repeat(valid[..., None], 3, 2), 64)
     above = None if sky is None else _planes(sky[..., None], 0)
     blurred = photometric.blurred(planes, width, height)
     return Target(width, height, camera_array(camera, antialiased), planes, blurred, used, above)
+
+
+def camera_array(camera: "Pinhole", antialiased: bool) -> Floats:
+    """A camera as the kernels take it (see `rasterise_kernels`)."""
+    fx, fy, cx, cy = (float(camera.intrinsics[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    pose = camera.world_to_camera.double().cpu()
+    turn, shift = pose[:3, :3], pose[:3, 3]
+    # J is taken at most 15 % of the image beyond its edges: further out the linear projection stretches without bound.
+    limits = [
+        -cx / fx - 0.15 * camera.width / fx,
+        (camera.width - cx) / fx + 0.15 * camera.width / fx,
+        -cy / fy - 0.15 * camera.height / fy,
+        (camera.height - cy) / fy + 0.15 * camera.height / fy,
+    ]
+    place = [*turn.flatten().tolist(), *shift.tolist(), fx, fy, cx, cy, *(-turn.T @ shift).tolist()]
+    return np.array([*place, *limits, camera.near, float(antialiased)], np.float32)
 
 
 def _planes(image: NDArray[Any], behind: int) -> Floats:

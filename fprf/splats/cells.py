@@ -27,6 +27,7 @@ from ..datamanagers.scene import Scene
 from ..errors import CheckpointError
 from ..interfaces import Partition, State
 from ..ops.rasterise import lift
+from ..ops.rasterise_gsplat import usable
 from ..ops.rasterise_training import compile_beside
 from ..progress import Display
 from ..rendering.cameras import Cameras
@@ -34,14 +35,14 @@ from ..training import checkpoint
 from ..training.camera_optimizers import Tones
 from ..training.driver import Schedule
 from ..training.model import Facts
-from ..training.prepare import read_scene
+from ..training.prepare import device_of, read_scene
 from ..training.run import Run, known_of
 from ..training.tasks import WHOLE, Part, Task, digest_of, read_done, train_all
 from ..types import Cell
 from .config import GaussiansConfig
 from .gaussians import Gaussians, from_tensors, tensors_of
 from .initial import curve_order
-from .learner import MOVES, GaussianLearner, Stage
+from .learner import CPU, MOVES, GaussianLearner, Stage, left_out
 from .levels import in_view
 from .loading import refined
 from .photographs import cover, load_photographs, make_levels
@@ -77,9 +78,9 @@ def load_cells(root: Path) -> list[Cell]:
 class Cells(Partition):
     """A scene that is ready to be trained cell by cell."""
 
-    def __init__(self, config: GaussiansConfig, scene: Scene, saved: Facts | None) -> None:
-        self.config, self.scene = config, scene
-        self.compiling = compile_beside((config.degree + 1) ** 2)
+    def __init__(self, config: GaussiansConfig, scene: Scene, saved: Facts | None, *, device: torch.device = CPU) -> None:
+        self.config, self.scene, self.device = config, scene, device
+        self.compiling = [] if usable(device) else compile_beside((config.degree + 1) ** 2)
         self._facts = saved or light_and_poses(config, scene, lambda view: load_images(scene, config.background, [view])[0])
 
     @property
@@ -94,9 +95,9 @@ class Cells(Partition):
         cells = self.write(run)
         pixels = [sum(width * height for _, _, width, height in cell.windows.values()) for cell in cells]
         share = sum(pixels) / int(size[self.scene.train].prod(1).sum())
-        display.say(f"{len(cells)} cells, whose windows are {share:.2f} times the photographs")
+        display.say(f"{len(cells)} cells, whose windows are {share:.2f} times the photographs{left_out(self.device)}")
         order = sorted(range(len(cells)), key=lambda cell: -pixels[cell])
-        executor = config.executor.on("cpu").build()
+        executor = config.executor.on(self.device.type if usable(self.device) else "cpu").build()
         train_all(config, run, executor, open_cell, order, whole_share=config.overview, spent=spent, quiet=display.quiet)
         display.say(f"{unite(run.root, cells)} Gaussians")
 
@@ -133,7 +134,7 @@ class Overview(Part):
         scene, facts = read_scene(self.config, self.facts), self.facts
         scene = replace(scene, train=scene.train[:: self.every])
         held = other_views(scene, scene.train.tolist()) if facts.exposure or facts.centres else ()
-        return build(self.config, scene, replace(facts, held=held))
+        return build(self.config, scene, replace(facts, held=held), device=device_of(self.config.device))
 
     def is_intact(self) -> bool:
         """Verify the checkpoint, once for all cells. Raises CheckpointError where it is damaged."""
@@ -184,6 +185,7 @@ class CellPart(Part):
             stage=Stage(start.step, config.overview, 1.0),
             known=known_of(own, config.data, self.facts),
             origin="the whole scene",
+            device=device_of(config.device),
         )
         # Their moments go on, and their number grows as if it had from the beginning of the schedule.
         passed = min(config.overview / config.grow, 0.99)

@@ -19,13 +19,14 @@ from torch import Tensor
 
 from ..datamanagers.images import Image
 from ..datamanagers.scene import Scene, find_sightings, sparser
-from ..ops.rasterise_training import LOG_SCALES, MEANS, TrainableGaussians, compile_beside
+from ..ops.rasterise_gsplat import Trainable, usable
+from ..ops.rasterise_training import LOG_SCALES, MEANS, compile_beside
 from ..training.model import Facts, poses_of, tones_of
 from ..training.prepare import exposure_of, facts_of
 from ..training.run import known_of
 from .config import GaussiansConfig
 from .initial import Points, initial_points, projected, surroundings
-from .learner import GaussianLearner, LimitWidths
+from .learner import CPU, GaussianLearner, LimitWidths
 from .photographs import load_photographs, make_levels
 
 _SURROUNDINGS = 10
@@ -50,9 +51,11 @@ def build(
     scene: Scene,
     saved: Facts | None = None,
     progress: Callable[[int, int, str], None] | None = None,
+    *,
+    device: torch.device = CPU,
 ) -> GaussianLearner:
     """Load photographs, find the first points, and put a Gaussian at each; arguments as of `RunConfig.build`."""
-    compiling = compile_beside((config.degree + 1) ** 2)  # while images are read
+    compiling = [] if usable(device) else compile_beside((config.degree + 1) ** 2)  # while images are read
     # Few photographs get few Gaussians, which they would else learn by heart; cells bound theirs by the whole scene.
     if config.cells == 1:
         pixels = int(scene.cameras.size[scene.train].prod(1).sum())
@@ -83,6 +86,7 @@ def build(
         poses=poses_of(facts, 1.0),
         known=known_of(scene, config.data, facts),
         origin=origin,
+        device=device,
     )
     learner.begin_at(points, draw, far)
     if compiling and progress is not None:
@@ -126,7 +130,7 @@ def limit_widths(scene: Scene, near: float, *, cells: bool, sphere: _Sphere | No
         some = centres[apart <= 1.001 * (apart.amin() + 2 * radius)]
         return torch.cdist(points, some, compute_mode="donot_use_mm_for_euclid_dist").amin(1)
 
-    def limit(gaussians: TrainableGaussians, step: int) -> None:
+    def limit(gaussians: Trainable, step: int) -> None:
         # Seen from beside, a wide one of the surroundings would be drawn before the scene.
         if sphere is not None and step % _SPHERE_EVERY == 0:
             square = np.square(gaussians.read(MEANS) - sphere.centre.numpy()).sum(1)
