@@ -170,6 +170,7 @@ class Session:
         """Do what a client asks for. Raises FprfError with what is wrong with it."""
         match message:
             case messages.View():
+                # Browsers draw Gaussians themselves; a field is drawn here.
                 if self._painter is not None:
                     cameras_of([message.camera])  # refused where it is none
                     request = Request(message.camera, self.state.shown, self._longest, message.captured)
@@ -185,6 +186,7 @@ class Session:
             case messages.Card():
                 self.apply(lambda state: _carded(state, message))
             case messages.Pick():
+                # The place is a share of the canvas; its right and lower edges belong to the last pixels.
                 cameras = cameras_of([message.camera], longest=1000)
                 width, height = cameras.size[0].tolist()
                 at = (min(message.x * width, width - 1e-3), min(message.y * height, height - 1e-3))
@@ -194,6 +196,7 @@ class Session:
             case messages.Map():
                 self.apply(lambda state: replace(state, map=message.map))
             case messages.Keep():
+                # A kept look of Gaussians becomes a style of the page, with colours of its own.
                 self.apply(lambda state: _kept(state, message))
                 if message.action == "keep" and isinstance(self.viewed.scene, SplatScene):
                     self._worker.run(("kept", message.name), lambda: self._colour(message.name, Shown(self.state.look)))
@@ -218,6 +221,7 @@ class Session:
 
     def apply(self, change: Callable[[State], State]) -> None:
         """Replace the state for all clients. Raises what `change` raises."""
+        # Clients change the state one after the other, each what the one before it left.
         with self._lock:
             before, self.state = self.state, change(self.state)
             now = self.state
@@ -235,6 +239,7 @@ class Session:
         path = self.uploads.store(data)
 
         def add() -> Photograph:
+            # Names tell photographs apart on the page: an equal one gets a number.
             taken = {photograph.name for photograph in self.state.shelf}
             plain = shown_name(name)
             unused = plain if plain not in taken else next(each for n in count(2) if (each := f"{plain} ({n})") not in taken)
@@ -277,6 +282,7 @@ class Session:
             self.viewed = viewed
             before = self.restyler.reload(viewed.scene)
             self._load()
+            # Clients fetch shapes and colours anew: Gaussians of this state are others.
             self._colours.clear()
             for kind, message in self.hello():
                 self._post(None, kind, message)
@@ -312,6 +318,7 @@ class Session:
                 before.unlink()
             path = self.uploads.folder / f"restyled-{next(self._version)}.ply"
             shown = scene.restyled(self.restyler.restyle(self.state.look)).shown
+            # Of a capture all but the colours stays as it was in its file.
             if viewed.capture is None:
                 write_gaussians(path, shown, antialiased=scene.antialiased, views=scene.views, plain=True, origin=scene.origin)
             else:
