@@ -20,7 +20,7 @@ Rows = Iterable[Iterable[str]]
 
 def splat_training(found: Any) -> Rows:
     """Training of Gaussians: what was trained for how long, and how near it comes."""
-    yield "capture", "wall time", "steps", "Gaussians", "PSNR", "SSIM", "memory"
+    yield "capture", "wall time", "steps", "Gaussians", "PSNR", "SSIM", "LPIPS", "memory"
     for row in found.values():
         size = re.search(r"--downscale (\d+)", row["command"])
         yield (
@@ -30,6 +30,7 @@ def splat_training(found: Any) -> Rows:
             str(row["gaussians"]),
             f"{row['psnr']:.2f} dB",
             f"{row['ssim']:.3f}",
+            f"{row['lpips']:.3f}" if "lpips" in row else "",
             "not measured" if row["peak_rss_mib"] is None else f"{row['peak_rss_mib']:.0f} MiB",
         )
 
