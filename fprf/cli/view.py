@@ -84,20 +84,20 @@ def run(args: list[str]) -> int:
 
             references = photographs(references, say)
         print(server.address, flush=True)
-        if path is None:
-            stack.callback(_start(server, config, references).close)
-        else:
-
-            def load() -> "Viewed":
-                return _load(config, path, None, server.notify)
-
-            session = None if config.follow else server.open(load, references, config.pixels)
-            if not is_capture(path):
-                from ..page.follow import TrainingFollower
-
-                # A run that is in training: the scene is loaded anew with each checkpoint.
-                stack.enter_context(TrainingFollower(server, path, load, session, config.pixels))
         try:
+            if path is None:
+                stack.callback(_start(server, config, references).close)
+            else:
+
+                def load() -> "Viewed":
+                    return _load(config, path, None, server.notify)
+
+                session = None if config.follow else server.open(load, references, config.pixels)
+                if not is_capture(path):
+                    from ..page.follow import TrainingFollower
+
+                    # A run that is in training: the scene is loaded anew with each checkpoint.
+                    TrainingFollower(server, path, load, session, config.pixels).run()
             threading.Event().wait()
         except KeyboardInterrupt:
             # Whatever a thread is in the middle of, the terminal comes back.

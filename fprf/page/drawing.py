@@ -302,18 +302,6 @@ def film_cameras(plan: FilmPlan) -> Cameras:
     return interpolate(keys, torch.arange(len(plan.keys)), plan.gap - 1)
 
 
-def new_folder(root: Path) -> Path:
-    """Make a folder for the next film of a run: RUN/films/0001 and so on."""
-    number = 1
-    while True:
-        folder = root / "films" / f"{number:04d}"
-        try:
-            folder.mkdir(parents=True)
-            return folder
-        except FileExistsError:
-            number += 1
-
-
 def write_film_files(
     folder: Path,
     plan: FilmPlan,

@@ -3,10 +3,10 @@ looks the folder says so (`training.driver.watch`), for which training saves mor
 """
 
 import json
-import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..errors import FprfError
 from ..training.driver import schedule_of, watch
@@ -24,7 +24,7 @@ _TAIL = 4096
 
 
 class TrainingFollower:
-    """Keeps the scene that a server shows at the newest checkpoint of a run. A context manager, which ends its thread.
+    """Keeps the scene that a server shows at the newest checkpoint of a run.
 
     `load` opens the run, and `opened` is the session where it is open already; without, it is opened at the first checkpoint.
     """
@@ -39,19 +39,11 @@ class TrainingFollower:
     ) -> None:
         self._server, self._root, self._load, self._session, self._pixels = server, root, load, opened, pixels
         self._shown = -1 if opened is None else opened.viewed.step
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._follow, name="fprf-follow", daemon=True)
 
-    def __enter__(self) -> "TrainingFollower":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self._thread.join(5)
-
-    def _follow(self) -> None:
-        while not self._over.wait(_POLL):
+    def run(self) -> NoReturn:
+        """Follow until interrupted."""
+        while True:
+            time.sleep(_POLL)
             try:
                 self.tick()
             except (FprfError, OSError) as error:  # the page says so; the next checkpoint may be better

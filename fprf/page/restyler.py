@@ -104,6 +104,7 @@ def set_rule(look: Look, region: int, action: RegionAction | None, photograph: P
 
     A region for which every photograph would be forbidden loses its rules instead.
     """
+    # Rules of other regions stay.
     mine = {rule for rule in look.rules if rule.region == region}
     rest = look.rules - mine
     if action is None:
@@ -240,6 +241,7 @@ class Restyler:
 
     def region_info(self, look: Look, region: int) -> RegionInfo:
         """Return the style that a region takes in a look."""
+        # A region stands for its points: its key is matched as they are.
         scene, styled = self.encoders.scene_style, self.styled(look)
         taken: list[tuple[str, float]] = []
         if styled is not None:

@@ -84,6 +84,7 @@ class Access:
 
     def refusal(self, headers: Mapping[str, str], given: str | None = None) -> str | None:
         """Return why a request is refused, or None. Header names are lower case; `given` is a token in the address."""
+        # A name that leads here by somebody else's DNS is not one of this machine (rebinding).
         name = headers.get("host", "")
         try:
             host = urlsplit(f"//{name}").hostname or ""
@@ -91,12 +92,14 @@ class Access:
             host = ""
         if not name or (is_loopback(self.host) and not is_loopback(host)):
             return f"this viewer does not go by the name {name!r}; open it by the address that it printed"
+        # Browsers say whose page asks; programs that are no browser say nothing, and have the token alone to pass.
         origin = headers.get("origin")
         if origin is not None and origin not in (f"http://{name}", f"https://{name}"):
             return "another site may not talk to this viewer"
         if self.token is None:
             return None
         kept = cookie_parser(headers.get("cookie", "")).get(COOKIE)
+        # Compared in constant time: how long it takes tells nothing of how much is right.
         shown = given or kept or headers.get("authorization", "").removeprefix("Bearer ")
         if hmac.compare_digest(shown.encode(), self.token.encode()):
             return None
@@ -222,6 +225,7 @@ class ViewerServer:
             fault = f"--host {access.host} --port {port}: cannot listen there ({error.strerror}); choose another port"
             raise UsageError(fault) from error
         self.port: int = listener.getsockname()[1]
+        # Bounded connections, heads and messages; no proxy is believed, and nothing of a request is logged.
         config = uvicorn.Config(
             self._make_app(),
             loop="asyncio",
@@ -248,6 +252,7 @@ class ViewerServer:
 
     def __exit__(self, *_: object) -> None:
         self._close_session()
+        # Open WebSockets would hold an orderly end up for ever.
         self._server.force_exit = self._server.should_exit = True
         self._thread.join(5)
 
@@ -348,6 +353,7 @@ class ViewerServer:
             raise HTTPException(503, "too many pages; close one and try again")
         await socket.accept()
         self._loop = asyncio.get_running_loop()
+        # From here on it hears what is posted to all, beginning with what is shown now.
         number, client = next(self._numbers), Client()
         self._clients[number] = client
         for kind, message in self._hello():

@@ -37,7 +37,6 @@ from .drawing import (
     cameras_of,
     film_frames,
     gaussian_colours,
-    new_folder,
     write_film_files,
 )
 from .pack import colour_header, colour_section, container
@@ -171,6 +170,7 @@ class Session:
         """Do what a client asks for. Raises FprfError with what is wrong with it."""
         match message:
             case messages.View():
+                # Browsers draw Gaussians themselves; a field is drawn here.
                 if self._painter is not None:
                     cameras_of([message.camera])  # refused where it is none
                     request = Request(message.camera, self.state.shown, self._longest, message.captured)
@@ -186,6 +186,7 @@ class Session:
             case messages.Card():
                 self.apply(lambda state: _carded(state, message))
             case messages.Pick():
+                # The place is a share of the canvas; its right and lower edges belong to the last pixels.
                 cameras = cameras_of([message.camera], longest=1000)
                 width, height = cameras.size[0].tolist()
                 at = (min(message.x * width, width - 1e-3), min(message.y * height, height - 1e-3))
@@ -195,6 +196,7 @@ class Session:
             case messages.Map():
                 self.apply(lambda state: replace(state, map=message.map))
             case messages.Keep():
+                # A kept look of Gaussians becomes a style of the page, with colours of its own.
                 self.apply(lambda state: _kept(state, message))
                 if message.action == "keep" and isinstance(self.viewed.scene, SplatScene):
                     self._worker.run(("kept", message.name), lambda: self._colour(message.name, Shown(self.state.look)))
@@ -219,6 +221,7 @@ class Session:
 
     def apply(self, change: Callable[[State], State]) -> None:
         """Replace the state for all clients. Raises what `change` raises."""
+        # Clients change the state one after the other, each what the one before it left.
         with self._lock:
             before, self.state = self.state, change(self.state)
             now = self.state
@@ -236,6 +239,7 @@ class Session:
         path = self.uploads.store(data)
 
         def add() -> Photograph:
+            # Names tell photographs apart on the page: an equal one gets a number.
             taken = {photograph.name for photograph in self.state.shelf}
             plain = shown_name(name)
             unused = plain if plain not in taken else next(each for n in count(2) if (each := f"{plain} ({n})") not in taken)
@@ -278,6 +282,7 @@ class Session:
             self.viewed = viewed
             before = self.restyler.reload(viewed.scene)
             self._load()
+            # Clients fetch shapes and colours anew: Gaussians of this state are others.
             self._colours.clear()
             for kind, message in self.hello():
                 self._post(None, kind, message)
@@ -313,6 +318,7 @@ class Session:
                 before.unlink()
             path = self.uploads.folder / f"restyled-{next(self._version)}.ply"
             shown = scene.restyled(self.restyler.restyle(self.state.look)).shown
+            # Of a capture all but the colours stays as it was in its file.
             if viewed.capture is None:
                 write_gaussians(path, shown, antialiased=scene.antialiased, views=scene.views, plain=True, origin=scene.origin)
             else:
@@ -369,7 +375,7 @@ class Session:
         def work() -> Steps[None]:
             try:
                 picture = yield from self._frame(cameras, 0, self.restyler.restyle(self.state.look))
-                path = next(each for n in count(1) if not (each := folder / f"{n:04d}.png").exists())
+                path = _unused(folder, ".png")
                 folder.mkdir(parents=True, exist_ok=True)
                 write_image(path, picture)
             except FprfError as error:
@@ -386,7 +392,8 @@ class Session:
                 raise UsageError("film: one is being made; wait for it")
             if self.viewed.root is None:
                 raise UsageError("this scene has no folder to put a film in")
-            folder, scene = new_folder(self.viewed.root), self.viewed.scene
+            folder, scene = _unused(self.viewed.root / "films"), self.viewed.scene
+            folder.mkdir(parents=True)
             write_film_files(folder, plan, scene.semantic_encoder, self.viewed.stylizer, scene.origin)
             self.apply(lambda state: replace(state, film=(0, 1, None)))
 
@@ -446,6 +453,11 @@ class Session:
             "film": {"done": state.film[0], "total": state.film[1], "ready": state.film[2] is not None},
             "pictures": len(state.pictures),
         }
+
+
+def _unused(folder: Path, ending: str = "") -> Path:
+    """The next film or picture: 0001 and so on."""
+    return next(each for number in count(1) if not (each := folder / f"{number:04d}{ending}").exists())
 
 
 def _added(state: State, photograph: Photograph) -> State:

@@ -112,6 +112,7 @@ class Start:
                 self._uploads[name] = SceneFiles(self._output / name / _FILES)
                 return {"scene": name}
             case Make():
+                # The folder came with the first file that was taken: none of those that were sent may have been.
                 folder = self._upload(asked.scene).folder
                 if not folder.is_dir():
                     raise UsageError("none of these files can become a scene; give photographs, a video or a capture")
@@ -147,6 +148,7 @@ class Start:
         with self._lock:
             if self._thread is not None and self._thread.is_alive():
                 raise UsageError(f"{self._progress.name} is being made; stop it first")
+            # One scene is made at a time: training takes all cores.
             self._stopped, self._picture = "", (-1, b"")
             folder = self._output / name if source.kind != "run" else source.path
             self._progress = Progress(name=name, stage="opening", folder=str(folder))
@@ -254,6 +256,7 @@ class Start:
 
     def _recent(self) -> list[dict[str, str]]:
         """Scenes and runs on this machine, the newest first."""
+        # Runs of the terminal lie in `runs`, that of the demo in its folder.
         runs = [(path.parent, path.parent.name) for path in Path("runs").glob("*/config.json") if newest_step(path.parent) >= 0]
         found = [*runs, (Path("demo/run"), "demo")]
         for folder in self._output.glob("*/"):  # a scene's run, or its files where there is none yet
@@ -273,6 +276,7 @@ class Start:
         from ..training.loading import open_run
         from ..training.quality import QualityConfig
 
+        # On the CPU, since training has the GPU; of a view that it does not see.
         opened = open_run(run, "cpu", QualityConfig())
         views = opened.known.test or opened.known.train
         view = views[len(views) // 2]

@@ -212,11 +212,13 @@ def find_source(path: Path) -> Source:
     if not path.is_dir():
         raise DataError(f"{path}: no scene can be made of it; give {_kinds()}")
     files = [each for each in path.rglob("*") if each.is_file() and not each.name.startswith(".")]
+    # Photographs with poses need no `fprf process`, whatever else lies beside them.
     try:
         recognise(path)
         return Source("scene", path)
     except DataError:
         pass  # its photographs have no poses
+    # Several photographs are a scene; a single video or capture is one where no photographs say otherwise.
     photographs = [each for each in files if each.suffix.lower() in IMAGE_SUFFIXES]
     if len(photographs) >= _FEWEST:
         return Source("photographs", path)
@@ -246,6 +248,7 @@ def check_file(name: str, head: bytes, size: int) -> None:
         return
     # Poses and descriptions of captures in parts are JSON alike; any other capture is known by its format.
     capture = suffix != ".json" and format_name(Path(name)) is not None
+    # What each ending must begin with; one that is not in here is not taken.
     whole = {
         **({suffix: format_of(Path(name)).recognises(head, size)} if capture else {}),
         ".npz": head.startswith(b"PK"),
@@ -294,10 +297,12 @@ class SceneFiles:
                     raise DataError(f"{path.name}: the disk of {self.folder} is full; make room there")
                 self._files, self._bytes = self._files + 1, self._bytes + size
                 part.unlink(missing_ok=True)
+            # Pieces come in their order, so that a file's own size says how far it is.
             written = part.stat().st_size if part.is_file() else 0
             if written != at or at + len(data) > size or (at > 0 and not data):
                 raise UsageError(f"{path.name}: a piece at byte {at} of {size}, where {written} are there; send it again")
             with part.open("ab") as file:
                 file.write(data)
+            # It gets its name when it is whole, in one step.
             if at + len(data) == size:
                 os.replace(part, path)

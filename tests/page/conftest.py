@@ -4,15 +4,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from pages import seen
 from session_helpers import Listener
 from splat_ball import ball
 from tiny_world import World
 
 from fprf.page.restyler import Photograph, Restyler
 from fprf.page.session import Session, Viewed, view_of_run
-from fprf.plugins.encoders.config import BundledSemanticConfig
-from fprf.splats.config import LookConfig
-from fprf.splats.scene import look_at_capture
 from fprf.training.loading import open_run
 
 
@@ -42,7 +40,5 @@ def session(run: Path, listener: Listener) -> Iterator[Session]:
 @pytest.fixture
 def splats(listener: Listener, tmp_path: Path) -> Iterator[Session]:
     """A session of a ball of Gaussians."""
-    config = LookConfig(views=4, size=(64, 48), inside=False)
-    scene = look_at_capture(ball(400, 2), True, BundledSemanticConfig().build(), config)
-    with Session(Viewed(scene, "ball", 1, tmp_path / "ball"), listener.post, longest=64) as opened:
+    with Session(Viewed(seen(ball(400, 2)), "ball", 1, tmp_path / "ball"), listener.post, longest=64) as opened:
         yield opened

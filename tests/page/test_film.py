@@ -14,7 +14,7 @@ from fprf.errors import UsageError
 from fprf.io.images import Picture
 from fprf.page import messages
 from fprf.page import session as viewer_session
-from fprf.page.drawing import FieldPainter, film_cameras, film_frames, new_folder, write_film_files
+from fprf.page.drawing import FieldPainter, film_cameras, film_frames, write_film_files
 from fprf.page.restyler import Look, Photograph, Restyler, set_rule
 from fprf.page.session import Session
 
@@ -35,7 +35,8 @@ def test_the_film_is_what_fprf_render_makes_of_its_folder(
     one = set_rule(Look(mix=((a, 1.0),), clusters=3), 0, "keep")
     two, faint = Look(mix=((b, 1.0),), clusters=3), Look(mix=((a, 1.0),), clusters=3, strength=0.75)
     plan = plan_of(scene, [Look(), one, two, faint, one])
-    folder = new_folder(run)
+    folder = run / "films" / "0001"
+    folder.mkdir(parents=True)
     write_film_files(folder, plan, scene.known.facts.semantic_encoder)
     rows = json.loads((folder / "keys.json").read_text())["keyframes"]
     numbers = (None, 1, 2, 3, 1)  # one file a look
@@ -54,12 +55,10 @@ def test_the_film_is_what_fprf_render_makes_of_its_folder(
 
 
 def test_paths_pass_through_their_keys(world: World) -> None:
-    scene = world.load()
-    plan = plan_of(scene, [Look()] * 4, seconds=0.2, fps=25)
+    plan = plan_of(world.load(), [Look()] * 4, seconds=0.2, fps=25)
     path = film_cameras(plan)
     assert len(path) == 3 * 5 + 1 and path.size[0].tolist() == [32, 24]
-    for i, key in enumerate(plan.keys):
-        assert np.allclose(path.pose[5 * i, :, 3], key.camera.place, atol=1e-9)
+    assert np.allclose(path.pose[::5, :, 3], [key.camera.place for key in plan.keys], atol=1e-9)
     assert len(film_cameras(plan._replace(keys=plan.keys[:1]))) == 1
     for change in ({"keys": ()}, {"seconds": 400.0}):
         with pytest.raises(UsageError, match="film"):
