@@ -81,12 +81,13 @@ def run(args: list[str]) -> int:
     config, file = read_flags(RestyleConfig(), args, prog="fprf restyle", description=_DESCRIPTION, positional=("captures",))
     outputs = _outputs(config)
     from ..memory import peak
-    from ..splats.captures import light_alone, open_captures
+    from ..splats.captures import light_alone, neighbouring_light, open_captures
     from ..splats.files import Written, read_capture, write_capture
     from ..style.regions import Regions
     from ..style.restyle import apply_style
 
     begun = time.perf_counter()
+    photographed = file.style.references
     file = _with_views(config, file)
     config = replace(config, references=file.style.references)
     with Display() as display:
@@ -97,11 +98,15 @@ def run(args: list[str]) -> int:
         scene = seen.scene
         scene.found()  # views are encoded now, or read from the cache: the time is reported apart from that of styles
         looked = time.perf_counter() - begun
+        gain = None
+        if config.match_light and photographed and all(format_name(path) is not None for path in photographed):
+            gain = neighbouring_light(seen, photographed)
+            display.say(f"--match-light: {'where the captures meet' if gain is not None else 'by the means of all colours'}")
         named, made, encoders = _styles(config, file), list[_Restyled](), scene.encoders()
         for name, each in named:
             start = time.perf_counter()
             styled = apply_style(scene, each, encoders)
-            styled = light_alone(styled) if config.match_light else styled
+            styled = light_alone(styled, gain) if config.match_light else styled
             made.append(_Restyled(name, styled, scene.restyled(styled.restyle), time.perf_counter() - start))
         # File by file, each in all styles: one of them is in memory at a time.
         written, faults, count, steps = Written(), dict[str, None](), 0, len(config.captures) * len(named)

@@ -185,7 +185,10 @@ class Source(NamedTuple):
 
 
 def _kinds() -> str:
-    return f"photographs, a video, or a capture of 3D Gaussians ({' '.join(sorted(f'.{each}' for each in endings()))})"
+    from ..splats.files.base import format_of  # imports torch
+
+    readable = sorted(ending for ending in endings() if format_of(Path(f"x{ending}")).reads)
+    return f"photographs, a video, or a capture of 3D Gaussians ({' '.join(readable)})"
 
 
 def is_capture(path: Path) -> bool:

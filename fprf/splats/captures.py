@@ -39,6 +39,8 @@ _VIEW, _SOLID = (480, 360), 0.95
 """Size of views in the place of photographs; opacity from which on their pixels count."""
 _GAP = 0.1
 """Distance between captures that would overlap, as a share of their width, where they are put in a row."""
+_SHARED, _ENOUGH, _ALIKE = 24, 64, 0.4
+"""Cells that captures share, at least and enough, and correlation of their brightness there: then they are of one place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,10 +162,54 @@ def _joined(parts: Sequence[Gaussians]) -> Gaussians:
     return Gaussians(*(torch.cat(each) for each in zip(*(vars(part).values() for part in same), strict=True)))
 
 
-def light_alone(styled: Styled) -> Styled:
+def neighbouring_light(captures: Captures, references: Sequence[Path]) -> Annotated[Tensor, "3"] | None:
+    """Gains of colours + 0.055 that take captures to the light of other captures which they overlap or border on.
+
+    Found where both have Gaussians in one cell, so that what only one of them shows has no part in it: the median over cells.
+    None where they share too few cells, or where their colours in these have nothing in common: then they are not of one place.
+    """
+    own = captures.scene.gaussians
+    means = own.means.clone()
+    for rows, by in zip(captures.rows, captures.moved, strict=True):
+        means[rows] -= by
+    others = [read_capture(path) for path in references]
+    parts = [sampled(other.gaussians.drawable(), SAMPLE // len(others)) for other in others]
+    shifts = [[a - b for a, b in zip(other.origin, captures.scene.origin, strict=True)] for other in others]
+    theirs = torch.cat([part.means + torch.tensor(shift) for part, shift in zip(parts, shifts, strict=True)])
+    places = torch.cat([means, theirs])
+    colours = (torch.cat([own.colours, *(part.colours for part in parts)]).double().clamp(0, 1) + _BLACK).log()
+    # What can be seen counts, by its opacity.
+    weight = torch.cat([own.opacities, *(part.opacities for part in parts)]).double()
+    low, edge = means.amin(0), (bulk_of(means.numpy()).side or 1.0) / _FINEST
+    gain, most = None, _SHARED - 1
+    for level in range(_LEVELS - 2):
+        cell = torch.unique(cells_of(places, low, edge * 2**level), return_inverse=True)[1]
+        count = int(cell.max()) + 1
+        # Of each cell the mean colour of either side.
+        sides = []
+        for rows in (slice(0, len(means)), slice(len(means), None)):
+            share = torch.zeros(count).double().index_add_(0, cell[rows], weight[rows])
+            sums = torch.zeros(count, 3).double().index_add_(0, cell[rows], weight[rows, None] * colours[rows])
+            sides.append((share, sums))
+        both = (sides[0][0] > 0.5) & (sides[1][0] > 0.5)
+        if int(both.sum()) <= most:
+            continue
+        before, after = (sums[both] / share[both, None] for share, sums in sides)
+        alike = torch.corrcoef(torch.stack([before.mean(1), after.mean(1)]))[0, 1]
+        if not alike > _ALIKE:
+            continue
+        gain, most = (after - before).median(0).values.exp(), int(both.sum())
+        # The smaller the cells, the more alike are the things in them.
+        if most >= _ENOUGH:
+            break
+    return gain
+
+
+def light_alone(styled: Styled, gain: Annotated[Tensor, "3"] | None = None) -> Styled:
     """A style as its exposure and white balance alone: one gain a channel, in linear light, for the whole scene.
 
-    It takes the scene's mean colour, of logarithms, to that of the references. Of one place, both are of the same materials.
+    Without a known `gain` it takes the scene's mean colour, of logarithms, to that of the references: right where both are of
+    the same materials.
     """
     style, dictionary, regions = styled.scene_style, styled.dictionary, len(styled.scene_style.keys)
     if dictionary.colour_mean is None:
@@ -173,7 +219,7 @@ def light_alone(styled: Styled) -> Styled:
     before, after = (
         (share.double() / share.double().sum()) @ (colour.double().clamp(0, 1) + _BLACK).log() for colour, share in sides
     )
-    gain = (after - before).exp()
+    gain = (after - before).exp() if gain is None else gain
     maps = ColourMaps(style, gain.diag().expand(regions, 3, 3), (_BLACK * (gain - 1)).expand(regions, 3), 1.0)
     return styled._replace(restyle=replace(styled.restyle, colours=maps, light=None, places=()))
 
@@ -218,7 +264,7 @@ class Neighbours:
         self.edge = (bulk_of(points.numpy()).side or 1.0) / _FINEST
         self.levels = []
         for level in range(_LEVELS):
-            keys, cell = torch.unique(self._cells(points, level), return_inverse=True)
+            keys, cell = torch.unique(cells_of(points, self.low, self.edge * 2**level), return_inverse=True)
             # A level has the means of its cells, by the sorted numbers of these.
             sums = torch.zeros(len(keys), features.shape[1]).index_add_(0, cell, features.float())
             self.levels.append((keys, (sums / cell.bincount()[:, None]).half()))
@@ -228,7 +274,7 @@ class Neighbours:
         out = self.fallback.half().expand(len(places), -1).clone()
         left = torch.arange(len(places))
         for level, (keys, means) in enumerate(self.levels):
-            cells = self._cells(places[left], level)
+            cells = cells_of(places[left], self.low, self.edge * 2**level)
             # Those without a cell at this level ask the next, where cells are twice as wide.
             at = torch.searchsorted(keys, cells).clamp_max(len(keys) - 1)
             found = keys[at] == cells
@@ -236,7 +282,8 @@ class Neighbours:
             left = left[~found]
         return out
 
-    def _cells(self, places: Annotated[Tensor, "N 3"], level: int) -> Annotated[Tensor, "N"]:
-        """Numbers of cells; places far outside share those at the border."""
-        cell: Tensor = ((places - self.low) / (self.edge * 2**level)).clamp(-1, 2.0**20).long() + 1
-        return (cell[:, 0] << 42) + (cell[:, 1] << 21) + cell[:, 2]
+
+def cells_of(places: Annotated[Tensor, "N 3"], low: Annotated[Tensor, "3"], edge: float) -> Annotated[Tensor, "N"]:
+    """Numbers of cells that begin at `low`; places far outside share those at the border."""
+    cell: Tensor = ((places - low) / edge).clamp(-1, 2.0**20).long() + 1
+    return (cell[:, 0] << 42) + (cell[:, 1] << 21) + cell[:, 2]

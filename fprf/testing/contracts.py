@@ -423,7 +423,7 @@ def check_capture_format(form: "CaptureFormat") -> None:
 
     check_config(form)
     name, path = type(form).__name__, Path("capture")
-    if not form.writes:
+    if not (form.reads and form.writes):
         try:
             form.read(path, b"")
         except DataError:

@@ -14,10 +14,11 @@ from splat_ball import ball
 
 from benchmarks.town.write import write_town
 from fprf.cli import main as cli
+from fprf.io.images import srgb_to_linear
 from fprf.ops.harmonics import HARMONIC
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.plugins.stylizers.config import RegionToneConfig
-from fprf.splats.captures import Neighbours, open_captures, sampled
+from fprf.splats.captures import Neighbours, neighbouring_light, open_captures, sampled
 from fprf.splats.config import GaussianSemanticsConfig, LookConfig
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.gaussians import Gaussians
@@ -154,22 +155,86 @@ main.main(sys.argv[1:])
     assert cli.main(words) == 0 and len(read_capture(tmp_path / "out.ply").gaussians) == 300
 
 
+def town(folder: Path, light: str) -> Gaussians:
+    """The surface points of the town as Gaussians."""
+    write_town(folder / light, seed=3, palette=light, views=24, width=120, height=90)
+    points = np.load(folder / light / "points.npz")
+    means = torch.from_numpy(points["xyz"])
+    sizes = torch.cdist(means, means).topk(4, largest=False).values[:, 1:].mean(1).clamp(0.02, 1.0).log() - 0.3
+    turns = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(len(means), 4)
+    harmonics = ((torch.from_numpy(points["rgb"]) / 255 - 0.5) / HARMONIC)[:, None]
+    return Gaussians(means, turns, sizes[:, None].expand(-1, 3), torch.full((len(means),), 4.0), harmonics)
+
+
+TOWN = [
+    "--up",
+    "0",
+    "0",
+    "1",
+    "--semantic.encoder",
+    "bundled-semantic",
+    "--regions",
+    "8",
+    "--views",
+    "12",
+    "--size",
+    "160",
+    "120",
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("gain", [(1.3, 0.9, 0.55), (0.6, 0.6, 0.6)])
+def test_two_halves_in_different_light_meet_without_a_step(
+    axis: int, gain: tuple[float, float, float], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The step across the seam is at most 1.2 times the error inside, and both are far below the difference as captured."""
+    made = town(tmp_path, "day")
+    made = made.recoloured(((made.colours.clamp(0, 1) - 0.5) / HARMONIC)[:, None])
+    along = made.means[:, axis]
+    seam = along.median()
+    first, second = made.select(along < seam), made.select(along >= seam)
+    linear = srgb_to_linear(second.colours.numpy()) * np.array(gain)
+    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    other = second.recoloured(((torch.from_numpy(shown).float() - 0.5) / HARMONIC)[:, None])
+    write_gaussians(tmp_path / "first.ply", first)
+    write_gaussians(tmp_path / "second.ply", other)
+    words = ["restyle", str(tmp_path / "second.ply"), "--references", str(tmp_path / "first.ply"), *TOWN]
+    words += ["--cache", str(tmp_path / "cache"), "--match-light", "true", "--output", str(tmp_path / "out.ply")]
+    assert cli.main(words) == 0
+    assert "where the captures meet" in capsys.readouterr().err
+    error = read_capture(tmp_path / "out.ply").gaussians.colours.clamp(0, 1) - second.colours.clamp(0, 1)
+    near = second.means[:, axis] - seam < 0.05 * (along.max() - along.min())
+    step, inside = (float(part.square().mean().sqrt()) for part in (error[near], error[~near]))
+    before = float((other.colours.clamp(0, 1) - second.colours.clamp(0, 1)).square().mean().sqrt())
+    assert step <= 1.2 * inside and inside < 0.3 * before
+
+
+def test_captures_of_different_places_have_no_light_in_common(tmp_path: Path) -> None:
+    made = ball(3000)
+    write_gaussians(tmp_path / "a.ply", made)
+    seen = open_captures([tmp_path / "a.ply"], look(), cache=tmp_path / "cache")
+    gain = torch.tensor([1.1, 0.9, 0.7])
+    for name, others, wanted in (
+        ("same", made.colours, gain),
+        ("other", made.colours[torch.randperm(3000)], None),
+    ):
+        other = made.recoloured((((others + 0.055) * gain - 0.055 - 0.5) / HARMONIC)[:, None])
+        write_gaussians(tmp_path / f"{name}.ply", other)
+        found = neighbouring_light(seen, [tmp_path / f"{name}.ply"])
+        assert found is wanted is None or torch.allclose(found.float(), wanted, atol=1e-3)
+    write_gaussians(tmp_path / "far.ply", replace(made, means=made.means + 50))
+    assert neighbouring_light(seen, [tmp_path / "far.ply"]) is None
+
+
 @pytest.mark.slow
 def test_the_town_in_another_light_comes_3_db_nearer_to_the_truth(tmp_path: Path) -> None:
     """Its surface points as Gaussians, by day and at sunset; the truth is the same points by day."""
-    made: dict[str, Gaussians] = {}
-    for light in ("day", "sunset"):
-        write_town(tmp_path / light, seed=3, palette=light, views=24, width=120, height=90)
-        points = np.load(tmp_path / light / "points.npz")
-        means = torch.from_numpy(points["xyz"])
-        sizes = torch.cdist(means, means).topk(4, largest=False).values[:, 1:].mean(1).clamp(0.02, 1.0).log() - 0.3
-        turns = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(len(means), 4)
-        harmonics = ((torch.from_numpy(points["rgb"]) / 255 - 0.5) / HARMONIC)[:, None]
-        opaque = torch.full((len(means),), 4.0)
-        made[light] = Gaussians(means, turns, sizes[:, None].expand(-1, 3), opaque, harmonics)
-        write_gaussians(tmp_path / f"{light}.ply", made[light])
-    words = ["restyle", str(tmp_path / "sunset.ply"), "--references", str(tmp_path / "day.ply"), "--up", "0", "0", "1"]
-    words += ["--semantic.encoder", "bundled-semantic", "--regions", "8", "--views", "12", "--size", "160", "120"]
+    made = {light: town(tmp_path, light) for light in ("day", "sunset")}
+    for light, gaussians in made.items():
+        write_gaussians(tmp_path / f"{light}.ply", gaussians)
+    words = ["restyle", str(tmp_path / "sunset.ply"), "--references", str(tmp_path / "day.ply"), *TOWN]
     words += ["--cache", str(tmp_path / "cache"), "--output", str(tmp_path / "out.ply")]
     truth = made["day"].colours.clamp(0, 1)
 

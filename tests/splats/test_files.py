@@ -25,7 +25,8 @@ from fprf.splats.gaussians import Gaussians
 from fprf.splats.photographs import camera_of
 from fprf.splats.views import draw
 
-WRITTEN = [ending for ending in endings() if format_of(Path(f"x{ending}")).writes]
+FORMATS = {ending: format_of(Path(f"x{ending}")) for ending in endings()}
+WRITTEN = [ending for ending, form in FORMATS.items() if form.writes and form.reads]
 SHAPE = ("means", "quaternions", "log_scales", "logits")
 COUNT = 600
 STEP = {  # most that positions in [-2, 2], ln-scales, opacities, mean colours and harmonics change by: half a step

@@ -4,6 +4,7 @@ import base64
 import json
 import math
 import struct
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -333,3 +334,37 @@ def test_gaussforge_and_we_agree(ending: str, tmp_path: Path) -> None:
     assert torch.allclose(covariances(ours), covariances(wanted.select(order)), rtol=0.02, atol=1e-5)
     assert (ours.colours - wanted.colours[order]).abs().max() < 0.01
     assert (ours.opacities - wanted.opacities[order]).abs().max() < 0.01
+
+
+@pytest.mark.parametrize("degree", [0, 3, 4])
+def test_a_usdz_holds_what_its_schema_names(degree: int, tmp_path: Path) -> None:
+    """As usd-core reads it: shapes and what is seen along directions, in axes right up back."""
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Usd, UsdGeom
+
+    made, path = cloud(degree, 50), tmp_path / "x.usdz"
+    write_gaussians(path, made)
+    stage = Usd.Stage.Open(str(path))
+    prim = stage.GetDefaultPrim()
+    assert prim.GetTypeName() == "ParticleField3DGaussianSplat" and UsdGeom.GetStageUpAxis(stage) == "Y"
+    names = ("positions", "scales", "opacities", "radiance:sphericalHarmonicsCoefficients")
+    means, sizes, opacities, harmonics = (torch.tensor(np.array(prim.GetAttribute(name).Get())) for name in names)
+    turns = torch.tensor([[q.real, *q.imaginary] for q in prim.GetAttribute("orientations").Get()])
+    kept = min(degree, 3)
+    assert prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get() == kept
+    read = Gaussians(means, turns, sizes.log(), opacities.logit(), harmonics.reshape(50, (kept + 1) ** 2, 3))
+    turn = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+    assert torch.allclose(read.means, made.means @ turn) and torch.allclose(read.opacities, made.opacities, atol=1e-6)
+    assert torch.allclose(covariances(read), turn.double() @ covariances(made) @ turn.double(), rtol=1e-4, atol=1e-9)
+    directions = torch.nn.functional.normalize(torch.randn(30, 3).double(), dim=1)
+    made = made.recoloured(made.harmonics[:, : (kept + 1) ** 2])
+    assert torch.allclose(seen_along(read, directions @ turn.double()), seen_along(made, directions), atol=1e-5)
+    with pytest.raises(DataError, match="not read"):
+        read_capture(path)
+
+
+def test_without_usd_core_one_line_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    with pytest.raises(DataError, match="pip install usd-core"):
+        write_gaussians(tmp_path / "x.usdz", ball(10))
+    assert not (tmp_path / "x.usdz").exists()

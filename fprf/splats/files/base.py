@@ -86,6 +86,8 @@ class CaptureFormat(PluginConfig):
     colours and opacities that views show."""
     writes: ClassVar[bool] = True
     """False = files of it are read alone, and what was read from them is written as another format."""
+    reads: ClassVar[bool] = True
+    """False = files of it are written alone."""
     exact: ClassVar[bool] = False
     """It holds every number as it is, NaN too, and positions in float64. Where it does not, it is given Gaussians that can be
     drawn, about a local origin that stands in a file beside."""
@@ -112,7 +114,7 @@ class CaptureFormat(PluginConfig):
 
     def holds(self, capture: Capture, read_as: "CaptureFormat") -> bool:
         """Whether a capture's own file, recoloured, is a file of this format."""
-        return self.writes and type(read_as) is type(self)
+        return self.writes and self.reads and type(read_as) is type(self)
 
     def write(self, path: Path, pieces: Iterable[bytes]) -> None:
         """Write what `pack` or `Capture.recolour` gave, whole or not at all."""
