@@ -198,11 +198,11 @@ MODULES: dict[str, tuple[str, ...]] = {
     "fprf/style/matching.py": ("style/test_matching.py", "ops/test_mixture.py"),
     "fprf/style/statistics.py": ("style/test_statistics.py",),
     "fprf/rendering/stepfun.py": ("rendering/test_stepfun.py",),
-    "fprf/rendering/space.py": ("rendering/test_space.py", "ops/test_march.py"),
+    "fprf/rendering/space.py": ("rendering/test_space.py",),
     "fprf/rendering/renderer.py": ("rendering/test_renderer.py",),
     "fprf/rendering/cameras.py": ("rendering/test_cameras.py",),
     "fprf/rendering/lens.py": ("rendering/test_cameras.py",),
-    "fprf/rendering/splines.py": ("rendering/test_splines.py",),
+    "fprf/rendering/splines.py": ("rendering/test_paths.py",),
 }
 """Each numerics module and its tests."""
 COMPILED = ("_kernels.py", "simd.py")

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from fprf.errors import DataError, NumericsError
 from fprf.evaluation.consistency import warp
-from fprf.evaluation.lpips import lpips
+from fprf.evaluation.metrics import lpips
 from fprf.rendering.cameras import Cameras
 
 SHORT, LONG = 1, 7

@@ -15,7 +15,17 @@ contract in `fprf.testing` checks an implementation, and fails with one sentence
                 DataManager      step -> batch of R pixels                   check_data_manager
     scale       BlockLayout      site -> cells                               check_layout
                 Executor         tasks -> results                            check_executor
+    files       CaptureFormat    bytes <-> Gaussians                         check_capture_format
     scenes      Scene, SceneView, SceneLearner, Partition: a kind of scene, built by `RunConfig.build`
+
+`CaptureFormat` is in `fprf/splats/files/base.py`, since it speaks of Gaussians; all others are below. To add
+
+    a stylizer           its config in `fprf/plugins/stylizers/config.py`, its class in a file beside; group fprf.stylizers
+    a file format        one file in `fprf/splats/files`, a `CaptureFormat`; group fprf.captures
+    a kind of scene      a `RunConfig` (`fprf/config.py`) whose `build` gives a SceneLearner, and a function that opens its
+                         runs, as `open_fields` of `fprf/training/loading.py` does; groups fprf.methods and fprf.scenes
+
+and an entry point in the named group of `pyproject.toml`, where each group has a line that says the same.
 
     letter  axis                 letter  axis                 letter  axis
     B       images               C       content channels     T       style codes
@@ -149,7 +159,8 @@ class Sampler(Regularised):
 class Decoder(nn.Module, ABC):
     """Content features to colour, point by point (paper, D_VGG): those of the scene as it is, and those of a style.
 
-    What is scene-agnostic comes frozen. Parameters that want gradients are the scene's own and are trained with it.
+    `build` returns parameters that all scenes share with `requires_grad` False; those with `requires_grad` True belong to one
+    scene, are trained with it and are saved in its checkpoints.
     """
 
     @abstractmethod

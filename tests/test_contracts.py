@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from fprf import testing
 from fprf.blocks.config import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig
 from fprf.datamanagers.config import RayBatchesConfig
-from fprf.fields.config import ContentFieldConfig, PlanesConfig, SemanticFieldConfig, SemanticPlanesConfig
+from fprf.fields.config import ContentFieldConfig, PlanesConfig, SemanticPlanesConfig
 from fprf.interfaces import (
     BlockLayout,
     ContentField,
@@ -22,7 +22,6 @@ from fprf.interfaces import (
     Executor,
     LossTerm,
     Sampler,
-    SemanticField,
     Stylizer,
 )
 from fprf.plugins import registry
@@ -97,28 +96,6 @@ class LinearConfig(ContentFieldConfig):
 
     def build(self, *, channels: int, seed: int) -> ContentField:
         return Linear(self.wrong, channels, seed)
-
-
-class Semantic(SemanticField):
-    def __init__(self, wrong: str, channels: int) -> None:
-        super().__init__()
-        self.weight, self.wrong = nn.Parameter(torch.ones(3, channels)), wrong
-
-    def forward(self, points: Tensor) -> Tensor:
-        found = points @ self.weight
-        changed = {"channels": found[:, 1:], "batch": found - found.mean(0), "frozen": found.detach(), "dtype": found.float()}
-        return changed.get(self.wrong, found)
-
-    def penalties(self) -> dict[str, Tensor]:
-        return {"own": self.weight.sum(0)} if self.wrong == "penalty" else {}
-
-
-@dataclass(frozen=True, kw_only=True)
-class SemanticConfig(SemanticFieldConfig):
-    wrong: str = ""
-
-    def build(self, *, channels: int, seed: int) -> SemanticField:
-        return Semantic(self.wrong, channels)
 
 
 class Term(LossTerm):
@@ -303,17 +280,6 @@ BREACHES: list[tuple[Callable[..., None], Any, dict[str, str]]] = [
             "penalty shape": "'own' must be a scalar",
             "penalty names": "the same penalties at each call",
             "penalty device": "'own': makes a tensor that is not on the device",
-        },
-    ),
-    (
-        testing.check_semantic_field,
-        SemanticConfig,
-        {
-            "channels": r"expected float32 \[",
-            "batch": "must not depend on the others",
-            "frozen": "no gradient goes through its answer",
-            "dtype": r"expected torch\.float64",
-            "penalty": "must be a scalar",
         },
     ),
     (

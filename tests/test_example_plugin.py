@@ -13,7 +13,7 @@ from tiny_world import World, trained_for
 from fprf.cli.parsing import load_method, parse
 from fprf.cli.plugins import run as plugins
 from fprf.plugins import registry
-from fprf.plugins.codec import Missing, load_config, save_config
+from fprf.plugins.codec import Missing
 from fprf.plugins.encoders.config import EncoderConfig
 from fprf.plugins.losses.config import LossTermConfig
 from fprf.testing import check_encoder, check_loss_term
@@ -73,20 +73,6 @@ def test_its_loss_trains(site: Path, world: World, tmp_path: Path) -> None:
         assert run.load_config()[0].loss.extra == config.loss.extra
     assert 0 < seen[-1].losses["extra"] < 1
     assert isinstance(run.load_config()[0].loss.extra, Missing), "where it is not installed"
-
-
-def test_a_run_with_it_opens_where_it_is_not_installed(site: Path, tmp_path: Path) -> None:
-    path = tmp_path / "config.json"
-    with packages_in(site):
-        config, name = load_method("fprf-gabor")
-        save_config(path, config, name)
-    loaded, name = load_config(path)
-    assert name == "fprf-gabor" and isinstance(loaded.semantic.encoder, Missing)
-    assert loaded.semantic.encoder.package == "fprf-gabor 0.3.0"
-    save_config(tmp_path / "again.json", loaded, name)
-    assert (tmp_path / "again.json").read_text() == path.read_text()
-    with packages_in(site):
-        assert repr(load_config(tmp_path / "again.json")) == repr((config, name)), "classes are imported anew: compare values"
 
 
 def test_choosing_it_imports_no_torch(site: Path) -> None:

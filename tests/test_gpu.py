@@ -131,10 +131,8 @@ def test_views_are_those_of_the_cpu(world: World, device: Device) -> None:
     assert there.kept == pytest.approx(here.kept, rel=0.01)
 
 
-OTHERS = [AdainConfig(), LocalAdainConfig(), RegionOtConfig()]
-OTHERS += [LocalAdainConfig(similarity="dot", centred=False, relative=False, temperature=1.0)]
-STYLES = [RegionToneConfig(), *(pytest.param(config, marks=pytest.mark.gpu) for config in OTHERS)]
-"""On the pretended device tests/training/test_views_on_a_device.py has the others."""
+STYLES = [AdainConfig(), LocalAdainConfig(), RegionOtConfig(), RegionToneConfig()]
+STYLES += [LocalAdainConfig(similarity="dot", centred=False, relative=False, temperature=1.0)]
 
 
 @pytest.mark.parametrize("stylizer", STYLES, ids=lambda config: type(config).__name__)

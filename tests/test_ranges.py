@@ -1,15 +1,22 @@
-"""Every config refuses what lies outside of its ranges, and names the field."""
+"""Checks of ranges, the sentences of errors, and that every config refuses what lies outside of its ranges by name."""
 
+import copy
+import math
+import pickle
+from collections.abc import Callable
 from math import inf, nan
 from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from benchmarks.restyle import RestyleConfig
 from fprf.blocks.config import AdaptiveConfig, GridConfig
+from fprf.checks import at_least, between, positive
 from fprf.config import LossConfig, OptimizerConfig, RenderConfig, SemanticConfig, StatisticsConfig, TrainConfig
-from fprf.errors import ConfigError
+from fprf.errors import CheckpointError, ConfigError, FprfError
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.plugins.encoders.config import (
     ConcatConfig,
@@ -96,3 +103,44 @@ def test_fields_that_contradict_each_other_are_refused() -> None:
         LossConfig(rgb=0.0, content=0.0, semantic=0.0)
     with pytest.raises(ConfigError):
         StyleConfig(references=(Path("a"), Path("b")), masks=(NO_MASK,))
+
+
+number = st.one_of(st.integers(), st.floats(allow_nan=False, allow_infinity=False))
+
+
+def passes(check: Callable[[], None]) -> bool:
+    try:
+        check()
+    except ConfigError:
+        return False
+    return True
+
+
+@given(number, number, number)
+def test_what_passes(value: float, low: float, high: float) -> None:
+    assert passes(lambda: positive("x", value)) == (value > 0)
+    assert passes(lambda: at_least("x", value, low)) == (value >= low)
+    assert passes(lambda: between("x", value, low, high)) == (low <= value <= high)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_what_is_not_a_number_never_passes(value: float) -> None:
+    for check in (lambda: positive("x", value), lambda: at_least("x", value, -1e308), lambda: between("x", value, 0, 1e308)):
+        assert not passes(check)
+
+
+@given(st.text())
+def test_a_text_is_one_printable_line(text: str) -> None:
+    said = str(FprfError(text))
+    assert said.isprintable() and (said == text or not text.isprintable())
+
+
+def test_line_breaks_and_escapes_of_a_terminal_are_spelled_out() -> None:
+    assert str(CheckpointError("a\nb\x1b[2J\udcff")) == "a\\nb\\x1b[2J\\udcff"
+    assert str(CheckpointError("süß 街道 1 °")) == "süß 街道 1 °"
+
+
+def test_an_error_survives_the_way_between_processes() -> None:
+    error = CheckpointError("a\nb")
+    for other in (pickle.loads(pickle.dumps(error)), copy.copy(error)):
+        assert type(other) is CheckpointError and str(other) == "a\\nb"

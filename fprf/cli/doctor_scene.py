@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from PIL import ImageCms
 
+from ..datamanagers.blur import blurred_views
 from ..datamanagers.images import Image, exif_orientation, load_images, load_mask, open_image, opened, uniform_colour
 from ..datamanagers.parsers.config import DataParserConfig, parse_scene, recognise
 from ..datamanagers.scene import Scene, exposures_differ, find_sightings, sparser, with_exposure
@@ -27,10 +28,6 @@ LOOKED = 48
 """Views whose files are opened."""
 _SIDE = 960
 """Longest side in pixels at which images are looked at."""
-_BLURRED = 0.25
-"""Share of the sharpness of the frames around it below which a photograph counts as blurred."""
-_AROUND = 3
-"""Frames on each side that a photograph's sharpness is compared with."""
 _FEW_POINTS = 100
 """Points below which the first Gaussians are not placed at them."""
 _TAIL = 1 << 16
@@ -76,7 +73,10 @@ def inspect_scene(data: Path, scene: Scene) -> Iterator[Finding]:
         more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
         yield Finding("images", f"{broken[0]}{more}", "replace them, or remove their poses")
     yield from _exposure(reduced, pixels)
-    yield from _blurred(scene, pixels)
+    if blurred := sorted(blurred_views(reduced.cameras, pixels, 1)[0]):
+        named = ", ".join(scene.paths[view].name for view in blurred[:3]) + (", ..." if len(blurred) > 3 else "")
+        found = f"{len(blurred)} of {len(pixels)} images: {named}; Gaussians are shown them rarely, fields like the others"
+        yield Finding("blur", found, "remove them, where others show the same", optional=True)
 
 
 def _points(data: Path, scene: Scene) -> Finding:
@@ -215,21 +215,3 @@ def _exposure(scene: Scene, images: Mapping[int, Image]) -> Iterator[Finding]:
     spread = float(exposure[train].log2().std())
     decided = "a factor for each view is learnt" if exposures_differ(exposure[train]) else "no factor is learnt"
     yield Finding("exposure", f"spread by {spread:.2f} stops: {decided}")
-
-
-def _blurred(scene: Scene, images: Mapping[int, Image]) -> Iterator[Finding]:
-    """Photographs far less sharp than those around them."""
-    from ..reconstruction.images import sharpness
-
-    views = list(images)
-    with ThreadPoolExecutor() as pool:
-        scores = list(pool.map(sharpness, images.values()))
-    blurred = []
-    for k, view in enumerate(views):
-        around = scores[max(0, k - _AROUND) : k] + scores[k + 1 : k + 1 + _AROUND]
-        if around and scores[k] < _BLURRED * float(np.median(around)):
-            blurred.append(scene.paths[view].name)
-    if blurred:
-        named = ", ".join(blurred[:3]) + (", ..." if len(blurred) > 3 else "")
-        found = f"{len(blurred)} of {len(views)} images: {named}; they are trained like the others"
-        yield Finding("blur", found, "remove them, where others show the same", optional=True)

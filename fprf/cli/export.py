@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import UsageError
 from ..export.config import FIT_MINUTES, KINDS, ExportConfig, Plan, plan
-from ..plugins.captures import endings, format_name
 from ..progress import Display
+from ..splats.config import endings, format_name
 from .style_flags import named_styles, read_flags, tidy
 
 if TYPE_CHECKING:
@@ -198,9 +198,9 @@ class _Export:
         """transforms.json, and the pictures that it names if they are wanted, in the last look."""
         if "cameras" not in self.what.kinds:
             return {}
-        from ..export.transforms import transforms
         from ..io.atomic import write_json
         from ..io.images import to_uint8, write_image
+        from ..rendering.camera_path import transforms
         from ..rendering.local_frame import added_and_beside, write_offset
 
         known, scene = self.opened.known, self.opened.scene.restyled(self.looks[-1].restyle)

@@ -94,10 +94,12 @@ def _run(args: list[str]) -> int:
     if args[0] == "--version":
         print(f"fprf {__version__}")
         return 0
+    # Each verb's module is imported when it is asked for: help and mistakes cost no torch.
     configure_process()
     verb, rest = args[0], args[1:]
     if verb in VERBS:
         return int(importlib.import_module(f".{verb}", __package__).run(rest))
+    # Verbs of packages are configs: their fields are the flags, their docstring is the help.
     others = packaged()
     if verb not in others:
         known = [*VERBS, *others]

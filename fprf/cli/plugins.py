@@ -14,7 +14,6 @@ from ..datamanagers.parsers.config import DataParserConfig
 from ..errors import PluginError
 from ..fields.config import ContentFieldConfig, SemanticFieldConfig
 from ..plugins import registry
-from ..plugins.captures import CaptureFormat
 from ..plugins.config import PluginConfig
 from ..plugins.decoders.config import DecoderConfig
 from ..plugins.encoders.config import EncoderConfig
@@ -22,6 +21,7 @@ from ..plugins.executors.config import ExecutorConfig
 from ..plugins.losses.config import LossTermConfig
 from ..plugins.samplers.config import SamplerConfig
 from ..plugins.stylizers.config import StylizerConfig
+from ..splats.config import CAPTURES
 from .config import CommandConfig
 from .parsing import load_method, parse
 
@@ -37,10 +37,9 @@ KINDS: dict[str, tuple[type[PluginConfig], ...]] = {
     "fprf.dataparsers": (DataParserConfig,),
     "fprf.executors": (ExecutorConfig,),
     "fprf.losses": (LossTermConfig,),
-    "fprf.captures": (CaptureFormat,),
     "fprf.commands": (CommandConfig,),
 }
-"""The groups of configs, and what a plug-in of each must derive from."""
+"""The groups of configs, and what a plug-in of each must derive from. Formats of captures, which import torch, stand apart."""
 
 
 class Row(NamedTuple):
@@ -87,7 +86,7 @@ def run(args: list[str]) -> int:
 
 def rows() -> Iterator[Row]:
     """Every entry point of every group of ours."""
-    for group in (METHODS, SCENES, *KINDS):
+    for group in (METHODS, SCENES, CAPTURES, *KINDS):
         for name, entries in registry.installed(group).items():
             for each in entries:
                 yield Row(group, name, each.point.value, each.package)
@@ -111,6 +110,11 @@ def _check(row: Row) -> None:
         return
     loaded = registry.load_object(row.group, row.name)
     if row.group == SCENES:
+        return
+    if row.group == CAPTURES:
+        from ..splats.files.base import CaptureFormat
+
+        registry.make(row.group, row.name, CaptureFormat)
         return
     if not (isinstance(loaded, type) and issubclass(loaded, KINDS[row.group])):
         registry.load(row.group, row.name, KINDS[row.group][0])  # says what it is instead

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ..checks import at_least, positive
 from ..errors import UsageError
-from ..plugins.captures import endings, format_name, format_of, is_scene
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from ..progress import Display
-from ..splats.config import LookConfig
+from ..splats.config import LookConfig, endings, format_name, is_scene
 from ..style.config import NO_MASK, StyleConfig
 from ..style.files import StyleFile, write_style
 from .style_flags import read_flags
@@ -165,6 +164,8 @@ def _outputs(config: RestyleConfig) -> list[Path]:
         raise UsageError("--references: at least one photograph is needed, for example --references autumn.jpg night.jpg")
     if config.output is None:
         return []
+    from ..splats.files.base import format_of
+
     if config.output.is_dir() or (len(config.captures) > 1 and format_name(config.output) is None):
         outputs = []
         for path in config.captures:

@@ -1,15 +1,23 @@
 """Renders against photographs: PSNR, SSIM and LPIPS of images [H W 3] in [0, 1], and the report of `fprf eval` on a run.
 
 PSNR = -10 log10(mean squared error), in decibels. SSIM after Wang et al. 2004: Gaussian window of 11 pixels (σ 1.5),
-K = (0.01, 0.03), dynamic range 1, mean over channels and over the windows that lie wholly inside.
+K = (0.01, 0.03), dynamic range 1, mean over channels and over the windows that lie wholly inside. LPIPS 0.1 with AlexNet
+(Zhang et al. 2018, arXiv:1801.03924), with the weights of its authors:
+
+    LPIPS(a, b) = Σ_layers mean over pixels of Σ_channels w_c (f_c(a) / |f(a)| - f_c(b) / |f(b)|)²
+
+f: activations of the five convolutions, w ≥ 0: the learned heads. 0 for equal images, about 0.7 for unrelated ones.
 """
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from pathlib import Path
 from typing import Annotated, Any
 
 import torch
+import torch.nn.functional as F
 from kornia.metrics import ssim as _ssim_map
 from torch import Tensor
 
@@ -19,15 +27,25 @@ from ..errors import DataError, NumericsError
 from ..interfaces import Scene
 from ..io.images import to_uint8
 from ..memory import peak
+from ..plugins.weights import read_weights
 from ..training.run import Known
 from ..types import View
 from .consistency import WarpError
-from .lpips import lpips
 
 PSNR_CAP = 99.0
 """PSNR of identical images, in dB: means over views stay finite. Reached at a mean squared error of 1.3e-10."""
 
 _WINDOW = 11
+_LPIPS_WEIGHTS = Path(__file__).parent / "weights" / "lpips-alex.safetensors"
+_STRIDES, _PADS = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)
+_POOLED = (2, 3)
+"""Convolutions after a pooling."""
+_SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+"""Of colours in [-1, 1]: ImageNet's mean and deviation."""
+_EPS = 1e-10
+"""Added to lengths, as the authors do: a feature may be 0."""
+_SMALLEST = 31
+"""Pixels of a side that the second pooling leaves one of."""
 
 
 def _pair(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
@@ -42,7 +60,7 @@ def _pair(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 def _finite(name: str, value: float) -> float:
     if not math.isfinite(value):
-        raise NumericsError(f"{name} is {value}: an image holds values that are not finite; nothing can be judged by it")
+        raise NumericsError(f"{name} is {value}: an image holds values that are not finite, or nothing of it counts")
     return value
 
 
@@ -72,6 +90,49 @@ def ssim(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"], where: An
         windows = windows[..., about] if bool(about.any()) else windows
     # Rounding can carry an identical pair past 1.
     return max(-1.0, min(1.0, _finite("ssim", float(windows.mean()))))
+
+
+@torch.no_grad()
+def lpips(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"], where: Annotated[Tensor, "H W"] | None = None) -> float:
+    """LPIPS of sRGB images in [0, 1], at least 0, symmetric; `where`: mean over the cells that lie there, by their share.
+
+    Images with a side below 31 pixels are enlarged. Raises DataError for unlike shapes, NumericsError for NaN and infinities.
+    """
+    a, b = _pair(a, b)
+    # Both images as one batch; small ones are enlarged, since the second pooling would leave nothing of them.
+    weights = {name: value.to(a.device) for name, value in _weights().items()}
+    pair = torch.stack([a, b]).float().permute(0, 3, 1, 2)
+    if min(pair.shape[2:]) < _SMALLEST:
+        scale = _SMALLEST / min(pair.shape[2:])
+        size = [max(_SMALLEST, round(scale * n)) for n in pair.shape[2:]]
+        pair = F.interpolate(pair, size, mode="bilinear", align_corners=False)
+    total = 0.0
+    for layer, features in enumerate(_activations(weights, pair), start=1):
+        # Features of unit length, compared channel by channel by the weights of the layer's head.
+        first, second = features / (features.square().sum(1, keepdim=True).sqrt() + _EPS)
+        apart = torch.einsum("chw,c->hw", (first - second).square(), weights[f"head{layer}"]).double()
+        # A cell counts by the share of it that lies in the mask.
+        share = torch.ones_like(apart)
+        if where is not None:
+            share = F.interpolate(where[None, None].to(apart), apart.shape, mode="area")[0, 0]
+        total += float((apart * share).sum() / share.sum())
+    return _finite("lpips", total)
+
+
+def _activations(weights: Mapping[str, Tensor], images: Annotated[Tensor, "B 3 H W"]) -> Iterator[Annotated[Tensor, "B C h w"]]:
+    """Of AlexNet's convolutions, one after the other."""
+    shift, scale = (images.new_tensor(each).view(1, 3, 1, 1) for each in (_SHIFT, _SCALE))
+    x = (2 * images - 1 - shift) / scale
+    for layer, (stride, padding) in enumerate(zip(_STRIDES, _PADS, strict=True), start=1):
+        if layer in _POOLED:
+            x = F.max_pool2d(x, 3, 2)
+        x = F.relu(F.conv2d(x, weights[f"conv{layer}.weight"], weights[f"conv{layer}.bias"], stride, padding))
+        yield x
+
+
+@cache
+def _weights() -> Mapping[str, Tensor]:
+    return read_weights(_LPIPS_WEIGHTS)[0]
 
 
 def image_metrics(

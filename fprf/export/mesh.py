@@ -28,7 +28,8 @@ from ..io.images import srgb_to_linear
 from ..rendering.cameras import Cameras, grid_rays, look_up, normals, project
 from ..rendering.local_frame import added_and_beside, write_offset
 from ..rendering.space import Space
-from ..splats.files.ply import in_world, ply_file
+from ..splats.files.base import in_world
+from ..splats.files.ply import ply_file
 from ..types import Origin
 
 Report = Callable[[int, int], None]

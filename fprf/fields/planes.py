@@ -93,8 +93,10 @@ class Planes(nn.Module):
     def density(
         self, points: Annotated[Tensor, "N 3"], weight: Annotated[Tensor, "out"]
     ) -> tuple[Annotated[Tensor, "N"], Annotated[Tensor, "N out"]]:
-        """`fields.density` of the features' product with the weight, and the features."""
-        # One linear map decides what is solid: cheap enough for every sample of every ray.
+        """Density exp(latent . weight - 1) per space unit, and the latent.
+
+        One linear map, no network: cheap enough for every sample of every ray, most of which are empty.
+        """
         latent = self(points)
         return density(latent @ weight), latent
 

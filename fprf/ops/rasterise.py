@@ -242,9 +242,11 @@ def _view(
     from .rasterise_training import camera_array
     from .simd import LANES, aligned
 
+    # The kernels read blocks of LANES Gaussians, property by property; the last block is padded.
     bands, seen, whole = harmonics.shape[1], camera_array(camera, antialiased), -(-len(means) // LANES) * LANES
     blocks, splats = aligned(whole * (FIXED + 3 * bands)), aligned(whole * kernels.SLOTS)
     pack(*(x.detach().contiguous().numpy() for x in (means, quaternions, log_scales, logits, harmonics)), blocks)
+    # Project all Gaussians, leave out what cannot be seen, and list for each tile of 16 x 16 pixels those on it by depth.
     tiles = kernels.see(blocks, len(means), bands, seen, camera.width, camera.height, splats)
     counts = dict(zip(_SKIPPED, tiles.skipped.tolist(), strict=True)) | {"entries": len(tiles.ids), "saturated": 0}
     return _View(tiles, blocks, bands, seen, counts)
@@ -266,16 +268,19 @@ def _composite(
     """Channels last: colour, depth, features; the transmittance left; counts; and planes and transmittance of each group."""
     from . import rasterise_kernels as kernels
 
+    # One pass over the sorted lists of Gaussians for each group of channels: a kernel composites 4 or 8 at a time, and the
+    # transmittance is the same in all.
     tiles = view.tiles
     made: list[tuple[_Array, _Array]] = []
     saturated = 0
     for channels, values, stride, first in _groups(view, features):
         out, left = np.empty((channels, *_padded(tiles)), np.float32), np.empty(_padded(tiles), np.float32)
         behind = np.zeros(channels, np.float32)
-        if not made:
+        if not made:  # colour and depth come first; only colour has a background
             behind[:3] = background.detach().numpy()
         saturated = kernels.composite(tiles, channels, values, stride, first, behind, out.reshape(-1), left.reshape(-1))
         made.append((out, left))
+    # Off with the margin of whole tiles and the padding of the last group; the arrays in `made` keep both for gradients.
     planes = torch.cat([torch.from_numpy(out[:, : tiles.height, : tiles.width]) for out, _ in made])
     planes = planes[: 4 + features.shape[1]].permute(1, 2, 0)
     passing = torch.from_numpy(made[0][1][: tiles.height, : tiles.width].copy())

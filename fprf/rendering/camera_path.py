@@ -1,4 +1,6 @@
-"""Nerfstudio's camera-path JSON, read and written: what its viewer exports is rendered here, and ours loads there.
+"""Cameras in Nerfstudio's files: camera paths, read and written, and the transforms.json of a capture, written.
+
+A camera path that its viewer exports is rendered here, and ours loads there:
 
     {"camera_type": "perspective", "render_width": W, "render_height": H, "fps": F, "seconds": S,
      "camera_path": [{"camera_to_world": [16 numbers, row by row], "fov": vertical degrees, "aspect": W / H}, ...]}
@@ -8,6 +10,7 @@ principal point is the middle: the format can say nothing else.
 """
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,7 +23,9 @@ from ..errors import DataError
 from ..io.atomic import write_json
 from ..types import Origin
 from .cameras import Cameras, ideal_cameras
+from .lens import FISHEYE, OPENCV
 
+_MODELS = {FISHEYE: "OPENCV_FISHEYE", OPENCV: "OPENCV"}
 _STRAY = 1e-3
 """Tolerance of a rotation's orthonormality: viewers round to a few digits."""
 _Matrix = Annotated[list[Annotated[float, Meta(gt=-1e30, lt=1e30)]], Meta(min_length=16, max_length=16)]
@@ -113,3 +118,24 @@ def write_camera_path(path: Path, cameras: Cameras, fps: float, origin: Origin =
         "keyframes": [],
     }
     write_json(path, content)
+
+
+def transforms(cameras: Cameras, files: Sequence[str], *, train: Sequence[int], test: Sequence[int]) -> dict[str, Any]:
+    """transforms.json of V views whose images are `files`, relative to it. Intrinsics stand once if all views share them."""
+    lenses = []
+    for view in range(len(cameras)):
+        width, height = cameras.size[view].tolist()
+        (fx, fy), (cx, cy) = cameras.focal[view].tolist(), cameras.centre[view].tolist()
+        lens = {"camera_model": _MODELS.get(int(cameras.lens[view]), "PINHOLE"), "w": width, "h": height}
+        lens |= {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+        if bool(torch.any(cameras.distortion[view] != 0)):
+            lens |= dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), cameras.distortion[view].tolist(), strict=True))
+        lenses.append(lens)
+    shared = all(lens == lenses[0] for lens in lenses)
+    frames = []
+    for view, file in enumerate(files):
+        rows = [*cameras.pose[view].tolist(), [0.0, 0.0, 0.0, 1.0]]
+        frames.append({"file_path": file, **({} if shared else lenses[view]), "transform_matrix": rows})
+    splits = {"train": train, "test": test, "val": test}
+    named = {f"{name}_filenames": [files[view] for view in views] for name, views in splits.items()}
+    return {**(lenses[0] if shared else {}), "frames": frames, **named}

@@ -79,6 +79,7 @@ def march(
     In full precision under autocast too: a density is an exponential.
     """
     with full_precision(rays.origin):
+        # Where to look along each ray: edges t [R E] of S = E - 1 steps, placed by the sampler.
         space = parts.space
         sampled = parts.sampler(_detached(rays), space=space, step=step, generator=generator)
         # A camera samples what is near it far more densely than any other camera does, and could explain its own image by a

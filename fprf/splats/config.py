@@ -1,13 +1,15 @@
-"""Configs of runs of 3D Gaussians and of views of a capture. Imports no torch."""
+"""Configs of runs of 3D Gaussians and of views of a capture, and which files are captures by name. Imports no torch."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from ..checks import at_least, between, positive
 from ..config import RunConfig
 from ..datamanagers.parsers.config import DataParserConfig
 from ..errors import ConfigError
+from ..plugins import registry
 from ..plugins.encoders.config import SEMANTICS, EncoderConfig
 from ..plugins.executors.config import ExecutorConfig, SerialConfig
 
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
     from ..interfaces import Partition, SceneLearner
     from ..training.model import Facts
 
+CAPTURES = "fprf.captures"
+"""Entry points of file formats of Gaussians (`splats.files.base.CaptureFormat`), by the ending of their files."""
 _CAP, _PASSES = 60_000, 280
 
 
@@ -190,3 +194,25 @@ class GaussiansConfig(RunConfig):
 
     def described(self) -> str:
         return f", up to {self.most:,} Gaussians"
+
+
+def endings() -> tuple[str, ...]:
+    """Endings of the files of installed formats, with their dot; an index of a folder (lod-meta.json) has none of its own."""
+    return tuple(f".{name}" for name in registry.installed(CAPTURES) if not name.endswith(".json"))
+
+
+def format_name(path: Path) -> str | None:
+    """The installed format that a file is of by its name; None where it is of none. A meta.json is that of a SOG folder."""
+    name = path.name.lower()
+    if name == "meta.json":
+        return "sog"
+    installed = registry.installed(CAPTURES)
+    fits = [each for each in installed if name.endswith(f".{each}") or (name == each and "." in each)]
+    return max(fits, key=len, default=None)
+
+
+def is_scene(path: Path) -> bool:
+    """Whether a path is that of a capture or of a run, and so of no photograph."""
+    if path.is_dir():
+        return any((path / name).is_file() for name in ("meta.json", "lod-meta.json", "config.json"))
+    return format_name(path) is not None

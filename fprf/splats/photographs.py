@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..datamanagers.blur import blurred_views
 from ..datamanagers.images import Image, load_images, load_mask
 from ..datamanagers.scene import Scene
 from ..errors import DataError
@@ -34,8 +35,12 @@ _SHARPEST = cv2.INTER_LANCZOS4
 _KEPT = 1 << 31
 """Bytes of photographs in the rasteriser's layout, some ten times as large as 8-bit pixels, that are kept between steps."""
 
-Level = Mapping[int, Target]
-"""Training views at one scale, by view; their sizes may differ."""
+
+class Level(Mapping[int, Target]):
+    """Training views at one scale, by view; their sizes may differ."""
+
+    blurred: frozenset[int] = frozenset()
+    """Views that are blurred at this scale."""
 
 
 class _View(NamedTuple):
@@ -60,11 +65,11 @@ class _Kept(OrderedDict[tuple[int, int], Target]):
             self.bytes -= _bytes(self.popitem(last=False)[1])
 
 
-class _Scaled(Mapping[int, Target]):
+class _Scaled(Level):
     """Views at 1/2^k of their size, brought into the rasteriser's layout when a step asks for them."""
 
-    def __init__(self, views: Mapping[int, _View], k: int, kept: _Kept) -> None:
-        self.views, self.k, self.kept = views, k, kept
+    def __init__(self, views: Mapping[int, _View], k: int, kept: _Kept, blurred: frozenset[int]) -> None:
+        self.views, self.k, self.kept, self.blurred = views, k, kept, blurred
 
     def __iter__(self) -> Iterator[int]:
         return iter(self.views)
@@ -193,8 +198,8 @@ def make_levels(
         image, valid = undistorted(scene.cameras, view, images[view], camera)
         mask, sky = straightened(masks, view), straightened(skies or {}, view)
         pixels[view] = _View(camera, image, mask if valid is None else valid if mask is None else valid & mask, sky)
-    kept = _Kept()
-    return [_Scaled(pixels, k, kept) for k in range(count)]
+    kept, blurred = _Kept(), blurred_views(scene.cameras, {view: images[view] for view in cameras}, count)
+    return [_Scaled(pixels, k, kept, blurred[k]) for k in range(count)]
 
 
 def _resized(mask: NDArray[np.bool_] | None, size: tuple[int, int]) -> NDArray[np.bool_] | None:

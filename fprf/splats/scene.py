@@ -18,7 +18,6 @@ from ..datamanagers.scene import Scene as ParsedScene
 from ..errors import CheckpointError, DataError
 from ..interfaces import Encoder, Scene, SceneView, Stylizer, Values
 from ..ops.rasterise_reference import MIN_ALPHA
-from ..plugins.captures import Data
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.cameras import Cameras, pixel_grid
 from ..rendering.renderer import enlarged
@@ -29,6 +28,7 @@ from ..training.camera_optimizers import Tones
 from ..training.run import Known
 from ..types import Origin, View
 from .config import GaussiansConfig, LookConfig
+from .files.base import Data
 from .gaussians import GaussianRows, Gaussians
 from .levels import Levels, StyledLevels
 from .photographs import cover, distorted

@@ -249,16 +249,19 @@ def _codes_of(r: Reference, clusters: int, blend: float, seed: int) -> StyleDict
     label, keys = r.semantic.new_zeros(len(r.semantic), dtype=torch.int64), r.semantic[:1].float()
     if r.semantic.shape[1] > 0:
         keys, label = kmeans(r.semantic, clusters, seed=seed)
-    # Codes with few members say little: the fewer, the more of the whole image they take.
+    # Codes with few members say little: the fewer, the more of the whole image they take. `at` [T] is that share: `blend` for
+    # codes of _FEW_MEMBERS or more, rising to 1 for a code without any.
     member = double(torch.nn.functional.one_hot(label, len(keys)))
     share = member.sum(0) / len(label)
     at = 1 - (1 - blend) * (share * len(label) / _FEW_MEMBERS).clamp_max(1.0)
 
     def statistics(features: Annotated[Tensor, "N C"]) -> tuple[Annotated[Tensor, "T C"], Annotated[Tensor, "T C C"]]:
+        """Mean M and covariance Sigma of each code (paper, Eq. 6), blended with those of the whole image."""
         whole = moments(features, features.new_ones(len(features)))
         mean, covariances, _ = group_moments(features, member)
         return blend_codes(mean, covariances, whole.mean, covariance(whole), at)
 
+    # Of content features always; of colours, and of what lies beyond, where the reference brings them.
     tables = dict(zip(("mean", "covariance"), statistics(r.content), strict=True))
     if r.colour is not None:
         tables |= dict(zip(_COLOURS, statistics(r.colour), strict=True))

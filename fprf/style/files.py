@@ -28,9 +28,9 @@ from typing import Any, NamedTuple, TypeVar
 
 from ..errors import ConfigError, DataError
 from ..io.atomic import write_json
-from ..plugins.captures import is_scene
 from ..plugins.codec import from_json, packages_of, read_json, to_json
 from ..plugins.registry import nearest
+from ..splats.config import is_scene
 from .config import NO_MASK, StyleConfig
 
 _FORMAT = 1

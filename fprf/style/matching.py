@@ -129,15 +129,19 @@ def match_keys(
 
     With cosines, moving one side or rotating both changes nothing. Dot products are the paper's, and know no frame.
     """
+    # Shares of each side sum to 1, in float64: the tables are small and decide everything that follows.
     regions, region_share = double(regions), double(region_share) / double(region_share).sum()
     codes, code_share = double(codes), double(code_share) / double(code_share).sum()
 
     def matched(queries: Annotated[Tensor, "K D"], keys: Annotated[Tensor, "T D"]) -> Annotated[Tensor, "K T"]:
+        """Eq. 5 and 6 at a temperature in units of the scores' own spread."""
         return attention(queries, keys, temperature * score_spread(queries, keys), double(prior))
 
+    # The paper's form: dot products of the semantics as they are.
     if similarity == "dot":
         # Softmax does not see what is subtracted from all keys; the smaller numbers round less.
         return matched(regions, codes - share_mean(codes, code_share))
+    # Plain cosines, for single things: both sides are seen from the encoder's zero.
     if not centred:
         zero = torch.zeros_like(regions[0]) if origin is None else double(origin)
         return matched(unit(regions, zero), unit(codes, zero))
@@ -146,11 +150,12 @@ def match_keys(
         """Whitened directions from the centre; of what lies at the centre there is none (0)."""
         return unit(unit(x, centre) @ white, torch.zeros_like(centre))
 
+    # The default: each side is whitened by its own scatter and seen from its own mean.
     queries = directions(regions, share_mean(regions, region_share), whitener(regions, region_share, whitening))
     white, weight = whitener(codes, code_share, whitening), code_share
     for _ in range(recentred + 1):
         table = matched(queries, directions(codes, share_mean(codes, weight), white))
-        # The next centre counts each code by how much of the scene takes it.
+        # Recentring: in the next mean each code counts by how much of the scene has taken it, p = share of regions x R^S.
         weight = region_share @ table
     return table
 

@@ -12,7 +12,7 @@ import math
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
 from torch import nn
@@ -37,7 +37,6 @@ from ..interfaces import (
     Stylizer,
 )
 from ..ops.harmonics import HARMONIC
-from ..plugins.captures import CaptureFormat
 from ..plugins.config import Need, PluginConfig
 from ..plugins.decoders.config import DecoderConfig
 from ..plugins.encoders.config import EncoderConfig, RandomConfig
@@ -63,6 +62,9 @@ from .outputs import (
     tensor,
     trainable,
 )
+
+if TYPE_CHECKING:
+    from ..splats.files.base import CaptureFormat
 
 Kind = TypeVar("Kind")
 
@@ -410,7 +412,7 @@ def check_executor(config: ExecutorConfig) -> None:
     raise AssertionError(f"{name}: an error in a task must reach the caller")
 
 
-def check_capture_format(form: CaptureFormat) -> None:
+def check_capture_format(form: "CaptureFormat") -> None:
     """A format reads what it writes: as many Gaussians of the same places and colours; recolouring changes nothing else.
 
     Damaged files end in DataError.

@@ -176,6 +176,7 @@ def learn(
     # All draws are functions of (seed, step): a resumed training is bit for bit the one that never stopped.
     saved = None if run is None else _resume(learner, run)
     step, before = (saved.step, saved.seconds) if saved is not None else (0, spent)
+    # `step` steps are made, `clock` seconds used; `went_back` is the step that faults led back to last.
     first, clock, went_back = step, before, -1
     begun = last_report = last_saved = time.perf_counter()
     pause = longest = 60 * schedule.checkpoint_minutes
@@ -199,6 +200,7 @@ def learn(
     with _SignalHandler() as signals:
         try:
             while (share := schedule.share(step, clock)) < 1:
+                # A signal waits until the step before it is whole.
                 if signals.asked:
                     raise KeyboardInterrupt
                 learner.step(step, share)

@@ -24,8 +24,8 @@ from typing import Literal, NamedTuple, TypeAlias
 from ..datamanagers.images import IMAGE_SUFFIXES, kind_of
 from ..datamanagers.parsers.config import recognise
 from ..errors import DataError, FprfError, UsageError
-from ..plugins.captures import endings, format_name, format_of
 from ..reconstruction.images import VIDEO_SUFFIXES
+from ..splats.config import endings, format_name
 
 MAX_BYTES = 20 << 20
 """Bytes of a photograph."""
@@ -239,6 +239,8 @@ def find_source(path: Path) -> Source:
 
 def check_file(name: str, head: bytes, size: int) -> None:
     """Raise DataError for a file that no scene is made of, by its name, its first bytes and its size."""
+    from ..splats.files.base import format_of
+
     suffix, stem = Path(name).suffix.lower(), Path(name).stem
     if suffix in IMAGE_SUFFIXES:
         check_photograph(head, name)

@@ -1,7 +1,6 @@
 """`python -m benchmarks peer` on frames that another system might have written."""
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,7 @@ from tiny_world import World
 
 from benchmarks.__main__ import main
 from benchmarks.peer import read_cameras, read_depths, read_pictures
-from benchmarks.town.write import read_truth, write_town
-from fprf.errors import DataError
+from benchmarks.town.write import write_town
 from fprf.rendering.cameras import pixel_grid, project, rays_through
 
 
@@ -47,30 +45,6 @@ def test_all_that_can_be_known(world: World, night: Path, tmp_path: Path, capsys
     assert page.read_text() in capsys.readouterr().out
 
 
-def test_a_run_gives_what_the_peer_did_not_write(world: World, tmp_path: Path) -> None:
-    document = peer(world, world.town / "images", tmp_path / "a.json", "--run", str(world.run))
-    assert document["published"]["short"]["pairs"] > 0 and "steadiness" not in document["missing"]
-
-
-def test_unlike_sizes_are_one_line(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for path in (world.town / "images").iterdir():
-        shutil.copy(world.references[0], tmp_path / path.name)
-    cameras = ["--cameras", str(world.town / "transforms.json"), "--device", "cpu"]
-    assert main(["peer", str(world.town / "images"), *cameras, "--plain", str(tmp_path)]) == 2
-    assert "the stylised frame 32x24; both must agree" in capsys.readouterr().err
-
-
-def test_a_scene_folder_is_read_as_its_parser_reads_it(world: World) -> None:
-    frames = read_pictures(world.town / "images")
-    cameras = read_cameras(world.town / "transforms.json", frames)
-    known = world.load().known.cameras
-    assert tuple(frames) == world.load().known.names
-    for field in ("pose", "focal", "centre", "size"):
-        assert torch.allclose(getattr(cameras, field).double(), getattr(known, field).double())
-    depths = read_depths(world.town / "depth", frames, cameras, "ray")
-    assert torch.equal(depths[3].float(), torch.from_numpy(read_truth(world.town, 3)[0]))
-
-
 def test_depths_along_the_axis_become_distances(world: World, tmp_path: Path) -> None:
     frames = read_pictures(world.town / "images", ["0001"])
     cameras = read_cameras(world.town / "transforms.json", frames)
@@ -81,28 +55,3 @@ def test_depths_along_the_axis_become_distances(world: World, tmp_path: Path) ->
     origin, direction = rays_through(cameras, view, pixel)
     _, ahead = project(cameras, view, origin + direction * depth.flatten()[:, None])
     assert torch.allclose(ahead, torch.full_like(ahead, 5.0))
-
-
-def test_frames_that_do_not_fit_are_named(world: World, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no pictures"):
-        read_pictures(tmp_path)
-    with pytest.raises(DataError, match="no picture named 77"):
-        read_pictures(world.town / "images", ["77"])
-    frames = read_pictures(world.town / "images")
-    known = json.loads((world.town / "transforms.json").read_text())
-    file = tmp_path / "transforms.json"
-    without = {key: value for key, value in known.items() if not key.startswith("fl_")}
-    for wrong, told in (
-        ({**known, "frames": known["frames"][:4]}, "cameras for 4 of 10 frames"),
-        ({**known, "k1": 0.1}, "k1 is not 0"),
-        (without, "no fl_x"),
-    ):
-        file.write_text(json.dumps(wrong))
-        with pytest.raises(DataError, match=told):
-            read_cameras(file, frames)
-    cameras = read_cameras(world.town / "transforms.json", frames)
-    with pytest.raises(DataError, match=r"neither 0000\.npz nor 0000\.npy"):
-        read_depths(tmp_path, frames, cameras, "ray")
-    np.save(tmp_path / "0000.npy", np.zeros((3, 3)))
-    with pytest.raises(DataError, match="24 rows of 32"):
-        read_depths(tmp_path, frames, cameras, "ray")

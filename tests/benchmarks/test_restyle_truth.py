@@ -4,12 +4,10 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import pytest
 import torch
-from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import World, stage_of
 from torch import Tensor
 
@@ -22,36 +20,15 @@ from benchmarks.restyle import (
     MATCHED,
     PLAIN,
     STYLIZERS,
-    dictionary_of,
-    in_scene,
-    nothing,
-    one_by_one,
-    verdict,
 )
-from benchmarks.single_image import encoded
-from benchmarks.town.surface import SKY
 from benchmarks.town.truth import (
-    PARTS,
-    Reference,
-    Row,
     best_class_maps,
-    code_classes,
-    photograph,
-    places,
-    shows,
     town_settings,
-    true_class_maps,
     true_views,
 )
 from benchmarks.town.write import read_truth
-from fprf.datamanagers.images import load_image
 from fprf.errors import DataError, UsageError
 from fprf.evaluation.metrics import psnr
-from fprf.ops import backend
-from fprf.plugins.stylizers.config import LocalAdainConfig, RegionToneConfig
-from fprf.style.dictionary import Reference as Samples
-from fprf.style.dictionary import build_dictionary
-from fprf.training.loading import load_run
 
 
 def test_the_truth_is_the_town_itself(world: World) -> None:
@@ -84,31 +61,6 @@ def test_runs_of_other_scenes_are_refused(world: World, tmp_path: Path) -> None:
         town_settings(moved.config)
 
 
-def test_three_references_share_the_work() -> None:
-    found = places((7, 11, 13), (48, 36))
-    assert [place.name for place in found["three"]] == list(PARTS)
-    assert [place.seed for place in found["three"]] == [7, 11, 13] and found["one"][0].seed == 7
-    seen = {place.name: photograph(place, "night") for place in found["three"]}
-    assert all(shows(seen[part].classes.numpy(), part) > 0.2 for part in PARTS)
-    assert shows(seen["facades"].classes.numpy(), "facades") > shows(seen["street"].classes.numpy(), "facades")
-
-
-def test_codes_are_of_the_class_that_they_were_made_of(world: World) -> None:
-    trained = world.load()
-    encoders = trained.encoders()
-    assert encoders.semantic is not None
-    guided = trained.config.datamanager.guided
-    shown = photograph(places((7, 11, 13), (96, 72))["one"][0], "autumn")
-    semantic = encoded(shown.image, encoders.semantic, guided, encoders.basis)
-    dictionary = build_dictionary([Samples("street", semantic, semantic)], clusters=8, seed=0)
-    classes = code_classes(dictionary, {"street": shown}, encoders, guided)
-    nearest = torch.cdist(semantic, dictionary.keys).argmin(1)
-    right = (classes[nearest] == shown.classes.flatten()).double().mean()
-    assert SKY in classes.tolist() and float(right) > 0.5, "chance is a twelfth, one class alone a third"
-    with pytest.raises(DataError, match="no semantics"):
-        code_classes(dictionary, {"street": shown}, encoders._replace(semantic=None), guided)
-
-
 def picture(seed: int) -> Tensor:
     return 0.2 + 0.6 * torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(seed))
 
@@ -123,54 +75,6 @@ def test_the_best_maps_find_any_map_of_classes() -> None:
         truth[grid == kind] = plain[grid == kind] @ matrix + 0.1 * (kind == 1) + 0.3 * (kind == 2)
     (found,) = best_class_maps([(plain, grid)], [truth])
     assert psnr(found, truth) > 45
-
-
-def test_true_classes_get_the_references_colours() -> None:
-    plain, style = picture(5), 0.3 + 0.4 * picture(6)
-    style[grid == 2] = style[grid == 2] * 0.5
-    (found,) = true_class_maps([(plain, grid)], [(style, grid)])
-    for kind in range(3):
-        here, there = found[grid == kind], style[grid == kind]
-        assert torch.allclose(here.mean(0), there.mean(0), atol=0.01)
-        assert torch.allclose(here.std(0), there.std(0), atol=0.02)
-    other = torch.full_like(grid, 7)
-    (found,) = true_class_maps([(plain, grid)], [(style, other)])
-    for kind in range(3):
-        assert torch.allclose(found[grid == kind].mean(0), style.reshape(-1, 3).mean(0), atol=0.01)
-
-
-def test_every_goal_is_judged_on_its_own() -> None:
-    others = {PLAIN: 10.0, FLAT: 13.5, "reinhard": 11.0, "histogram": 10.0, "adain": 12.0}
-    rows: dict[str, Row] = {name: {"psnr": psnr} for name, psnr in others.items()}
-    rows["best"] = {"psnr": 14.0, "match_inside": 0.95, "consistency": 0.01}
-    found = verdict(rows, "best")
-    assert found["best_global"] == "adain" and found["goals"].keys() == GOALS.keys()
-    assert found["reached"] == dict(zip(GOALS, (4.0, 2.0, 0.5, 0.95, 0.01), strict=True))
-    assert found["met"] == dict(zip(GOALS, (True, True, False, True, True), strict=True))
-
-
-def measured(world: World, device: str) -> list[Any]:
-    """Pictures and matches in the scene and one by one, and whose class codes are."""
-    trained = load_run(world.run, device)
-    encoders, paths = trained.encoders(), world.references[:1]
-    views = stage_of(trained, views=1, frames=8, longest=32).shown
-    dictionary = dictionary_of(paths, encoders, clusters=3, blend=0.1)[0]
-    image = torch.from_numpy(load_image(paths[0])).float() / 255
-    shown = Reference(paths[0].name, image, torch.arange(image[..., 0].numel()).view(image.shape[:2]) % 3)
-    plain = nothing(views).pictures
-    there = in_scene(trained, views, LocalAdainConfig(), dictionary, encoders, paths)
-    alone = one_by_one(trained, plain, RegionToneConfig(), dictionary, encoders)
-    classes = code_classes(dictionary, {shown.name: shown}, encoders, trained.config.datamanager.guided)
-    return [*plain, *(x for each in (there, alone) for x in (*each.pictures, *(each.taken or []))), classes]
-
-
-def test_ways_to_restyle(world: World) -> None:
-    with backend.plain():
-        expected = measured(world, "cpu")
-    with pretend_cuda() as seen:
-        found = measured(world, str(CUDA))
-    assert seen.uploads and len(found) == len(expected)
-    assert all(a.device.type == "cpu" and torch.equal(a, b) for a, b in zip(found, expected, strict=True))
 
 
 SMALL = ["--palettes", "night", "--views", "1", "--longest", "24", "--clusters", "4", "--device", "cpu"]

@@ -1,8 +1,6 @@
 """`bench speed`: what is compared is the same, what is counted is there, rounds and goals."""
 
-import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -10,16 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import World
 
-from benchmarks.report import Row, Watch, ratio
-from benchmarks.speed import SpeedConfig, grid_sample_lookup, plain_planes
+from benchmarks.report import ratio
+from benchmarks.speed import grid_sample_lookup, plain_planes
 from benchmarks.subject import (
-    attempt,
-    batch_rays,
-    colour_gradient,
     difference,
     exact,
-    find,
-    fresh_model,
     plainly,
     view_rays,
 )
@@ -69,53 +62,8 @@ def test_grid_sample_is_the_same_lookup(resolutions: list[int], channels: int, s
     assert torch.allclose(*gradients, rtol=1e-9, atol=1e-9)
 
 
-def test_a_run_without_images_can_be_measured_but_for_training(world: World, tmp_path: Path) -> None:
-    shutil.copytree(world.run, tmp_path / "run")
-    config = tmp_path / "run" / "config.json"
-    config.write_text(config.read_text().replace(str(world.town), str(tmp_path / "gone")))
-    asked = SpeedConfig(references=world.references, device="cpu")
-    prepared, missing = attempt(find(tmp_path / "run", asked, tmp_path))
-    assert prepared is None and f"{tmp_path / 'gone'}: no such folder" in missing
-    prepared, missing = attempt(find(tmp_path / "run", replace(asked, data=world.town), tmp_path))
-    assert prepared is not None and missing == ""
-
-
-def test_skipping_moves_the_gradient_and_exactness_does_not(world: World) -> None:
-    trained, prepared = world.load(), world.prepared
-    batch = prepared.manager.batch(3)
-
-    def gradient(budget: float, dtype: torch.dtype) -> torch.Tensor:
-        model = fresh_model(trained).to(dtype)
-        config = replace(trained.config, render=replace(trained.config.render, train_budget=budget))
-        rays = batch_rays(model, prepared, batch)
-        rays = type(rays)(*(x.to(dtype) for x in rays))
-        return colour_gradient(model, prepared, config, batch, rays, 3).double()
-
-    truth = gradient(0.0, torch.float64)
-    errors = [float((gradient(b, torch.float32) - truth).norm() / truth.norm()) for b in (0.0, 0.2, 0.45)]
-    assert errors[0] < 1e-4 < errors[1] < errors[2]
-
-
 @given(st.lists(st.floats(1e-6, 1e3), min_size=1, max_size=9), st.floats(0.1, 50))
 def test_load_that_both_meet_in_a_round_cancels(loads: list[float], faster: float) -> None:
     found = ratio([faster * load for load in loads], loads)
     for value in found[:3]:
         assert value == pytest.approx(faster)
-
-
-def test_rounds_run_everything_in_turn_after_one_that_does_not_count() -> None:
-    heard: list[str] = []
-    told: list[tuple[int, int]] = []
-    calls = {name: lambda name=name: heard.append(name) for name in "abc"}
-    taken = Watch(4, torch.device("cpu")).in_turn(calls, lambda done, total: told.append((done, total)))
-    assert "".join(heard) == "abc" + "abc" + "bca" + "cab" + "abc"
-    assert {name: len(seconds) for name, seconds in taken.items()} == {"a": 4, "b": 4, "c": 4}
-    assert told == [(0, 4), (1, 4), (2, 4), (3, 4), (4, 4)]
-
-
-@pytest.mark.parametrize(
-    ("goal", "more", "met"),
-    [(None, False, True), (3.0, False, True), (2.0, False, True), (1.9, False, False), (2.0, True, True), (2.1, True, False)],
-)
-def test_a_goal_is_met_at_its_edge(goal: float | None, more: bool, met: bool) -> None:
-    assert Row(name="x", figure=2.0, unit="s", goal=goal, more_is_better=more).met is met

@@ -1,7 +1,9 @@
-"""Differences of style against their definitions."""
+"""Scores of styles, matches, transfers and films against their definitions."""
 
 import math
+from itertools import pairwise
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -11,30 +13,28 @@ from kornia.color import rgb_to_lab
 from ssim_oracle import noise, ssim_oracle
 from torch import Tensor
 
+from benchmarks.semantic_matching import matching_rate
+from benchmarks.single_image import histogram_matching, reinhard
+from benchmarks.steadiness import published, steadiness
 from benchmarks.style_metrics import (
-    Contrast,
+    MIXED,
     RegionStatistics,
-    contrast_kept,
     delta_e_2000,
     gaussian_distance,
-    matched_regions,
-    region_contrasts,
-    relative_distance,
     srgb_to_lab,
     structure,
     style_distances,
+    whole_cells,
 )
+from benchmarks.town.layout import build_town
+from benchmarks.town.palettes import palette
+from benchmarks.town.render import geometry, render, walk
+from benchmarks.town.truth import short_path, town_view
 from fprf.errors import DataError
 from fprf.interfaces import Encoder
-
-
-@pytest.mark.parametrize("shape", [(14, 15, 3), (15, 14, 4), (14, 15), (0, 14, 3)])
-def test_unlike_shapes_are_refused(shape: tuple[int, ...]) -> None:
-    with pytest.raises(DataError):
-        structure(torch.zeros(shape), torch.zeros(15, 14, 3))
-    with pytest.raises(DataError):
-        structure(torch.zeros(10, 30, 3), torch.zeros(10, 30, 3))
-
+from fprf.plugins.encoders.config import BundledContentConfig
+from fprf.rendering.cameras import Cameras
+from fprf.rendering.paths import pinhole
 
 # Sharma, Wu, Dalal 2005, table 1: two colours in Lab and their difference, two pairs a line.
 PUBLISHED = """
@@ -150,66 +150,146 @@ def test_no_change_is_one_and_the_reference_itself_is_zero() -> None:
     assert 0.1 < (rows["half"]["mean"] or 0.0) < 0.9
 
 
-def test_a_style_that_is_right_in_the_wrong_places_is_no_style() -> None:
-    plain, style = draws(0), draws(1) + torch.where(HALVES == 0, 0.3, -0.3)[..., None]
-    local, everywhere = (
-        style_distances({"it": Pixels()}, [(plain, parts)], {"swapped": [(style.flip(1), parts)]}, [(style, parts)])
-        for parts in (HALVES, torch.zeros_like(HALVES))
-    )
-    assert (local["swapped"]["mean"] or 0.0) > 1.5 and (everywhere["swapped"]["mean"] or 1.0) < 0.1
+def rate_oracle(a: np.ndarray, b: np.ndarray, la: np.ndarray, lb: np.ndarray, regions: list[int]) -> float:
+    """Cell by cell, in float64."""
+    centre = np.concatenate([a, b]).mean(0)
+    a, b = a - centre, b - centre
+    hits: dict[int, list[bool]] = {r: [] for r in regions}
+    for x, label in zip(a, la, strict=True):
+        if label not in regions:
+            continue
+        best = {}
+        for r in regions:
+            like = sorted((x @ y / np.linalg.norm(x) / np.linalg.norm(y) for y in b[lb == r]), reverse=True)[:3]
+            best[r] = sum(like) / len(like)
+        hits[label].append(max(best, key=lambda r: best[r]) == label)
+    return float(np.mean([np.mean(hits[r]) for r in regions]))
 
 
-def test_regions_weigh_by_their_share_and_small_ones_not_at_all() -> None:
-    def at(mean: float, cells: int) -> RegionStatistics:
-        return RegionStatistics(cells, torch.tensor([mean]).double(), torch.zeros(1, 1).double())
-
-    plain = {0: at(1.0, 30), 1: at(1.0, 10), 2: at(9.0, 4)}
-    styled = {0: at(0.5, 30), 1: at(1.0, 10), 2: at(9.0, 4)}
-    style = {0: at(0.0, 9), 1: at(0.0, 9), 2: at(0.0, 9), 3: at(5.0, 9)}
-    assert relative_distance(plain, styled, style) == pytest.approx((30 * 0.5 + 10) / 40)
-    assert relative_distance(style, style, style) is None
-    assert relative_distance({7: at(1.0, 30)}, styled, style) is None
-
-
-def bands(heights: tuple[int, ...], colours: list[tuple[float, float, float]]) -> Tensor:
-    return torch.cat([torch.tensor(c).expand(h, 12, 3) for h, c in zip(heights, colours, strict=True)])
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), st.integers(2, 4), st.integers(6, 40), st.integers(6, 40))
+def test_the_rate_is_the_written_out_one(seed: int, regions: int, n: int, m: int) -> None:
+    draw = np.random.default_rng(seed)
+    la, lb = (np.concatenate([np.arange(regions), draw.integers(-1, regions, k - regions)]) for k in (n, m))
+    a, b = (draw.normal(size=(len(labels), 5)) + labels[:, None] for labels in (la, lb))
+    tensors = [torch.from_numpy(x) for x in (a, b, la, lb)]
+    found = matching_rate(*tensors, list(range(regions)))
+    assert found == pytest.approx(rate_oracle(a, b, la, lb, list(range(regions))), abs=1e-12)
 
 
-DAY = [(0.2, 0.4, 0.9), (0.9, 0.2, 0.2), (0.2, 0.8, 0.2)]
-NIGHT = [(0.1, 0.15, 0.3), (0.3, 0.1, 0.08), (0.1, 0.28, 0.08)]
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 1000), st.integers(3, 20), st.integers(3, 20), st.integers(1, 3), st.integers(1, 3))
+def test_a_whole_cell_holds_nothing_else(seed: int, height: int, width: int, h: int, w: int) -> None:
+    regions = torch.from_numpy(np.random.default_rng(seed).integers(0, 2, (height, width)))
+    cells = whole_cells(regions, (h, w))
+    for i in range(h):
+        for j in range(w):
+            rows = slice(i * height // h, math.ceil((i + 1) * height / h))
+            columns = slice(j * width // w, math.ceil((j + 1) * width / w))
+            kinds = regions[rows, columns].unique()
+            assert int(cells[i, j]) == (int(kinds[0]) if len(kinds) == 1 else MIXED)
 
 
-def test_bands_of_another_light_find_their_like() -> None:
-    content, other, style = bands((8, 4, 12), DAY), bands((4, 12, 8), DAY), bands((8, 8, 8), NIGHT)
-    here, there = matched_regions(Pixels(stride=2), [content, other], [style], regions=3, seed=0)
-    assert [tuple(each.shape) for each in here] == [(12, 6), (12, 6)]
-    sky, wall, grass = (int(there[0][row, 0]) for row in (1, 5, 9))
-    assert len({sky, wall, grass}) == 3
-    assert there[0].equal(torch.tensor([sky, wall, grass]).repeat_interleave(4)[:, None].expand(12, 6))
-    assert here[0][:, 0].tolist() == [sky] * 4 + [wall] * 2 + [grass] * 6
-    assert here[1][:, 0].tolist() == [sky] * 2 + [wall] * 6 + [grass] * 4
+@pytest.fixture(scope="module")
+def content() -> Encoder:
+    return BundledContentConfig().build()
 
 
-def test_contrast_follows_an_affine_change_of_light_and_not_the_borders() -> None:
-    image = 0.2 + 0.3 * noise(40, 60)[..., :1].expand(-1, -1, 3)
-    image[:, 30:] += 0.4  # an edge that lies on the regions' border
-    regions = torch.zeros(40, 60)
-    regions[:, 30:] = 1
-    before, after = region_contrasts([(image, regions)]), region_contrasts([(0.5 * image + 0.1, regions)])
-    assert before[0].gradient == pytest.approx(0.3 / 3, rel=0.1)  # mean distance of two uniform numbers
-    assert (before[0].black, before[0].white) == pytest.approx((0.203, 0.497), abs=0.005)
-    for kind in (0, 1):
-        assert before[kind].pixels == after[kind].pixels == 39 * (28 if kind == 0 else 27)
-        assert after[kind].gradient == pytest.approx(0.5 * before[kind].gradient, rel=1e-4)
-        assert after[kind].black == pytest.approx(0.5 * before[kind].black + 0.1, abs=1e-5)
-        assert after[kind].range == pytest.approx(0.5 * before[kind].range, rel=1e-4)
+def colours(count: int, seed: int, low: float = 0.3, high: float = 0.7) -> Tensor:
+    return low + (high - low) * torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
 
 
-def test_contrast_counts_where_the_style_has_as_much() -> None:
-    plain = {0: Contrast(30, 0.1, 0.2, 0.6), 1: Contrast(10, 0.2, 0.0, 0.5), 2: Contrast(99, 0.1, 0.0, 1.0)}
-    styled = {0: Contrast(30, 0.05, 0.2, 0.4), 1: Contrast(10, 0.2, 0.1, 0.6), 2: Contrast(99, 0.0, 0.0, 0.1)}
-    style = {0: Contrast(5, 0.0, 0.1, 0.6), 1: Contrast(5, 0.0, 0.0, 0.5), 2: Contrast(5, 0.0, 0.5, 0.6)}
-    kept = contrast_kept(plain, styled, style)
-    assert kept["gradient_kept"] == pytest.approx((30 * 0.5 + 10 * 1.0) / 40)
-    assert kept["range_kept"] == pytest.approx((30 * 0.5 + 10 * 1.0) / 40)
-    assert contrast_kept(plain, styled, {})["range_kept"] is None
+def lab(x: Tensor) -> Tensor:
+    return rgb_to_lab(x.T.reshape(1, 3, -1, 1))[0, :, :, 0].T
+
+
+@given(st.integers(0, 1000), st.integers(20, 200), st.integers(20, 200))
+def test_reinhard_takes_mean_and_deviation(seed: int, n: int, m: int) -> None:
+    content, style = colours(n, seed), colours(m, seed + 1, 0.4, 0.6)
+    there, found = lab(style), lab(reinhard(content, style))
+    assert torch.allclose(found.mean(0), there.mean(0), atol=0.05)
+    assert torch.allclose(found.std(0, correction=0), there.std(0, correction=0), atol=0.05)
+
+
+@given(st.integers(0, 1000), st.integers(1, 40), st.integers(1, 40))
+def test_ranks_are_those_of_numpys_quantiles(seed: int, n: int, m: int) -> None:
+    content, style = colours(n, seed, 0, 1).double(), colours(m, seed + 1, 0, 1).double()
+    found = histogram_matching(content, style)
+    for channel in range(3):
+        rank = (np.argsort(np.argsort(content[:, channel].numpy())) + 0.5) / n
+        wanted = np.quantile(style[:, channel].numpy(), rank, method="hazen")
+        assert np.allclose(found[:, channel].numpy(), wanted, atol=1e-12)
+
+
+FILM_WIDTH, FILM_HEIGHT, FILM_FRAMES = 96, 72, 8
+
+
+@pytest.fixture(scope="module")
+def path() -> Cameras:
+    view = walk(seed=0, views=10, width=FILM_WIDTH, height=FILM_HEIGHT)[3]
+    fov = math.degrees(2 * math.atan(FILM_HEIGHT / 2 / view.focal))
+    start = pinhole(torch.from_numpy(view.pose)[None], width=FILM_WIDTH, height=FILM_HEIGHT, fov=fov)
+    return short_path(start, FILM_FRAMES)
+
+
+@pytest.fixture(scope="module")
+def depths(path: Cameras) -> list[Tensor]:
+    town = build_town(0)
+    return [torch.from_numpy(geometry(town, town_view(path, i))[0]) for i in range(FILM_FRAMES)]
+
+
+@pytest.fixture(scope="module")
+def day(path: Cameras) -> list[Tensor]:
+    town, look = build_town(0), palette("day")
+    return [torch.from_numpy(render(town, town_view(path, i), look).rgb).float() / 255 for i in range(FILM_FRAMES)]
+
+
+def spoilt(frame: Tensor, k: int, fault: str, size: float) -> Tensor:
+    """The k-th frame with a fault."""
+    draw = torch.Generator().manual_seed(k)
+    if fault == "blur":
+        return torch.from_numpy(cv2.GaussianBlur(frame.numpy(), (0, 0), size))
+    if fault == "drift":
+        return frame + size * k / 7 * torch.tensor([1.0, 0.0, -1.0])
+    return frame + size * torch.randn((3,) if fault == "flicker" else frame.shape, generator=draw)
+
+
+def score(plain: list[Tensor], styled: list[Tensor], depths: list[Tensor], path: Cameras) -> float:
+    found = steadiness(plain, styled, depths, path).score
+    assert found is not None
+    return found
+
+
+def test_the_render_itself_scores_zero(day: list[Tensor], depths: list[Tensor], path: Cameras) -> None:
+    found = steadiness(day, day, depths, path)
+    assert found.score == 0 and found.sharpness == 1
+    assert found.short == found.plain_short and found.long == found.plain_long
+    assert found.plain_short is not None and found.plain_short < 0.05, "true depth warps a true picture onto the next"
+    assert found.valid_share > 0.4
+
+
+@pytest.mark.parametrize(
+    ("fault", "sizes"),
+    [("flicker", (0.01, 0.03, 0.09)), ("drift", (0.02, 0.06, 0.15)), ("blur", (0.5, 1, 2)), ("noise", (0.02, 0.05, 0.1))],
+)
+def test_faults_rank_by_their_size(
+    fault: str, sizes: tuple[float, ...], day: list[Tensor], depths: list[Tensor], path: Cameras
+) -> None:
+    films = [[spoilt(frame, k, fault, size) for k, frame in enumerate(day)] for size in sizes]
+    found = [0.0, *(score(day, frames, depths, path) for frames in films)]
+    assert all(after > 1.3 * before + 0.01 for before, after in pairwise(found)), found
+
+
+def test_a_camera_at_rest_compares_pixel_with_pixel() -> None:
+    """Brighter by 0.01 with every frame: neighbours differ by that, frames 7 apart by seven times as much."""
+    images, depths = [torch.full((12, 12, 3), 0.2 + 0.01 * t) for t in range(9)], [torch.full((12, 12), 2.0)] * 9
+    still = pinhole(torch.eye(4, dtype=torch.float64)[None, :3].repeat(9, 1, 1), width=12, height=12, fov=53.0)
+    found = published(images, depths, still)
+    assert found["short"]["rmse"] == pytest.approx(0.01, rel=1e-4) and found["short"]["pairs"] == 8
+    assert found["short"]["e_warp"] == pytest.approx(1e-4, rel=1e-4)
+    assert 0 < found["short"]["lpips"] < found["long"]["lpips"] < 0.1
+    assert found["long"]["rmse"] == pytest.approx(0.07, rel=1e-4) and found["long"]["pairs"] == 2
+    nothing = published(images, [torch.zeros(12, 12)] * 9, still)
+    assert nothing["short"] == {"rmse": None, "e_warp": None, "lpips": None, "pairs": 0}
+    with pytest.raises(DataError):
+        published(images[:2], depths, still)

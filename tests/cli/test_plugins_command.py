@@ -1,9 +1,13 @@
+"""`fprf plugins` lists and checks what is installed; verbs that packages add are parsed and called like built-in ones."""
+
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from fake_packages import ENCODER, Packages, packages_in
 
+from fprf.cli import main as cli
+from fprf.cli.config import CommandConfig
 from fprf.cli.plugins import faults, run
 
 
@@ -47,7 +51,62 @@ def test_what_is_broken_is_told_and_nothing_else(
     assert run([]) == 0, "listing loads nothing"
 
 
-def test_unreadable_metadata_is_told(packages: Packages, capsys: pytest.CaptureFixture[str]) -> None:
-    packages.raw("acme-damaged", "[fprf.encoders]\nno equals sign\n")
-    assert run(["--check"]) == 1
-    assert "entry points cannot be read" in " ".join(capsys.readouterr().out.split())
+COUNT = '''
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+from fprf.cli.config import CommandConfig
+from fprf.errors import DataError
+from fprf.plugins.samplers.config import SamplerConfig, UniformConfig
+
+@dataclass(frozen=True, kw_only=True)
+class CountConfig(CommandConfig):
+    """Count the files of a folder."""
+
+    positional: ClassVar[tuple[str, ...]] = ("folder",)
+    folder: Path = Path()
+    step: int = 1
+    sampler: SamplerConfig = UniformConfig()
+
+    def run(self) -> int:
+        if not self.folder.is_dir():
+            raise DataError(f"{self.folder}: no such folder")
+        print(len(list(self.folder.iterdir())) * self.step, type(self.sampler).__name__)
+        return 3
+'''
+
+
+@pytest.fixture
+def counting(tmp_path: Path) -> Iterator[Packages]:
+    with packages_in(tmp_path) as found:
+        point = {CommandConfig.group: {"count": "acme_count:CountConfig"}}
+        found.install("acme-count", point, code={"acme_count": COUNT}, version="0.2")
+        yield found
+
+
+def test_it_is_parsed_and_called_like_a_built_in_one(counting: Packages, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = counting.root / "some"
+    folder.mkdir()
+    (folder / "a").touch()
+    assert cli.main(["count", "--step", "4", str(folder), "--sampler", "proposal"]) == 3
+    assert capsys.readouterr().out == "4 ProposalConfig\n"
+    assert cli.main(["count", str(folder / "b")]) == 2
+    assert capsys.readouterr().err == f"error: {folder / 'b'}: no such folder\n"
+    assert cli.main(["count", str(folder), "--stp", "2"]) == 2 and "did you mean --step?" in capsys.readouterr().err
+    assert cli.main(["count", "--help"]) == 0
+    shown = capsys.readouterr().out
+    assert "usage: fprf count" in shown and "Count the files of a folder." in shown and "--step INT" in shown
+    assert cli.main(["cuont"]) == 2 and "did you mean 'count'?" in capsys.readouterr().err
+
+
+def test_a_broken_verb_harms_only_its_callers(counting: Packages, capsys: pytest.CaptureFixture[str]) -> None:
+    counting.install("acme-bad", {CommandConfig.group: {"bad": "acme_bad5:C"}}, code={"acme_bad5": "1 / 0"})
+    for k in (1, 2):
+        counting.install(f"acme-twice-{k}", {CommandConfig.group: {"twice": "acme_count:CountConfig"}})
+    counting.install("acme-train", {CommandConfig.group: {"plugins": "acme_bad5:C"}})
+    assert cli.main(["--help"]) == 0
+    assert "of acme-twice-1 1 and acme-twice-2 1" in capsys.readouterr().out
+    assert cli.main(["bad"]) == 2
+    assert "'bad' (acme_bad5:C from acme-bad 1) failed to import: ZeroDivisionError" in capsys.readouterr().err
+    assert cli.main(["twice"]) == 2 and "several packages provide 'twice'" in capsys.readouterr().err
+    assert cli.main(["plugins", "--help"]) == 0, "ours wins"

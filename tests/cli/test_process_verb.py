@@ -1,4 +1,4 @@
-"""`fprf process` over a fake pycolmap (tests/reconstruction/fake) that records its calls; test_town_sfm has the real one."""
+"""`fprf process` over a fake pycolmap (tests/reconstruction/fake) that records its calls; test_colmap has the real one."""
 
 import json
 import os

@@ -1,3 +1,6 @@
+"""`fprf train`: refused, interrupted, watched, in blocks."""
+
+import json
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -6,6 +9,8 @@ import pytest
 from tiny_world import World, flags, parameters, same
 
 from fprf.cli import main as cli
+from fprf.cli.main import main
+from fprf.cli.train import ViewAddress, take_view
 from fprf.config import TrainConfig
 from fprf.datamanagers.batches import RayBatches
 from fprf.errors import UsageError
@@ -14,7 +19,7 @@ from fprf.plugins import registry
 from fprf.plugins.config import Need
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import EncoderConfig
-from fprf.training import checkpoint
+from fprf.training import checkpoint, driver
 from fprf.training.driver import train
 from fprf.training.run import Run
 
@@ -92,3 +97,61 @@ def test_a_size_that_is_found_stays_with_the_run(world: World, tmp_path: Path, m
     run = Run(tmp_path / "run")
     assert run.load_config()[0].downscale == 2 and run.load_known().cameras.size[0].tolist() == [16, 12]
     assert checkpoint.steps(run.checkpoints) == [2, 3]
+
+
+@pytest.mark.parametrize(
+    ("words", "rest", "place"),
+    [
+        ("--steps 3", "--steps 3", None),
+        ("--view", "", ViewAddress()),
+        ("--view --steps 3", "--steps 3", ViewAddress()),
+        ("--steps 3 --view 9000 --seed 1", "--steps 3 --seed 1", ViewAddress("127.0.0.1", 9000)),
+        ("--view=0.0.0.0:0", "", ViewAddress("0.0.0.0", 0)),
+        ("--view [::1]:81", "", ViewAddress("::1", 81)),
+        ("--view :81", "", ViewAddress("127.0.0.1", 81)),
+    ],
+)
+def test_the_flag_is_taken_out_of_the_others(words: str, rest: str, place: ViewAddress | None) -> None:
+    assert take_view(words.split()) == (rest.split(), place)
+
+
+@pytest.mark.parametrize("words", ["--view everywhere", "--view=70000", "--view=", "--view host:", "--view=²"])
+def test_what_is_no_place_is_refused(words: str) -> None:
+    with pytest.raises(UsageError, match="--view"):
+        take_view(words.split())
+
+
+def test_what_is_trained_is_the_same_to_the_bit_whoever_looks(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a viewer of its own process that cannot start, too."""
+    monkeypatch.setattr(driver, "REPORT_SECONDS", 0.0)
+    monkeypatch.setattr(driver, "_MIN_PAUSE", 0.0)
+    monkeypatch.setattr(driver, "is_watched", lambda root: True)
+    assert cli.main(["train", "fprf-lite", *flags(world, tmp_path / "run"), "--view", "256.0.0.1:1"]) == 0
+    run = Run(tmp_path / "run")
+    assert run.load_config() == (replace(world.config, output=None), "fprf-lite")
+    assert same(parameters(run, 15), parameters(Run(world.run), 15))
+    assert (run.root / "style.safetensors").read_bytes() == (world.run / "style.safetensors").read_bytes()
+
+
+BLOCKS = ["--blocks", "grid", "--blocks.cells", "2", "1", "--steps", "4"]
+
+
+def test_from_training_to_styles(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = tmp_path / "run"
+    command = ["train", "fprf-lite", *flags(world, run), *BLOCKS]
+    assert main(command) == 0
+    assert main(["eval", str(run), "--max-memory", "1"]) == 0
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert 5 < metrics["psnr"] < 40
+    assert main(["stylize", str(run), "--references", *map(str, world.references), "--max-memory", "1"]) == 0
+    assert len(list((run / "styles").rglob("*.png"))) >= 2
+    film = ["render", str(run), "--path", "interpolate", "--frames", "3", "--output", str(tmp_path / "film")]
+    assert main([*film, "--max-memory", "1"]) == 0
+    assert len(list((tmp_path / "film").glob("*.png"))) >= 3
+    before = (run / "blocks/00/done.json").read_bytes()
+    capsys.readouterr()
+    assert main(command) == 0
+    assert "block 00 is finished already" in capsys.readouterr().err
+    assert (run / "blocks/00/done.json").read_bytes() == before

@@ -6,9 +6,11 @@ import shutil
 from pathlib import Path
 
 import pytest
+from splat_ball import ball
 from tiny_world import World
 
 from fprf.cli import main as cli
+from fprf.splats.files import write_gaussians
 
 MISTAKES = """
     doctor run --device x | --device
@@ -52,6 +54,16 @@ MISTAKES = """
     render run --path orbit --frames 2 --fps 1e9 --output a.mp4 | --fps 1e+09
     render run --keyframes absent.json | absent.json
     render run --keyframes keys.json --references A.png | --keyframes
+    restyle --references A.png --output out.ply | name a capture
+    restyle in.ply --output out.ply | --references
+    restyle in.ply --references A.png | --output
+    restyle in.ply --references A.png --output out.obj | out.obj
+    restyle in.ply --references A.png --output out.ksplat | read, not written
+    restyle in.ply --references A.png --output out.ply --up 0 0 0 | up
+    restyle in.ply --references A.png --page out.png | --page
+    restyle in.ply in.ply --references A.png --output out | several captures
+    restyle in.ply other.spz --references A.png --output out.ply | need a folder
+    restyle in.ply other.spz --references A.png --output . | the captures lie there
     stylize run | --references
     stylize run --references A.png --forbid 0=0 | region 0
     stylize run --references A.png --keep 0000:99,1 | 0000:99,1
@@ -93,6 +105,8 @@ def _place(_world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
         config.write_text(config.read_text().replace(str(_world.town), str(data)))
     known = folder / "untested" / "scene.json"
     known.write_text(json.dumps(json.loads(known.read_text()) | {"test": []}))
+    for name in ("in.ply", "other.spz"):
+        write_gaussians(folder / name, ball(20))
     (folder / "path.json").write_text("{}")
     (folder / "keys.json").write_text(json.dumps({"format": 1, "keyframes": [{"frame": 0, "style": None}]}))
     return folder

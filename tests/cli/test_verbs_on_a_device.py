@@ -17,16 +17,16 @@ from fprf.plugins.weights import read_weights
 VIEW = ["--views", "0000"]
 QUICK = ["--clusters", "3"]
 SMALL = ["--side", "16", "--views", "3", "--lut-size", "3", "--fit", "1e-6", "--fit-cap", "50"]
-DEVICE = "cuda:0"
+DEVICE, APPLE = "cuda:0", "mps:0"
 
 
 def ran(args: list[str], device: str) -> dict[str, int]:
-    """Host waits of a verb, by operator."""
+    """Host waits of a verb, by operator. `mps` has no float64."""
     if device == "cpu":
         with backend.plain():
             assert cli.main([*args, "--device", device]) == 0
         return {}
-    with pretend_cuda() as seen:
+    with pretend_cuda(mps=device == APPLE) as seen:
         assert cli.main([*args, "--device", device, "--debug"]) == 0
     assert seen.uploads, "nothing was on the device"
     return dict(seen.syncs)
@@ -77,10 +77,13 @@ VERBS: dict[str, Callable[[World, Path], list[str]]] = {
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow) if name == "export" else name for name in VERBS])
-def test_a_verb_writes_what_the_cpu_writes(world: World, tmp_path: Path, name: str) -> None:
-    outputs = [tmp_path / device for device in ("cpu", "cuda")]
-    for output, device in zip(outputs, ("cpu", DEVICE), strict=True):
+@pytest.mark.parametrize(
+    ("name", "there"),
+    [("stylize", DEVICE), ("stylize", APPLE), ("render", DEVICE), pytest.param("export", DEVICE, marks=pytest.mark.slow)],
+)
+def test_a_verb_writes_what_the_cpu_writes(world: World, tmp_path: Path, name: str, there: str) -> None:
+    outputs = [tmp_path / device for device in ("cpu", "other")]
+    for output, device in zip(outputs, ("cpu", there), strict=True):
         output.mkdir()
         args = [name.split()[0], str(world.run), *VERBS[name](world, tmp_path)]
         ran([arg.replace("OUT", str(output)) for arg in args], device)

@@ -13,7 +13,6 @@ import torch
 from capture_files import cameras_of, write_image
 from hypothesis import given
 from hypothesis import strategies as st
-from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import World
 
 import fprf.datamanagers.batches as pixel_file
@@ -104,35 +103,6 @@ def test_the_share_of_semantic_rays(scene: Scene, tmp_path: Path, share: float, 
     store = manager.semantic_store
     assert store is not None and store.basis is not None
     assert torch.equal(batch.semantic, store.at(batch.view[:expected], batch.pixel[:expected], batch.rgb[:expected]))
-
-
-def test_a_device_draws_what_the_host_draws(scene: Scene, tmp_path: Path) -> None:
-    """Pixels, colours, features, masks, sky and depths; its generator is the CPU's here, which on a card is another one."""
-    masks = tuple(
-        write_mask(tmp_path / f"half-{view}.png", np.uint8(255) * (np.arange(height)[:, None] <= height // 2).repeat(width, 1))
-        for view, (width, height) in enumerate(SIZES)
-    )
-    points = torch.tensor([[0.1, 0.2, -2.0], [-0.3, 0.1, -3.0], [0.0, 0.0, -1.0]], dtype=torch.float64)
-    scene = replace(scene, masks=masks, sky_masks=(None, None, *masks[2:]), points=points)
-    fields = {"rays": 200, "semantic_share": 0.5, "depth_share": 0.2}
-    manager = make(scene, tmp_path, seed=3, content=True, semantic=True, **fields)
-    with pretend_cuda() as seen:
-        assert manager.to(CUDA, room=manager.held_bytes - 1) is manager is manager.to(torch.device("mps"), room=1 << 40)
-        there = manager.to(CUDA, room=manager.held_bytes)
-        seen.syncs.clear()
-        seen.uploads.clear()
-        for step in (0, 7):
-            found = there.batch(step)
-            assert not seen.syncs and not seen.uploads
-            here = manager.batch(step)
-            for name, value, other in zip(found._fields, found, here, strict=True):
-                assert value.device == CUDA and other.device.type == "cpu"
-                if name in ("content", "semantic"):
-                    assert (value.cpu() - other).abs().max() <= 1e-5 * other.abs().max()
-                else:
-                    assert torch.equal(value.cpu().nan_to_num(-1.0), other.nan_to_num(-1.0)), name
-            seen.syncs.clear()
-        assert torch.equal(there.image(2), manager.image(2)), "views stay in host memory"
 
 
 MASKS = st.lists(st.lists(st.booleans(), min_size=1, max_size=12), max_size=5)

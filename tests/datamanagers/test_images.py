@@ -21,10 +21,8 @@ from photo_files import HEIC, oriented, turned_jpeg, upright
 from PIL import Image, ImageCms
 
 from fprf.datamanagers.images import (
-    MAX_PIXELS,
     image_names,
     load_image,
-    load_images,
     load_mask,
     photographs,
     read_header,
@@ -251,7 +249,6 @@ def profile(primaries: list[tuple[float, float]], gamma: float) -> bytes:
     return whole + struct.pack(">I", len(tags)) + table + body
 
 
-SRGB = [(0.64, 0.33), (0.30, 0.60), (0.15, 0.06)]
 P3 = profile([(0.68, 0.32), (0.265, 0.69), (0.15, 0.06)], 2.2)
 ADOBE = profile([(0.64, 0.33), (0.21, 0.71), (0.15, 0.06)], 2.19921875)
 
@@ -383,18 +380,6 @@ def test_a_file_is_refused_wherever_it_is_cut(tmp_path: Path, kind: str) -> None
             load_image(path)
 
 
-def test_large_claims_cost_nothing(tmp_path: Path) -> None:
-    """Whatever the pixels are, a size over the limit is refused by the header alone."""
-    side = int(MAX_PIXELS**0.5) + 1
-    (tmp_path / "a.png").write_bytes(png((side, side), 1, 0, []))
-    with pytest.raises(DataError, match=f"{side}x{side} pixels"):
-        load_image(tmp_path / "a.png")
-    head = b"RIFF" + struct.pack("<I", 30) + b"WEBPVP8X" + struct.pack("<I", 10) + bytes(4)
-    (tmp_path / "a.webp").write_bytes(head + (16000).to_bytes(3, "little") * 2 + bytes(8))
-    with pytest.raises(DataError):
-        load_image(tmp_path / "a.webp")
-
-
 MASKS = ["L", "1", "01", "16", "01 of 16", "RGB", "01 RGB", "red on black", "red on white", "opaque RGBA", "RGBA", "black RGBA"]
 MASKS += ["other RGBA", "LA", "opaque LA", "palette", "swapped palette", "dark palette"]
 LEFT = np.zeros((64, 96), np.uint8)
@@ -465,11 +450,3 @@ def test_masks_that_leave_nothing_or_everything_are_told(tmp_path: Path) -> None
                 cv2.imwrite(str(path), np.full((8, 8), value, np.uint8))
         found = useless_masks(replace(scene, masks=tuple(paths)))
         assert said in found and bool(said) == bool(found)
-
-
-def test_an_image_that_was_rotated_after_parsing_is_refused(tmp_path: Path) -> None:
-    write_transforms(tmp_path, Capture.make(3))
-    scene = parse_scene(tmp_path, 1, None)
-    write_image(scene.paths[1], (16, 24))
-    with pytest.raises(DataError, match="16x24 pixels do not fit its camera's 24x16"):
-        load_images(scene)

@@ -32,7 +32,7 @@ RUN = ("eval", "stylize", "restyle", "render", "gallery", "export", "plugins", "
 """Verbs whose commands are run here."""
 PARSED = {
     "demo": "minutes; tests/cli/test_demo_verb.py runs it small",
-    "process": "needs pycolmap; tests/reconstruction/test_town_sfm.py runs it",
+    "process": "needs pycolmap; tests/reconstruction/test_colmap.py runs it",
     "train": "minutes; run below with `-m slow`",
     "view": "stays up; tests/viewer run it",
     "pretrain": "hours; tests/pretraining run it small",

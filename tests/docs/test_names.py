@@ -1,7 +1,10 @@
-"""What the documents name exists: files, modules, anchors and flags; their tables are those of the results."""
+"""What the documents name exists: files, modules, anchors and flags; tables are those of the results; the site builds."""
 
 import importlib.util
+import os
 import re
+import subprocess
+import sys
 from dataclasses import fields as dataclass_fields
 from dataclasses import is_dataclass
 from importlib.metadata import entry_points
@@ -15,6 +18,8 @@ from fprf.cli.main import VERBS
 
 ROOT = DOCS.parent
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+LEGENDS = [ROOT / "fprf/interfaces.py", ROOT / "pyproject.toml"]
+"""Files beside the documents that say where a newcomer adds what."""
 FILE = re.compile(r"`((?:fprf|tests|benchmarks|tools|examples)/[\w./+-]+)`")
 BELOW = re.compile(
     r"`((?:blocks|cli|datamanagers|evaluation|export|fields|io|ops|page|plugins|rendering|splats|style|training|viewer)/[\w/]+\.py)`"
@@ -30,7 +35,7 @@ def anchor(title: str) -> str:
     return "#" + re.sub(r"[^\w -]", "", title.lower()).strip().replace(" ", "-")
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", [*PAGES, *LEGENDS], ids=lambda page: page.stem)
 def test_paths_modules_and_anchors_exist(page: Path) -> None:
     text = page.read_text("utf-8")
     missing = [name for name in FILE.findall(text) if not (ROOT / name).exists()]
@@ -84,3 +89,20 @@ def test_flags_exist(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=lambda page: page.stem)
 def test_tables_are_those_of_the_results(page: Path) -> None:
     assert filled(page.read_text("utf-8")) == page.read_text("utf-8"), "python -m benchmarks tables"
+
+
+MISSING = "the extra `docs` is not installed: pip install -e '.[docs]'"
+
+
+def test_it_builds_without_a_warning(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs", reason=MISSING)
+    pytest.importorskip("material", reason=MISSING)
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-f", str(ROOT / "mkdocs.yml"), "-d", str(tmp_path)]
+    quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    made = subprocess.run(command, capture_output=True, text=True, check=False, env=quiet)
+    assert made.returncode == 0 and "WARNING" not in made.stderr, made.stderr
+    assert {path.stem for path in (tmp_path / "verbs").glob("*.html")} == set(VERBS)
+    for page in [tmp_path / "index.html", tmp_path / "verbs" / "export.html"]:
+        text = page.read_text()
+        assert not re.search(r'<(?:script|img)[^>]+src="https?:|<link[^>]+rel="stylesheet"[^>]+href="https?:', text)
+    assert "restyle" in (tmp_path / "search" / "search_index.json").read_text()

@@ -1,11 +1,22 @@
-"""Scores of pictures against their definitions."""
+"""Scores of pictures against their definitions and LPIPS against its authors; held-out views and fitted poses."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from ssim_oracle import noise, ssim_oracle
+from tiny_world import World
+from torch import Tensor
 
+from fprf.datamanagers.images import load_image
 from fprf.errors import DataError, NumericsError
-from fprf.evaluation.metrics import PSNR_CAP, image_metrics, psnr, ssim
+from fprf.evaluation.metrics import PSNR_CAP, image_metrics, judge, lpips, psnr, ssim
+from fprf.io.images import to_uint8, write_image
+from fprf.training import views
+from fprf.training.camera_optimizers import moved_cameras, rotated
+from fprf.training.views import render_view
 
 
 def test_psnr_of_identical_images_is_the_cap_and_nothing_is_above() -> None:
@@ -30,12 +41,6 @@ def test_what_is_not_finite_is_no_score(value: float) -> None:
             metric(broken, noise(12, 12))
 
 
-@pytest.mark.parametrize("shape", [(14, 15, 3), (15, 14, 4), (14, 15), (0, 14, 3)])
-def test_unlike_shapes_are_refused(shape: tuple[int, ...]) -> None:
-    with pytest.raises(DataError):
-        psnr(torch.zeros(shape), torch.zeros(15, 14, 3))
-
-
 def test_what_a_mask_leaves_out_does_not_count() -> None:
     """Any change there leaves PSNR as it is, and SSIM but for windows that reach into it: those see the same in both images."""
     draw = torch.Generator().manual_seed(0)
@@ -48,3 +53,103 @@ def test_what_a_mask_leaves_out_does_not_count() -> None:
     assert image_metrics(render, truth, torch.ones_like(where)) == pytest.approx(image_metrics(render, truth))
     with pytest.raises(DataError, match="leaves nothing"):
         image_metrics(render, truth, torch.zeros_like(where))
+
+
+def picture(height: int, width: int, phase: float) -> Tensor:
+    """Smooth waves of colour and a disc [H W 3]."""
+    y, x = torch.meshgrid(torch.linspace(0, 1, height), torch.linspace(0, 1, width), indexing="ij")
+    waves = (
+        torch.stack([torch.sin(9 * x + phase), torch.sin(7 * y - phase), torch.cos(5 * (x + y) * (1 + phase))], -1) / 2 + 0.5
+    )
+    disc = ((x - 0.6) ** 2 + (y - 0.4) ** 2 < 0.05)[..., None]
+    return torch.where(disc, 1 - waves, waves)
+
+
+def noisy(image: Tensor) -> Tensor:
+    steps = torch.arange(image.numel(), dtype=torch.float64)
+    return (image + 0.3 * torch.frac(torch.sin(steps * 12.9898) * 43758.5453).reshape(image.shape).float()).clamp(0, 1)
+
+
+STORED = {
+    "other colours": (picture(64, 96, 0.0), picture(64, 96, 0.5), 0.266698),
+    "nearly the same": (picture(127, 90, 0.0), picture(127, 90, 0.1), 0.031176),
+    "noise": (picture(100, 100, 0.2), noisy(picture(100, 100, 0.2)), 0.494266),
+    "grey": (picture(64, 64, 0.0), torch.full((64, 64, 3), 0.5), 0.945153),
+}
+"""Two images and what `lpips` 0.1.4 of PyPI said: net alex, version 0.1, its own heads."""
+
+
+@pytest.mark.parametrize("name", STORED)
+def test_numbers_are_those_of_the_authors_package(name: str) -> None:
+    a, b, expected = STORED[name]
+    assert lpips(a, b) == pytest.approx(expected, abs=1e-3)
+    assert lpips(b, a) == pytest.approx(lpips(a, b), rel=1e-5)
+    assert lpips(a, a) == 0
+
+
+def test_only_what_counts_is_judged() -> None:
+    a = picture(96, 96, 0.0)
+    b, where = a.clone(), torch.zeros(96, 96, dtype=torch.bool)
+    b[:, :30] = 0
+    where[:, 64:] = True
+    assert lpips(a, b, ~where) > 0.1 > 10 * lpips(a, b, where)
+    assert lpips(a, b, torch.ones_like(where)) == pytest.approx(lpips(a, b), rel=1e-6)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (12, 48), (30, 31)])
+def test_small_images_are_judged_too(size: tuple[int, int]) -> None:
+    assert 0 < lpips(torch.zeros(*size, 3), torch.ones(*size, 3)) < 2
+
+
+def test_images_that_cannot_be_compared_are_refused() -> None:
+    with pytest.raises(DataError, match="one size"):
+        lpips(torch.zeros(32, 32, 3), torch.zeros(32, 33, 3))
+    with pytest.raises(NumericsError):
+        lpips(torch.full((32, 32, 3), math.nan), torch.zeros(32, 32, 3))
+
+
+def test_metrics_are_those_of_the_renders(world: World) -> None:
+    trained, scene = world.load(), world.prepared.scene
+    told: list[tuple[int, int, str]] = []
+    metrics, images = judge(trained, trained.known, scene, trained.known.test, lambda *of: told.append(of))
+    assert [of[:2] for of in told] == [(0, 2), (1, 2), (2, 2)]
+    assert len(images) == metrics["views"] == 2 and metrics["per_view"].keys() == {"0000", "0008"}
+    for view, image in zip(trained.known.test, images, strict=True):
+        again = render_view(trained.model, trained.known.facts, trained.known.cameras, view, trained.config.render)
+        assert (to_uint8(again.rgb) == image).all()
+        truth = torch.from_numpy(load_image(scene.paths[view], (32, 24))).float() / 255
+        assert metrics["per_view"][scene.paths[view].stem] == image_metrics(again.rgb, truth)
+    assert metrics["psnr"] == pytest.approx(sum(v["psnr"] for v in metrics["per_view"].values()) / 2)
+    assert metrics["rays_per_second"] == pytest.approx(2 * 24 * 32 / metrics["render_seconds"])
+    assert metrics["seconds_per_view"] == pytest.approx(metrics["render_seconds"] / 2)
+    assert 0 < metrics["lpips"] < 2
+    assert metrics["consistency"]["pairs"] == 1 and 0 < metrics["kept_samples_share"] <= 1
+
+
+def test_a_turned_view_comes_back(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its image is what the scene looks like from where it was; the fit starts a little beside."""
+    trained = world.load()
+    view = trained.known.test[0]
+    cameras, config = trained.known.cameras, trained.config.render
+    truth = render_view(trained.model, trained.known.facts, cameras, view, config).rgb
+    write_image(tmp_path / "truth.png", to_uint8(truth))
+    paths = list(world.prepared.scene.paths)
+    paths[view] = tmp_path / "truth.png"
+    pose = cameras.pose.clone()
+    turn = torch.tensor([[0.0, 0.0, 0.03]], dtype=torch.float64)
+    for axis in range(3):
+        pose[view, :, axis] = rotated(pose[view, :, axis][None], turn)[0]
+    wrong = replace(trained, known=replace(trained.known, cameras=replace(cameras, pose=pose)))
+    before = {name: t.clone() for name, t in trained.model.state_dict().items()}
+    monkeypatch.setattr(views, "FIT_STEPS", 60)
+    moves = wrong.fit_poses(replace(world.prepared.scene, paths=tuple(paths)), [view], lambda *of: None)
+    found = replace(wrong, known=replace(wrong.known, cameras=moved_cameras(wrong.known.cameras, moves)))
+
+    def error(run: object) -> float:
+        known = run.known  # type: ignore[attr-defined]
+        return float((render_view(trained.model, known.facts, known.cameras, view, config).rgb - truth).square().mean())
+
+    assert error(found) < 0.5 * error(wrong)
+    others = [k for k in range(len(pose)) if k != view]
+    assert torch.equal(found.known.cameras.pose[others], pose[others])
+    assert all(torch.equal(t, before[name]) for name, t in trained.model.state_dict().items())

@@ -8,7 +8,6 @@ import torch
 import trimesh
 from analytic import RADIUS, globe
 
-from fprf.errors import DataError
 from fprf.export.mesh import Maps, Mesh, build_mesh, surface_nets, vertex_colours, write_mesh
 from fprf.io.images import srgb_to_linear
 from fprf.rendering.local_frame import read_offset
@@ -116,11 +115,3 @@ def test_far_from_0_the_mesh_lies_where_the_capture_does(mesh: Mesh, tmp_path: P
         whole = trimesh.load_scene(path, process=False)
         assert np.abs(whole.to_geometry().vertices - mesh.point.numpy()).max() < 1e-6
         assert read_offset(path) == origin
-
-
-def test_where_nothing_is_seen_there_is_a_clear_mistake(seen: Maps) -> None:
-    with pytest.raises(DataError, match=r"no surface for a mesh.*--mesh-edge"):
-        build_mesh(seen, edge=50.0)
-    nothing = [torch.full_like(depth, torch.inf) for depth in seen.depth]
-    with pytest.raises(DataError, match="no view sees a surface within reach"):
-        build_mesh(seen._replace(depth=nothing))

@@ -1,15 +1,23 @@
-"""What `fprf export` writes, opened again by other programs' readers: counts, places and colours agree."""
+"""What `fprf export` writes, opened again by other programs' readers and our own."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+import torch
 import trimesh
+from analytic import ring
 from splatter import read_gaussians, read_splat
 from tiny_world import World
 
 from fprf.cli import main as cli
+from fprf.datamanagers.parsers.config import parse_scene
+from fprf.export.config import plan
+from fprf.rendering.camera_path import transforms
+from fprf.rendering.cameras import Cameras
 
 LOOKS = {"": "plain", ".dusk": "dusk", ".snow": "snow"}
 
@@ -45,3 +53,57 @@ def test_all_files_of_one_geometry_agree(folder: Path) -> None:
         seen.append((ply.colour, mesh.visual.vertex_colors[:, :3] / 255))
     for kind in (0, 1):
         assert all(np.abs(seen[a][kind] - seen[b][kind]).mean() > 0.008 for a, b in ((0, 1), (0, 2), (1, 2)))
+
+
+def test_a_folder_takes_the_usual_kinds_or_those_that_are_named(tmp_path: Path) -> None:
+    assert plan([], tmp_path) == (("ply", "splat", "glb", "cameras", "lut"), tmp_path, None)
+    assert plan(["splat", "ply", "splat"], Path("out")) == (("splat", "ply"), Path("out"), None)
+    assert plan(["splats", "mesh", "spz", "glb"], Path("out")).kinds == ("ply", "splat", "glb", "spz")
+    assert plan(["mesh", "compressed.ply"], Path("out")).formats == ("compressed.ply",)
+    assert plan(["glb"], Path("out")).paths("mesh", "dusk", ".ply", ".glb") == [
+        Path("out/mesh.dusk.ply"),
+        Path("out/mesh.dusk.glb"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("kinds", "name", "kind"),
+    [
+        *(([], "a.ply", "ply"), (["mesh"], "a.ply", "glb"), ([], "a.SPLAT", "splat"), ([], "t.json", "cameras")),
+        *(([], "a.compressed.ply", "compressed.ply"), (["sog"], "meta.json", "sog"), (["lut"], "a.cube", "lut")),
+    ],
+)
+def test_a_file_holds_what_its_ending_says(kinds: list[str], name: str, kind: str) -> None:
+    assert plan(kinds, Path("to") / name) == ((kind,), Path("to"), Path("to") / name)
+    assert plan(kinds, Path("to") / name).paths("splats", "dusk", ".x") == [Path("to") / name]
+
+
+def written(folder: Path, cameras: Cameras, **more: object) -> dict[str, object]:
+    files = [f"images/{k:02d}.png" for k in range(len(cameras))]
+    (folder / "images").mkdir(parents=True)
+    for file, (width, height) in zip(files, cameras.size.tolist(), strict=True):
+        cv2.imwrite(str(folder / file), np.zeros((height, width, 3), dtype=np.uint8))
+    document = transforms(cameras, files, train=[1, 2, 4], test=[0, 3], **more)  # type: ignore[arg-type]
+    (folder / "transforms.json").write_text(json.dumps(document))
+    return document
+
+
+@pytest.mark.parametrize("kind", ["shared", "each", "opencv", "fisheye"])
+def test_our_own_parser_reads_the_cameras_back(tmp_path: Path, kind: str) -> None:
+    cameras = ring(5)
+    if kind == "each":
+        cameras = replace(cameras, focal=cameras.focal + torch.arange(5).double()[:, None])
+    if kind == "opencv":
+        bent = torch.tensor([0.1, -0.02, 0.003, -0.0004, 0.001, -0.002], dtype=torch.float64)
+        cameras = replace(cameras, distortion=bent.repeat(5, 1), lens=torch.ones(5, dtype=torch.int64))
+    if kind == "fisheye":
+        bent = torch.tensor([0.1, -0.02, 0.003, -0.0004, 0.0, 0.0], dtype=torch.float64)
+        cameras = replace(cameras, distortion=bent.repeat(5, 1), lens=torch.full((5,), 2))
+    document = written(tmp_path, cameras)
+    frames = document["frames"]
+    assert isinstance(frames, list) and ("fl_x" in frames[0]) == (kind == "each") != ("fl_x" in document)
+    scene = parse_scene(tmp_path, 1, None)
+    for name in ("focal", "centre", "size", "distortion", "lens"):
+        assert torch.equal(getattr(scene.cameras, name), getattr(cameras, name)), name
+    assert torch.allclose(scene.cameras.pose, cameras.pose, atol=1e-12)
+    assert scene.train.tolist() == [1, 2, 4] and scene.test.tolist() == [0, 3]

@@ -22,18 +22,6 @@ def cloud(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
     return torch.empty(count, 3).uniform_(-1, 1, generator=draw), view
 
 
-def test_kernels_and_plain_form_agree() -> None:
-    field = SMALL.build(channels=6, seed=0)
-    points, view = cloud(200)
-    view = view[::5].repeat_interleave(5, 0)
-    latent = field.density(points).latent
-    with torch.no_grad():
-        found = field.content(latent, view)
-        assert field.content(latent[:0], view[:0]).shape == (0, 6)
-        exact = field.double().content(latent.double(), view.double())
-    assert torch.allclose(found.double(), exact, atol=1e-5)
-
-
 def test_direction_changes_content_unless_there_is_none() -> None:
     points, view = cloud(20)
     for degree, changes in ((1, False), (2, True), (4, True)):

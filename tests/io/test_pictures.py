@@ -1,3 +1,6 @@
+"""Pictures and maps in files."""
+
+import math
 from pathlib import Path
 
 import cv2
@@ -9,6 +12,9 @@ from hypothesis import strategies as st
 
 from fprf.errors import DataError, NumericsError
 from fprf.io.images import encode, shrink, srgb_to_linear, to_uint8, write_image
+from fprf.io.maps import depth_image, depth_limits, match_image, match_summary, palette
+from fprf.io.sheet import side_by_side
+from fprf.io.video import missing_frames
 
 
 def ramp(height: int = 40, width: int = 60) -> np.ndarray:
@@ -61,3 +67,81 @@ def test_light_is_srgb_to_linear() -> None:
     assert srgb_to_linear(np.array([0.0, 0.04045, 0.5, 1.0], np.float32)) == pytest.approx(
         [0, 0.0031308, 0.2140411, 1], abs=1e-6
     )
+
+
+def lightness(picture: np.ndarray) -> np.ndarray:
+    return picture.astype(float) @ np.array([0.2126, 0.7152, 0.0722])
+
+
+def test_depth_scale_does_not_matter_and_outliers_do_not_blind() -> None:
+    depth = 1 + torch.rand(30, 30)
+    solid = torch.ones(30, 30)
+    assert np.abs(depth_image(depth, solid).astype(int) - depth_image(depth * 512, solid)).max() <= 1
+    outlier = depth.clone()
+    outlier[0, 0] = 1e-3
+    assert np.abs(depth_image(outlier, solid)[1:].astype(int) - depth_image(depth, solid)[1:]).mean() < 8
+
+
+@pytest.mark.parametrize("nothing", [0.0, -1.0, math.nan, math.inf])
+def test_where_nothing_is_it_is_grey(nothing: float) -> None:
+    depth = torch.full((5, 5), 2.0)
+    depth[0] = nothing
+    picture = depth_image(depth, torch.ones(5, 5))
+    empty = depth_image(torch.full((5, 5), 2.0), torch.zeros(5, 5))
+    assert np.array_equal(picture[0], empty[0]) and np.ptp(empty[0, 0]) < 10
+    assert not np.array_equal(picture[1], empty[1])
+    assert depth_limits([depth], [torch.zeros(5, 5)]) == (0.0, 1.0)
+
+
+def certain(codes: torch.Tensor, count: int) -> torch.Tensor:
+    return torch.nn.functional.one_hot(codes, count).float()
+
+
+def test_match_map_shows_hue_shade_and_doubt() -> None:
+    reference = torch.tensor([0, 0, 1])
+    sure = match_image(certain(torch.tensor([[0, 1, 2]]), 3), reference, ["a", "b"]).astype(int)
+    unsure = match_image(torch.full((1, 3, 3), 1 / 3), reference, ["a", "b"]).astype(int)
+    assert np.abs(sure[0, 2] - (palette(2)[1].numpy() * 255)).max() <= 1
+    assert lightness(sure)[0, 0] < lightness(sure)[0, 1]  # two shades of the first reference
+    assert sure[0, 0, 0] > sure[0, 0, 2] and sure[0, 1, 0] > sure[0, 1, 2]  # both orange
+    assert lightness(unsure)[0, 0] == pytest.approx(0.45 * lightness(sure)[0, 0], rel=0.05)
+    empty = match_image(certain(torch.tensor([[0]]), 3), reference, ["a", "b"], torch.zeros(1, 1))
+    assert np.ptp(empty[0, 0]) < 10
+
+
+def test_match_summary_in_closed_form() -> None:
+    attention = torch.tensor([[[1.0, 0, 0], [0, 0.5, 0.5]]])
+    row = match_summary(attention, torch.tensor([0, 1, 1]), ["a", "b"])
+    assert row == {
+        "references": [{"name": "a", "share": 0.5}, {"name": "b", "share": 0.5}],
+        "mean_score": 0.75,
+        "entropy_bits": pytest.approx(0.5),
+    }
+    hidden = match_summary(attention, torch.tensor([0, 1, 1]), ["a", "b"], torch.tensor([[3.0, 0.0]]))
+    assert hidden["references"] == [{"name": "a", "share": 1.0}, {"name": "b", "share": 0.0}]
+    nothing = match_summary(attention, torch.tensor([0, 1, 1]), ["a", "b"], torch.zeros(1, 2))
+    assert nothing["mean_score"] == 0.0
+
+
+def flat(value: int, width: int = 40, height: int = 6) -> np.ndarray:
+    return np.full((height, width, 3), value, np.uint8)
+
+
+def test_beside_keeps_every_pixel() -> None:
+    whole = side_by_side([flat(10), flat(20, 30), flat(30, 5)])
+    assert whole.shape == (6, 40 + 2 + 30 + 2 + 5, 3)
+    assert (whole[:, :40] == 10).all() and (whole[:, 42:72] == 20).all() and (whole[:, 74:] == 30).all()
+    assert (whole[:, 40:42] == 255).all() and np.array_equal(side_by_side([flat(7)]), flat(7))
+    with pytest.raises(DataError, match="heights"):
+        side_by_side([flat(1), flat(2, height=7)])
+
+
+def test_missing_frames_are_those_not_there(tmp_path: Path) -> None:
+    paths = [tmp_path / f"{k}.png" for k in range(3)]
+    assert missing_frames(tmp_path, "a", paths) == paths
+    paths[1].write_bytes(b"x")
+    (tmp_path / "mine.txt").write_text("stays")
+    assert missing_frames(tmp_path, "a", paths) == [paths[0], paths[2]]
+    assert missing_frames(tmp_path, "b", paths) == paths and not paths[1].exists() and (tmp_path / "mine.txt").is_file()
+    (tmp_path / ".render.json").write_text("damaged")
+    assert missing_frames(tmp_path, "b", paths) == paths

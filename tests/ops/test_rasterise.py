@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from fprf.ops import backend, rasterise
+from fprf.ops import rasterise
 
 ROUGH = 1.1e-4
 """Relative error of the kernels' exponential."""
@@ -164,14 +164,6 @@ def test_no_input_leaves_the_image_or_a_gradient_without_a_number(spoilt: dict[i
         images.append(found.image.double().detach())
     # Alphas of 0.99 let factors of 1 - alpha err by 99 ROUGH.
     assert (images[0] - images[1]).abs().median() < 100 * ROUGH
-
-
-def test_the_plain_form_on_request() -> None:
-    given, view = cloud(channels=3), camera()
-    with backend.plain():
-        plain = render(given, view)
-    assert plain.image.dtype == torch.float32 and not plain.counts
-    assert (plain.image - render(given, view).image).abs().mean() < ROUGH
 
 
 def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:

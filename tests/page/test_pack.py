@@ -4,7 +4,7 @@ import torch
 from pages import recoloured, street
 from splat_ball import ball
 
-from fprf.page.pack import CHUNK, colour_section, fit_maps, pack, sections
+from fprf.page.pack import CHUNK, fit_maps, pack
 from fprf.splats.files.base import three_to_four
 from fprf.splats.gaussians import HARMONIC, Gaussians
 
@@ -61,11 +61,3 @@ def test_the_maps_of_a_style_carry_its_view_dependence() -> None:
     made = torch.einsum("nkc,ncd->nkd", gaussians.harmonics[:, 1:], torch.from_numpy(maps).view(-1, 3, 3)[label.astype(int)])
     assert float((made - styled[:, 1:]).abs().max()) < 1e-4
     assert len(maps) <= 256
-
-
-def test_a_style_costs_four_bytes_a_gaussian_and_its_maps() -> None:
-    packed = pack(ball(1000, 2))
-    colours = packed.colours(recoloured(ball(1000, 2)))
-    assert colours.rows.nbytes == 4 * 1000 and colours.maps.nbytes <= 256 * 36
-    assert packed.shape.nbytes == 16 * 1000
-    assert len(colour_section(colours)) < 4 * 1000 + 256 * 36 and set(sections(packed)) == {"shape", "chunks", "palette"}

@@ -180,17 +180,6 @@ def test_a_missing_plugin_is_kept_as_data_and_fails_when_built(packages: Package
     assert "install acme-gone 0.3, or choose another with --semantic.encoder NAME" in str(caught.value)
 
 
-def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
-    path = tmp_path / "config.json"
-    save_config(path, fprf(), "fprf")
-    before = path.read_bytes()
-    broken = dataclasses.replace(fprf(), checkpoint_minutes=1.0)
-    object.__setattr__(broken, "checkpoint_minutes", math.nan)
-    with pytest.raises(ConfigError, match="checkpoint_minutes: nan"):
-        save_config(path, broken, "fprf")
-    assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
-
-
 def acme(packages: Packages, folder: Path) -> Path:
     """A saved config of a stranger's method with fields of its own."""
     packages.install("acme-method", {"fprf.methods": {"acme": "acme_method:acme"}}, code={"acme_method": METHOD}, version="0.3")

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.errors import DataError, WeightsError
+from fprf.errors import WeightsError
 from fprf.plugins.encoders.config import (
     EncoderConfig,
     Vgg16Config,
@@ -29,19 +29,6 @@ def test_round_trip(tmp_path_factory: pytest.TempPathFactory, shape: list[int], 
     assert torch.equal(tensors["a"], value.float())
     assert tensors["n"].dtype == torch.int64
     assert [file.name for file in path.parent.iterdir()] == ["er.safetensors"]
-
-
-def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "w.safetensors"
-    write_weights(path, {"a": torch.zeros(2)}, {})
-
-    def fail(*_: object) -> None:
-        raise OSError("disk full")
-
-    monkeypatch.setattr("os.replace", fail)
-    with pytest.raises(DataError, match="disk full"):
-        write_weights(path, {"a": torch.ones(2)}, {})
-    assert torch.equal(read_weights(path)[0]["a"], torch.zeros(2))
 
 
 @settings(max_examples=15, deadline=None)

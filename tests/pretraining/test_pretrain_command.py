@@ -1,21 +1,27 @@
-"""`fprf pretrain` and `tools.distil`: two steps of each kind give files that load; a broken-off run goes on where it was."""
+"""`fprf pretrain` and `tools.distil`: files that load, losses that count, resuming, and the same on a device."""
 
 import json
+import shlex
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from photo_folder import teacher_files, vgg_file
+from photo_folder import photo_folder, teacher_files, vgg_file
+from pretend_cuda import pretend_cuda
 from torch import Tensor, nn
 
 from fprf.cli.pretrain import run
-from fprf.errors import UsageError
+from fprf.errors import UsageError, WeightsError
+from fprf.methods import fprf_lite
+from fprf.ops import backend
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, RandomConfig
 from fprf.plugins.weights import read_weights
 from fprf.pretraining.config import PretrainConfig
 from fprf.pretraining.loop import train, training_folder
+from fprf.training.model import build_decoder
 from tools.distil.__main__ import main
 
 QUICK = ["--steps", "2", "--batch", "2"]
@@ -106,3 +112,79 @@ def test_a_resumed_run_ends_where_an_unbroken_one_does(tmp_path: Path) -> None:
     assert said[0] == "resumed at step 5"
     assert torch.equal(resumed.weight, whole.weight)
     assert not training_folder(output).exists()
+
+
+SMALL = ["--steps", "2", "--batch", "2"]
+
+
+@pytest.mark.parametrize("kind", ["decoder", "content", pytest.param("semantic", marks=pytest.mark.slow)])
+def test_the_same_weights_and_report(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    images = str(photo_folder(tmp_path / "photos", 4))
+    own = {
+        "decoder": ["--encoder", "random", "--encoder.channels", "5", "--pixels", "50", "--style", "0.1", "--content", "0.1",
+                    "--every", "1", "--size", "16", "--style-weights", str(vgg_file(tmp_path))],
+        "content": ["--teachers", str(vgg_file(tmp_path)), "--size", "32", "--crops", "1"],
+        "semantic": ["--teachers", *map(str, teacher_files(tmp_path)), "--size", "32", "--towns", "0"],
+    }[kind]  # fmt: skip
+    found = {}
+    for device in ("cpu", "cuda:0"):
+        output = tmp_path / device.replace(":", "") / "weights.safetensors"
+        train = run if kind == "decoder" else main
+        args = [kind, "--images", images, "--output", str(output), "--device", device, *own, *SMALL]
+        if device == "cpu":
+            with backend.plain():
+                assert train(args) == 0
+        else:
+            with pretend_cuda() as seen:
+                assert train(args) == 0
+            assert seen.uploads, "nothing was on the device"
+        report = json.loads(capsys.readouterr().out)
+        found[device] = read_weights(output), {k: v for k, v in report.items() if k not in ("seconds", "weights")}
+    (there, about), report = found["cuda:0"]
+    (here, before), expected = found["cpu"]
+    assert (about, report) == (before, expected)
+    assert there.keys() == here.keys() and all(torch.equal(there[name], here[name]) for name in here)
+
+
+ENCODER = ["--encoder", "random", "--encoder.channels", "6", "--encoder.stride", "2"]
+FEW = ["--pixels", "60", "--batch", "64", "--size", "24", "--pairs", "1"]
+
+
+@pytest.fixture(scope="module")
+def vgg(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return str(vgg_file(tmp_path_factory.mktemp("vgg")))
+
+
+def made(photos: Path, output: Path, *more: str) -> dict[str, float]:
+    assert run(["decoder", "--images", str(photos), "--output", str(output), *ENCODER, *FEW, *more]) == 0
+    report: dict[str, float] = json.loads(output.with_name(output.stem + ".report.json").read_text())
+    return report
+
+
+def test_the_paper_losses_change_the_decoder_as_they_weigh(vgg: str, tmp_path: Path) -> None:
+    photos = photo_folder(tmp_path / "photos", 30)  # two of them are held out: one in the style of the other
+    steps = ["--steps", "300", "--rate", "0.005", "--style-weights", vgg, "--every", "1"]
+    plain = made(photos, tmp_path / "plain.safetensors", *steps)
+    styled = made(photos, tmp_path / "styled.safetensors", *steps, "--style", "0.03")
+    assert styled["style_loss"] < 0.6 * plain["style_loss"]
+    assert styled["psnr_db"] < plain["psnr_db"] - 3, "what the style gains, the identity pays"
+
+
+def test_without_weights_for_it_no_style_is_measured(photos: Path, vgg: str, tmp_path: Path) -> None:
+    steps = ["--steps", "3"]
+    assert "style_loss" not in made(photos, tmp_path / "a.safetensors", *steps)
+    measured = made(photos, tmp_path / "b.safetensors", *steps, "--style-weights", vgg)
+    assert measured["style_loss"] > 0
+    first, second = (read_weights(tmp_path / f"{name}.safetensors")[0] for name in "ab")
+    assert all(torch.equal(first[name], second[name]) for name in first), "measuring is not training"
+
+
+def test_the_line_that_users_are_told_makes_a_decoder_that_fits(photos: Path, tmp_path: Path) -> None:
+    encoder, output, lite = RandomConfig(channels=4, seed=3), tmp_path / "made.safetensors", fprf_lite()
+    config = replace(lite, content=replace(lite.content, encoder=encoder, decoder=MlpDecoderConfig()))
+    with pytest.raises(WeightsError) as raised:
+        build_decoder(config, encoder=encoder.build().identity, channels=4)
+    line = str(raised.value).split("`")[1].replace("DIR", str(photos)).replace("decoder.safetensors", str(output))
+    assert run([*shlex.split(line)[2:], "--steps", "1", "--pixels", "20"]) == 0
+    fitting = replace(config, content=replace(config.content, decoder=MlpDecoderConfig(weights=output)))
+    build_decoder(fitting, encoder=encoder.build().identity, channels=4)

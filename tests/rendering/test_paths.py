@@ -1,9 +1,11 @@
-"""Camera paths: rigid, smooth, near the capture; which views are covered well."""
+"""Camera paths: rigid, smooth, near the capture, there and back in files; the splines that they follow; covered views."""
 
+import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -11,11 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import DataError, UsageError
-from fprf.rendering.camera_path import write_camera_path
+from fprf.rendering.camera_path import read_camera_path, write_camera_path
 from fprf.rendering.cameras import Cameras, ideal_cameras, project
 from fprf.rendering.lens import OPENCV
 from fprf.rendering.paths import coverage, interpolate, look_at, make_path, orbit, pinhole, spiral, upwards, well_covered
 from fprf.rendering.space import Space
+from fprf.rendering.splines import catmull_rom, quaternions, rotations, slerp
 
 UP = torch.tensor([0.0, 0, 1], dtype=torch.float64)
 
@@ -201,13 +204,118 @@ def test_the_middle_of_a_row_is_covered_better_than_its_ends_and_strays_least(ki
     assert bool((coverage(cameras, range(0, 23, 5), space) <= score).all()), "fewer cameras cover less"
 
 
-def test_wrong_requests() -> None:
-    cameras = forward_facing()
-    for wrong in (
-        lambda: spiral(cameras, 0),
-        lambda: orbit(cameras, 0),
-        lambda: interpolate(cameras, torch.tensor([0, 1]), -1),
-        lambda: interpolate(cameras, torch.tensor([], dtype=torch.int64), 3),
-    ):
-        with pytest.raises(UsageError):
-            wrong()
+def turn(axis: torch.Tensor, angle: float) -> torch.Tensor:
+    """Rodrigues' formula."""
+    x, y, z = torch.nn.functional.normalize(axis, dim=-1).tolist()
+    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    return torch.eye(3, dtype=torch.float64) + math.sin(angle) * cross + 2 * math.sin(angle / 2) ** 2 * cross @ cross
+
+
+def axis(seed: int) -> torch.Tensor:
+    return torch.randn(3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+@given(st.integers(0, 10_000), st.floats(-math.pi, math.pi) | st.sampled_from([0.0, 1e-9, math.pi, math.pi - 1e-9]))
+def test_quaternions_round_trip(seed: int, angle: float) -> None:
+    rotation = turn(axis(seed), angle)[None]
+    quaternion = quaternions(rotation)
+    assert abs(float(quaternion.norm()) - 1) < 1e-14
+    torch.testing.assert_close(rotations(quaternion), rotation, atol=1e-13, rtol=0)
+    torch.testing.assert_close(rotations(-3 * quaternion), rotation, atol=1e-13, rtol=0)
+
+
+@given(st.integers(0, 10_000), st.floats(1e-12, math.pi - 1e-6) | st.just(0.0), st.floats(0, 1), st.booleans())
+def test_slerp_is_the_part_of_the_turn(seed: int, angle: float, u: float, flip: bool) -> None:
+    start = turn(axis(seed + 1), 1.3)
+    ends = quaternions(torch.stack([start, start @ turn(axis(seed), angle)]))
+    found = slerp(ends[:1], -ends[1:] if flip else ends[1:], torch.tensor([u], dtype=torch.float64))
+    assert abs(float(found.norm()) - 1) < 1e-12
+    torch.testing.assert_close(rotations(found)[0], start @ turn(axis(seed), u * angle), atol=1e-9, rtol=0)
+
+
+@given(st.integers(2, 6), st.integers(0, 1000))
+def test_catmull_rom_passes_through_keys_with_one_velocity(count: int, seed: int) -> None:
+    keys = torch.randn(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    gaps = torch.arange(count - 1)
+    torch.testing.assert_close(catmull_rom(keys, gaps, torch.zeros(count - 1).double()), keys[:-1])
+    ends = torch.full((count - 1,), 1 - 1e-12, dtype=torch.float64)
+    torch.testing.assert_close(catmull_rom(keys, gaps, ends), keys[1:], atol=1e-10, rtol=0)
+    step = 1e-6
+    before = keys[1:-1] - catmull_rom(keys, gaps[:-1], torch.full((count - 2,), 1 - step, dtype=torch.float64))
+    after = catmull_rom(keys, gaps[1:], torch.full((count - 2,), step, dtype=torch.float64)) - keys[1:-1]
+    torch.testing.assert_close(before / step, after / step, atol=1e-4, rtol=0)
+
+
+@given(st.lists(st.floats(0, 10) | st.just(0.0), min_size=2, max_size=6))
+def test_catmull_rom_never_turns_back_on_a_line(distances: list[float]) -> None:
+    along = torch.tensor([0.0, *distances], dtype=torch.float64).cumsum(0)
+    keys = along[:, None] * torch.tensor([1.0, -1, 2], dtype=torch.float64)
+    u = torch.linspace(0, 1, 40, dtype=torch.float64).repeat(len(distances))
+    gaps = torch.arange(len(distances)).repeat_interleave(40)
+    assert float(catmull_rom(keys, gaps, u)[:, 0].diff().min()) > -1e-12
+
+
+IDENTITY = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+
+
+def file(path: Path, **changes: Any) -> Path:
+    frame = {"camera_to_world": IDENTITY, "fov": 90.0, "aspect": 1.5}
+    content = {"render_width": 300, "render_height": 200, "camera_path": [frame], **changes}
+    path.write_text(json.dumps(content))
+    return path
+
+
+@settings(max_examples=15)
+@given(st.integers(1, 6), st.floats(20, 4000), st.floats(1, 120), st.integers(0, 99))
+def test_what_is_written_reads_back(
+    tmp_path_factory: pytest.TempPathFactory, count: int, focal: float, fps: float, seed: int
+) -> None:
+    draw = torch.Generator().manual_seed(seed)
+    position = torch.randn(count, 3, dtype=torch.float64, generator=draw)
+    pose = look_at(position, position + torch.randn(count, 3, dtype=torch.float64, generator=draw), torch.eye(3).double()[2])
+    cameras = pinhole(pose, width=320, height=240, fov=math.degrees(2 * math.atan(120 / focal)))
+    path = tmp_path_factory.getbasetemp() / "path.json"
+    write_camera_path(path, cameras, fps)
+    found, rate = read_camera_path(path)
+    assert rate == fps
+    torch.testing.assert_close(found.pose, cameras.pose, atol=1e-12, rtol=0)
+    torch.testing.assert_close(found.focal, cameras.focal, atol=0, rtol=1e-9)
+    assert torch.equal(found.centre, cameras.centre) and torch.equal(found.size, cameras.size)
+
+
+def test_a_file_as_the_viewer_exports_it(tmp_path: Path) -> None:
+    cameras, fps = read_camera_path(file(tmp_path / "p.json", camera_type="perspective", seconds=4, keyframes=[{}]))
+    assert fps == 24 and cameras.focal.tolist() == [[pytest.approx(100.0)] * 2]
+    assert cameras.centre.tolist() == [[150, 100]] and cameras.size.tolist() == [[300, 200]]
+    rows = [IDENTITY[:4], IDENTITY[4:8], IDENTITY[8:12], IDENTITY[12:]]
+    nested = file(tmp_path / "q.json", fps=30, camera_path=[{"camera_to_world": rows, "fov": 90}])
+    again, fps = read_camera_path(nested)
+    assert fps == 30 and torch.equal(again.pose, cameras.pose)
+
+
+def test_a_rounded_rotation_is_made_exact(tmp_path: Path) -> None:
+    turned = [0.70711, -0.70711, 0, 1, 0.70711, 0.70711, 0, 2, 0, 0, 1, 3, 0, 0, 0, 1]
+    cameras, _ = read_camera_path(file(tmp_path / "p.json", camera_path=[{"camera_to_world": turned, "fov": 60}]))
+    rotation = cameras.pose[0, :, :3]
+    assert float((rotation.T @ rotation - torch.eye(3)).abs().max()) < 1e-14
+    assert cameras.pose[0, :, 3].tolist() == [1, 2, 3]
+
+
+FRAME = {"camera_to_world": IDENTITY, "fov": 60}
+
+
+WRONG = [("camera_type", "equirectangular"), ("render_width", 0), ("render_width", 10**400), ("fps", 0), ("camera_path", [])]
+WRONG_FRAMES = [{"fov": 60}, {**FRAME, "fov": 180}]
+# letters, what is too large, a scale, a mirroring
+WRONG_FRAMES += [{**FRAME, "camera_to_world": [first, *IDENTITY[1:]]} for first in ("x", 10**400, 2, -1)]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [(name, value, name) for name, value in WRONG]
+    + [("camera_path", [FRAME, frame], r"camera_path\[1\]") for frame in WRONG_FRAMES]
+    + [("render_height", value, "cannot be read") for value in (math.inf, math.nan)],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, name: str, value: object, told: str) -> None:
+    with pytest.raises(DataError, match=told):
+        read_camera_path(file(tmp_path / "p.json", **{name: value}))

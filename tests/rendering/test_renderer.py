@@ -8,7 +8,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor, nn
 from toy_parts import Never, Ones, Shift, Squash, Uniform, parts_of, rays_of, space_of
 
@@ -81,35 +80,6 @@ def test_the_budget_bounds_the_colour_error(seed: int, budget: float, thickness:
     assert quick.counts["kept"] <= exact.counts["kept"] <= exact.counts["samples"] == 24 * 17
     assert quick.weights is not None
     assert quick.counts["kept"] == int((quick.weights > 0).sum()) or budget > 0
-
-
-@pytest.mark.parametrize("budget", [0.0, 0.3])
-def test_a_step_on_a_device_is_the_same_without_waiting(budget: float) -> None:
-    """All samples are there, those that the budget drops with weight 0: values and gradients up to the order of sums."""
-    parts, rays = parts_of(thickness=3.0), rays_of("contraction", 16)
-
-    def loss(given: Rays) -> tuple[Tensor, Rendered]:
-        found = render_rays(given, parts, want=ALL, budget=budget, step=0)
-        assert found.rgb is not None and found.content is not None and found.semantic is not None
-        return found.rgb.square().sum() + found.content.square().sum() + found.semantic.square().sum(), found
-
-    modules = nn.ModuleList([parts.field, parts.decoder])
-    here, plain = loss(rays)
-    expected = gradients(here, modules)
-    with pretend_cuda() as seen:
-        given = Rays(*(x.to(CUDA) for x in rays))
-        modules.to(CUDA)
-        assert parts.semantic is not None
-        parts.semantic.to(CUDA)
-        there, found = loss(given)
-        gradient = gradients(there, modules)
-        assert not seen.syncs
-        assert plain.counts["kept"] < found.counts["kept"] == found.counts["samples"] or budget == 0
-        assert float(there.detach()) == pytest.approx(float(here.detach()), rel=1e-5)
-        for one, other in zip(gradient, expected, strict=True):
-            assert (one is None) == (other is None)
-            if one is not None and other is not None:
-                torch.testing.assert_close(one.cpu(), other, rtol=1e-4, atol=1e-5 * float(other.abs().max()))
 
 
 @torch.no_grad()

@@ -14,8 +14,9 @@ from fprf import testing
 from fprf.cli import main as cli
 from fprf.errors import DataError
 from fprf.plugins import registry
-from fprf.plugins.captures import CaptureFormat, endings, format_of
+from fprf.splats.config import endings
 from fprf.splats.files import read_capture, write_gaussians
+from fprf.splats.files.base import CaptureFormat, format_of
 from fprf.viewer.uploads import check_file, find_source
 
 CODE = '''
@@ -27,7 +28,7 @@ from typing import ClassVar
 import numpy as np
 
 from fprf.errors import DataError
-from fprf.plugins.captures import CaptureFormat
+from fprf.splats.files.base import CaptureFormat
 from fprf.splats.files import Capture
 from fprf.splats.gaussians import HARMONIC, from_arrays
 

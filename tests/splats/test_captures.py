@@ -65,26 +65,6 @@ def test_neighbouring_captures_take_one_style(photograph: Path, tmp_path: Path) 
     assert (tmp_path / "out" / "left.style.json").is_file()
 
 
-@pytest.mark.parametrize(
-    ("captures", "output", "said"),
-    [
-        (["left.ply", "left.ply"], "out", "several captures"),
-        (["left.ply", "right.spz"], "out.ply", "need a folder"),
-        (["left.ply", "right.spz"], ".", "the captures lie there"),
-        (["left.ply"], "out.ksplat", "read, not written"),
-        ([], "out.ply", "name a capture"),
-    ],
-)
-def test_outputs_that_cannot_be_are_told_before_anything_takes_time(
-    captures: list[str], output: str, said: str, photograph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    halves(tmp_path, ball(40))
-    words = ["restyle", *(str(tmp_path / name) for name in captures), "--references", str(photograph)]
-    assert cli.main([*words, "--output", str(tmp_path / output)]) == 2
-    error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1
-
-
 def look() -> LookConfig:
     semantic = replace(GaussianSemanticsConfig(), encoder=BundledSemanticConfig())
     return LookConfig(views=6, size=(64, 48), regions=4, semantic=semantic)

@@ -15,11 +15,11 @@ import torch
 from splat_ball import ball
 
 from fprf.errors import DataError
-from fprf.plugins.captures import endings, format_of
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import look_at, pinhole
+from fprf.splats.config import endings
 from fprf.splats.files import Capture, read_capture, write_capture, write_gaussians, write_ply_parts
-from fprf.splats.files.base import spatial_order
+from fprf.splats.files.base import format_of, spatial_order
 from fprf.splats.files.sog import bundle, unbundle
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.photographs import camera_of
@@ -272,18 +272,6 @@ def test_sog_of_version_1(tmp_path: Path) -> None:
     new = capture.gaussians.harmonics * 0.5
     again = restyled(tmp_path / "there" / "meta.json", capture, new).gaussians
     assert (again.harmonics - new).abs().max() < 2 / 255 and torch.equal(again.logits, capture.gaussians.logits)
-
-
-def test_gaussians_that_are_not_finite_are_kept_by_ply_alone(tmp_path: Path) -> None:
-    made = cloud(0, 6)
-    made.means[1, 0], made.logits[2], made.logits[3] = torch.nan, torch.inf, torch.nan
-    assert written(tmp_path / "x.ply", made).gaussians.finite.tolist() == [True, False, True, False, True, True]
-    bright = cloud(1, 6)
-    bright.means[0, 1], bright.harmonics[1, 1, 0], bright.log_scales[2, 0] = torch.inf, -torch.inf, torch.inf
-    assert written(tmp_path / "y.ply", bright).gaussians.finite.tolist() == [False] * 3 + [True] * 3
-    for ending in (".compressed.ply", ".splat", ".spz", ".sog"):
-        assert len(written(tmp_path / f"x{ending}", made).gaussians) == 4
-        assert len(written(tmp_path / f"y{ending}", bright).gaussians) == 3
 
 
 def test_what_is_refused_is_refused_in_one_line(tmp_path: Path) -> None:

@@ -277,23 +277,3 @@ def test_any_encoder_finds_the_regions(photographs: list[Path], tmp_path: Path) 
     assert other == again != bundled
     known = json.loads((tmp_path / "random.style.json").read_text())
     assert known["semantic_encoder"] == RandomConfig(channels=6).build().identity
-
-
-@pytest.mark.parametrize(
-    ("photos", "flags", "said"),
-    [
-        (1, "", "--output"),
-        (0, "--output out.ply", "--references"),
-        (1, "--output out.obj", "out.obj"),
-        (1, "--page out.png", "--page"),
-        (1, "--output out.ply --up 0 0 0", "up"),
-    ],
-)
-def test_mistakes_are_told_in_one_line(
-    photographs: list[Path], photos: int, flags: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_gaussians(tmp_path / "in.ply", ball(20))
-    words = restyled(tmp_path, photographs[:photos])
-    assert cli.main([*(words if photos else words[:-1]), *flags.split()]) == 2
-    error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1

@@ -471,3 +471,23 @@ def test_means_move_by_what_views_see_not_by_how_far_apart_they_are(scene: Scene
     twice = replace(scene, cameras=both, train=train, points=torch.cat([scene.points, scene.points + apart]), seen=None)
     assert scene_scale(twice) < 1.5 * scene_scale(replace(scene, seen=None))
     assert scene_scale(replace(twice, points=None)) > 500
+
+
+def test_blurred_views_are_shown_in_every_eighth_epoch_alone(config: GaussiansConfig, scene: Scene) -> None:
+    images = {view: np.zeros((24, 32, 3), np.uint8) for view in scene.train.tolist()}
+    level = photographs.make_levels(scene, images, {}, 0.01)[0]
+    views = len(level)
+    learner = GaussianLearner(config, [level], 1.0, 32)
+
+    def shown(steps: range) -> list[int]:
+        return [learner._view(level, step) for step in steps]
+
+    # None is blurred: each epoch is a permutation of all.
+    assert all(sorted(shown(range(e * views, (e + 1) * views))) == sorted(level) for e in range(9))
+    level.blurred = frozenset(list(level)[:2])
+    sharp, cycle = views - 2, views + 7 * (views - 2)
+    for begin in (0, cycle):
+        assert sorted(shown(range(begin, begin + views))) == sorted(level)
+        for epoch in range(7):
+            first = begin + views + epoch * sharp
+            assert sorted(shown(range(first, first + sharp))) == sorted(set(level) - level.blurred)

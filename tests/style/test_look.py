@@ -187,18 +187,6 @@ def test_each_region_is_styled_by_what_it_may_take_from(config: StylizerConfig) 
         assert float(made.match(semantic)[banned][:, d.reference == i].sum()) == 0.0
 
 
-@pytest.mark.parametrize("config", STYLIZERS)
-def test_one_choice_for_all_regions_is_the_stylizer_of_those_references(config: StylizerConfig) -> None:
-    content, semantic, scene, d = setting(1.0, 2.0, 3.0, clusters=2)
-    allowed = torch.tensor([[False, True, False]] * 3)
-    made = regional(d, scene, allowed, config)
-    alone = config.build(dictionary=choose(d, allowed[0])[0], scene=scene)
-    given = semantic if Want.SEMANTIC in made.needs else None
-    assert made.needs == alone.needs
-    torch.testing.assert_close(made(content, given), alone(content, given), rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(made.match(semantic)[:, d.reference == 1], alone.match(semantic), rtol=0.0, atol=1e-6)
-
-
 def test_a_scene_without_semantics_can_be_pinned_as_a_whole() -> None:
     content, _ = points()
     scene = scene_of(content, None, 8)

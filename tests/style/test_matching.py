@@ -7,7 +7,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.errors import ConfigError
 from fprf.style.matching import (
     attention,
     match_keys,
@@ -171,9 +170,3 @@ def test_dot_products_know_no_frame_and_weights_count() -> None:
         more = match_keys(*here, *there, favoured, temperature=0.3, **frame)
         before = table(here, there, **frame)
         torch.testing.assert_close(more[:, 0] / more[:, 1], 5 * before[:, 0] / before[:, 1])
-
-
-@pytest.mark.parametrize("temperature", [0.0, -1.0, float("nan")])
-def test_temperatures_that_are_not_above_zero_are_refused(temperature: float) -> None:
-    with pytest.raises(ConfigError):
-        attention(torch.ones(1, 2), torch.ones(1, 2), temperature)

@@ -11,7 +11,7 @@ from tiny_world import World
 from two_sided import region_adain
 
 from fprf.errors import ConfigError
-from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, StylizerConfig
+from fprf.plugins.stylizers.config import AdainConfig
 from fprf.style.config import NO_MASK, StyleConfig
 from fprf.style.dictionary import Encoders
 from fprf.style.files import StyleFile, write_style
@@ -95,19 +95,6 @@ def test_styles_that_lead_back_to_themselves_are_refused(bench: Bench, tmp_path:
         write_style(path, StyleFile(replace(bench.base, between=towards)))
     with pytest.raises(ConfigError, match=r"a\.json: lies between styles that lead back to it"):
         bench.show(replace(bench.base, between=a))
-
-
-@pytest.mark.parametrize("stylizer", [LocalAdainConfig(), RegionOtConfig()], ids=lambda s: type(s).__name__)
-def test_region_controls_work_with_every_stylizer(bench: Bench, stylizer: StylizerConfig) -> None:
-    base = replace(bench.base, stylizer=stylizer)
-    first, count = bench.show(base), 4
-    for wish in ({"pin": ("0=1", "1=0")}, {"forbid": ("1=0",)}, {"keep": ("0",)}, {"region_strength": ("0=0.3",)}):
-        assert not torch.allclose(bench.show(replace(base, **wish)), first, atol=1e-5), wish  # type: ignore[arg-type]
-    everything = replace(base, keep=tuple(str(k) for k in range(count)))
-    assert torch.equal(bench.show(everything), bench.plain), "all regions kept: bit for bit"
-    one = replace(base, pin=tuple(f"{k}=1" for k in range(count)))
-    alone = bench.show(replace(base, references=base.references[1:]))
-    assert torch.allclose(bench.show(one), alone, atol=1e-5), "pinned throughout: as if it were the only reference"
 
 
 def test_the_order_of_references_does_not_matter_to_wishes(bench: Bench) -> None:

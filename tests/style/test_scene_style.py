@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from style_cases import points
 
-from fprf.errors import CheckpointError, DataError
+from fprf.errors import CheckpointError
 from fprf.style.scene_style import Membership, from_tensors, region_smoothing, scene_style, to_tensors
 
 
@@ -80,8 +80,3 @@ def test_smoothing_mixes_and_keeps_the_mean_over_the_scene(regions: int, smoothn
     torch.testing.assert_close(scene.share.double() @ smooth, scene.share.double())
     far = region_smoothing(scene, 1e9)
     torch.testing.assert_close(far, scene.share.double().expand(regions, -1), rtol=0.0, atol=1e-5)
-
-
-def test_an_empty_scene_is_an_error() -> None:
-    with pytest.raises(DataError):
-        scene_style(torch.ones(3, 2), None, torch.zeros(3), None, 1, 0)

@@ -1,15 +1,26 @@
-"""Style files: there and back, moved, shared, edited by hand, and whatever may be wrong with them."""
+"""Style files, keyframes and what users say of regions and references: there and back, moved, shared, and mistakes."""
 
 import json
+import math
 import shutil
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tiny_world import World
 
-from fprf.errors import ConfigError, DataError
+from fprf.errors import ConfigError, DataError, UsageError
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig
-from fprf.style.config import NO_MASK, StyleConfig
-from fprf.style.files import StyleFile, check_photographs, read_style, write_style
+from fprf.style.config import NO_MASK, RegionValue, StyleConfig, find_reference, labels, parse_region_value, parse_strength
+from fprf.style.files import Keyframe, StyleFile, check_photographs, fade, read_keyframes, read_style, write_style
+from fprf.style.look import blend_strength
+from fprf.style.regions import allowed_references
+from fprf.style.restyle import keyed_looks
 
 
 def photo(path: Path, text: str = "pixels") -> Path:
@@ -117,3 +128,115 @@ def test_what_is_wrong_is_named_with_the_file(tmp_path: Path, text: str, said: s
     with pytest.raises(ConfigError) as caught:
         read_style(photo(tmp_path / "style.json", text))
     assert str(caught.value).startswith(f"{tmp_path / 'style.json'}: ") and said in str(caught.value)
+
+
+def test_pins_exclude_the_others_and_forbidding_leaves_the_rest() -> None:
+    allowed = allowed_references(4, 3, pin={0: {1}, 3: {0, 2}}, forbid=[(1, 2), (3, 0)])
+    assert allowed.tolist() == [[False, True, False], [True, True, False], [True, True, True], [False, False, True]]
+
+
+PHOTOS = [Path("a/autumn.jpg"), Path("b/night.jpg"), Path("b/7.jpg"), Path("c/night.png")]
+
+
+@pytest.mark.parametrize(
+    ("text", "wish"),
+    [
+        ("3=autumn.jpg", RegionValue("3", "autumn.jpg")),
+        ("IMG_0012:120,80=0", RegionValue("IMG_0012:120,80", "0")),
+        ("a=b:mask.png=x.jpg", RegionValue("a=b:mask.png", "x.jpg")),
+    ],
+)
+def test_a_wish_is_split_at_its_last_equals_sign(text: str, wish: RegionValue) -> None:
+    assert parse_region_value("pin", text) == wish and parse_strength("region_strength", "sky=0.5") == ("sky", 0.5)
+
+
+@pytest.mark.parametrize(
+    ("text", "index"),
+    [("autumn.jpg", 0), ("a/autumn.jpg", 0), ("autumn", 0), ("night.jpg", 1), ("1", 1), ("3", 3), ("night.png", 3)],
+)
+def test_references_are_found_by_path_name_number_and_stem(text: str, index: int) -> None:
+    assert find_reference(text, PHOTOS) == index
+
+
+@pytest.mark.parametrize(
+    ("paths", "names"),
+    [
+        (["a/x.jpg", "b/y.jpg"], ("x.jpg", "y.jpg")),
+        (["a/x.jpg", "b/x.jpg"], ("a/x.jpg", "b/x.jpg")),
+        (["1/a/x.jpg", "2/a/x.jpg"], ("1/a/x.jpg", "2/a/x.jpg")),
+        (["a/x.jpg", "a/x.jpg", "a/x.jpg"], ("x.jpg", "x.jpg (2)", "x.jpg (3)")),
+    ],
+)
+def test_labels_are_short_and_different(paths: list[str], names: tuple[str, ...]) -> None:
+    assert labels([Path(p) for p in paths]) == names and len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize(
+    ("kind", "mistake"),
+    [
+        *((UsageError, partial(blend_strength, torch.zeros(1, 1), torch.zeros(1, 1), s)) for s in (-0.1, 1.1, math.nan)),
+        *((UsageError, partial(allowed_references, 2, 2, pin=pin)) for pin in ({2: {0}}, {0: {2}})),
+        *((UsageError, partial(allowed_references, 2, 2, forbid=ban)) for ban in ([(0, -1)], [(1, 0), (1, 1)])),
+        (UsageError, partial(allowed_references, 2, 2, pin={1: {0}}, forbid=[(1, 0)])),
+        *((ConfigError, partial(parse_strength, "region_strength", text)) for text in ("3=1.5", "3=nan", "3=much")),
+        *((UsageError, partial(find_reference, text, PHOTOS)) for text in ("x", "night")),
+    ],
+)
+def test_what_cannot_be_is_refused(kind: type[Exception], mistake: Callable[[], object]) -> None:
+    with pytest.raises(kind):
+        mistake()
+
+
+PLAIN = {"frame": 1, "style": None}
+
+
+@pytest.mark.parametrize("rows", [[], [PLAIN, PLAIN], [PLAIN | {"frame": -1}], [PLAIN, 3], {}])
+def test_what_is_wrong_with_the_file_is_told(tmp_path: Path, rows: object) -> None:
+    file = tmp_path / "k.json"
+    file.write_text(json.dumps({"format": 1, "keyframes": [PLAIN]}))
+    assert read_keyframes(file) == (Keyframe(1, None),)
+    for whole in ({"format": 1, "keyframes": rows}, {"format": 2, "keyframes": [PLAIN]}):
+        file.write_text(json.dumps(whole))
+        with pytest.raises(ConfigError) as caught:
+            read_keyframes(file)
+        assert str(caught.value).startswith(f"{file}: ")
+
+
+@given(st.lists(st.integers(0, 60), min_size=1, max_size=5, unique=True).map(sorted), st.integers(0, 70))
+def test_a_fade_lies_between_its_neighbours(frames: list[int], at: int) -> None:
+    before, after, way = fade(frames, at)
+    assert 0 <= way < 1
+    if before == after:
+        assert way == 0 and (at <= frames[0] or at >= frames[-1] or at == frames[before])
+        assert frames[before] == min(max(at, frames[0]), frames[-1])
+    else:
+        assert after == before + 1 and frames[before] <= at < frames[after]
+        assert (way == 0) == (at == frames[before])
+
+
+def test_a_fade_is_even_about_its_middle_and_starts_and_ends_without_a_jerk() -> None:
+    ways = [fade([0, 100], at)[2] for at in range(100)] + [1.0]
+    steps = np.diff(ways)
+    assert ways[50] == pytest.approx(0.5) and np.allclose(steps, steps[::-1]) and (steps > 0).all()
+    assert steps[0] < 0.05 * steps.max() and np.abs(np.diff(steps)).max() < 0.05 * steps.max()
+
+
+def test_each_frame_has_its_look(world: World, tmp_path: Path) -> None:
+    styles = (tmp_path / "dusk.json", tmp_path / "snow.json")
+    for path, reference, strength in zip(styles, world.references, (1.0, 0.8), strict=True):
+        style = StyleConfig(references=(reference,), clusters=2, stylizer=AdainConfig(), strength=strength, luminance=0.5)
+        write_style(path, StyleFile(style))
+    looks = keyed_looks(
+        world.load(),
+        [Keyframe(2, None), Keyframe(6, styles[0]), Keyframe(10, styles[1]), Keyframe(14, None), Keyframe(20, None)],
+    )
+    assert looks(0) is looks(2) is looks(14) is looks(17) is looks(30) is None
+    first, second = looks(6), looks(10)
+    assert first is not None and second is not None and first.others == second.others == ()
+    middle = looks(8)
+    assert middle is not None and [part.share for part in middle.parts] == [0.5, 0.5]
+    assert [part.strength for part in middle.parts] == [1.0, 0.8]
+    for at, strengths in ((4, [0.0, 1.0]), (12, [0.8, 0.0])):
+        rising = looks(at)
+        assert rising is not None and [part.strength for part in rising.parts] == strengths
+        assert {part.luminance for part in rising.parts} == {0.5}, "luminance does not fade: it is kept throughout"

@@ -1,3 +1,6 @@
+"""Runs opened from their folder alone, in any quality and in the light of any view."""
+
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -7,11 +10,16 @@ import torch
 from fake_packages import METHOD, packages_in
 from tiny_world import World
 
+from fprf.cli import main as cli
 from fprf.cli.parsing import load_method
 from fprf.config import IncompleteConfig
-from fprf.errors import CheckpointError, UsageError
+from fprf.errors import CheckpointError, PluginError, UsageError
+from fprf.plugins.samplers.config import ProposalConfig, SamplerConfig
+from fprf.training.camera_optimizers import Tones
 from fprf.training.driver import train
-from fprf.training.loading import load_run
+from fprf.training.loading import Trained, load_run
+from fprf.training.model import Model
+from fprf.training.quality import PRESETS, QualityConfig, at_quality
 
 
 @pytest.fixture
@@ -69,3 +77,93 @@ def test_a_run_of_a_method_with_fields_of_its_own(world: World, moved: Path, tmp
     assert torch.equal(trained.render(trained.cameras, 0).rgb, there.render(there.cameras, 0).rgb)
     there.run.save_config(there.config, there.method)
     assert (moved / "config.json").read_text() == saved
+
+
+def picture(trained: Trained) -> torch.Tensor:
+    return trained.render(trained.known.cameras, 0).rgb
+
+
+def test_trained_parameters_are_kept_and_the_first_model_is_not_touched(world: World) -> None:
+    trained = world.load()
+    before = picture(trained)
+    finer = at_quality(trained, QualityConfig(samples=3.0))
+    own, new = trained.model.state_dict(), finer.model.state_dict()
+    assert own.keys() == new.keys() and all(torch.equal(own[key], new[key]) for key in own)
+    assert not any(p.requires_grad for p in finer.model.parameters())
+    assert not torch.equal(picture(finer), before) and torch.equal(picture(trained), before)
+
+
+def test_samplers_that_do_not_scale_or_that_learn_for_their_number_of_samples(world: World) -> None:
+    trained = world.load()
+    learning = ProposalConfig(samples=(16,), final=8, resolutions=(4,))
+    for sampler, error in ((SamplerConfig(), PluginError), (learning, UsageError)):
+        other = replace(trained, config=replace(trained.config, sampler=sampler))
+        with pytest.raises(error):
+            at_quality(other, QualityConfig(quality="best"))
+        assert at_quality(other, QualityConfig(quality="standard")).model is trained.model
+
+
+def test_eval_takes_it(world: World, tmp_path: Path) -> None:
+    shutil.copytree(world.run, tmp_path / "run")
+    kept = {}
+    for name in (None, *PRESETS):
+        args = ["eval", str(tmp_path / "run"), "--no-images", *([] if name is None else ["--quality", name])]
+        assert cli.main(args) == 0
+        metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+        assert metrics["quality"] == name
+        kept[name] = metrics["psnr"], metrics["kept_samples_share"]
+    assert kept[None] == kept["standard"] and len(set(kept.values())) == 3
+
+
+def test_a_reduced_view_is_the_small_one_enlarged(world: World) -> None:
+    trained = world.load()
+    known = trained.known
+    whole, half = (trained.render(known.cameras, 2, resolution=resolution) for resolution in (1.0, 0.5))
+    small = trained.render(known.cameras.scaled(2), 2)
+    assert half.rgb.shape == whole.rgb.shape and half.depth.shape == whole.depth.shape == half.opacity.shape
+    assert float(half.rgb.min()) >= 0 and float(half.rgb.max()) <= 1
+    assert {*half.depth.flatten().tolist()} == {*small.depth.flatten().tolist()}, "no depth that nobody measured"
+    blocks = half.opacity.view(12, 2, 16, 2).mean((1, 3))
+    assert torch.allclose(blocks[1:-1, 1:-1], small.opacity[1:-1, 1:-1], atol=0.05)
+    assert float((half.rgb - whole.rgb).abs().mean()) < 0.05 and not torch.equal(half.rgb, whole.rgb)
+
+
+def lit(world: World) -> Trained:
+    """The run, with tones as if they had been learnt."""
+    trained = world.load()
+    known = trained.known
+    tones = Tones(torch.linspace(-0.5, 0.5, len(known.names)), known.test)
+    with torch.no_grad():
+        tones.gain.copy_(0.2 * torch.randn(len(known.names), 3, generator=torch.Generator().manual_seed(0)))
+    return replace(trained, model=Model(trained.model.parts, tones))
+
+
+def shown(trained: Trained, *tone: str) -> tuple[torch.Tensor, torch.Tensor]:
+    chosen = at_quality(trained, QualityConfig(tone=tone))
+    view = chosen.known.cameras, chosen.known.test[0]
+    return chosen.render(*view).rgb, chosen.cached(*view).restyled().rgb
+
+
+def test_colours_are_multiplied_by_a_view_s_light_or_the_mean_of_logarithms_of_several(world: World) -> None:
+    trained = lit(world)
+    assert trained.model.tones is not None
+    a, b = trained.known.train[:2]
+    log = trained.model.tones(torch.tensor([a, b])).detach().log()
+    for texts, share in (
+        ((trained.known.names[a],), 1.0),
+        ((str(b),), 0.0),
+        ((f"{a}=7",), 1.0),
+        ((str(a), str(b)), 0.5),
+        ((f"{a}=1", f"{b}=3"), 0.25),
+        ((f"{a}=0.5", f"{b}=0"), 1.0),
+    ):
+        wanted = shown(trained)[0] * (share * log[0] + (1 - share) * log[1]).exp()
+        for image in shown(trained, *texts):
+            torch.testing.assert_close(image, wanted.clamp(0, 1), atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("tone", ["nowhere", "0=x", "99", "1=-2", "0", "1=0"])
+def test_what_is_no_light_of_a_training_view_is_refused(world: World, tone: str) -> None:
+    for trained in (lit(world), world.load()):
+        with pytest.raises(UsageError):
+            shown(trained, tone)

@@ -1,14 +1,12 @@
 """Terms of the training loss: their values, whom they move, those of packages, depths and sky."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import World, rays_of
 from torch import Tensor
 
@@ -17,7 +15,7 @@ from fprf.errors import ConfigError, PluginError
 from fprf.interfaces import LossTerm
 from fprf.plugins.losses.config import LossTermConfig
 from fprf.rendering.renderer import Parts, render_rays
-from fprf.training.losses import SHELL, check_penalties, emptiness, ending, extra_term, terms, total, wanted
+from fprf.training.losses import check_penalties, emptiness, ending, extra_term, terms, total, wanted
 from fprf.training.model import Model, build_model
 from fprf.types import Batch, Rendered, Want
 
@@ -129,7 +127,6 @@ def test_a_term_of_a_package_counts(world: World) -> None:
             terms(bad, world.prepared.facts, out, batch, model, step=0, extra=extra_term(bad))
 
 
-NAN = float("nan")
 EDGES = torch.linspace(0.0, 10.0, 101)
 
 
@@ -169,36 +166,6 @@ def test_in_device_coordinates_it_is_about_depths_too(found: float) -> None:
     depths, end = straight_rays(1)[:, 10:], torch.tensor([5.0])
     weights = spike(found)[:, 10:]
     torch.testing.assert_close(ending(1 - 1 / depths, weights, 1 - 1 / end, ndc=True), ending(depths, weights, end))
-
-
-def ends_at(t: Tensor, weights: Tensor, kind: Tensor) -> Tensor:
-    return ending(t, weights, torch.where(kind, 1 + torch.arange(len(kind), device=kind.device), NAN))
-
-
-def is_sky(t: Tensor, weights: Tensor, kind: Tensor) -> Tensor:
-    return emptiness(t, weights, kind, within=SHELL)
-
-
-@pytest.mark.parametrize("term", [ends_at, is_sky])
-@pytest.mark.parametrize("kind", [[True, False, True, False], [False] * 4])
-def test_depths_and_sky_on_a_device_are_the_same_without_waiting(
-    term: Callable[[Tensor, Tensor, Tensor], Tensor], kind: list[bool]
-) -> None:
-    weights = torch.rand(4, 100)
-    here = weights.clone().requires_grad_()
-    expected = term(straight_rays(4), here, torch.tensor(kind))
-    expected.backward()  # type: ignore[no-untyped-call]
-    assert bool(expected > 0) == any(kind)
-    with pretend_cuda() as seen:
-        there, given = weights.to(CUDA).requires_grad_(), torch.tensor(kind).to(CUDA)
-        edges = straight_rays(4).to(CUDA)
-        seen.syncs.clear()
-        found = term(edges, there, given)
-        found.backward()  # type: ignore[no-untyped-call]
-        assert not seen.syncs
-        assert there.grad is not None and here.grad is not None
-        torch.testing.assert_close(found.detach().cpu(), expected.detach())
-        torch.testing.assert_close(there.grad.cpu(), here.grad)
 
 
 @pytest.mark.parametrize(("shell", "wanted"), [(4.0, (0.3**2 + 1.0**2) / 2), (math.inf, (0.9**2 + 1.0**2) / 2), (0.5, 0.0)])

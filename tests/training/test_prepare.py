@@ -12,7 +12,6 @@ from tiny_world import World, prepared_for
 
 from fprf.errors import PluginError, UsageError
 from fprf.methods import fprf_lite
-from fprf.training.driver import Report, forecast
 from fprf.training.learner import training_summary
 from fprf.training.model import build_model
 from fprf.training.prepare import device_of, exposure_of, planned, read_scene
@@ -101,12 +100,6 @@ def test_what_training_came_to(world: World, tmp_path: Path) -> None:
     )
     assert "--minutes 16" in timed and "--downscale" not in timed
     assert "--steps 24000" in reduced and "--downscale 4" in reduced
-
-
-def test_hours_are_told_from_the_first_steps() -> None:
-    first, later = (Report(step, 0.0, 97.0 + 3 * step, 20.0, 1.0, 1.0, {}, 0) for step in (1, 3))
-    assert "30,000 steps at 3 s a step take 25 hours" in forecast(first, later, 30_000, "fprf")
-    assert forecast(first, later, 600, "fprf") == ""
 
 
 @pytest.mark.parametrize("name", ["gpu", "", "cuda:99"])

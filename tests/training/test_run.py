@@ -1,13 +1,11 @@
 """Run folders: what they keep, one process at a time, the images that a run was begun with, its history."""
 
 import json
-import multiprocessing
 import os
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,8 +18,6 @@ from tiny_world import World
 
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import CheckpointError, DataError, UsageError
-from fprf.training import checkpoint
-from fprf.training.driver import train
 from fprf.training.run import (
     IMAGES,
     LOCK,
@@ -53,31 +49,6 @@ def test_scene_json_gives_the_scene_back(world: World) -> None:
     assert known.split("all") == tuple(sorted(known.train + known.test)) == tuple(range(10))
 
 
-def _without(key: str) -> Any:
-    return lambda d: {k: v for k, v in d.items() if k != key}
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        *(_without(key) for key in ("format", "cameras", "facts")),
-        lambda d: d | {"format": 99},
-        lambda d: d | {"facts": 3},
-        lambda d: d | {"facts": d["facts"] | {"space": "box"}},
-        lambda d: d | {"facts": d["facts"] | {"more": 1}},
-        lambda d: d | {"facts": _without("space")(d["facts"])},
-        lambda d: d | {"cameras": d["cameras"] | {"pose": [[1.0], [1.0, 2.0]]}},
-        lambda d: d | {"cameras": d["cameras"] | {"size": [[10**30, 1]]}},
-        lambda d: None,
-    ],
-)
-def test_a_spoilt_scene_json_is_named(run: Run, change: Any) -> None:
-    path = run.root / "scene.json"
-    path.write_text(json.dumps(change(json.loads(path.read_text()))))
-    with pytest.raises(CheckpointError):
-        run.load_known()
-
-
 def test_an_event_after_a_torn_line_has_a_line_of_its_own(tmp_path: Path) -> None:
     torn = '{"step": 2, "los'
     (tmp_path / "events.jsonl").write_text(torn)
@@ -90,30 +61,6 @@ def test_an_event_after_a_torn_line_has_a_line_of_its_own(tmp_path: Path) -> Non
 def test_names_are_never_alike(paths: list[list[str]]) -> None:
     names = view_names([Path("/scene", *parts).with_suffix(".png") for parts in paths])
     assert len(set(names)) == len(paths) and not any("/" in name for name in names)
-
-
-@pytest.fixture
-def town(world: World, tmp_path: Path) -> Path:
-    shutil.copytree(world.town, tmp_path / "town")
-    return tmp_path / "town"
-
-
-def test_training_goes_on_with_the_same_images_and_with_others_when_asked(world: World, town: Path, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(world.run, run)
-    config = replace(world.config, data=town, output=run, steps=16)
-    image = sorted((town / "images").iterdir())[3]
-    image.write_bytes(sorted((town / "images").iterdir())[4].read_bytes())
-    before = json.loads((run / IMAGES).read_text())
-    with pytest.raises(UsageError, match=f"{image.name} is another"):
-        train(config, "fprf-lite", quiet=True)
-    assert json.loads((run / IMAGES).read_text()) == before and checkpoint.steps(run / "checkpoints")[-1] == 15
-    train(config, "fprf-lite", quiet=True, changed_images=True)
-    after = json.loads((run / IMAGES).read_text())
-    assert [name for name in before["images"] if before["images"][name] != after["images"][name]] == [image.stem]
-    assert checkpoint.steps(run / "checkpoints")[-1] == 16
-    train(replace(config, steps=17), "fprf-lite", quiet=True)
-    assert checkpoint.steps(run / "checkpoints")[-1] == 17
 
 
 HOLDER = """
@@ -160,31 +107,6 @@ def test_who_is_refused_changes_nothing_and_an_empty_folder_is_not_left_behind(t
     for place in (folder / "file", folder / "file" / "run"):
         with pytest.raises(DataError), lock_folder(place):
             pass
-
-
-def _count(folder: Path, rounds: int) -> None:
-    """Add to a number that only one may touch at a time."""
-    done = 0
-    while done < rounds:
-        try:
-            with lock_folder(folder):
-                counter = folder / "counter"
-                value = int(counter.read_text())
-                time.sleep(0.001)
-                counter.write_text(str(value + 1))
-                done += 1
-        except DataError:
-            time.sleep(0.0005)
-
-
-def test_never_two_at_a_time(tmp_path: Path) -> None:
-    (tmp_path / "counter").write_text("0")
-    workers = [multiprocessing.get_context("fork").Process(target=_count, args=(tmp_path, 15)) for _ in range(3)]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join(60)
-    assert (tmp_path / "counter").read_text() == "45"
 
 
 def write(folder: Path, *events: dict[str, Any] | str) -> Path:

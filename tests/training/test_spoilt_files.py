@@ -173,14 +173,6 @@ def test_a_spoilt_cut_is_named_and_its_cells_stay(example: Example) -> None:
     example.restore()
 
 
-@pytest.mark.parametrize("text", ["[]", "null", '{"format": 1, "step": "x"}', f'{{"format": 1, "step": {LARGE}}}'])
-def test_a_spoilt_done_json_is_named(example: Example, text: str) -> None:
-    (example.parts[0] / "done.json").write_text(text)
-    with pytest.raises(CheckpointError, match=r"done\.json"):
-        read_done(example.parts[0])
-    example.restore()
-
-
 def test_a_line_of_events_with_a_number_too_large_is_passed_over(example: Example) -> None:
     events = example.parts[0] / "events.jsonl"
     events.write_text(events.read_text() + f'{{"step": 4, "seconds": {LARGE}}}\n{{"step": {LARGE}, "seconds": 2}}\n')

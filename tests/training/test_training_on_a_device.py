@@ -17,9 +17,11 @@ from tiny_world import Altered, Change, World, events, parameters, prepared_for,
 from fprf.config import TrainConfig
 from fprf.interfaces import DataManager
 from fprf.methods import fprf
+from fprf.ops import backend
 from fprf.plugins.samplers.config import UniformConfig
 from fprf.training import checkpoint, driver, learner
 from fprf.training.driver import Report
+from fprf.training.loading import load_run
 from fprf.training.model import build_model
 from fprf.training.prepare import device_of
 from fprf.training.run import Run
@@ -237,3 +239,13 @@ def test_a_block_is_trained_on_a_device(block_world: BlockWorld, tmp_path: Path,
     assert found.keys() == expected.keys()
     for key, value in expected.items():
         assert (found[key] - value).double().norm() <= 1e-5 * value.double().norm(), key
+
+
+def test_blocks_of_a_large_scene_are_rendered_on_a_device(block_world: BlockWorld) -> None:
+    found = []
+    for device, within in (("cpu", backend.plain), (str(CUDA), pretend_cuda)):
+        with within():
+            trained = load_run(block_world.root, device, max_memory=1.0)
+            found.append(trained.render(trained.cameras, 2)[:3])
+    # Off the CPU points are turned into a block without a matrix product: sums of three, in another order.
+    torch.testing.assert_close(*found, rtol=1e-5, atol=1e-5)

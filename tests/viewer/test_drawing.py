@@ -4,18 +4,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from pretend_cuda import CUDA, pretend_cuda
 from session_helpers import camera_of
-from tiny_world import World
 
 from fprf.io.images import Picture, to_uint8
 from fprf.io.maps import depth_image, match_image
-from fprf.ops import backend
 from fprf.style.match_maps import match_map
-from fprf.training.loading import load_run
 from fprf.training.views import render_view
 from fprf.viewer import drawing
 from fprf.viewer.drawing import FieldPainter, Request, Shown, resolutions
@@ -102,29 +97,6 @@ def test_a_picked_region_stands_out(watched: Watched, restyler: Restyler) -> Non
     grey = 0.45 * whole.mean(-1, keepdims=True)
     assert np.abs(sum(each - grey for each in shown) - (whole - grey)).max() <= len(shown)
     assert len(shown) > 1 and all(np.abs(each - whole).max() > 20 for each in shown)
-
-
-def everything(world: World, device: str) -> dict[str, Any]:
-    """Every picture of a view, and what there is to say of a region in it."""
-    restyler = Restyler(load_run(world.run, device))
-    a, b = (restyler.encode(path, path.name) for path in world.references)
-    look = set_rule(Look(mix=((a, 1.0), (b, 0.5)), clusters=3), 0, "keep")
-    cameras = restyler.scene.known.cameras
-    found: dict[str, Any] = {"picked": restyler.region_info(look, 1), "region": restyler.region_at(cameras, (16.5, 12.5))}
-    for name in ("none", "matches", "regions", "depth"):
-        for kind, picture, _ in Watched(restyler).look(Shown(look, name, 1), captured=True):  # type: ignore[arg-type]
-            found[f"{name} {kind}"] = picture
-    return found
-
-
-def test_every_picture_is_the_same_on_another_device(world: World) -> None:
-    with backend.plain():
-        expected = everything(world, "cpu")
-    with pretend_cuda() as seen:
-        found = everything(world, str(CUDA))
-    assert seen.uploads and found.keys() == expected.keys() and found.pop("picked") == expected.pop("picked")
-    assert [name for name in expected if not np.array_equal(found[name], expected[name])] == []
-    assert torch.is_inference_mode_enabled() is False
 
 
 @given(st.integers(1, 4096), st.integers(1, 4096))

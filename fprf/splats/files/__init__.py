@@ -1,4 +1,4 @@
-"""Files of 3D Gaussians, read, recoloured and written in the formats that are installed (see `plugins.captures`)."""
+"""Files of 3D Gaussians, read, recoloured and written in the formats that are installed (`base.CaptureFormat`)."""
 
 import glob
 import mmap
@@ -16,14 +16,13 @@ from torch import Tensor
 
 from ...errors import DataError
 from ...io.atomic import unwritable
-from ...plugins.captures import Data, format_of
 from ...rendering.cameras import Cameras
 from ...rendering.local_frame import added_and_beside, read_offset, write_offset
 from ...training.run import lock_folder
 from ...types import Origin
 from ..gaussians import Gaussians, bulk_of
 from ..views import seen_means
-from .base import ROWS, Capture, pieces, release
+from .base import ROWS, Capture, Data, format_of, pieces, release
 from .ply import ply_head, ply_rows
 
 __all__ = ["Capture", "Written", "read_capture", "release", "write_capture", "write_gaussians", "write_ply_parts"]

@@ -1,26 +1,35 @@
-"""What files of Gaussians have in common: the capture that was read, rounding to integers, packed rotations, outliers.
+"""The base of file formats of 3D Gaussians, what a reader returns, and what formats share: rounding, rotations, outliers.
 
-Arrays are NumPy's. A reader never allocates on a file's word: what a header claims is held against the size of the file.
+To add a format: a subclass of `CaptureFormat` in a file of this folder, and its entry point in the group `fprf.captures`. The
+name of the entry point is the ending of its files: `sog` stands for *.sog; of several that fit, the longest is meant.
+N Gaussians · K harmonics a colour channel. Arrays are NumPy's.
+
+A reader never allocates on a file's word: what a header claims is held against the size of the file.
 """
 
 import mmap
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError
+from ...io.atomic import atomic_path
 from ...ops.harmonics import HARMONIC, spherical_harmonics
-from ...plugins.captures import Data
+from ...plugins import registry
+from ...plugins.config import PluginConfig
 from ...rendering.cameras import Cameras
 from ...rendering.local_frame import local_origin
 from ...types import Origin
+from ..config import CAPTURES, endings, format_name
 from ..gaussians import Gaussians, bulk_of, from_arrays, morton_order
 
+Data: TypeAlias = bytes | mmap.mmap
+"""The content of a file: large ones are mapped. Both are sliced into bytes, and read by np.frombuffer."""
 Floats: TypeAlias = NDArray[Any]
 Bools: TypeAlias = NDArray[np.bool_]
 Recolour: TypeAlias = Callable[[Floats, Bools], Iterable[bytes]]
@@ -66,6 +75,61 @@ class Capture:
         return self.shift[0] + self.offset[0], self.shift[1] + self.offset[1], self.shift[2] + self.offset[2]
 
 
+@dataclass(frozen=True, kw_only=True)
+class CaptureFormat(PluginConfig):
+    """A format of files of 3D Gaussians. It has no state: there is nothing to build."""
+
+    group: ClassVar[str] = CAPTURES
+
+    view_dependent: ClassVar[bool] = True
+    """It holds harmonics, and whether opacities are compensated for antialiasing. Where it does not, it is given the mean
+    colours and opacities that views show."""
+    writes: ClassVar[bool] = True
+    """False = files of it are read alone, and what was read from them is written as another format."""
+    exact: ClassVar[bool] = False
+    """It holds every number as it is, NaN too, and positions in float64. Where it does not, it is given Gaussians that can be
+    drawn, about a local origin that stands in a file beside."""
+
+    def recognises(self, head: bytes, size: int) -> bool:
+        """False where a file of `size` bytes that begin with `head` is certainly damaged or of another format."""
+        raise NotImplementedError
+
+    def read(self, path: Path, data: Data) -> Capture:
+        """The Gaussians of a file, and how to recolour it. Raises DataError for anything else than a sound file."""
+        raise NotImplementedError
+
+    def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> Iterable[bytes]:
+        """The file of these Gaussians, on the CPU, in pieces. `origin` is to be added to their positions; 0 unless `exact`."""
+        raise DataError(f"{type(self).__name__}: files of this format are read, not written; name a .ply, .spz, .sog or .glb")
+
+    def keeps(self, gaussians: Gaussians) -> NDArray[np.bool_] | None:
+        """Gaussians [N] that a file holds: all but outliers that would cost the others their precision; None = all."""
+        return None
+
+    def notes(self, gaussians: Gaussians) -> list[str]:
+        """What else a file cannot hold of them, each as a phrase."""
+        return []
+
+    def holds(self, capture: Capture, read_as: "CaptureFormat") -> bool:
+        """Whether a capture's own file, recoloured, is a file of this format."""
+        return self.writes and type(read_as) is type(self)
+
+    def write(self, path: Path, pieces: Iterable[bytes]) -> None:
+        """Write what `pack` or `Capture.recolour` gave, whole or not at all."""
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            file.writelines(pieces)
+
+
+def format_of(path: Path) -> CaptureFormat:
+    """The format of a file by its name. Raises DataError where it is of none, PluginError where that cannot be loaded."""
+    name = format_name(path)
+    if name is None:
+        raise DataError(
+            f"{path}: no file of Gaussians by its name; known endings are {', '.join(endings())}, or meta.json of a SOG folder"
+        )
+    return registry.make(CaptureFormat.group, name, CaptureFormat)
+
+
 def pieces(count: int) -> Iterator[slice]:
     """Rows 0 to `count` in slices of at most `ROWS`."""
     for start in range(0, count, ROWS):
@@ -92,6 +156,17 @@ def decoded(bands: int, *sections: tuple[int, Callable[[slice], tuple[Floats, ..
     return from_arrays(parts[0], parts[1], parts[2], parts[3], parts[4]), shift
 
 
+def in_world(table: NDArray[np.void], local: Floats, origin: Origin) -> NDArray[np.void]:
+    """Rows with local x y z [N 3] about an origin as float64 of the world; as they are where the origin is 0."""
+    if not any(origin):
+        return table
+    kinds = {name: "<f8" if name in ("x", "y", "z") else table.dtype[name] for name in table.dtype.names or ()}
+    out = table.astype([*kinds.items()])
+    for name, column, of in zip("xyz", local.astype(np.float64).T, origin, strict=True):
+        out[name] = column + of
+    return out
+
+
 def release(data: Data) -> None:
     """Let go of the memory of a mapped file that was read through; it is read again where it is asked for."""
     if isinstance(data, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
@@ -112,6 +187,24 @@ def short(path: Path, has: int, needs: int, what: str) -> DataError:
 def steps(values: Floats, most: int) -> NDArray[np.int64]:
     """Values in [0, 1] as integers 0 to `most`, rounded; what lies outside is clipped, NaN becomes 0."""
     return np.rint(np.clip(np.nan_to_num(values.astype(np.float64), nan=0.0), 0, 1) * most).astype(np.int64)
+
+
+def pack_bits(shares: Floats, bits: Sequence[int]) -> NDArray[np.int64]:
+    """Columns in [0, 1] in one word each row, the first one highest."""
+    word = np.zeros(len(shares), np.int64)
+    for column, width in zip(shares.T, bits, strict=True):
+        word = word << width | steps(column, (1 << width) - 1)
+    return word
+
+
+def unpack_bits(word: NDArray[np.uint32], bits: Sequence[int]) -> Floats:
+    """The columns of `pack_bits`, in [0, 1]."""
+    columns, shift = [], 0
+    for width in reversed(bits):
+        most = (1 << width) - 1
+        columns.append((word >> shift & most) / most)
+        shift += width
+    return np.stack(columns[::-1], 1)
 
 
 def shares(values: Floats, low: Floats, high: Floats) -> Floats:

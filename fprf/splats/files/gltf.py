@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...io.images import srgb_to_linear
-from ...plugins.captures import CaptureFormat, Data
 from ...rendering.splines import quaternions, rotations
 from ...types import Origin
 from ..gaussians import COUNTS, Gaussians
 from . import base
-from .base import Bools, Capture, Floats
+from .base import Bools, Capture, CaptureFormat, Data, Floats
 
 _NAME = "KHR_gaussian_splatting"
 _HARMONICS = [f"{_NAME}:SH_DEGREE_{degree}_COEF_{k}" for degree in range(4) for k in range(2 * degree + 1)]

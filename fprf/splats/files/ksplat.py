@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ...plugins.captures import CaptureFormat, Data
 from ..gaussians import COUNTS
 from . import base
-from .base import Capture, Floats
+from .base import Capture, CaptureFormat, Data, Floats
 
 _HEADER, _SECTION = struct.Struct("<BBxxII4xIHxx12xff"), struct.Struct("<IIIIfHxxI4xIIH")
 _HEADER_SIZE, _SECTION_SIZE = 4096, 1024

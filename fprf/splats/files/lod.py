@@ -13,9 +13,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ...errors import DataError
-from ...plugins.captures import CaptureFormat, Data
 from . import base
-from .base import Capture
+from .base import Capture, CaptureFormat, Data
 from .sog import Sog, bundle
 
 _UNSOUND = (LookupError, TypeError, ValueError, AttributeError, RecursionError)

@@ -20,12 +20,11 @@ import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ...plugins.captures import CaptureFormat, Data
 from ...rendering.cameras import Cameras, ideal_cameras
 from ...types import Origin
 from ..gaussians import COUNTS, Gaussians
 from . import base
-from .base import Bools, Capture, Floats
+from .base import Bools, Capture, CaptureFormat, Data, Floats
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
@@ -129,14 +128,14 @@ class CompressedPly(Ply):
         words = np.zeros((len(means), 4), np.uint32)
         for column, values in ((0, means), (2, np.clip(scales, -20, 20))):
             share, low, high = _in_chunks(values)
-            words[:, column] = _pack(share, (11, 10, 11))
+            words[:, column] = base.pack_bits(share, (11, 10, 11))
             bounds += [low, high]
         largest, three = base.smallest_three(turns)
-        words[:, 1] = largest << 30 | _pack(three / 2 + 0.5, (10, 10, 10))
+        words[:, 1] = largest << 30 | base.pack_bits(three / 2 + 0.5, (10, 10, 10))
         share, low, high = _in_chunks(base.colours_of(harmonics).clip(*_COLOURS))
         opacity = base.sigmoid(logits)
         opacity[1:][filled] = 0
-        words[:, 3] = _pack(np.concatenate([share, opacity[:, None]], 1), (8, 8, 8, 8))
+        words[:, 3] = base.pack_bits(np.concatenate([share, opacity[:, None]], 1), (8, 8, 8, 8))
         bounds += [low, high]
         # Three tables: bounds of chunks, words of Gaussians and bytes of harmonics.
         names = [name for pair in (_POSITION, _SCALE, _COLOUR) for of in pair for name in of]
@@ -165,31 +164,23 @@ def ply_rows(gaussians: Gaussians, origin: Origin) -> NDArray[np.void]:
     names += [f"f_rest_{i}" for i in range(3 * harmonics.shape[1] - 3)]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     columns = np.concatenate([means, np.zeros_like(means), _flat(harmonics), logits[:, None], scales, turns], 1)
-    return in_world(np.ascontiguousarray(columns, "<f4").view([(name, "<f4") for name in names])[:, 0], means, origin)
+    return base.in_world(np.ascontiguousarray(columns, "<f4").view([(name, "<f4") for name in names])[:, 0], means, origin)
 
 
-def in_world(table: NDArray[np.void], local: Floats, origin: Origin) -> NDArray[np.void]:
-    """Rows with local x y z [N 3] about an origin as float64 of the world; as they are where the origin is 0."""
-    if not any(origin):
-        return table
-    kinds = {name: "<f8" if name in ("x", "y", "z") else table.dtype[name] for name in table.dtype.names or ()}
-    out = table.astype([*kinds.items()])
-    for name, column, of in zip("xyz", local.astype(np.float64).T, origin, strict=True):
-        out[name] = column + of
-    return out
-
-
-def ply_file(tables: Mapping[str, NDArray[np.void]], antialiased: bool = False) -> bytes:
+def ply_file(tables: Mapping[str, NDArray[np.void]], antialiased: bool = False, comments: Sequence[str] = ()) -> bytes:
     """A little-endian binary PLY of elements by name, a property a field; a field of (count, values) is a list.
 
     trimesh would write meshes too, but keeps neither comments nor colours without alpha.
     """
-    return ply_head(tables, antialiased) + b"".join(table.tobytes() for table in tables.values())
+    return ply_head(tables, antialiased, comments=comments) + b"".join(table.tobytes() for table in tables.values())
 
 
-def ply_head(tables: Mapping[str, NDArray[np.void]], antialiased: bool, count: int | None = None) -> bytes:
-    """What stands before the rows of `ply_file`; `count`: of a file with so many rows such as these."""
-    lines = ["ply", "format binary_little_endian 1.0", *(["comment SplatRenderMode: mip"] if antialiased else [])]
+def ply_head(
+    tables: Mapping[str, NDArray[np.void]], antialiased: bool, count: int | None = None, *, comments: Sequence[str] = ()
+) -> bytes:
+    """The header of `ply_file`, with lines of `comments`. `count` is the number of rows where the tables are samples."""
+    lines = ["ply", "format binary_little_endian 1.0", *comments]
+    lines += ["comment SplatRenderMode: mip"] if antialiased else []
     for name, table in tables.items():
         lines.append(f"element {name} {len(table) if count is None else count}")
         for field in table.dtype.names or ():
@@ -217,6 +208,7 @@ class _Header(NamedTuple):
 
 
 def _read_inria(path: Path, data: Data, elements: Mapping[str, _Element]) -> Capture:
+    # First every property that is needed is looked for; then rows are read, and later recoloured, in pieces.
     vertex = elements.get("vertex")
     if vertex is None:
         raise DataError(f"{path}: no element `vertex`; not a file of 3D Gaussians")
@@ -256,6 +248,7 @@ def _read_inria(path: Path, data: Data, elements: Mapping[str, _Element]) -> Cap
         return means, turns, scales, table["opacity"], harmonics
 
     def recolour(harmonics: Floats, changed: Bools) -> Iterator[bytes]:
+        """The file's own bytes, with other numbers in the columns of colours of the rows that change."""
         yield data[: vertex.offset]
         for rows in base.pieces(vertex.rows):
             table, here, new = whole[rows].copy(), changed[rows], harmonics[rows]
@@ -273,6 +266,7 @@ def _read_inria(path: Path, data: Data, elements: Mapping[str, _Element]) -> Cap
 
 
 def _read_compressed(path: Path, data: Data, elements: Mapping[str, _Element]) -> Capture:
+    # All properties that SuperSplat writes must be there, of its types; only bounds of colours are missing in early files.
     known = {name: element.names() for name, element in elements.items()}
     tinted = _COLOUR[0][0] in known.get("chunk", ())
     bounds = [name for pair in (_POSITION, _SCALE, *([_COLOUR] if tinted else [])) for of in pair for name in of]
@@ -281,6 +275,7 @@ def _read_compressed(path: Path, data: Data, elements: Mapping[str, _Element]) -
             if name not in known.get(element, ()) or elements[element].kind[name] != kind:
                 raise DataError(f"{path}: no property {name}; not the compressed layout of SuperSplat")
     chunk, vertex = (elements[name].table(data) for name in ("chunk", "vertex"))
+    # `of` is the chunk of each Gaussian. Harmonics, where there are any, are one row of bytes a Gaussian.
     count, of = len(vertex), np.arange(len(vertex)) // _CHUNK
     sh = elements["sh"].table(data) if "sh" in elements else None
     rest = known.get("sh", ())
@@ -291,12 +286,14 @@ def _read_compressed(path: Path, data: Data, elements: Mapping[str, _Element]) -
         raise DataError(f"{path}: {len(chunk)} chunks for {count} Gaussians; there is one for each {_CHUNK}")
 
     def part(rows: slice) -> tuple[Floats, ...]:
+        """Some of the Gaussians as `base.decoded` wants them."""
+
         def unpacked(share: Floats, pair: tuple[tuple[str, ...], tuple[str, ...]]) -> Floats:
             low, high = (np.stack([chunk[name][of[rows]] for name in names], 1).astype(np.float64) for names in pair)
             return np.asarray(low * (1 - share) + high * share)
 
         position, turned, scale, colour = (vertex[name][rows] for name in _PACKED)
-        rgba = _unpack(colour, (8, 8, 8, 8))
+        rgba = base.unpack_bits(colour, (8, 8, 8, 8))
         harmonics = base.constants_of(unpacked(rgba[:, :3], _COLOUR) if tinted else rgba[:, :3])
         if sh is not None:
             # The two outermost bytes stand for the very ends of the range.
@@ -305,20 +302,17 @@ def _read_compressed(path: Path, data: Data, elements: Mapping[str, _Element]) -
             bands = ((share - 0.5) * _SPAN).reshape(len(raw), 3, -1).transpose(0, 2, 1)
             harmonics = np.concatenate([harmonics, bands], 1)
         return (
-            unpacked(_unpack(position, (11, 10, 11)), _POSITION),
-            base.three_to_four((turned >> 30).astype(np.int64), 2 * _unpack(turned, (10, 10, 10)) - 1),
-            unpacked(_unpack(scale, (11, 10, 11)), _SCALE),
+            unpacked(base.unpack_bits(position, (11, 10, 11)), _POSITION),
+            base.three_to_four((turned >> 30).astype(np.int64), 2 * base.unpack_bits(turned, (10, 10, 10)) - 1),
+            unpacked(base.unpack_bits(scale, (11, 10, 11)), _SCALE),
             base.logit(rgba[:, 3]),
             harmonics,
         )
 
     def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
         out = bytearray(data)
-        target, share = (
-            {name: element.table(out) for name, element in elements.items()},
-            base.colours_of(base.finite(harmonics)),
-        )
-        changed_here = changed
+        target = {name: element.table(out) for name, element in elements.items()}
+        share, changed_here = base.colours_of(base.finite(harmonics)), changed
         if tinted:  # a chunk in which anything changes gets new bounds, and all of its colours are rounded again
             share, *limits = _in_chunks(share.clip(*_COLOURS))
             there = np.unique(of[changed])
@@ -326,7 +320,7 @@ def _read_compressed(path: Path, data: Data, elements: Mapping[str, _Element]) -
             for names, values in zip(_COLOUR, limits, strict=True):
                 for name, column in zip(names, values.T, strict=True):
                     target["chunk"][name][there] = column[there]
-        colour = _pack(share, (8, 8, 8)).astype(np.uint32) << 8 | (vertex["packed_color"] & 255)
+        colour = base.pack_bits(share, (8, 8, 8)).astype(np.uint32) << 8 | (vertex["packed_color"] & 255)
         target["vertex"]["packed_color"][changed_here] = colour[changed_here]
         for name, column in zip(rest, _rest_bytes(harmonics).T, strict=True):
             target["sh"][name][changed] = column[changed]
@@ -405,10 +399,7 @@ def _from_ascii(path: Path, data: Data, header: _Header, elements: Mapping[str, 
         except (ValueError, StopIteration) as error:
             raise DataError(f"{path}: the rows of element {name} are no numbers for its properties ({error})") from error
     # Comments go along, which may say what points up.
-    head, newline = ply_head(tables, False), b"\n"
-    said = [" ".join(words).encode("latin-1") for words in header.lines if words[0] in ("comment", "obj_info")]
-    head = head.replace(b" 1.0\n", newline.join([b" 1.0", *said, b""]), 1)
-    whole = head + b"".join(table.tobytes() for table in tables.values())
+    whole = ply_file(tables, comments=[" ".join(words) for words in header.lines if words[0] in ("comment", "obj_info")])
     binary = _header(whole)
     assert binary is not None
     return whole, _elements(path, whole, binary)
@@ -499,21 +490,3 @@ def _in_chunks(values: Floats) -> tuple[Floats, Floats, Floats]:
     low, high = (what.reduceat(values, starts, axis=0).astype(np.float32) for what in (np.minimum, np.maximum))
     at = np.arange(len(values)) // _CHUNK
     return base.shares(values, low[at], high[at]), low, high
-
-
-def _pack(shares: Floats, bits: Sequence[int]) -> NDArray[np.int64]:
-    """Columns in [0, 1] in one word each row, the first one highest."""
-    word = np.zeros(len(shares), np.int64)
-    for column, width in zip(shares.T, bits, strict=True):
-        word = word << width | base.steps(column, (1 << width) - 1)
-    return word
-
-
-def _unpack(word: NDArray[np.uint32], bits: Sequence[int]) -> Floats:
-    """The columns of `_pack`, in [0, 1]."""
-    columns, shift = [], 0
-    for width in reversed(bits):
-        most = (1 << width) - 1
-        columns.append((word >> shift & most) / most)
-        shift += width
-    return np.stack(columns[::-1], 1)

@@ -27,11 +27,10 @@ from numpy.typing import NDArray
 from ...datamanagers.images import header_of
 from ...errors import DataError
 from ...io.atomic import write_bytes
-from ...plugins.captures import CaptureFormat, Data
 from ...types import Origin
 from ..gaussians import COUNTS, Gaussians
 from . import base
-from .base import Bools, Capture, Floats
+from .base import Bools, Capture, CaptureFormat, Data, Floats
 
 _Bytes: TypeAlias = NDArray[np.uint8]
 _LEVELS = 256

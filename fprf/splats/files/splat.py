@@ -10,11 +10,10 @@ from typing import ClassVar
 import numpy as np
 
 from ...errors import DataError
-from ...plugins.captures import CaptureFormat, Data
 from ...types import Origin
 from ..gaussians import Gaussians
 from . import base
-from .base import Bools, Capture, Floats
+from .base import Bools, Capture, CaptureFormat, Data, Floats
 
 _RECORD = np.dtype([("mean", "<f4", 3), ("deviation", "<f4", 3), ("rgba", "u1", 4), ("turn", "u1", 4)])
 _LEAST = 1e-12

@@ -21,11 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ...plugins.captures import CaptureFormat, Data
 from ...types import Origin
 from ..gaussians import COUNTS, Gaussians, bulk_of
 from . import base
-from .base import Bools, Capture, Floats
+from .base import Bools, Capture, CaptureFormat, Data, Floats
 
 _MAGIC = 0x5053474E
 _HEADER, _WIDE_HEADER = struct.Struct("<IIIBBBB"), struct.Struct("<IIIBBBBI12x")

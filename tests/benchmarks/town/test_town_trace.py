@@ -1,13 +1,17 @@
-"""The vectorised tracer against one ray at a time, written from the definitions of the solids."""
+"""The town: its tracer against one ray at a time, and colours that views agree on."""
 
 import math
 
 import numpy as np
 import pytest
+from town_views import project, world
 
 from benchmarks.town.layout import build_town
-from benchmarks.town.render import cast, directions, shadowed, walk
+from benchmarks.town.palettes import PALETTES, palette
+from benchmarks.town.render import cast, colours, directions, geometry, render, shadowed, walk
 from benchmarks.town.shapes import Cylinder, Ellipsoid, Material, Polyhedron
+from benchmarks.town.surface import CLASSES
+from fprf.plugins.encoders.frozen import street
 
 TOWN = build_town(0)
 
@@ -64,14 +68,6 @@ def test_depth_and_face_are_those_of_a_plain_loop():
         assert (within > -1e-9).all() and (within < town.faces.extent[face[flat]] + 1e-9).all()
 
 
-def test_finer_grids_and_smaller_windows_change_no_ray():
-    view = walk(seed=0, views=5, width=30, height=20)[1]
-    triple = cast(TOWN, view, directions(view, 3), 3)
-    single = cast(TOWN, view, directions(view, 1), 1)
-    np.testing.assert_allclose(triple.distance[1::3, 1::3], single.distance, rtol=1e-12)
-    assert (triple.face[1::3, 1::3] == single.face).mean() > 0.999
-
-
 def test_shadows_are_those_of_a_plain_loop():
     rng = np.random.default_rng(5)
     points = np.column_stack([rng.uniform(-5, 40, 150), rng.uniform(-8, 8, 150), rng.uniform(0, 3, 150)])
@@ -83,3 +79,60 @@ def test_shadows_are_those_of_a_plain_loop():
         hits = np.array([slow_enter(shape, p, sun.tolist()) < math.inf for shape in TOWN.shapes])
         assert (solid[k], leaves[k]) == (bool((hits & ~leafy).any()), bool((hits & leafy).any()))
     assert 0.1 < (solid | leaves).mean() < 0.9
+
+
+TOWN = build_town(0)
+VIEWS = walk(seed=0, views=40, width=48, height=36)
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    return {name: [render(TOWN, VIEWS[k], look) for k in (0, 5, 11)] for name, look in PALETTES.items()}
+
+
+def test_palettes_change_colours_only(pictures):
+    for name, shots in pictures.items():
+        for shot, day in zip(shots, pictures["day"], strict=True):
+            assert shot.depth.tobytes() == day.depth.tobytes()
+            assert shot.labels.tobytes() == day.labels.tobytes()
+            difference = np.abs(shot.rgb.astype(int) - day.rgb).mean()
+            assert (difference == 0) if name == "day" else (difference > 8)
+
+
+def test_views_agree_on_colours():
+    """What two cameras both see has the same colour in both, up to the pixels' footprints."""
+    big = walk(seed=0, views=40, width=120, height=90)
+    a, b = big[2], big[3]
+    one, two = (colours(TOWN, view, palette("day"), 1) for view in (a, b))
+    points, seen = world(a, geometry(TOWN, a)[0])
+    row, column, distance = project(b, points)
+    there = geometry(TOWN, b)[0][row, column]
+    both = (row >= 0) & (np.abs(there - distance) < 0.02 * there)
+    assert both.sum() > 1000
+    difference = np.abs(one[seen] - two[row, column])[both].mean(1)
+    assert np.median(difference) < 0.02 and difference.mean() < 0.05
+
+
+def test_the_pictures_that_encoders_are_measured_on_are_the_towns():
+    town, views = build_town(0), walk(seed=0, views=len(PALETTES), width=160, height=128)
+    pictures = [render(town, view, look).rgb for view, look in zip(views, PALETTES.values(), strict=True)]
+    assert np.array_equal((street() * 255).round().byte().permute(0, 2, 3, 1).numpy(), np.stack(pictures))
+
+
+def test_towns_are_functions_of_their_seed():
+    for field in ("material", "tint", "origin", "extent"):
+        a, b, c = (getattr(build_town(seed).faces, field) for seed in (1, 1, 2))
+        assert np.array_equal(a, b)
+        assert not np.array_equal(a, c)
+    first, same, other = (walk(seed=s, views=4, width=8, height=8) for s in (1, 1, 2))
+    assert all(np.array_equal(a.pose, b.pose) for a, b in zip(first, same, strict=True))
+    assert not any(np.array_equal(a.pose, b.pose) for a, b in zip(first, other, strict=True))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_every_town_shows_every_class(seed):
+    town = build_town(seed)
+    views = walk(seed=seed, views=40, width=40, height=30)
+    seen = sum(np.bincount(geometry(town, view)[1].ravel(), minlength=len(CLASSES)) for view in views[::3])
+    assert len(seen) == len(CLASSES) <= 12
+    assert (seen > 14 * 1200 * 0.001).all(), dict(zip(CLASSES, seen, strict=True))
