@@ -11,7 +11,7 @@ ORDER = (
     *("version", "errors", "types", "memory", "checks", "process", "progress", "io", "interfaces", "configs", "outputs"),
     *("ops", "rendering", "datamanagers", "style", "fields", "plugins", "blocks", "testing"),
     *("training", "splats", "pretraining", "reconstruction", "evaluation", "export"),
-    *("page", "viewer", "api", "cli", "__main__"),
+    *("page", "api", "cli", "__main__"),
 )
 """Layers from the lowest to the highest. Imports within functions, such as those of `build`, may lead anywhere."""
 MECHANISM = ("config.py", "methods.py")

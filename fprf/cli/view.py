@@ -16,9 +16,9 @@ from .parsing import parse
 from .style_flags import say
 
 if TYPE_CHECKING:
-    from ..viewer.server import ViewerServer
-    from ..viewer.session import Viewed
-    from ..viewer.start import Start
+    from ..page.server import ViewerServer
+    from ..page.session import Viewed
+    from ..page.start import Start
 
 _EXIT_TIMEOUT = 15.0
 """Seconds after an interrupt within which all must have ended."""
@@ -67,13 +67,13 @@ def run(args: list[str]) -> int:
     """Serve until interrupted."""
     description = "Look at a run in the browser; without one, make a scene there of photographs, a video or a capture."
     config = parse(ViewConfig(), args, prog="fprf view", description=description, positional=("run",))
-    from ..viewer.server import ViewerServer, make_access
+    from ..page.server import ViewerServer, make_access
 
     access = make_access(config.host, config.token)
     with contextlib.ExitStack() as stack:
         # The address is taken first: while torch is imported the browser already has a page.
         server = stack.enter_context(ViewerServer(access, config.port))
-        from ..viewer.uploads import is_capture
+        from ..page.uploads import is_capture
 
         path = config.run
         if path is not None and not (config.follow or is_capture(path) or (path / "config.json").is_file()):
@@ -93,7 +93,7 @@ def run(args: list[str]) -> int:
 
             session = None if config.follow else server.open(load, references, config.pixels)
             if not is_capture(path):
-                from ..viewer.live import TrainingFollower
+                from ..page.follow import TrainingFollower
 
                 # A run that is in training: the scene is loaded anew with each checkpoint.
                 stack.enter_context(TrainingFollower(server, path, load, session, config.pixels))
@@ -109,7 +109,7 @@ def run(args: list[str]) -> int:
 
 
 def _start(server: "ViewerServer", config: ViewConfig, references: Sequence[Path]) -> "Start":
-    from ..viewer.start import Start
+    from ..page.start import Start
 
     def show(path: Path, name: str) -> None:
         server.open(lambda: _load(config, path, name, server.notify), references, config.pixels)
@@ -124,14 +124,13 @@ def _start(server: "ViewerServer", config: ViewConfig, references: Sequence[Path
 
 def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[str], None]) -> "Viewed":
     """The scene of a run or a capture, under its own name where none is given."""
-    from ..viewer.session import Viewed, view_of_run
-    from ..viewer.uploads import is_capture
+    from ..page.session import Viewed, view_of_run
+    from ..page.uploads import is_capture
 
     if not is_capture(path):
         from ..training.loading import open_run
 
-        run = open_run(path, config.device, config)
-        viewed = view_of_run(run.scene, run.run, run.known, run.step)
+        viewed = view_of_run(open_run(path, config.device, config))
         return viewed if name is None else replace(viewed, name=name)
     from ..plugins.stylizers.config import RegionToneConfig
     from ..splats.config import LookConfig

@@ -1,1 +1,20 @@
-"""One page that shows a scene in 3D: packed Gaussians, a renderer for browsers, and the writer of the page's file."""
+"""The page that shows a scene in 3D: one file (`fprf restyle --page`), or served with a scene behind it (`fprf view`).
+
+- What browsers run: `web/` (`splats.js` draws, `place.js` moves, `page.js` is in every page, the rest in the served one).
+- Gaussians as bytes: `pack.py`. The page as one file: `writer.py`.
+- Who may connect, and with what: `server.py`, `messages.py`. Photographs and files that come: `uploads.py`, `start.py`.
+- The scene that is open, its looks and its training: `session.py`, `restyler.py`, `follow.py`.
+- What it shows, drawn step by step: `drawing.py`, in the thread of `render_worker.py`.
+"""
+
+from importlib.resources import files
+
+
+def read_asset(name: str) -> str:
+    """A text that browsers get: a file of `web/`."""
+    return (files(__package__) / "web" / name).read_text("utf-8")
+
+
+def script(*more: str) -> str:
+    """The scripts of every page, and `more`, one after the other."""
+    return "\n".join(map(read_asset, ("splats.js", "place.js", "page.js", *more)))

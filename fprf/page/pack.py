@@ -206,14 +206,13 @@ def colour_section(colours: Colours, level: int = 9) -> bytes:
     return zlib.compress(np.ascontiguousarray(colours.rows.T).tobytes() + colours.maps.tobytes(), level)
 
 
-def header(packed: Packed, **more: Any) -> dict[str, Any]:
+def header(packed: Packed) -> dict[str, Any]:
     """What the page has to know to read the sections."""
     return {
         "count": len(packed.order),
         "harmonics": packed.palette.shape[1] + 1,
         "entries": len(packed.palette),
         "largest": packed.largest,
-        **more,
     }
 
 

@@ -31,8 +31,8 @@ from ..rendering.paths import upwards
 from ..splats.photographs import camera_of
 from ..splats.scene import SplatScene
 from ..style.look import Restyle
-from .live import read, script
-from .pack import colour_header, colour_section, header, pack, sections
+from . import read_asset, script
+from .pack import Packed, colour_header, colour_section, header, pack, sections
 
 CAPTURED = "Captured"
 _STILL, _VIEW, _MAP, _REFERENCE = 800, 512, 320, 320
@@ -123,7 +123,7 @@ def page_html(page: Page, *, megabytes: float | None = None, path: Path = Path("
     # Pack all, and while it is too large keep the share that would fit, of the Gaussians that weigh most in the views.
     empty, kept = len(fixed.encode()), None
     for _ in range(4):
-        head, parts = packed_scene(scene, harmonics, kept, page.start)
+        _, head, parts = packed_scene(scene, harmonics, page.start, kept)
         text = _text(page, film, head, parts)
         size, count = len(text.encode()), int(head["count"])
         if room is None or size <= room:
@@ -151,22 +151,29 @@ def notebook_html(scene: Scene, name: str, view: int, styled: tuple[str, Restyle
 
 
 def packed_scene(
-    scene: SplatScene, harmonics: Sequence[Annotated[Tensor, "N K 3"]], kept: Tensor | None, start: int
-) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """Head and deflated sections of a scene's Gaussians, of those `kept`, in several colours, of which the first is captured.
+    scene: SplatScene,
+    harmonics: Sequence[Annotated[Tensor, "N K 3"]],
+    start: int,
+    kept: Annotated[Tensor, "n"] | None = None,
+    level: int = 9,
+) -> tuple[Packed, dict[str, Any], dict[str, bytes]]:
+    """Pack a scene's Gaussians, of those `kept`, in several colours, of which the first is captured; return the head and the
+    deflated sections that the page reads, too.
 
-    The page begins at the camera `start`.
+    The page begins at the camera `start`. `level` of deflating: 1 where somebody waits.
     """
     gaussians = scene.gaussians.recoloured(harmonics[0])
     if kept is not None:
         gaussians, harmonics = gaussians.select(kept), [each[kept] for each in harmonics]
     packed = pack(gaussians)
-    parts, styles = sections(packed), []
+    parts, styles = sections(packed, level), []
     for k, each in enumerate(harmonics):
         colours = packed.colours(each)
         styles.append(colour_header(colours))
-        parts[f"style-{k}"] = colour_section(colours)
-    return {**header(packed), **about_gaussians(scene, start), "styles": styles}, parts
+        parts[f"style-{k}"] = colour_section(colours, level)
+    drawing = {"antialiased": scene.antialiased, "near": scene.near, "background": list(scene.background)}
+    place = about(scene.views, start, lambda view: _depth(scene, view))
+    return packed, {**header(packed), **drawing, **place, "styles": styles}, parts
 
 
 def about(cameras: Cameras, start: int, depth: Callable[[int], float]) -> dict[str, Any]:
@@ -184,16 +191,6 @@ def about(cameras: Cameras, start: int, depth: Callable[[int], float]) -> dict[s
         "up": up.tolist(),
         "reach": {"centre": centre.tolist(), "radius": radius},
         "cameras": [_camera(cameras, view, far) for view, far in zip(chosen, depths, strict=True)],
-    }
-
-
-def about_gaussians(scene: SplatScene, start: int) -> dict[str, Any]:
-    """What drawing a scene's Gaussians needs beside them."""
-    return {
-        "antialiased": scene.antialiased,
-        "near": scene.near,
-        "background": list(scene.background),
-        **about(scene.views, start, lambda view: _depth(scene, view)),
     }
 
 
@@ -248,13 +245,13 @@ def _text(page: Page, film: str, head: Mapping[str, Any] | None, parts: Mapping[
     ]
     present = [(name, part) for name, part in below if part]
     code = f"{script()}\nopen(JSON.parse(at('data').textContent));\n"
-    return Template(read("page.html")).substitute(
+    return Template(read_asset("page.html")).substitute(
         title=escape(page.title),
         lead=f'<p class="lead">{escape(page.lead)}</p>' if page.lead else "",
-        css=read("page.css"),
+        css=read_asset("page.css"),
         hash=f"'sha256-{base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()}'",
         nav="\n".join(f'<a href="#{name.lower()}">{name}</a>' for name, _ in present),
-        stage=Template(read("stage.html")).substitute(
+        stage=Template(read_asset("stage.html")).substitute(
             still=f'src="{stills[0][0]}"', ratio=f'style="--ratio:{width / height:.4f}"', facts=_facts(page.facts)
         ),
         body="\n".join(f'<section id="{name.lower()}"><h2>{name}</h2>\n{part}\n</section>' for name, part in present),

@@ -34,7 +34,7 @@ PARSED = {
     "demo": "minutes; tests/cli/test_demo_verb.py runs it small",
     "process": "needs pycolmap; tests/reconstruction/test_colmap.py runs it",
     "train": "minutes; run below with `-m slow`",
-    "view": "stays up; tests/viewer run it",
+    "view": "stays up; tests/page run it",
     "pretrain": "hours; tests/pretraining run it small",
 }
 """Verbs whose commands are parsed whole, with the files that they name."""

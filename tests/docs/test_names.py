@@ -22,7 +22,7 @@ LEGENDS = [ROOT / "fprf/interfaces.py", ROOT / "pyproject.toml"]
 """Files beside the documents that say where a newcomer adds what."""
 FILE = re.compile(r"`((?:fprf|tests|benchmarks|tools|examples)/[\w./+-]+)`")
 BELOW = re.compile(
-    r"`((?:blocks|cli|datamanagers|evaluation|export|fields|io|ops|page|plugins|rendering|splats|style|training|viewer)/[\w/]+\.py)`"
+    r"`((?:blocks|cli|datamanagers|evaluation|export|fields|io|ops|page|plugins|rendering|splats|style|training)/[\w/]+\.py)`"
 )
 MODULE = re.compile(r"`(fprf(?:\.\w+)+)`")
 LINK = re.compile(r"\]\((?!https?:)([^)#\s]*)(#[\w-]*)?\)")

@@ -13,11 +13,11 @@ from splat_ball import ball
 from fprf import testing
 from fprf.cli import main as cli
 from fprf.errors import DataError
+from fprf.page.uploads import check_file, find_source
 from fprf.plugins import registry
 from fprf.splats.config import endings
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.files.base import CaptureFormat, format_of
-from fprf.viewer.uploads import check_file, find_source
 
 CODE = '''
 """Means, ln-scales, logits, quaternions and mean colours as rows of float32 behind a word."""

@@ -2,7 +2,9 @@
 
 import base64
 import json
+import math
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -68,19 +70,51 @@ def test_a_glb_has_what_the_extension_demands(tmp_path: Path) -> None:
     assert np.allclose(column("COLOR_0")[:, :3] / 255, made.colours.clamp(0, 1), atol=0.51 / 255)
 
 
-def test_sizes_of_the_review_draft_are_told_by_a_negative_one(tmp_path: Path) -> None:
-    made, path = ball(40), tmp_path / "x.glb"
+@pytest.mark.parametrize("unit", [0.01, 1.0, 100.0])
+@pytest.mark.parametrize("logarithmic", [False, True])
+@pytest.mark.parametrize(
+    ("generator", "space"),
+    [(None, None), ("tool 1.0", "srgb_rec709_display"), ("splat-transform 2.{}.1", None), (None, "BT.709")],
+)
+def test_linear_and_logarithmic_sizes_are_told_apart(
+    unit: float, logarithmic: bool, generator: str | None, space: str | None, tmp_path: Path
+) -> None:
+    """By a negative one, by what wrote the file, by the draft's colour space, or by what fits the distances between them."""
+    if space == "BT.709" and not logarithmic:
+        pytest.skip("no file of a draft has linear sizes")
+    made, path = ball(400), tmp_path / "x.glb"
+    made = replace(made, means=made.means * unit, log_scales=made.log_scales - 0.7 + math.log(unit))
     write_gaussians(path, made)
-    final = read_capture(path)
+    assert "fprf wrote it" in read_capture(path).notes[0]
     document, body = glb_parts(path.read_bytes())
-    scale = document["bufferViews"][2]
-    assert scale["byteLength"] == 40 * 12
-    start = scale["byteOffset"]
-    body = body[:start] + made.log_scales.numpy().tobytes() + body[start + 480 :]
+    extension = document["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
+    extension["colorSpace"] = space or "srgb_rec709_display"
+    document["asset"]["generator"] = (generator or "").format(6 if logarithmic else 7)
+    view = document["bufferViews"][2]
+    sizes = made.log_scales if logarithmic else made.log_scales.exp()
+    body = body[: view["byteOffset"]] + sizes.numpy().tobytes() + body[view["byteOffset"] + view["byteLength"] :]
     path.write_bytes(glb_of(document, body))
-    draft = read_capture(path)
-    assert torch.allclose(draft.gaussians.log_scales, final.gaussians.log_scales, atol=1e-6)
-    assert "linear" in final.notes[0] and "review draft" in draft.notes[0]
+    found = read_capture(path)
+    assert torch.allclose(found.gaussians.log_scales, made.log_scales, atol=1e-5), found.notes
+    assert ("review draft" in found.notes[0]) == logarithmic and "\n" not in found.notes[0]
+    positive = unit == 100
+    assert not positive or bool((sizes > 0).all())
+    told = {"tool 1.0": "neighbours", None: "BT.709" if space else "neighbours"}.get(generator, "splat-transform")
+    assert ("negative" if logarithmic and not positive else told) in found.notes[0]
+
+
+def test_whole_numbers_of_sizes_are_shares_only_where_they_are_said_to_be(tmp_path: Path) -> None:
+    """The review draft allows logarithms as bytes."""
+    made, path = ball(40), tmp_path / "x.glb"
+    made = replace(made, log_scales=made.log_scales.round())
+    write_gaussians(path, made)
+    document, body = glb_parts(path.read_bytes())
+    sizes = np.zeros((40, 4), np.int8)
+    sizes[:, :3] = made.log_scales.numpy()
+    document["bufferViews"].append({"buffer": 0, "byteOffset": len(body), "byteLength": 160, "byteStride": 4})
+    document["accessors"][2] |= {"bufferView": len(document["bufferViews"]) - 1, "componentType": 5120}
+    path.write_bytes(glb_of(document, body + sizes.tobytes()))
+    assert torch.allclose(read_capture(path).gaussians.log_scales, made.log_scales, atol=1e-6)
 
 
 def test_nodes_turn_scale_and_move_gaussians_and_their_harmonics(tmp_path: Path) -> None:

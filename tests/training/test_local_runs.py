@@ -17,6 +17,9 @@ import fprf
 from fprf.cli.main import main
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.images import write_image
+from fprf.page.drawing import FilmPlan, Key, write_film_files
+from fprf.page.messages import Camera
+from fprf.page.restyler import Look
 from fprf.rendering.camera_path import read_camera_path
 from fprf.rendering.local_frame import read_offset
 from fprf.splats.files import read_capture
@@ -25,9 +28,6 @@ from fprf.splats.scene import SplatScene
 from fprf.training.driver import train
 from fprf.training.loading import load_run, open_run
 from fprf.training.run import Run
-from fprf.viewer.drawing import FilmPlan, Key, write_film_files
-from fprf.viewer.messages import Camera
-from fprf.viewer.restyler import Look
 
 SPLATS = ["--downscale", "1", "--initial", "300", "--cap", "400", "--steps", "40"]
 

@@ -1,13 +1,15 @@
 """glTF 2.0 with `KHR_gaussian_splatting`: a binary .glb, or a .gltf, which is written with its buffer inside.
 
 Primitives of points with POSITION, ROTATION (x y z w), SCALE, OPACITY in [0, 1] and SH_DEGREE_l_COEF_n, beside any other nodes,
-cameras and meshes, which are kept. SCALE is a size in the final text of the extension and its logarithm in the review draft: a
-negative one betrays the latter. Colours are sRGB or linear (`colorSpace`). Axes are right up back; what this module writes has
-those of PLY files, right down front, under a node that turns them by 180 degrees about x.
+cameras and meshes, which are kept. SCALE is a size in the final text of the extension and its logarithm in the review draft
+(`_logarithmic` tells them apart). Colours are sRGB or linear (`colorSpace`). Axes are right up back; what this module writes
+has those of PLY files, right down front, under a node that turns them by 180 degrees about x.
 """
 
 import base64
 import json
+import math
+import re
 import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -35,6 +37,14 @@ _UNSOUND = (LookupError, TypeError, ValueError, AttributeError, RecursionError, 
 """What a document that is no glTF raises where it is taken apart."""
 _LEAST = 1e-30
 """Sizes are at least this, so that their logarithm is finite."""
+_DRAFTS = ("BT.", "Display-P3", "linear")
+"""What names of colour spaces began with while SCALE was a logarithm; the review draft and the final text share theirs."""
+_LINEAR_SINCE = (2, 7)
+"""Version of splat-transform from which on its .glb has linear sizes (playcanvas/splat-transform#268)."""
+_ASKED = 64
+"""Gaussians whose nearest neighbours are looked for."""
+_TYPICAL = -0.5
+"""ln of the middle axis of Gaussians over the distance to the nearest neighbour: -0.2 to -0.9 in trained captures."""
 
 
 class _Part(NamedTuple):
@@ -46,18 +56,24 @@ class _Part(NamedTuple):
     scale: float
     translation: Floats
     extension: dict[str, Any]
-    logarithmic: bool
-    """Its SCALE is a logarithm."""
+    whole: bool
+    """Its SCALE is whole numbers as they are, not shares."""
 
     @property
     def linear(self) -> bool:
         """Its colours are those of linear light."""
         return str(self.extension.get("colorSpace")).startswith("lin")
 
-    def decoded(self, rows: slice, names: list[str]) -> tuple[Floats, ...]:
-        """Means, quaternions, ln-scales, logits and harmonics of some rows."""
+    def sizes(self, rows: slice | NDArray[np.int64]) -> Floats:
+        """SCALE of some rows, as it stands in the file."""
+        column = self.columns[_SHAPE[2]][rows]
+        return column.astype(np.float64) if self.whole else _values(column)
+
+    def decoded(self, rows: slice, names: list[str], logarithmic: bool) -> tuple[Floats, ...]:
+        """Means, quaternions, ln-scales, logits and harmonics of some rows; SCALE is those ln-scales, or sizes."""
         # Attributes may be whole numbers that stand for shares, except of harmonics.
-        points, turns, scale, opacity = (_values(self.columns[name][rows]) for name in _SHAPE)
+        points, turns, opacity = (_values(self.columns[name][rows]) for name in (*_SHAPE[:2], _SHAPE[3]))
+        scale = self.sizes(rows)
         # The quaternion product of the node's rotation and the Gaussians' own.
         a, b, c, d = quaternions(torch.from_numpy(self.rotation)[None])[0].tolist()
         product = np.array([[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]])
@@ -66,7 +82,7 @@ class _Part(NamedTuple):
         return (
             self.scale * points @ self.rotation.T + self.translation,
             np.roll(turns, 1, 1) @ product.T,
-            (scale if self.logarithmic else np.log(np.maximum(scale, _LEAST))) + np.log(self.scale),
+            (scale if logarithmic else np.log(np.maximum(scale, _LEAST))) + np.log(self.scale),
             base.logit(opacity[:, 0]),
             np.matmul(base.turned_harmonics(self.rotation, len(names)), harmonics),
         )
@@ -115,11 +131,15 @@ class Gltf(CaptureFormat):
             return [bytes(out)]
 
         # One section a primitive: each has its own node, and so its own axes.
-        sections = [(len(part.columns["POSITION"]), lambda rows, part=part: part.decoded(rows, names)) for part in parts]
+        logarithmic, reason = _logarithmic(document, parts)
+        sections = [
+            (len(part.columns["POSITION"]), lambda rows, part=part: part.decoded(rows, names, logarithmic)) for part in parts
+        ]
         gaussians, shift = base.decoded(len(names), *sections)
-        kind = "logarithms, as in the review draft" if parts[0].logarithmic else "linear, as in the final text"
+        kind = "logarithms, as in the review draft" if logarithmic else "linear, as in the final text"
         compensated = parts[0].extension.get("extras") == {"antialiased": True}
-        return Capture(path, gaussians, compensated, data, recolour, shift=shift, notes=(f"sizes are {kind} of {_NAME}",))
+        notes = (f"sizes are {kind} of {_NAME}: {reason}",)
+        return Capture(path, gaussians, compensated, data, recolour, shift=shift, notes=notes)
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
         """A .glb of one node; harmonics of degree 4 are left out."""
@@ -242,11 +262,50 @@ def _parts(path: Path, document: dict[str, Any], data: Data | bytearray, start: 
             linear, scale = matrix[:3, :3], float(np.cbrt(np.linalg.det(matrix[:3, :3])))
             if not scale > 0 or not np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() < 1e-3:
                 raise DataError(f"{path}: a node shears, mirrors or stretches its Gaussians; apply its transform first")
-            # A size is never negative; its logarithm is where anything is smaller than the unit.
-            sizes = columns[_SHAPE[2]]
-            logarithmic = any(bool((_values(sizes[rows]) < 0).any()) for rows in base.pieces(len(sizes)))
-            found.append(_Part(columns, linear / scale, scale, matrix[:3, 3], extension, logarithmic))
+            about = document["accessors"][primitive["attributes"][_SHAPE[2]]]
+            whole = about["componentType"] != 5126 and not about.get("normalized")
+            found.append(_Part(columns, linear / scale, scale, matrix[:3, 3], extension, whole))
     return found
+
+
+def _logarithmic(document: dict[str, Any], parts: list[_Part]) -> tuple[bool, str]:
+    """Whether SCALE is the logarithm of sizes, in all of a file's Gaussians, and what told so."""
+    # A size is never negative; its logarithm is where anything is smaller than the unit.
+    for part in parts:
+        if any(bool((part.sizes(rows) < 0).any()) for rows in base.pieces(len(part.columns["POSITION"]))):
+            return True, "some are negative"
+    # What wrote the file may be known, or the draft that it follows.
+    generator = str(document["asset"].get("generator"))
+    version = re.match(r"splat-transform (\d+)\.(\d+)", generator)
+    if version or generator == "fprf":
+        return version is not None and (int(version[1]), int(version[2])) < _LINEAR_SINCE, f"{generator[:40]} wrote it"
+    for part in parts:
+        if str(part.extension.get("colorSpace")).startswith(_DRAFTS):
+            return True, f"colorSpace {part.extension['colorSpace']} is that of a draft"
+    # Else sizes are held against the distances between neighbours: Gaussians that cover a surface are about as wide.
+    part = max(parts, key=lambda part: len(part.columns["POSITION"]))
+    points = part.columns["POSITION"]
+    some = np.linspace(0, len(points) - 1, _ASKED).astype(np.int64)
+    asked = torch.from_numpy(_values(points[some]))
+    asked = asked[asked.isfinite().all(1)]
+    nearest = torch.full((len(asked),), torch.inf)
+    for rows in base.pieces(len(points)):
+        here = torch.from_numpy(_values(points[rows]))
+        # About the first one, so that float32 keeps the digits of places far from 0.
+        apart = torch.cdist(
+            (asked - asked[:1]).float(), (here - asked[:1]).float(), compute_mode="donot_use_mm_for_euclid_dist"
+        )
+        nearest = torch.minimum(nearest, apart.masked_fill(~(apart > 0), torch.inf).amin(1))
+    nearest = nearest[nearest.isfinite()]
+    middle = np.sort(part.sizes(some), 1)[:, 1]
+    middle = middle[np.isfinite(middle)]
+    if not len(nearest) or not len(middle):
+        return False, "nothing tells otherwise"
+    spacing, number = float(nearest.median().log()), float(np.median(middle))
+    ratios = (math.log(max(number, _LEAST)) - spacing, number - spacing)
+    logarithmic = abs(ratios[1] - _TYPICAL) < abs(ratios[0] - _TYPICAL)
+    shares = [f"{math.exp(min(ratio, 99)):.2g}" for ratio in (ratios[logarithmic], ratios[not logarithmic])]
+    return logarithmic, f"so they are {shares[0]} of the distance between neighbours, not {shares[1]}"
 
 
 def _local(node: dict[str, Any]) -> Floats:

@@ -118,6 +118,8 @@ def test_gaussians_take_photographs_looks_are_kept_and_two_pages_agree(world: Wo
         page.locator("#keep-name").fill("faint")
         page.locator("#keep button").click()
         other.wait_for_function("() => fprf.place.splats.styles.has('faint')", timeout=60_000)
+        other.set_viewport_size({"width": 400, "height": 800})
+        assert other.evaluate("() => document.documentElement.scrollWidth") == 400
         other.close()
         before = page.evaluate("() => [...fprf.place.splats.colours.get('Now').rows.subarray(0, 400)]")
         page.locator("#map").select_option("regions")

@@ -15,8 +15,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from fprf.errors import UsageError
-from fprf.viewer import server
-from fprf.viewer.server import COOKIE, Access, Client, ViewerServer, make_access
+from fprf.page import server
+from fprf.page.server import COOKIE, Access, Client, ViewerServer, make_access
 
 HERE = Access("127.0.0.1", None)
 TOKEN = "a-token-of-sixteen-characters"
@@ -175,7 +175,8 @@ def test_a_client_that_does_not_read_is_dropped(http: ViewerServer) -> None:
 
 def test_a_token_in_the_address_becomes_a_cookie() -> None:
     with Probe(Access("127.0.0.1", TOKEN), 0) as http:
-        assert status(http, "GET /") == status(http, "GET /?token=wrong") == 403
+        assert http.address.endswith(f"/?token={TOKEN}")
+        assert status(http, "GET /scene") == status(http, "GET /") == status(http, "GET /?token=wrong") == 403
         answer = request(http, f"GET /?token={TOKEN}")
         assert answer.startswith(b"HTTP/1.1 303 ") and b"location: /\r\n" in answer
         assert f"set-cookie: {COOKIE}={TOKEN}; Path=/; HttpOnly; SameSite=Strict".encode() in answer
@@ -267,11 +268,3 @@ def test_before_the_scene_is_there_a_page_says_so() -> None:
             ViewerServer(HERE, found.port)
     with pytest.raises(OSError):
         page_of(address)
-
-
-def test_the_address_carries_the_token_and_without_it_nothing_opens() -> None:
-    with ViewerServer(make_access("127.0.0.1", "a-token/of-&-characters"), 0) as found:
-        assert "?token=a-token/of-%26-characters" in found.address
-        for path in ("", "app.js", "scene"):
-            with pytest.raises(urllib.error.HTTPError, match="403"):
-                page_of(found.address.partition("?")[0] + path)

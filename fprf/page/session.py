@@ -5,7 +5,7 @@ a newer one of the same kind takes the place of one that was not sent yet.
 """
 
 import threading
-from collections.abc import Callable, Generator, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
@@ -19,16 +19,13 @@ from ..interfaces import Scene
 from ..io.images import Picture, encode, to_uint8, write_image
 from ..io.maps import palette
 from ..io.video import write_video
-from ..page.pack import colour_header, colour_section, container, header, pack, sections
-from ..page.writer import about, about_gaussians
 from ..plugins.stylizers.config import RegionToneConfig
 from ..rendering.cameras import Cameras
 from ..splats.files import Capture, write_capture, write_gaussians
 from ..splats.scene import SplatScene
 from ..style.config import PRESETS
 from ..style.look import Restyle
-from ..training.loading import Trained
-from ..training.run import Known, Run
+from ..training.loading import LoadedRun, Trained
 from . import messages
 from .drawing import (
     FieldPainter,
@@ -43,9 +40,11 @@ from .drawing import (
     new_folder,
     write_film_files,
 )
+from .pack import colour_header, colour_section, container
 from .render_worker import RenderWorker, Steps
 from .restyler import Look, Photograph, RegionInfo, Restyler, matching_regions, only, renumbered, set_rule, set_weight
 from .uploads import Uploads, shown_name
+from .writer import about, packed_scene
 
 Post: TypeAlias = Callable[[Hashable | None, str, "Mapping[str, Any] | bytes"], None]
 """Sends a client, or all (None), a message under the name of its kind."""
@@ -75,10 +74,10 @@ class Viewed:
     """Step of the checkpoint that it was read from."""
 
 
-def view_of_run(scene: Scene, run: Run, known: Known, step: int) -> Viewed:
+def view_of_run(opened: LoadedRun[Scene]) -> Viewed:
     """A run, beginning at the middle one of the views that training did not see."""
-    views = known.test or known.train
-    return Viewed(scene, known.name, views[len(views) // 2], run.root, step=step)
+    views = opened.known.test or opened.known.train
+    return Viewed(opened.scene, opened.known.name, views[len(views) // 2], opened.run.root, step=opened.step)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,10 +129,9 @@ class Session:
         self._requests: dict[Hashable, Request] = {}
         self._photographs: frozenset[Photograph] = frozenset()
         self._painter: FieldPainter | None = None
-        self._worker: RenderWorker[Request] = RenderWorker(self._render, self._on_error)
+        self._worker = RenderWorker(self._on_error)
         self._version = count(1)
         self._colours: dict[str, tuple[int, bytes]] = {}
-        self._coloured: Shown | None = None
         self._progress: dict[str, Any] | None = None
         self._load()
 
@@ -149,12 +147,9 @@ class Session:
         """Prepare what browsers are sent of the scene, or the painter of a field."""
         scene, home = self.viewed.scene, self.viewed.home
         if isinstance(scene, SplatScene):
-            # Shapes and captured colours go to browsers once, deflated at the fastest level: somebody is waiting.
-            self.packed = pack(scene.gaussians)
-            captured = self.packed.colours(scene.gaussians.harmonics)
-            head = {**header(self.packed), **about_gaussians(scene, home), "styles": [colour_header(captured)]}
-            parts = {**sections(self.packed, 1), "style-0": colour_section(captured, 1)}
-            self.geometry, self._coloured = container(head, parts), None
+            # Shapes and captured colours go to browsers once.
+            self.packed, head, parts = packed_scene(scene, [scene.gaussians.harmonics], home, level=1)
+            self.geometry = container(head, parts)
         elif isinstance(scene, Trained):
             self._painter = FieldPainter(scene, self.restyler, self._show)
             # A camera of a field turns about a point as far away as most cameras are from their middle.
@@ -181,7 +176,7 @@ class Session:
                     request = Request(message.camera, self.state.shown, self._longest, message.captured)
                     with self._lock:
                         self._requests[client] = request
-                    self._worker.request(client, request)
+                    self._worker.draw(client, self._painter.render(client, request))
             case messages.Set():
                 value: Any = int(message.value) if message.name == "clusters" else round(message.value, 4)
                 self.apply(lambda state: replace(state, look=replace(state.look, **{message.name: value})))
@@ -254,13 +249,13 @@ class Session:
             self.restyler.retain(used)
             return photograph
 
-        return self._worker.result(("add", path), add)
+        return self._worker.result(add)
 
     def warm_up(self) -> None:
         """Prepare what the first photograph needs while nobody waits: decoder, encoders, kernels, a style."""
         threading.Thread(target=self.uploads.start_decoder, name="fprf-warm-up", daemon=True).start()
 
-        def work() -> Steps:
+        def work() -> Steps[None]:
             self.restyler.encoders  # noqa: B018  they are opened by asking for them
             yield
             # A gradient in the place of a photograph: all that a drop runs is loaded and compiled by it.
@@ -324,21 +319,18 @@ class Session:
                 write_capture(path, viewed.capture, shown.harmonics)
             return path
 
-        return self._worker.result("gaussians", written)
+        return self._worker.result(written)
 
     def _refresh(self) -> None:
         """Show all clients what is shown now."""
         with self._lock:
             shown = self.state.shown
             for client, request in self._requests.items():
+                assert self._painter is not None  # Gaussians are drawn by browsers, which request nothing
                 self._requests[client] = request._replace(shown=shown)
-                self._worker.request(client, self._requests[client])
+                self._worker.draw(client, self._painter.render(client, self._requests[client]))
         if isinstance(self.viewed.scene, SplatScene):
             self._worker.run("colours", lambda: self._colour(NOW, self.state.shown))
-
-    def _render(self, client: Hashable, request: Request) -> Steps:
-        assert self._painter is not None  # others request nothing
-        return self._painter.render(client, request)
 
     def _show(self, client: Hashable, kind: str, picture: Picture, final: bool) -> None:
         """A picture as one byte for its kind, and a JPEG."""
@@ -352,11 +344,7 @@ class Session:
         """Make colours for browsers, of what is shown now or of a look that is kept."""
         scene = self.viewed.scene
         assert isinstance(scene, SplatScene)
-        if name == NOW and shown == self._coloured:  # a slider went there and back
-            return
         colours = gaussian_colours(scene, self.packed, self.restyler, shown)
-        if name == NOW:
-            self._coloured = shown
         self._colours[name] = (next(self._version), container(colour_header(colours), {"rows": colour_section(colours, 1)}))
         self._post(None, f"colours {name}", self._colours_message(name))
 
@@ -367,7 +355,7 @@ class Session:
         picked = None if region is None else self.restyler.region_info(self.state.look, region)
         self.apply(lambda state: replace(state, picked=picked))
 
-    def _frame(self, cameras: Cameras, view: int, look: Restyle | None) -> Generator[None, None, Picture]:
+    def _frame(self, cameras: Cameras, view: int, look: Restyle | None) -> Steps[Picture]:
         if self._painter is not None:
             return (yield from self._painter.frame(cameras, view, look))
         yield
@@ -378,7 +366,7 @@ class Session:
         cameras = cameras_of([camera], longest=min(2048, round(max(camera.size))))
         folder = (self.viewed.root or self.uploads.folder) / "pictures"
 
-        def work() -> Steps:
+        def work() -> Steps[None]:
             try:
                 picture = yield from self._frame(cameras, 0, self.restyler.restyle(self.state.look))
                 path = next(each for n in count(1) if not (each := folder / f"{n:04d}.png").exists())
@@ -402,7 +390,7 @@ class Session:
             write_film_files(folder, plan, scene.semantic_encoder, self.viewed.stylizer, scene.origin)
             self.apply(lambda state: replace(state, film=(0, 1, None)))
 
-        def rendered(frames: list[Generator[None, None, Picture]]) -> Iterator[Picture]:
+        def rendered(frames: list[Steps[Picture]]) -> Iterator[Picture]:
             for done, frame in enumerate(frames, 1):
                 yield self._worker.result_when_idle(frame)
                 self.apply(lambda state, done=done: replace(state, film=(done, len(frames), None)))  # type: ignore[misc]
@@ -410,7 +398,7 @@ class Session:
         def work() -> None:
             try:
                 # Frames are rendered one at a time, as the encoder asks for them.
-                frames = self._worker.result("film", lambda: film_frames(folder, scene, self._frame))
+                frames = self._worker.result(lambda: film_frames(folder, scene, self._frame))
                 write_video(folder / "film.mp4", rendered(frames), plan.fps)
             except Exception as error:  # whatever it is, the next film can be made
                 self.apply(lambda state: replace(state, film=(0, 0, None)))
@@ -528,12 +516,7 @@ def _keyed(state: State, message: messages.Key) -> State:
         return replace(state, keys=(*keys, Key(message.camera, state.look)))
     if not at < len(keys):
         raise UsageError(f"film: key {at + 1} of {len(keys)}: there is none")
-    if message.action == "replace" and message.camera is not None:
-        cameras_of([message.camera])
-        keys[at] = Key(message.camera, state.look)
-    elif message.action in ("earlier", "later"):
-        to = min(len(keys) - 1, max(0, at + (1 if message.action == "later" else -1)))
-        keys.insert(to, keys.pop(at))
-    elif message.action == "remove":
-        del keys[at]
+    key = keys.pop(at)
+    if message.action == "earlier":
+        keys.insert(max(0, at - 1), key)
     return replace(state, keys=tuple(keys))

@@ -11,7 +11,7 @@ these very files, so the same command makes it again, at any size.
 
 import shutil
 import time
-from collections.abc import Callable, Generator, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, TypeAlias
@@ -20,14 +20,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import between
 from ..errors import UsageError
 from ..interfaces import Scene
 from ..io.atomic import write_json
 from ..io.images import Picture, to_uint8
 from ..io.maps import depth_image, match_image, palette
 from ..ops.harmonics import HARMONIC
-from ..page.pack import Colours, Packed
 from ..plugins.stylizers.config import RegionToneConfig
 from ..rendering.camera_path import read_camera_path, write_camera_path
 from ..rendering.cameras import Cameras, ideal_cameras
@@ -41,6 +39,7 @@ from ..training.loading import Trained
 from ..training.views import ViewChunk, view_chunks
 from ..types import Origin
 from .messages import Camera
+from .pack import Colours, Packed
 from .render_worker import Steps
 from .restyler import Look, Restyler, style_config
 
@@ -90,45 +89,52 @@ def gaussian_colours(scene: SplatScene, packed: Packed, restyler: Restyler, show
     if shown.map in ("none", "depth") and shown.region is None:
         return packed.colours(harmonics, rounds=2)
     # Maps are flat colours in the place of harmonics: what each Gaussian's features match.
-    features, solid = scene.found().features, torch.ones(len(scene.gaussians))
+    features, solid = scene.found().features.float(), torch.ones(len(scene.gaussians))
     colours = 0.5 + HARMONIC * harmonics[:, 0]
+
+    def match(restyle: Restyle) -> Tensor:
+        return restyle.match(features, scene.gaussians.means)
+
+    mapped = _mapped(colours, solid, shown, styled, match, lambda: _memberships(restyler, features))
+    return packed.colours(((mapped - 0.5) / HARMONIC)[:, None], rounds=0)
+
+
+def _mapped(
+    colours: Annotated[Tensor, "N 3"],
+    opacity: Annotated[Tensor, "N"],
+    shown: Shown,
+    styled: Styled | None,
+    match: Callable[[Restyle], Annotated[Tensor, "N T"]],
+    memberships: Callable[[], Annotated[Tensor, "N K"]],
+) -> Annotated[Tensor, "N 3"]:
+    """Colours of a map of matches or regions in the place of those of the look, and one region lit up among them."""
     if shown.map == "matches":
-        taken = None if styled is None else styled.restyle.match(features.float(), scene.gaussians.means)
-        colours = _match_colours(styled, taken, solid)
-    if shown.map == "regions" or shown.region is not None:
-        memberships = _memberships(restyler, features)
-        colours = _mapped(colours, memberships, solid, shown)
-    return packed.colours(((colours - 0.5) / HARMONIC)[:, None], rounds=0)
-
-
-def _mapped(colours: Tensor, memberships: Tensor, opacity: Tensor, shown: Shown) -> Annotated[Tensor, "N 3"]:
-    """Colours of regions in the place of those of the look, or one region lit up among them."""
+        if styled is None:
+            colours = torch.full((len(opacity), 3), _NO_MATCH)
+        else:
+            # Colours of the references, by what is taken of each code. The rest is what the look leaves as it is.
+            taken, codes = match(styled.restyle), styled.codes
+            total = taken.sum(-1, keepdim=True)
+            attention, kept = taken / total.clamp_min(1e-10), (1 - total[:, 0]).clamp(0, 1)
+            picture = match_image(attention[None], codes.reference, codes.names, opacity[None], kept[None])[0]
+            colours = torch.from_numpy(np.ascontiguousarray(picture)).float() / 255
+    if shown.map != "regions" and shown.region is None:
+        return colours
+    share = memberships()
     if shown.map == "regions":
-        most, region = memberships.max(-1)
-        colours = palette(memberships.shape[1])[region] * ((_UNSURE + (1 - _UNSURE) * most) * opacity)[:, None]
+        # A region's colour is dimmed where a point belongs to many.
+        most, region = share.max(-1)
+        colours = palette(share.shape[1])[region] * ((_UNSURE + (1 - _UNSURE) * most) * opacity)[:, None]
     if shown.region is None:
         return colours
     grey = _DIM * colours.mean(-1, keepdim=True)
-    return grey + (colours - grey) * memberships[:, shown.region, None]
+    return grey + (colours - grey) * share[:, shown.region, None]
 
 
 def _memberships(restyler: Restyler, semantic: Tensor) -> Annotated[Tensor, "N K"]:
     style = restyler.encoders.scene_style
     share: Tensor = RegionWeight(style, torch.eye(len(style.share))).to(semantic.device)(semantic.float())
     return share
-
-
-def _match_colours(
-    styled: Styled | None, taken: Annotated[Tensor, "N T"] | None, opacity: Annotated[Tensor, "N"]
-) -> Annotated[Tensor, "N 3"]:
-    """Colours of the references that each point takes its style from, by what it takes of each code; grey without a style."""
-    if styled is None or taken is None:
-        return torch.full((len(opacity), 3), _NO_MATCH)
-    # The rest of what is taken is what the look leaves as it is.
-    total = taken.sum(-1, keepdim=True)
-    attention, kept, codes = taken / total.clamp_min(1e-10), (1 - total[:, 0]).clamp(0, 1), styled.codes
-    picture = match_image(attention[None], codes.reference, codes.names, opacity[None], kept[None])[0]
-    return torch.from_numpy(np.ascontiguousarray(picture)).float() / 255
 
 
 class FieldPainter:
@@ -144,7 +150,7 @@ class FieldPainter:
         """Drop what is kept for a client."""
         self._views.pop(client, None)
 
-    def render(self, client: Hashable, request: Request) -> Steps:
+    def render(self, client: Hashable, request: Request) -> Steps[None]:
         """Show ever sharper pictures, a step each chunk of rays."""
         camera, ready, features = self._views.get(client, (None, None, []))
         if camera != request.camera:
@@ -186,25 +192,26 @@ class FieldPainter:
     @torch.inference_mode()
     def _colours(self, part: ViewChunk, styled: Styled | None, shown: Shown) -> Annotated[Tensor, "N 3"]:
         """A chunk as it is shown; of the map of depths, depth and opacity."""
-        restyle, semantic = None if styled is None else styled.restyle, part.semantic
         if shown.map == "depth":
             return torch.stack([part.depth, part.opacity], -1).cpu()
-        colours: Tensor = part.colour(self._trained.model.decoder, restyle).cpu()
-        opacity = part.opacity.cpu()
-        if shown.map == "matches":
-            taken = None if styled is None or semantic is None else part.mean(styled.restyle.match(semantic)).cpu()
-            colours = _match_colours(styled, taken, opacity)
-        if shown.map == "regions" or shown.region is not None:
-            memberships = part.mean(_memberships(self._restyler, part.content[:, :0] if semantic is None else semantic)).cpu()
-            colours = _mapped(colours, memberships, opacity, shown)
-        return colours
+        colours: Tensor = part.colour(self._trained.model.decoder, None if styled is None else styled.restyle).cpu()
+        # Without semantics all points are alike: features without channels.
+        semantic = part.content[:, :0] if part.semantic is None else part.semantic
+
+        def match(restyle: Restyle) -> Tensor:
+            return part.mean(restyle.match(semantic)).cpu()
+
+        def memberships() -> Tensor:
+            return part.mean(_memberships(self._restyler, semantic)).cpu()
+
+        return _mapped(colours, part.opacity.cpu(), shown, styled, match, memberships)
 
     def _parts(self, cameras: Cameras, view: int) -> Iterable[ViewChunk]:
         trained = self._trained
         config = replace(trained.config.render, chunk=min(CHUNK, trained.config.render.chunk))
         return view_chunks(trained.model, trained.known.facts, cameras, view, config)
 
-    def frame(self, cameras: Cameras, view: int, look: Restyle | None) -> Generator[None, None, Picture]:
+    def frame(self, cameras: Cameras, view: int, look: Restyle | None) -> Steps[Picture]:
         """Render one frame of a film, step by step, and return it."""
         rows = []
         for part in self._parts(cameras, view):
@@ -245,18 +252,11 @@ def cameras_of(cameras: "list[Camera]", size: tuple[int, int] | None = None, lon
         focal.append([camera.lens[0] * by, camera.lens[1] * by])
         offset = [(camera.lens[2 + k] - camera.size[k] / 2) * by for k in (0, 1)]
         centre.append([size[0] / 2 + offset[0], size[1] / 2 + offset[1]])
-    made = ideal_cameras(torch.stack(poses), 1.0, size)
-    return type(made)(
-        made.pose,
-        torch.tensor(focal, dtype=torch.float64),
-        torch.tensor(centre, dtype=torch.float64),
-        made.size,
-        made.distortion,
-        made.lens,
-    )
+    focals, centres = torch.tensor([focal, centre], dtype=torch.float64)
+    return replace(ideal_cameras(torch.stack(poses), 1.0, size), focal=focals, centre=centres)
 
 
-Frame: TypeAlias = Callable[[Cameras, int, Restyle | None], Generator[None, None, Picture]]
+Frame: TypeAlias = Callable[[Cameras, int, Restyle | None], Steps[Picture]]
 """Renders one frame, step by step."""
 _MAX_SECONDS = 600.0
 
@@ -295,8 +295,6 @@ def film_cameras(plan: FilmPlan) -> Cameras:
     """A camera each frame; a single key is one frame. Raises UsageError for no keys or a film that is too long."""
     if not plan.keys:
         raise UsageError("film: no keys yet; go somewhere and add one")
-    between("fps", plan.fps, 1.0, 120.0)
-    between("seconds", plan.seconds, 0.1, _MAX_SECONDS)
     seconds = plan.seconds * (len(plan.keys) - 1)
     if seconds > _MAX_SECONDS:
         raise UsageError(f"film: {seconds:.0f} s; at most {_MAX_SECONDS:.0f} s are filmed from the page")
@@ -352,12 +350,12 @@ def write_film_files(
     write_json(folder / "keys.json", {"format": 1, "keyframes": rows})
 
 
-def film_frames(folder: Path, scene: Scene, frame: Frame) -> list[Generator[None, None, Picture]]:
+def film_frames(folder: Path, scene: Scene, frame: Frame) -> list[Steps[Picture]]:
     """The frames of a film's folder, each to be rendered step by step."""
     cameras, _ = read_camera_path(folder / "path.json", scene.origin)
     looks = keyed_looks(scene, read_keyframes(folder / "keys.json"))
 
-    def rendered(number: int) -> Generator[None, None, Picture]:
+    def rendered(number: int) -> Steps[Picture]:
         return (yield from frame(cameras, number, looks(number)))
 
     return [rendered(number) for number in range(len(cameras))]

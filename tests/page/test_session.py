@@ -2,20 +2,17 @@ import json
 import threading
 import zlib
 from dataclasses import replace
-from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from session_helpers import Listener, camera_of, until
 from tiny_world import World
 
 from fprf.errors import FprfError, UsageError
+from fprf.page import messages
+from fprf.page.render_worker import Steps
+from fprf.page.session import SHELF, Session, State
 from fprf.splats.files import read_capture
-from fprf.viewer import messages
-from fprf.viewer.drawing import cameras_of
-from fprf.viewer.render_worker import Steps
-from fprf.viewer.session import SHELF, Session, State
 
 
 def unpacked(body: bytes) -> tuple[dict[str, object], dict[str, bytes]]:
@@ -139,7 +136,7 @@ def test_the_warm_up_leaves_nothing_behind(session: Session, listener: Listener)
     session.warm_up()
     done = threading.Event()
 
-    def last() -> Steps:
+    def last() -> Steps[None]:
         yield
         done.set()
 
@@ -160,9 +157,3 @@ def test_newer_states_of_a_training_are_shown_as_they_come(splats: Session, list
     assert scenes[-1]["step"] == 9 and splats.geometry != before
     splats.trained({"step": 9, "share": 0.5})
     assert ("training", {"type": "training", "step": 9, "share": 0.5}) in splats.hello()
-
-
-def test_a_client_is_a_camera_of_the_captured_world(session: Session) -> None:
-    camera = camera_of(session.viewed.scene, 2)
-    assert np.allclose(cameras_of([camera]).pose[0], session.viewed.scene.cameras.pose[2])
-    assert Path(session.viewed.root or "").is_dir()

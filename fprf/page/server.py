@@ -17,6 +17,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from string import Template
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlsplit
 
@@ -32,7 +33,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ..errors import DataError, FprfError, UsageError
-from ..page.live import live_page, live_script, live_style
+from . import read_asset, script
 from .messages import StartRequest, read_message
 from .start import Start
 
@@ -319,9 +320,9 @@ class ViewerServer:
 
     def _routes(self) -> list[BaseRoute]:
         return [
-            Route("/", _asset("text/html", live_page)),
-            Route("/app.js", _asset("text/javascript", live_script)),
-            Route("/app.css", _asset("text/css", live_style)),
+            Route("/", _asset("text/html", _page)),
+            Route("/app.js", _asset("text/javascript", lambda: script("live.js", "start.js") + "\nlive();\n")),
+            Route("/app.css", _asset("text/css", lambda: read_asset("page.css") + read_asset("live.css"))),
             WebSocketRoute("/live", self._live),
             Route("/scene", self._scene),
             Route("/colours", self._colours),
@@ -473,6 +474,12 @@ def _integer(request: Request, name: str) -> int:
     if not (text.isdigit() and text.isascii() and len(text) <= 12):
         raise UsageError(f"{name}: {text[:20]!r} is no number from 0")
     return int(text)
+
+
+def _page() -> str:
+    """The page's HTML: the stage of any page, with the panel of the served one."""
+    stage = Template(read_asset("stage.html")).substitute(still="hidden", ratio="", facts=read_asset("panel.html"))
+    return Template(read_asset("live.html")).substitute(stage=stage)
 
 
 def _asset(kind: str, text: Callable[[], str]) -> Callable[[Request], Response]:

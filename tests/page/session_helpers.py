@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 
 from fprf.interfaces import Scene
+from fprf.page.drawing import FilmPlan, Key
+from fprf.page.messages import Camera
+from fprf.page.restyler import Look
 from fprf.splats.photographs import camera_of as pinhole_of
-from fprf.viewer.drawing import FilmPlan, Key
-from fprf.viewer.messages import Camera
-from fprf.viewer.restyler import Look
 
 
 def camera_of(scene: Scene, view: int) -> Camera:

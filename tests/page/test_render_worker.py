@@ -4,7 +4,7 @@ from collections.abc import Hashable, Iterator
 import pytest
 from session_helpers import until
 
-from fprf.viewer.render_worker import RenderWorker, Steps
+from fprf.page.render_worker import RenderWorker, Steps
 
 
 class Workplace:
@@ -16,9 +16,9 @@ class Workplace:
         self.log: list[tuple[Hashable, object, int]] = []
         self.closed: list[object] = []
         self.errors: list[str] = []
-        self.worker: RenderWorker[object] = RenderWorker(self.work, self.report)
+        self.worker: RenderWorker = RenderWorker(self.report)
 
-    def work(self, client: Hashable, request: object) -> Steps:
+    def work(self, client: Hashable, request: object) -> Steps[None]:
         try:
             for step in range(self.steps):
                 self.permits.acquire()
@@ -32,6 +32,9 @@ class Workplace:
     def report(self, error: Exception) -> None:
         self.errors.append(str(error))
         raise RuntimeError("the client has gone")
+
+    def ask(self, client: Hashable, request: object) -> None:
+        self.worker.draw(client, self.work(client, request))
 
     def let(self, count: int) -> None:
         for _ in range(count):
@@ -51,11 +54,11 @@ def place() -> Iterator[Workplace]:
 
 def test_a_newer_request_takes_over_between_steps_and_those_between_are_never_begun(place: Workplace) -> None:
     place.worker.start()
-    place.worker.request("a", 0)
+    place.ask("a", 0)
     place.let(1)
     until(lambda: len(place.log) == 1)
     for request in range(1, 200):  # while the second step of request 0 is held
-        place.worker.request("a", request)
+        place.ask("a", request)
     place.let(100)
     until(lambda: 199 in place.closed)
     assert {*place.requests()} == {0, 199} and place.requests().count(0) <= 2 and 0 in place.closed
@@ -65,7 +68,7 @@ def test_jobs_come_first_then_clients_in_turns_then_idle_work_in_order(place: Wo
     for name in ("first", "second"):
         place.worker.run_when_idle(place.work("film", name))
     for client in ("a", "b"):
-        place.worker.request(client, client)
+        place.ask(client, client)
     jobs: list[str] = []
     for name, text in (("slider", "replaced"), ("photograph", "photograph"), ("slider", "slider")):
         place.worker.run(name, lambda text=text: jobs.append(f"{text} after {len(place.log)}"))  # type: ignore[misc]
@@ -79,19 +82,19 @@ def test_jobs_come_first_then_clients_in_turns_then_idle_work_in_order(place: Wo
 
 def test_errors_are_reported_and_work_goes_on_even_where_reporting_fails(place: Workplace) -> None:
     place.worker.start()
-    place.worker.request("a", "bad")
+    place.ask("a", "bad")
     place.let(2)
     until(lambda: place.errors == ["it broke"])
     place.worker.run("job", lambda: 1 / 0)
     until(lambda: len(place.errors) == 2)
-    place.worker.request("a", "good")
+    place.ask("a", "good")
     place.let(4)
     until(lambda: "good" in place.closed)
 
 
 def test_a_client_that_leaves_is_dropped(place: Workplace) -> None:
     place.worker.start()
-    place.worker.request("a", 1)
+    place.ask("a", 1)
     place.let(1)
     until(lambda: len(place.log) == 1)
     place.worker.forget("a")
@@ -103,7 +106,7 @@ def test_a_client_that_leaves_is_dropped(place: Workplace) -> None:
 def test_closing_ends_the_thread_in_the_middle_of_work() -> None:
     place = Workplace(steps=10_000)
     place.worker.start()
-    place.worker.request("a", 1)
+    place.ask("a", 1)
     place.let(3)
     until(lambda: len(place.log) == 3)
     threading.Timer(0.05, lambda: place.let(5)).start()
@@ -117,7 +120,7 @@ def test_many_threads_ask_at_once(place: Workplace) -> None:
 
     def ask(client: int) -> None:
         for request in range(50):
-            place.worker.request(client, request)
+            place.ask(client, request)
 
     threads = [threading.Thread(target=ask, args=(client,)) for client in range(8)]
     for thread in threads:

@@ -5,16 +5,15 @@ terms of `style.json`. `Restyler` applies looks; it runs on the render worker al
 clustered once for each number of clusters: a slider costs the stylizer alone.
 """
 
-from collections import OrderedDict
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, TypeAlias, TypeVar
 
 import torch
 from torch import Tensor
 
-from ..checks import at_least, between, positive
 from ..datamanagers.images import load_image
 from ..errors import UsageError
 from ..interfaces import Scene
@@ -30,7 +29,15 @@ from ..style.regions import memberships
 from ..style.restyle import Styled, apply_dictionary
 from ..style.scene_style import SceneStyle
 
+Key = TypeVar("Key")
+Value = TypeVar("Value")
 RegionAction: TypeAlias = Literal["pin", "forbid", "keep"]
+_THUMBNAIL = 128
+"""Longest side in pixels."""
+_CACHED = 24
+"""Dictionaries and styles that are kept for when somebody returns to them."""
+_SOLID = 0.01
+"""Opacity below which there is nothing to point at."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +79,7 @@ class Look:
     rules: frozenset[RegionRule] = frozenset()
 
     def __post_init__(self) -> None:
-        for name in ("strength", "bold", "blend", "luminance"):
-            between(name, getattr(self, name), 0.0, 1.0)
-        at_least("clusters", self.clusters, 1)
-        positive("temperature", self.temperature)
-        at_least("smoothness", self.smoothness, 0.0)
-        for _, weight in self.mix:
-            positive("weights", weight)
+        style_config(self)  # which knows the ranges
 
     @property
     def plain(self) -> bool:
@@ -156,17 +157,6 @@ def _valid_rules(look: Look) -> Look:
     return replace(look, rules=frozenset(rule for rule in look.rules if rule.photograph is None or rule.photograph in mix))
 
 
-Key = TypeVar("Key")
-Value = TypeVar("Value")
-
-_THUMBNAIL = 128
-"""Longest side in pixels."""
-_CACHED = 24
-"""Dictionaries and styles that are kept for when somebody returns to them."""
-_SOLID = 0.01
-"""Opacity below which there is nothing to point at."""
-
-
 class RegionInfo(NamedTuple):
     """A region that was picked."""
 
@@ -186,8 +176,8 @@ class Restyler:
         self._encoders: Encoders | None = None
         self._stale = False
         self._photographs = 0
-        self._dictionaries: OrderedDict[tuple[Photograph, int, float], StyleDictionary] = OrderedDict()
-        self._styles: OrderedDict[Look, Styled] = OrderedDict()
+        self._dictionaries: dict[tuple[Photograph, int, float], StyleDictionary] = {}
+        self._styles: dict[Look, Styled] = {}
 
     @property
     def encoders(self) -> Encoders:
@@ -203,11 +193,6 @@ class Restyler:
         self._styles.clear()
         return None if self._encoders is None else self._encoders.scene_style
 
-    @property
-    def regions(self) -> int:
-        """Number of regions of the scene."""
-        return len(self.encoders.scene_style.share)
-
     def encode(self, path: Path, name: str) -> Photograph:
         """Encode a photograph. Raises DataError for an unreadable one."""
         reference = encode_photograph(path, self.encoders, name=name)
@@ -218,18 +203,25 @@ class Restyler:
         """The look on the scene; None for the scene as it is. Raises UsageError for rules that contradict each other."""
         if look.plain:
             return None
-        if look not in self._styles:
+
+        def made() -> Styled:
             # Each photograph is clustered once; a mix is their dictionaries side by side under the mix's weights.
-            parts = [self._dictionary(photograph, look.clusters, look.blend) for photograph, _ in look.mix]
+            clusters, blend, parts = look.clusters, look.blend, []
+            for photograph, _ in look.mix:
+                cluster = partial(
+                    build_dictionary, [photograph.reference], clusters=clusters, blend=blend, seed=self.encoders.seed
+                )
+                parts.append(_cached(self._dictionaries, (photograph, clusters, blend), cluster))
             style = style_config(look, self._stylizer)
             dictionary = concatenate(parts, labels(style.references), [weight for _, weight in look.mix])
-            self._styles[look] = apply_dictionary(self.scene, StyleFile(style), self.encoders, dictionary)
-        return _use(self._styles, look)
+            return apply_dictionary(self.scene, StyleFile(style), self.encoders, dictionary)
+
+        return _cached(self._styles, look, made)
 
     def retain(self, photographs: Collection[Photograph]) -> None:
         """Drop what is kept for any other photograph."""
-        self._dictionaries = OrderedDict((key, value) for key, value in self._dictionaries.items() if key[0] in photographs)
-        self._styles = OrderedDict((look, value) for look, value in self._styles.items() if {*dict(look.mix)} <= {*photographs})
+        self._dictionaries = {key: value for key, value in self._dictionaries.items() if key[0] in photographs}
+        self._styles = {look: value for look, value in self._styles.items() if {*dict(look.mix)} <= {*photographs}}
 
     def restyle(self, look: Look) -> Restyle | None:
         """The look for a renderer."""
@@ -258,19 +250,12 @@ class Restyler:
             taken = sorted(zip(names, shares.tolist(), strict=True), key=lambda row: -row[1])
         return RegionInfo(region, float(scene.share[region]), tuple(taken))
 
-    def _dictionary(self, photograph: Photograph, clusters: int, blend: float) -> StyleDictionary:
-        key = (photograph, clusters, blend)
-        if key not in self._dictionaries:
-            seed = self.encoders.seed
-            self._dictionaries[key] = build_dictionary([photograph.reference], clusters=clusters, blend=blend, seed=seed)
-        return _use(self._dictionaries, key)
 
-
-def _use(cache: OrderedDict[Key, Value], key: Key) -> Value:
-    """Return what is kept under a key, which becomes the last to be dropped."""
-    cache.move_to_end(key)
+def _cached(cache: dict[Key, Value], key: Key, make: Callable[[], Value]) -> Value:
+    """Return what is kept under a key, or make it; it becomes the last to be dropped."""
+    cache[key] = cache.pop(key) if key in cache else make()
     while len(cache) > _CACHED:
-        cache.popitem(last=False)
+        del cache[next(iter(cache))]
     return cache[key]
 
 

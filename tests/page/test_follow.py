@@ -4,11 +4,11 @@ from pathlib import Path
 import pytest
 
 from fprf.errors import CheckpointError
+from fprf.page.follow import TrainingFollower, training_progress
+from fprf.page.server import Access, ViewerServer
+from fprf.page.session import Viewed, view_of_run
 from fprf.training.driver import is_watched
-from fprf.training.loading import load_run
-from fprf.viewer.live import TrainingFollower, training_progress
-from fprf.viewer.server import Access, ViewerServer
-from fprf.viewer.session import Viewed, view_of_run
+from fprf.training.loading import open_run
 
 
 def test_a_run_is_opened_at_its_first_checkpoint_and_followed(run: Path) -> None:
@@ -17,8 +17,7 @@ def test_a_run_is_opened_at_its_first_checkpoint_and_followed(run: Path) -> None
     shutil.move(newest, hidden)
 
     def load() -> Viewed:
-        trained = load_run(run, "cpu")
-        return view_of_run(trained, trained.run, trained.known, trained.step)
+        return view_of_run(open_run(run, "cpu"))
 
     with ViewerServer(Access("127.0.0.1", None), 0) as server:
         follower = TrainingFollower(server, run, load)

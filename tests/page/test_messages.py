@@ -10,9 +10,9 @@ from session_helpers import camera_of
 from tiny_world import World
 
 from fprf.errors import DataError, UsageError
-from fprf.viewer import messages
-from fprf.viewer.drawing import cameras_of
-from fprf.viewer.messages import StartRequest, read_message
+from fprf.page import messages
+from fprf.page.drawing import cameras_of
+from fprf.page.messages import StartRequest, read_message
 
 CAMERA = {"place": [0, 1, 2.5], "axes": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "lens": [300, 300, 160, 120], "size": [320, 240]}
 MESSAGES: list[dict[str, Any]] = [

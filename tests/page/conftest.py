@@ -8,12 +8,12 @@ from session_helpers import Listener
 from splat_ball import ball
 from tiny_world import World
 
+from fprf.page.restyler import Photograph, Restyler
+from fprf.page.session import Session, Viewed, view_of_run
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.splats.config import LookConfig
 from fprf.splats.scene import look_at_capture
-from fprf.training.loading import load_run
-from fprf.viewer.restyler import Photograph, Restyler
-from fprf.viewer.session import Session, Viewed, view_of_run
+from fprf.training.loading import open_run
 
 
 @pytest.fixture
@@ -35,8 +35,7 @@ def listener() -> Listener:
 @pytest.fixture
 def session(run: Path, listener: Listener) -> Iterator[Session]:
     """A session of a copy of the trained run of fields."""
-    trained = load_run(run, "cpu")
-    with Session(view_of_run(trained, trained.run, trained.known, trained.step), listener.post, longest=64) as opened:
+    with Session(view_of_run(open_run(run, "cpu")), listener.post, longest=64) as opened:
         yield opened
 
 

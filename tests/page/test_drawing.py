@@ -10,11 +10,11 @@ from session_helpers import camera_of
 
 from fprf.io.images import Picture, to_uint8
 from fprf.io.maps import depth_image, match_image
+from fprf.page import drawing
+from fprf.page.drawing import FieldPainter, Request, Shown, resolutions
+from fprf.page.restyler import Look, Photograph, Restyler, set_rule
 from fprf.style.match_maps import match_map
 from fprf.training.views import render_view
-from fprf.viewer import drawing
-from fprf.viewer.drawing import FieldPainter, Request, Shown, resolutions
-from fprf.viewer.restyler import Look, Photograph, Restyler, set_rule
 
 Pair = tuple[Photograph, Photograph]
 
@@ -92,7 +92,10 @@ def test_maps_are_what_the_command_line_renders(watched: Watched, restyler: Rest
 
 def test_a_picked_region_stands_out(watched: Watched, restyler: Restyler) -> None:
     whole = watched.look()[-1][1].astype(int)
-    shown = [watched.look(Shown(Look(), region=region))[-1][1].astype(int) for region in range(restyler.regions)]
+    shown = [
+        watched.look(Shown(Look(), region=region))[-1][1].astype(int)
+        for region in range(len(restyler.encoders.scene_style.share))
+    ]
     # Each is grey but for its region's share, and the shares of all regions are the whole.
     grey = 0.45 * whole.mean(-1, keepdims=True)
     assert np.abs(sum(each - grey for each in shown) - (whole - grey)).max() <= len(shown)
@@ -107,8 +110,3 @@ def test_resolutions_double_up_to_the_very_size(width: int, height: int) -> None
     for small, large in itertools.pairwise(found):
         assert abs(small[0] - large[0] / 2) <= 1 and abs(small[1] - large[1] / 2) <= 1
     assert max(found[0]) < 33 or len(found) == 1
-
-
-def test_a_fast_machine_begins_sharp(watched: Watched) -> None:
-    watched._pixel_seconds = 1e-9
-    assert [final for _, _, final in watched.look()] == [True]

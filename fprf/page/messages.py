@@ -93,7 +93,7 @@ class Keep(Message, tag="keep"):
 class Key(Message, tag="key"):
     """A keyframe of the film."""
 
-    action: Literal["add", "replace", "earlier", "later", "remove"]
+    action: Literal["add", "earlier", "remove"]
     at: Count = 0
     camera: Camera | None = None
 

@@ -15,7 +15,6 @@ import shutil
 import signal
 import tempfile
 import threading
-from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path, PurePosixPath
@@ -274,12 +273,26 @@ class SceneFiles:
 
         Raises UsageError for a name that leads elsewhere and for a piece out of order, DataError for what is not taken.
         """
-        path = self.folder.joinpath(*_parts(name))
+        # The name leads to a place below the folder, by parts that are plain names on every system.
+        parts = PurePosixPath(name).parts
+        plain = all(
+            part.isprintable() and not part.startswith(".") and not {*part} & {*'\\:*?"<>|'} and len(part) <= _MAX_PART
+            for part in parts
+        )
+        if not parts or not plain or name.startswith("/") or len(parts) > _MAX_DEPTH:
+            raise UsageError(f"{name[:80]!r}: no name of a file in a folder; rename it")
+        path = self.folder.joinpath(*parts)
         part = path.with_name(f"{path.name}.part")
         with self._lock:
             if at == 0:
                 check_file(path.name, data, size)
-                self._begin(path, size)
+                if self._files >= _MAX_FILES or self._bytes + size > _MAX_SCENE_BYTES:
+                    limits = f"at most {_MAX_FILES} files of {_MAX_SCENE_BYTES >> 30} GiB in all"
+                    raise DataError(f"{path.name}: a scene takes {limits}")
+                path.parent.mkdir(parents=True, exist_ok=True)
+                if shutil.disk_usage(path.parent).free < size + _ROOM:
+                    raise DataError(f"{path.name}: the disk of {self.folder} is full; make room there")
+                self._files, self._bytes = self._files + 1, self._bytes + size
                 part.unlink(missing_ok=True)
             written = part.stat().st_size if part.is_file() else 0
             if written != at or at + len(data) > size or (at > 0 and not data):
@@ -288,23 +301,3 @@ class SceneFiles:
                 file.write(data)
             if at + len(data) == size:
                 os.replace(part, path)
-
-    def _begin(self, path: Path, size: int) -> None:
-        if self._files >= _MAX_FILES or self._bytes + size > _MAX_SCENE_BYTES:
-            raise DataError(f"{path.name}: a scene takes at most {_MAX_FILES} files of {_MAX_SCENE_BYTES >> 30} GiB in all")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if shutil.disk_usage(path.parent).free < size + _ROOM:
-            raise DataError(f"{path.name}: the disk of {self.folder} is full; make room there")
-        self._files, self._bytes = self._files + 1, self._bytes + size
-
-
-def _parts(name: str) -> Sequence[str]:
-    """The parts of a file's name below its folder. Raises UsageError for one that leads out of it, or is no plain name."""
-    parts = PurePosixPath(name).parts
-    plain = all(
-        part.isprintable() and not part.startswith(".") and not {*part} & {*'\\:*?"<>|'} and len(part) <= _MAX_PART
-        for part in parts
-    )
-    if not parts or not plain or name.startswith("/") or len(parts) > _MAX_DEPTH:
-        raise UsageError(f"{name[:80]!r}: no name of a file in a folder; rename it")
-    return parts

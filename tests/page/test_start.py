@@ -9,9 +9,9 @@ import pytest
 from session_helpers import until
 
 from fprf.errors import DataError, FprfError, UsageError
-from fprf.viewer import start as start_module
-from fprf.viewer.messages import Leave, Make, New, Open, Stop
-from fprf.viewer.start import Start
+from fprf.page import start as start_module
+from fprf.page.messages import Leave, Make, New, Open, Stop
+from fprf.page.start import Start
 
 PROGRAM = f"""#!{sys.executable}
 import json, pathlib, signal, sys, time

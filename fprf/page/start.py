@@ -117,12 +117,22 @@ class Start:
                     raise UsageError("none of these files can become a scene; give photographs, a video or a capture")
                 self._begin(find_source(folder), asked.scene, asked.minutes)
             case Open():
-                self._open(asked.path.strip().strip("\"'"), asked.minutes)
+                # A file or folder of this machine, by its path as it is copied from elsewhere.
+                if not (text := asked.path.strip().strip("\"'")):
+                    raise UsageError("name a run folder, a capture, a video or a folder of photographs")
+                path = Path(text).expanduser()
+                source, whole = find_source(path), path.resolve()
+                if source.kind == "run":
+                    name = whole.parent.name if whole.name == _RUN else whole.name
+                else:
+                    ours = whole.name == _FILES and whole.parent.parent == self._output
+                    name = whole.parent.name if ours else self._unused(path.stem)
+                self._begin(source, name, asked.minutes)
             case Stop():
                 busy = self._thread is not None and self._thread.is_alive()  # asked before it ends by this very request
                 self._interrupt(asked.then)
                 if not busy:  # a failure is put away
-                    self._reset()
+                    self._tell(Progress())
             case Leave():
                 if self._progress.stage in ("idle", "open"):
                     self._progress = Progress()
@@ -132,19 +142,6 @@ class Start:
     def piece(self, scene: str, name: str, at: int, size: int, data: bytes) -> None:
         """Take a piece of a file. Raises as `SceneFiles.add`."""
         self._upload(scene).add(name, at, size, data)
-
-    def _open(self, text: str, minutes: float) -> None:
-        """Open, or make a scene of, a file or folder of this machine."""
-        if not text:
-            raise UsageError("name a run folder, a capture, a video or a folder of photographs")
-        path = Path(text).expanduser()
-        source, whole = find_source(path), path.resolve()
-        if source.kind == "run":
-            name = whole.parent.name if whole.name == _RUN else whole.name
-        else:
-            ours = whole.name == _FILES and whole.parent.parent == self._output
-            name = whole.parent.name if ours else self._unused(path.stem)
-        self._begin(source, name, minutes)
 
     def _begin(self, source: Source, name: str, minutes: float) -> None:
         with self._lock:
@@ -176,7 +173,7 @@ class Start:
             self._show(path, name)
             self._set(stage="open")
         except _Left:
-            self._reset()
+            self._tell(Progress())
         except FprfError as error:
             self._set(error=str(error))
         except Exception as error:  # whatever it is, the page goes on and the files are there
@@ -236,11 +233,10 @@ class Start:
             last.start()
 
     def _set(self, **changes: Any) -> None:
-        self._progress = replace(self._progress, **changes)
-        self._post(None, "start", self.state())
+        self._tell(replace(self._progress, **changes))
 
-    def _reset(self) -> None:
-        self._progress = Progress()
+    def _tell(self, progress: Progress) -> None:
+        self._progress = progress
         self._post(None, "start", self.state())
 
     def _upload(self, name: str) -> SceneFiles:

@@ -1,1 +1,0 @@
-"""A scene in the browser: `fprf view`."""
