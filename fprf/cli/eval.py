@@ -144,11 +144,11 @@ def write_scalars(folder: Path, histories: "Sequence[History]") -> int:
 
 def _print(metrics: dict[str, object]) -> None:
     table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 3, 0, 0))
-    units = {"psnr": "dB", "rays_per_second": "rays/s", "peak_rss_mib": "MiB", "seconds_per_view": "s", "train_seconds": "s"}
-    for key in ("psnr", "ssim", "seconds_per_view", "rays_per_second", "kept_samples_share", "peak_rss_mib", "train_seconds"):
+    units = {"psnr": "dB", "cc_psnr": "dB", "ssim": "", "lpips": "", "seconds_per_view": "s", "rays_per_second": "rays/s"}
+    for key, unit in (units | {"kept_samples_share": "", "peak_rss_mib": "MiB", "train_seconds": "s"}).items():
         value = metrics[key]
         assert isinstance(value, float)
-        table.add_row(key, f"{value:,.3f}" if value < 1000 else f"{value:,.0f}", units.get(key, ""))
+        table.add_row(key, f"{value:,.3f}" if value < 1000 else f"{value:,.0f}", unit)
     warped = metrics["consistency"]
     assert isinstance(warped, dict)
     if warped["rmse"] is not None:

@@ -45,7 +45,8 @@ def detail(image: Image, scales: int) -> Annotated[NDArray[np.float64], "K"]:
         energy[k] = cv2.Laplacian(grey, cv2.CV_32F).var(dtype=np.float64)
     coarse = energy[_APART:]
     ratio = np.full(scales, np.nan)
-    return np.divide(energy[:scales], coarse, out=ratio, where=coarse > 1e-3)
+    np.divide(energy[:scales], coarse, out=ratio, where=coarse > 1e-3)
+    return ratio
 
 
 def blurred_views(cameras: Cameras, images: Mapping[int, Image], scales: int) -> tuple[frozenset[int], ...]:

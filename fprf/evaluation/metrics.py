@@ -140,20 +140,39 @@ def image_metrics(
 ) -> dict[str, float]:
     """Every metric of one view, by name. Pixels that are not `where` (a capture's mask) are left out.
 
-    Windows of SSIM and cells of LPIPS about the others still see them: the same in both images. Raises DataError where the
-    mask leaves nothing.
+    `cc_psnr` is the PSNR in the photograph's own exposure and white balance: after the factor of each channel that brings the
+    render nearest to it (nerfstudio's name; there an affine map is fitted).
+
+    Windows of SSIM and cells of LPIPS about pixels that are left out still see them: the same in both images. Raises DataError
+    where the mask leaves nothing.
     """
     if where is None:
-        return {"psnr": psnr(render, truth), "ssim": ssim(render, truth), "lpips": lpips(render, truth)}
+        corrected = _exposed_as(render, truth)
+        return {
+            "psnr": psnr(render, truth),
+            "cc_psnr": psnr(corrected, truth),
+            "ssim": ssim(render, truth),
+            "lpips": lpips(render, truth),
+        }
     if not bool(where.any()):
         raise DataError("a mask leaves nothing of a view that is to be judged; leave the view out, or its mask")
     # Pixels that are left out are made equal, so that windows over them see no difference.
     filled = torch.where(where[..., None], render, truth)
+    seen, shown = truth[where][None], render[where][None]
     return {
-        "psnr": psnr(render[where][None], truth[where][None]),
+        "psnr": psnr(shown, seen),
+        "cc_psnr": psnr(_exposed_as(shown, seen), seen),
         "ssim": ssim(filled, truth, where),
         "lpips": lpips(filled, truth, where),
     }
+
+
+def _exposed_as(render: Annotated[Tensor, "H W 3"], truth: Annotated[Tensor, "H W 3"]) -> Annotated[Tensor, "H W 3"]:
+    """A render times f = sum(render truth) / sum(render^2) of each channel, the least squares."""
+    first, second = _pair(render, truth)
+    square = first.square().double().sum((0, 1))
+    factor = torch.where(square > 0, (first * second).double().sum((0, 1)) / square.clamp_min(1e-12), 1.0)
+    return (first * factor.to(first.dtype)).clamp(0, 1)
 
 
 def mean_metrics(views: Iterable[Mapping[str, float]]) -> dict[str, float]:

@@ -18,6 +18,7 @@ class Figure(NamedTuple):
 
 _KNOWN: dict[str, tuple[str, str]] = {
     "psnr": ("PSNR", "dB"),
+    "cc_psnr": ("PSNR in the photograph's exposure", "dB"),
     "ssim": ("SSIM", ""),
     "lpips": ("LPIPS", ""),
     "rmse": ("Warp error, RMSE", "of [0, 1]"),

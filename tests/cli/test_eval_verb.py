@@ -11,8 +11,8 @@ from fprf.cli.eval import write_scalars
 from fprf.training.run import History
 
 KEYS = {
-    "method", "scene", "split", "psnr", "ssim", "lpips", "views", "render_seconds", "seconds_per_view", "rays_per_second",
-    "kept_samples_share", "peak_rss_mib", "train_seconds", "train_steps", "consistency", "per_view",
+    "method", "scene", "split", "psnr", "cc_psnr", "ssim", "lpips", "views", "render_seconds", "seconds_per_view",
+    "rays_per_second", "kept_samples_share", "peak_rss_mib", "train_seconds", "train_steps", "consistency", "per_view",
 }  # fmt: skip
 
 

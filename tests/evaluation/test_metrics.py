@@ -41,6 +41,17 @@ def test_what_is_not_finite_is_no_score(value: float) -> None:
             metric(broken, noise(12, 12))
 
 
+def test_exposure_and_white_balance_cost_nothing_of_the_corrected_psnr() -> None:
+    draw = torch.Generator().manual_seed(0)
+    truth = 0.1 + 0.5 * torch.rand(30, 40, 3, generator=draw)
+    render = truth + 0.02 * torch.randn(30, 40, 3, generator=draw)
+    before, darker = image_metrics(render, truth), image_metrics(render * torch.tensor([0.5, 0.7, 0.6]), truth)
+    assert darker["psnr"] < 20 < before["psnr"]
+    # 1e-3: rounding, and the least that the clamp to [0, 1] moves.
+    assert before["psnr"] <= before["cc_psnr"] == pytest.approx(darker["cc_psnr"], abs=1e-3)
+    assert image_metrics(torch.zeros_like(truth), truth)["cc_psnr"] == pytest.approx(psnr(torch.zeros_like(truth), truth))
+
+
 def test_what_a_mask_leaves_out_does_not_count() -> None:
     """Any change there leaves PSNR as it is, and SSIM but for windows that reach into it: those see the same in both images."""
     draw = torch.Generator().manual_seed(0)
