@@ -344,10 +344,9 @@ class GaussianLearner(SceneLearner):
         blur = f"; blurred, and so shown rarely: {len(dull)} of {len(self.levels[0])} ({few})" if dull else ""
         light = ", tones" if self.tones is not None else ""
         where = "" if self.device == CPU else f", on {self.device} by gsplat"
-        return (
-            f", {self.model.count} Gaussians at {self.origin}{light}{where}{blur}{passes if most < self.config.steps else ''}"
-            f"{left_out(self.asked)}"
-        )
+        limit = passes if most < self.config.steps else ""
+        begun = f", {self.model.count} Gaussians at {self.origin}{light}{where}{blur}{limit}"
+        return begun + left_out(self.asked)
 
 
 def left_out(device: torch.device) -> str:
