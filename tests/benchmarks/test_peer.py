@@ -38,7 +38,7 @@ def test_all_that_can_be_known(world: World, night: Path, tmp_path: Path, capsys
         "--truth", str(night / "images"), "--references", str(world.references[0]), "--page", str(page),
     )  # fmt: skip
     assert document["frames"] == 10 and document["size"] == [32, 24] and document["missing"] == {}
-    assert document["truth"] == {"psnr": 99.0, "ssim": 1.0, "lpips": 0.0, "delta_e": 0.0}
+    assert document["truth"] == {"psnr": 99.0, "cc_psnr": 99.0, "ssim": 1.0, "lpips": 0.0, "delta_e": 0.0}
     assert document["published"]["short"]["pairs"] > 0 and document["published"]["long"]["rmse"] > 0
     assert document["steadiness"]["sharpness"] > 0.5
     assert document["style"]["style_distance"] > 0 and 0 < document["style"]["structure"] < 1
