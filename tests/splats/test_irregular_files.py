@@ -587,3 +587,11 @@ def test_a_small_gzip_that_unpacks_to_much_is_refused(tmp_path: Path) -> None:
     (tmp_path / "x.spz").write_bytes(packer.compress(content + bytes(64 << 20)) + packer.flush())
     with pytest.raises(DataError):
         read_capture(tmp_path / "x.spz")
+
+
+@pytest.mark.parametrize("ending", ["ply", "glb", "sog", "splat"])
+def test_a_pointer_of_git_lfs_is_told(ending: str, tmp_path: Path) -> None:
+    path = tmp_path / f"x.{ending}"
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 12\n")
+    with pytest.raises(DataError, match="git lfs pull"):
+        read_capture(path)

@@ -62,6 +62,8 @@ def read_capture(path: Path) -> Capture:
                 data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
+    if data[:23] == b"version https://git-lfs":
+        raise DataError(f"{path}: a pointer of Git LFS in the place of the file; run git lfs pull")
     with np.errstate(over="ignore", invalid="ignore"):  # damaged files hold numbers of any kind
         capture = form.read(path, data)
     release(data)
