@@ -45,7 +45,7 @@ from .initial import curve_order
 from .learner import CPU, MOVES, GaussianLearner, Stage, left_out
 from .levels import in_view
 from .loading import refined
-from .photographs import cover, load_photographs, make_levels
+from .photographs import covering, load_photographs, make_levels
 from .training import build, light_and_poses, limit_widths, scene_scale
 
 Number = TypeVar("Number", bound=np.generic)
@@ -307,7 +307,7 @@ def shown_in_windows(cameras: Cameras, cell: Cell, gaussians: Gaussians, near: f
     shown = torch.zeros(order.shape, dtype=torch.bool)
     views = list(cell.windows)
     for view in views[:: -(-len(views) // _LOOKED)]:
-        camera = cover(cameras.select(torch.tensor([view])).scaled(_COARSER), 0, near)[0]
+        camera = covering(cameras.select(torch.tensor([view])).scaled(_COARSER), 0, near)
         runs = torch.from_numpy(in_view(camera, centre.numpy(), radius.numpy())[1]).nonzero()[:, 0]
         mean, quaternion, log_scale = (x[runs].flatten(0, 1) for x in (means, quaternions, log_scales))
         ones = torch.ones(camera.height, camera.width, 1)

@@ -14,7 +14,7 @@ from ..datamanagers.images import Image
 from ..datamanagers.scene import Scene
 from ..rendering.cameras import project
 from .gaussians import morton_order
-from .photographs import cover, undistorted
+from .photographs import covering, undistorted
 
 Doubles = NDArray[np.float64]
 _TINY = float(np.finfo(np.float32).tiny)
@@ -137,7 +137,7 @@ def _matched(scene: Scene, images: Mapping[int, Image]) -> Points:
     # Pictures without their lenses: triangulation is that of pinholes.
     views = scene.train.tolist()
     detector = cv2.SIFT.create(nfeatures=_FEATURES, contrastThreshold=0.01)
-    cameras = {view: cover(scene.cameras, view, 1e-6)[0] for view in views}
+    cameras = {view: covering(scene.cameras, view, 1e-6) for view in views}
     pictures = {view: undistorted(scene.cameras, view, images[view], cameras[view])[0] for view in views}
     places: dict[int, Doubles] = {}
     features: dict[int, NDArray[np.float32]] = {}

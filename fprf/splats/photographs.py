@@ -133,26 +133,35 @@ def undistorted(cameras: Cameras, view: int, image: Image, camera: Pinhole) -> t
     return _sampled(image, np.nan_to_num(place, nan=-1e6)), inside
 
 
-def cover(cameras: Cameras, view: int, near: float) -> tuple[Pinhole, Annotated[Tensor, "H W 2"] | None]:
-    """A pinhole camera that covers what a view shows, and where each of the view's pixels lies in its image.
-
-    The second is None where the view is a pinhole itself.
-    """
+def covering(cameras: Cameras, view: int, near: float) -> Pinhole:
+    """The pinhole camera that covers what a view shows: how far a lens reaches, its outermost pixels say."""
     plain = camera_of(cameras, view, near)
     if int(cameras.lens[view]) == 0:
-        return plain, None
-    # Tangents of all pixels' rays in OpenCV's axes: what lies behind the camera is put at the widest angle.
-    width, height = plain.width, plain.height
-    _, direction = rays_through(cameras, torch.full((width * height,), view), pixel_grid(cameras, view))
+        return plain
+    grid = pixel_grid(cameras, view).view(plain.height, plain.width, 2)
+    reached = _tangents(cameras, view, torch.cat([grid[0], grid[-1], grid[:, 0], grid[:, -1]])) * cameras.focal[view]
+    # The pinhole keeps the focal length, and has a border of two pixels to interpolate in.
+    low, high = reached.amin(0).floor() - 2, reached.amax(0).ceil() + 2
+    wide, tall = (high - low).int().tolist()
+    return plain._replace(intrinsics=_intrinsics(cameras.focal[view], -low), width=wide, height=tall)
+
+
+def cover(cameras: Cameras, view: int, near: float) -> tuple[Pinhole, Annotated[Tensor, "H W 2"] | None]:
+    """`covering`, and where each of the view's pixels lies in its image; None where the view is a pinhole itself."""
+    camera = covering(cameras, view, near)
+    if int(cameras.lens[view]) == 0:
+        return camera, None
+    width, height = cameras.size[view].tolist()
+    tangent = _tangents(cameras, view, pixel_grid(cameras, view))
+    return camera, (tangent * cameras.focal[view] + camera.intrinsics[:2, 2]).view(height, width, 2)
+
+
+def _tangents(cameras: Cameras, view: int, pixel: Annotated[Tensor, "N 2"]) -> Annotated[Tensor, "N 2"]:
+    """Tangents of pixels' rays in OpenCV's axes: what lies behind the camera is put at the widest angle."""
+    _, direction = rays_through(cameras, torch.full((len(pixel),), view), pixel)
     local = direction @ cameras.pose[view][:, :3]
     ahead = (-local[:, 2]).clamp_min(1e-9)
-    tangent = torch.stack([local[:, 0] / ahead, -local[:, 1] / ahead], -1).clamp(-_WIDEST, _WIDEST)
-    # The pinhole keeps the focal length, and is as large as these reach, with a border of two pixels to interpolate in.
-    focal = cameras.focal[view]
-    low, high = (tangent * focal).amin(0).floor() - 2, (tangent * focal).amax(0).ceil() + 2
-    wide, tall = (high - low).int().tolist()
-    camera = plain._replace(intrinsics=_intrinsics(focal, -low), width=wide, height=tall)
-    return camera, (tangent * focal - low).view(height, width, 2)
+    return torch.stack([local[:, 0] / ahead, -local[:, 1] / ahead], -1).clamp(-_WIDEST, _WIDEST)
 
 
 def distorted(
@@ -181,7 +190,7 @@ def make_levels(
 
     A view counts where its mask, if it has one, is true; where that in `skies` is true it shows sky.
     """
-    cameras = {view: cover(scene.cameras, view, near)[0] for view in scene.train.tolist()}
+    cameras = {view: covering(scene.cameras, view, near) for view in scene.train.tolist()}
     longest = max(max(each.width, each.height) for each in cameras.values())
     shortest = min(min(each.width, each.height) for each in cameras.values())
     count = max(2, min((longest // 120).bit_length(), (shortest // WINDOW).bit_length()))  # SSIM needs its window

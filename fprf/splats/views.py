@@ -25,7 +25,7 @@ from ..rendering.cameras import Cameras
 from ..rendering.local_frame import extent_of
 from ..rendering.paths import look_at, pinhole
 from .gaussians import Gaussians, bulk_of
-from .photographs import camera_of, cover
+from .photographs import camera_of, covering
 
 _LIFTS = (-8.0, 12.0, 32.0, 55.0)
 """Heights of the rings, in degrees above the middle."""
@@ -124,7 +124,7 @@ def seen_means(gaussians: Gaussians, cameras: Cameras, *, antialiased: bool) -> 
     near = clip_distance(gaussians)
     # Sums over views, each by the Gaussian's weight in its pixels; what none shows weighs the same in all of them.
     for view in torch.linspace(0, len(cameras) - 1, min(_MEAN_VIEWS, len(cameras))).round().long().tolist():
-        camera = cover(cameras, view, near)[0]
+        camera = covering(cameras, view, near)
         direction = torch.nn.functional.normalize(gaussians.means - cameras.pose[view, :, 3].float(), dim=1)
         pixels = torch.ones(camera.height, camera.width, 1)
         weight = _UNSEEN + lift(*shape, camera, pixels, antialiased=antialiased)

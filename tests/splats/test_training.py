@@ -25,7 +25,7 @@ from fprf.io.images import write_image
 from fprf.ops.rasterise import lift
 from fprf.ops.rasterise_training import LOG_SCALES, TrainableGaussians
 from fprf.plugins.encoders.config import SEMANTICS, RandomConfig
-from fprf.rendering.cameras import Cameras, project
+from fprf.rendering.cameras import Cameras, ideal_cameras, project
 from fprf.splats import initial, photographs, training
 from fprf.splats.config import GaussiansConfig
 from fprf.splats.files import read_capture
@@ -491,3 +491,15 @@ def test_blurred_views_are_shown_in_every_eighth_epoch_alone(config: GaussiansCo
         for epoch in range(7):
             first = begin + views + epoch * sharp
             assert sorted(shown(range(first, first + sharp))) == sorted(set(level) - level.blurred)
+
+
+@pytest.mark.parametrize("lens", [1, 2])
+@pytest.mark.parametrize("k", [(0.0, 0.0, 0.0), (-0.3, 0.1, 0.0), (0.2, -0.05, 0.01)])
+def test_a_pinhole_covers_all_that_a_lens_shows(lens: int, k: tuple[float, float, float]) -> None:
+    """No pixel lies outside of the pinhole's image or in its border of two pixels, and some reach that on each side."""
+    cameras = ideal_cameras(torch.eye(3, 4, dtype=torch.float64)[None], 60.0, (80, 64), lens)
+    cameras = replace(cameras, distortion=torch.tensor([[*k, 0.0, 0.001, -0.001]], dtype=torch.float64))
+    camera, place = photographs.cover(cameras, 0, 0.01)
+    assert place is not None
+    low, high = place.amin((0, 1)), torch.tensor([camera.width, camera.height]) - place.amax((0, 1))
+    assert (low >= 2).all() and (high >= 2).all() and (low < 3).all() and (high < 3).all()
