@@ -195,7 +195,7 @@ def _fits(*tensors: Tensor) -> bool:
 
 
 def _form(*tensors: Tensor) -> Callable[..., tuple[Tensor, Tensor]]:
-    """What draws where the kernels of the CPU don't: gsplat for float32 on a device where it works, else the plain form."""
+    """The rasteriser of tensors that are not the CPU kernels': gsplat for float32 where it works, else the plain form."""
     device = tensors[0].device
     if compiled() and device.type == "cuda" and all(x.dtype == torch.float32 for x in tensors):
         from .rasterise_gsplat import rasterise_gsplat, usable

@@ -39,7 +39,7 @@ def usable(device: torch.device) -> bool:
 
 @functools.cache
 def obstacle(device: torch.device) -> str | None:
-    """What keeps gsplat from drawing on a CUDA device; None where it has drawn a Gaussian there.
+    """The reason why gsplat can't draw on a CUDA device; None where it has drawn a Gaussian there.
 
     gsplat compiles its kernels at the first use where its wheel has none, which takes minutes and CUDA's toolkit.
     """

@@ -212,7 +212,7 @@ def format_name(path: Path) -> str | None:
 
 
 def is_scene(path: Path) -> bool:
-    """Whether a path is that of a capture or of a run, and so of no photograph."""
+    """True for the path of a capture or of a run, which is no photograph."""
     if path.is_dir():
         return any((path / name).is_file() for name in ("meta.json", "lod-meta.json", "config.json"))
     return format_name(path) is not None

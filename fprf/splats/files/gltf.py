@@ -38,7 +38,7 @@ _UNSOUND = (LookupError, TypeError, ValueError, AttributeError, RecursionError, 
 _LEAST = 1e-30
 """Sizes are at least this, so that their logarithm is finite."""
 _DRAFTS = ("BT.", "Display-P3", "linear")
-"""What names of colour spaces began with while SCALE was a logarithm; the review draft and the final text share theirs."""
+"""Beginnings of colour-space names from before the review draft, when SCALE was a logarithm; draft and final text share theirs."""
 _LINEAR_SINCE = (2, 7)
 """Version of splat-transform from which on its .glb has linear sizes (playcanvas/splat-transform#268)."""
 _ASKED = 64
@@ -269,7 +269,7 @@ def _parts(path: Path, document: dict[str, Any], data: Data | bytearray, start: 
 
 
 def _logarithmic(document: dict[str, Any], parts: list[_Part]) -> tuple[bool, str]:
-    """Whether SCALE is the logarithm of sizes, in all of a file's Gaussians, and what told so."""
+    """True where SCALE holds logarithms of sizes, for all of a file's Gaussians, and the reason in words."""
     # A size is never negative; its logarithm is where anything is smaller than the unit.
     for part in parts:
         if any(bool((part.sizes(rows) < 0).any()) for rows in base.pieces(len(part.columns["POSITION"]))):
