@@ -38,7 +38,7 @@ _UNSOUND = (LookupError, TypeError, ValueError, AttributeError, RecursionError, 
 _LEAST = 1e-30
 """Sizes are at least this, so that their logarithm is finite."""
 _DRAFTS = ("BT.", "Display-P3", "linear")
-"""Beginnings of colour-space names from before the review draft, when SCALE was a logarithm; draft and final text share theirs."""
+"""Beginnings of colour-space names of drafts before the review draft, when SCALE was a logarithm; later texts share theirs."""
 _LINEAR_SINCE = (2, 7)
 """Version of splat-transform from which on its .glb has linear sizes (playcanvas/splat-transform#268)."""
 _ASKED = 64
