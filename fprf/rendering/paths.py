@@ -19,7 +19,7 @@ from ..errors import UsageError
 from ..types import Origin
 from .camera_path import read_camera_path
 from .cameras import Cameras, ideal_cameras, project, rays_through
-from .lens import PANORAMA, PINHOLE
+from .lens import PINHOLE
 from .space import Space
 from .splines import catmull_rom, quaternions, rotations, slerp
 
@@ -240,18 +240,6 @@ def upwards(cameras: Cameras) -> Annotated[Tensor, "3"]:
     """The mean of the cameras' up, or, where they look straight down, against their view; world axes, not of unit length."""
     up = cameras.pose[:, :, 1].mean(dim=0)
     return cameras.pose[:, :, 2].mean(dim=0) if float(up.norm()) < 0.3 else up
-
-
-def panoramas(cameras: Cameras, width: int, up: Annotated[Tensor, "3"]) -> Cameras:
-    """Level panoramas at the cameras' places, `width` x `width` / 2 pixels, the middle where each camera looks."""
-    ahead = -cameras.pose[:, :, 2]
-    upright = torch.nn.functional.normalize(up, dim=0)
-    level = ahead - (ahead @ upright)[:, None] * upright
-    # A camera that looks straight up or down: its own up is ahead, or behind.
-    level = torch.where(level.norm(dim=-1, keepdim=True) < 1e-3, cameras.pose[:, :, 1], level)
-    place = cameras.pose[:, :, 3]
-    pose = look_at(place, place + level, upright)
-    return ideal_cameras(pose, width / (2 * math.pi), (width, max(1, width // 2)), PANORAMA)
 
 
 _GRID = (4, 3)

@@ -34,7 +34,7 @@ MISTAKES = """
     export run --styles a=absent.png | absent.png
     export run --styles a=x.png b=x.png --output out/one.ply | one file holds one style
     export run cameras --output out/one.splat | holds splat
-    export run mesh --reach 1e-6 --output out | no view sees a surface
+    export run glb --reach 1e-6 --output out | no view sees a surface
     gallery run | --references
     gallery untested --references A.png --split test | --split test
     gallery run --references empty | no image

@@ -24,8 +24,8 @@ UP = torch.tensor([0.0, 0, 1], dtype=torch.float64)
 
 
 def looking(position: torch.Tensor, target: torch.Tensor) -> Cameras:
-    views = ideal_cameras(look_at(position, target.expand_as(position), UP), 90.0, (100, 80), OPENCV)
-    return replace(views, distortion=views.distortion + 0.01)
+    views = ideal_cameras(look_at(position, target.expand_as(position), UP), 90.0, (100, 80))
+    return replace(views, distortion=views.distortion + 0.01, lens=torch.full_like(views.lens, OPENCV))
 
 
 def random(count: int, seed: int) -> torch.Tensor:
