@@ -12,6 +12,7 @@ from torch import Tensor
 from ..config import RunConfig
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError, UsageError
+from ..io.tensorfiles import load_sealed, save
 from ..rendering.cameras import Cameras
 from ..training import checkpoint
 from ..training.camera_optimizers import Poses, Tones, moved_cameras
@@ -21,7 +22,6 @@ from ..training.model import Facts, tones_of
 from ..training.prepare import cache_folder, reach_of
 from ..training.quality import PRESETS, QualityConfig, tone_of
 from ..training.run import Run, in_training
-from ..training.tensorfiles import load_sealed, save
 from .config import GaussiansConfig, LookConfig
 from .files import Capture
 from .gaussians import from_tensors

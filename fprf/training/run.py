@@ -32,12 +32,12 @@ from ..config import RunConfig
 from ..datamanagers.images import load_image, load_mask
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError, DataError, UsageError
+from ..io import tensorfiles
 from ..io.atomic import unwritable, write_json
 from ..io.strict_json import open_json, parse_json
 from ..plugins.codec import from_json, load_config, save_config
 from ..plugins.registry import nearest
 from ..rendering.cameras import Cameras
-from . import tensorfiles
 from .model import Facts
 
 FORMAT = 1

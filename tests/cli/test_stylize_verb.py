@@ -15,11 +15,11 @@ from tiny_world import World
 from fprf.cli import main as cli
 from fprf.cli.style_flags import named_styles, read_flags
 from fprf.errors import ConfigError, DataError, UsageError
+from fprf.io import tensorfiles
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig
 from fprf.style.config import PRESETS, StyleConfig, preset_flags, with_preset
 from fprf.style.dictionary import load_dictionary
 from fprf.style.files import StyleFile, write_style
-from fprf.training import tensorfiles
 
 MADE = {"dictionary_seconds", "seconds_per_view", "match_seconds_per_view", "codes", "matches"}
 

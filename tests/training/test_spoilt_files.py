@@ -16,6 +16,7 @@ from fprf.blocks.partition import write_cells
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import Scene
 from fprf.errors import CheckpointError, FprfError
+from fprf.io import tensorfiles
 from fprf.io.atomic import write_json
 from fprf.methods import fprf_lite
 from fprf.plugins.codec import save_config
@@ -23,7 +24,7 @@ from fprf.rendering.space import Space
 from fprf.splats import cells
 from fprf.splats.cells import Cells, load_cells
 from fprf.splats.config import GaussiansConfig
-from fprf.training import blocks, checkpoint, tensorfiles
+from fprf.training import blocks, checkpoint
 from fprf.training.blocks import load_blocks, load_finished
 from fprf.training.learner import training_summary
 from fprf.training.model import Facts
