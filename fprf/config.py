@@ -421,18 +421,6 @@ class TrainConfig(RunConfig):
         return missing
 
 
-@dataclass(frozen=True, kw_only=True)
-class IncompleteConfig(TrainConfig):
-    """A saved config whose method is not installed here: enough to render, not to train, which may need the method's fields."""
-
-    reason: str
-    """Why the method cannot be loaded."""
-    unknown: str
-    """The fields that the method added, as JSON text."""
-    packages: str
-    """The packages of the method and of the plug-ins in its fields, by path, as JSON text."""
-
-
 def fields_only(config: RunConfig, root: Path) -> TrainConfig:
     """The config of a run of fields. Raises UsageError, with the way out, where it is of another kind."""
     if isinstance(config, TrainConfig):

@@ -266,10 +266,6 @@ def test_a_file_as_the_viewer_exports_it(tmp_path: Path) -> None:
     cameras, fps = read_camera_path(file(tmp_path / "p.json", camera_type="perspective", seconds=4, keyframes=[{}]))
     assert fps == 24 and cameras.focal.tolist() == [[pytest.approx(100.0)] * 2]
     assert cameras.centre.tolist() == [[150, 100]] and cameras.size.tolist() == [[300, 200]]
-    rows = [IDENTITY[:4], IDENTITY[4:8], IDENTITY[8:12], IDENTITY[12:]]
-    nested = file(tmp_path / "q.json", fps=30, camera_path=[{"camera_to_world": rows, "fov": 90}])
-    again, fps = read_camera_path(nested)
-    assert fps == 30 and torch.equal(again.pose, cameras.pose)
 
 
 def test_a_rounded_rotation_is_made_exact(tmp_path: Path) -> None:
