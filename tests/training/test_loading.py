@@ -122,7 +122,7 @@ def test_colours_are_multiplied_by_a_view_s_light(world: World) -> None:
     trained = lit(world)
     assert trained.model.tones is not None
     view = trained.known.train[1]
-    wanted = (shown(trained)[0] * trained.model.tones(torch.tensor([view]))[0]).clamp(0, 1)
+    wanted = (shown(trained)[0] * trained.model.tones(torch.tensor([view]))[0].detach()).clamp(0, 1)
     for text in (trained.known.names[view], str(view)):
         for image in shown(trained, text):
             torch.testing.assert_close(image, wanted, atol=1e-6, rtol=1e-5)
