@@ -197,8 +197,6 @@ class RunConfig:
     """Entry point in `fprf.scenes` of the function that opens such a run."""
     untrained: ClassVar[tuple[str, ...]] = ()
     """Fields that may differ when a run is resumed, beside RESUMABLE: nothing that is trained depends on them."""
-    former: ClassVar[tuple[str, ...]] = ()
-    """Fields of files written before that mean nothing any more."""
     open: ClassVar[tuple[str, ...]] = ("downscale",)
     """Fields whose value may be None, which `planned` decides before a run begins."""
 

@@ -63,8 +63,6 @@ def load_config(path: Path) -> "tuple[RunConfig, str]":
             if "method" in packages:
                 raise PluginError(f"{path}: {fault}; install {packages['method']}") from fault
             kind = TrainConfig
-        if isinstance(fields, dict):
-            fields = {name: value for name, value in fields.items() if name not in kind.former}
         return from_json(fields, kind, packages=packages), method
     except ConfigError as fault:
         raise ConfigError(f"{path}: {fault}") from fault
