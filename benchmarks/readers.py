@@ -32,6 +32,7 @@ from fprf.datamanagers.parsers.config import (
 from fprf.datamanagers.parsers.files import read_npz
 from fprf.datamanagers.parsers.phototourism import read_list
 from fprf.errors import FprfError
+from fprf.io import tensorfiles
 from fprf.plugins.codec import load_config
 from fprf.rendering.camera_path import read_camera_path
 from fprf.splats.files import read_capture, write_gaussians
@@ -39,7 +40,7 @@ from fprf.splats.gaussians import Gaussians
 from fprf.style.dictionary import load_dictionary, save_dictionary
 from fprf.style.files import read_style
 from fprf.testing import cases
-from fprf.training import checkpoint, tensorfiles
+from fprf.training import checkpoint
 
 WHOLE_EVERY = 16
 """Rounds of which one is read to the end, where a reader of the bytes alone is known."""

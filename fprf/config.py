@@ -197,8 +197,6 @@ class RunConfig:
     """Entry point in `fprf.scenes` of the function that opens such a run."""
     untrained: ClassVar[tuple[str, ...]] = ()
     """Fields that may differ when a run is resumed, beside RESUMABLE: nothing that is trained depends on them."""
-    former: ClassVar[tuple[str, ...]] = ()
-    """Fields of files written before that mean nothing any more."""
     open: ClassVar[tuple[str, ...]] = ("downscale",)
     """Fields whose value may be None, which `planned` decides before a run begins."""
 
@@ -276,10 +274,6 @@ class RunConfig:
         """Describe the plan beyond the views and their size, for the line that is shown before training."""
         return ""
 
-    def changeable(self, before: "RunConfig") -> tuple[str, ...]:
-        """Fields that may differ from those that a run was begun with when it goes on."""
-        return *RESUMABLE, *self.untrained
-
     def needs(self) -> list[Need]:
         """Packages and weights that training needs and that are not here, each opened by the path of its slot.
 
@@ -319,6 +313,7 @@ class TrainConfig(RunConfig):
     """Everything that decides a run of fields."""
 
     kind: ClassVar[str] = "fields"
+    untrained: ClassVar[tuple[str, ...]] = ("executor",)
 
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
@@ -411,12 +406,6 @@ class TrainConfig(RunConfig):
             wanted = min(wanted, max(encoded, pace.least / 4))
         return max(1, round(math.sqrt(float(sizes.double().prod(1).mean()) / wanted)))
 
-    def changeable(self, before: RunConfig) -> tuple[str, ...]:
-        """The same; blocks may be cut anew: those that the cut does not concern are kept."""
-        former = getattr(before, "blocks", None)
-        anew = self.blocks.cuts and isinstance(former, LayoutConfig) and former.cuts
-        return *(FREE_IN_BLOCKS if anew else RESUMABLE), *self.untrained
-
     def needs(self) -> list[Need]:
         """The same, and a decoder for the content encoder, whose weights are read where both could be built."""
         missing = super().needs()
@@ -428,18 +417,6 @@ class TrainConfig(RunConfig):
         except WeightsError as fault:
             missing.append(Need(f"content.decoder: {fault}", pretrain_line(self.content.encoder)))
         return missing
-
-
-@dataclass(frozen=True, kw_only=True)
-class IncompleteConfig(TrainConfig):
-    """A saved config whose method is not installed here: enough to render, not to train, which may need the method's fields."""
-
-    reason: str
-    """Why the method cannot be loaded."""
-    unknown: str
-    """The fields that the method added, as JSON text."""
-    packages: str
-    """The packages of the method and of the plug-ins in its fields, by path, as JSON text."""
 
 
 def fields_only(config: RunConfig, root: Path) -> TrainConfig:

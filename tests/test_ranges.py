@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.restyle import RestyleConfig
-from fprf.blocks.config import AdaptiveConfig, GridConfig
+from fprf.blocks.config import GridConfig
 from fprf.checks import at_least, between, positive
 from fprf.config import LossConfig, OptimizerConfig, RenderConfig, SemanticConfig, StatisticsConfig, TrainConfig
 from fprf.errors import CheckpointError, ConfigError, FprfError
@@ -47,11 +47,10 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
     OptimizerConfig: {"rate": [0.0], "final": [1.5], "beta2": [-0.1], "eps": [0.0]},
     RenderConfig: {"budget": [0.6], "train_budget": [-0.1], "chunk": [0], "background": [(0.0, 1.5, 0.0), (0.0, nan, 0.0)]},
     StatisticsConfig: {"rays": [3], "regions": [0]},
-    QualityConfig: {"samples": [0.0], "budget": [0.6, -0.1], "chunk": [0], "resolution": [0.0, 1.5]},
+    QualityConfig: {"budget": [0.6, -0.1], "chunk": [0], "resolution": [0.0, 1.5]},
     PlanesConfig: PLANES | {"degree": [0, 5]},
     SemanticPlanesConfig: PLANES,
     GridConfig: {"cells": [(0, 1)], "size": [0.0], "margin": [0.0, 0.6]},
-    AdaptiveConfig: {"rays": [0], "smallest": [-1.0], "margin": [0.0]},
     UniformConfig: {"samples": [0, -3]},
     ProposalConfig: {
         "final": [0],
