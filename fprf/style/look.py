@@ -29,13 +29,12 @@ from torch import Tensor, nn
 from ..checks import between
 from ..errors import UsageError
 from ..interfaces import Decoder, Stylizer
-from ..ops import mixture
 from ..ops.precision import double
 from ..types import Want
 from .config import Place
 from .dictionary import StyleDictionary, blend_codes, choose
 from .light import Light, luma
-from .scene_style import Membership, RegionWeight, SceneStyle
+from .scene_style import Membership, RegionWeight, SceneStyle, mixed_maps
 from .statistics import mix, monge, symmetric_root
 
 if TYPE_CHECKING:
@@ -141,7 +140,7 @@ class ColourMaps(nn.Module):
         """
         if belongs is None:
             belongs = self.membership(colour[:, :0] if semantic is None else semantic)
-        change = mixture.affine(colour.to(self.bias), belongs.to(self.bias), self.matrix, self.bias, centre=self.origin)
+        change = mixed_maps(colour.to(self.bias), belongs.to(self.bias), self.matrix, self.bias, centre=self.origin)
         return (colour + change.to(colour)).clamp(0, 1) - colour
 
 
