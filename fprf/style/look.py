@@ -17,11 +17,8 @@ decoder are those of draws from the region's Gaussian of features: a trained sce
 colour still depends on the point alone.
 """
 
-import hashlib
-import io
-import pickle
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 from torch import Tensor, nn
@@ -329,13 +326,6 @@ class Restyle:
         return (replace(self, others=()), *self.others)
 
     @property
-    def digest(self) -> str:
-        """A key of all that it does: of every number in it."""
-        file = io.BytesIO()
-        _TensorValuePickler(file).dump(self)
-        return hashlib.sha256(file.getvalue()).hexdigest()
-
-    @property
     def idle(self) -> bool:
         """It changes nothing: the renderer need not ask."""
         return all(part.strength == 0 for part in self.parts if part.share > 0)
@@ -449,12 +439,3 @@ class Restyle:
                     own = torch.lerp(own, own_confidence(other), place_weight(place, points)[:, None])
             total = total + part.share * own
         return total
-
-
-class _TensorValuePickler(pickle.Pickler):
-    """Pickles tensors by their values alone."""
-
-    def reducer_override(self, value: Any) -> Any:
-        if isinstance(value, Tensor):
-            return bytes, (value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes(),)
-        return NotImplemented
