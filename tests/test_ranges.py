@@ -23,7 +23,6 @@ from fprf.plugins.encoders.config import (
     DinoConfig,
     Dinov2Config,
     RandomConfig,
-    Vgg16Config,
     Vgg19Config,
 )
 from fprf.plugins.executors.config import RayConfig
@@ -64,8 +63,7 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
         "resolutions": [(1, 8)],
     },
     RandomConfig: {"channels": [0], "stride": [0], "seed": [-1]},
-    Vgg16Config: {"layer": ["relu3_4", "fc7"]},
-    Vgg19Config: {"layer": ["relu0_1", "relu2_3", "relu2_1 "]},
+    Vgg19Config: {"layer": ["relu0_1", "relu2_3", "relu2_1 ", "relu3_5", "fc7"]},
     DinoConfig: {"layer": [0], "stride": [0]},
     Dinov2Config: {"layer": [0], "stride": [0]},
     ConcatConfig: {"weights": [(0.0,), (1.0, -1.0), (inf,)]},

@@ -1,11 +1,6 @@
 """`fprf demo`: a garden from photographs to a page that shows it restyled. No network, no data."""
 
-import contextlib
-import os
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -24,8 +19,6 @@ LEAD = (
     "Trained on a CPU from 25 photographs. Each look is then taken from one picture, without training, and is the same "
     "from every viewpoint."
 )
-_NICE = 10
-"""Lowered priority of what compiles beside the training."""
 LOOKS = ("winter", "night", "sunset", "autumn")
 """References, in the order in which they are shown."""
 CREDITS = (
@@ -78,10 +71,8 @@ def run(args: list[str]) -> int:
     garden = Path(str(files("fprf") / "garden"))
     output = config.output / "run"
     training = replace(fprf_splats(), data=garden, downscale=config.downscale, output=output, minutes=config.minutes)
-    # Training ends with its minutes, whoever else computes; a style is then timed without the compilation.
-    with compiling():
-        root = train(training, "fprf-splats")
-        metrics = evaluate(EvalConfig(run=root, images=False))
+    root = train(training, "fprf-splats")
+    metrics = evaluate(EvalConfig(run=root, images=False))
     opened = open_gaussians(Run(root), training, "cpu", QualityConfig())
     scene, views = opened.scene, opened.known.test
     names = {garden / "references" / f"{name}.jpg": name for name in LOOKS}
@@ -143,35 +134,3 @@ def run(args: list[str]) -> int:
         f"open {page}; {config.output}/*.ply open in any viewer of Gaussians"
     )
     return 0
-
-
-@contextlib.contextmanager
-def compiling() -> Iterator[None]:
-    """Compile what restyling needs in a process of low priority, where that was not done before: it takes 12 s of a core.
-
-    At the end it is waited for.
-    """
-    from ..ops import mixture_kernels
-
-    if any(Path(str(mixture_kernels.scaled.stats.cache_path)).glob("mixture_kernels.scaled*.nbi")):
-        yield
-        return
-    quiet = subprocess.DEVNULL
-    with subprocess.Popen([sys.executable, "-m", __name__], stdin=quiet, stdout=quiet, stderr=quiet):
-        yield
-
-
-def _compile() -> None:
-    import torch
-
-    from ..ops.mixture import scaled
-
-    if hasattr(os, "nice"):
-        os.nice(_NICE)
-    point = torch.zeros(1, 3)
-    with torch.inference_mode():
-        scaled(point, torch.ones(1, 1), point, point, centre=point[0])
-
-
-if __name__ == "__main__":
-    _compile()
