@@ -156,9 +156,10 @@ def test_photographs_become_a_restyled_ply_without_a_terminal(tmp_path: Path) ->
         page.locator("#fault", has_text="1 photograph is no scene").wait_for()
         page.fill("#minutes", "5")
         page.set_input_files("#folder", str(given))
-        page.locator("#picture").wait_for(timeout=240_000)  # of training, which need not end
-        page.locator("#show").click()
-        page.wait_for_selector(".place.drawn", timeout=120_000)
+        page.wait_for_selector(".place.drawn", timeout=240_000)  # of the training, which need not end
+        page.wait_for_function("() => fprf.live.scene.step > 0")
+        page.locator("#finish").click()
+        page.locator("#finish").wait_for(state="hidden", timeout=60_000)
         assert {path.name for path in (made / "garden").iterdir()} == {"files", "run"}
         page.set_input_files("#photographs", str(shipped / "references" / "sunset.jpg"))
         page.wait_for_function("() => fprf.place.splats.styles.has('Now')", timeout=240_000)
