@@ -1,4 +1,4 @@
-"""`fprf doctor`: what this machine offers, what a method needs, what a scene folder holds, how a run stands.
+"""`fprf doctor`: what this machine offers, what a method needs, what a scene folder holds.
 
 Each problem names its remedy.
 """
@@ -9,7 +9,6 @@ import shlex
 import shutil
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from itertools import chain
@@ -20,9 +19,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from .. import __version__
-from ..errors import CheckpointError, ConfigError, DataError
+from ..errors import ConfigError, DataError
 from ..plugins import registry
-from ..plugins.codec import Missing
 from ..plugins.slots import slots
 from .parsing import parse
 
@@ -49,7 +47,7 @@ class DoctorConfig:
     """Settings of `fprf doctor`."""
 
     target: Path | None = None
-    """A run, a scene folder or a method; none = this machine."""
+    """A scene folder or a method; none = this machine."""
     device: str = "auto"
     """Device of this machine that is tested: cpu, cuda, mps, or auto; not with a target."""
     clean: bool = False
@@ -67,8 +65,8 @@ class DoctorConfig:
 def run(args: list[str]) -> int:
     """Print the findings as they come; 1 if something that is needed is wrong."""
     about = (
-        "`fprf doctor` looks over this machine and tests its device, `fprf doctor RUN` a run, `fprf doctor DIR` a scene\n"
-        "folder, `fprf doctor METHOD` what a method needs here."
+        "`fprf doctor` looks over this machine and tests its device, `fprf doctor DIR` a scene folder,\n"
+        "`fprf doctor METHOD` what a method needs here."
     )
     config = parse(DoctorConfig(), args, prog="fprf doctor", description=about, positional=("target",))
     target = config.target
@@ -82,8 +80,6 @@ def run(args: list[str]) -> int:
         findings = iter([Finding("features", f"{(size - _size(folder)) / _MIB:.0f} MiB deleted in {folder}")])
     elif target is None:
         findings = chain(machine(), self_test(config.device))
-    elif (target / "config.json").is_file():
-        findings = run_folder(target)
     elif str(target) in registry.installed("fprf.methods"):
         findings = method_needs(str(target))
     else:
@@ -188,42 +184,6 @@ def method_needs(name: str) -> Iterator[Finding]:
 
 def _size(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-
-
-def run_folder(folder: Path) -> Iterator[Finding]:
-    """Config, progress, plug-ins and what was computed of a run. Raises ConfigError where its config cannot be read."""
-    from ..plugins.codec import load_config
-    from ..training import checkpoint
-    from ..training.run import read_history
-
-    config, method = load_config(folder / "config.json")
-    yield Finding("run", f"method {method}, scene {config.data}, {config.steps} steps asked for")
-    steps = checkpoint.steps(folder / "checkpoints")
-    again = f"fprf train {shlex.quote(str(folder / 'config.json'))} --output {shlex.quote(str(folder))}"
-    if not steps:
-        yield Finding("checkpoints", "none is complete", again)
-    else:
-        short = steps[-1] < config.steps and config.minutes is None
-        yield Finding("checkpoints", f"step {steps[-1]} of {config.steps}", again if short else "", optional=True)
-    for slot in slots(config):
-        if isinstance(slot.value, Missing):
-            package = slot.value.package or "the package that provides it"
-            remedy = f"install {package}, or choose another with --{slot.path} NAME; rendering goes on without it"
-            yield Finding("plug-ins", slot.value.reason, remedy, optional=slot.path.endswith("encoder"))
-    for name, use in (("scene.json", "rendering"), ("style.safetensors", "restyling")):
-        there = (folder / name).is_file()
-        yield Finding(name, "there" if there else f"absent; {use} needs it", "" if there else again)
-    measure = f"fprf eval {shlex.quote(str(folder))}"
-    measured = (folder / "metrics.json").is_file()
-    yield Finding("metrics", "there" if measured else "not measured yet", "" if measured else measure, True)
-    # Notes of the training: skipped steps, damaged checkpoints.
-    events, notes = folder / "events.jsonl", list[str]()
-    if events.is_file():
-        with suppress(CheckpointError):
-            notes = [note for history in read_history(folder) for note in history.notes]
-    if notes:
-        more = f" and {len(notes) - 1} more" if len(notes) > 1 else ""
-        yield Finding("events", notes[-1] + more, f"read {shlex.quote(str(events))}", True)
 
 
 def scene_folder(data: Path) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""`fprf doctor`: runs, methods and caches, its test of a device, and what it finds in scene folders."""
+"""`fprf doctor`: methods and caches, its test of a device, and what it finds in scene folders."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -16,55 +16,15 @@ from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import World
 
 from fprf.cli import main as cli
-from fprf.cli.doctor import Finding, machine, method_needs, run, run_folder, scene_folder, self_test
-from fprf.methods import fprf_lite
+from fprf.cli.doctor import Finding, machine, method_needs, run, scene_folder, self_test
 from fprf.ops import dense
-from fprf.plugins.codec import save_config
 from fprf.style.look import Restyle
 from fprf.training import device_check, views
 from fprf.training.device_check import compare
 
-LAST = fprf_lite().steps
-
 
 def _by_name(findings: Iterator[Finding]) -> dict[str, Finding]:
     return {finding.what: finding for finding in findings}
-
-
-@pytest.fixture
-def trained(tmp_path: Path) -> Path:
-    folder = tmp_path / "a run"
-    folder.mkdir()
-    save_config(folder / "config.json", fprf_lite(), "fprf-lite")
-    for step in (100, LAST, LAST + 1000):
-        (folder / "checkpoints" / f"step-{step:07d}").mkdir(parents=True)
-    for step in (100, LAST):
-        (folder / "checkpoints" / f"step-{step:07d}" / "manifest.json").write_text("{}")
-    for name in ("scene.json", "style.safetensors", "metrics.json"):
-        (folder / name).write_bytes(b"x" * 1000)
-    return folder
-
-
-def test_an_unfinished_run_says_how_to_go_on(trained: Path) -> None:
-    (trained / "checkpoints" / f"step-{LAST:07d}" / "manifest.json").unlink()
-    (trained / "style.safetensors").unlink()
-    found = _by_name(run_folder(trained))
-    remedy = f"fprf train '{trained}/config.json' --output '{trained}'"
-    assert found["checkpoints"] == Finding("checkpoints", f"step 100 of {LAST}", remedy, optional=True)
-    assert found["style.safetensors"].remedy == remedy and not found["style.safetensors"].optional
-    (trained / "checkpoints" / "step-0000100" / "manifest.json").unlink()
-    assert _by_name(run_folder(trained))["checkpoints"] == Finding("checkpoints", "none is complete", remedy)
-    assert run([str(trained)]) == 1
-
-
-def test_a_missing_plugin_of_a_run_is_named(trained: Path) -> None:
-    whole = json.loads((trained / "config.json").read_text())
-    whole["config"]["semantic"]["encoder"] = {"type": "gone"}
-    whole["plugins"]["semantic.encoder"] = "gone acme-gone 0.3"
-    (trained / "config.json").write_text(json.dumps(whole))
-    finding = _by_name(run_folder(trained))["plug-ins"]
-    assert finding.optional and "acme-gone 0.3" in finding.remedy and "--semantic.encoder NAME" in finding.remedy
-    assert run([str(trained)]) == 0, "it renders without its encoder"
 
 
 def test_scene_folders(world: World, capsys: pytest.CaptureFixture[str]) -> None:
