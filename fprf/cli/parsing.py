@@ -5,7 +5,6 @@ import dataclasses
 import difflib
 import enum
 import io
-import json
 import os
 import re
 import shutil
