@@ -11,7 +11,6 @@ from torch import Tensor
 
 from fprf.checks import at_least
 from fprf.config import RenderConfig
-from fprf.io.figures import number
 from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.rendering.cameras import Cameras
 from fprf.style.config import StyleConfig
@@ -23,7 +22,7 @@ from fprf.training.quality import PRESETS, QualityConfig, at_quality
 from fprf.training.views import render_view
 
 from .common import BenchConfig, Progress, bench_run
-from .report import Outcome, Spread, Watch, document, spread, table
+from .report import Outcome, Spread, Watch, document, number, spread, table
 from .speed import plain_planes
 from .subject import count, difference, exact, find, plainly, settings, size_of, small_view, view_rays, watch_of
 

@@ -274,6 +274,10 @@ class RunConfig:
         """Describe the plan beyond the views and their size, for the line that is shown before training."""
         return ""
 
+    def changeable(self, before: "RunConfig") -> tuple[str, ...]:
+        """Fields that may differ from those that a run was begun with when it goes on."""
+        return *RESUMABLE, *self.untrained
+
     def needs(self) -> list[Need]:
         """Packages and weights that training needs and that are not here, each opened by the path of its slot.
 
@@ -313,7 +317,6 @@ class TrainConfig(RunConfig):
     """Everything that decides a run of fields."""
 
     kind: ClassVar[str] = "fields"
-    untrained: ClassVar[tuple[str, ...]] = ("executor",)
 
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
@@ -405,6 +408,12 @@ class TrainConfig(RunConfig):
             encoded = 1e6 * _FEATURE_SHARE * 60 * self.minutes / pace.features / len(sizes)
             wanted = min(wanted, max(encoded, pace.least / 4))
         return max(1, round(math.sqrt(float(sizes.double().prod(1).mean()) / wanted)))
+
+    def changeable(self, before: RunConfig) -> tuple[str, ...]:
+        """The same; blocks may be cut anew: those that the cut does not concern are kept."""
+        former = getattr(before, "blocks", None)
+        anew = self.blocks.cuts and isinstance(former, LayoutConfig) and former.cuts
+        return *(FREE_IN_BLOCKS if anew else RESUMABLE), *self.untrained
 
     def needs(self) -> list[Need]:
         """The same, and a decoder for the content encoder, whose weights are read where both could be built."""

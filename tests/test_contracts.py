@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from fprf import testing
-from fprf.blocks.config import GridConfig, LayoutConfig, SingleConfig
+from fprf.blocks.config import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig
 from fprf.datamanagers.config import RayBatchesConfig
 from fprf.fields.config import ContentFieldConfig, PlanesConfig, SemanticPlanesConfig
 from fprf.interfaces import (
@@ -44,6 +44,7 @@ BUILT_IN: list[tuple[Callable[[Any], None], Any]] = [
     (testing.check_semantic_field, SemanticPlanesConfig(resolutions=(3,), channels=5, hidden=4, layers=0)),
     (testing.check_layout, SingleConfig()),
     (testing.check_layout, GridConfig()),
+    (testing.check_layout, AdaptiveConfig()),
     (testing.check_executor, SerialConfig()),
     (testing.check_data_manager, RayBatchesConfig(rays=64, semantic_share=0.5)),
     *(

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.restyle import RestyleConfig
-from fprf.blocks.config import GridConfig
+from fprf.blocks.config import AdaptiveConfig, GridConfig
 from fprf.checks import at_least, between, positive
 from fprf.config import LossConfig, OptimizerConfig, RenderConfig, SemanticConfig, StatisticsConfig, TrainConfig
 from fprf.errors import CheckpointError, ConfigError, FprfError
@@ -23,7 +23,6 @@ from fprf.plugins.encoders.config import (
     DinoConfig,
     Dinov2Config,
     RandomConfig,
-    Vgg16Config,
     Vgg19Config,
 )
 from fprf.plugins.executors.config import RayConfig
@@ -51,6 +50,7 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
     PlanesConfig: PLANES | {"degree": [0, 5]},
     SemanticPlanesConfig: PLANES,
     GridConfig: {"cells": [(0, 1)], "size": [0.0], "margin": [0.0, 0.6]},
+    AdaptiveConfig: {"rays": [0], "smallest": [-1.0], "margin": [0.0]},
     UniformConfig: {"samples": [0, -3]},
     ProposalConfig: {
         "final": [0],
@@ -64,8 +64,7 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
         "resolutions": [(1, 8)],
     },
     RandomConfig: {"channels": [0], "stride": [0], "seed": [-1]},
-    Vgg16Config: {"layer": ["relu3_4", "fc7"]},
-    Vgg19Config: {"layer": ["relu0_1", "relu2_3", "relu2_1 "]},
+    Vgg19Config: {"layer": ["relu0_1", "relu2_3", "relu2_1 ", "relu3_5", "fc7"]},
     DinoConfig: {"layer": [0], "stride": [0]},
     Dinov2Config: {"layer": [0], "stride": [0]},
     ConcatConfig: {"weights": [(0.0,), (1.0, -1.0), (inf,)]},

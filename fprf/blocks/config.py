@@ -63,3 +63,27 @@ class GridConfig(LayoutConfig):
         from .partition import GridLayout
 
         return GridLayout(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdaptiveConfig(LayoutConfig):
+    """Halves the scene where cameras and points are dense until each block fits a budget."""
+
+    rays: int = 20_000_000
+    """Most training pixels of a block, counted by its share of the cameras and of the sparse points."""
+    smallest: float | None = None
+    """No side of a block falls below this, world units; none = a tenth of the scene's."""
+    margin: float = 0.25
+    """Overlap of a block with its neighbours, as a share of the smallest side; in (0, 0.5]."""
+
+    def __post_init__(self) -> None:
+        at_least("blocks.rays", self.rays, 1)
+        if self.smallest is not None:
+            positive("blocks.smallest", self.smallest)
+        positive("blocks.margin", self.margin)
+        between("blocks.margin", self.margin, 0.0, 0.5)
+
+    def build(self) -> BlockLayout:
+        from .partition import AdaptiveLayout
+
+        return AdaptiveLayout(self)

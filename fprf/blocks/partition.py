@@ -2,7 +2,8 @@
 
 Blocks lie in the scene's space and cut it seen from above; what none of them holds is surroundings. Sparse points reach as
 far as the eye does; most of a scene's detail lies where its cameras are. So the region that is cut is the cameras' bounds
-widened by REACH, but no wider than the points there are.
+widened by REACH, but no wider than the points there are. A region weighs half by the pixels of the cameras that stand in it
+and half by its share of the sparse points: cameras say where pixels come from, points where they end.
 
 Cells of Gaussians cover all of space: it is bisected along the principal axes of the reconstruction's points, so that the
 points of each cell were seen about equally often, and outer cells have no end. A cell learns from the windows of photographs
@@ -11,10 +12,10 @@ that show its points and a border around it, so its cost follows from its window
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import numpy as np
 import torch
@@ -27,7 +28,7 @@ from ..io.atomic import write_json
 from ..io.strict_json import open_json
 from ..plugins.codec import from_json
 from ..types import Cell, Site, Window
-from .config import GridConfig
+from .config import AdaptiveConfig, GridConfig
 
 REACH = 1.0
 """Units beyond the cameras that still belong to the region; a unit is the distance that views commonly see."""
@@ -46,8 +47,24 @@ OWN = 0.15
 LEAST, ROOM = 64, 6
 """Least width and height of a window; pixels around the points in it."""
 
+State = TypeVar("State")
 Box = tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]
 """Lowest and highest corner."""
+
+
+def bisect(box: Box, state: State, place: Callable[[Box, State], tuple[int, float, State, State] | None]) -> list[Box]:
+    """Halve a box again and again, in the order of the tree.
+
+    `place` says across which axis a box is cut, where, and the states of both halves; None where it stays whole.
+    """
+    cut = place(box, state)
+    if cut is None:
+        return [box]
+    axis, at, first, second = cut
+    low, high = box
+    middle_high, middle_low = high.clone(), low.clone()
+    middle_high[axis] = middle_low[axis] = at
+    return bisect((low, middle_high), first, place) + bisect((middle_low, high), second, place)
 
 
 def bounds(site: Site) -> Box:
@@ -60,6 +77,11 @@ def bounds(site: Site) -> Box:
     room = PADDING * (ends[1] - ends[0]) + 1e-6
     least, most = site.position.amin(0), site.position.amax(0)
     return torch.maximum(low, torch.minimum(ends[0], least) - room), torch.minimum(high, torch.maximum(ends[1], most) + room)
+
+
+def _blocks(boxes: Sequence[Box], margin: float) -> list[Cell]:
+    border = torch.full((3,), margin, dtype=torch.float64)
+    return [Cell(low=low, high=high, border=border) for low, high in boxes]
 
 
 class GridLayout(BlockLayout):
@@ -80,13 +102,58 @@ class GridLayout(BlockLayout):
         lows = torch.cartesian_prod(sides[0][:-1], sides[1][:-1], low[2:])
         highs = torch.cartesian_prod(sides[0][1:], sides[1][1:], high[2:])
         # Cells that no camera stands in, and where next to nothing was found, are surroundings.
-        cells, border = [], torch.full((3,), margin, dtype=torch.float64)
+        boxes = []
         for first, last in zip(lows, highs, strict=True):
             cameras = ((site.position >= first) & (site.position <= last))[:, :2].all(1)
             points = ((site.points >= first) & (site.points <= last)).all(1)
             if bool(cameras.any()) or int(points.sum()) >= FEW or not len(site.points):
-                cells.append(Cell(low=first, high=last, border=border))
-        return cells
+                boxes.append((first, last))
+        return _blocks(boxes, margin)
+
+
+class AdaptiveLayout(BlockLayout):
+    """Splits along the longer horizontal side, where the weight halves."""
+
+    def __init__(self, config: AdaptiveConfig) -> None:
+        self.config = config
+
+    def cut(self, site: Site) -> list[Cell]:
+        """The leaves that weigh anything, in the order of the tree."""
+        low, high = bounds(site)
+        smallest = 0.1 * float((high - low)[:2].amax()) if self.config.smallest is None else self.config.smallest / site.unit
+        # Places seen from above, and the training pixels that each stands for.
+        points = site.points[((site.points >= low) & (site.points <= high)).all(1)]
+        rays, share = site.rays.double(), 0.5 if len(points) else 1.0
+        each = points.new_full((len(points),), 0.5 * float(rays.sum()) / max(1, len(points)))
+        place, weight = torch.cat([site.position[:, :2], points[:, :2]]), torch.cat([share * rays, each])
+
+        def inside(box: Box) -> Annotated[Tensor, "N"]:
+            return ((place >= box[0][:2]) & (place < box[1][:2])).all(1)
+
+        def halved(box: Box, _: None) -> tuple[int, float, None, None] | None:
+            extent = (box[1] - box[0])[:2]
+            axis, here = int(extent.argmax()), inside(box)
+            load = float(weight[here].sum())
+            if load <= self.config.rays or float(extent[axis]) < 2 * smallest:
+                return None
+            # The weighted median, moved so that neither half is too small.
+            values = place[here, axis]
+            order = values.argsort()
+            total = weight[here][order].cumsum(0)
+            at = float(values[order[int(torch.searchsorted(total, total[-1] / 2))]])
+            return axis, min(max(at, float(box[0][axis]) + smallest), float(box[1][axis]) - smallest), None, None
+
+        leaves = [box for box in bisect((low, high), None, halved) if float(weight[inside(box)].sum()) > 0] or [(low, high)]
+        # The border is that of the smallest side that may be: another budget moves no block that it does not split.
+        margin = self.config.margin * smallest if len(leaves) > 1 else 0.0
+        # What is found on the region's border lies inside its blocks.
+        return _blocks(
+            [
+                (torch.where(first <= low, first - margin, first), torch.where(last >= high, last + margin, last))
+                for first, last in leaves
+            ],
+            margin,
+        )
 
 
 def bisect_sightings(scene: Scene, count: int) -> list[Cell]:
@@ -102,20 +169,18 @@ def bisect_sightings(scene: Scene, count: int) -> list[Cell]:
     frame = torch.linalg.eigh(centred.T @ centred).eigenvectors.T.flip(0).contiguous()
     local = sightings.point @ frame.T
 
-    def halved(low: Tensor, high: Tensor, count: int) -> list[Box]:
-        """Boxes in the order of the tree, each cut across its longest side so that the halves have sightings by their cells."""
+    def halved(box: Box, count: int) -> tuple[int, float, int, int] | None:
         if count == 1:
-            return [(low, high)]
-        inside = local[((local >= low) & (local < high)).all(1)]
+            return None
+        inside = local[((local >= box[0]) & (local < box[1])).all(1)]
         first, last = _extent(inside)
-        axis, half = int((last - first).argmax()), count // 2
-        middle_high, middle_low = high.clone(), low.clone()
-        middle_high[axis] = middle_low[axis] = float(np.quantile(inside[:, axis].numpy(), half / count))
-        return halved(low, middle_high, half) + halved(middle_low, high, count - half)
+        axis = int((last - first).argmax())
+        half = count // 2
+        return axis, float(np.quantile(inside[:, axis].numpy(), half / count)), half, count - half
 
     endless = torch.full((3,), math.inf, dtype=torch.float64)
     cells = []
-    for low, high in halved(-endless, endless, count):
+    for low, high in bisect((-endless, endless), count, halved):
         # The cell learns what lies within a border around it as well, so that nothing is missing at its faces.
         inside = ((local >= low) & (local < high)).all(1)
         first, last = _extent(local[inside])

@@ -1,6 +1,5 @@
 """`fprf export RUN [ply splat glb cameras ...]`: a scene, plain or restyled, as files that other programs open."""
 
-import hashlib
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -119,9 +118,7 @@ class _Export:
     def gaussians(self) -> dict[str, Any]:
         """Gaussians as they are, or fitted to the scene's own renders; the same in each look, but for their colours."""
         from ..splats.files import Written, write_gaussians, write_ply_parts
-        from ..training.checkpoint import digest
 
-        # The key names what a file was made from: the checkpoint, the style, the frame.
         config, scene, paths, losses, count = self.config, self.opened.scene, [], dict[str, None](), 0
         own = scene.gaussian_rows() is not None
         if not self.what.formats:
@@ -131,17 +128,14 @@ class _Export:
         rows = (scene.restyled(look.restyle).gaussian_rows() for look in self.looks) if own else self._fitted()
         for look, gaussians in zip(self.looks, rows, strict=True):
             assert gaussians is not None
-            count, style = gaussians.count, "" if look.restyle is None else look.restyle.digest
-            state = f"{digest(self.opened.run.checkpoints)} {style}{' local' * config.local}" if own else ""
-            key = hashlib.sha256(state.encode()).hexdigest() if own else ""
+            count = gaussians.count
             for path in self.what.paths("splats", look.name, *(f".{each}" for each in self.what.formats)):
-                if key and not config.plain and format_name(path) == "ply":  # in parts: what was cut off goes on
+                if own and not config.plain and format_name(path) == "ply":  # in parts: of large scenes little is in memory
                     written = Written()
                     write_ply_parts(
                         path,
                         gaussians.part,
                         count,
-                        key,
                         antialiased=gaussians.antialiased,
                         origin=scene.origin,
                         local=config.local,

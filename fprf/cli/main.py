@@ -46,7 +46,7 @@ VERBS = {
     "export": Verb("RUN [ply splat glb cameras]", "points, splats, meshes, cameras as files"),
     "pretrain": Verb("decoder", "train the decoder of an encoder"),
     "plugins": Verb("[--check]", "list what is installed, and check that it loads"),
-    "doctor": Verb("[RUN|DIR|METHOD]", "look over this machine, a run, a scene or a method's needs"),
+    "doctor": Verb("[DIR|METHOD]", "look over this machine, a scene or a method's needs"),
 }
 
 

@@ -34,7 +34,7 @@ from .loading import load_run
 from .model import Facts, build_decoder
 from .prepare import Prepared, build_encoders, cache_folder, device_of, exposure_of, field_facts, read_scene, scene_background
 from .run import Run
-from .tasks import WHOLE, Part, Task, digest_of, train_all
+from .tasks import WHOLE, Part, Task, digest_of, renumber, task_of, train_all
 
 RAYS = "rays.safetensors"
 """In a block's folder: `views` [M] and their tiles `seen` [M TILES TILES] that it learns from."""
@@ -101,17 +101,25 @@ class Blocks(Partition):
         finish(run, display, config, load_run(run.root, config.device).model, scene)
 
     def write(self, run: Run) -> None:
-        """Write all that tasks read."""
+        """Write all that tasks read. Blocks that were trained as what another number is now are moved there."""
         plan = self.plan
         if self.basis is not None:
             run.save_tensors("basis", self.basis.tensors())
         # The views that see a block, and the tiles of them whose rays meet it; the surroundings learn from everything.
+        rays = {}
         for block in (WHOLE, *range(len(plan.cells))):
             views = plan.views if block == WHOLE else plan.views_of(block)
             at = torch.isin(plan.views, views)
             seen = torch.ones_like(plan.seen[at, 0]) if block == WHOLE else plan.seen[at, block]
+            rays[block] = {"views": views, "seen": seen.to(torch.uint8)}
+        folder = folder_of(run.root, 0).parent
+        if any(task_of(part) for part in folder.glob("*")):  # digests read all images
+            blocks = range(len(plan.cells))
+            asked = {z: block_task(self.config, self.facts, self.scene, plan.cells, z, rays[z])["task"] for z in blocks}
+            renumber(folder, asked)
+        for block, own in rays.items():
             folder_of(run.root, block).mkdir(parents=True, exist_ok=True)
-            tensorfiles.save(folder_of(run.root, block) / RAYS, {"views": views, "seen": seen.to(torch.uint8)})
+            tensorfiles.save(folder_of(run.root, block) / RAYS, own)
         write_cells(run.root / "blocks.json", plan.cells)
 
 

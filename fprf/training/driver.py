@@ -20,7 +20,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple
 
-from ..config import RESUMABLE, RunConfig
+from ..config import RunConfig
 from ..datamanagers.images import useless_masks
 from ..errors import CheckpointError, NumericsError, UsageError
 from ..interfaces import Figures, Learner, Partition
@@ -362,12 +362,12 @@ def _sized(run: Run, config: RunConfig, display: Display) -> RunConfig:
 
 
 def _check_same(run: Run, config: RunConfig) -> None:
-    """Raise UsageError where a folder holds a run with another config; fields that training does not depend on may differ."""
+    """Raise UsageError where a folder holds a run with another config; only what `changeable` names may differ."""
     if not run.exists:
         return
     old, _ = run.load_config()
     # What the run itself left open was never decided there.
-    free = (*RESUMABLE, *config.untrained, *(name for name in config.open if getattr(old, name, None) is None))
+    free = (*config.changeable(old), *(name for name in config.open if getattr(old, name, None) is None))
     # Whole branches of the config may be free: what is compared are its leaves, by their paths.
     mine, theirs = leaves(config), leaves(old)
     changed = [path for path in theirs | mine if path.partition(".")[0] not in free and mine.get(path) != theirs.get(path)]

@@ -12,6 +12,7 @@ The whole scene is trained first, coarsely; each part goes on from there, on any
 
 import hashlib
 import json
+import os
 import shutil
 import time
 import zlib
@@ -36,6 +37,7 @@ from .run import Run, lock_folder
 WHOLE = -1
 """The number of the whole scene among the parts."""
 _TASK, _DONE, _FORMAT = "task.json", "done.json", 1
+_MOVING = "moving-"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,3 +199,31 @@ def read_done(folder: Path) -> Done | None:
         return None
     with open_json(file, "remove it and train again") as document:
         return from_json(document, Done, path="done") if document["format"] == _FORMAT else None
+
+
+def renumber(folder: Path, asked: Mapping[int, str]) -> None:
+    """Move each part in a folder that was begun as what some number is asked for now to that number.
+
+    One in the way that nobody asks for is removed. Where it is cut off, the next call finishes it.
+    """
+    tasks = {mark.parent: task_of(mark.parent) for mark in sorted(folder.glob(f"*/{_TASK}"))}
+    known = {part: task for part, task in tasks.items() if task is not None}
+    targets = {number: folder / f"{number:02d}" for number in asked}
+    # Those that are where they belong stay; of the others each number takes the first that was begun as what it is asked for.
+    moves: dict[int, Path] = {}
+    for number, task in asked.items():
+        if known.get(targets[number]) == task:
+            known.pop(targets[number])
+    for number, task in asked.items():
+        holder = next((part for part, was in known.items() if was == task), None)
+        if holder is not None:
+            known.pop(holder)
+            moves[number] = holder
+    # Twice, so that no folder stands in another's way.
+    for number, holder in moves.items():
+        os.rename(holder, folder / f"{_MOVING}{asked[number]}")
+    for number in moves:
+        shutil.rmtree(targets[number], ignore_errors=True)
+        os.rename(folder / f"{_MOVING}{asked[number]}", targets[number])
+    for left in folder.glob(f"{_MOVING}*"):
+        shutil.rmtree(left)

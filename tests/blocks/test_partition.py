@@ -8,7 +8,7 @@ import torch
 from block_scenes import drone, street
 from torch import Tensor
 
-from fprf.blocks.config import GridConfig, LayoutConfig, SingleConfig
+from fprf.blocks.config import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig
 from fprf.blocks.partition import bisect_sightings, bounds, read_cells, write_cells
 from fprf.blocks.routing import shares
 from fprf.blocks.visibility import make_plan, open_space, pixel_mask, site_of
@@ -37,8 +37,10 @@ def holding(cells: list[Cell], points: Tensor) -> Tensor:
         (SingleConfig(), DRONE),
         (GridConfig(), DRONE),
         (GridConfig(cells=(5, 3)), DRONE),
+        (AdaptiveConfig(rays=20_000), DRONE),
         (SingleConfig(), STREET),
         (GridConfig(cells=(5, 1)), STREET),
+        (AdaptiveConfig(rays=20_000), STREET),
     ],
     ids=str,
 )
@@ -58,6 +60,21 @@ def test_a_grid_has_equal_cells_that_share_faces() -> None:
     assert torch.allclose(sides, sides[:1].expand_as(sides))
     assert cells[0].high[1] == cells[1].low[1] and cells[0].high[0] == cells[2].low[0]
     assert float(cells[0].border[0]) == pytest.approx(0.1 * float(sides[0, :2].min()), rel=0.2)
+
+
+@pytest.mark.parametrize("budget", [8_000, 30_000, 120_000])
+def test_adaptive_blocks_fit_the_budget_or_cannot_be_split(budget: int) -> None:
+    cells = AdaptiveConfig(rays=budget, smallest=1.0).build().cut(DRONE)
+    total = int(DRONE.rays.sum())
+    assert len(cells) >= total / budget
+    low, high = bounds(DRONE)
+    inside = DRONE.points[((DRONE.points >= low) & (DRONE.points <= high)).all(1)][:, :2]
+    for cell in cells:
+        first, last = cell.low[:2], cell.high[:2]
+        cameras = ((DRONE.position[:, :2] >= first) & (DRONE.position[:, :2] < last)).all(1)
+        points = ((inside >= first) & (inside < last)).all(1)
+        load = 0.5 * float(DRONE.rays[cameras].sum()) + 0.5 * total * float(points.double().mean())
+        assert load <= budget * 1.001
 
 
 def test_each_block_sees_the_tiles_whose_rays_meet_it() -> None:

@@ -283,7 +283,7 @@ def test_verbs_of_a_run(run: Path, tmp_path: Path) -> None:
     assert plain.semantic_encoder == SEMANTICS.build().identity and len(plain.measured()[0].share) > 3
     encoder = RandomConfig(channels=6).build().identity
     assert other.semantic_encoder == other.encoders().semantic.identity == encoder and len(other.measured()[0].share) == 3
-    assert main(["train", str(run / "config.json"), "--semantic.encoder", "vgg16", "--semantic.encoder.weights", "no.pth"]) == 2
+    assert main(["train", str(run / "config.json"), "--semantic.encoder", "vgg19", "--semantic.encoder.weights", "no.pth"]) == 2
 
 
 def test_training_is_watched_and_changes_no_bit(

@@ -6,15 +6,17 @@ from typing import Any
 
 import pytest
 import torch
-from block_world import BlockWorld, done_of
+from block_world import BlockWorld, done_of, small
 from task_world import world_of_blocks
 
+from fprf.blocks.config import AdaptiveConfig
 from fprf.blocks.fields import Member
 from fprf.blocks.visibility import make_plan
 from fprf.errors import CheckpointError
 from fprf.io import tensorfiles
 from fprf.training.block_training import RAYS, block_task
 from fprf.training.blocks import BlockCache, Built, folder_of, load_blocks, load_finished, restore, surroundings
+from fprf.training.driver import train
 from fprf.training.loading import load_run
 from fprf.training.prepare import read_scene
 from fprf.training.run import Run
@@ -104,6 +106,21 @@ def test_pictures_do_not_depend_on_the_limit(block_world: BlockWorld) -> None:
         trained = replace(trained, config=replace(trained.config, render=replace(trained.config.render, chunk=400)))
         pictures.append(trained.render(trained.cameras, 0).rgb)
     assert torch.equal(pictures[0], pictures[1]) and torch.equal(pictures[0], pictures[2])
+
+
+def test_another_cut_trains_only_the_blocks_that_it_concerns(block_world: BlockWorld, tmp_path: Path) -> None:
+    """Halving the heaviest block leaves the others what they were, under whatever number."""
+    coarse, fine = AdaptiveConfig(rays=3700, smallest=2.0), AdaptiveConfig(rays=3300, smallest=2.0)
+    config, root = replace(small(block_world.config.data, tmp_path / "run"), blocks=coarse), tmp_path / "run"
+    train(config, "fprf-lite", quiet=True)
+    first = {folder.name: done_of(root, folder.name) for folder in (root / "blocks").iterdir()}
+    train(replace(config, blocks=fine), "fprf-lite", quiet=True)
+    second = {folder.name: done_of(root, folder.name) for folder in (root / "blocks").iterdir()}
+    assert (len(first), len(second)) == (4, 5)
+    # The surroundings, and the two blocks that were not split, which have other numbers now.
+    assert len([one for one in second.values() if one in first.values()]) == 3
+    assert first["01"] == second["02"]
+    load_run(root, "cpu")
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from fprf.training.blocks import load_blocks, load_finished
 from fprf.training.learner import training_summary
 from fprf.training.model import Facts
 from fprf.training.run import Run, check_images, image_hashes, read_history, save_image_hashes
-from fprf.training.tasks import WHOLE, begin, read_done, task_of
+from fprf.training.tasks import WHOLE, begin, read_done, renumber, task_of
 from fprf.types import Cell
 
 LARGE = "1" + "0" * 400
@@ -74,6 +74,7 @@ class Example:
         yield lambda: training_summary(Run(root), fprf_lite(), self.scene)
         yield lambda: load_blocks(root)
         yield lambda: load_finished(self.parts[0])
+        yield lambda: renumber(root / "blocks", {1: "other"})
         yield lambda: load_cells(root)
         yield lambda: [read_done(folder) for folder in self.parts]
         yield lambda: [checkpoint.load_latest(folder / "checkpoints") for folder in self.parts]

@@ -1,10 +1,12 @@
 """Parts of a scene as tasks, of both kinds: lost, interrupted, killed, contended, gone on with, renumbered."""
 
+import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,6 +15,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from task_world import TaskWorld
 from tiny_world import events, same
 
@@ -23,7 +27,7 @@ from fprf.training import driver
 from fprf.training.driver import Report, train
 from fprf.training.loading import open_run
 from fprf.training.run import Run
-from fprf.training.tasks import WHOLE, Task, task_of, train_all
+from fprf.training.tasks import WHOLE, Task, renumber, task_of, train_all
 
 
 @pytest.mark.parametrize("part", [WHOLE, 0])
@@ -146,6 +150,55 @@ def test_a_time_limit_is_shared_between_the_whole_scene_and_its_parts(
     assert (whole.part, [task.part for task in parts]) == (WHOLE, [2, 0, 1])
     assert whole.minutes == pytest.approx(0.2 * left)
     assert sum(task.minutes or 0 for task in parts) == pytest.approx(max(left - 0.2 * left, 0.5))
+
+
+tasks = st.lists(st.sampled_from("abcdefgh"), unique=True, max_size=6)
+
+
+def lay(folder: Path, names: list[str]) -> None:
+    for number, name in enumerate(names):
+        part = folder / f"{number:02d}"
+        part.mkdir()
+        (part / "task.json").write_text(json.dumps({"task": name}))
+        (part / "weights").write_text(name)
+
+
+def weights_in(folder: Path) -> dict[str, str]:
+    return {part.name: (part / "weights").read_text() for part in folder.glob("*") if part.is_dir()}
+
+
+@given(tasks, tasks)
+def test_each_part_finds_what_was_trained_for_it(before: list[str], now: list[str]) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        lay(Path(name), before)
+        renumber(Path(name), dict(enumerate(now)))
+        found = weights_in(Path(name))
+        for number, task in enumerate(now):
+            if task in before:
+                assert found[f"{number:02d}"] == task
+        assert not [name for name in found if not name.isdigit()]
+
+
+@given(tasks, st.permutations(range(6)), st.integers(0, 12))
+def test_cut_off_anywhere_the_next_call_finishes_it(before: list[str], order: list[int], until: int) -> None:
+    now = {number: before[at] for number, at in enumerate([k for k in order if k < len(before)])}
+    real, left = os.rename, [until]
+
+    def rename(source: Path, target: Path) -> None:
+        left[0] -= 1
+        if left[0] < 0:
+            raise KeyboardInterrupt
+        real(source, target)
+
+    with tempfile.TemporaryDirectory() as name, pytest.MonkeyPatch.context() as patch:
+        lay(Path(name), before)
+        patch.setattr(os, "rename", rename)
+        try:
+            renumber(Path(name), now)
+        except KeyboardInterrupt:
+            left[0] = 99
+            renumber(Path(name), now)
+        assert {k: v for k, v in weights_in(Path(name)).items() if k.isdigit()} == {f"{k:02d}": v for k, v in now.items()}
 
 
 @pytest.mark.fault
