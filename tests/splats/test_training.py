@@ -354,7 +354,7 @@ def test_styles_on_a_run(run: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
 UNKNOWN = """export RUN splat --fit 1
 export RUN cameras --output x.ply
 render RUN --tone 1
-stylize RUN --references a.png --chunk 2
+stylize RUN --references a.png --max-memory 2
 train fprf-splats --plan
 bench speed RUN
 train fprf-splats --degree 4"""
