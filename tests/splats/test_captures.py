@@ -149,20 +149,6 @@ def town(folder: Path, light: str) -> Gaussians:
 
 TOWN = ["--up", "0", "0", "1", "--semantic.encoder", "bundled-semantic", "--regions", "8"]
 TOWN += ["--views", "12", "--size", "160", "120"]
-    "--up",
-    "0",
-    "0",
-    "1",
-    "--semantic.encoder",
-    "bundled-semantic",
-    "--regions",
-    "8",
-    "--views",
-    "12",
-    "--size",
-    "160",
-    "120",
-]
 
 
 @pytest.mark.slow
