@@ -22,7 +22,6 @@ from rich.table import Table
 from torch import Tensor
 
 from fprf import __version__
-from fprf.io.figures import number
 from fprf.io.images import Picture, resized, to_uint8
 from fprf.training.prepare import device_of
 
@@ -43,6 +42,21 @@ class Spread(NamedTuple):
         """The spread of a monotonic function of the figure."""
         low, high = sorted((function(self.low), function(self.high)))
         return Spread(function(self.median), low, high, self.rounds)
+
+
+def number(value: float | int | str | bool | None) -> str:
+    """Three digits that matter, thousands apart; a dash for what was not measured."""
+    if value is None:
+        return "–"
+    if isinstance(value, str):
+        return value
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int) or value == 0 or abs(value) >= 100:
+        return f"{value:,.0f}"
+    if abs(value) < 1e-3:
+        return f"{value:.1e}"
+    return f"{value:.{1 if abs(value) >= 50 else 2 if abs(value) >= 1 else 3}f}"
 
 
 def spread(values: Sequence[float]) -> Spread:

@@ -4,7 +4,6 @@ and files of the repository that pages link to."""
 import contextlib
 import importlib
 import io
-import json
 import logging
 import os
 import posixpath
@@ -16,7 +15,6 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 from fprf.cli.main import VERBS, Verb
-from fprf.cli.parsing import DESCRIBE
 
 ROOT = Path(__file__).resolve().parents[2]
 LOG = logging.getLogger("mkdocs.hooks.fprf")
@@ -94,59 +92,20 @@ def verb_page(verb: str, about: Verb) -> str:
         f"fprf {verb} {about.usage}",
         "```",
     ]
-    words: tuple[str | None, ...] = {"pretrain": ("decoder",), "train": ("fprf-lite",)}.get(verb, (None,))
-    for word in words:
-        found = described(verb, word)
-        if found is None:
-            lines += ["", "```text", help_of(verb), "```"]
-            continue
-        title = [] if word is None or verb == "train" else ["", f"## {verb} {word}"]
-        lines += [*title, "", found["description"].strip(), *tables(found)]
+    word = {"pretrain": ["decoder"], "train": ["fprf-lite"]}.get(verb, [])
+    lines += ["", "```text", help_of(verb, word), "```"]
     if verb == "train":
         lines += ["", "Defaults are those of `fprf-lite`. Fields of other plug-ins follow from what fills a slot:", ""]
         lines += ["`fprf train METHOD --semantic.encoder vgg19 --help` shows them."]
     return "\n".join([*lines, ""])
 
 
-def described(verb: str, word: str | None) -> dict[str, Any] | None:
-    """What the verb says of itself; None if it has no flags."""
-    heard = io.StringIO()
-    with contextlib.redirect_stdout(heard), contextlib.suppress(SystemExit, Exception):
-        importlib.import_module(f"fprf.cli.{verb}").run([*([word] if word else []), DESCRIBE])
-    return json.loads(heard.getvalue()) if heard.getvalue().startswith("{") else None
-
-
-def help_of(verb: str) -> str:
+def help_of(verb: str, words: list[str]) -> str:
     """What `--help` prints."""
     heard = io.StringIO()
     with contextlib.redirect_stdout(heard), contextlib.suppress(SystemExit):
-        importlib.import_module(f"fprf.cli.{verb}").run(["--help"])
+        importlib.import_module(f"fprf.cli.{verb}").run([*words, "--help"])
     return heard.getvalue().strip()
-
-
-def tables(found: dict[str, Any]) -> list[str]:
-    """Flags in one table for each config that they belong to, and the slots."""
-    lines: list[str] = []
-    for owner in dict.fromkeys(row["of"] for row in found["flags"]):
-        lines += ["", f"### {owner}"] if owner else []
-        lines += ["", "| flag | meaning |", "|---|---|"]
-        for row in (row for row in found["flags"] if row["of"] == owner):
-            name = row["flag"].upper() if row["positional"] else row["flag"]
-            default = f"; `{row['default']}`" if row["default"] else ""
-            takes = "required" if row["positional"] else f"{row['takes']}{default}"
-            # The meaning first: on a phone little more is seen.
-            lines.append(f"| `{name}` | {cell(row['meaning'])}<br>*{cell(takes)}* |")
-    if found["slots"]:
-        lines += ["", "### Plug-ins", "", "| slot | what fills it |", "|---|---|"]
-        for slot in found["slots"]:
-            names = ", ".join(slot["one of"])
-            lines.append(f"| `{slot['flag']}` | {cell(slot['meaning'])}<br>*one of {names}*; `{slot['default']}` |")
-    return lines
-
-
-def cell(text: str) -> str:
-    """A text that a table can hold."""
-    return text.replace("|", "\\|").replace("\n", " ").replace("<", "&lt;")
 
 
 def _pages(nav: Any) -> list[str]:

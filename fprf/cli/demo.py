@@ -5,13 +5,12 @@ from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 from ..checks import at_least, positive
 from ..progress import Display
 from ..style.config import StyleConfig
 from ..style.files import StyleFile
-from .gallery import fading, page_styles, page_views
+from .gallery import page_styles, page_views
 from .parsing import parse
 
 TITLE = "One garden, photographed once"
@@ -29,14 +28,12 @@ CREDITS = (
 
 @dataclass(frozen=True, kw_only=True)
 class DemoConfig:
-    """A garden in Seattle: train, measure, restyle, film, and one page that shows it."""
+    """A garden in Seattle: train, measure, restyle, and one page that shows it."""
 
     output: Path = Path("demo")
     """Folder for everything that the demo makes."""
     minutes: float = 1.15
     """Training time."""
-    frames: int = 60
-    """Frames of the film, about."""
     downscale: int = 1
     """The photographs, 356x634, are reduced by this factor."""
 
@@ -46,20 +43,17 @@ class DemoConfig:
     def __post_init__(self) -> None:
         positive("minutes", self.minutes)
         positive("megabytes", self.megabytes)
-        at_least("frames", self.frames, 2)
         at_least("downscale", self.downscale, 1)
 
 
 def run(args: list[str]) -> int:
-    """Train the garden, or resume, then measure, restyle, film, export and write the page."""
+    """Train the garden, or resume, then measure, restyle, export and write the page."""
     config = parse(DemoConfig(), args, prog="fprf demo", description="Train, restyle and show a garden that ships with fprf.")
     start = time.perf_counter()
     from ..datamanagers.images import load_image
     from ..io.atomic import write_json
-    from ..io.video import write_video
     from ..methods import fprf_splats
     from ..page.writer import Page, Reference, write_page
-    from ..rendering.paths import make_path
     from ..splats.files import write_gaussians
     from ..splats.loading import open_gaussians
     from ..splats.scene import SplatScene
@@ -83,25 +77,16 @@ def run(args: list[str]) -> int:
         scene.measured()
         looked = time.perf_counter() - begun
         styles = page_styles(scene, chosen, views, names, display)
-        for style, look in styles:
+        for style, look, _ in styles:
             assert isinstance(look, SplatScene)
             # For viewers that do not compensate opacities; these depend on no colour, so that the views are looked at once.
             plain = scene.seen.plain(look.shown)
             write_gaussians(config.output / f"{style.name.replace(' ', '-')}.ply", plain, origin=scene.origin)
-        # From one held-out view to the next, where other views surround the camera.
-        tour = make_path(opened.known.cameras, views, "interpolate", config.frames, scene.origin)
-        frames = list(fading([scene, *(look for _, look in styles[: len(LOOKS)])], tour, display))
         shown_views = page_views(opened, views, display)
-    film = config.output / "film.mp4"
-    if write_video(film, frames, fps=12) == "mp4v":  # browsers do not play that
-        film = film.with_suffix(".webp")
-        write_video(film, frames, fps=12)
-    figures: list[dict[str, Any]] = [dict(style.metrics) for style, _ in styles]
     # Of the single styles: the one of all together encodes nothing anew.
     metrics |= {
         "looked_seconds": looked,
-        "new_style_seconds": fmean(each["new_style_seconds"] for each in figures[: len(LOOKS)]),
-        "restyled_seconds_per_view": fmean(each["each_view_seconds"] for each in figures),
+        "new_style_seconds": fmean(seconds for *_, seconds in styles[: len(LOOKS)]),
         "total_seconds": time.perf_counter() - start,
     }
     write_json(config.output / "metrics.json", metrics)
@@ -119,18 +104,16 @@ def run(args: list[str]) -> int:
             "A new style": f"{metrics['new_style_seconds']:.1f} s",
         },
         views=shown_views,
-        styles=[style for style, _ in styles],
+        styles=[style for style, *_ in styles],
         references=[Reference(name, load_image(path, upright=True)) for path, name in names.items()],
         scene=scene,
         start=views[0],
-        metrics={name: value for name, value in metrics.items() if name != "per_view"},
-        film=film,
         credits=CREDITS,
     )
     write_page(page, content, megabytes=config.megabytes)
     print(
-        f"PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.3f}; a new style in {metrics['new_style_seconds']:.2f} s "
-        f"and {metrics['restyled_seconds_per_view']:.2f} s a view; all in {metrics['total_seconds']:.0f} s\n"
+        f"PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.3f}; a new style in {metrics['new_style_seconds']:.2f} s; "
+        f"all in {metrics['total_seconds']:.0f} s\n"
         f"open {page}; {config.output}/*.ply open in any viewer of Gaussians"
     )
     return 0

@@ -1,4 +1,4 @@
-"""`fprf doctor`: what this machine offers, what a method needs, what a scene folder holds, how a run stands.
+"""`fprf doctor`: what this machine offers, what a method needs, what a scene folder holds.
 
 Each problem names its remedy.
 """
@@ -8,32 +8,38 @@ import platform
 import shlex
 import shutil
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
+
+from rich.console import Console
+from rich.markup import escape
 
 from .. import __version__
-from ..errors import CheckpointError, ConfigError
+from ..errors import ConfigError, DataError
 from ..plugins import registry
-from ..plugins.codec import Missing
 from ..plugins.slots import slots
-from .findings import Finding, show
 from .parsing import parse
 
 _MIB = 1 << 20
 _LEAST_DISK = 1 << 30
 """Bytes below which a training may fail for want of room."""
-_SHIPPED: dict[str, tuple[str, ...]] = {"encoders": ("content", "semantic"), "decoders": ()}
-"""Weights that must be in the package; of decoders any will do."""
-_CACHES = (
-    (".cache/fprf/weights", "*"),
-    (".cache/torch/hub/checkpoints", "vgg19-*.pth"),
-    (".cache/huggingface/hub", "models--facebook--dino*"),
-)
-"""Folders in the user's home, and files in them, where downloaded weights lie."""
+_LOOKED = 48
+"""Views of a scene folder whose files are opened, evenly through the scene."""
+
+
+class Finding(NamedTuple):
+    """One line of the report."""
+
+    what: str
+    found: str
+    remedy: str = ""
+    """The one command or act that mends it; empty where nothing is wrong."""
+    optional: bool = False
+    """Everything else works without it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +47,7 @@ class DoctorConfig:
     """Settings of `fprf doctor`."""
 
     target: Path | None = None
-    """A run, a scene folder or a method; none = this machine."""
+    """A scene folder or a method; none = this machine."""
     device: str = "auto"
     """Device of this machine that is tested: cpu, cuda, mps, or auto; not with a target."""
     clean: bool = False
@@ -59,8 +65,8 @@ class DoctorConfig:
 def run(args: list[str]) -> int:
     """Print the findings as they come; 1 if something that is needed is wrong."""
     about = (
-        "`fprf doctor` looks over this machine and tests its device, `fprf doctor RUN` a run, `fprf doctor DIR` a scene\n"
-        "folder, `fprf doctor METHOD` what a method needs here."
+        "`fprf doctor` looks over this machine and tests its device, `fprf doctor DIR` a scene folder,\n"
+        "`fprf doctor METHOD` what a method needs here."
     )
     config = parse(DoctorConfig(), args, prog="fprf doctor", description=about, positional=("target",))
     target = config.target
@@ -74,19 +80,22 @@ def run(args: list[str]) -> int:
         findings = iter([Finding("features", f"{(size - _size(folder)) / _MIB:.0f} MiB deleted in {folder}")])
     elif target is None:
         findings = chain(machine(), self_test(config.device))
-    elif (target / "config.json").is_file():
-        findings = run_folder(target)
     elif str(target) in registry.installed("fprf.methods"):
         findings = method_needs(str(target))
     else:
-        from .doctor_scene import scene_folder
-
         findings = scene_folder(target)
-    return int(show(findings))
+    console, bad = Console(highlight=False), False
+    for finding in findings:
+        mark = "[green]ok[/]      " if not finding.remedy else "[yellow]optional[/]" if finding.optional else "[red]problem[/] "
+        bad |= bool(finding.remedy) and not finding.optional
+        console.print(f"{mark}  [bold]{escape(finding.what):<14}[/] {escape(finding.found)}", soft_wrap=True)
+        if finding.remedy:
+            console.print(f"{'':<26} → {escape(finding.remedy)}", soft_wrap=True)
+    return int(bad)
 
 
 def machine() -> Iterator[Finding]:
-    """Versions, processors, accelerators, optional packages, weights, plug-ins."""
+    """Versions, processors, accelerators, optional packages, room on the disk, plug-ins."""
     yield Finding("fprf", f"{__version__}, Python {platform.python_version()}, {platform.platform()}")
     # Packages that pyproject.toml requires, without importing them.
     for requirement in requires("fprf") or ():
@@ -94,53 +103,41 @@ def machine() -> Iterator[Finding]:
         extra = requirement.partition("extra == ")[2].strip("\"'")
         if extra in ("test", "dev"):
             continue
-        if found := _version(name):
-            yield Finding(name, found)
-        else:
+        try:
+            yield Finding(name, version(name))
+        except PackageNotFoundError:
             remedy = f'pip install "fprf[{extra}]"' if extra else f"pip install '{requirement}'"
             yield Finding(name, f"not installed{f' (extra {extra})' if extra else ''}", remedy, optional=bool(extra))
     try:
-        yield from _devices()
+        import torch
+
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        yield Finding("processor", f"{platform.machine()}, {cores} cores usable, {torch.get_num_threads()} threads")
+        if torch.cuda.is_available():
+            for at in range(torch.cuda.device_count()):
+                device = torch.cuda.get_device_properties(at)
+                yield Finding(f"cuda:{at}", f"{device.name}, {device.total_memory / 1024**3:.0f} GiB")
+        elif torch.backends.mps.is_available():
+            yield Finding("mps", "Apple GPU")
+        elif Path("/proc/driver/nvidia/version").is_file() and torch.version.cuda is None:
+            remedy = "pip install --force-reinstall torch --index-url https://download.pytorch.org/whl/cu126"
+            yield Finding("cuda", "an NVIDIA GPU is here, but torch was built without CUDA", remedy, optional=True)
+        else:
+            yield Finding("accelerator", "none: `--device auto` takes the processor")
     except Exception as error:  # a broken installation is a finding, not a crash
         yield Finding("torch", f"{type(error).__name__}: {error}", "pip install --force-reinstall torch")
     from ..datamanagers.features import CACHED_BYTES
     from ..training.prepare import cache_folder
 
-    yield from speed(os.environ)
     free = shutil.disk_usage(Path.cwd()).free
     clean = "fprf doctor --clean    # deletes feature targets, which are made again when needed"
     yield Finding("disk", f"{free / 1024**3:.1f} GiB free here", clean if free < _LEAST_DISK else "")
     folder, most = cache_folder() / "features", 2 * CACHED_BYTES / _MIB  # content and semantics
     yield Finding("features", f"{_size(folder) / _MIB:.0f} MiB of at most {most:.0f} in {folder}; --clean deletes them")
-    # Networks that ship with the package, and those that were downloaded.
-    for kind, names in _SHIPPED.items():
-        weights = Path(__file__).parents[1] / "plugins" / kind / "weights"
-        there = sorted(path.stem for path in weights.glob("*.safetensors"))
-        absent = [name for name in names if name not in there] or (["any"] if not there else [])
-        listed = ", ".join(there) or "none"
-        remedy = "pip install --force-reinstall --no-deps fprf" if absent else ""
-        yield Finding(kind, f"in the package: {listed}" + (f"; absent: {', '.join(absent)}" if absent else ""), remedy)
-    cached = [path.name for place, pattern in _CACHES for path in sorted((Path.home() / place).glob(pattern))]
-    yield Finding("cached", ", ".join(cached) or "no downloads yet")
     count = sum(len(registry.installed(group)) for group in registry.groups())
     yield Finding("plug-ins", f"{count} installed; `fprf plugins --check` loads each")
     for complaint in registry.unreadable():
         yield Finding("plug-ins", complaint, "reinstall or uninstall that package")
-
-
-def _devices() -> Iterator[Finding]:
-    """Processor and accelerators, as torch sees them."""
-    import torch
-
-    yield Finding("processor", f"{platform.machine()}, {_cores()} cores usable, {torch.get_num_threads()} threads")
-    if torch.cuda.is_available():
-        for at in range(torch.cuda.device_count()):
-            device = torch.cuda.get_device_properties(at)
-            yield Finding(f"cuda:{at}", f"{device.name}, {device.total_memory / 1024**3:.0f} GiB")
-    elif torch.backends.mps.is_available():
-        yield Finding("mps", "Apple GPU")
-    else:
-        yield Finding("accelerator", "none: `--device auto` takes the processor")
 
 
 def self_test(name: str) -> Iterator[Finding]:
@@ -172,22 +169,6 @@ def self_test(name: str) -> Iterator[Finding]:
     yield Finding("self-test", f"{names} as on the CPU: {figure}; {time.perf_counter() - start:.1f} s")
 
 
-def speed(environment: Mapping[str, str]) -> Iterator[Finding]:
-    """Causes of a slow machine: fewer threads than cores, other programs, a GPU that torch misses."""
-    cores = _cores()
-    for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        threads = environment.get(name, "")
-        if threads.isdecimal() and int(threads) < cores:
-            yield Finding("threads", f"{name}={threads}, {cores} cores are usable", f"unset {name}", optional=True)
-    busy = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
-    if busy > cores + 1:
-        finding = f"{busy:.0f} programs want the {cores} cores: everything here takes that much longer"
-        yield Finding("load", finding, "top    # and end what is not needed", optional=True)
-    if Path("/proc/driver/nvidia/version").is_file() and "+cpu" in _version("torch"):
-        remedy = "pip install --force-reinstall torch --index-url https://download.pytorch.org/whl/cu126"
-        yield Finding("cuda", "an NVIDIA GPU is here, but torch was built without CUDA", remedy, optional=True)
-
-
 def method_needs(name: str) -> Iterator[Finding]:
     """Packages and weights that training by a method needs. Raises PluginError for a method that cannot be loaded."""
     from ..plugins.codec import method_config
@@ -205,50 +186,42 @@ def _size(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def scene_folder(data: Path) -> Iterator[Finding]:
+    """Format, views, split, points and readable images of a scene. Raises DataError where it cannot be parsed."""
+    from ..datamanagers.images import load_images, useless_masks
+    from ..datamanagers.parsers.config import DataParserConfig, parse_scene, recognise
+    from ..datamanagers.scene import find_sightings, sparser
 
-
-def _version(package: str) -> str:
-    """Installed version; empty where it is not installed."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return ""
-
-
-def run_folder(folder: Path) -> Iterator[Finding]:
-    """Config, progress, plug-ins and what was computed of a run. Raises ConfigError where its config cannot be read."""
-    from ..plugins.codec import load_config
-    from ..training import checkpoint
-    from ..training.run import read_history
-
-    config, method = load_config(folder / "config.json")
-    yield Finding("run", f"method {method}, scene {config.data}, {config.steps} steps asked for")
-    steps = checkpoint.steps(folder / "checkpoints")
-    again = f"fprf train {shlex.quote(str(folder / 'config.json'))} --output {shlex.quote(str(folder))}"
-    if not steps:
-        yield Finding("checkpoints", "none is complete", again)
+    parser = recognise(data)
+    yield Finding("format", registry.name_of(DataParserConfig.group, type(parser)))
+    scene = parse_scene(data, 1, parser)
+    count = len(scene.paths)
+    sizes = sorted({(int(w), int(h)) for w, h in scene.cameras.size.tolist()})
+    shown = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (f" and {len(sizes) - 3} more" if len(sizes) > 3 else "")
+    lenses = sorted({("pinhole", "OpenCV", "fisheye")[lens] for lens in scene.cameras.lens.tolist()})
+    yield Finding("views", f"{count} of {shown} pixels, {' and '.join(lenses)} lens")
+    yield Finding("split", f"{len(scene.train)} to train, {len(scene.test)} held out")
+    for note in scene.notes:
+        yield Finding("note", note)
+    # Points begin the first Gaussians, where training views see them.
+    if scene.points is None or not len(scene.points):
+        yield Finding("points", "none; bounds come from the cameras, first Gaussians from matches between views")
     else:
-        short = steps[-1] < config.steps and config.minutes is None
-        yield Finding("checkpoints", f"step {steps[-1]} of {config.steps}", again if short else "", optional=True)
-    for slot in slots(config):
-        if isinstance(slot.value, Missing):
-            package = slot.value.package or "the package that provides it"
-            remedy = f"install {package}, or choose another with --{slot.path} NAME; rendering goes on without it"
-            yield Finding("plug-ins", slot.value.reason, remedy, optional=slot.path.endswith("encoder"))
-    for name, use in (("scene.json", "rendering"), ("style.safetensors", "restyling")):
-        there = (folder / name).is_file()
-        yield Finding(name, "there" if there else f"absent; {use} needs it", "" if there else again)
-    measure = f"fprf eval {shlex.quote(str(folder))}"
-    measured = (folder / "metrics.json").is_file()
-    yield Finding("metrics", "there" if measured else "not measured yet", "" if measured else measure, True)
-    # Notes of the training: skipped steps, damaged checkpoints.
-    events, notes = folder / "events.jsonl", list[str]()
-    if events.is_file():
-        with suppress(CheckpointError):
-            notes = [note for history in read_history(folder) for note in history.notes]
-    if notes:
-        more = f" and {len(notes) - 1} more" if len(notes) > 1 else ""
-        yield Finding("events", notes[-1] + more, f"read {shlex.quote(str(events))}", True)
-    yield Finding("size", f"{_size(folder) / _MIB:.1f} MiB")
+        sightings = find_sightings(sparser(scene))
+        seeing = 0 if sightings is None else len({*sightings.view.tolist()})
+        found = f"{len(scene.points)} of the reconstruction, in view of {seeing} of {len(scene.train)} training views"
+        remedy = "" if seeing else "remove them, or give those of this scene: they lie elsewhere or behind"
+        yield Finding("points", found, remedy, optional=True)
+    if fault := useless_masks(scene):
+        found, _, remedy = fault.partition("; ")
+        yield Finding("masks", found, remedy, optional="are white" in found)
+    broken = []
+    for view in range(0, count, -(-count // _LOOKED)):
+        try:
+            load_images(scene, views=[view])
+        except DataError as fault:
+            broken.append(str(fault))
+    if broken:
+        more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
+        yield Finding("images", f"{broken[0]}{more}", "replace them, or remove their poses")
+    yield Finding("next", f"fprf train --data {shlex.quote(str(data))}")

@@ -1,11 +1,11 @@
 """`fprf gallery RUN --references DIR`: a run in every style, as one page that needs nothing else."""
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from ..checks import at_least, positive
 from ..errors import FprfError, UsageError
@@ -19,16 +19,10 @@ if TYPE_CHECKING:
     from ..interfaces import Scene
     from ..io.images import Picture
     from ..page.writer import PageView, Style
-    from ..rendering.cameras import Cameras
     from ..style.dictionary import Reference
     from ..training.loading import LoadedRun
 
-_REDUCED = 4.0
-"""Factor by which views are reduced whose matches are only counted, not shown."""
-_FADE = 5
-"""Frames in which a film goes over to the next look."""
-
-_DESCRIPTION = """A run in every style, as one page to walk through, with match maps, depth and figures. It loads nothing.
+_DESCRIPTION = """A run in every style, as one page to walk through, with match maps. It loads nothing.
 
 Each reference is a style of its own; with several of them all together are one more."""
 
@@ -43,16 +37,12 @@ class GalleryConfig(StyleConfig, QualityConfig):
     """Style files (style.json), each one more style."""
     together: bool = True
     """Also show all photographs as one style."""
-    split: Literal["covered", "test", "train", "all"] = "covered"
-    """Views to choose from. covered: at most 8, those that training views surround; test: those held out from training."""
+    split: Literal["some", "test", "train", "all"] = "some"
+    """Views to choose from. some: at most 8 training views, spread evenly; test: those held out from training."""
     most: int = 6
     """Views that are shown, evenly taken from the split."""
     views: tuple[str, ...] = ()
     """Views to show by name, instead."""
-    frames: int = 0
-    """Frames of a flight through the last style; 0 = none."""
-    path: str = "interpolate"
-    """Path of the flight: spiral, orbit, interpolate, or a camera-path file."""
     title: str = ""
     """Headline; empty = the scene's name."""
     megabytes: float = 16.0
@@ -66,21 +56,17 @@ class GalleryConfig(StyleConfig, QualityConfig):
         StyleConfig.__post_init__(self)
         QualityConfig.__post_init__(self)
         at_least("most", self.most, 1)
-        at_least("frames", self.frames, 0)
         positive("megabytes", self.megabytes)
 
 
 def run(args: list[str]) -> int:
-    """Render the views in every style, film, write the page."""
+    """Render the views in every style, write the page."""
     config, file = read_flags(GalleryConfig(), args, prog="fprf gallery", description=_DESCRIPTION, positional=("run",))
     output = config.output if config.output is not None else config.run / "gallery.html"
     if output.suffix.lower() != ".html":
         raise UsageError(f"--output {output}: the page is an .html file; give such a name")
     from ..datamanagers.images import load_image
-    from ..io.video import write_video
     from ..page.writer import Page, Reference, write_page
-    from ..plugins.codec import read_json
-    from ..rendering.paths import make_path
     from ..splats.scene import SplatScene
     from ..training.loading import open_run
 
@@ -92,19 +78,9 @@ def run(args: list[str]) -> int:
     views = [views[k * len(views) // most] for k in range(most)]
     chosen = _chosen(config, file)
     called = _called([*config.references, *(path for _, each in chosen for path in each.style.references)])
-    film = None
     with Display() as display:
         originals = page_views(opened, views, display)
         styles = page_styles(scene, chosen, views, called, display)
-        if config.frames:
-            film = output.with_suffix(".mp4")
-            flight = make_path(known.cameras, known.split("all"), config.path, config.frames, scene.origin)
-            write_video(film, fading([styles[-1][1]], flight, display), fps=24)
-    # Figures of `fprf eval`, where it has run, without those of single views.
-    measured: Any = {}
-    if (path := config.run / "metrics.json").is_file():
-        measured = read_json(path, "the metrics.json of `fprf eval`")
-    figures = measured if isinstance(measured, dict) else {}
     width, height = known.cameras.size[views[0]].tolist()
     page = Page(
         title=config.title or known.name,
@@ -116,12 +92,10 @@ def run(args: list[str]) -> int:
             "Trained for": f"{opened.seconds / 60:.1f} min",
         },
         views=originals,
-        styles=[style for style, _ in styles],
+        styles=[style for style, *_ in styles],
         references=[Reference(name, load_image(path, upright=True)) for path, name in called.items()],
         scene=scene if isinstance(scene, SplatScene) else None,
         start=views[0],
-        metrics={name: value for name, value in figures.items() if name not in ("per_view", "method", "scene")},
-        film=film,
     )
     write_page(output, page, megabytes=config.megabytes)
     print(f"{len(views)} views in {len(styles)} styles: {output} ({output.stat().st_size / 2**20:.1f} MiB)")
@@ -158,23 +132,17 @@ def _called(paths: Sequence[Path]) -> dict[Path, str]:
 
 
 def page_views(opened: "LoadedRun[Scene]", views: Sequence[int], display: Display) -> "list[PageView]":
-    """Views of a run as a page shows them: rendered, in depth, and photographed where they were held out.
+    """Views of a run as a page shows them: rendered, and photographed where they were held out.
 
     Photographs are absent where the scene's folder is no longer what it was.
     """
     from ..datamanagers.images import load_images
     from ..io.images import to_uint8
-    from ..io.maps import depth_image, depth_limits
     from ..page.writer import PageView
     from ..training.prepare import read_scene
     from ..training.run import view_names
 
     scene, known = opened.scene, opened.known
-    drawn = []
-    for done, view in enumerate(views):
-        display.count(done, len(views), "rendering")
-        drawn.append(scene.render(scene.cameras, view))
-    limits = depth_limits([each.depth for each in drawn], [each.opacity for each in drawn])
     photographs: dict[int, Picture] = {}
     try:
         captured = read_scene(opened.run.load_config()[0])
@@ -183,10 +151,12 @@ def page_views(opened: "LoadedRun[Scene]", views: Sequence[int], display: Displa
             photographs = dict(zip(unseen, load_images(captured, views=unseen), strict=True))
     except FprfError:
         pass
-    return [
-        PageView(scene.names[view], to_uint8(each.rgb), photographs.get(view), depth_image(each.depth, each.opacity, limits))
-        for view, each in zip(views, drawn, strict=True)
-    ]
+    shown = []
+    for done, view in enumerate(views):
+        display.count(done, len(views), "rendering")
+        rendered = to_uint8(scene.render(scene.cameras, view).rgb)
+        shown.append(PageView(scene.names[view], rendered, photographs.get(view)))
+    return shown
 
 
 def page_styles(
@@ -195,15 +165,12 @@ def page_styles(
     views: Sequence[int],
     called: Mapping[Path, str],
     display: Display,
-) -> "list[tuple[Style, Scene]]":
-    """Each style on the views, with match maps and how well the views agree with each other, and the scene in that style.
+) -> "list[tuple[Style, Scene, float]]":
+    """Each style on the views, with match maps; the scene in that style; the seconds that the style took.
 
     `called` are the names of all photographs. A photograph that is in several styles is encoded once, which counts as time of
     the first of them.
     """
-    import torch
-
-    from ..evaluation.consistency import consistency
     from ..io.images import to_uint8
     from ..page.writer import Style
     from ..splats.scene import SplatScene
@@ -214,64 +181,31 @@ def page_styles(
     # Encoders are loaded once, and photographs encoded once, for all styles.
     encoders, made = scene.encoders(), []
     encoded: dict[tuple[Path, Path], Reference] = {}
-    reduced = scene.cameras.scaled(_REDUCED)
-    shown_cameras = scene.cameras.select(torch.tensor(list(views), dtype=torch.int64))
     for i, (name, file) in enumerate(chosen):
         display.count(i, len(chosen), "restyling")
         start = time.perf_counter()
         styled = apply_style(scene, file, encoders, encoded=encoded)
-        built = time.perf_counter()
+        seconds = time.perf_counter() - start
         look = scene.restyled(styled.restyle)
-        drawn = [look.render(scene.cameras, view) for view in views]
-        done = time.perf_counter()
-        # Where there is one photograph nobody sees the map, and the figures need few pixels.
-        several = len(styled.codes.names) > 1
-        summaries, maps = [], []
-        for view in views:
-            matched = match_map(scene, styled, view, scene.cameras if several else reduced)
-            summaries.append(summarize(matched, styled.codes))
-            maps += [match_picture(matched, styled.codes)] if several else []
-        # Each view against the next one, warped onto it.
-        pairs = [(k, k + 1) for k in range(len(views) - 1)]
-        warped = consistency([each.rgb for each in drawn], [each.depth for each in drawn], shown_cameras, pairs)
+        stills = [to_uint8(look.render(scene.cameras, view).rgb) for view in views]
         # Of a style on the way to another, the page names its own photographs alone.
         paths = dict(zip(labels(file.style.references), file.style.references, strict=True))
         names = [label for label in styled.codes.names if label in paths]
-        shares = [fmean(row["references"][k]["share"] for row in summaries) for k in range(len(styled.codes.names))]
+        # Match maps say which photograph is where: there is something to say where there are several.
+        rows, maps = [], []
+        for view in views if len(styled.codes.names) > 1 else ():
+            matched = match_map(scene, styled, view)
+            maps.append(match_picture(matched, styled.codes))
+            rows.append([row["share"] for row in summarize(matched, styled.codes)["references"]])
+        shares = [fmean(column) for column in zip(*rows, strict=True)]
         style = Style(
             name,
-            [to_uint8(each.rgb) for each in drawn],
+            stills,
             look.shown.harmonics if isinstance(look, SplatScene) else None,
             references=[called[paths[label]] for label in names],
-            shares=shares if several and len(shares) == len(names) else [],
+            shares=shares if len(shares) == len(names) else [],
             matches=maps,
-            metrics={
-                "match_score": fmean(row["score"] for row in summaries),
-                "match_entropy_bits": fmean(row["entropy_bits"] for row in summaries),
-                "warp_error": warped["rmse"],
-                "new_style_seconds": built - start,
-                "each_view_seconds": (done - built) / len(views),
-            },
         )
-        made.append((style, look))
+        made.append((style, look, seconds))
     display.count(len(chosen), len(chosen), "restyling")
     return made
-
-
-def fading(looks: "Sequence[Scene]", cameras: "Cameras", display: Display) -> "Iterator[Picture]":
-    """Frames of a flight: every look for an equal share of them, each fading into the next.
-
-    Pictures fade, as their colours would: what is drawn is linear in these.
-    """
-    from ..io.images import to_uint8
-
-    share = len(cameras) / len(looks)
-    for frame in range(len(cameras)):
-        display.count(frame, len(cameras), "rendering")
-        place = min(int(frame / share), len(looks) - 1)
-        into = (frame - (place + 1) * share) / _FADE + 1
-        rgb = looks[place].render(cameras, frame).rgb
-        if into > 0 and place + 1 < len(looks):
-            rgb = rgb.lerp(looks[place + 1].render(cameras, frame).rgb, into)
-        yield to_uint8(rgb)
-    display.count(len(cameras), len(cameras), "rendering")

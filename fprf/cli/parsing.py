@@ -1,23 +1,19 @@
 """Arguments to a config: slots first, then every field as a flag, by tyro."""
 
-import ast
 import contextlib
 import dataclasses
 import difflib
 import enum
-import inspect
 import io
-import json
 import os
 import re
 import shutil
 import sys
-import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_origin
 
-from ..errors import ConfigError, PluginError, UsageError
+from ..errors import ConfigError, UsageError
 from ..plugins import registry
 from ..plugins.codec import Missing, load_config, method_config
 from ..plugins.slots import Slot, hints_of, is_slot, members, resolve, slots
@@ -28,8 +24,6 @@ if TYPE_CHECKING:
 
 C = TypeVar("C")
 
-DESCRIBE = "--describe"
-"""Asks any verb for all of its flags with their meanings, as JSON."""
 _COLUMNS = 100
 """Widest help text: a page, not a wide screen."""
 _TRUTHS = (["True"], ["False"], ["true"], ["false"])
@@ -179,9 +173,6 @@ def parse(default: C, args: Sequence[str], *, prog: str, description: str, posit
     `none` empties whatever may be None. Fields named in `positional` are given without a flag, in that order, and must
     be given. `--help` prints all of it and exits. Raises UsageError, PluginError or ConfigError with one line.
     """
-    if DESCRIBE in args:
-        print(describe(default, prog=prog, description=description, positional=positional))
-        raise SystemExit(0)
     # Slots first: what fills them decides which flags there are.
     config, rest = resolve(default, args)
     for slot in slots(config):
@@ -210,14 +201,8 @@ def parse(default: C, args: Sequence[str], *, prog: str, description: str, posit
 
 def load_method(name: str) -> "tuple[RunConfig, str]":
     """The config of a method, or of a saved `config.json` with the name of the method that it started from."""
-    from ..config import IncompleteConfig
-
     if name.endswith(".json"):
-        config, method = load_config(Path(name))
-        if isinstance(config, IncompleteConfig):
-            package = json.loads(config.packages)["method"]
-            raise PluginError(f"{name}: {config.reason}; to train with this config install {package}")
-        return config, method
+        return load_config(Path(name))
     if (Path(name) / "config.json").is_file() and name not in registry.installed("fprf.methods"):
         raise UsageError(f"{name}: is a folder, not a method; to train with its config name {Path(name) / 'config.json'}")
     return method_config(name), name
@@ -304,53 +289,3 @@ def _page_width() -> Iterator[None]:
             del os.environ["COLUMNS"]
         else:
             os.environ["COLUMNS"] = before
-
-
-def describe(config: Any, *, prog: str, description: str, positional: Sequence[str]) -> str:
-    """The JSON text of a config that flags change."""
-    rows = []
-    for text, flag in flags_of(config).items():
-        of, _, name = flag.path.rpartition(".")
-        given = name if flag.path in positional else text
-        row = {"flag": given, "takes": flag.takes, "default": _written(getattr(flag.owner, name)), "of": of}
-        rows.append(row | {"meaning": meanings(type(flag.owner)).get(name, ""), "positional": flag.path in positional})
-    chosen = [
-        {
-            "flag": f"--{_dashed(slot.path)}",
-            "one of": slot.choices,
-            "default": _filled_by(slot),
-            "meaning": first_line(slot.kind),
-        }
-        for slot in slots(config)
-    ]
-    return json.dumps({"prog": prog, "description": description, "flags": rows, "slots": chosen}, indent=1)
-
-
-def meanings(kind: type) -> dict[str, str]:
-    """The docstring below each field of a dataclass, those of its bases included; of a class without source, none."""
-    texts: dict[str, str] = {}
-    for base in reversed(kind.__mro__):  # a derived class may document a field anew
-        if not dataclasses.is_dataclass(base):
-            continue
-        try:
-            body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
-        except (OSError, TypeError, SyntaxError):
-            continue
-        assert isinstance(body, ast.ClassDef)
-        for field, text in zip(body.body, body.body[1:], strict=False):
-            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr):
-                said = text.value.value if isinstance(text.value, ast.Constant) else None
-                if isinstance(said, str):
-                    texts[field.target.id] = " ".join(said.split())
-    return texts
-
-
-def _written(value: Any) -> str:
-    """A default as it would be typed."""
-    if value is None:
-        return "none"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, (tuple, list)):
-        return " ".join(map(_written, value))
-    return "" if isinstance(value, Path) and value == Path() else str(value)

@@ -270,7 +270,7 @@ def _show(config: RestyleConfig, scene: "SplatScene", made: Sequence[_Restyled])
         of = [names[k]] if config.each else each.styled.dictionary.names
         name = each.name or " + ".join(Path(label).stem for label in of)
         harmonics = each.scene.shown.harmonics
-        styles.append(Style(name, pictures, harmonics, references=of, metrics={"new_style_seconds": each.seconds}))
+        styles.append(Style(name, pictures, harmonics, references=of))
     page = Page(
         title=config.captures[0].resolve().name.partition(".")[0] or "capture",
         facts={"Gaussians": len(scene.gaussians), "Regions": len(scene.measured()[0].share), "Styles": len(styles)},

@@ -3,13 +3,12 @@
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
-from ..errors import PluginError, UsageError
+from ..errors import PluginError
 from ..plugins import registry
 from .parsing import first_line, load_method, parse
 
@@ -30,61 +29,31 @@ def run(args: list[str]) -> int:
     source = Path(args[0])
     if source.suffix == ".json" and config.output is None:
         config = replace(config, output=source.parent)
-    rest, address = take_view(args[1:])
-    flags, changed = [arg for arg in rest if arg != CHANGED], CHANGED in rest
+    flags = [arg for arg in args[1:] if arg not in (VIEW, CHANGED)]
+    changed = CHANGED in args
     about = (
         f"Train a scene with {method}.\n"
-        f"{VIEW} [[HOST:]PORT] shows training live in the browser, at http://127.0.0.1:8080 if nothing is said;\n"
+        f"{VIEW} shows training live in the browser, as `fprf view RUN --follow` does, which takes another address;\n"
         f"{CHANGED} goes on with a run although its images are no longer those that it was begun with."
     )
     config = parse(config, flags, prog=f"fprf train {args[0]}", description=about)
     from ..training.driver import default_output, train
 
-    if address is None:
+    if VIEW not in args:
         train(config, method, changed_images=changed)
         return 0
-    with viewed(config.output or default_output(config, method), address):
+    with viewed(config.output or default_output(config, method)):
         train(config, method, changed_images=changed)
     return 0
 
 
-class ViewAddress(NamedTuple):
-    """Address to listen at."""
-
-    host: str = "127.0.0.1"
-    port: int = 8080
-
-
-def take_view(args: Sequence[str]) -> tuple[list[str], ViewAddress | None]:
-    """Split `--view [[HOST:]PORT]` from the other arguments; None where it is absent. Raises UsageError for no port."""
-    rest: list[str] = []
-    address: ViewAddress | None = None
-    words = iter(range(len(args)))
-    for i in words:
-        name, equals, value = args[i].partition("=")
-        if name != VIEW:
-            rest.append(args[i])
-            continue
-        # A bare word behind the flag is its value.
-        if not equals and i + 1 < len(args) and not args[i + 1].startswith("-"):
-            value = args[next(words)]
-        address = ViewAddress()
-        if value or equals:
-            host, _, port = value.rpartition(":")
-            if not (port.isascii() and port.isdigit() and int(port) < 65536):
-                raise UsageError(f"{VIEW} {value}: it takes a port from 0 to 65535, or HOST:PORT, or nothing")
-            address = ViewAddress(host.strip("[]") or address.host, int(port))
-    return rest, address
-
-
 @contextmanager
-def viewed(run: Path, address: ViewAddress) -> Iterator[None]:
+def viewed(run: Path) -> Iterator[None]:
     """`fprf view RUN --follow` beside the block, in a process of its own: whatever becomes of it, training goes on."""
     from ..training.driver import is_watched
 
-    words = ["view", str(run), "--follow", "--host", address.host, "--port", str(address.port)]
     # An interrupt at the terminal is training's; the viewer is then ended here.
-    process = subprocess.Popen([sys.executable, "-m", "fprf", *words], start_new_session=True)
+    process = subprocess.Popen([sys.executable, "-m", "fprf", "view", str(run), "--follow"], start_new_session=True)
     try:
         yield
         while sys.stderr.isatty() and process.poll() is None and is_watched(run):  # Ctrl-C ends the page as well

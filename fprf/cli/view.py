@@ -97,7 +97,7 @@ def run(args: list[str]) -> int:
                     from ..page.follow import TrainingFollower
 
                     # A run that is in training: the scene is loaded anew with each checkpoint.
-                    TrainingFollower(server, path, load, session, config.pixels).run()
+                    TrainingFollower(server, path, load, session, references, config.pixels).run(threading.Event())
             threading.Event().wait()
         except KeyboardInterrupt:
             # Whatever a thread is in the middle of, the terminal comes back.
@@ -109,15 +109,19 @@ def run(args: list[str]) -> int:
 
 
 def _start(server: "ViewerServer", config: ViewConfig, references: Sequence[Path]) -> "Start":
+    from ..page.follow import TrainingFollower
     from ..page.start import Start
 
     def show(path: Path, name: str) -> None:
         server.open(lambda: _load(config, path, name, server.notify), references, config.pixels)
 
+    def follow(path: Path, name: str) -> TrainingFollower:
+        return TrainingFollower(server, path, lambda: _load(config, path, name, server.notify), None, references, config.pixels)
+
     def leave() -> None:
         server.show_start(start)
 
-    start = Start(config.output, show, leave, server.post)
+    start = Start(config.output, show, follow, leave, server.post)
     leave()
     return start
 
@@ -136,6 +140,7 @@ def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[st
     from ..splats.config import LookConfig
     from ..splats.files import read_capture
     from ..splats.loading import open_capture
+    from ..style.config import StyleConfig
 
     def progress(done: int, total: int) -> None:
         if done == 0:
@@ -144,4 +149,5 @@ def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[st
     capture, look = read_capture(path), LookConfig(up=config.up, inside=config.inside, semantic=config.semantic)
     scene = open_capture(capture, look, progress=progress)
     name = name or path.resolve().name.partition(".")[0]
-    return Viewed(scene, name, 0, root=config.output / name, capture=capture, stylizer=RegionToneConfig(centred=False))
+    style = StyleConfig(stylizer=RegionToneConfig(centred=False))
+    return Viewed(scene, name, 0, root=config.output / name, capture=capture, style=style)

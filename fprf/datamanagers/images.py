@@ -15,13 +15,13 @@ import os
 import re
 import threading
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+from typing import IO, TYPE_CHECKING, NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
@@ -192,21 +192,18 @@ def load_mask(path: Path, size: tuple[int, int] | None = None, *, upright: bool 
 
 def useless_masks(scene: "Scene") -> str:
     """Describe masks that leave no pixel of any view, or every pixel of all; empty for others and without masks."""
-    shares = (1.0 if path is None else float(load_mask(path).mean()) for path in scene.masks)
-    colour, count = uniform_colour(shares), f"the masks of all {len(scene.masks)} views"
-    if colour == "black":
-        return f"{count} are black: no pixel is used; paint white, or opaque, what is to be used"
-    return f"{count} are white: every pixel is used; paint black, or transparent, what is to be left out" if colour else ""
-
-
-def uniform_colour(shares: Iterable[float]) -> Literal["", "black", "white"]:
-    """`black` or `white` where the white shares of masks are all 0, or all 1; empty for others, which end the reading early."""
     first = None
-    for share in shares:
+    for path in scene.masks:
+        share = 1.0 if path is None else float(load_mask(path).mean())
         first = share if first is None else first
-        if share not in (0, 1) or share != first:
+        if share not in (0, 1) or share != first:  # masks that say something end the reading early
             return ""
-    return "" if first is None else "white" if first else "black"
+    if first is None:
+        return ""
+    count = f"the masks of all {len(scene.masks)} views"
+    if first == 0:
+        return f"{count} are black: no pixel is used; paint white, or opaque, what is to be used"
+    return f"{count} are white: every pixel is used; paint black, or transparent, what is to be left out"
 
 
 def load_images(scene: "Scene", background: Sequence[float] | None = None, views: Sequence[int] | None = None) -> list[Image]:

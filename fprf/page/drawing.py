@@ -1,8 +1,7 @@
 """What clients see: colours of Gaussians, which their browsers draw, and pictures of fields, which are drawn here.
 
-A moving camera must see something at once, a camera at rest everything: the first picture of a field is the finest one that can
-be had within `FIRST_SECONDS`, as fast as this machine has been so far, and each next one has four times the pixels. What a
-client's last view holds is kept, so that a slider that is moved while the camera rests costs decoding alone.
+A moving camera must see something at once, a camera at rest everything: a new camera gets a small picture of a field, then the
+whole one. What a client's last view holds is kept, so that a slider that is moved while the camera rests costs decoding alone.
 
 Films: keyframes that were set on the page become an mp4 in the run's folder. A film's folder holds what `fprf render` takes:
 `path.json` (a camera path), `keys.json` (styles by frame) and the styles with their photographs. The film is rendered from
@@ -10,11 +9,10 @@ these very files, so the same command makes it again, at any size.
 """
 
 import shutil
-import time
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, TypeAlias
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
@@ -26,7 +24,6 @@ from ..io.atomic import write_json
 from ..io.images import Picture, to_uint8
 from ..io.maps import depth_image, match_image, palette
 from ..ops.harmonics import HARMONIC
-from ..plugins.stylizers.config import RegionToneConfig
 from ..rendering.camera_path import read_camera_path, write_camera_path
 from ..rendering.cameras import Cameras, ideal_cameras
 from ..rendering.paths import interpolate
@@ -37,38 +34,26 @@ from ..style.restyle import Styled, keyed_looks
 from ..style.scene_style import RegionWeight
 from ..training.loading import Trained
 from ..training.views import ViewChunk, view_chunks
-from ..types import Origin
 from .messages import Camera
 from .pack import Colours, Packed
 from .render_worker import Steps
-from .restyler import Look, Restyler, style_config
+from .restyler import Restyler
+from .state import Key, Look, Shown
 
-Map: TypeAlias = Literal["none", "matches", "regions", "depth"]
 CACHE_BYTES = 128 << 20
 """Features that are kept of each client's last view."""
 CHUNK = 4096
 """Rays of a step: after each one a newer request may take over."""
-FIRST_SECONDS = 0.1
-"""Time for the first picture of a new camera."""
+_PREVIEW = 6
+"""Factor by which the first picture of a new camera is smaller."""
 _MIN_CANVAS, _MAX_CANVAS = 8, 4096
 """Longer sides of pictures, in pixels."""
-_MIN_SIDE = 16
-"""No picture's longer side is smaller."""
 _NO_MATCH = 0.5
 """Grey of the map of matches without a style."""
 _DIM = 0.45
 """Brightness of what does not belong to the region that is picked; it is grey, too."""
 _UNSURE = 0.45
 """Brightness of a region's colour where a pixel belongs to many."""
-
-
-class Shown(NamedTuple):
-    """What is shown of a scene."""
-
-    look: Look
-    map: Map = "none"
-    region: int | None = None
-    """A region to be highlighted; the others are dimmed."""
 
 
 class Request(NamedTuple):
@@ -142,51 +127,46 @@ class FieldPainter:
 
     def __init__(self, trained: Trained, restyler: Restyler, show: Callable[[Hashable, str, Picture, bool], None]) -> None:
         self._trained, self._restyler, self._show = trained, restyler, show
-        # Of each client's last view: its camera, and the sharpest size whose features were kept, with them.
-        self._views: dict[Hashable, tuple[Camera, tuple[int, int], list[ViewChunk]]] = {}
-        self._pixel_seconds = 1e-5  # a running mean, until something was measured a guess
+        # Of each client's last view: its camera, and the features of the whole picture.
+        self._views: dict[Hashable, tuple[Camera, list[ViewChunk]]] = {}
 
     def forget(self, client: Hashable) -> None:
         """Drop what is kept for a client."""
         self._views.pop(client, None)
 
     def render(self, client: Hashable, request: Request) -> Steps[None]:
-        """Show ever sharper pictures, a step each chunk of rays."""
-        camera, ready, features = self._views.get(client, (None, None, []))
-        if camera != request.camera:
-            self._views.pop(client, None)
-            ready = None
+        """Show a small picture of a new camera, then the whole one, a step each chunk of rays."""
+        kept = self._views.get(client)
+        if kept is not None and kept[0] != request.camera:
+            del self._views[client]
+            kept = None
         styled = self._restyler.styled(request.shown.look)
         full = cameras_of([request.camera], longest=request.longest)
-        sizes = resolutions((int(full.size[0, 0]), int(full.size[0, 1])))
-        # From the size whose features are kept, else from the finest that should come at once, up to the full one.
-        quick = [k for k, (width, height) in enumerate(sizes) if width * height * self._pixel_seconds <= FIRST_SECONDS]
-        for size in sizes[sizes.index(ready) if ready in sizes else max(quick, default=0) :]:
-            start, again = time.perf_counter(), size == ready
+        width, height = full.size[0].tolist()
+        small = (max(1, round(width / _PREVIEW)), max(1, round(height / _PREVIEW)))
+        for size in [(width, height)] if kept else [small, (width, height)]:
             rows: list[Tensor] = []
             captured: list[Tensor] = []
             parts: list[ViewChunk] = []
             # Features are marched once; another look only decodes them again.
-            for part in features if again else self._parts(cameras_of([request.camera], size), 0):
+            for part in kept[1] if kept else _parts(self._trained, cameras_of([request.camera], size), 0):
                 rows.append(self._colours(part, styled, request.shown))
                 if request.captured:
                     captured.append(part.colour(self._trained.model.decoder, None).cpu())
                 parts.append(part)
                 yield
-            if not again:
-                seconds = (time.perf_counter() - start) / (size[0] * size[1])
-                self._pixel_seconds += 0.3 * (seconds - self._pixel_seconds)
-                if sum(part.bytes for part in parts) <= CACHE_BYTES:
-                    self._views[client] = (request.camera, size, parts)
+            whole = size == (width, height)
+            if whole and sum(part.bytes for part in parts) <= CACHE_BYTES:
+                self._views[client] = (request.camera, parts)
             shape = (size[1], size[0])
             if request.shown.map == "depth":
                 depth, opacity = torch.cat(rows).view(*shape, 2).unbind(-1)
                 picture = depth_image(depth, opacity)
             else:
                 picture = to_uint8(torch.cat(rows).view(*shape, 3))
-            self._show(client, "look", picture, size == sizes[-1])
+            self._show(client, "look", picture, whole)
             if captured:
-                self._show(client, "captured", to_uint8(torch.cat(captured).view(*shape, 3)), size == sizes[-1])
+                self._show(client, "captured", to_uint8(torch.cat(captured).view(*shape, 3)), whole)
             yield
 
     @torch.inference_mode()
@@ -206,31 +186,14 @@ class FieldPainter:
 
         return _mapped(colours, part.opacity.cpu(), shown, styled, match, memberships)
 
-    def _parts(self, cameras: Cameras, view: int) -> Iterable[ViewChunk]:
-        trained = self._trained
-        config = replace(trained.config.render, chunk=min(CHUNK, trained.config.render.chunk))
-        return view_chunks(trained.model, trained.known.facts, cameras, view, config)
 
-    def frame(self, cameras: Cameras, view: int, look: Restyle | None) -> Steps[Picture]:
-        """Render one frame of a film, step by step, and return it."""
-        rows = []
-        for part in self._parts(cameras, view):
-            rows.append(part.colour(self._trained.model.decoder, look).cpu())
-            yield
-        width, height = (int(v) for v in cameras.size[view])
-        return to_uint8(torch.cat(rows).view(height, width, 3))
+def _parts(trained: Trained, cameras: Cameras, view: int) -> Iterable[ViewChunk]:
+    """A view of a field, some rays at a time."""
+    config = replace(trained.config.render, chunk=min(CHUNK, trained.config.render.chunk))
+    return view_chunks(trained.model, trained.known.facts, cameras, view, config)
 
 
-def resolutions(size: tuple[int, int]) -> list[tuple[int, int]]:
-    """Sizes (width, height) from the coarsest to `size` itself, each twice as wide as the one before."""
-    sizes, divisor = [size], 2
-    while max(size) / divisor >= _MIN_SIDE:
-        sizes.append((max(1, round(size[0] / divisor)), max(1, round(size[1] / divisor))))
-        divisor *= 2
-    return sizes[::-1]
-
-
-def cameras_of(cameras: "list[Camera]", size: tuple[int, int] | None = None, longest: int = 640) -> Cameras:
+def cameras_of(cameras: Sequence[Camera], size: tuple[int, int] | None = None, longest: int = 640) -> Cameras:
     """Pinhole cameras of one size: `size`, or the shape of the first one's canvas, `longest` pixels at its longer side.
 
     Each keeps its vertical angle. Raises UsageError for axes that are no rotation.
@@ -256,69 +219,43 @@ def cameras_of(cameras: "list[Camera]", size: tuple[int, int] | None = None, lon
     return replace(ideal_cameras(torch.stack(poses), 1.0, size), focal=focals, centre=centres)
 
 
-Frame: TypeAlias = Callable[[Cameras, int, Restyle | None], Steps[Picture]]
-"""Renders one frame, step by step."""
+FPS, FILM_SIDE = 24.0, 960
+"""Frames a second of a film, and its longest side in pixels."""
 _MAX_SECONDS = 600.0
 
 
-class Key(NamedTuple):
-    """A keyframe of a film."""
-
-    camera: Camera
-    look: Look
+def film_gap(seconds: float) -> int:
+    """Frames from one key to the next, which are so many seconds apart."""
+    return max(1, round(seconds * FPS))
 
 
-class FilmPlan(NamedTuple):
-    """Keyframes and timing of a film."""
+def film_cameras(keys: Sequence[Key], seconds: float, side: int = FILM_SIDE) -> Cameras:
+    """A camera each frame, of even sizes in the shape of the first key's canvas; a single key is one frame.
 
-    keys: tuple[Key, ...]
-    seconds: float
-    """Between keys."""
-    fps: float
-    side: int
-    """Longest side, in pixels."""
-
-    @property
-    def gap(self) -> int:
-        """Frames from one key to the next."""
-        return max(1, round(self.seconds * self.fps))
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Even width and height, in the shape of the first key's canvas."""
-        width, height = self.keys[0].camera.size
-        by = self.side / max(width, height) / 2
-        return max(2, 2 * round(width * by)), max(2, 2 * round(height * by))
-
-
-def film_cameras(plan: FilmPlan) -> Cameras:
-    """A camera each frame; a single key is one frame. Raises UsageError for no keys or a film that is too long."""
-    if not plan.keys:
+    Raises UsageError for no keys or a film that is too long.
+    """
+    if not keys:
         raise UsageError("film: no keys yet; go somewhere and add one")
-    seconds = plan.seconds * (len(plan.keys) - 1)
-    if seconds > _MAX_SECONDS:
-        raise UsageError(f"film: {seconds:.0f} s; at most {_MAX_SECONDS:.0f} s are filmed from the page")
-    keys = cameras_of([key.camera for key in plan.keys], plan.size)
-    return interpolate(keys, torch.arange(len(plan.keys)), plan.gap - 1)
+    length = seconds * (len(keys) - 1)
+    if length > _MAX_SECONDS:
+        raise UsageError(f"film: {length:.0f} s; at most {_MAX_SECONDS:.0f} s are filmed from the page")
+    width, height = keys[0].camera.size
+    by = side / max(width, height) / 2
+    size = (max(2, 2 * round(width * by)), max(2, 2 * round(height * by)))
+    cameras = cameras_of([key.camera for key in keys], size)
+    return interpolate(cameras, torch.arange(len(keys)), film_gap(seconds) - 1)
 
 
-def write_film_files(
-    folder: Path,
-    plan: FilmPlan,
-    encoder: str,
-    stylizer: RegionToneConfig | None = None,
-    origin: Origin = (0.0, 0.0, 0.0),
-) -> None:
+def write_film_files(folder: Path, keys: Sequence[Key], seconds: float, scene: Scene, side: int = FILM_SIDE) -> None:
     """Write path.json, keys.json, and a folder a look with style.json and its photographs.
 
-    `encoder` is the identity of the scene's semantic encoder, `stylizer` what its looks are based on; None = the default.
-    The path is in the capture's coordinates; `origin` is that of the scene.
+    The path is in the capture's coordinates.
     """
-    write_camera_path(folder / "path.json", film_cameras(plan), plan.fps, origin)
+    write_camera_path(folder / "path.json", film_cameras(keys, seconds, side), FPS, scene.origin)
     # Keys with equal looks share a style, so that nothing is restyled between them.
     looks: dict[Look, Path] = {}
     rows: list[dict[str, object]] = []
-    for i, key in enumerate(plan.keys):
+    for i, key in enumerate(keys):
         if not key.look.plain and key.look not in looks:
             path = folder / f"style-{len(looks) + 1}" / "style.json"
             path.parent.mkdir()
@@ -329,21 +266,31 @@ def write_film_files(
                 plain = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stem)
                 references.append(path.with_name(f"{k + 1}-{plain or 'photograph'}.png"))
                 shutil.copyfile(photograph.path, references[-1])
-            style_of_look = replace(style_config(key.look, stylizer), references=tuple(references))
-            write_style(path, StyleFile(style_of_look, {}, encoder))
+            style_of_look = replace(key.look.config(), references=tuple(references))
+            write_style(path, StyleFile(style_of_look, {}, scene.semantic_encoder))
             looks[key.look] = path
         # A key without a look is the scene as captured.
         style = looks.get(key.look)
-        rows.append({"frame": i * plan.gap, "style": None if style is None else str(style.relative_to(folder))})
+        rows.append({"frame": i * film_gap(seconds), "style": None if style is None else str(style.relative_to(folder))})
     write_json(folder / "keys.json", {"format": 1, "keyframes": rows})
 
 
-def film_frames(folder: Path, scene: Scene, frame: Frame) -> list[Steps[Picture]]:
+def film_frames(folder: Path, scene: Scene) -> list[Steps[Picture]]:
     """The frames of a film's folder, each to be rendered step by step."""
     cameras, _ = read_camera_path(folder / "path.json", scene.origin)
     looks = keyed_looks(scene, read_keyframes(folder / "keys.json"))
 
     def rendered(number: int) -> Steps[Picture]:
-        return (yield from frame(cameras, number, looks(number)))
+        look = looks(number)
+        yield
+        if not isinstance(scene, Trained):
+            return to_uint8(scene.restyled(look).render(cameras, number).rgb)
+        # A field takes its time: after each chunk of rays a client may come first.
+        rows = []
+        for part in _parts(scene, cameras, number):
+            rows.append(part.colour(scene.model.decoder, look).cpu())
+            yield
+        width, height = cameras.size[number].tolist()
+        return to_uint8(torch.cat(rows).view(height, width, 3))
 
     return [rendered(number) for number in range(len(cameras))]

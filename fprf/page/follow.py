@@ -3,10 +3,10 @@ looks the folder says so (`training.driver.watch`), for which training saves mor
 """
 
 import json
-import time
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 from ..errors import FprfError
 from ..training.driver import schedule_of, watch
@@ -26,7 +26,8 @@ _TAIL = 4096
 class TrainingFollower:
     """Keeps the scene that a server shows at the newest checkpoint of a run.
 
-    `load` opens the run, and `opened` is the session where it is open already; without, it is opened at the first checkpoint.
+    `load` opens the run, and `opened` is the session where it is open already; without, it is opened at the first checkpoint,
+    with `references` on the shelf.
     """
 
     def __init__(
@@ -35,15 +36,16 @@ class TrainingFollower:
         root: Path,
         load: "Callable[[], Viewed]",
         opened: "Session | None" = None,
+        references: Sequence[Path] = (),
         pixels: int = 640,
     ) -> None:
-        self._server, self._root, self._load, self._session, self._pixels = server, root, load, opened, pixels
+        self._server, self._root, self._load, self.session = server, root, load, opened
+        self._references, self._pixels = references, pixels
         self._shown = -1 if opened is None else opened.viewed.step
 
-    def run(self) -> NoReturn:
-        """Follow until interrupted."""
-        while True:
-            time.sleep(_POLL)
+    def run(self, ended: threading.Event) -> None:
+        """Follow until the event is set."""
+        while not ended.wait(_POLL):
             try:
                 self.tick()
             except (FprfError, OSError) as error:  # the page says so; the next checkpoint may be better
@@ -57,12 +59,12 @@ class TrainingFollower:
         if newest <= self._shown:
             return
         self._shown = newest
-        if self._session is None:
-            self._session = self._server.open(self._load, (), self._pixels, warm=False)
+        if self.session is None:
+            self.session = self._server.open(self._load, self._references, self._pixels, warm=False)
         else:
-            self._session.reload(self._load())
+            self.session.reload(self._load())
         if (progress := training_progress(self._root)) is not None:
-            self._session.trained(progress)
+            self.session.trained(progress)
 
 
 def training_progress(root: Path) -> dict[str, Any] | None:

@@ -44,7 +44,7 @@ class View(Message, tag="view"):
 class Set(Message, tag="set"):
     """A control of the look was moved."""
 
-    name: Literal["strength", "bold", "luminance", "temperature", "clusters", "blend", "smoothness"]
+    name: Literal["strength", "bold", "luminance", "clusters", "blend", "stylizer.temperature", "stylizer.smoothness"]
     value: Number
 
 
@@ -84,10 +84,10 @@ class Map(Message, tag="map"):
 
 
 class Keep(Message, tag="keep"):
-    """A look is kept under a name, taken up again, or dropped."""
+    """A look is kept under a name, or taken up again."""
 
     name: Text
-    action: Literal["keep", "restore", "drop"]
+    action: Literal["keep", "restore"]
 
 
 class Key(Message, tag="key"):
@@ -102,17 +102,11 @@ class Film(Message, tag="film"):
     """The film is to be made."""
 
     seconds: Annotated[float, Meta(ge=0.1, le=60)] = 2.0
-    fps: Annotated[float, Meta(ge=1, le=60)] = 24.0
-    side: Annotated[int, Meta(ge=64, le=1920)] = 960
 
 
-class Picture(Message, tag="picture"):
-    """A picture of this view is to be saved."""
-
-    camera: Camera
-
-
-AnyMessage: TypeAlias = View | Set | Preset | Card | Pick | Region | Map | Keep | Key | Film | Picture
+Change: TypeAlias = Set | Preset | Card | Region | Map | Keep | Key
+"""Messages that change what all clients see."""
+AnyMessage: TypeAlias = View | Pick | Film | Change
 
 Minutes: TypeAlias = Annotated[float, Meta(ge=0.05, le=600)]
 
@@ -138,13 +132,11 @@ class Open(Message, tag="open"):
 
 
 class Stop(Message, tag="stop"):
-    """What is being made is to be stopped: to show what there is, or to leave it."""
-
-    then: Literal["show", "leave"] = "leave"
+    """What is being made is to be ended; a scene that was trained so far is kept and shown."""
 
 
 class Leave(Message, tag="leave"):
-    """The scene that is shown is to be closed."""
+    """The scene that is shown, or made, is to be closed."""
 
 
 StartRequest: TypeAlias = New | Make | Open | Stop | Leave

@@ -58,12 +58,6 @@ class RenderWorker:
         with self._change:
             self._drop((_CLIENT, client))
 
-    @property
-    def idle(self) -> bool:
-        """True where no client waits; work for idle times does not count."""
-        with self._change:
-            return not self._dropped and all(order == _IDLE for order, _ in self._work)
-
     def close(self, timeout: float = 5.0) -> None:
         """Stop after the current step and drop the rest."""
         with self._change:

@@ -1,15 +1,13 @@
-"""Looks, and photographs, on one scene.
+"""Photographs and looks on one scene.
 
-A look says how a scene is coloured: an immutable value, made by the page's controls, that `style_config` translates into the
-terms of `style.json`. `Restyler` applies looks; it runs on the render worker alone. A photograph is encoded when it comes and
-clustered once for each number of clusters: a slider costs the stylizer alone.
+`Restyler` runs on the render worker alone. A photograph is encoded when it comes and clustered once for each number of
+clusters: a slider costs the stylizer alone.
 """
 
-from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Annotated, TypeVar
 
 import torch
 from torch import Tensor
@@ -17,21 +15,20 @@ from torch import Tensor
 from ..datamanagers.images import load_image
 from ..errors import UsageError
 from ..interfaces import Scene
-from ..io.images import Picture, shrink
-from ..plugins.stylizers.config import RegionToneConfig
+from ..io.images import shrink
 from ..rendering.cameras import Cameras
-from ..style.config import StyleConfig, labels
-from ..style.dictionary import Encoders, Reference, StyleDictionary, build_dictionary, concatenate, encode_photograph
+from ..style.config import labels
+from ..style.dictionary import Encoders, StyleDictionary, build_dictionary, concatenate, encode_photograph
 from ..style.files import StyleFile
 from ..style.look import Restyle
 from ..style.matching import unit
 from ..style.regions import memberships
 from ..style.restyle import Styled, apply_dictionary
 from ..style.scene_style import SceneStyle
+from .state import Look, Photograph, RegionInfo
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
-RegionAction: TypeAlias = Literal["pin", "forbid", "keep"]
 _THUMBNAIL = 128
 """Longest side in pixels."""
 _CACHED = 24
@@ -40,140 +37,11 @@ _SOLID = 0.01
 """Opacity below which there is nothing to point at."""
 
 
-@dataclass(frozen=True, eq=False)
-class Photograph:
-    """A photograph on the shelf, encoded once; compared by identity."""
-
-    number: int
-    """Its name in requests of the page."""
-    name: str
-    path: Path
-    thumbnail: Picture
-    reference: Reference
-
-
-class RegionRule(NamedTuple):
-    """A style that a region may take; `photograph` is None where the region is kept as it is."""
-
-    region: int
-    action: RegionAction
-    photograph: Photograph | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Look:
-    """Colours of a scene; equal looks are the same style. Ranges are those of `StyleConfig`."""
-
-    mix: tuple[tuple[Photograph, float], ...] = ()
-    """Photographs with their weights, above 0, in the order of the shelf; none = the scene as it is."""
-    strength: float = 1.0
-    bold: float = StyleConfig.bold
-    """How far paint goes where the match is not sure, in [0, 1]."""
-    luminance: float = 0.0
-    temperature: float = 0.2
-    """Of the matching of regions and codes, relative; low = each region takes from what is most like it."""
-    clusters: int = 20
-    blend: float = 0.1
-    smoothness: float = RegionToneConfig.smoothness
-    """Smoothness of styles between neighbouring regions without an edge between them, at least 0."""
-    rules: frozenset[RegionRule] = frozenset()
-
-    def __post_init__(self) -> None:
-        style_config(self)  # which knows the ranges
-
-    @property
-    def plain(self) -> bool:
-        """True for the scene as it was captured."""
-        return not self.mix or self.strength == 0
-
-
-def only(look: Look, photograph: Photograph) -> Look:
-    """The look with one photograph alone."""
-    return _valid_rules(replace(look, mix=((photograph, 1.0),)))
-
-
-def set_weight(look: Look, photograph: Photograph, weight: float, shelf: Iterable[Photograph]) -> Look:
-    """The look with another weight of a photograph; 0 removes it together with the rules that name it."""
-    weights = dict(look.mix) | {photograph: weight}
-    mix = tuple((each, weights[each]) for each in shelf if weights.get(each, 0.0) > 0)
-    return _valid_rules(replace(look, mix=mix))
-
-
-def set_rule(look: Look, region: int, action: RegionAction | None, photograph: Photograph | None = None) -> Look:
-    """The look with a rule for a region; None removes its rules. Pinning and keeping replace the rules it had.
-
-    A region for which every photograph would be forbidden loses its rules instead.
-    """
-    # Rules of other regions stay.
-    mine = {rule for rule in look.rules if rule.region == region}
-    rest = look.rules - mine
-    if action is None:
-        return replace(look, rules=rest)
-    new = {RegionRule(region, action, None if action == "keep" else photograph)}
-    # Forbidden photographs add up; every other rule takes the place of those before it.
-    if action == "forbid":
-        new |= {rule for rule in mine if rule.action == "forbid"}
-        if {rule.photograph for rule in new} >= {each for each, _ in look.mix}:
-            return replace(look, rules=rest)
-    return replace(look, rules=rest | new)
-
-
-def renumbered(look: Look, regions: Sequence[int]) -> Look:
-    """The look with region r as regions[r]: regions were measured again."""
-    return replace(look, rules=frozenset(rule._replace(region=regions[rule.region]) for rule in look.rules))
-
-
-def style_config(look: Look, stylizer: RegionToneConfig | None = None) -> StyleConfig:
-    """The look as a style; references in the order of the mix."""
-    number = {photograph: i for i, (photograph, _) in enumerate(look.mix)}
-
-    def order(rule: RegionRule) -> tuple[int, str, int]:
-        return rule.region, rule.action, -1 if rule.photograph is None else number.get(rule.photograph, -1)
-
-    # REGION=REFERENCE, by the reference's place in the mix, as `--pin` and `--forbid` take them; `--keep` takes regions.
-    texts: dict[str, list[str]] = {"pin": [], "forbid": [], "keep": []}
-    for rule in sorted(look.rules, key=order):
-        if rule.photograph is None:
-            texts[rule.action].append(str(rule.region))
-        elif rule.photograph in number:
-            texts[rule.action].append(f"{rule.region}={number[rule.photograph]}")
-    return StyleConfig(
-        references=tuple(photograph.path for photograph, _ in look.mix),
-        weights=tuple(weight for _, weight in look.mix),
-        stylizer=replace(stylizer or RegionToneConfig(), temperature=look.temperature, smoothness=look.smoothness),
-        clusters=look.clusters,
-        blend=look.blend,
-        strength=look.strength,
-        bold=look.bold,
-        luminance=look.luminance,
-        pin=tuple(texts["pin"]),
-        forbid=tuple(texts["forbid"]),
-        keep=tuple(texts["keep"]),
-    )
-
-
-def _valid_rules(look: Look) -> Look:
-    """The look without rules for photographs that are not in its mix."""
-    mix = {photograph for photograph, _ in look.mix}
-    return replace(look, rules=frozenset(rule for rule in look.rules if rule.photograph is None or rule.photograph in mix))
-
-
-class RegionInfo(NamedTuple):
-    """A region that was picked."""
-
-    region: int
-    share: float
-    """Of the scene."""
-    taken: tuple[tuple[str, float], ...]
-    """Share that it takes from each photograph, the largest first; empty without a style."""
-
-
 class Restyler:
     """Looks as styles on one scene; encoders are opened when they are first needed."""
 
-    def __init__(self, scene: Scene, stylizer: RegionToneConfig | None = None) -> None:
+    def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        self._stylizer = stylizer
         self._encoders: Encoders | None = None
         self._stale = False
         self._photographs = 0
@@ -207,13 +75,13 @@ class Restyler:
 
         def made() -> Styled:
             # Each photograph is clustered once; a mix is their dictionaries side by side under the mix's weights.
-            clusters, blend, parts = look.clusters, look.blend, []
+            style = look.config()
+            clusters, blend, parts = style.clusters, style.blend, []
             for photograph, _ in look.mix:
                 cluster = partial(
                     build_dictionary, [photograph.reference], clusters=clusters, blend=blend, seed=self.encoders.seed
                 )
                 parts.append(_cached(self._dictionaries, (photograph, clusters, blend), cluster))
-            style = style_config(look, self._stylizer)
             dictionary = concatenate(parts, labels(style.references), [weight for _, weight in look.mix])
             return apply_dictionary(self.scene, StyleFile(style), self.encoders, dictionary)
 

@@ -314,10 +314,10 @@ class ViewerServer:
             self.post(None, kind, message)
 
     def _hello(self) -> list[tuple[str, dict[str, Any]]]:
-        back = {"back": self._start is not None}
-        if self._session is not None:
-            return [(kind, {**message, **back}) for kind, message in self._session.hello()]
-        return [("scene", {"type": "loading"} if self._start is None else self._start.state())]
+        start = [] if self._start is None else [("start", self._start.state())]
+        if self._session is not None:  # without a start there is none to go back to
+            return [*self._session.hello(), *start]
+        return start or [("scene", {"type": "loading"})]
 
     def _close_session(self) -> None:
         self._session = None
@@ -334,11 +334,9 @@ class ViewerServer:
             Route("/card", self._card),
             Route("/gaussians", self._gaussians),
             Route("/film", self._film),
-            Route("/picture", self._picture),
             Route("/photograph", self._photograph, methods=["POST"]),
             Route("/start", self._start_request, methods=["POST"]),
             Route("/start/piece", self._start_piece, methods=["POST"]),
-            Route("/start/picture", self._start_picture),
         ]
 
     def _make_app(self) -> ASGIApp:
@@ -417,12 +415,6 @@ class ViewerServer:
             raise HTTPException(404, "no film yet")
         return self._download(path, f"{path.parent.name}.mp4")
 
-    async def _picture(self, request: Request) -> Response:
-        pictures, number = self.session.state.pictures, _integer(request, "number")
-        if number >= len(pictures):
-            raise HTTPException(404, "no such picture")
-        return self._download(pictures[number], pictures[number].name)
-
     def _download(self, path: Path, name: str) -> Response:
         """A file to be saved under the scene's name and its own."""
         return FileResponse(path, filename=f"{self.session.viewed.name}-{name}")
@@ -448,12 +440,6 @@ class ViewerServer:
         place = (query.get("scene", ""), query.get("name", ""), _integer(request, "at"), _integer(request, "size"))
         await asyncio.to_thread(self.start.piece, *place, data)
         return JSONResponse({})
-
-    async def _start_picture(self, request: Request) -> Response:
-        data = await asyncio.to_thread(self.start.picture)
-        if not data:
-            raise HTTPException(404, "no picture yet")
-        return Response(data, media_type="image/jpeg")
 
     async def body(self, request: Request) -> bytes:
         """A body of at most `_MAX_BODY` bytes. A longer one is refused by its header, or as soon as it is."""

@@ -1,4 +1,4 @@
-"""The scene that is viewed: its looks, its clients' wishes, and everything that changes either. Knows no network.
+"""The scene that is viewed: its state (`state.py`), its clients' requests, its photographs and films. Knows no network.
 
 Calls come from any thread. What touches the model runs on the render worker; clients learn of the results by messages, of which
 a newer one of the same kind takes the place of one that was not sent yet.
@@ -6,53 +6,34 @@ a newer one of the same kind takes the place of one that was not sent yet.
 
 import threading
 from collections.abc import Callable, Hashable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import msgspec
 import numpy as np
 
 from ..errors import FprfError, UsageError
 from ..interfaces import Scene
-from ..io.images import Picture, encode, to_uint8, write_image
-from ..io.maps import palette
+from ..io.images import Picture, encode
 from ..io.video import write_video
-from ..plugins.stylizers.config import RegionToneConfig
-from ..rendering.cameras import Cameras
 from ..splats.files import Capture, write_capture, write_gaussians
 from ..splats.scene import SplatScene
-from ..style.config import PRESETS
-from ..style.look import Restyle
+from ..style.config import StyleConfig
 from ..training.loading import LoadedRun, Trained
 from . import messages
-from .drawing import (
-    FieldPainter,
-    FilmPlan,
-    Key,
-    Map,
-    Request,
-    Shown,
-    cameras_of,
-    film_frames,
-    gaussian_colours,
-    write_film_files,
-)
+from .drawing import FPS, FieldPainter, Request, cameras_of, film_frames, gaussian_colours, write_film_files
 from .pack import colour_header, colour_section, container
 from .render_worker import RenderWorker, Steps
-from .restyler import Look, Photograph, RegionInfo, Restyler, matching_regions, only, renumbered, set_rule, set_weight
+from .restyler import Restyler, matching_regions
+from .state import NOW, Look, Photograph, Shown, State
 from .uploads import Uploads, shown_name
 from .writer import about, packed_scene
 
 Post: TypeAlias = Callable[[Hashable | None, str, "Mapping[str, Any] | bytes"], None]
 """Sends a client, or all (None), a message under the name of its kind."""
-SHELF = 12
-"""Photographs on the shelf; the oldest that no look needs makes room."""
-_MAX_KEYS = 64
 _QUALITY = {False: 72, True: 90}
-NOW = "Now"
-"""Name of the colours of the present look, beside those of looks that are kept."""
+"""Of JPEGs: of a preview, and of the whole picture."""
 
 
 @dataclass(frozen=True)
@@ -64,11 +45,11 @@ class Viewed:
     home: int
     """View at which clients begin."""
     root: Path | None = None
-    """Folder for films and pictures: that of a run; None = there is none."""
+    """Folder for films: that of a run; None = there is none."""
     capture: Capture | None = None
     """The file of Gaussians that it was read from; None = it is a run."""
-    stylizer: RegionToneConfig | None = None
-    """Style that a look starts from; None = the default."""
+    style: StyleConfig = StyleConfig()
+    """Style that looks start from."""
     step: int = 0
     """Step of the checkpoint that it was read from."""
 
@@ -79,50 +60,13 @@ def view_of_run(opened: LoadedRun[Scene]) -> Viewed:
     return Viewed(opened.scene, opened.known.name, views[len(views) // 2], opened.run.root, step=opened.step)
 
 
-@dataclass(frozen=True, kw_only=True)
-class State:
-    """What the page shows, for all clients alike but for their cameras."""
-
-    shelf: tuple[Photograph, ...] = ()
-    look: Look = field(default_factory=Look)
-    together: bool = False
-    """A photograph that is dropped joins the others; else it becomes the style alone."""
-    map: Map = "none"
-    picked: RegionInfo | None = None
-    kept: tuple[tuple[str, Look], ...] = ()
-    """Looks that were kept, by name."""
-    keys: tuple[Key, ...] = ()
-    film: tuple[int, int, Path | None] = (0, 0, None)
-    """Frames done, of how many, and the film that is finished."""
-    pictures: tuple[Path, ...] = ()
-    """Pictures that were saved."""
-
-    @property
-    def shown(self) -> Shown:
-        """What is shown of the scene."""
-        return Shown(self.look, self.map, None if self.picked is None else self.picked.region)
-
-    @property
-    def in_use(self) -> frozenset[Photograph]:
-        """Photographs that some look needs."""
-        looks = [self.look, *(look for _, look in self.kept), *(key.look for key in self.keys)]
-        return frozenset(photograph for look in looks for photograph, _ in look.mix)
-
-    def photograph(self, number: int | None) -> Photograph:
-        """A photograph of the shelf. Raises UsageError where it is not there."""
-        for each in self.shelf:
-            if each.number == number:
-                return each
-        raise UsageError(f"card {number}: none of the shelf")
-
-
 class Session:
     """Use as a context manager, which ends its threads and processes."""
 
     def __init__(self, viewed: Viewed, post: Post, *, longest: int = 640, together: bool = False) -> None:
         self.viewed, self._post, self._longest = viewed, post, longest
-        self.restyler = Restyler(viewed.scene, viewed.stylizer)
-        self.state = State(together=together)
+        self.restyler = Restyler(viewed.scene)
+        self.state = State(look=Look(style=viewed.style), together=together)
         self.uploads = Uploads()
         self._lock = threading.RLock()
         self._requests: dict[Hashable, Request] = {}
@@ -164,7 +108,7 @@ class Session:
         scene = {"type": "scene", "name": viewed.name, "gaussians": drawn_there, "step": viewed.step}
         ready = [("colours " + name, self._colours_message(name)) for name in self._colours]
         training = [] if self._progress is None else [("training", self._progress)]
-        return [("scene", scene), ("state", self._described()), *ready, *training]
+        return [("scene", scene), ("state", self.state.described()), *ready, *training]
 
     def handle(self, client: Hashable, message: messages.AnyMessage) -> None:
         """Do what a client asks for. Raises FprfError with what is wrong with it."""
@@ -177,35 +121,23 @@ class Session:
                     with self._lock:
                         self._requests[client] = request
                     self._worker.draw(client, self._painter.render(client, request))
-            case messages.Set():
-                value: Any = int(message.value) if message.name == "clusters" else round(message.value, 4)
-                self.apply(lambda state: replace(state, look=replace(state.look, **{message.name: value})))
-            case messages.Preset():
-                values: dict[str, Any] = {path.rpartition(".")[2]: value for path, value in PRESETS[message.name].items()}
-                self.apply(lambda state: replace(state, look=replace(state.look, **values)))
-            case messages.Card():
-                self.apply(lambda state: _carded(state, message))
             case messages.Pick():
                 # The place is a share of the canvas; its right and lower edges belong to the last pixels.
                 cameras = cameras_of([message.camera], longest=1000)
                 width, height = cameras.size[0].tolist()
                 at = (min(message.x * width, width - 1e-3), min(message.y * height, height - 1e-3))
                 self._worker.run("pick", lambda: self._select(self.restyler.region_at(cameras, at)))
-            case messages.Region():
-                self.apply(lambda state: _ruled(state, message))
-            case messages.Map():
-                self.apply(lambda state: replace(state, map=message.map))
-            case messages.Keep():
-                # A kept look of Gaussians becomes a style of the page, with colours of its own.
-                self.apply(lambda state: _kept(state, message))
-                if message.action == "keep" and isinstance(self.viewed.scene, SplatScene):
-                    self._worker.run(("kept", message.name), lambda: self._colour(message.name, Shown(self.state.look)))
-            case messages.Key():
-                self.apply(lambda state: _keyed(state, message))
             case messages.Film():
-                self._record(FilmPlan(self.state.keys, message.seconds, message.fps, message.side))
-            case messages.Picture():
-                self._save_picture(message.camera)
+                self._record(message.seconds)
+            case messages.Keep(action="keep") if isinstance(self.viewed.scene, SplatScene):
+                # A look of Gaussians that is kept becomes a style of the page, with colours of its own.
+                self.apply(lambda state: state.changed(message))
+                name, look = self.state.kept[-1]
+                self._worker.run(("kept", name), lambda: self._colour(name, Shown(look)))
+            case _:
+                if isinstance(message, messages.Key) and message.camera is not None:
+                    cameras_of([message.camera])  # refused where it is none
+                self.apply(lambda state: state.changed(message))
 
     def disconnect(self, client: Hashable) -> None:
         """Drop everything of a client."""
@@ -232,19 +164,15 @@ class Session:
         if now.shown != before.shown:
             self._refresh()
         if now != before:
-            self._post(None, "state", self._described())
+            self._post(None, "state", self.state.described())
 
     def upload(self, data: bytes, name: str) -> Photograph:
         """Decode and encode a photograph and restyle the scene with it. Raises DataError for what is none."""
         path = self.uploads.store(data)
 
         def add() -> Photograph:
-            # Names tell photographs apart on the page: an equal one gets a number.
-            taken = {photograph.name for photograph in self.state.shelf}
-            plain = shown_name(name)
-            unused = plain if plain not in taken else next(each for n in count(2) if (each := f"{plain} ({n})") not in taken)
-            photograph = self.restyler.encode(path, unused)
-            self.apply(lambda state: _added(state, photograph))
+            photograph = self.restyler.encode(path, self.state.unused_name(shown_name(name)))
+            self.apply(lambda state: state.added(photograph))
             # Photographs that left the shelf and that no look needs go, with what was made of them: some 6 MB each.
             used = self.state.in_use | frozenset(self.state.shelf)
             for gone in {*self._photographs, photograph} - used:
@@ -267,7 +195,7 @@ class Session:
             path.write_bytes(encode(np.linspace(0, 255, 96 * 128 * 3).reshape(96, 128, 3).astype(np.uint8), "png"))
             photograph = self.restyler.encode(path, "warm-up")
             yield
-            styled = self.restyler.styled(only(Look(), photograph))
+            styled = self.restyler.styled(Look(style=self.viewed.style).mixed([(photograph, 1.0)]))
             yield
             if styled is not None and isinstance(self.viewed.scene, SplatScene):
                 self.packed.colours(self.viewed.scene.restyled(styled.restyle).shown.harmonics, rounds=1)
@@ -289,7 +217,7 @@ class Session:
             # Regions are measured anew, in any order: what is pinned is found again among them.
             if before is not None and (self.state.look.rules or self.state.picked is not None):
                 regions = matching_regions(before, self.restyler.encoders.scene_style).tolist()
-                self.apply(lambda state: replace(state, look=renumbered(state.look, regions), picked=None))
+                self.apply(lambda state: replace(state, look=state.look.renumbered(regions), picked=None))
             if not self.state.look.plain:
                 self._refresh()
 
@@ -361,40 +289,17 @@ class Session:
         picked = None if region is None else self.restyler.region_info(self.state.look, region)
         self.apply(lambda state: replace(state, picked=picked))
 
-    def _frame(self, cameras: Cameras, view: int, look: Restyle | None) -> Steps[Picture]:
-        if self._painter is not None:
-            return (yield from self._painter.frame(cameras, view, look))
-        yield
-        return to_uint8(self.viewed.scene.restyled(look).render(cameras, view).rgb)
-
-    def _save_picture(self, camera: messages.Camera) -> None:
-        """Render what a camera sees, as large as it is there, into the scene's folder while no client waits for a picture."""
-        cameras = cameras_of([camera], longest=min(2048, round(max(camera.size))))
-        folder = (self.viewed.root or self.uploads.folder) / "pictures"
-
-        def work() -> Steps[None]:
-            try:
-                picture = yield from self._frame(cameras, 0, self.restyler.restyle(self.state.look))
-                path = _unused(folder, ".png")
-                folder.mkdir(parents=True, exist_ok=True)
-                write_image(path, picture)
-            except FprfError as error:
-                self.notify(f"picture: {error}", bad=True)
-            else:
-                self.apply(lambda state: replace(state, pictures=(*state.pictures, path)))
-
-        self._worker.run_when_idle(work())
-
-    def _record(self, plan: FilmPlan) -> None:
+    def _record(self, seconds: float) -> None:
         """Make a film in the scene's folder while no client waits for a picture, one at a time."""
         with self._lock:
             if self.state.film[1] and self.state.film[2] is None:
                 raise UsageError("film: one is being made; wait for it")
             if self.viewed.root is None:
                 raise UsageError("this scene has no folder to put a film in")
-            folder, scene = _unused(self.viewed.root / "films"), self.viewed.scene
+            films, scene = self.viewed.root / "films", self.viewed.scene
+            folder = next(each for number in count(1) if not (each := films / f"{number:04d}").exists())
             folder.mkdir(parents=True)
-            write_film_files(folder, plan, scene.semantic_encoder, self.viewed.stylizer, scene.origin)
+            write_film_files(folder, self.state.keys, seconds, scene)
             self.apply(lambda state: replace(state, film=(0, 1, None)))
 
         def rendered(frames: list[Steps[Picture]]) -> Iterator[Picture]:
@@ -405,8 +310,8 @@ class Session:
         def work() -> None:
             try:
                 # Frames are rendered one at a time, as the encoder asks for them.
-                frames = self._worker.result(lambda: film_frames(folder, scene, self._frame))
-                write_video(folder / "film.mp4", rendered(frames), plan.fps)
+                frames = self._worker.result(lambda: film_frames(folder, scene))
+                write_video(folder / "film.mp4", rendered(frames), FPS)
             except Exception as error:  # whatever it is, the next film can be made
                 self.apply(lambda state: replace(state, film=(0, 0, None)))
                 self.notify(f"film: {error}", bad=True)
@@ -420,115 +325,3 @@ class Session:
         expected = isinstance(error, FprfError)
         text = str(error) if expected else f"this should not have happened: {type(error).__name__}: {error}"
         self.notify(text, bad=True)
-
-    def _described(self) -> dict[str, Any]:
-        """The state as the page reads it."""
-        state, picked = self.state, self.state.picked
-        weights = dict(state.look.mix)
-        hues = palette(len(weights)).mul(255).round().int().tolist() if state.map == "matches" else []
-        colours = {each: "rgb({}, {}, {})".format(*hue) for each, hue in zip(weights, hues, strict=False)}
-        names = ("strength", "bold", "luminance", "temperature", "clusters", "blend", "smoothness")
-        return {
-            "type": "state",
-            "shelf": [
-                {"card": each.number, "name": each.name, "weight": weights.get(each, 0.0), "colour": colours.get(each)}
-                for each in state.shelf
-            ],
-            "look": {name: getattr(state.look, name) for name in names},
-            "map": state.map,
-            "picked": None
-            if picked is None
-            else {
-                "region": picked.region,
-                "share": picked.share,
-                "taken": [{"name": name, "share": share} for name, share in picked.taken],
-                "rules": [
-                    {"action": rule.action, "card": None if rule.photograph is None else rule.photograph.number}
-                    for rule in state.look.rules
-                    if rule.region == picked.region
-                ],
-            },
-            "kept": [name for name, _ in state.kept],
-            "keys": [msgspec.to_builtins(key.camera) for key in state.keys],
-            "film": {"done": state.film[0], "total": state.film[1], "ready": state.film[2] is not None},
-            "pictures": len(state.pictures),
-        }
-
-
-def _unused(folder: Path, ending: str = "") -> Path:
-    """The next film or picture: 0001 and so on."""
-    return next(each for number in count(1) if not (each := folder / f"{number:04d}{ending}").exists())
-
-
-def _added(state: State, photograph: Photograph) -> State:
-    """With a new photograph on the shelf and in the look; the oldest one that no look needs makes room."""
-    shelf = (*state.shelf, photograph)
-    together = state.together and state.look.mix
-    look = set_weight(state.look, photograph, 1.0, shelf) if together else only(state.look, photograph)
-    state = replace(state, shelf=shelf, look=replace(look, strength=look.strength or 1.0), picked=None)
-    while len(state.shelf) > SHELF:
-        spare = [each for each in state.shelf if each not in state.in_use] or [state.shelf[0]]
-        state = _removed(state, spare[0])
-    return state
-
-
-def _removed(state: State, photograph: Photograph) -> State:
-    """Without a photograph on the shelf and in the look; looks that were kept, and keys of the film, keep it."""
-    shelf = tuple(each for each in state.shelf if each is not photograph)
-    return replace(state, shelf=shelf, look=set_weight(state.look, photograph, 0.0, shelf))
-
-
-def _carded(state: State, message: messages.Card) -> State:
-    photograph = state.photograph(message.card)
-    if message.action == "remove":
-        return _removed(state, photograph)
-    if message.action == "alone":
-        return replace(state, look=only(state.look, photograph))
-    return replace(state, look=set_weight(state.look, photograph, message.weight, state.shelf))
-
-
-def _ruled(state: State, message: messages.Region) -> State:
-    if message.action == "close":
-        return replace(state, picked=None)
-    if state.picked is None:
-        raise UsageError("region: none is picked")
-    look, photograph = state.look, None
-    if message.action in ("pin", "forbid"):
-        photograph = state.photograph(message.card)
-        if photograph not in dict(look.mix):
-            look = set_weight(look, photograph, 1.0, state.shelf)
-    action = None if message.action == "free" else message.action
-    return replace(state, look=set_rule(look, state.picked.region, action, photograph))
-
-
-def _kept(state: State, message: messages.Keep) -> State:
-    """With a look kept under a name, or that of a name in use again, or dropped."""
-    name, held = " ".join(message.name.split())[:40], dict(state.kept)
-    if message.action == "restore" and name in held:
-        return replace(state, look=held[name])
-    others = tuple(row for row in state.kept if row[0] != name)
-    if message.action == "drop":
-        return replace(state, kept=others)
-    if not name or name in (NOW, "Captured") or message.action == "restore":
-        raise UsageError("keep look: give it a name of its own")
-    if len(others) >= _MAX_KEYS:
-        raise UsageError(f"keep look: at most {_MAX_KEYS} are kept; remove one first")
-    return replace(state, kept=(*others, (name, state.look)))
-
-
-def _keyed(state: State, message: messages.Key) -> State:
-    """With a keyframe more, less, or in another place."""
-    keys, at = list(state.keys), message.at
-    if message.action == "add":
-        if message.camera is None:
-            raise UsageError("key: a camera is needed")
-        if len(keys) >= _MAX_KEYS:
-            raise UsageError(f"film: at most {_MAX_KEYS} keys; remove one first")
-        cameras_of([message.camera])
-        return replace(state, keys=(*keys, Key(message.camera, state.look)))
-    if not at < len(keys):
-        raise UsageError(f"film: key {at + 1} of {len(keys)}: there is none")
-    key = keys.pop(at)
-    if message.action == "earlier":
-        keys.insert(max(0, at - 1), key)
-    return replace(state, keys=tuple(keys))

@@ -1,7 +1,8 @@
 """The start of `fprf view` without a run: photographs, a video or a capture come in, and become a scene that the viewer shows.
 
-Poses and training are `fprf process` and `fprf train` in processes of their own; the page shows the lines that they print. A
-scene has one folder: its `files`, the `scene` with their poses, and the run folder `run`.
+Poses and training are `fprf process` and `fprf train` in processes of their own; the page shows the lines that they print, and
+from the first checkpoint on the scene itself (`follow.py`). A scene has one folder: its `files`, the `scene` with their poses,
+and the run folder `run`.
 """
 
 import contextlib
@@ -15,11 +16,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from ..errors import DataError, FprfError, UsageError
 from .messages import Leave, Make, New, Open, StartRequest, Stop
 from .uploads import SceneFiles, Source, find_source, is_capture, newest_step
+
+if TYPE_CHECKING:
+    from .follow import TrainingFollower
 
 METHOD = "fprf-splats"
 _FILES, _SCENE, _RUN = "files", "scene", "run"
@@ -28,10 +32,6 @@ _LINES = 40
 _RECENT = 12
 _EXIT_TIMEOUT = 10.0
 """Seconds that a process has to save and end."""
-_PICTURE = 480
-"""Longest side of the picture of training, in pixels."""
-_SAVES = 40
-"""Times that training saves, and so shows another picture, at most every six seconds."""
 
 Stage: TypeAlias = Literal["idle", "poses", "training", "opening", "open"]
 
@@ -61,25 +61,26 @@ class _Left(Exception):
 class Start:
     """`output` holds a folder a scene; `show` opens the viewer on a run folder or a capture, `leave` closes it.
 
-    `post` sends all pages how far it is.
+    `follow` gives what opens it at the first checkpoint of a run that is trained, and follows it. `post` sends all pages how
+    far it is.
     """
 
     def __init__(
         self,
         output: Path,
         show: Callable[[Path, str], None],
+        follow: "Callable[[Path, str], TrainingFollower]",
         leave: Callable[[], None],
         post: Callable[[None, str, Mapping[str, Any]], None] = lambda client, kind, message: None,
     ) -> None:
-        self._output, self._show, self._leave, self._post = output.resolve(), show, leave, post
+        self._output, self._show, self._follow, self._leave, self._post = output.resolve(), show, follow, leave, post
         self._uploads: dict[str, SceneFiles] = {}
         self._progress = Progress()
-        self._lock, self._drawing = threading.Lock(), threading.Lock()
+        self._lock = threading.Lock()
         self._process: subprocess.Popen[str] | None = None
         self._stopped = ""
-        """Request on which it was stopped: `show` or `leave`."""
+        """Request on which it was stopped: `stop` or `leave`."""
         self._thread: threading.Thread | None = None
-        self._picture: tuple[int, bytes] = (-1, b"")
 
     def close(self) -> None:
         """End what is being made, as an interrupt at the terminal would."""
@@ -90,19 +91,8 @@ class Start:
     def state(self) -> dict[str, Any]:
         """How far it is, as the page reads it; idle, what can be opened."""
         progress = self._progress
-        step = newest_step(self._output / progress.name / _RUN) if progress.stage == "training" else -1
         recent = self._recent() if progress.stage == "idle" else []
-        return {"type": "start", **asdict(progress), "picture": step, "output": str(self._output), "recent": recent}
-
-    def picture(self) -> bytes:
-        """A view of the newest checkpoint as a JPEG; empty where there is none."""
-        run = self._output / self._progress.name / _RUN
-        with self._drawing:
-            step = newest_step(run)
-            if step > self._picture[0]:
-                with contextlib.suppress(FprfError, OSError):  # while it is saved or replaced the one before is good
-                    self._picture = (step, self._drawn(run))
-            return self._picture[1]
+        return {"type": "start", **asdict(progress), "output": str(self._output), "recent": recent}
 
     def handle(self, asked: StartRequest) -> dict[str, str]:
         """Do what the page asks for. Raises UsageError or DataError where no scene can be made of what is named."""
@@ -130,15 +120,20 @@ class Start:
                     name = whole.parent.name if ours else self._unused(path.stem)
                 self._begin(source, name, asked.minutes)
             case Stop():
-                busy = self._thread is not None and self._thread.is_alive()  # asked before it ends by this very request
-                self._interrupt(asked.then)
+                busy = self._busy  # asked before it ends by this very request
+                self._interrupt("stop")
                 if not busy:  # a failure is put away
                     self._tell(Progress())
             case Leave():
-                if self._progress.stage in ("idle", "open"):
-                    self._progress = Progress()
-                    self._leave()
+                if self._busy:
+                    self._interrupt("leave")
+                self._progress = Progress()
+                self._leave()
         return {}
+
+    @property
+    def _busy(self) -> bool:
+        return self._thread is not None and self._thread.is_alive()
 
     def piece(self, scene: str, name: str, at: int, size: int, data: bytes) -> None:
         """Take a piece of a file. Raises as `SceneFiles.add`."""
@@ -146,10 +141,10 @@ class Start:
 
     def _begin(self, source: Source, name: str, minutes: float) -> None:
         with self._lock:
-            if self._thread is not None and self._thread.is_alive():
+            if self._busy:
                 raise UsageError(f"{self._progress.name} is being made; stop it first")
             # One scene is made at a time: training takes all cores.
-            self._stopped, self._picture = "", (-1, b"")
+            self._stopped = ""
             folder = self._output / name if source.kind != "run" else source.path
             self._progress = Progress(name=name, stage="opening", folder=str(folder))
             self._thread = threading.Thread(target=self._make, args=(source, name, minutes), name="fprf-make", daemon=True)
@@ -167,19 +162,36 @@ class Start:
                 path = root / _SCENE
             if source.kind in ("photographs", "video", "scene"):
                 self._set(stage="training", what="reading photographs", share=None, detail="")
-                often = f"{max(0.1, minutes / _SAVES):g}"
-                place = ["--data", str(path), "--output", str(root / _RUN)]
-                self._call(["train", METHOD, *place, "--minutes", f"{minutes:g}", "--checkpoint-minutes", often])
-                path = root / _RUN
-            self._set(stage="opening", what="opening the scene", share=None, detail="")
-            self._show(path, name)
+                self._train(path, root / _RUN, name, minutes)
+            else:
+                self._set(stage="opening", what="opening the scene", share=None, detail="")
+                self._show(path, name)
+            if self._stopped == "leave":
+                raise _Left
             self._set(stage="open")
         except _Left:
-            self._tell(Progress())
+            self._progress = Progress()
+            self._leave()
         except FprfError as error:
             self._set(error=str(error))
         except Exception as error:  # whatever it is, the page goes on and the files are there
             self._set(error=f"this should not have happened: {type(error).__name__}: {error}")
+
+    def _train(self, data: Path, run: Path, name: str, minutes: float) -> None:
+        """Train a scene; from its first checkpoint on the viewer shows it."""
+        follower, ended = self._follow(run, name), threading.Event()
+        following = threading.Thread(target=follower.run, args=(ended,), name="fprf-follow", daemon=True)
+        following.start()
+        try:
+            place = ["--data", str(data), "--output", str(run)]
+            self._call(["train", METHOD, *place, "--minutes", f"{minutes:g}"])
+        finally:
+            ended.set()
+            following.join()
+        self._set(stage="opening", what="opening the scene", share=None, detail="")
+        follower.tick()
+        if follower.session is None:  # the last checkpoint could not be shown before
+            self._show(run, name)
 
     def _call(self, args: Sequence[str]) -> None:
         """Run a verb to its end. Raises DataError with what it says when it fails, `_Left` when it is to be left."""
@@ -195,7 +207,7 @@ class Start:
             for line in process.stdout:
                 if line.strip():
                     last = line.strip()
-                    self._follow(last)
+                    self._read(last)
         self._process = None
         # An interrupted training has saved what there was, if there was anything.
         if self._stopped == "leave" or (self._stopped and newest_step(self._output / self._progress.name / _RUN) < 0):
@@ -203,7 +215,7 @@ class Start:
         if process.returncode and not self._stopped:
             raise DataError(last.removeprefix("error: ") or f"fprf {args[0]} has ended with {process.returncode}")
 
-    def _follow(self, line: str) -> None:
+    def _read(self, line: str) -> None:
         """Take a line that a process printed: progress as JSON, or a message."""
         try:
             event = json.loads(line)
@@ -270,15 +282,3 @@ class Start:
             when = time.strftime("%d %b %H:%M", time.localtime(date))
             rows.append({"path": str(path.resolve()), "name": name, "kind": kind, "when": when})
         return rows
-
-    def _drawn(self, run: Path) -> bytes:
-        from ..io.images import encode, to_uint8
-        from ..training.loading import open_run
-        from ..training.quality import QualityConfig
-
-        # On the CPU, since training has the GPU; of a view that it does not see.
-        opened = open_run(run, "cpu", QualityConfig())
-        views = opened.known.test or opened.known.train
-        view = views[len(views) // 2]
-        small = min(1.0, _PICTURE / int(opened.known.cameras.size[view].amax()))
-        return encode(to_uint8(opened.scene.render(opened.known.cameras, view, resolution=small).rgb), "jpg")

@@ -1,4 +1,4 @@
-"""The page as one file: the scene in 3D with its styles, and below it film, held-out views, references, figures.
+"""The page as one file: the scene in 3D with its styles, and below it held-out views and the references.
 
 It loads nothing. Where there are no Gaussians, or no WebGL 2, the stage shows pictures in their place.
 """
@@ -6,16 +6,12 @@ It loads nothing. Where there are no Gaussians, or no WebGL 2, the stage shows p
 import base64
 import hashlib
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from html import escape
-from itertools import groupby
 from pathlib import Path
 from string import Template
-from types import MappingProxyType
 from typing import Annotated, Any, NamedTuple
-from urllib.parse import quote
 
 import torch
 from torch import Tensor
@@ -23,7 +19,6 @@ from torch import Tensor
 from ..errors import DataError
 from ..interfaces import Scene
 from ..io.atomic import write_text
-from ..io.figures import Metrics, figures, number
 from ..io.images import Picture, data_uri, shrink, to_uint8
 from ..io.maps import palette
 from ..rendering.cameras import Cameras
@@ -41,8 +36,6 @@ _CAMERAS = 48
 """Captured cameras that one can go to, at most."""
 _ROOM = 1.6
 """How far one may go from the middle of the cameras, relative to the farthest of them."""
-_SMALL_FILM = 1.5 * 2**20
-"""Bytes up to which a film is put into the page, and a third of the budget at most."""
 
 
 class Reference(NamedTuple):
@@ -66,7 +59,6 @@ class Style(NamedTuple):
     """Share of the scene that each of them styled; none where that was not measured."""
     matches: Sequence[Picture] = ()
     """Match maps, one per view or fewer."""
-    metrics: Metrics = MappingProxyType({})
 
 
 class PageView(NamedTuple):
@@ -76,7 +68,6 @@ class PageView(NamedTuple):
     original: Picture
     photograph: Picture | None = None
     """What a camera saw there."""
-    depth: Picture | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +76,7 @@ class Page:
 
     title: str
     lead: str = ""
-    facts: Mapping[str, str | int | float]
+    facts: Mapping[str, str | int]
     """A few, by their labels ("Photographs": 34)."""
     views: Sequence[PageView]
     """At least one."""
@@ -95,9 +86,6 @@ class Page:
     """The Gaussians as captured; None = the stage shows pictures."""
     start: int = 0
     """Camera of the scene that the stage begins at."""
-    metrics: Metrics = field(default_factory=dict)
-    film: Path | None = None
-    """H.264 or WebP; embedded where it is small, else linked beside the page."""
     credits: Sequence[str] = ()
 
 
@@ -115,8 +103,7 @@ def write_page(path: Path, page: Page, *, megabytes: float | None = None) -> int
 def page_html(page: Page, *, megabytes: float | None = None, path: Path = Path("page.html")) -> tuple[str, int]:
     """The text of a page that lies at `path`, and how many Gaussians it shows. Raises as `write_page`."""
     room = None if megabytes is None else int(megabytes * 2**20)
-    film = "" if page.film is None else _film(page.film, path, _SMALL_FILM if room is None else min(_SMALL_FILM, room / 3))
-    fixed = _text(page, film, None, {})
+    fixed = _text(page, None, {})
     if (scene := page.scene) is None:
         return fixed, 0
     harmonics = [scene.shown.harmonics, *(style.harmonics for style in page.styles if style.harmonics is not None)]
@@ -124,7 +111,7 @@ def page_html(page: Page, *, megabytes: float | None = None, path: Path = Path("
     empty, kept = len(fixed.encode()), None
     for _ in range(4):
         _, head, parts = packed_scene(scene, harmonics, page.start, kept)
-        text = _text(page, film, head, parts)
+        text = _text(page, head, parts)
         size, count = len(text.encode()), int(head["count"])
         if room is None or size <= room:
             return text, count
@@ -218,7 +205,7 @@ def _depth(scene: SplatScene, view: int) -> float:
     return float(depth[inside].median()) if bool(inside.any()) else 1.0
 
 
-def _text(page: Page, film: str, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]) -> str:
+def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]) -> str:
     """The page; `head` None = without Gaussians."""
     names = [CAPTURED, *(style.name for style in page.styles)]
     # With Gaussians one picture a style is enough: it stands in until the first frame, and where there is no WebGL 2.
@@ -234,15 +221,13 @@ def _text(page: Page, film: str, head: Mapping[str, Any] | None, parts: Mapping[
     height, width = page.views[0].original.shape[:2]
     known = {reference.name: reference for reference in page.references}
     blocks = "\n".join(_style(style, page.views, known) for style in page.styles)
-    maps = "".join(_figure(view.depth, view.name, _MAP) for view in page.views if view.depth is not None)
     # Sections below the stage; those without content are left out, of the navigation too.
     below = [
-        ("Film", film),
         ("Views", _views(page.views) if any(view.photograph is not None for view in page.views) else ""),
         ("Styles", blocks),
-        ("Depth", f'<div class="grid small">{maps}</div>' if maps else ""),
-        ("Figures", _figures(page.metrics)),
     ]
+    facts = ((name, fact if isinstance(fact, str) else f"{fact:,}") for name, fact in page.facts.items())
+    rows = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(fact)}</dd></div>" for name, fact in facts)
     present = [(name, part) for name, part in below if part]
     code = f"{script()}\nopen(JSON.parse(at('data').textContent));\n"
     return Template(read_asset("page.html")).substitute(
@@ -252,7 +237,9 @@ def _text(page: Page, film: str, head: Mapping[str, Any] | None, parts: Mapping[
         hash=f"'sha256-{base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()}'",
         nav="\n".join(f'<a href="#{name.lower()}">{name}</a>' for name, _ in present),
         stage=Template(read_asset("stage.html")).substitute(
-            still=f'src="{stills[0][0]}"', ratio=f'style="--ratio:{width / height:.4f}"', facts=_facts(page.facts)
+            still=f'src="{stills[0][0]}"',
+            ratio=f'style="--ratio:{width / height:.4f}"',
+            facts=f'<dl class="facts">{rows}</dl>' if rows else "",
         ),
         body="\n".join(f'<section id="{name.lower()}"><h2>{name}</h2>\n{part}\n</section>' for name, part in present),
         credits="\n".join(f"<p>{escape(line)}</p>" for line in page.credits),
@@ -278,11 +265,6 @@ def _figure(picture: Picture, name: str, side: int) -> str:
     return f"<figure>{_img(picture, side, name)}<figcaption>{escape(name)}</figcaption></figure>"
 
 
-def _facts(facts: Mapping[str, str | int | float]) -> str:
-    rows = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(number(fact))}</dd></div>" for name, fact in facts.items())
-    return f'<dl class="facts">{rows}</dl>' if rows else ""
-
-
 def _views(views: Sequence[PageView]) -> str:
     """Photographs beside what the scene shows from their places."""
     rows = "".join(
@@ -297,7 +279,7 @@ def _views(views: Sequence[PageView]) -> str:
 
 
 def _style(style: Style, views: Sequence[PageView], known: Mapping[str, Reference]) -> str:
-    """References of a style, with the colours of its match maps and with shares where there are any; its figures; the maps."""
+    """References of a style, with the colours of its match maps and with shares where there are any; the maps."""
     rows = []
     colours = to_uint8(palette(len(style.references))[None])[0] if style.references else []
     for place, name in enumerate(style.references):
@@ -305,45 +287,8 @@ def _style(style: Style, views: Sequence[PageView], known: Mapping[str, Referenc
         share = f'<data value="{style.shares[place]:.4f}">{style.shares[place]:.0%}</data>' if style.shares else ""
         image = _img(known[name].image, _REFERENCE, f"Reference {name}")
         rows.append(f"<figure>{image}<figcaption>{chip}<span>{escape(name)}</span>{share}</figcaption></figure>")
-    measured = "".join(
-        f"<div><dt>{escape(row.label)}</dt><dd>{escape(row.value)} {escape(row.unit)}</dd></div>"
-        for row in figures(style.metrics)
-    )
     maps = "".join(_figure(each, view.name, _MAP) for view, each in zip(views, style.matches, strict=False))
     return f"""<article class="style"><h3>{escape(style.name)}</h3>
 <div class="sources">{"".join(rows)}</div>
-{f'<dl class="measured">{measured}</dl>' if measured else ""}
 {f'<p class="lead">Which reference each place took its style from</p><div class="grid small">{maps}</div>' if maps else ""}
 </article>"""
-
-
-def _film(video: Path, page: Path, most: float) -> str:
-    """A film, embedded where it has at most so many bytes."""
-    size = video.stat().st_size
-    with video.open("rb") as file:
-        data = file.read(int(most) + 1)
-    beside = quote(Path(os.path.relpath(video, page.parent)).as_posix())
-    animated = video.suffix.lower() == ".webp"
-    media, small = "image/webp" if animated else "video/mp4", size <= most
-    source = f"data:{media};base64,{base64.b64encode(data).decode('ascii')}" if small else escape(beside)
-    if animated and small:
-        return f'<img class="flight" src="{source}" alt="Flight through the scene" decoding="async">'
-    # The codec's box lies at the front of what we write; other codecs do not play in browsers.
-    if animated or b"avc1" not in data:
-        link = f'<a href="{escape(beside)}">{escape(video.name)}</a>'
-        return f'<p class="lead">This film lies beside the page, for a player: {link}</p>'
-    return (
-        f'<video class="flight" src="{source}" controls loop muted playsinline preload="metadata" aria-label="Flight"></video>'
-    )
-
-
-def _figures(metrics: Metrics) -> str:
-    tables = []
-    for group, rows in groupby(figures(metrics), key=lambda figure: figure.group):
-        body = "".join(
-            f'<tr><th scope="row">{escape(row.label)}</th><td class="value">{escape(row.value)}</td>'
-            f'<td class="unit">{escape(row.unit)}</td></tr>'
-            for row in rows
-        )
-        tables.append(f"<table><caption>{escape(group or 'Quality and cost')}</caption><tbody>{body}</tbody></table>")
-    return f'<div class="figures">{"".join(tables)}</div>' if tables else ""

@@ -13,6 +13,9 @@ from pathlib import Path
 from typing import Any
 
 NO_PYCOLMAP, NO_MODEL = 3, 4
+_FIRST_ANGLES = 16.0, 2.0
+"""Degrees between the rays of the first pair, at least; COLMAP itself goes down to a quarter. Where all photographs face the
+same things from nearly one place (llff_flower: 34 within an arm's length) none has more than four."""
 
 
 def main(job: dict[str, Any]) -> int:
@@ -90,9 +93,14 @@ def _mapping(pycolmap: Any, job: dict[str, Any]) -> int:
     # COLMAP calls back for the first pair and for every image after it.
     out = Path(job["models"])
     out.mkdir(parents=True, exist_ok=True)
-    mapped = pycolmap.incremental_mapping(
-        job["database"], job["images"], str(out), options, initial_image_pair_callback=count, next_image_callback=count
-    )
+    mapped = {}
+    for angle in _FIRST_ANGLES:
+        options.mapper.init_min_tri_angle = angle
+        mapped = pycolmap.incremental_mapping(
+            job["database"], job["images"], str(out), options, initial_image_pair_callback=count, next_image_callback=count
+        )
+        if mapped:
+            break
     models = sorted(mapped.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     described = [
         {

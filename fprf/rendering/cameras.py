@@ -10,7 +10,7 @@ need one table (24 bytes a pixel). Above `LIMIT` bytes, for thousands of differe
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -21,8 +21,7 @@ from .lens import PINHOLE, bend, lens_reach, unbend
 
 @dataclass(frozen=True)
 class Cameras:
-    """V views. `lens` is 0 pinhole, 1 OpenCV (k1..k4 radial, p1 p2 tangential), 2 fisheye (equidistant, k1..k4),
-    3 panorama (equirectangular: pixels are angles)."""
+    """V views. `lens` is 0 pinhole, 1 OpenCV (k1..k4 radial, p1 p2 tangential), 2 fisheye (equidistant, k1..k4)."""
 
     pose: Annotated[Tensor, "V 3 4"]
     """Camera to world, float64."""
@@ -68,10 +67,8 @@ class Cameras:
         return self.resized((self.size.double() / downscale).round().clamp_min(1))
 
 
-def ideal_cameras(
-    pose: Annotated[Tensor, "V 3 4"], focal: Tensor | float, size: tuple[int, int], lens: int = PINHOLE
-) -> Cameras:
-    """Views of one size (width, height) without distortion, the principal point in the middle, pixels square.
+def ideal_cameras(pose: Annotated[Tensor, "V 3 4"], focal: Tensor | float, size: tuple[int, int]) -> Cameras:
+    """Pinhole views of one size (width, height) without distortion, the principal point in the middle, pixels square.
 
     `focal` in pixels is one number, or one for each view.
     """
@@ -82,7 +79,7 @@ def ideal_cameras(
         centre=(sides.double() / 2).repeat(count, 1),
         size=sides.repeat(count, 1),
         distortion=torch.zeros(count, 6, dtype=torch.float64),
-        lens=torch.full((count,), lens),
+        lens=torch.full((count,), PINHOLE),
     )
 
 
@@ -167,7 +164,7 @@ class PixelRays:
         self.start = area.cumsum(0) - area
         self.table: Tensor | None = None
         if int(area.sum()) * 24 <= limit:
-            self.table = torch.cat([_lens_directions(cameras, int(view), cameras.pose.device) for view in first])
+            self.table = torch.cat([directions_of(intrinsics_of(cameras, int(view)), cameras.pose.device) for view in first])
 
     @property
     def waits(self) -> bool:
@@ -209,31 +206,36 @@ def grid_rays(
     The frames of a path, and mostly the views of a capture, look through one lens: the last two are remembered.
     """
     pose = cameras.pose[view].to(device)
-    direction = _lens_directions(cameras, view, pose.device) @ pose[:, :3].T
+    direction = directions_of(intrinsics_of(cameras, view), pose.device) @ pose[:, :3].T
     return pose[:, 3].expand_as(direction), direction
 
 
-def _lens_directions(cameras: Cameras, view: int, device: torch.device) -> Annotated[Tensor, "N 3"]:
-    """Unit directions in camera axes through all pixels of a view."""
-    numbers = (cameras.focal, cameras.centre, cameras.distortion)
-    width, height = cameras.size[view].tolist()
-    return _solved(*(tuple(x[view].tolist()) for x in numbers), width, height, int(cameras.lens[view]), device)
+class Intrinsics(NamedTuple):
+    """A view without its pose, as plain numbers, which a cache can compare."""
+
+    focal: tuple[float, ...]
+    centre: tuple[float, ...]
+    distortion: tuple[float, ...]
+    size: tuple[int, ...]
+    lens: int
+
+    def camera(self) -> Cameras:
+        """One view with these intrinsics, at the origin, looking along -z."""
+        still = torch.cat([torch.eye(3, dtype=torch.float64), torch.zeros(3, 1, dtype=torch.float64)], 1)
+        focal, centre, distortion = (torch.tensor([x], dtype=torch.float64) for x in self[:3])
+        return Cameras(still[None], focal, centre, torch.tensor([self.size]), distortion, torch.tensor([self.lens]))
+
+
+def intrinsics_of(cameras: Cameras, view: int) -> Intrinsics:
+    """Intrinsics of a view."""
+    focal, centre, distortion = (tuple(each[view].tolist()) for each in (cameras.focal, cameras.centre, cameras.distortion))
+    return Intrinsics(focal, centre, distortion, tuple(cameras.size[view].tolist()), int(cameras.lens[view]))
 
 
 @lru_cache(maxsize=2)
-def _solved(
-    focal: tuple[float, ...],
-    centre: tuple[float, ...],
-    distortion: tuple[float, ...],
-    width: int,
-    height: int,
-    lens: int,
-    device: torch.device,
-) -> Annotated[Tensor, "N 3"]:
-    """`_lens_directions` by plain numbers, which a cache can compare."""
-    still = torch.cat([torch.eye(3, dtype=torch.float64), torch.zeros(3, 1, dtype=torch.float64)], 1)
-    focals, centres, bends = (torch.tensor([x], dtype=torch.float64) for x in (focal, centre, distortion))
-    camera = Cameras(still[None], focals, centres, torch.tensor([[width, height]]), bends, torch.tensor([lens]))
+def directions_of(intrinsics: Intrinsics, device: torch.device) -> Annotated[Tensor, "N 3"]:
+    """Unit directions in camera axes, float64, through all pixels of a view (`pixel_grid`)."""
+    camera = intrinsics.camera()
     pixel = pixel_grid(camera, 0)
     return rays_through(camera, torch.zeros(len(pixel), dtype=torch.int64), pixel)[1].to(device)
 

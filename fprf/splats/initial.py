@@ -180,11 +180,11 @@ def _pairs(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[NDA
     alike = first @ second.T
     rows = np.arange(len(first))
     # The two best matches of each; distances of unit vectors follow from their cosines.
-    two = np.argpartition(-alike, 1, axis=1)[:, :2]
-    a, b = alike[rows, two[:, 0]], alike[rows, two[:, 1]]
-    best = np.where(a >= b, two[:, 0], two[:, 1])
-    near, next_ = (np.sqrt(np.maximum(2 - 2 * each, 0)) for each in (np.maximum(a, b), np.minimum(a, b)))
-    kept = (near < 0.85 * next_) & (alike.argmax(0)[best] == rows)
+    backwards, best = alike.argmax(0), alike.argmax(1)
+    likeness = alike[rows, best]
+    alike[rows, best] = -np.inf
+    near, next_ = (np.sqrt(np.maximum(2 - 2 * each, 0)) for each in (likeness, alike.max(1)))
+    kept = (near < 0.85 * next_) & (backwards[best] == rows)
     return rows[kept], best[kept]
 
 

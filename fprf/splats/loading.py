@@ -12,6 +12,7 @@ from torch import Tensor
 from ..config import RunConfig
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError, UsageError
+from ..io.tensorfiles import load_sealed, save
 from ..rendering.cameras import Cameras
 from ..training import checkpoint
 from ..training.camera_optimizers import Poses, Tones, moved_cameras
@@ -19,9 +20,8 @@ from ..training.driver import Schedule, learn
 from ..training.loading import LoadedRun
 from ..training.model import Facts, tones_of
 from ..training.prepare import cache_folder, reach_of
-from ..training.quality import PRESETS, QualityConfig, mixed_tone
+from ..training.quality import PRESETS, QualityConfig, tone_of
 from ..training.run import Run, in_training
-from ..training.tensorfiles import load_sealed, save
 from .config import GaussiansConfig, LookConfig
 from .files import Capture
 from .gaussians import from_tensors
@@ -43,7 +43,7 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
     Raises CheckpointError with what is missing, UsageError for qualities other than a resolution.
     """
     assert isinstance(config, GaussiansConfig)  # by its kind
-    for name in ("samples", "budget", "chunk", "max_memory"):
+    for name in ("budget", "chunk", "max_memory"):
         if getattr(quality, name):
             raise UsageError(f"--{name.replace('_', '-')}: is for runs of fields; leave it out")
     root, preset = run.root, None if quality.quality is None else PRESETS[quality.quality]
@@ -71,7 +71,7 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
         # What a training has learnt so far is looked at quickly, and not kept.
         found=whole.found if training else functools.cache(lambda: _semantics(run, saved.step, whole, config)),
         resolution=resolution if quality.resolution is None else quality.resolution,
-        tone=mixed_tone(tones, known, quality.tone) if quality.tone else (1.0, 1.0, 1.0),
+        tone=(1.0, 1.0, 1.0) if quality.tone is None else tone_of(tones, known, quality.tone),
         tones=tones,
         poses=fit,
         merged=merged,

@@ -6,8 +6,9 @@ pixel centres lie at +0.5. Camera axes of the rasteriser are OpenCV's (x right, 
 
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
+from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import cv2
 import numpy as np
@@ -18,16 +19,14 @@ from torch import Tensor
 from ..datamanagers.blur import blurred_views
 from ..datamanagers.images import Image, load_images, load_mask
 from ..datamanagers.scene import Scene
-from ..errors import DataError
 from ..ops.photometric import WINDOW
 from ..ops.rasterise import Pinhole
 from ..ops.rasterise_training import Floats, Target, target_of
-from ..rendering.cameras import Cameras, pixel_grid, project, rays_through
+from ..rendering.cameras import Cameras, Intrinsics, directions_of, intrinsics_of, pixel_grid, project, rays_through
 from .config import GaussiansConfig
 
 Masks = dict[int, NDArray[np.bool_]]
 """Masks [H W] by view."""
-_PANORAMA = 3
 _WIDEST = 4.0
 """Tangent of the widest angle that a pinhole shows: 76 degrees."""
 _SHARPEST = cv2.INTER_LANCZOS4
@@ -100,9 +99,7 @@ def _bytes(target: Target) -> int:
 
 
 def camera_of(cameras: Cameras, view: int, near: float = 0.01) -> Pinhole:
-    """A view without its lens as the rasteriser takes it: OpenCV's axes, world to camera. Raises DataError for a panorama."""
-    if int(cameras.lens[view]) == _PANORAMA:
-        raise DataError("Gaussians are drawn through pinholes: a panorama has to be cut into views first")
+    """A view without its lens as the rasteriser takes it: OpenCV's axes, world to camera."""
     width, height = cameras.size[view].tolist()
     pose = cameras.pose[view]
     turn = (pose[:, :3] * torch.tensor([1.0, -1.0, -1.0], dtype=pose.dtype)).T
@@ -118,19 +115,31 @@ def undistorted(cameras: Cameras, view: int, image: Image, camera: Pinhole) -> t
     """
     if int(cameras.lens[view]) == 0:
         return image, None
-    # Rays through the pixels of the pinhole, from OpenCV's axes to OpenGL's and into the world.
-    width, height = cameras.size[view].tolist()
-    x, y = torch.arange(camera.width).double() + 0.5, torch.arange(camera.height).double() + 0.5
+    pinhole = tuple(camera.intrinsics.flatten().tolist())
+    x, y, inside = _places(intrinsics_of(cameras, view), pinhole, camera.width, camera.height)
+    return np.asarray(cv2.remap(image, x, y, _SHARPEST, borderMode=cv2.BORDER_REPLICATE)), inside
+
+
+@lru_cache(maxsize=2)
+def _places(
+    lens: Intrinsics, pinhole: tuple[float, ...], width: int, height: int
+) -> tuple[Annotated[Floats, "h w"], Annotated[Floats, "h w"], Annotated[NDArray[np.bool_], "h w"]]:
+    """Where a lens shows the pixels of a pinhole with an intrinsic matrix, as `cv2.remap` takes it, and which of them it shows.
+
+    Most views of a capture look through one lens.
+    """
+    # Rays through the pixels of the pinhole, from OpenCV's axes to OpenGL's.
+    x, y = torch.arange(width).double() + 0.5, torch.arange(height).double() + 0.5
     grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).view(-1, 2)
-    local = (grid - camera.intrinsics[:2, 2]) / camera.intrinsics.diagonal()[:2]
-    turned = torch.stack([local[:, 0], -local[:, 1], -torch.ones(len(local), dtype=torch.float64)], -1)
-    pose = cameras.pose[view]
-    points = turned @ pose[:, :3].T + pose[:, 3]
+    matrix = torch.tensor(pinhole, dtype=torch.float64).view(3, 3)
+    local = (grid - matrix[:2, 2]) / matrix.diagonal()[:2]
+    points = torch.stack([local[:, 0], -local[:, 1], -torch.ones(len(local), dtype=torch.float64)], -1)
     # Where the lens maps them; what falls beyond the outermost pixel centres would only repeat the edge.
-    pixel, _ = project(cameras, torch.full((len(points),), view), points)
-    place = pixel.view(camera.height, camera.width, 2).numpy()
-    inside = np.isfinite(place).all(-1) & (place >= 0.5).all(-1) & (place <= np.array([width - 0.5, height - 0.5])).all(-1)
-    return _sampled(image, np.nan_to_num(place, nan=-1e6)), inside
+    pixel, _ = project(lens.camera(), torch.zeros(len(points), dtype=torch.int64), points)
+    place = pixel.view(height, width, 2).numpy()
+    inside = np.isfinite(place).all(-1) & (place >= 0.5).all(-1) & (place <= np.array(lens.size) - 0.5).all(-1)
+    where = (np.nan_to_num(place, nan=-1e6) - 0.5).astype(np.float32)
+    return np.ascontiguousarray(where[..., 0]), np.ascontiguousarray(where[..., 1]), inside
 
 
 def covering(cameras: Cameras, view: int, near: float) -> Pinhole:
@@ -138,8 +147,7 @@ def covering(cameras: Cameras, view: int, near: float) -> Pinhole:
     plain = camera_of(cameras, view, near)
     if int(cameras.lens[view]) == 0:
         return plain
-    grid = pixel_grid(cameras, view).view(plain.height, plain.width, 2)
-    reached = _tangents(cameras, view, torch.cat([grid[0], grid[-1], grid[:, 0], grid[:, -1]])) * cameras.focal[view]
+    reached = _outermost(intrinsics_of(cameras, view)) * cameras.focal[view]
     # The pinhole keeps the focal length, and has a border of two pixels to interpolate in.
     low, high = reached.amin(0).floor() - 2, reached.amax(0).ceil() + 2
     wide, tall = (high - low).int().tolist()
@@ -152,23 +160,33 @@ def cover(cameras: Cameras, view: int, near: float) -> tuple[Pinhole, Annotated[
     if int(cameras.lens[view]) == 0:
         return camera, None
     width, height = cameras.size[view].tolist()
-    tangent = _tangents(cameras, view, pixel_grid(cameras, view))
+    tangent = _tangents(directions_of(intrinsics_of(cameras, view), torch.device("cpu")))
     return camera, (tangent * cameras.focal[view] + camera.intrinsics[:2, 2]).view(height, width, 2)
 
 
-def _tangents(cameras: Cameras, view: int, pixel: Annotated[Tensor, "N 2"]) -> Annotated[Tensor, "N 2"]:
-    """Tangents of pixels' rays in OpenCV's axes: what lies behind the camera is put at the widest angle."""
-    _, direction = rays_through(cameras, torch.full((len(pixel),), view), pixel)
-    local = direction @ cameras.pose[view][:, :3]
-    ahead = (-local[:, 2]).clamp_min(1e-9)
-    return torch.stack([local[:, 0] / ahead, -local[:, 1] / ahead], -1).clamp(-_WIDEST, _WIDEST)
+@lru_cache(maxsize=2)
+def _outermost(lens: Intrinsics) -> Annotated[Tensor, "N 2"]:
+    """Tangents of the rays through a lens's outermost pixels."""
+    camera, (width, height) = lens.camera(), lens.size
+    grid = pixel_grid(camera, 0).view(height, width, 2)
+    border = torch.cat([grid[0], grid[-1], grid[:, 0], grid[:, -1]])
+    return _tangents(rays_through(camera, torch.zeros(len(border), dtype=torch.int64), border)[1])
+
+
+def _tangents(direction: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 2"]:
+    """Tangents, in OpenCV's axes, of rays in OpenGL's: what lies behind the camera is put at the widest angle."""
+    ahead = (-direction[:, 2]).clamp_min(1e-9)
+    return torch.stack([direction[:, 0] / ahead, -direction[:, 1] / ahead], -1).clamp(-_WIDEST, _WIDEST)
 
 
 def distorted(
     image: Annotated[Tensor, "h w C"], place: Annotated[Tensor, "H W 2"], *, linear: bool = False
 ) -> Annotated[Tensor, "H W C"]:
     """An image at the places of `cover`; `linear` for what must not swing over its edges."""
-    return torch.from_numpy(np.atleast_3d(_sampled(image.numpy(), place.numpy(), cv2.INTER_LINEAR if linear else _SHARPEST)))
+    x, y = np.ascontiguousarray((place.numpy() - 0.5).astype(np.float32).transpose(2, 0, 1))
+    interpolation = cv2.INTER_LINEAR if linear else _SHARPEST
+    sampled = cv2.remap(np.ascontiguousarray(image), x, y, interpolation, borderMode=cv2.BORDER_REPLICATE)
+    return torch.from_numpy(np.atleast_3d(sampled))
 
 
 def load_photographs(config: GaussiansConfig, scene: Scene, views: list[int]) -> tuple[dict[int, Image], Masks, Masks]:
@@ -216,12 +234,6 @@ def _resized(mask: NDArray[np.bool_] | None, size: tuple[int, int]) -> NDArray[n
     if mask is None or mask.shape[::-1] == size:
         return mask
     return np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999)
-
-
-def _sampled(image: NDArray[Any], place: NDArray[np.float64], interpolation: int = _SHARPEST) -> NDArray[Any]:
-    where = (place - 0.5).astype(np.float32)
-    x, y = np.ascontiguousarray(where[..., 0]), np.ascontiguousarray(where[..., 1])
-    return np.asarray(cv2.remap(np.ascontiguousarray(image), x, y, interpolation, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _intrinsics(focal: Annotated[Tensor, "2"], centre: Annotated[Tensor, "2"]) -> Annotated[Tensor, "3 3"]:

@@ -125,7 +125,7 @@ class SplatScene(Scene):
 
     @torch.inference_mode()
     def render(self, cameras: Cameras, view: int, *, resolution: float | None = None) -> View:
-        """Draw a view, its lens included. Raises DataError for a panorama."""
+        """Draw a view, its lens included."""
         # At a part of the resolution a smaller view is drawn, and enlarged.
         share = self.resolution if resolution is None else resolution
         if share < 1:

@@ -1,11 +1,8 @@
 import json
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from importlib.resources import files
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import cv2
 import pytest
@@ -13,11 +10,8 @@ import torch
 
 import fprf.methods
 from fprf.cli import main as cli
-from fprf.cli.gallery import fading
 from fprf.datamanagers.parsers.config import parse_scene
-from fprf.progress import Display
 from fprf.splats.files import read_capture
-from fprf.types import View
 
 GARDEN = Path(str(files("fprf") / "garden"))
 
@@ -28,10 +22,10 @@ def test_the_demo_from_nothing_to_a_page(
     small = replace(fprf.methods.fprf_splats(), steps=10, initial=800, cap=900)
     monkeypatch.setattr(fprf.methods, "fprf_splats", lambda: small)
     out = tmp_path / "out"
-    args = ["demo", "--output", str(out), "--minutes", "5", "--frames", "10", "--downscale", "8"]
+    args = ["demo", "--output", str(out), "--minutes", "5", "--downscale", "8"]
     assert cli.main(args) == 0
     styles = ["all-together.ply", "autumn.ply", "night.ply", "sunset.ply", "winter.ply"]
-    assert {p.name for p in out.iterdir()} >= {"run", "film.mp4", "metrics.json", "garden.html", *styles}
+    assert {p.name for p in out.iterdir()} >= {"run", "metrics.json", "garden.html", *styles}
     plain, *others = [read_capture(out / name).gaussians for name in ("night.ply", "autumn.ply", "winter.ply")]
     assert all(torch.equal(plain.means, each.means) and not torch.equal(plain.harmonics, each.harmonics) for each in others)
     metrics = json.loads((out / "metrics.json").read_text())
@@ -55,21 +49,3 @@ def test_photographs_that_ship_are_credited_and_small() -> None:
     assert references and all(path.stem in credits for path in references)
     assert all(max(cv2.imread(str(path)).shape) <= 640 for path in references)
     assert sum(path.stat().st_size for path in GARDEN.rglob("*") if path.is_file()) < 3e6
-
-
-class Plain(NamedTuple):
-    """A look that is one grey."""
-
-    grey: float
-
-    def render(self, cameras: Sequence[int], view: int) -> View:
-        rgb = torch.full((4, 4, 3), self.grey)
-        return View(rgb, rgb[..., 0], rgb[..., 0], 1.0)
-
-
-def test_the_film_fades_from_look_to_look() -> None:
-    looks: Any = [Plain(0.0), Plain(0.5), Plain(1.0)]
-    greys = [float(frame[0, 0, 0]) / 255 for frame in fading(looks, range(30), Display())]  # type: ignore[arg-type]
-    assert greys == sorted(greys) and greys[0] == 0 and greys[-1] == 1
-    assert max(b - a for a, b in pairwise(greys)) < 0.11
-    assert len([grey for grey in greys if abs(grey - 0.5) < 0.003]) >= 5

@@ -1,4 +1,3 @@
-import json
 import os
 import subprocess
 import sys
@@ -76,12 +75,3 @@ def test_a_reader_that_leaves_is_met_with_silence() -> None:
     )
     os.close(write)
     assert (ended.returncode, ended.stderr) == (141, b"")
-
-
-@pytest.mark.parametrize("verb", sorted(cli.VERBS))
-def test_every_verb_describes_itself_and_every_flag_has_a_meaning(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    word = {"train": ["fprf-lite"], "pretrain": ["decoder"]}.get(verb, [])
-    assert cli.main([verb, *word, "--describe"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["prog"].startswith(f"fprf {verb}") and found["description"]
-    assert found["flags"] and [row["flag"] for row in found["flags"] if not row["meaning"]] == []

@@ -117,16 +117,6 @@ def test_help_shows_fields_and_slots_and_imports_no_torch(capsys: pytest.Capture
     assert max(map(len, text.splitlines())) <= 100
 
 
-def test_a_description_offers_the_plugins_that_a_slot_takes(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        train("--describe")
-    offered = {slot["flag"]: slot["one of"] for slot in json.loads(capsys.readouterr().out)["slots"]}
-    for flag, names in offered.items():
-        for name in names:
-            train(flag, name)
-    assert "semantic-planes" in offered["--semantic.field"] and "none" in offered["--semantic.encoder"]
-
-
 def test_methods_by_name_and_by_file(tmp_path: Path) -> None:
     assert load_method("fprf") == (fprf(), "fprf")
     save_config(tmp_path / "config.json", fprf_lite(), "fprf-lite")

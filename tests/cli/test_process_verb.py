@@ -121,6 +121,12 @@ def test_similar_matching_reads_the_features(photos: Path) -> None:
     assert 30 * 3 / 2 <= matched < 30 * 29 / 2
 
 
+def test_photographs_from_nearly_one_place_find_their_poses_too(photos: Path) -> None:
+    """No first pair has the angle that COLMAP asks for (4 degrees at its least): smaller ones are tried."""
+    assert process(photos, plan={"angle": 1.0}) == 0
+    assert calls(photos)[-2:] == ["mapping", "mapping"] and report(photos)["images"]["posed"] == 5
+
+
 def test_nothing_fits_together_and_what_the_decoder_lost_is_told(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (photos / "empty [1].jpg").write_bytes(b"")
     assert process(photos, plan={"nothing": True}) == 2

@@ -16,10 +16,10 @@ from tiny_world import World
 from fprf.cli import main as cli
 from fprf.cli.style_flags import named_styles, read_flags
 from fprf.errors import ConfigError, DataError, UsageError
+from fprf.io import tensorfiles
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig
 from fprf.style.config import PRESETS, StyleConfig, preset_flags, with_preset
 from fprf.style.files import StyleFile, write_style
-from fprf.training import tensorfiles
 
 MADE = {"dictionary_seconds", "seconds_per_view", "match_seconds_per_view", "codes", "matches"}
 
@@ -31,7 +31,7 @@ def stylize(run: Path, world: World, output: Path, *words: str) -> dict[str, Any
     return json.loads((output / "style.json").read_text())
 
 
-def test_folders_stand_for_their_photographs_and_views_are_the_covered_ones(
+def test_folders_stand_for_their_photographs_and_views_are_some(
     run: Path, world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     photos, out = tmp_path / "photos", tmp_path / "s"
@@ -45,8 +45,8 @@ def test_folders_stand_for_their_photographs_and_views_are_the_covered_ones(
     style = json.loads((out / "style.json").read_text())["style"]
     assert [Path(path).name for path in style["references"]] == ["dusk.png", "snow.png"] and style["weights"] == [2, 2]
     known = world.load().known
-    assert {p.stem for p in out.glob("*.png")} == {known.names[view] for view in known.split("covered")}
-    assert len(known.split("covered")) == 8
+    assert {p.stem for p in out.glob("*.png")} == {known.names[view] for view in known.split("some")}
+    assert len(known.split("some")) == 8
     assert cli.main([*args, "--masks", str(world.references[0])]) == 2
     assert "is for one photograph" in capsys.readouterr().err
 

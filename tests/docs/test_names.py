@@ -66,8 +66,8 @@ def _is_module(name: str) -> bool:
 def test_flags_exist(capsys: pytest.CaptureFixture[str]) -> None:
     for verb in VERBS:
         for method in ("fprf", "fprf-lite", "fprf-splats") if verb == "train" else ("",):
-            cli.main([word for word in (verb, method, "--describe") if word])
-    known = OTHERS | set(re.findall(r'"(--[\w.-]+)"', capsys.readouterr().out))
+            cli.main([word for word in (verb, method, "--help") if word])
+    known = OTHERS | set(re.findall(r"(--[a-z][\w.-]*\w)", capsys.readouterr().out))
     # Of `--slot.field` the field may be that of any plug-in.
     fields = {
         field.name.replace("_", "-")

@@ -2,16 +2,15 @@
 
 import threading
 import time
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from typing import Any
 
 import cv2
 import numpy as np
 
 from fprf.interfaces import Scene
-from fprf.page.drawing import FilmPlan, Key
 from fprf.page.messages import Camera
-from fprf.page.restyler import Look
+from fprf.page.state import Key, Look
 from fprf.splats.photographs import camera_of as pinhole_of
 
 
@@ -25,10 +24,9 @@ def camera_of(scene: Scene, view: int) -> Camera:
     return Camera(place=place, axes=axes, lens=numbers, size=(float(camera.width), float(camera.height)))
 
 
-def plan_of(scene: Scene, looks: Sequence[Look], seconds: float = 0.125, fps: float = 24.0) -> FilmPlan:
-    """A film of 32 x 24 pixels through captured views."""
-    keys = tuple(Key(camera_of(scene, view), look) for view, look in enumerate(looks))
-    return FilmPlan(keys, seconds, fps, 32)
+def keys_of(scene: Scene, looks: Iterable[Look]) -> tuple[Key, ...]:
+    """Keyframes at captured views."""
+    return tuple(Key(camera_of(scene, view), look) for view, look in enumerate(looks))
 
 
 def until(true: Callable[[], bool], act: Callable[[], object] = lambda: None) -> None:

@@ -22,13 +22,13 @@ def test_a_run_is_opened_at_its_first_checkpoint_and_followed(run: Path) -> None
     with ViewerServer(Access("127.0.0.1", None), 0) as server:
         follower = TrainingFollower(server, run, load)
         follower.tick()
-        assert follower._session is None and not is_watched(run)
+        assert follower.session is None and not is_watched(run)
         shutil.move(hidden, newest)
         follower.tick()
-        session = follower._session
+        session = follower.session
         assert session is not None and session.viewed.step == 15
         follower.tick()
-        assert follower._session is session
+        assert follower.session is session
         server._clients[1] = None  # type: ignore[assignment]  # somebody looks
         follower.tick()
         server._clients.clear()

@@ -156,9 +156,10 @@ def test_photographs_become_a_restyled_ply_without_a_terminal(tmp_path: Path) ->
         page.locator("#fault", has_text="1 photograph is no scene").wait_for()
         page.fill("#minutes", "5")
         page.set_input_files("#folder", str(given))
-        page.locator("#picture").wait_for(timeout=240_000)  # of training, which need not end
-        page.locator("#show").click()
-        page.wait_for_selector(".place.drawn", timeout=120_000)
+        page.wait_for_selector(".place.drawn", timeout=240_000)  # of the training, which need not end
+        page.wait_for_function("() => fprf.live.scene.step > 0")
+        page.locator("#finish").click()
+        page.locator("#finish").wait_for(state="hidden", timeout=60_000)
         assert {path.name for path in (made / "garden").iterdir()} == {"files", "run"}
         page.set_input_files("#photographs", str(shipped / "references" / "sunset.jpg"))
         page.wait_for_function("() => fprf.place.splats.styles.has('Now')", timeout=240_000)
@@ -187,12 +188,10 @@ def test_training_is_shown_as_checkpoints_come_and_goes_on_without_its_viewer(
     few[few.index("--steps") + 1] = "100000"
     if method == "fprf-splats":
         few = [*few[:4], "--steps", "1000000", "--passes", "1000000", "--initial", "300", "--cap", "400"]
-    command = [sys.executable, "-m", "fprf", "train", method, *few, "--checkpoint-minutes", "0.05", "--view", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
-        assert process.stdout is not None
+    command = [sys.executable, "-m", "fprf", "train", method, *few, "--checkpoint-minutes", "0.05"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
-            address = next(line.strip() for line in process.stdout if line.startswith("http://"))
-            with front(address) as page:
+            with served(tmp_path / "run", "--follow") as address, front(address) as page:
                 first = page.evaluate("() => fprf.live.scene.step")
                 page.wait_for_function("(first) => fprf.live.scene.step > first", arg=first, timeout=120_000)
             assert process.poll() is None

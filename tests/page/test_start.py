@@ -1,6 +1,7 @@
 """The start without a browser: the programs that find poses and train are stood in for by a script."""
 
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from fprf.errors import DataError, FprfError, UsageError
 from fprf.page import start as start_module
 from fprf.page.messages import Leave, Make, New, Open, Stop
 from fprf.page.start import Start
+from fprf.page.uploads import newest_step
 
 PROGRAM = f"""#!{sys.executable}
 import json, pathlib, signal, sys, time
@@ -45,7 +47,11 @@ class Shown(Start):
     def __init__(self, output: Path) -> None:
         self.shown: list[tuple[Path, str]] = []
         self.posted: list[Any] = []
-        super().__init__(output, self.view, self.shown.clear, lambda client, kind, message: self.posted.append(message))
+
+        def post(client: None, kind: str, message: Any) -> None:
+            self.posted.append(message)
+
+        super().__init__(output, self.view, lambda *place: Follower(self, *place), self.shown.clear, post)  # type: ignore[arg-type,return-value]
 
     def view(self, path: Path, name: str) -> None:
         if path.suffix == ".ply":
@@ -56,6 +62,22 @@ class Shown(Start):
         """The state, as soon as it is so."""
         until(lambda: wanted.items() <= self.state().items())
         return self.state()
+
+
+class Follower:
+    """Opens the viewer at the first checkpoint."""
+
+    def __init__(self, page: Shown, run: Path, name: str) -> None:
+        self.page, self.run_folder, self.name, self.session = page, run, name, None
+
+    def run(self, ended: threading.Event) -> None:
+        while not ended.wait(0.01):
+            self.tick()
+
+    def tick(self) -> None:
+        if self.session is None and newest_step(self.run_folder) >= 0:
+            self.page.view(self.run_folder, self.name)
+            self.session: Any = self.page
 
 
 @pytest.fixture
@@ -83,7 +105,7 @@ def test_photographs_are_posed_trained_and_shown(page: Shown, photographs: Path,
     page.handle(Open(path=f' "{photographs}" ', minutes=1))
     state = page.reached(stage="open")
     assert page.shown == [(tmp_path / "made" / "yard" / "run", "yard")] and state["error"] is None
-    assert [each["stage"] for each in page.posted if each["stage"] != "training"][-2:] == ["opening", "open"]
+    assert [each["stage"] for each in page.posted][-2:] == ["opening", "open"]
     assert list(state["lines"]) == ["hello from process", "hello from train"]
     page.handle(Leave())
     recent = page.reached(stage="idle")["recent"]
@@ -93,16 +115,17 @@ def test_photographs_are_posed_trained_and_shown(page: Shown, photographs: Path,
     assert page.shown == [(tmp_path / "made" / "yard" / "run", "yard")]
 
 
-@pytest.mark.parametrize("then", ["show", "leave"])
-def test_training_is_stopped_to_show_what_there_is_or_to_leave_it(page: Shown, photographs: Path, then: str) -> None:
+@pytest.mark.parametrize(("asked", "stage"), [(Stop(), "open"), (Leave(), "idle")])
+def test_a_scene_in_training_is_shown_until_it_is_left(page: Shown, photographs: Path, asked: Any, stage: str) -> None:
     page.handle(Open(path=str(photographs)))
     state = page.reached(stage="training", share=0.5)
-    assert state["picture"] == 7 and state["detail"] == "step 7 · 20.0 dB · 1:01 left"
+    assert state["detail"] == "step 7 · 20.0 dB · 1:01 left"
+    until(lambda: len(page.shown) == 1)
     with pytest.raises(UsageError, match="yard is being made"):
         page.handle(Open(path=str(photographs)))
-    page.handle(Stop(then=then))
-    page.reached(stage="open" if then == "show" else "idle")
-    assert len(page.shown) == (then == "show")
+    page.handle(asked)
+    until(lambda: not page._busy)
+    assert page.reached(stage=stage) and len(page.shown) == (stage == "open")
 
 
 def test_a_failure_is_told_and_nothing_is_lost(page: Shown, photographs: Path, tmp_path: Path) -> None:
@@ -127,5 +150,4 @@ def test_requests_that_make_no_sense_are_refused(page: Shown) -> None:
             page.handle(asked)
     with pytest.raises(UsageError):
         page.piece("../yard", "a.ply", 0, 4, b"x")
-    assert page.picture() == b""
     assert page.reached(stage="idle")["folder"] == ""

@@ -15,7 +15,6 @@ from pages import page_of, seen, written
 from splat_ball import ball
 
 from fprf.errors import DataError
-from fprf.io.video import write_video
 from fprf.page.writer import PageView, Style, write_page
 
 VOID = {"meta", "link", "img", "input", "br"}
@@ -100,7 +99,6 @@ def test_names_are_text_whatever_they_hold(tmp_path: Path) -> None:
         views=[PageView(EVIL, view.original, view.photograph) for view in plain.views],
         styles=[style._replace(name=EVIL + str(k), references=[EVIL]) for k, style in enumerate(plain.styles)],
         references=[plain.references[0]._replace(name=EVIL)],
-        metrics={EVIL: EVIL},
         credits=[EVIL],
     )
     write_page(tmp_path / "evil.html", evil)
@@ -129,18 +127,3 @@ def test_without_gaussians_there_are_pictures(tmp_path: Path) -> None:
     assert write_page(tmp_path / "field.html", page) == 0
     data = Read(tmp_path / "field.html").data
     assert data["scene"] is None and {name: len(rows) for name, rows in data["stills"].items()} == {"Captured": 3, "dusk": 3}
-
-
-def test_films_are_embedded_linked_or_named(tmp_path: Path) -> None:
-    frames = [np.full((32, 32, 3), 20 * k, np.uint8) for k in range(4)]
-    film = tmp_path / "a film.mp4"
-    write_video(film, iter(frames), 12)
-    scene = seen(ball(50))
-    (video,) = Read(written(tmp_path / "a.html", scene, film=film)).all("video")
-    assert base64.b64decode(video["src"].split(",")[1]) == film.read_bytes()
-    film.write_bytes(film.read_bytes() + bytes(2 << 20))
-    (video,) = Read(written(tmp_path / "b.html", scene, film=film)).all("video")
-    assert video["src"] == "a%20film.mp4"
-    film.write_bytes(b"mp4v")
-    read = Read(written(tmp_path / "c.html", scene, film=film))
-    assert not read.all("video") and read.all("a", href="a%20film.mp4")

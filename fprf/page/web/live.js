@@ -45,13 +45,21 @@ class Live {
     if (typeof data !== "string") { await this.paint(new Uint8Array(data)); return; }
     const message = JSON.parse(data);
     if (message.type === "said") say(message.text, message.bad);
-    else if (message.type === "start" && this.scene) location.reload();
-    else if (message.type === "start") { this.mode("start"); this.start.fill(message); }
+    else if (message.type === "start") this.begun(message);
     else if (message.type === "loading") this.mode("loading");
     else if (message.type === "scene") await this.open(message);
     else if (message.type === "state") this.fill(message);
     else if (message.type === "training") this.trained(message);
     else if (message.type === "colours") await this.recolour(message);
+  }
+
+  // How far the start is; with a scene of its own, which may still be trained.
+  begun(message) {
+    if (!this.scene) { this.mode("start"); this.start.fill(message); return; }
+    if (message.stage === "idle") { location.reload(); return; }
+    at("scenes").hidden = false;
+    at("finish").hidden = message.stage !== "training";
+    if (message.error) say(message.error, true);
   }
 
   mode(name) {
@@ -67,7 +75,6 @@ class Live {
     this.scene = scene;
     document.title = `${scene.name} - fprf`;
     at("title").textContent = scene.name;
-    at("scenes").hidden = !scene.back;
     at("place").classList.toggle("field", !scene.gaussians);
     at("save-ply").hidden = !scene.gaussians;
     head.alone = true;
@@ -168,16 +175,27 @@ class Live {
     at("make-film").disabled = busy || !state.keys.length;
     at("play").disabled = state.keys.length < 2;
     if (this.before && state.film.ready && !this.before.film.ready) this.offer("/film", "download the film");
-    if (this.before && state.pictures > this.before.pictures) this.offer(`/picture?number=${state.pictures - 1}`, "download the picture", true);
     this.before = state;
   }
 
-  offer(href, text, at_once = false) {
-    const link = make("a", { href, textContent: text, download: "" });
-    if (at_once) { document.body.append(link); link.click(); link.remove(); return; }
+  offer(href, text) {
     const line = say("", true);
     line.classList.remove("bad");
-    line.append(link);
+    line.append(make("a", { href, textContent: text, download: "" }));
+  }
+
+  download(href, name = "") {
+    const link = make("a", { href, download: name });
+    document.body.append(link);
+    link.click();
+    link.remove();
+  }
+
+  // What is seen, as large as it is here; WebGL keeps no picture, so it is drawn once more.
+  picture() {
+    const { canvas, splats, camera, lens, look, scene } = this.place;
+    splats?.draw(camera.view, lens, look, { near: scene.near, background: scene.background, exact: true });
+    canvas.toBlob((blob) => this.download(URL.createObjectURL(blob), `${this.scene.name}.png`));
   }
 
   card(row) {
@@ -266,8 +284,9 @@ class Live {
       }
     };
     at("make-film").onclick = () => this.tell("film", { seconds: +at("seconds").value });
-    at("save-ply").onclick = () => this.offer("/gaussians", "", true);
-    at("save-picture").onclick = () => this.tell("picture", { camera: this.camera() });
+    at("save-ply").onclick = () => this.download("/gaussians");
+    at("save-picture").onclick = () => this.picture();
+    at("finish").onclick = () => this.start.stop();
     at("scenes").onclick = () => post("/start", JSON.stringify({ type: "leave" })).catch((error) => say(error.message, true));
   }
 }

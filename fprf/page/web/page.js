@@ -170,8 +170,4 @@ const open = async (data) => {
     stage.add(styles[k]);
   }
   root.classList.add("ready");
-  const film = document.querySelector("video.flight");
-  if (film && !matchMedia("(prefers-reduced-motion: reduce)").matches) {
-    new IntersectionObserver(([entry]) => (entry.isIntersecting ? film.play().catch(() => {}) : film.pause()), { threshold: 0.3 }).observe(film);
-  }
 };

@@ -26,7 +26,7 @@ const tidy = (rows) => {
 
 class Start {
   constructor() {
-    Object.assign(this, { sending: null, drawn: -1 });
+    Object.assign(this, { sending: null });
     at("pick-files").onclick = () => at("files").click();
     at("pick-folder").onclick = () => at("folder").click();
     for (const id of ["files", "folder"]) {
@@ -36,8 +36,7 @@ class Start {
       };
     }
     at("path").onsubmit = (event) => { event.preventDefault(); this.open(at("path-of").value); };
-    at("show").onclick = () => this.stop("show");
-    at("stop").onclick = () => this.stop("leave");
+    at("stop").onclick = () => this.stop();
   }
 
   get minutes() { return Number(at("minutes").value) || 2; }
@@ -47,10 +46,10 @@ class Start {
   ask(type, more) { return post("/start", JSON.stringify({ type, ...more })); }
   open(path) { return this.attempt(async () => { this.fault(""); await this.ask("open", { path, minutes: this.minutes }); }); }
 
-  stop(then) {
+  stop() {
     return this.attempt(async () => {
       this.fault("");
-      if (this.sending) { this.sending.stopped = true; this.fill({ stage: "idle", recent: [] }); } else await this.ask("stop", { then });
+      if (this.sending) { this.sending.stopped = true; this.fill({ stage: "idle", recent: [] }); } else await this.ask("stop");
     });
   }
 
@@ -98,8 +97,6 @@ class Start {
     at("making").hidden = idle;
     if (idle) {
       at("strip").replaceChildren();
-      at("picture").hidden = true;
-      this.drawn = -1;
       at("recent").hidden = !state.recent.length;
       at("recent").querySelector("ul").replaceChildren(...state.recent.map((row) => make("li", {}, make("button", { type: "button", title: row.path, onclick: () => this.open(row.path) },
         make("b", { textContent: row.name }), make("small", { textContent: `${row.kind}, ${row.when}` })))));
@@ -116,18 +113,11 @@ class Start {
     at("what").children[1].textContent = state.detail;
     at("bar").className = state.share === null ? "busy" : "";
     at("bar").firstChild.style.width = `${100 * (state.share ?? 0)}%`;
-    at("show").hidden = state.stage !== "training" || !(state.picture >= 0) || Boolean(state.error);
     at("stop").textContent = state.error ? "Back" : "Stop";
     at("stop").hidden = ["opening", "open"].includes(state.stage) && !state.error;
     at("lines").hidden = !state.lines?.length;
     at("lines").querySelector("pre").textContent = (state.lines ?? []).join("\n");
     document.querySelector(".where").hidden = !state.folder;
     document.querySelector(".where code").textContent = state.folder ?? "";
-    if (state.picture > this.drawn) {
-      this.drawn = state.picture;
-      const next = new Image();
-      next.onload = () => { at("picture").src = next.src; at("picture").hidden = false; at("strip").replaceChildren(); };
-      next.src = `/start/picture?step=${this.drawn}`;
-    }
   }
 }

@@ -1,7 +1,8 @@
 """Stands in for pycolmap in tests: the same calls, a database of the same tables, a model of cameras in a row.
 
-`fake.json` beside the database steers it: {"bare": images without features, "lonely": images that match nothing,
-"apart": images that end in a second model, "unposed": images without a pose, "fail": a step that ends the process}.
+`fake.json` beside the database steers it: {"bare": images without features, "lonely": images that match nothing, "apart":
+images that end in a second model, "angle": degrees between the rays of any two images, at most, "unposed": images without a
+pose, "fail": a step that ends the process}.
 What was done is written to `calls.txt` there.
 """
 
@@ -23,7 +24,8 @@ Device = Enum("Device", ["auto", "cpu"])
 CameraMode = Enum("CameraMode", ["SINGLE"])
 FeatureExtractionOptions = lambda: SimpleNamespace(max_image_size=-1, num_threads=-1, sift=SimpleNamespace())  # noqa: E731
 ImageReaderOptions = FeatureMatchingOptions = ImportedPairingOptions = SimpleNamespace
-TwoViewGeometryOptions = IncrementalPipelineOptions = SimpleNamespace
+TwoViewGeometryOptions = SimpleNamespace
+IncrementalPipelineOptions = lambda: SimpleNamespace(mapper=SimpleNamespace(init_min_tri_angle=16.0))  # noqa: E731
 
 
 def set_random_seed(seed):
@@ -141,7 +143,7 @@ def incremental_mapping(database, images, out, options, *, initial_image_pair_ca
     names = list(sizes)
     lost = {name for key in ("bare", "lonely", "apart", "unposed") for name in plan.get(key, [])}
     main = [name for name in names if name not in lost]
-    if plan.get("nothing"):
+    if plan.get("nothing") or plan.get("angle", 180) < options.mapper.init_min_tri_angle / 4:
         return {}
     initial_image_pair_callback()
     for _ in main[2:]:

@@ -1,0 +1,301 @@
+"""What the page shows, as immutable values: looks, the shelf of photographs, keyframes; and what messages change in them.
+
+A look says how a scene is coloured: `StyleConfig` holds what the sliders set, `Look.config` is the whole style in the terms of
+`style.json`.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import count
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, TypeAlias
+
+import msgspec
+
+from ..errors import UsageError
+from ..io.images import Picture
+from ..io.maps import palette
+from ..plugins import slots
+from ..style.config import StyleConfig, with_preset
+from ..style.dictionary import Reference
+from . import messages
+from .messages import Camera
+
+Map: TypeAlias = Literal["none", "matches", "regions", "depth"]
+RegionAction: TypeAlias = Literal["pin", "forbid", "keep"]
+SHELF = 12
+"""Photographs on the shelf; the oldest that no look needs makes room."""
+NOW = "Now"
+"""Name of the colours of the present look, beside those of looks that are kept."""
+_MAX_KEYS = 64
+_SLIDERS = (
+    "strength", "bold", "luminance", "clusters", "blend", "stylizer.temperature", "stylizer.smoothness",
+)  # fmt: skip
+"""Fields of `StyleConfig` that the page shows."""
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """A photograph on the shelf, encoded once; compared by identity."""
+
+    number: int
+    """Its name in requests of the page."""
+    name: str
+    path: Path
+    thumbnail: Picture
+    reference: Reference
+
+
+class RegionRule(NamedTuple):
+    """A style that a region may take; `photograph` is None where the region is kept as it is."""
+
+    region: int
+    action: RegionAction
+    photograph: Photograph | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Look:
+    """Colours of a scene; equal looks are the same style."""
+
+    mix: tuple[tuple[Photograph, float], ...] = ()
+    """Photographs with their weights, above 0, in the order of the shelf; none = the scene as it is."""
+    style: StyleConfig = StyleConfig()
+    """All else, without references and rules."""
+    rules: frozenset[RegionRule] = frozenset()
+
+    @property
+    def plain(self) -> bool:
+        """True for the scene as it was captured."""
+        return not self.mix or self.style.strength == 0
+
+    def mixed(self, mix: Iterable[tuple[Photograph, float]]) -> "Look":
+        """The look with other photographs; rules that name a photograph that is not among them go."""
+        mix = tuple(mix)
+        rules = frozenset(rule for rule in self.rules if rule.photograph is None or rule.photograph in dict(mix))
+        return replace(self, mix=mix, rules=rules)
+
+    def weighted(self, photograph: Photograph, weight: float, shelf: Iterable[Photograph]) -> "Look":
+        """The look with another weight of a photograph; 0 removes it."""
+        weights = dict(self.mix) | {photograph: weight}
+        return self.mixed((each, weights[each]) for each in shelf if weights.get(each, 0.0) > 0)
+
+    def ruled(self, region: int, action: RegionAction | None, photograph: Photograph | None = None) -> "Look":
+        """The look with a rule for a region; None removes its rules. Pinning and keeping replace the rules it had.
+
+        A region for which every photograph would be forbidden loses its rules instead.
+        """
+        # Rules of other regions stay.
+        mine = {rule for rule in self.rules if rule.region == region}
+        rest = self.rules - mine
+        if action is None:
+            return replace(self, rules=rest)
+        new = {RegionRule(region, action, None if action == "keep" else photograph)}
+        # Forbidden photographs add up; every other rule takes the place of those before it.
+        if action == "forbid":
+            new |= {rule for rule in mine if rule.action == "forbid"}
+            if {rule.photograph for rule in new} >= {each for each, _ in self.mix}:
+                return replace(self, rules=rest)
+        return replace(self, rules=rest | new)
+
+    def renumbered(self, regions: Sequence[int]) -> "Look":
+        """The look with region r as regions[r]: regions were measured again."""
+        return replace(self, rules=frozenset(rule._replace(region=regions[rule.region]) for rule in self.rules))
+
+    def config(self) -> StyleConfig:
+        """The look as a style; references in the order of the mix."""
+        # REGION=REFERENCE, by the reference's place in the mix, as `--pin` and `--forbid` take them; `--keep` takes regions.
+        place = {photograph: i for i, (photograph, _) in enumerate(self.mix)}
+        texts: dict[str, list[str]] = {"pin": [], "forbid": [], "keep": []}
+        for region, action, photograph in self.rules:
+            if photograph is None:
+                texts[action].append(str(region))
+            elif photograph in place:
+                texts[action].append(f"{region}={place[photograph]}")
+        return replace(
+            self.style,
+            references=tuple(photograph.path for photograph, _ in self.mix),
+            weights=tuple(weight for _, weight in self.mix),
+            pin=tuple(sorted(texts["pin"])),
+            forbid=tuple(sorted(texts["forbid"])),
+            keep=tuple(sorted(texts["keep"])),
+        )
+
+
+class RegionInfo(NamedTuple):
+    """A region that was picked."""
+
+    region: int
+    share: float
+    """Of the scene."""
+    taken: tuple[tuple[str, float], ...]
+    """Share that it takes from each photograph, the largest first; empty without a style."""
+
+
+class Key(NamedTuple):
+    """A keyframe of a film."""
+
+    camera: Camera
+    look: Look
+
+
+class Shown(NamedTuple):
+    """What is shown of a scene."""
+
+    look: Look
+    map: Map = "none"
+    region: int | None = None
+    """A region to be highlighted; the others are dimmed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """What the page shows, for all clients alike but for their cameras."""
+
+    shelf: tuple[Photograph, ...] = ()
+    look: Look = field(default_factory=Look)
+    together: bool = False
+    """A photograph that is dropped joins the others; else it becomes the style alone."""
+    map: Map = "none"
+    picked: RegionInfo | None = None
+    kept: tuple[tuple[str, Look], ...] = ()
+    """Looks that were kept, by name."""
+    keys: tuple[Key, ...] = ()
+    film: tuple[int, int, Path | None] = (0, 0, None)
+    """Frames done, of how many, and the film that is finished."""
+
+    @property
+    def shown(self) -> Shown:
+        """What is shown of the scene."""
+        return Shown(self.look, self.map, None if self.picked is None else self.picked.region)
+
+    @property
+    def in_use(self) -> frozenset[Photograph]:
+        """Photographs that some look needs."""
+        looks = [self.look, *(look for _, look in self.kept), *(key.look for key in self.keys)]
+        return frozenset(photograph for look in looks for photograph, _ in look.mix)
+
+    def photograph(self, number: int | None) -> Photograph:
+        """A photograph of the shelf. Raises UsageError where it is not there."""
+        for each in self.shelf:
+            if each.number == number:
+                return each
+        raise UsageError(f"card {number}: none of the shelf")
+
+    def unused_name(self, name: str) -> str:
+        """The name, with a number where a photograph of the shelf has it already."""
+        taken = {photograph.name for photograph in self.shelf}
+        return name if name not in taken else next(each for n in count(2) if (each := f"{name} ({n})") not in taken)
+
+    def added(self, photograph: Photograph) -> "State":
+        """With a new photograph on the shelf and in the look; the oldest one that no look needs makes room."""
+        shelf = (*self.shelf, photograph)
+        together = self.together and self.look.mix
+        look = self.look.weighted(photograph, 1.0, shelf) if together else self.look.mixed([(photograph, 1.0)])
+        look = replace(look, style=replace(look.style, strength=look.style.strength or 1.0))  # else nothing is seen of it
+        state = replace(self, shelf=shelf, look=look, picked=None)
+        while len(state.shelf) > SHELF:
+            spare = [each for each in state.shelf if each not in state.in_use] or [state.shelf[0]]
+            state = state.removed(spare[0])
+        return state
+
+    def removed(self, photograph: Photograph) -> "State":
+        """Without a photograph on the shelf and in the look; looks that were kept, and keys of the film, keep it."""
+        shelf = tuple(each for each in self.shelf if each is not photograph)
+        return replace(self, shelf=shelf, look=self.look.weighted(photograph, 0.0, shelf))
+
+    def changed(self, message: messages.Change) -> "State":
+        """What a control of the page makes of the state. Raises UsageError or ConfigError for what is not possible."""
+        look = self.look
+        match message:
+            case messages.Set():
+                value: Any = int(message.value) if message.name == "clusters" else round(message.value, 4)
+                return replace(self, look=replace(look, style=slots.replace(look.style, message.name, value)))
+            case messages.Preset():
+                return replace(self, look=replace(look, style=with_preset(look.style, message.name)))
+            case messages.Map():
+                return replace(self, map=message.map)
+            case messages.Card():
+                photograph = self.photograph(message.card)
+                if message.action == "remove":
+                    return self.removed(photograph)
+                if message.action == "alone":
+                    return replace(self, look=look.mixed([(photograph, 1.0)]))
+                return replace(self, look=look.weighted(photograph, message.weight, self.shelf))
+            case messages.Region():
+                return self._ruled(message)
+            case messages.Keep():
+                return self._kept(message)
+            case messages.Key():
+                return self._keyed(message)
+
+    def _ruled(self, message: messages.Region) -> "State":
+        """With a rule for the region that is picked, or with none picked."""
+        if message.action == "close":
+            return replace(self, picked=None)
+        if self.picked is None:
+            raise UsageError("region: none is picked")
+        look, photograph = self.look, None
+        if message.action in ("pin", "forbid"):
+            photograph = self.photograph(message.card)
+            if photograph not in dict(look.mix):
+                look = look.weighted(photograph, 1.0, self.shelf)
+        action = None if message.action == "free" else message.action
+        return replace(self, look=look.ruled(self.picked.region, action, photograph))
+
+    def _kept(self, message: messages.Keep) -> "State":
+        """With the look kept under a name, or that of a name in use again."""
+        name, held = " ".join(message.name.split())[:40], dict(self.kept)
+        if message.action == "restore" and name in held:
+            return replace(self, look=held[name])
+        if not name or name in (NOW, "Captured") or message.action == "restore":
+            raise UsageError("keep look: give it a name of its own")
+        if len(held.keys() - {name}) >= _MAX_KEYS:
+            raise UsageError(f"keep look: at most {_MAX_KEYS} are kept")
+        held.pop(name, None)  # a look that takes the place of another comes last
+        return replace(self, kept=(*held.items(), (name, self.look)))
+
+    def _keyed(self, message: messages.Key) -> "State":
+        """With a keyframe more, less, or in another place."""
+        keys, at = list(self.keys), message.at
+        if message.action == "add":
+            if message.camera is None:
+                raise UsageError("key: a camera is needed")
+            if len(keys) >= _MAX_KEYS:
+                raise UsageError(f"film: at most {_MAX_KEYS} keys; remove one first")
+            return replace(self, keys=(*keys, Key(message.camera, self.look)))
+        if not at < len(keys):
+            raise UsageError(f"film: key {at + 1} of {len(keys)}: there is none")
+        key = keys.pop(at)
+        if message.action == "earlier":
+            keys.insert(max(0, at - 1), key)
+        return replace(self, keys=tuple(keys))
+
+    def described(self) -> dict[str, Any]:
+        """The state as the page reads it."""
+        picked, weights = self.picked, dict(self.look.mix)
+        hues = palette(len(weights)).mul(255).round().int().tolist() if self.map == "matches" else []
+        colours = {each: "rgb({}, {}, {})".format(*hue) for each, hue in zip(weights, hues, strict=False)}
+        region = None
+        if picked is not None:
+            rules = [
+                {"action": rule.action, "card": None if rule.photograph is None else rule.photograph.number}
+                for rule in self.look.rules
+                if rule.region == picked.region
+            ]
+            taken = [{"name": name, "share": share} for name, share in picked.taken]
+            region = {"region": picked.region, "share": picked.share, "taken": taken, "rules": rules}
+        return {
+            "type": "state",
+            "shelf": [
+                {"card": each.number, "name": each.name, "weight": weights.get(each, 0.0), "colour": colours.get(each)}
+                for each in self.shelf
+            ],
+            "look": {name: attrgetter(name)(self.look.style) for name in _SLIDERS},
+            "map": self.map,
+            "picked": region,
+            "kept": [name for name, _ in self.kept],
+            "keys": [msgspec.to_builtins(key.camera) for key in self.keys],
+            "film": {"done": self.film[0], "total": self.film[1], "ready": self.film[2] is not None},
+        }

@@ -1,0 +1,111 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from fprf.errors import ConfigError, UsageError
+from fprf.page.messages import Camera, Card, Keep, Key, Preset, Set
+from fprf.page.state import SHELF, Look, Photograph, State
+from fprf.page.state import Key as Keyframe
+from fprf.style.config import StyleConfig
+from fprf.style.dictionary import Reference
+
+
+def card(number: int) -> Photograph:
+    empty = Reference(f"{number}", torch.zeros(0, 2), torch.zeros(0, 2))
+    return Photograph(number, f"{number}.png", Path(f"/tmp/{number}.png"), np.zeros((1, 1, 3), np.uint8), empty)
+
+
+A, B, C = (card(i) for i in range(3))
+STATE = State().added(A)
+
+
+def test_pins_replace_each_other_and_forbidden_references_add_up() -> None:
+    look = Look(mix=((A, 1.0), (B, 1.0), (C, 1.0)))
+    assert {*look.ruled(1, "pin", A).ruled(1, "pin", B).rules} == {(1, "pin", B)}
+    look = look.ruled(1, "forbid", A).ruled(1, "forbid", B)
+    assert {*look.rules} == {(1, "forbid", A), (1, "forbid", B)}
+    assert look.ruled(1, "forbid", C).rules == look.ruled(1, None).rules == frozenset(), "something must be left to take"
+    assert {*look.mixed([(B, 1.0)]).rules} == {(1, "forbid", B)}, "rules go with their photographs"
+    assert {*look.ruled(0, "keep").renumbered([2, 0]).rules} == {(0, "forbid", A), (0, "forbid", B), (2, "keep", None)}
+
+
+def test_a_look_in_the_terms_of_a_style() -> None:
+    set_ = StyleConfig(strength=0.7, clusters=4, luminance=0.3)
+    look = Look(mix=((A, 1.0), (B, 0.5)), style=set_).ruled(2, "pin", B).ruled(0, "forbid", A).ruled(5, "keep")
+    style = look.config()
+    assert style.references == (A.path, B.path) and style.weights == (1.0, 0.5)
+    assert (style.strength, style.clusters, style.luminance, style.stylizer) == (0.7, 4, 0.3, set_.stylizer)
+    assert style.pin == ("2=1",) and style.forbid == ("0=0",) and style.keep == ("5",)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("strength", 1.5), ("bold", -1.0), ("clusters", 0), ("stylizer.temperature", 0.0), ("stylizer.smoothness", -1.0)],
+)
+def test_an_impossible_look_is_refused(name: str, value: float) -> None:
+    with pytest.raises(ConfigError):
+        STATE.changed(Set(name=name, value=value))  # type: ignore[arg-type]
+
+
+def test_sliders_and_presets_change_the_style() -> None:
+    moved = STATE.changed(Set(name="stylizer.smoothness", value=3)).changed(Set(name="clusters", value=7.0))
+    shown = moved.described()["look"]
+    assert (shown["stylizer.smoothness"], shown["clusters"]) == (3, 7)
+    assert moved.changed(Preset(name="gentle")).described()["look"]["strength"] == 0.9
+
+
+def test_a_new_photograph_is_the_style_or_joins() -> None:
+    assert STATE.look.mix == ((A, 1.0),) and STATE.shelf == (A,)
+    assert STATE.added(B).look.mix == ((B, 1.0),)
+    mixed = State(together=True).added(A).added(B)
+    assert mixed.look.mix == ((A, 1.0), (B, 1.0)) and mixed.shelf == (A, B)
+    off = STATE.changed(Set(name="strength", value=0))
+    assert off.look.plain and off.added(B).look.style.strength == 1.0, "else nothing would be seen of it"
+    assert mixed.changed(Card(card=1, action="alone")).look.mix == ((B, 1.0),)
+    assert mixed.changed(Card(card=1, action="weight", weight=0.5)).look.mix == ((A, 1.0), (B, 0.5))
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_the_shelf_is_bounded(together: bool) -> None:
+    state = State(together=together).added(A).changed(Keep(name="mine", action="keep"))
+    for number in range(10, 10 + 3 * SHELF):
+        state = state.added(card(number))
+        assert len(state.shelf) <= SHELF and state.look.mix[-1][0] is state.shelf[-1] and state.shelf[-1].number == number
+    assert together or A in state.shelf, "the look that was kept needs it"
+
+
+def test_kept_looks_outlive_their_photographs() -> None:
+    state = STATE.changed(Keep(name="  autumn   light ", action="keep"))
+    assert state.kept == (("autumn light", state.look),) == state.changed(Keep(name="autumn light", action="keep")).kept
+    gone = state.changed(Card(card=0, action="remove"))
+    assert gone.shelf == () and gone.look.plain and gone.kept == state.kept and A in gone.in_use
+    assert gone.changed(Keep(name="autumn light", action="restore")).look == state.look
+    for k in range(63):
+        state = state.changed(Keep(name=f"look {k}", action="keep"))
+    for name in ("  ", "one too many", "Now"):
+        with pytest.raises(UsageError, match="keep look"):
+            state.changed(Keep(name=name, action="keep"))
+
+
+def test_keys_are_added_moved_and_removed() -> None:
+    def camera(number: int) -> Camera:
+        return Camera((float(number), 0, 0), ((1, 0, 0), (0, 1, 0), (0, 0, 1)), (9, 9, 8, 6), (16, 12))
+
+    def numbers(state: State) -> list[int]:
+        return [round(each.camera.place[0]) for each in state.keys]
+
+    state = STATE
+    for number in range(3):
+        state = state.changed(Key(action="add", camera=camera(number)))
+    assert numbers(state) == [0, 1, 2] and state.keys[0] == Keyframe(camera(0), state.look)
+    assert numbers(state.changed(Key(action="earlier", at=2))) == [0, 2, 1]
+    assert numbers(state.changed(Key(action="earlier", at=0))) == [0, 1, 2]
+    assert numbers(state.changed(Key(action="remove", at=1))) == [0, 2]
+    full = State(keys=(Keyframe(camera(0), Look()),) * 64)
+    wrong = [(state, Key(action=each, at=3), "of 3") for each in ("earlier", "remove")]  # type: ignore[arg-type]
+    wrong += [(state, Key(action="add"), "camera"), (full, Key(action="add", camera=camera(1)), "64 keys")]
+    for before, message, told in wrong:
+        with pytest.raises(UsageError, match=told):
+            before.changed(message)
