@@ -1,28 +1,40 @@
-"""The rasteriser of 3D Gaussians: kernels against the plain torch form, time and error.
+"""The rasteriser of 3D Gaussians: kernels against the plain torch form, time and error; and what a step of training costs.
 
     python -m benchmarks gaussians [--count 50000] [--threads 1] [--output FILE.json]
+    python -m benchmarks gaussians --training [--threads 2] [--output FILE.json]
 
 A cloud in front of a camera of 500 x 375 pixels; most Gaussians are a pixel or two wide, as in a trained scene. Seconds are the
 least of several calls: of wall time, and of processor time, which counts all threads. The plain form runs once.
+
+`--training` takes photographs and clouds of several sizes, each in a process of its own: seconds of a step, and MiB that the
+Gaussians and one photograph add to the process.
 """
 
 import json
 import math
+import multiprocessing
+import resource
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 import torch
 from torch import Tensor
 
 from fprf.ops import backend
 from fprf.ops.rasterise import Pinhole, Rasterised, lift, rasterise
+from fprf.ops.rasterise_training import TrainableGaussians, target_of
 
 from .common import arguments, report
 
 WIDTH, HEIGHT, BANDS, CHANNELS = 500, 375, 4, 32
+SIZES = (504, 378), (1008, 756), (1600, 1200)
+COUNTS = 60_000, 250_000, 1_000_000
+RATES = 1e-4
+"""Learning rate of all parameters of training steps."""
 
 
 Cloud = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
@@ -102,13 +114,53 @@ def measure(count: int, times: int) -> dict[str, Any]:
     }
 
 
+def step(size: tuple[int, int], count: int, times: int, threads: int) -> dict[str, Any]:
+    """Seconds of a training step, and MiB of the Gaussians with their moments, and of a photograph."""
+    torch.set_num_threads(threads)
+    numba.set_num_threads(threads)
+    width, height = size
+    means, turns, scales, logits, harmonics = cloud(count)
+    rows = torch.cat([means, scales, turns, logits[:, None], harmonics.flatten(1)], 1).numpy()
+    view = camera()
+    grown = torch.tensor([[width / WIDTH], [height / HEIGHT], [1.0]])
+    view = view._replace(intrinsics=view.intrinsics * grown, width=width, height=height)
+    photograph = np.random.default_rng(0).random((height, width, 3), np.float32)
+
+    def peak() -> float:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+    before = peak()
+    model = TrainableGaussians(count, BANDS)
+    model.start(rows)
+    target = target_of(view, photograph)
+    rates = np.full(rows.shape[1], RATES, np.float32)
+    taken = least(lambda: model.learn(target, background=(0.0, 0.0, 0.0), ssim=0.2, rates=rates), times)
+    kept = sum(part.nbytes for part in target if isinstance(part, np.ndarray)) / 2**20
+    return {"size": size, "gaussians": count, **taken, "mib": peak() - before, "mib_of_a_photograph": kept}
+
+
+def training(times: int, threads: int) -> list[dict[str, Any]]:
+    """`step` for all sizes and counts."""
+    found = []
+    for size in SIZES:
+        for count in COUNTS:
+            with multiprocessing.get_context("spawn").Pool(1) as pool:
+                found.append(pool.apply(step, (size, count, times, threads)))
+            print(json.dumps(found[-1]), flush=True)
+    return found
+
+
 def main(argv: list[str]) -> None:
     parser = arguments("gaussians", __doc__)
     parser.add_argument("--count", type=int, default=50_000)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--times", type=int, default=30)
+    parser.add_argument("--training", action="store_true", help="what a step of training costs")
     parser.add_argument("--output", type=Path)
     args = parser.parse_args(argv)
+    if args.training:
+        report(args.output, {"threads": args.threads, "steps": training(args.times, args.threads)})
+        return
     torch.set_num_threads(args.threads)
     numba.set_num_threads(args.threads)
     found: dict[str, Any] = {"threads": args.threads, **measure(args.count, args.times)}

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from fprf.config import RenderConfig
 from fprf.datamanagers.features import FeatureStore
-from fprf.ops import backend, dense, mixture, triplane
+from fprf.ops import backend, dense, triplane
 from fprf.rendering.cameras import Cameras
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
@@ -53,7 +53,6 @@ SWITCHES: dict[str, Patches] = {
     "tri-planes": [(triplane, "usable", never)],
     "tri-planes: total variation": [(triplane, "variation", triplane.variation_reference)],
     "networks": [(dense, "usable", never)],
-    "styles at points": [(mixture, "usable", never)],
     "guided features": [(FeatureStore, "at", plain_lookups)],
 }
 """What is replaced where a kernel is off."""

@@ -35,6 +35,7 @@ from fprf.style.dictionary import Encoders
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
 from fprf.style.restyle import apply_style
+from fprf.style.scene_style import to_tensors
 from fprf.training.driver import Report, learn, schedule_of
 from fprf.training.learner import FieldLearner
 from fprf.training.loading import Trained
@@ -198,8 +199,10 @@ def short_training(config: TrainConfig, folder: Path, progress: Progress) -> Sho
     learn(learner, run, schedule_of(config, len(prepared.scene.train)), report)
     model = learner.model.requires_grad_(False).eval()
     seconds = time.perf_counter() - start
-    style = measure_style(config, model, prepared.scene.cameras, prepared.scene.train), prepared.basis
-    trained = Trained(run, config, "", run.load_known(), model, config.steps, seconds, style=lambda: style)
+    run.save_tensors("style", to_tensors(measure_style(config, model, prepared.scene.cameras, prepared.scene.train)))
+    if prepared.basis is not None:
+        run.save_tensors("basis", prepared.basis.tensors())
+    trained = Trained(run, config, "", run.load_known(), model, config.steps, seconds)
     return Short(trained, trained.encoders())
 
 

@@ -27,7 +27,6 @@ from .speed import plain_planes
 from .subject import count, difference, exact, find, plainly, settings, size_of, small_view, view_rays, watch_of
 
 BUDGETS = {"0": 0.0, "1/4096": 1 / 4096, "1/1024": 1 / 1024, "1/512": 1 / 512, "1/256": 1 / 256, "1/64": 1 / 64, "1/16": 1 / 16}
-SAMPLES = (0.25, 0.5, 0.75, 1.5, 2.0, 4.0)
 CHUNKS = (1024, 4096, 32768)
 SIZES = (0.25, 0.5, 0.75)
 Draw = Callable[[Cameras], Annotated[Tensor, "H W 3"]]
@@ -72,8 +71,6 @@ def knobs(trained: Trained, look: Restyle | None) -> Iterator[tuple[str, Draw]]:
         yield f"quality {preset}", drawer(chosen, chosen.config.render)
     for name, budget in BUDGETS.items():
         yield f"budget {name}", drawer(trained, replace(render, budget=budget))
-    for share in SAMPLES:
-        yield f"samples x {share:g}", drawer(at_quality(trained, QualityConfig(samples=share)), render)
     for chunk in CHUNKS:
         yield f"chunk {chunk}", drawer(trained, replace(render, chunk=chunk))
     for size in SIZES:

@@ -32,14 +32,14 @@ from fprf.datamanagers.parsers.config import (
 from fprf.datamanagers.parsers.files import read_npz
 from fprf.datamanagers.parsers.phototourism import read_list
 from fprf.errors import FprfError
+from fprf.io import tensorfiles
 from fprf.plugins.codec import load_config
 from fprf.rendering.camera_path import read_camera_path
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.gaussians import Gaussians
-from fprf.style.dictionary import load_dictionary, save_dictionary
 from fprf.style.files import read_style
 from fprf.testing import cases
-from fprf.training import checkpoint, tensorfiles
+from fprf.training import checkpoint
 
 WHOLE_EVERY = 16
 """Rounds of which one is read to the end, where a reader of the bytes alone is known."""
@@ -255,12 +255,10 @@ def _config(folder: Path) -> Target:
 
 def _tensors(folder: Path) -> list[Target]:
     folder.mkdir()
-    sealed, codes = folder / "style.safetensors", folder / "dictionary.safetensors"
+    sealed = folder / "style.safetensors"
     tensorfiles.save(sealed, {"mean": torch.arange(6.0), "keys": torch.ones(3, 4)}, sealed=True)
-    save_dictionary(codes, cases.dictionary(3, 4, 2))
     return [
         Target("sealed tensors", sealed, lambda: tensorfiles.load_sealed(sealed)),
-        Target("style dictionary", codes, lambda: load_dictionary(codes)),
     ]
 
 

@@ -14,6 +14,7 @@ from fprf.config import RenderConfig
 from fprf.datamanagers.bounds import find_space
 from fprf.datamanagers.scene import Scene
 from fprf.errors import FprfError
+from fprf.io import tensorfiles
 from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.renderer import render_rays
@@ -22,7 +23,6 @@ from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
 from fprf.style.restyle import apply_style
 from fprf.testing import cases
-from fprf.training import tensorfiles
 from fprf.training.loading import Trained
 from fprf.training.model import Facts, Model, background_of
 from fprf.types import Rays, Want

@@ -35,6 +35,15 @@ def splat_training(found: Any) -> Rows:
         )
 
 
+def training_steps(found: Any) -> Rows:
+    """What a step of training Gaussians costs."""
+    yield "photograph", "Gaussians", "a step", "Gaussians and a step", "a photograph"
+    for row in found["steps"]:
+        size = "x".join(map(str, row["size"]))
+        told = f"{row['mib']:.0f} MiB", f"{row['mib_of_a_photograph']:.0f} MiB"
+        yield size, str(row["gaussians"]), f"{1000 * row['seconds']:.0f} ms", *told
+
+
 def methods(found: Any) -> Rows:
     """The two methods for a CPU on captures; the better one is bold."""
     yield "capture", "photographs", "size", "`fprf-splats`", "`fprf-lite`"
@@ -69,6 +78,7 @@ def splat_restyle(found: Any) -> Rows:
 
 TABLES: Mapping[str, Callable[[Any], Rows]] = {
     "splat_training": splat_training,
+    "training_steps": training_steps,
     "methods": methods,
     "restyle_town_gaussians": restyle_town_gaussians,
     "splat_restyle": splat_restyle,

@@ -197,8 +197,6 @@ class RunConfig:
     """Entry point in `fprf.scenes` of the function that opens such a run."""
     untrained: ClassVar[tuple[str, ...]] = ()
     """Fields that may differ when a run is resumed, beside RESUMABLE: nothing that is trained depends on them."""
-    former: ClassVar[tuple[str, ...]] = ()
-    """Fields of files written before that mean nothing any more."""
     open: ClassVar[tuple[str, ...]] = ("downscale",)
     """Fields whose value may be None, which `planned` decides before a run begins."""
 
@@ -428,18 +426,6 @@ class TrainConfig(RunConfig):
         except WeightsError as fault:
             missing.append(Need(f"content.decoder: {fault}", pretrain_line(self.content.encoder)))
         return missing
-
-
-@dataclass(frozen=True, kw_only=True)
-class IncompleteConfig(TrainConfig):
-    """A saved config whose method is not installed here: enough to render, not to train, which may need the method's fields."""
-
-    reason: str
-    """Why the method cannot be loaded."""
-    unknown: str
-    """The fields that the method added, as JSON text."""
-    packages: str
-    """The packages of the method and of the plug-ins in its fields, by path, as JSON text."""
 
 
 def fields_only(config: RunConfig, root: Path) -> TrainConfig:

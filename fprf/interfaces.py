@@ -398,10 +398,6 @@ class SceneLearner(Learner):
     def facts(self) -> "Facts":
         """Facts found before the first step, for scene.json."""
 
-    @abstractmethod
-    def scene(self) -> Scene:
-        """The scene as learnt so far."""
-
     def begin(self, run: "Run") -> str:
         """Write further files of the run before the first step; return a line about what will be learnt, or nothing."""
         return ""

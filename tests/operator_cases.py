@@ -11,7 +11,7 @@ import torch
 from ops.plain_forms import plainly
 from torch import Tensor
 
-from fprf.ops import dense, guided, mixture, triplane
+from fprf.ops import dense, guided, triplane
 from fprf.rendering import cameras, lens, space, splines, stepfun
 from fprf.rendering.lens import lens_reach
 from fprf.style import dictionary, light, look, matching, scene_style, statistics
@@ -140,14 +140,8 @@ CASES = [
     Case("guided.apply", lambda n: (_draw(4, 5, 6, 4), 37 * _unit(n, 2), _unit(n, 3)),
          lambda c, p, rgb: guided.apply(c, p, rgb, (37, 37))),
     Case("space.distance", lambda n: (_edges(n, 21), _unit(n) + 0.05, 9 * _unit(n) + 2), _open("contraction").distance),
-    Case("mixture.affine", lambda n: (_draw(n, 16), _shares(n, 3), _draw(3, 16, 16), _draw(3, 16), _draw(16)),
-         lambda x, s, m, b, c: mixture.affine(x, s, m, b, centre=c)),
-    Case("mixture.affine, plain", lambda n: (_draw(n, 16), _shares(n, 3), _draw(3, 16, 16), _draw(3, 16), _draw(16)),
-         plainly(lambda x, s, m, b, c: mixture.affine(x, s, m, b, centre=c)), slopes=(0, 2, 3)),
-    Case("mixture.scaled", lambda n: (_draw(n, 16), _shares(n, 3), _draw(3, 16), _draw(3, 16), _draw(16)),
-         lambda x, s, g, b, c: mixture.scaled(x, s, g, b, centre=c)),
-    Case("mixture.scaled, plain", lambda n: (_draw(n, 16), _shares(n, 3), _draw(3, 16), _draw(3, 16), _draw(16)),
-         plainly(lambda x, s, g, b, c: mixture.scaled(x, s, g, b, centre=c)), slopes=(0, 1, 2, 3)),
+    Case("scene_style.mixed_maps", lambda n: (_draw(n, 16), _shares(n, 3), _draw(3, 16, 16), _draw(3, 16), _draw(16)),
+         lambda x, s, m, b, c: scene_style.mixed_maps(x, s, m, b, centre=c), slopes=(0, 2, 3)),
     Case("triplane.lookup", _planes, lambda p, t, w: triplane.lookup(p, t, (8, 16)), slopes=(1,)),
     Case("triplane.lookup_reference", _planes, lambda p, t, w: triplane.lookup_reference(p, t, (8, 16)), slopes=(1,)),
     Case("triplane.variation", lambda n: (_draw(triplane.rows((n,)), 8),), lambda t: triplane.variation(t, (_side(t),)),

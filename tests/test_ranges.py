@@ -23,7 +23,6 @@ from fprf.plugins.encoders.config import (
     DinoConfig,
     Dinov2Config,
     RandomConfig,
-    Vgg16Config,
     Vgg19Config,
 )
 from fprf.plugins.executors.config import RayConfig
@@ -47,7 +46,7 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
     OptimizerConfig: {"rate": [0.0], "final": [1.5], "beta2": [-0.1], "eps": [0.0]},
     RenderConfig: {"budget": [0.6], "train_budget": [-0.1], "chunk": [0], "background": [(0.0, 1.5, 0.0), (0.0, nan, 0.0)]},
     StatisticsConfig: {"rays": [3], "regions": [0]},
-    QualityConfig: {"samples": [0.0], "budget": [0.6, -0.1], "chunk": [0], "resolution": [0.0, 1.5]},
+    QualityConfig: {"budget": [0.6, -0.1], "chunk": [0], "resolution": [0.0, 1.5]},
     PlanesConfig: PLANES | {"degree": [0, 5]},
     SemanticPlanesConfig: PLANES,
     GridConfig: {"cells": [(0, 1)], "size": [0.0], "margin": [0.0, 0.6]},
@@ -65,8 +64,7 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
         "resolutions": [(1, 8)],
     },
     RandomConfig: {"channels": [0], "stride": [0], "seed": [-1]},
-    Vgg16Config: {"layer": ["relu3_4", "fc7"]},
-    Vgg19Config: {"layer": ["relu0_1", "relu2_3", "relu2_1 "]},
+    Vgg19Config: {"layer": ["relu0_1", "relu2_3", "relu2_1 ", "relu3_5", "fc7"]},
     DinoConfig: {"layer": [0], "stride": [0]},
     Dinov2Config: {"layer": [0], "stride": [0]},
     ConcatConfig: {"weights": [(0.0,), (1.0, -1.0), (inf,)]},

@@ -83,9 +83,6 @@ class PlaneLearner(SceneLearner):
     def load(self, state):
         self.plane.texture.copy_(state.model["texture"])
 
-    def scene(self):
-        return self.plane
-
 
 def open_plane(run, config, device, quality):
     saved, _ = checkpoint.load_latest(run.checkpoints)

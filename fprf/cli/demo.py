@@ -1,8 +1,5 @@
 """`fprf demo`: a garden from photographs to a page that shows it restyled. No network, no data."""
 
-import os
-import subprocess
-import sys
 import time
 from dataclasses import dataclass, replace
 from importlib.resources import files
@@ -21,8 +18,6 @@ LEAD = (
     "Trained on a CPU from 25 photographs. Each look is then taken from one picture, without training, and is the same "
     "from every viewpoint."
 )
-_NICE = 10
-"""Lowered priority of what compiles beside the training."""
 LOOKS = ("winter", "night", "sunset", "autumn")
 """References, in the order in which they are shown."""
 CREDITS = (
@@ -70,12 +65,8 @@ def run(args: list[str]) -> int:
     garden = Path(str(files("fprf") / "garden"))
     output = config.output / "run"
     training = replace(fprf_splats(), data=garden, downscale=config.downscale, output=output, minutes=config.minutes)
-    # What restyling needs is compiled beside the training, at low priority: else the first style takes 12 s more. Training ends
-    # with its minutes, whoever else computes.
-    quiet = subprocess.DEVNULL
-    with subprocess.Popen([sys.executable, "-m", __name__], stdin=quiet, stdout=quiet, stderr=quiet):
-        root = train(training, "fprf-splats")
-        metrics = evaluate(EvalConfig(run=root, images=False))
+    root = train(training, "fprf-splats")
+    metrics = evaluate(EvalConfig(run=root, images=False))
     opened = open_gaussians(Run(root), training, "cpu", QualityConfig())
     scene, views = opened.scene, opened.known.test
     names = {garden / "references" / f"{name}.jpg": name for name in LOOKS}
@@ -126,19 +117,3 @@ def run(args: list[str]) -> int:
         f"open {page}; {config.output}/*.ply open in any viewer of Gaussians"
     )
     return 0
-
-
-def _compile() -> None:
-    import torch
-
-    from ..ops.mixture import scaled
-
-    if hasattr(os, "nice"):
-        os.nice(_NICE)
-    point = torch.zeros(1, 3)
-    with torch.inference_mode():
-        scaled(point, torch.ones(1, 1), point, point, centre=point[0])
-
-
-if __name__ == "__main__":
-    _compile()

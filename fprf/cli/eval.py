@@ -1,9 +1,11 @@
 """`fprf eval RUN`: measure a run on views it has not seen."""
 
 import math
+import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console
 from rich.table import Table
@@ -12,6 +14,10 @@ from ..errors import UsageError
 from ..progress import Display
 from ..training.quality import QualityConfig
 from .parsing import parse
+
+if TYPE_CHECKING:
+    from ..training.run import History
+
 
 _LONGEST = 1600
 """Longest side of views as they are judged, where neither the user nor the training says another."""
@@ -34,6 +40,8 @@ class EvalConfig(QualityConfig):
     metrics.json then says how far they were moved."""
     images: bool = True
     """Write the renders to RUN/renders/SPLIT."""
+    tensorboard: Path | None = None
+    """A folder for how training went, as event files of TensorBoard (extra tensorboard): `tensorboard --logdir` shows them."""
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
 
@@ -43,6 +51,10 @@ def run(args: list[str]) -> int:
     description = "Measure a run: PSNR, SSIM, speed, memory, consistency over views."
     config = parse(EvalConfig(), args, prog="fprf eval", description=description, positional=("run",))
     metrics = evaluate(config)
+    if config.tensorboard is not None:
+        from ..training.run import read_history
+
+        write_scalars(config.tensorboard, read_history(config.run))
     _print(metrics)
     return 0
 
@@ -102,6 +114,32 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
     if config.images:
         write_frames(config.run / "renders" / config.split, [known.names[view] for view in views], images)
     return metrics
+
+
+def write_scalars(folder: Path, histories: "Sequence[History]") -> int:
+    """One run of TensorBoard for the training and each block, replaced if it is there; how many values were written.
+
+    Times are those of training, so that a resumed run has no gap. Raises UsageError without the package `tensorboard`.
+    """
+    try:
+        from torch.utils.tensorboard.writer import SummaryWriter
+    except ImportError as fault:
+        raise UsageError("--tensorboard: the package tensorboard is not installed; pip install 'fprf[tensorboard]'") from fault
+    written = 0
+    for history in histories:
+        place = folder / (history.name or "training")
+        shutil.rmtree(place, ignore_errors=True)
+        writer = SummaryWriter(str(place))
+        # A figure that a step did not measure leaves a gap in its curve.
+        try:
+            for name, values in history.values.items():
+                for step, seconds, value in zip(history.step, history.seconds, values, strict=True):
+                    if value is not None:
+                        writer.add_scalar(name, value, step, walltime=seconds)
+                        written += 1
+        finally:
+            writer.close()
+    return written
 
 
 def _print(metrics: dict[str, object]) -> None:

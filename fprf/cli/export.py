@@ -1,6 +1,5 @@
-"""`fprf export RUN [ply splat glb cameras lut ...]`: a scene, plain or restyled, as files that other programs open."""
+"""`fprf export RUN [ply splat glb cameras ...]`: a scene, plain or restyled, as files that other programs open."""
 
-import hashlib
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -44,9 +43,6 @@ def run(args: list[str]) -> int:
     for name in names:
         if names.count(name) > 1:
             raise UsageError(f"--styles {name}: two styles of this name; give each its own")
-    # Tables are a way into a style; where nobody asked for them they are left out without a word.
-    if "lut" in what.kinds and not styles and (config.kinds or what.single):
-        raise UsageError("fprf export: a lut is the way into a style; name one with --references, --style or --styles")
     if what.single is not None and len(styles) > 1:
         raise UsageError(f"--output {what.single}: one file holds one style, {len(styles)} are asked for; name a folder")
     from ..io.atomic import write_json
@@ -67,7 +63,6 @@ def run(args: list[str]) -> int:
             **export.gaussians(),
             **export.meshes(),
             **export.cameras(),
-            **export.tables(),
         }
     made["seconds"] = time.perf_counter() - start
     if what.single is None:
@@ -123,9 +118,7 @@ class _Export:
     def gaussians(self) -> dict[str, Any]:
         """Gaussians as they are, or fitted to the scene's own renders; the same in each look, but for their colours."""
         from ..splats.files import Written, write_gaussians, write_ply_parts
-        from ..training.checkpoint import digest
 
-        # The key names what a file was made from: the checkpoint, the style, the frame.
         config, scene, paths, losses, count = self.config, self.opened.scene, [], dict[str, None](), 0
         own = scene.gaussian_rows() is not None
         if not self.what.formats:
@@ -135,17 +128,14 @@ class _Export:
         rows = (scene.restyled(look.restyle).gaussian_rows() for look in self.looks) if own else self._fitted()
         for look, gaussians in zip(self.looks, rows, strict=True):
             assert gaussians is not None
-            count, style = gaussians.count, "" if look.restyle is None else look.restyle.digest
-            state = f"{digest(self.opened.run.checkpoints)} {style}{' local' * config.local}" if own else ""
-            key = hashlib.sha256(state.encode()).hexdigest() if own else ""
+            count = gaussians.count
             for path in self.what.paths("splats", look.name, *(f".{each}" for each in self.what.formats)):
-                if key and not config.plain and format_name(path) == "ply":  # in parts: what was cut off goes on
+                if own and not config.plain and format_name(path) == "ply":  # in parts: of large scenes little is in memory
                     written = Written()
                     write_ply_parts(
                         path,
                         gaussians.part,
                         count,
-                        key,
                         antialiased=gaussians.antialiased,
                         origin=scene.origin,
                         local=config.local,
@@ -214,31 +204,3 @@ class _Export:
         write_json(path, transforms(scene.cameras.shifted(added), files, train=known.train, test=known.test))
         write_offset(path, beside)
         return {"cameras": len(files)}
-
-    def tables(self) -> dict[str, Any]:
-        """Lookup tables of every style, for the whole scene and each region."""
-        styled = [look for look in self.looks if look.restyle is not None]
-        if "lut" not in self.what.kinds or not styled:
-            return {}
-        from ..export.lut import colour_pairs, fit_table, moved, write_cube
-
-        (plain, *others), share = colour_pairs(
-            self.opened.scene, [None, *(look.restyle for look in styled)], self.opened.known.train
-        )
-        made: dict[str, Any] = {}
-        for look, target in zip(styled, others, strict=True):
-            weights = {"all": share.sum(1)}
-            if self.what.single is None and share.shape[1] > 1:
-                weights |= {f"region{k}": share[:, k] for k in range(share.shape[1])}
-            for region, weight in weights.items():
-                table = fit_table(plain, target, weight, self.config.lut_size)
-                # What the table leaves of the difference between the looks, and what is there without one.
-                parts = weight.double()[:, None] / weight.double().sum().clamp_min(1e-12) / 3
-                rms = [
-                    float((parts * (colour - target).double().square()).sum().sqrt())
-                    for colour in (moved(table, plain).clamp(0, 1), plain)
-                ]
-                made[f"{look.name}/{region}"] = {"rms": rms[0], "rms_without": rms[1]}
-                path = self.what.single or self.what.folder / "luts" / look.name / f"{region}.cube"
-                write_cube(path, table, f"{look.name} {region}")
-        return {"luts": made}

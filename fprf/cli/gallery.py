@@ -37,8 +37,8 @@ class GalleryConfig(StyleConfig, QualityConfig):
     """Style files (style.json), each one more style."""
     together: bool = True
     """Also show all photographs as one style."""
-    split: Literal["covered", "test", "train", "all"] = "covered"
-    """Views to choose from. covered: at most 8, those that training views surround; test: those held out from training."""
+    split: Literal["some", "test", "train", "all"] = "some"
+    """Views to choose from. some: at most 8 training views, spread evenly; test: those held out from training."""
     most: int = 6
     """Views that are shown, evenly taken from the split."""
     views: tuple[str, ...] = ()

@@ -43,7 +43,7 @@ VERBS = {
     "gallery": Verb("RUN --references DIR", "a run in every style, as one page to walk through"),
     "render": Verb("RUN --path PATH --output X.mp4", "fly through a scene, plain or restyled"),
     "view": Verb("[RUN]", "in the browser: make a scene, drop a photograph on it"),
-    "export": Verb("RUN [ply splat glb cameras lut]", "points, splats, meshes, cameras, lookup tables as files"),
+    "export": Verb("RUN [ply splat glb cameras]", "points, splats, meshes, cameras as files"),
     "pretrain": Verb("decoder", "train the decoder of an encoder"),
     "plugins": Verb("[--check]", "list what is installed, and check that it loads"),
     "doctor": Verb("[DIR|METHOD]", "look over this machine, a scene or a method's needs"),

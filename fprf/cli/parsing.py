@@ -5,7 +5,6 @@ import dataclasses
 import difflib
 import enum
 import io
-import json
 import os
 import re
 import shutil
@@ -14,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_origin
 
-from ..errors import ConfigError, PluginError, UsageError
+from ..errors import ConfigError, UsageError
 from ..plugins import registry
 from ..plugins.codec import Missing, load_config, method_config
 from ..plugins.slots import Slot, hints_of, is_slot, members, resolve, slots
@@ -202,14 +201,8 @@ def parse(default: C, args: Sequence[str], *, prog: str, description: str, posit
 
 def load_method(name: str) -> "tuple[RunConfig, str]":
     """The config of a method, or of a saved `config.json` with the name of the method that it started from."""
-    from ..config import IncompleteConfig
-
     if name.endswith(".json"):
-        config, method = load_config(Path(name))
-        if isinstance(config, IncompleteConfig):
-            package = json.loads(config.packages)["method"]
-            raise PluginError(f"{name}: {config.reason}; to train with this config install {package}")
-        return config, method
+        return load_config(Path(name))
     if (Path(name) / "config.json").is_file() and name not in registry.installed("fprf.methods"):
         raise UsageError(f"{name}: is a folder, not a method; to train with its config name {Path(name) / 'config.json'}")
     return method_config(name), name

@@ -67,10 +67,6 @@ class RenderVerbConfig(StyleConfig, QualityConfig):
     """Layers of each frame, from left to right."""
     format: Literal["png", "jpg"] = "png"
     """Format of frames in a folder."""
-    lens: Literal["own", "panorama"] = "own"
-    """own: as the path has it. panorama: all round (equirectangular)."""
-    across: int = 2048
-    """Width of a panorama in pixels; it is half as high."""
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
 
@@ -79,7 +75,6 @@ class RenderVerbConfig(StyleConfig, QualityConfig):
         QualityConfig.__post_init__(self)
         at_least("frames", self.frames, 1)
         at_least("fps", self.fps, 1)
-        at_least("across", self.across, 2)
         if not self.show:
             raise ConfigError("show: name at least one of colour, depth, normals, match")
         if self.keyframes is not None and (self.references or self.style):
@@ -95,7 +90,7 @@ def run(args: list[str]) -> int:
     from ..io.maps import depth_limits
     from ..io.sheet import side_by_side
     from ..io.video import FILMS, MAX_FPS, missing_frames, write_video
-    from ..rendering.paths import make_path, panoramas, upwards
+    from ..rendering.paths import make_path
     from ..training.loading import open_run
 
     if config.output.suffix.lower() in _NO_FOLDERS:
@@ -108,10 +103,6 @@ def run(args: list[str]) -> int:
     cameras = make_path(known.cameras, views, config.path, config.frames, opened.scene.origin)
     # Captured views keep the stem of their image.
     names = [known.names[view] for view in views] if config.path == "dataset" else [f"{i:05d}" for i in range(len(cameras))]
-    if config.lens != "own":
-        if known.facts.space.kind == "ndc":  # nothing was seen behind the cameras
-            raise UsageError(f"--lens {config.lens}: this scene was captured from one side (space ndc); nothing is all round")
-        cameras = panoramas(cameras, config.across, upwards(known.cameras))
     takes = _takes(opened.scene, config, file)
     whole = config.output.suffix.lower() in FILMS
     folder = config.output.with_suffix(".frames") if whole else config.output

@@ -41,8 +41,8 @@ class StylizeConfig(StyleConfig, QualityConfig):
     """A style file, such as the style.json of an earlier run, of this scene or another; flags come over it."""
     output: Path | None = None
     """Folder for what is made; by default RUN/styles/NAME, with the name of the style file's folder or of the references."""
-    split: Literal["covered", "test", "train", "all"] = "covered"
-    """Views to restyle. covered: at most 8, those that training views surround; test: those held out from training."""
+    split: Literal["some", "test", "train", "all"] = "some"
+    """Views to restyle. some: at most 8 training views, spread evenly; test: those held out from training."""
     views: tuple[str, ...] = ()
     """Views to restyle by name, instead of a split."""
     explain: bool = False

@@ -4,9 +4,9 @@ Extraction runs the encoder once a view at the image's own size and keeps guided
 precision in files; `FeatureStore.at` reads the cells around the pixels of a batch and applies them. Full-size feature maps
 never exist. Semantic features are projected on principal components of the training views before they are kept.
 
-A file is named by the hash of everything that it was made from, holds a checksum of what it should contain, and appears
-under its name only when it is whole. So whatever an interrupted run, a second writer or a bad disk leaves behind is either
-right or made again; nothing is ever found by position.
+A file is named by the hash of everything that it was made from, holds checksums (`io.tensorfiles`), and appears under its
+name only when it is whole. So whatever an interrupted run, a second writer or a bad disk leaves behind is either right or
+made again; nothing is ever found by position.
 
 Half precision keeps 11 bits of each number, so numbers are made small first: b is taken at mid-grey (colours are then in
 [-0.5, 0.5]) and relative to its mean, and each channel is divided by its largest coefficient.
@@ -20,22 +20,18 @@ import copy
 import hashlib
 import os
 import time
-import zlib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-import safetensors
-import safetensors.torch
 import torch
 import torch.nn.functional as F
-from safetensors import SafetensorError
 from torch import Tensor
 
-from ..errors import DataError, NumericsError, PluginError
+from ..errors import CheckpointError, DataError, NumericsError, PluginError
 from ..interfaces import Encoder
-from ..io.atomic import atomic_path
+from ..io import tensorfiles
 from ..ops import guided
 from .basis import Basis, fit_basis
 from .config import GuidedConfig
@@ -78,26 +74,16 @@ def digest(*parts: str | bytes) -> str:
     return state.hexdigest()[:32]
 
 
-def write_tensors(folder: Path, key: str, tensors: Mapping[str, Tensor]) -> None:
-    """Named tensors in FOLDER/KEY.safetensors with key and checksum, whole or not at all."""
-    plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    with atomic_path(folder / f"{key}.safetensors") as temporary:
-        safetensors.torch.save_file(plain, temporary, metadata={"key": key, "crc32": str(_checksum(plain))})
-
-
-def read_tensors(folder: Path, key: str) -> dict[str, Tensor] | None:
-    """Read what `write_tensors` wrote under the key; None where it is absent, damaged or of another key."""
+def read_kept(folder: Path, key: str) -> dict[str, Tensor] | None:
+    """The tensors in FOLDER/KEY.safetensors, mapped; None where it is absent or damaged."""
     path = folder / f"{key}.safetensors"
     try:
-        with safetensors.safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, SafetensorError):
+        tensors = tensorfiles.load_sealed(path)
+    except CheckpointError:
         return None
     with contextlib.suppress(OSError):  # a cache that is only read; its order of use is then not known
         os.utime(path)
-    right = metadata.get("key") == key and metadata.get("crc32") == str(_checksum(tensors))
-    return tensors if right else None
+    return tensors
 
 
 def keep_within(folder: Path, size: int, used: Collection[str]) -> None:
@@ -118,15 +104,6 @@ def keep_within(folder: Path, size: int, used: Collection[str]) -> None:
             with contextlib.suppress(OSError):
                 path.unlink()
                 total -= bytes_of
-
-
-def _checksum(tensors: Mapping[str, Tensor]) -> int:
-    result = 0
-    for name in sorted(tensors):
-        tensor = tensors[name]
-        result = zlib.crc32(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode(), result)
-        result = zlib.crc32(tensor.reshape(-1).view(torch.uint8).numpy().data, result)
-    return result
 
 
 Progress = Callable[[int, int, str], None]
@@ -260,13 +237,13 @@ def extract(
         stride = min(config.stride, max(1, (2 * radius + 1) // CELLS_PER_WINDOW))
         settings = f"radius {radius} eps {config.eps!r} stride {stride} fineness {guided.FINENESS}"
         keys[view] = key = digest(prints[view], encoder.identity, settings, projection, *place)
-        tensors, features = read_tensors(folder, key), remembered.pop(view, None)
+        tensors, features = read_kept(folder, key), remembered.pop(view, None)
         if tensors is None or tensors.keys() != set(Entry._fields):
             features = _encode(encoder, pixels, view) if features is None else features
             made = _make(features, pixels, basis, radius=radius, eps=config.eps, stride=stride)._asdict()
-            write_tensors(folder, key, made)
+            tensorfiles.save(folder / f"{key}.safetensors", made, sealed=True)
             # Read back: what trains is what lies on disk, mapped rather than held in memory.
-            tensors = read_tensors(folder, key) or made
+            tensors = read_kept(folder, key) or made
         entries[view] = Entry(**tensors)
     keep_within(folder, CACHED_BYTES, set(keys.values()))
     if progress is not None:
@@ -329,7 +306,7 @@ def _basis(
     views = list(prints)
     chosen = views[:: max(1, -(-len(views) // BASIS_VIEWS))]
     key = digest("basis", str(dim), str(BASIS_CELLS), encoder.identity, *(prints[view] for view in chosen))
-    kept = read_tensors(folder, key)
+    kept = read_kept(folder, key)
     if kept is not None:
         return Basis.from_tensors(kept)
     # As many cells of each view, drawn evenly.
@@ -344,5 +321,5 @@ def _basis(
         count = min(len(cells), max(1, BASIS_CELLS // len(chosen)))
         samples.append(cells[torch.randperm(len(cells), generator=generator)[:count]])
     basis = fit_basis(torch.cat(samples), dim)
-    write_tensors(folder, key, basis.tensors())
+    tensorfiles.save(folder / f"{key}.safetensors", basis.tensors(), sealed=True)
     return basis

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from ..checks import at_least, between, positive
+from ..checks import at_least, positive
 from ..errors import UsageError
 from ..plugins.registry import nearest
 from ..splats.config import endings, format_name
@@ -19,7 +19,7 @@ class ExportConfig(StyleConfig):
     run: Path = Path()
     """Run folder."""
     kinds: tuple[str, ...] = ()
-    """Kinds of files; none named = ply splat glb cameras, and lut where there are styles."""
+    """Kinds of files; none named = ply splat glb cameras."""
     output: Path | None = None
     """A folder, or a single file, whose ending says the kind; by default RUN/exports."""
     style: Path | None = None
@@ -45,8 +45,6 @@ class ExportConfig(StyleConfig):
     origin, each with NAME.offset.json beside it, for programs that do not read float64 positions or a node's translation."""
     mesh_edge: float | None = None
     """Edge of the mesh's lattice in world units, above 0; none = twice the median pixel's on the surface."""
-    lut_size: int = 33
-    """Nodes a side of lookup tables, in [2, 129]; editors take 17, 33 or 65."""
     images: bool = False
     """With cameras: also render every view, in the style if there is one, so that other methods can train on them."""
     device: str = "auto"
@@ -56,7 +54,6 @@ class ExportConfig(StyleConfig):
         super().__post_init__()
         at_least("views", self.views, 2)
         at_least("side", self.side, 8)
-        between("lut_size", self.lut_size, 2, 129)
         at_least("fit_cap", self.fit_cap, 1)
         for name in ("fit", "reach", "mesh_edge"):
             if getattr(self, name) is not None:
@@ -66,14 +63,11 @@ class ExportConfig(StyleConfig):
 KINDS = {
     "glb": "mesh.glb and mesh.ply with vertex colours",
     "cameras": "transforms.json of Nerfstudio",
-    "lut": "3D lookup tables of each style, for video editors",
 }
 """Kinds of files but those of Gaussians, whose kinds are the formats that are installed."""
 FIT_MINUTES = 4.0
-_DEFAULT = ("ply", "splat", "glb", "cameras", "lut")
-_ALSO = {"gaussians": "ply", "mesh": "glb", "transforms": "cameras", "luts": "lut"}
-"""Other words for the kinds; `splats` are ply and splat."""
-_ENDINGS = {".glb": "glb", ".json": "cameras", ".cube": "lut"}
+_DEFAULT = ("ply", "splat", "glb", "cameras")
+_ENDINGS = {".glb": "glb", ".json": "cameras"}
 
 
 class Plan(NamedTuple):
@@ -102,13 +96,11 @@ def plan(kinds: Sequence[str], output: Path) -> Plan:
     Raises UsageError for what does not fit.
     """
     formats = [ending[1:] for ending in endings() if ending[1:] not in KINDS]
-    wanted: list[str] = []
+    known = [*formats, *KINDS]
     for kind in kinds:
-        if kind not in (*formats, *KINDS, *_ALSO, "splats"):
-            near = nearest(kind, [*formats, *KINDS, *_ALSO, "splats"])
-            raise UsageError(f"fprf export: {kind!r} is nothing to export{near} (kinds: {', '.join([*formats, *KINDS])})")
-        wanted += ["ply", "splat"] if kind == "splats" else [_ALSO.get(kind, kind)]
-    wanted = [*dict.fromkeys(wanted)]
+        if kind not in known:
+            raise UsageError(f"fprf export: {kind!r} is nothing to export{nearest(kind, known)} (kinds: {', '.join(known)})")
+    wanted = [*dict.fromkeys(kinds)]
     kind_of_file = format_name(output) or _ENDINGS.get(output.suffix.lower())
     if kind_of_file is None or output.is_dir():
         return Plan(tuple(wanted) or _DEFAULT, output, None)

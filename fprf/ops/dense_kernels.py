@@ -5,11 +5,10 @@ vectors (padded with zeros), and the padding of one layer's outputs meets zero w
 
 A product is made of tiles, whose outputs are held in registers while the inputs stream by:
 
-    multiply     out[r, :]  = max(start[r, :] + sum_k x[r, k] w[k, :], floor)     r < ROWS[columns], : = columns vectors of WIDE
-    accumulate   out[r, :] += scale[r] (start[r, :] + sum_k x[r, k] w[k, :])
+    out[r, :] = max(start[r, :] + sum_k x[r, k] w[k, :], floor)     r < ROWS[columns], : = columns vectors of WIDE
 
-Each output is one sum over k in order, whatever the tile: results do not depend on how a product is cut. Strides are x by row
-and by k, w by k, the others by row; `_at` is the first number of each.
+Each output is one sum over k in order, whatever the tile: results do not depend on how a product is cut. Rows of x follow each
+other, `depth` numbers each; strides are w by k, the others by row; `_at` is the first number of each.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, call-arg"
@@ -26,51 +25,37 @@ ROWS = (0, 16, 12, 8, 6) if WIDE == 16 else (0, 12, 6, 4, 3)
 """Rows of the tile with so many columns of vectors."""
 
 
-def _sums(x, x_at, x_row, x_step, w, w_at, w_step, start, s_at, s_row, depth, columns):
-    """start + x w, a row of vectors after the other."""
+@traced
+def multiply(x, x_at, w, w_at, w_step, start, s_at, s_row, out, o_at, depth, floor, columns):
+    """A tile of outputs from the floor on. A NaN is not below it and stays."""
     places = [(r, c) for r in range(ROWS[columns]) for c in range(columns)]
 
     def step(k, sums):
         weights = [load(w, w_at + k * w_step + c * WIDE, WIDE) for c in range(columns)]
-        values = [narrow(x[x_at + x_row * r + k * x_step], WIDE) for r in range(ROWS[columns])]
+        values = [narrow(x[x_at + depth * r + k], WIDE) for r in range(ROWS[columns])]
         return [each + values[r] * weights[c] for each, (r, c) in zip(sums, places, strict=True)]
 
-    return zip(places, repeat(depth, [load(start, s_at + s_row * r + c * WIDE, WIDE) for r, c in places], step), strict=True)
-
-
-@traced
-def multiply(x, x_at, x_row, x_step, w, w_at, w_step, start, s_at, s_row, out, o_at, o_row, depth, floor, columns):
-    """A tile of outputs from the floor on. A NaN is not below it and stays."""
-    for (r, c), value in _sums(x, x_at, x_row, x_step, w, w_at, w_step, start, s_at, s_row, depth, columns):
-        store(out, o_at + o_row * r + c * WIDE, maximum(narrow(floor, WIDE), value))
-
-
-@traced
-def accumulate(
-    x, x_at, x_row, x_step, w, w_at, w_step, start, s_at, s_row, out, o_at, o_row, depth, scale, c_at, c_row, columns
-):
-    """Add a tile times the scales of its rows."""
-    for (r, c), value in _sums(x, x_at, x_row, x_step, w, w_at, w_step, start, s_at, s_row, depth, columns):
-        o = o_at + o_row * r + c * WIDE
-        store(out, o, load(out, o, WIDE) + value * narrow(scale[c_at + c_row * r], WIDE))
+    begin = [load(start, s_at + s_row * r + c * WIDE, WIDE) for r, c in places]
+    for (r, c), value in zip(places, repeat(depth, begin, step), strict=True):
+        store(out, o_at + w_step * r + c * WIDE, maximum(narrow(floor, WIDE), value))
 
 
 @numba.njit(inline="always", cache=True)
-def product(x, x_at, x_row, x_step, rows, w, w_at, width, start, s_at, s_row, out, o_at, o_row, depth, floor):
-    """out[r] = max(start[r] + x[r] w, floor) for `rows` rows (whole tiles: a divisor or multiple of BLOCK) of `width`."""
+def product(x, x_at, w, w_at, width, start, s_at, s_row, out, depth, floor):
+    """out[r] = max(start[r] + x[r] w, floor) for a block of rows of `width`."""
     for c in range(0, width, 4 * WIDE):
         columns = min(4, (width - c) // WIDE)
-        for r in range(0, rows, ROWS[columns]):
-            i, s, o = x_at + r * x_row, s_at + r * s_row + c, o_at + r * o_row + c
+        for r in range(0, BLOCK, ROWS[columns]):
+            i, s, o = x_at + r * depth, s_at + r * s_row + c, r * width + c
             # The shape of a tile is a constant of the compiled code.
             if columns == 4:
-                multiply(x, i, x_row, x_step, w, w_at + c, width, start, s, s_row, out, o, o_row, depth, floor, 4)
+                multiply(x, i, w, w_at + c, width, start, s, s_row, out, o, depth, floor, 4)
             elif columns == 3:
-                multiply(x, i, x_row, x_step, w, w_at + c, width, start, s, s_row, out, o, o_row, depth, floor, 3)
+                multiply(x, i, w, w_at + c, width, start, s, s_row, out, o, depth, floor, 3)
             elif columns == 2:
-                multiply(x, i, x_row, x_step, w, w_at + c, width, start, s, s_row, out, o, o_row, depth, floor, 2)
+                multiply(x, i, w, w_at + c, width, start, s, s_row, out, o, depth, floor, 2)
             else:
-                multiply(x, i, x_row, x_step, w, w_at + c, width, start, s, s_row, out, o, o_row, depth, floor, 1)
+                multiply(x, i, w, w_at + c, width, start, s, s_row, out, o, depth, floor, 1)
 
 
 @traced
@@ -96,7 +81,7 @@ def _layers(source, at, depth, weights, biases, widths, side, row, first, rows, 
         floor = np.float32(0) if layer < layers - 1 else _LEAST
         # Sums that start from `here` may end there: a tile is read whole before it is written.
         goal = here if layer % 2 == 0 else there
-        product(source, at, depth, 1, BLOCK, weights, w_at, width, start, b_at, s_row, goal, 0, width, depth, floor)
+        product(source, at, weights, w_at, width, start, b_at, s_row, goal, depth, floor)
         w_at, b_at = w_at + depth * width, b_at + width
         start, s_row, source, at, depth = biases, 0, goal, 0, width
     if depth == outputs:

@@ -2,22 +2,15 @@
 
     colour' = colour A + b,   0.5 + Y0 dc' = (0.5 + Y0 dc) A + b,   higher harmonics' = harmonics A
 
-exact from every direction, with the zeroth harmonic Y0. The plain form is the reference for every device and dtype; float32
-on the CPU is compiled.
+exact from every direction, with the zeroth harmonic Y0.
 """
-
-# The checker takes compiled functions to have one argument.
-# mypy: disable-error-code="call-arg"
 
 import functools
 import math
 from typing import Annotated, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
-
-from .dense import array, usable
 
 HARMONIC = 0.28209479177387814
 """The zeroth spherical harmonic, 1 / (2 sqrt(pi))."""
@@ -95,16 +88,9 @@ def recoloured(
 ) -> Annotated[Tensor, "N K 3"]:
     """Harmonics as drawn, mapped by A = 1 + change[:, :3] and b = change[:, 3]; those of no weight stay, bit for bit.
 
-    Mean colours stay below `MAX_COLOUR`, but for those that were above it. Both forms agree within 60 u of the largest harmonic
-    and change, u = 2^-24; the compiled one has no gradients.
+    Mean colours stay below `MAX_COLOUR`, but for those that were above it. Within 60 u of the largest harmonic and change,
+    u = 2^-24.
     """
-    if usable(harmonics):
-        from . import harmonics_kernels as kernels
-
-        out = torch.empty_like(harmonics, memory_format=torch.contiguous_format)
-        flat = [array(x.float()) for x in (harmonics, change, weight, directions.values, directions.fit)]
-        kernels.recolour(*flat, len(directions.values), np.float32(MAX_COLOUR), out.view(-1).numpy())
-        return out
     # All harmonics by A; the zeroth again, as colour A + b within its limit.
     drawn = as_drawn(harmonics, directions)
     matrix = torch.eye(3).to(change) + change[:, :3]

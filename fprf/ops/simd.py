@@ -356,22 +356,6 @@ def greater_bits(x, y):
     return _Index(x.build, x.build.zext(x.build.bitcast(bits, ir.IntType(LANES)), _LONG))
 
 
-@traced
-def scaled(x, x_at, factor, y, y_at, out, to):
-    """out[to : to + NARROW] = y[y_at :] + factor * x[x_at :]."""
-    store(out, to, load(y, y_at, NARROW) + load(x, x_at, NARROW) * narrow(factor, NARROW))
-
-
-@traced
-def dot(x, x_at, y, y_at, count):
-    """Sum of x[x_at + i] * y[y_at + i] over i < count, a multiple of NARROW: lanes first, then halves of them."""
-
-    def step(i, sums):
-        return [sums[0] + load(x, x_at + i, NARROW) * load(y, y_at + i, NARROW)]
-
-    return total(*repeat(count, [splat(x, 0, NARROW)], step, NARROW))
-
-
 def _picked(x, y, mask):
     y = _undefined(x.lanes) if y is None else y.value
     return Vector(x.build, x.build.shuffle_vector(x.value, y, ir.Constant(_ints(len(mask)), mask)))

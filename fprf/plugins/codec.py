@@ -2,8 +2,8 @@
 
 Strict: duplicate keys, NaN, unknown keys and foreign formats are refused. Written whole or not at all.
 
-A method returns a `RunConfig`, of fprf or of its own: a file is read as the class that its method returns.
-Where that method is not installed, fields that fprf does not know are kept as data (`IncompleteConfig`).
+A method returns a `RunConfig`, of fprf or of its own: a file is read as the class that its method returns, so a method whose
+config has fields of its own must be installed.
 """
 
 import json
@@ -15,7 +15,7 @@ from ..errors import ConfigError, FprfError, PluginError
 from ..io.atomic import write_text
 from ..io.strict_json import parse_json
 from . import registry
-from .slots import hints_of, slots
+from .slots import slots
 from .typed_json import Missing as Missing
 from .typed_json import from_json as from_json
 from .typed_json import to_json as to_json
@@ -34,25 +34,23 @@ def save_config(path: Path, config: "RunConfig", method: str) -> None:
 
     Raises ConfigError where the config has fields of its own and `method` would not give them back.
     """
-    from ..config import IncompleteConfig, TrainConfig  # the knob tree is made of plug-in configs, which lie above this module
+    from ..config import TrainConfig  # the knob tree is made of plug-in configs, which lie above this module
 
-    # A config whose method is not installed gives back what was kept of it.
-    fields, packages = to_json(config), packages_of(config)
-    if isinstance(config, IncompleteConfig):
-        fields = {name: value for name, value in fields.items() if name not in ("reason", "unknown", "packages")}
-        fields |= json.loads(config.unknown)
-        packages |= json.loads(config.packages)
-    elif type(config) is not TrainConfig:
+    packages = packages_of(config)
+    if type(config) is not TrainConfig:
         if type(method_config(method)) is not type(config):
             raise ConfigError(f"method {method!r} gives no {type(config).__name__}, so its fields could not be read again")
         packages["method"] = registry.entry(_METHODS, method).package
-    whole = {"format": _FORMAT, "fprf": _VERSION, "method": method, "plugins": packages, "config": fields}
+    whole = {"format": _FORMAT, "fprf": _VERSION, "method": method, "plugins": packages, "config": to_json(config)}
     write_text(path, json.dumps(whole, indent=1, allow_nan=False) + "\n")
 
 
 def load_config(path: Path) -> "tuple[RunConfig, str]":
-    """The config of a file and the name of its method. Raises ConfigError naming the file and the field."""
-    from ..config import IncompleteConfig, TrainConfig
+    """The config of a file and the name of its method.
+
+    Raises ConfigError naming the file and the field, PluginError where the method is needed and not installed.
+    """
+    from ..config import TrainConfig
 
     whole = read_json(path)
     try:
@@ -60,21 +58,12 @@ def load_config(path: Path) -> "tuple[RunConfig, str]":
         fields, method, packages = whole["config"], whole["method"], whole["plugins"]
         try:
             kind = type(method_config(method))
-            if isinstance(fields, dict):
-                fields = {name: value for name, value in fields.items() if name not in kind.former}
-            return from_json(fields, kind, packages=packages), method
         except PluginError as fault:  # not installed, or broken
-            reason = str(fault)
-        # Only a method whose package is on record had fields of its own; elsewhere an unknown field is a mistake.
-        if "method" not in packages or not isinstance(fields, dict):
-            return from_json(fields, TrainConfig, packages=packages), method
-        # What fprf knows is read as ever; the rest, and the packages of its plug-ins, is kept as data.
-        known = hints_of(TrainConfig)
-        unknown = {name: value for name, value in fields.items() if name not in known}
-        theirs = {path: text for path, text in packages.items() if path.partition(".")[0] in {*unknown, "method"}}
-        ours = from_json({name: value for name, value in fields.items() if name in known}, TrainConfig, packages=packages)
-        data = json.dumps(unknown, allow_nan=False)
-        return IncompleteConfig(**vars(ours), reason=reason, unknown=data, packages=json.dumps(theirs)), method
+            # Only a method whose package is on record had fields of its own.
+            if "method" in packages:
+                raise PluginError(f"{path}: {fault}; install {packages['method']}") from fault
+            kind = TrainConfig
+        return from_json(fields, kind, packages=packages), method
     except ConfigError as fault:
         raise ConfigError(f"{path}: {fault}") from fault
 

@@ -16,17 +16,6 @@ from ..errors import PluginError
 
 T = TypeVar("T")
 
-REMOVED: Mapping[tuple[str, str], str] = MappingProxyType(
-    {
-        ("fprf.decoders", "residual"): "train the scene again with `--content.decoder mlp`",
-        ("fprf.stylizers", "identity"): "leave the style out, or use strength 0: both show the scene as it is",
-        ("fprf.stylizers", "region-adain"): (
-            "use `region-tone`, which is the same with features 1, colours 0, light false, temperature 0.4 and smoothness 0"
-        ),
-    }
-)
-"""What to do in the place of plug-ins that fprf once had, by group and name."""
-
 
 class Entry(NamedTuple):
     """One registered plug-in, not imported."""
@@ -73,10 +62,7 @@ def forget() -> None:
 
 def entry(group: str, name: str, kind: type = object) -> Entry:
     """The one entry of that name. Raises PluginError where there is none or more than one; others of the kind are named."""
-    # Gone, never there, or there twice.
     entries = installed(group).get(name, ())
-    if not entries and (group, name) in REMOVED:
-        raise PluginError(f"{group}: {name!r} was removed; {REMOVED[group, name]}")
     if not entries:
         others = choices(group, kind)
         raise PluginError(

@@ -38,15 +38,13 @@ class Missing(PluginConfig):
     """Reason why it cannot be loaded."""
 
     def needs(self) -> tuple[Need, ...]:
-        return (Need(self.reason, self._remedy() or "choose another"),)
+        return (Need(self.reason, self._remedy()),)
 
     def build(self, *args: object, **kwargs: object) -> NoReturn:
         """Raise PluginError: takes what any kind's `build` takes."""
-        raise PluginError("; ".join(filter(None, (f"{self.slot}: {self.reason}", self._remedy()))))
+        raise PluginError(f"{self.slot}: {self.reason}; {self._remedy()}")
 
     def _remedy(self) -> str:
-        if (self.kind, self.name) in registry.REMOVED:
-            return ""  # which the reason says
         package = self.package or "the package that provides it"
         return f"install {package}, or choose another with --{self.slot} NAME"
 

@@ -35,8 +35,8 @@ _Side = Annotated[float, Meta(ge=1, le=65536, multiple_of=1)]
 class _Frame(Struct):
     """A frame of a file; other fields are passed over."""
 
-    camera_to_world: list[Any]
-    """16 numbers row by row, or 4 rows of them."""
+    camera_to_world: _Matrix
+    """16 numbers row by row."""
     fov: Annotated[float, Meta(gt=0, lt=180)]
 
 
@@ -50,12 +50,6 @@ class _CameraPath(Struct):
     fps: Annotated[float, Meta(gt=0, lt=1000)] = 24.0
 
 
-class _Poses(Struct):
-    """The matrices of a file's frames, row by row."""
-
-    camera_path: list[_Matrix]
-
-
 def read_camera_path(path: Path, origin: Origin = (0.0, 0.0, 0.0)) -> tuple[Cameras, float]:
     """The frames of a file as pinhole cameras about an origin, float64, and its frames a second.
 
@@ -63,11 +57,7 @@ def read_camera_path(path: Path, origin: Origin = (0.0, 0.0, 0.0)) -> tuple[Came
     """
     try:
         content = msgspec.json.decode(path.read_bytes(), type=_CameraPath)
-        # Matrices are nested or flat; once they are flat, their numbers are checked.
-        rows = [frame.camera_to_world for frame in content.camera_path]
-        flat = [[x for row in matrix for x in (row if isinstance(row, list) else [row])] for matrix in rows]
-        matrices = msgspec.convert({"camera_path": flat}, _Poses).camera_path
-        poses = [_orthonormal(f"$.camera_path[{index}]", matrix) for index, matrix in enumerate(matrices)]
+        poses = [_orthonormal(f"$.camera_path[{k}]", frame.camera_to_world) for k, frame in enumerate(content.camera_path)]
     except FileNotFoundError as error:
         raise DataError(f"{path}: no such camera path; give spiral, interpolate, dataset or a JSON file") from error
     except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError) as error:

@@ -21,8 +21,7 @@ from .lens import PINHOLE, bend, lens_reach, unbend
 
 @dataclass(frozen=True)
 class Cameras:
-    """V views. `lens` is 0 pinhole, 1 OpenCV (k1..k4 radial, p1 p2 tangential), 2 fisheye (equidistant, k1..k4),
-    3 panorama (equirectangular: pixels are angles)."""
+    """V views. `lens` is 0 pinhole, 1 OpenCV (k1..k4 radial, p1 p2 tangential), 2 fisheye (equidistant, k1..k4)."""
 
     pose: Annotated[Tensor, "V 3 4"]
     """Camera to world, float64."""
@@ -68,10 +67,8 @@ class Cameras:
         return self.resized((self.size.double() / downscale).round().clamp_min(1))
 
 
-def ideal_cameras(
-    pose: Annotated[Tensor, "V 3 4"], focal: Tensor | float, size: tuple[int, int], lens: int = PINHOLE
-) -> Cameras:
-    """Views of one size (width, height) without distortion, the principal point in the middle, pixels square.
+def ideal_cameras(pose: Annotated[Tensor, "V 3 4"], focal: Tensor | float, size: tuple[int, int]) -> Cameras:
+    """Pinhole views of one size (width, height) without distortion, the principal point in the middle, pixels square.
 
     `focal` in pixels is one number, or one for each view.
     """
@@ -82,7 +79,7 @@ def ideal_cameras(
         centre=(sides.double() / 2).repeat(count, 1),
         size=sides.repeat(count, 1),
         distortion=torch.zeros(count, 6, dtype=torch.float64),
-        lens=torch.full((count,), lens),
+        lens=torch.full((count,), PINHOLE),
     )
 
 

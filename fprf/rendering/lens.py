@@ -4,7 +4,6 @@ Letters: x y ideal, r = |(x, y)|, θ = angle to the axis; axes are OpenCV's here
 model is u(ρ) = ρ (1 + k1 ρ² + k2 ρ⁴ + k3 ρ⁶ + k4 ρ⁸), with ρ = r for OpenCV's lens and ρ = θ for the fisheye; OpenCV's
 adds tangential terms p1 p2. u grows only up to a *reach* ρ*: what lies beyond folds back onto the image, and pixels
 farther out than u(ρ*) see nothing. Everything is float64; the inverse is good to 1e-12 of the focal length.
-The coordinates of a panorama (equirectangular) are its angles, to the right and downwards.
 """
 
 import math
@@ -13,7 +12,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-PINHOLE, OPENCV, FISHEYE, PANORAMA = 0, 1, 2, 3
+PINHOLE, OPENCV, FISHEYE = 0, 1, 2
 _TOLERANCE = 1e-14
 """Error of the inverse in focal lengths; pixels are some 1e3 to 1e4 times smaller, which leaves 1e-10 px."""
 _STEPS = 60
@@ -148,9 +147,7 @@ def bend(
     # On the axis the direction on the plane is open and the length 0.
     round_ = points[:, :2] * (torch.where(theta <= reach, share * theta, math.nan) / radius.clamp_min(1e-300))[:, None]
     bent = torch.where((lens == OPENCV)[:, None], _brown(distortion, flat), flat)
-    bent = torch.where((lens == FISHEYE)[:, None], round_, bent)
-    turned = torch.stack([torch.atan2(x, z), torch.atan2(y, torch.hypot(x, z))], -1)
-    return torch.where((lens == PANORAMA)[:, None], turned, bent)
+    return torch.where((lens == FISHEYE)[:, None], round_, bent)
 
 
 def unbend(
@@ -164,14 +161,8 @@ def unbend(
     Coordinates that no direction maps to get the direction at the lens's reach.
     """
     ideal = torch.cat([plane, torch.ones_like(plane[:, :1])], -1)
-    around = lens == PANORAMA
-    if bool(around.any()):
-        longitude, latitude = plane.unbind(-1)
-        level = latitude.cos()
-        turned = torch.stack([longitude.sin() * level, latitude.sin(), longitude.cos() * level], -1)
-        ideal = torch.where(around[:, None], turned, ideal)
-    # Only lenses that bend are solved; pinholes and panoramas are closed forms.
-    bent = (lens == OPENCV) | (lens == FISHEYE)
+    # Only lenses that bend are solved.
+    bent = lens != PINHOLE
     if bool(bent.any()):
         index = bent.nonzero()[:, 0]
         distortion, lens, reach, plane = distortion[index], lens[index], reach[index], plane[index]

@@ -2,8 +2,6 @@
 
 World units and OpenGL axes as in `rendering.cameras`; float64. Every path stays where the training cameras were: a
 radiance field knows nothing of places that no camera has seen.
-
-A captured view is worth showing where several training cameras have seen the same from about the same direction (coverage).
 """
 
 import math
@@ -18,9 +16,8 @@ from torch import Tensor
 from ..errors import UsageError
 from ..types import Origin
 from .camera_path import read_camera_path
-from .cameras import Cameras, ideal_cameras, project, rays_through
-from .lens import PANORAMA, PINHOLE
-from .space import Space
+from .cameras import Cameras, ideal_cameras
+from .lens import PINHOLE
 from .splines import catmull_rom, quaternions, rotations, slerp
 
 
@@ -240,69 +237,3 @@ def upwards(cameras: Cameras) -> Annotated[Tensor, "3"]:
     """The mean of the cameras' up, or, where they look straight down, against their view; world axes, not of unit length."""
     up = cameras.pose[:, :, 1].mean(dim=0)
     return cameras.pose[:, :, 2].mean(dim=0) if float(up.norm()) < 0.3 else up
-
-
-def panoramas(cameras: Cameras, width: int, up: Annotated[Tensor, "3"]) -> Cameras:
-    """Level panoramas at the cameras' places, `width` x `width` / 2 pixels, the middle where each camera looks."""
-    ahead = -cameras.pose[:, :, 2]
-    upright = torch.nn.functional.normalize(up, dim=0)
-    level = ahead - (ahead @ upright)[:, None] * upright
-    # A camera that looks straight up or down: its own up is ahead, or behind.
-    level = torch.where(level.norm(dim=-1, keepdim=True) < 1e-3, cameras.pose[:, :, 1], level)
-    place = cameras.pose[:, :, 3]
-    pose = look_at(place, place + level, upright)
-    return ideal_cameras(pose, width / (2 * math.pi), (width, max(1, width // 2)), PANORAMA)
-
-
-_GRID = (4, 3)
-"""Pixels of a view that are looked through, across and down."""
-_HALF = 4
-"""Cameras that see a point at which half of what more of them could add is reached."""
-_ANGLE = 0.7
-"""A camera counts where the cosine between its ray to the point and the view's is larger."""
-_MOST = 256
-"""Views, and training cameras, that are looked at; of more, so many at equal steps."""
-_CHUNK = 16
-"""Views at a time."""
-
-
-def well_covered(cameras: Cameras, train: Sequence[int], space: Space, most: int) -> list[int]:
-    """At most `most` of the views, in their order: all where there are no more, else well-covered ones, spread evenly."""
-    if len(cameras) <= most:
-        return list(range(len(cameras)))
-    views, score = _thinned(range(len(cameras)), max(_MOST, most)), coverage(cameras, train, space)
-    covered = score[views].argsort(descending=True, stable=True)[: max(most, len(views) // 2)].sort().values.tolist()
-    return [views[covered[k * len(covered) // most]] for k in range(most)]
-
-
-def coverage(cameras: Cameras, train: Sequence[int], space: Space) -> Annotated[Tensor, "V"]:
-    """Coverage of each view: n / (n + 4) for n training cameras that see the same from about its direction, in [0, 1).
-
-    What a view shows is not known from cameras alone: it is looked at half as far, as far and twice as far as the scene
-    commonly lies. Of more than 256 views the others have the score 0.
-    """
-    far = 2 * space.near if space.kind == "ndc" else 1 / space.scale
-    distances = torch.tensor([0.5 * far, far, 2 * far], dtype=torch.float64)
-    centres = [(torch.arange(count) + 0.5) / count for count in _GRID]
-    pixels = torch.cartesian_prod(*centres).double()
-    others = torch.tensor(_thinned(train, _MOST))
-    score = torch.zeros(len(cameras), dtype=torch.float64)
-    # Points along a few rays of each view, looked at by all others: in their image, and from about its direction?
-    for views in torch.split(torch.tensor(_thinned(range(len(cameras)), _MOST)), _CHUNK):
-        view = views.repeat_interleave(len(pixels))
-        origin, direction = rays_through(cameras, view, pixels.repeat(len(views), 1) * cameras.size[view])
-        points = (origin[:, None] + direction[:, None] * distances[:, None]).reshape(-1, 3)
-        other = others.repeat_interleave(len(points))
-        pixel, _ = project(cameras, other, points.repeat(len(others), 1))
-        seen = ((pixel >= 0) & (pixel <= cameras.size[other])).all(-1).view(len(others), len(points))
-        way = torch.nn.functional.normalize(points - cameras.pose[others, None, :, 3], dim=-1)
-        alike = (way * direction.repeat_interleave(len(distances), 0)).sum(-1) > _ANGLE
-        count = (seen & alike).sum(0).double().view(len(views), -1)
-        score[views] = (count / (count + _HALF)).mean(1)
-    return score
-
-
-def _thinned(views: Sequence[int], most: int) -> list[int]:
-    """At most so many, at equal steps."""
-    count = min(most, len(views))
-    return [views[k * len(views) // count] for k in range(count)]

@@ -62,7 +62,6 @@ class GaussiansConfig(RunConfig):
 
     kind: ClassVar[str] = "gaussians"
     untrained: ClassVar[tuple[str, ...]] = ("semantic", "regions", "semantic_size", "executor")
-    former: ClassVar[tuple[str, ...]] = ("rounds",)
     open: ClassVar[tuple[str, ...]] = ("downscale", "cap", "passes")
 
     device: str = "auto"

@@ -23,7 +23,6 @@ moments and the step are all the state there is.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -53,7 +52,6 @@ from .config import GaussiansConfig
 from .gaussians import Gaussians, from_arrays, from_rows, from_tensors, tensors_of
 from .initial import Points, curve_order, spacing
 from .photographs import Level
-from .scene import SplatScene, run_scene
 
 _START_OPACITY, _START_SCALE, _FAR_OPACITY = 0.3, 0.7, 0.9
 """First Gaussians: opacity, standard deviation as a share of the distance to their neighbours, opacity far away."""
@@ -329,12 +327,6 @@ class GaussianLearner(SceneLearner):
             for key, each in zip(_KEPT, kept, strict=True):
                 if f"{name}.{key}" in moments:
                     each.copy_(moments[f"{name}.{key}"])
-
-    def scene(self) -> SplatScene:
-        """The Gaussians as they are now, seen from where the cameras are now."""
-        assert self.known is not None  # learners of a run have it
-        cameras = self.known.cameras if self.poses is None else self.poses.refined(self.known.cameras)
-        return run_scene(self.config, replace(self.known, cameras=cameras), self.gaussians(), self.near)
 
     def begin(self, run: Run) -> str:
         most = self.config.limited(len(self.levels[0]))

@@ -12,6 +12,7 @@ from torch import Tensor
 from ..config import RunConfig
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError, UsageError
+from ..io.tensorfiles import load_sealed, save
 from ..rendering.cameras import Cameras
 from ..training import checkpoint
 from ..training.camera_optimizers import Poses, Tones, moved_cameras
@@ -19,14 +20,13 @@ from ..training.driver import Schedule, learn
 from ..training.loading import LoadedRun
 from ..training.model import Facts, tones_of
 from ..training.prepare import cache_folder, reach_of
-from ..training.quality import PRESETS, QualityConfig, mixed_tone
+from ..training.quality import PRESETS, QualityConfig, tone_of
 from ..training.run import Run, in_training
-from ..training.tensorfiles import load_sealed, save
 from .config import GaussiansConfig, LookConfig
 from .files import Capture
 from .gaussians import from_tensors
 from .learner import MOVES, GaussianLearner
-from .levels import Levels, make_levels_of_detail, open_levels, write_levels
+from .levels import make_levels_of_detail
 from .photographs import load_photographs, make_levels
 from .scene import SplatScene, cache_name, load_scene, look_at_capture, run_scene, scene_tensors
 from .semantics import Semantics, load_semantics, semantics_tensors
@@ -35,8 +35,6 @@ _FIT_RATE, _FIT_STEPS = 2e-3, 120
 """Rate of poses (`GaussiansConfig.poses`) and steps of each view, where poses of views are fitted to a finished scene."""
 _CACHED = 24
 """Captures of which the cache keeps what was found out."""
-_LEVELS, _MANY = "levels", 400_000
-"""Folder of a run; Gaussians from which on levels of detail are kept there and mapped, not made in memory."""
 
 
 def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityConfig) -> LoadedRun[SplatScene]:
@@ -45,14 +43,12 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
     Raises CheckpointError with what is missing, UsageError for qualities other than a resolution.
     """
     assert isinstance(config, GaussiansConfig)  # by its kind
-    for name in ("samples", "budget", "chunk", "max_memory"):
+    for name in ("budget", "chunk", "max_memory"):
         if getattr(quality, name):
             raise UsageError(f"--{name.replace('_', '-')}: is for runs of fields; leave it out")
     root, preset = run.root, None if quality.quality is None else PRESETS[quality.quality]
     merged = None if preset is None else preset.merged
-    # Levels of detail were written from what was verified.
-    key = "" if merged is None else checkpoint.digest(run.checkpoints)
-    saved, _ = checkpoint.load_latest(run.checkpoints, verify=not key or open_levels(root / _LEVELS, key) is None)
+    saved, _ = checkpoint.load_latest(run.checkpoints)
     if saved is None:
         raise CheckpointError(f"{root}: no checkpoint yet; go on with `fprf train {root / 'config.json'} --output {root}`")
     # The scene as training left it: its cameras where they were put, in the light that all views have in common.
@@ -70,26 +66,16 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
     def fit(scene: Scene, views: Sequence[int]) -> Annotated[Tensor, "V 6"]:
         return fit_poses(config, replace(scene, cameras=known.cameras), known.facts, whole, tones, views)
 
-    def levels() -> Levels:
-        """Levels of detail; those of many Gaussians lie in a file, written where there is none of this checkpoint."""
-        if len(gaussians) < _MANY:
-            return make_levels_of_detail(gaussians)
-        if open_levels(root / _LEVELS, key) is None:
-            write_levels(root / _LEVELS, gaussians, key)
-        mapped = open_levels(root / _LEVELS, key)
-        assert mapped is not None  # it was just written
-        return mapped
-
     shown = replace(
         whole,
         # What a training has learnt so far is looked at quickly, and not kept.
         found=whole.found if training else functools.cache(lambda: _semantics(run, saved.step, whole, config)),
         resolution=resolution if quality.resolution is None else quality.resolution,
-        tone=mixed_tone(tones, known, quality.tone) if quality.tone else (1.0, 1.0, 1.0),
+        tone=(1.0, 1.0, 1.0) if quality.tone is None else tone_of(tones, known, quality.tone),
         tones=tones,
         poses=fit,
         merged=merged,
-        levels=functools.cache(levels),
+        levels=functools.cache(lambda: make_levels_of_detail(gaussians)),
     )
     return LoadedRun(run, run.load_config()[1], known, saved.step, saved.seconds, shown)
 

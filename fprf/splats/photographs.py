@@ -19,7 +19,6 @@ from torch import Tensor
 from ..datamanagers.blur import blurred_views
 from ..datamanagers.images import Image, load_images, load_mask
 from ..datamanagers.scene import Scene
-from ..errors import DataError
 from ..ops.photometric import WINDOW
 from ..ops.rasterise import Pinhole
 from ..ops.rasterise_training import Floats, Target, target_of
@@ -28,7 +27,6 @@ from .config import GaussiansConfig
 
 Masks = dict[int, NDArray[np.bool_]]
 """Masks [H W] by view."""
-_PANORAMA = 3
 _WIDEST = 4.0
 """Tangent of the widest angle that a pinhole shows: 76 degrees."""
 _SHARPEST = cv2.INTER_LANCZOS4
@@ -101,9 +99,7 @@ def _bytes(target: Target) -> int:
 
 
 def camera_of(cameras: Cameras, view: int, near: float = 0.01) -> Pinhole:
-    """A view without its lens as the rasteriser takes it: OpenCV's axes, world to camera. Raises DataError for a panorama."""
-    if int(cameras.lens[view]) == _PANORAMA:
-        raise DataError("Gaussians are drawn through pinholes: a panorama has to be cut into views first")
+    """A view without its lens as the rasteriser takes it: OpenCV's axes, world to camera."""
     width, height = cameras.size[view].tolist()
     pose = cameras.pose[view]
     turn = (pose[:, :3] * torch.tensor([1.0, -1.0, -1.0], dtype=pose.dtype)).T

@@ -30,7 +30,7 @@ from ..types import Origin, View
 from .config import GaussiansConfig, LookConfig
 from .files.base import Data
 from .gaussians import GaussianRows, Gaussians
-from .levels import Levels, StyledLevels
+from .levels import Levels
 from .photographs import cover, distorted
 from .restyle import Colours, region_maps, restyled_harmonics
 from .semantics import Semantics, find_semantics, load_semantics, semantics_tensors, tensor_group
@@ -113,18 +113,10 @@ class SplatScene(Scene):
         return GaussianRows(len(self.gaussians), self.part, self.antialiased)
 
     @cached_property
-    def _detail(self) -> Levels | StyledLevels:
+    def _detail(self) -> Levels:
         """Levels of detail in the scene's look."""
         assert self.levels is not None  # by `merged`
-        levels, look = self.levels(), self.look
-        if look is None:
-            return levels
-        features = self.found().features
-
-        def recolour(gaussians: Gaussians, index: Tensor) -> Tensor:
-            return restyled_harmonics(gaussians.harmonics, gaussians.means, features[index], look)
-
-        return StyledLevels(levels, recolour)
+        return self.levels() if self.look is None else self.levels().recoloured(self.shown.harmonics)
 
     @cached_property
     def seen(self) -> SeenMeans:
@@ -133,7 +125,7 @@ class SplatScene(Scene):
 
     @torch.inference_mode()
     def render(self, cameras: Cameras, view: int, *, resolution: float | None = None) -> View:
-        """Draw a view, its lens included. Raises DataError for a panorama."""
+        """Draw a view, its lens included."""
         # At a part of the resolution a smaller view is drawn, and enlarged.
         share = self.resolution if resolution is None else resolution
         if share < 1:
@@ -332,5 +324,5 @@ def cache_name(data: Data, encoder: str, config: LookConfig) -> str:
     """A name for what is found out about a file: by its content, the encoder, and how it is looked at."""
     # The first number counts the versions of what is found.
     digest = hashlib.sha256(data)
-    digest.update(f"9 {encoder} {config.up} {config.inside} {config.views} {config.size} {config.regions}".encode())
+    digest.update(f"10 {encoder} {config.up} {config.inside} {config.views} {config.size} {config.regions}".encode())
     return f"{digest.hexdigest()[:32]}.safetensors"

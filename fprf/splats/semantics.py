@@ -1,10 +1,9 @@
 """Semantics of Gaussians, found by looking at them: features of rendered views, carried back to what they show.
 
-Views are encoded as photographs are; a guided filter brings the features to their pixels, regions compete for the pixels where
-they meet by colour and depth (`ops.local_mixture`), and each Gaussian takes the mean of the pixels that it shows in, by its
-weights there. The *content* of such a scene is its colour, as drawn: a style is then an affine map of colours, which acts on
-harmonics exactly. Statistics are those of pixels: Gaussians themselves have less contrast (deviation 0.13 against 0.17 on a
-plant), since what is seen is a mix of many.
+Views are encoded as photographs are; a guided filter brings the features to their pixels, and each Gaussian takes the mean of
+the pixels that it shows in, by its weights there. The *content* of such a scene is its colour, as drawn: a style is then an
+affine map of colours, which acts on harmonics exactly. Statistics are those of pixels: Gaussians themselves have less contrast
+(deviation 0.13 against 0.17 on a plant), since what is seen is a mix of many.
 
 Shapes: N Gaussians, V views of H W pixels and h w cells of the encoder's, C channels of the encoder, D principal components of
 them that are kept, K regions. Layers are channels last; colours in [0, 1].
@@ -27,10 +26,9 @@ from ..errors import CheckpointError, DataError
 from ..interfaces import Encoder
 from ..ops.backend import compiled
 from ..ops.guided import upsample
-from ..ops.local_mixture import explained
 from ..ops.rasterise import lift
 from ..rendering.cameras import Cameras
-from ..style.scene_style import SceneStyle, membership, region_contacts, region_units, scene_style
+from ..style.scene_style import SceneStyle, region_contacts, scene_style
 from ..style.scene_style import from_tensors as style_from
 from ..style.scene_style import to_tensors as style_tensors
 from .gaussians import Gaussians, bulk_of
@@ -48,10 +46,6 @@ _SAMPLES = 65_536
 """Pixels of all views together that statistics are taken of, about."""
 _COARSER = 2
 """Features, which are smooth, are filtered and carried back at the views' resolution divided by this."""
-_MEETING = 0.25
-"""Half the width of the windows in which regions compete for pixels, as a share of the root of a view's area."""
-_GRAIN, _ROUGH = 0.03, 0.05
-"""Deviations of colours in [0, 1], and of the logarithm of depth, that tell nothing apart."""
 _TOGETHER = 8
 """Components of the features that are spread at a time: of all Gaussians there are copies of so many."""
 _NEIGHBOURS, _NEIGHBOURHOODS, _EDGE = 1.0, 8, 0.02
@@ -79,7 +73,6 @@ class _Picture(NamedTuple):
     image: Annotated[Tensor, "H W 3"]
     """Colours times opacity."""
     opacity: Annotated[Tensor, "H W"]
-    depth: Annotated[Tensor, "H W"]
     maps: Annotated[Tensor, "C h w"]
 
 
@@ -98,14 +91,14 @@ def find_semantics(
 
     Raises DataError where nothing is opaque enough to be seen.
     """
-    count, total = len(cameras), 3 * len(cameras)
+    count, total = len(cameras), 2 * len(cameras)
 
     # 1. Draw the views and encode them; the encoder leaves out what is transparent.
     def encoded(view: int) -> _Picture:
         camera = camera_of(cameras, view, near)
         drawn = draw(gaussians.select(seen_by(gaussians, camera)), camera, antialiased=antialiased)
         maps = encoder.cutout(drawn.image.permute(2, 0, 1)[None], drawn.opacity[None])[0].float()
-        return _Picture(drawn.image, drawn.opacity, drawn.depth, maps)
+        return _Picture(drawn.image, drawn.opacity, maps)
 
     pictures, solid = [], []
     for view, picture in enumerate(_in_threads(encoded, count)):
@@ -121,81 +114,59 @@ def find_semantics(
     # and a fir before the sky was half sky.
     basis, guided, reduced = fit_basis(torch.cat(solid), _CHANNELS), GuidedConfig(), cameras.scaled(_COARSER)
 
-    def filtered(view: int) -> tuple[Tensor, Tensor]:
-        """Colours times opacity, opacity and depth times opacity [h w 5], and features [h w D]."""
-        image, opacity, depth, maps = pictures[view]
+    every = max(1, sum(picture.opacity.numel() for picture in pictures) // (_SAMPLES * _COARSER**2))
+
+    def carried(view: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
+        """Numbers of the Gaussians that the view shows, sums of features and of weights over their pixels [M D+1], and samples.
+
+        Samples are colours, features and opacities of some pixels, and colours and features of both ends of pairs [P 2 3+D].
+        """
+        image, opacity, maps = pictures[view]
         width, height = reduced.size[view].tolist()
-        layers = torch.cat([image, opacity[..., None], (depth * opacity)[..., None]], 2)
+        layers = torch.cat([image, opacity[..., None]], 2)
         coarse = interpolate(layers.permute(2, 0, 1)[None], (height, width), mode="area")[0].permute(1, 2, 0)
         low = basis.project(maps.flatten(1).T).T.reshape(-1, *maps.shape[1:])
-        filled = (coarse[..., :3] + (1 - coarse[..., 3])[..., None]).clamp(0, 1)
+        filled = (coarse[..., :3] + 1 - coarse[..., 3:]).clamp(0, 1)
         radius = round(guided.radius * math.sqrt(width * height))
-        return coarse, upsample(low, filled, radius=radius, eps=guided.eps, stride=guided.stride)
-
-    pixels = []
-    for view, each in enumerate(_in_threads(filtered, count)):
-        progress(count + view, total)
-        pixels.append(each)
-    style = _statistics(pictures, pixels, regions)
-    pictures.clear()  # they are seen; what follows takes as much memory
-    # Before the threads begin: some of numba's own layers bear one caller at a time.
-    units = region_units(style.keys, style.semantic_mean)
-    shares = [membership(fine.flatten(0, 1), style.semantic_mean, *units).view(*fine.shape[:2], -1) for _, fine in pixels]
-
-    # 3. Where regions meet, features move to those that explain what a pixel looks like, by its colour and depth; then each
-    # Gaussian takes the mean of its pixels, by its weights there.
-    def carried(view: int) -> tuple[Tensor, Tensor]:
-        """Numbers of the Gaussians that the view shows, and sums of features and of weights over their pixels [M D+1]."""
-        (coarse, fine), share = pixels[view], shares[view]
-        opacity = coarse[..., 3]
-        depth = (coarse[..., 4] / opacity.clamp_min(_SOLID)).clamp_min(1e-30).log()
-        guide, noise = torch.cat([_colours(coarse), depth[..., None]], 2), torch.tensor([*3 * (_GRAIN,), _ROUGH])
-        after = explained(share, guide, opacity > _SOLID, radius=_MEETING * math.sqrt(opacity.numel()), noise=noise)
-        fine, trust = fine + (after - share) @ style.keys, coarse[..., 3:4] ** _TRUST
-        camera = camera_of(reduced, view, near)
+        fine = upsample(low, filled, radius=radius, eps=guided.eps, stride=guided.stride)
+        # Colours are those of single pixels of the whole picture: averages would have less contrast.
+        colour, seen = (each[::_COARSER, ::_COARSER][:height, :width].flatten(0, 1) for each in (image, opacity))
+        at = (seen[::every] > _SOLID).nonzero()[:, 0] * every
+        sample = (colour[at] / seen[at, None]).clamp(0, 1), fine.flatten(0, 1)[at], seen[at]
+        # Neighbours along rows: where both are solid, with their colours without what is behind them.
+        solid = coarse[..., 3] > _SOLID
+        pair = (solid[:, :-1] & solid[:, 1:]).flatten().nonzero()[::every, 0]
+        shown = torch.cat([(coarse[..., :3] / coarse[..., 3:].clamp_min(_SOLID)).clamp(0, 1), fine], 2)
+        ends = torch.stack([shown[:, :-1].flatten(0, 1)[pair], shown[:, 1:].flatten(0, 1)[pair]], 1)
+        # Each Gaussian that the camera may see takes the sum over its pixels, by its weights there.
+        camera, trust = camera_of(reduced, view, near), coarse[..., 3:] ** _TRUST
         index = seen_by(gaussians, camera)
         shape = (gaussians.means[index], gaussians.quaternions[index], gaussians.log_scales[index], gaussians.logits[index])
-        return index, lift(*shape, camera, torch.cat([fine * trust, trust], 2), antialiased=antialiased)
+        lifted = lift(*shape, camera, torch.cat([fine * trust, trust], 2), antialiased=antialiased)
+        return index, lifted, sample, ends
 
     dim = basis.matrix.shape[1]
     sums, weights = torch.zeros(len(gaussians), dim), torch.zeros(len(gaussians))
-    for view, (index, lifted) in enumerate(_in_threads(carried, count)):
-        progress(2 * count + view, total)
+    samples, pairs = [], []
+    for view, (index, lifted, sample, ends) in enumerate(_in_threads(carried, count)):
+        progress(count + view, total)
         sums.index_add_(0, index, lifted[:, :dim])
         weights.index_add_(0, index, lifted[:, dim])
+        samples.append(sample)
+        pairs.append(ends)
     progress(total, total)
+
+    # 3. Regions and statistics of pixels, and which regions meet.
+    colour, semantic, seen = (torch.cat(each) for each in zip(*samples, strict=True))
+    style = scene_style(colour, semantic, seen, None, regions, seed=0)
+    if len(style.share) > 1:
+        met = torch.cat(pairs)
+        style = style._replace(contacts=region_contacts(style, met[..., 3:], met[..., :3]))
     # As many pixels as the views have at their own size.
     sums *= _COARSER**2
     weights *= _COARSER**2
     features = _spread(gaussians.means, sums, weights, style.semantic_mean)
     return Semantics(style, basis, features, encoder.identity)
-
-
-def _statistics(pictures: list[_Picture], pixels: list[tuple[Tensor, Tensor]], regions: int) -> SceneStyle:
-    """Regions and statistics of pixels, and which regions meet, from some of the pixels at reduced resolution."""
-    every = max(1, sum(picture.opacity.numel() for picture in pictures) // (_SAMPLES * _COARSER**2))
-    samples, pairs = [], []
-    for (image, opacity, _, _), (coarse, fine) in zip(pictures, pixels, strict=True):
-        # Colours are those of single pixels of the whole picture: averages would have less contrast.
-        height, width = fine.shape[:2]
-        colour, seen = (each[::_COARSER, ::_COARSER][:height, :width].flatten(0, 1) for each in (image, opacity))
-        at = (seen[::every] > _SOLID).nonzero()[:, 0] * every
-        samples.append(((colour[at] / seen[at, None]).clamp(0, 1), fine.flatten(0, 1)[at], seen[at]))
-        # Neighbours along rows: where both are solid.
-        solid = coarse[..., 3] > _SOLID
-        pair = (solid[:, :-1] & solid[:, 1:]).flatten().nonzero()[::every, 0]
-        shown = torch.cat([_colours(coarse), fine], 2)
-        pairs.append(torch.stack([shown[:, :-1].flatten(0, 1)[pair], shown[:, 1:].flatten(0, 1)[pair]], 1))
-    colour, semantic, seen = (torch.cat(each) for each in zip(*samples, strict=True))
-    style, ends = scene_style(colour, semantic, seen, None, regions, seed=0), torch.cat(pairs)
-    if len(style.share) == 1:
-        return style
-    return style._replace(contacts=region_contacts(style, ends[..., 3:], ends[..., :3]))
-
-
-def _colours(coarse: Annotated[Tensor, "H W 4+"]) -> Annotated[Tensor, "H W 3"]:
-    """Colours of solid pixels without what is behind them."""
-    return (coarse[..., :3] / coarse[..., 3:4].clamp_min(_SOLID)).clamp(0, 1)
 
 
 def _in_threads(function: Callable[[int], _Result], count: int) -> Iterator[_Result]:

@@ -18,14 +18,13 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import cv2
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
 from ..checks import at_least, between
 from ..datamanagers.config import GuidedConfig
 from ..datamanagers.images import Image, load_image, load_mask
-from ..errors import CheckpointError, DataError
+from ..errors import DataError
 from ..interfaces import Encoder
 from ..io.atomic import write_bytes
 from ..ops.guided import apply, coefficients
@@ -56,7 +55,6 @@ _CELL = 16
 _ROWS = 4096
 """Pixels filtered at a time: bounds the memory."""
 
-_FORMAT = "fprf-style-1"
 _TABLES = ("keys", "mean", "covariance", "share", "weight")
 """Fields of a dictionary with a row a code."""
 _COLOURS = ("colour_mean", "colour_covariance")
@@ -331,59 +329,10 @@ def choose(d: StyleDictionary, references: Annotated[Tensor, "references"]) -> t
 
 
 def save_dictionary(path: Path, d: StyleDictionary) -> None:
-    """Write the dictionary to `path`; a crash leaves the old file or the new one, never a part."""
+    """Write the dictionary as safetensors, for people and other programs; a crash leaves the old file or the new one."""
     fields = [name for name in (*_TABLES, "reference", *_OPTIONAL) if getattr(d, name) is not None]
     tensors = {name: getattr(d, name).detach().cpu().contiguous() for name in fields}
-    meta = {"format": _FORMAT, "names": json.dumps(d.names), "blend": repr(d.blend), "sha256": _digest(tensors)}
-    write_bytes(path, save(tensors, metadata=meta))
-
-
-def load_dictionary(path: Path) -> StyleDictionary:
-    """Read a dictionary. Raises CheckpointError where it is absent, damaged, or no dictionary."""
-    if not path.is_file():
-        raise CheckpointError(f"{path}: no style dictionary there; stylize with --references first")
-    try:
-        with safe_open(path, framework="pt") as file:
-            meta = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{path}: not readable as safetensors ({error}); build the style again") from error
-    # Older dictionaries know neither colours nor what lies beyond the basis.
-    needed = {*_TABLES, "reference"}
-    if meta.get("format") != _FORMAT or set(tensors) - {"beyond"} not in (needed, needed | {*_COLOURS}):
-        raise CheckpointError(f"{path}: not a style dictionary of format {_FORMAT}; build the style again")
-    if meta.get("sha256") != _digest(tensors):
-        raise CheckpointError(f"{path}: checksum does not match, the file is damaged; build the style again")
-    try:
-        names = tuple(str(name) for name in json.loads(meta["names"]))
-        blend = float(meta["blend"])
-    except (KeyError, ValueError, TypeError) as error:
-        raise CheckpointError(f"{path}: its names or blend are unreadable; build the style again") from error
-    d = StyleDictionary(**tensors, names=names, blend=blend)
-    # The checksum says the file is whole; the rest says that it is a dictionary, whoever wrote it.
-    t = len(d.keys) if d.keys.ndim == 2 else 0
-    c = d.mean.shape[-1] if d.mean.ndim == 2 else 0
-    shapes = {"mean": (t, c), "covariance": (t, c, c), "share": (t,), "reference": (t,), "weight": (t,), "beyond": (t,)}
-    shapes |= {"colour_mean": (t, 3), "colour_covariance": (t, 3, 3)}
-    wrong = [name for name, shape in shapes.items() if name in tensors and tuple(tensors[name].shape) != shape]
-    if t == 0 or c == 0 or wrong:
-        raise CheckpointError(f"{path}: {', '.join(wrong) or 'keys'} of the wrong shape; build the style again")
-    if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
-        raise CheckpointError(f"{path}: a value is not finite; build the style again")
-    if d.reference.dtype != torch.int64 or not torch.equal(torch.unique(d.reference), torch.arange(len(names))):
-        raise CheckpointError(f"{path}: codes and {len(names)} reference names don't fit; build the style again")
-    if not bool((d.share > 0).all() & (d.weight > 0).all()) or not 0 <= d.blend <= 1:
-        raise CheckpointError(f"{path}: shares and weights must be above 0, blend in [0, 1]; build the style again")
-    return d
-
-
-def _digest(tensors: dict[str, Tensor]) -> str:
-    digest = hashlib.sha256()
-    for name in sorted(tensors):
-        t = tensors[name]
-        digest.update(f"{name} {t.dtype} {tuple(t.shape)} ".encode())
-        digest.update(t.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
-    return digest.hexdigest()
+    write_bytes(path, save(tensors, metadata={"names": json.dumps(d.names), "blend": repr(d.blend)}))
 
 
 def _check_references(references: Sequence[Reference]) -> None:

@@ -17,11 +17,8 @@ decoder are those of draws from the region's Gaussian of features: a trained sce
 colour still depends on the point alone.
 """
 
-import hashlib
-import io
-import pickle
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 from torch import Tensor, nn
@@ -29,13 +26,12 @@ from torch import Tensor, nn
 from ..checks import between
 from ..errors import UsageError
 from ..interfaces import Decoder, Stylizer
-from ..ops import mixture
 from ..ops.precision import double
 from ..types import Want
 from .config import Place
 from .dictionary import StyleDictionary, blend_codes, choose
 from .light import Light, luma
-from .scene_style import Membership, RegionWeight, SceneStyle
+from .scene_style import Membership, RegionWeight, SceneStyle, mixed_maps
 from .statistics import mix, monge, symmetric_root
 
 if TYPE_CHECKING:
@@ -141,7 +137,7 @@ class ColourMaps(nn.Module):
         """
         if belongs is None:
             belongs = self.membership(colour[:, :0] if semantic is None else semantic)
-        change = mixture.affine(colour.to(self.bias), belongs.to(self.bias), self.matrix, self.bias, centre=self.origin)
+        change = mixed_maps(colour.to(self.bias), belongs.to(self.bias), self.matrix, self.bias, centre=self.origin)
         return (colour + change.to(colour)).clamp(0, 1) - colour
 
 
@@ -330,13 +326,6 @@ class Restyle:
         return (replace(self, others=()), *self.others)
 
     @property
-    def digest(self) -> str:
-        """A key of all that it does: of every number in it."""
-        file = io.BytesIO()
-        _TensorValuePickler(file).dump(self)
-        return hashlib.sha256(file.getvalue()).hexdigest()
-
-    @property
     def idle(self) -> bool:
         """It changes nothing: the renderer need not ask."""
         return all(part.strength == 0 for part in self.parts if part.share > 0)
@@ -450,12 +439,3 @@ class Restyle:
                     own = torch.lerp(own, own_confidence(other), place_weight(place, points)[:, None])
             total = total + part.share * own
         return total
-
-
-class _TensorValuePickler(pickle.Pickler):
-    """Pickles tensors by their values alone."""
-
-    def reducer_override(self, value: Any) -> Any:
-        if isinstance(value, Tensor):
-            return bytes, (value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes(),)
-        return NotImplemented

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import CheckpointError, DataError
-from ..ops.precision import double
+from ..ops.precision import double, full_precision
 from .dictionary import BLEND, StyleDictionary, blend_codes
 from .matching import point_shares, score_spread, unit
 from .statistics import Moments, covariance, group_moments, kmeans
@@ -126,6 +126,30 @@ class Membership(nn.Module):
     def forward(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N K"]:
         """Rows sum to 1."""
         return membership(semantic.to(self.units), self.centre, self.units, self._temperature)
+
+
+def mixed_maps(
+    x: Annotated[Tensor, "N C"],
+    share: Annotated[Tensor, "N K"],
+    matrix: Annotated[Tensor, "K C C"],
+    bias: Annotated[Tensor, "K C"],
+    *,
+    centre: Annotated[Tensor, "C"],
+) -> Annotated[Tensor, "N C"]:
+    """sum_k share_k ((x - centre) matrix_k + bias_k): the affine maps of regions, mixed by membership.
+
+    Within (C + K + 3) u sum_k share_k (|x - centre| |matrix_k| + |bias_k|), u = 2^-24.
+    """
+    with full_precision(x):
+        x = x - centre
+        if len(matrix) == 1:
+            return x @ matrix[0] + bias[0]
+        mixed = share @ bias
+        # A point belongs to two or three regions: the maps of the others are not computed.
+        for k in range(len(matrix)):
+            inside = share[:, k].nonzero().squeeze(1)
+            mixed.index_add_(0, inside, (x[inside] * share[inside, k, None]) @ matrix[k])
+        return mixed
 
 
 class RegionWeight(nn.Module):

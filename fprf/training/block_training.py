@@ -24,9 +24,9 @@ from ..datamanagers.images import load_image
 from ..datamanagers.scene import Scene
 from ..errors import ConfigError
 from ..interfaces import Learner, Partition
+from ..io import tensorfiles
 from ..progress import Display
 from ..types import Cell
-from . import tensorfiles
 from .blocks import FILE, Built, block_in_surroundings, folder_of, load_blocks, load_finished, surroundings
 from .driver import Schedule
 from .learner import FieldLearner, finish

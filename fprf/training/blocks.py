@@ -24,10 +24,10 @@ from ..blocks.routing import BlendRouter, InsetRouter, Router, SingleRouter, cha
 from ..config import TrainConfig
 from ..errors import CheckpointError
 from ..interfaces import Decoder
+from ..io import tensorfiles
 from ..rendering.renderer import Parts
 from ..testing.outputs import check_parts
 from ..types import Cell
-from . import tensorfiles
 from .camera_optimizers import Poses, Tones
 from .checkpoint import misfit
 from .model import Facts, Model, build_decoder, build_fields, poses_of, tones_of

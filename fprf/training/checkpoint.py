@@ -17,9 +17,9 @@ from torch import Tensor, nn
 
 from ..errors import CheckpointError, DataError
 from ..interfaces import State
+from ..io import tensorfiles
 from ..io.atomic import remove_unfinished, write_json
 from ..io.strict_json import open_json
-from . import tensorfiles
 
 KEEP = 2
 """Checkpoints that stay on disk."""

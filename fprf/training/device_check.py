@@ -71,7 +71,7 @@ def fast_paths(device: torch.device) -> Iterator[tuple[str, str]]:
     with torch.no_grad():
         compiled = dense.usable(probe)
     if compiled:
-        yield "kernels", "numba's: tri-planes, networks, maps of styles, guided filter"
+        yield "kernels", "numba's: tri-planes, networks, guided filter"
     else:
         yield "kernels", "none: everything by torch"
     if device.type == "cuda":

@@ -41,14 +41,10 @@ WATCHED = ".watched"
 _WATCH_SECONDS, _SAVING_SHARE, _MIN_PAUSE = 5.0, 0.05, 2.0
 """Age up to which that file says that somebody looks; the share of the time that checkpoints may then take, and the least
 seconds between them."""
-_TIMED_VIEWS = 2
-"""Views after which the time of all features is estimated."""
 _SMALL = 96
 """Pixels of an image's shorter side below which a `--downscale` that was asked for is probably a mistake."""
 _SHOWN = 4
 """Differences of a run's config that a message names."""
-_LONG_HOURS, _TIMED_SECONDS = 1.0, 5.0
-"""Trainings without a time limit that take longer say so; the time over which their first steps are measured."""
 
 
 class Schedule(NamedTuple):
@@ -121,7 +117,7 @@ def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images
         if run.exists and not changed_images:
             check_images(output, scene, hashes)
         # Reading photographs and extracting features takes minutes: nothing is written before it has worked.
-        learner = config.build(scene, device_of(config.trained_on), saved=saved, progress=_told(config, display))
+        learner = config.build(scene, device_of(config.trained_on), saved=saved, progress=display.count)
         output.mkdir(parents=True, exist_ok=True)
         run.save_config(replace(config, output=None), method)  # the folder may be moved
         save_image_hashes(output, hashes)
@@ -134,22 +130,7 @@ def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images
             learner.train(run, display, spent=spent)
         else:
             display.say(shown + learner.begin(run))
-            # On a CPU the first steps tell how long all of them will take; a time limit says that itself.
-            warns = learner.device.type == "cpu" and config.minutes is None
-            schedule = schedule_of(config, len(scene.train))
-            log, first = reporter(display, run), None
-
-            def report(event: Report) -> None:
-                nonlocal first, warns
-                log(event)
-                if first is None:  # its time holds the compilation of kernels
-                    first = event
-                elif warns and event.step > first.step and event.seconds - first.seconds >= _TIMED_SECONDS:
-                    warns = False
-                    if line := forecast(first, event, schedule.steps or 0, method):
-                        display.say(line)
-
-            learn(learner, run, schedule, report, spent=spent)
+            learn(learner, run, schedule_of(config, len(scene.train)), reporter(display, run), spent=spent)
             learner.finish(run, display)
         quoted, seconds = shlex.quote(str(output)), time.perf_counter() - start
         display.say(f"done after {seconds:.0f} s: fprf stylize {quoted} --references PHOTO.jpg, fprf eval {quoted}")
@@ -343,19 +324,6 @@ def reporter(display: Display, run: Run, name: str = "training") -> Callable[[Re
     return report
 
 
-def forecast(first: Report, now: Report, steps: int, method: str) -> str:
-    """A line about a training on a CPU that will take hours, from two of its first reports; else nothing."""
-    pace = (now.seconds - first.seconds) / (now.step - first.step)
-    hours = (steps - now.step) * pace / 3600
-    if hours < _LONG_HOURS:
-        return ""
-    other = "; the method fprf-lite is made for a CPU and needs 8" if method == "fprf" else ""
-    return (
-        f"{steps:,} steps at {pace:.2g} s a step take {hours:,.0f} hours on this CPU; "
-        f"--minutes N fits steps and learning rate into N minutes{other}"
-    )
-
-
 def _check_needs(config: RunConfig, method: str, display: Display) -> None:
     """Raise UsageError where something is missing that nothing downloads, after showing all that is missing."""
     missing = config.needs()
@@ -411,20 +379,3 @@ def _check_same(run: Run, config: RunConfig) -> None:
             f"{run.root}: holds a run with {', '.join(shown)}{more}; go on with it by its own values, or begin another with "
             f"--output {shlex.quote(str(other))}"
         )
-
-
-def _told(config: RunConfig, display: Display) -> Callable[[int, int, str], None]:
-    """Progress of the preparation, with a line where features will take most of a time limit."""
-    begun: dict[str, float] = {}
-
-    def progress(done: int, total: int, what: str) -> None:
-        display.count(done, total, what)
-        now = time.perf_counter()
-        seconds = (now - begun.setdefault(what, now)) / max(done, 1) * total
-        if done == _TIMED_VIEWS and config.minutes is not None and seconds > 30 * config.minutes:
-            display.say(
-                f"warning: {what} will take {seconds:.0f} s of the {60 * config.minutes:.0f} s of --minutes; "
-                f"--downscale {2 * (config.downscale or 1)} and another --output take a quarter"
-            )
-
-    return progress

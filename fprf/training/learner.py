@@ -11,15 +11,12 @@ import math
 import shlex
 from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
-from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 from torch.profiler import record_function
 
 from ..config import PASSES, OptimizerConfig, TrainConfig
-from ..datamanagers.basis import Basis
 from ..datamanagers.batches import generator_of
 from ..datamanagers.scene import Scene as ParsedScene
 from ..errors import CheckpointError
@@ -29,15 +26,14 @@ from ..ops.precision import tf32
 from ..progress import Display
 from ..rendering.cameras import PixelRays
 from ..rendering.renderer import render_rays
-from ..style.scene_style import SceneStyle, to_tensors
+from ..style.scene_style import to_tensors
 from ..types import Batch, Rays
 from . import checkpoint
 from .camera_optimizers import rays_of_moving_cameras
-from .loading import Trained
 from .losses import check_penalties, extra_term, terms, total, wanted
 from .model import Facts, Model, background_of, build_model
 from .prepare import Prepared
-from .run import Run, known_of, read_history
+from .run import Run, read_history
 from .style_pass import measure_style
 
 SMOOTHING = 0.95
@@ -197,17 +193,6 @@ class FieldLearner(SceneLearner):
         checkpoint.restore(state, self.model, self.optimizer)
         self.failed = 0
         self.statistics.failed.zero_()
-
-    def scene(self) -> Trained:
-        """The model as it is, which goes on learning with this learner."""
-        scene, basis = self.prepared.scene, self.prepared.basis
-        known = known_of(scene, self.config.data, self.facts)
-        known = replace(known, cameras=self.model.refined(known.cameras))
-
-        def measured() -> tuple[SceneStyle, Basis | None]:
-            return measure_style(self.config, self.model, scene.cameras, scene.train), basis
-
-        return Trained(Run(self.config.output or Path()), self.config, "", known, self.model, 0, 0.0, style=measured)
 
     def begin(self, run: Run) -> str:
         """Write the basis of the semantics."""

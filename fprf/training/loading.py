@@ -1,6 +1,5 @@
 """A trained run, ready to render; blocks of a large scene are fetched as they are met."""
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Annotated, Generic, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from ..config import IncompleteConfig, RunConfig, TrainConfig, fields_only
+from ..config import RunConfig, TrainConfig, fields_only
 from ..datamanagers.basis import Basis
 from ..datamanagers.scene import Scene as ParsedScene
 from ..errors import CheckpointError, PluginError, WeightsError
@@ -63,8 +62,6 @@ class Trained(Scene):
     """Training time."""
     look: Restyle | None = None
     """Look that it is rendered in; None = as it was captured."""
-    style: Callable[[], tuple[SceneStyle, Basis | None]] | None = None
-    """The scene's own statistics and basis; None = those of the run folder."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -137,8 +134,6 @@ class Trained(Scene):
 
     def measured(self) -> tuple[SceneStyle, Basis | None]:
         """Statistics as training has written them; while it goes on those of now, from few rays."""
-        if self.style is not None:
-            return self.style()
         if in_training(self.run.root) or not (self.run.root / "style.safetensors").is_file():
             # What changes soon need not be measured exactly.
             few = replace(self.config.statistics, rays=min(_FEW_RAYS, self.config.statistics.rays))
@@ -210,10 +205,6 @@ def load_run(root: Path, device: str = "auto", max_memory: float | None = None) 
     saved_config, method = run.load_config()
     config = fields_only(saved_config, root)
     known = run.load_known()
-    # Fields of a method that is not installed render by their plug-ins alone; another kind of scene cannot.
-    if isinstance(config, IncompleteConfig) and not known.facts.channels:
-        package = json.loads(config.packages)["method"]
-        raise PluginError(f"{root}: {config.reason}; to open a scene of its kind install {package}")
     if known.facts.space.kind == "open":
         # Blocks: their space has no cube of its own, each brings one.
         model, step, seconds = load_blocked(root, config, known.facts, device_of(device), max_memory)

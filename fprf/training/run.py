@@ -32,18 +32,17 @@ from ..config import RunConfig
 from ..datamanagers.images import load_image, load_mask
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError, DataError, UsageError
+from ..io import tensorfiles
 from ..io.atomic import unwritable, write_json
 from ..io.strict_json import open_json, parse_json
 from ..plugins.codec import from_json, load_config, save_config
 from ..plugins.registry import nearest
 from ..rendering.cameras import Cameras
-from ..rendering.paths import well_covered
-from . import tensorfiles
 from .model import Facts
 
 FORMAT = 1
 _SHOWN = 8
-"""Views of the split `covered`, at most."""
+"""Views of the split `some`, at most."""
 _CAMERA = {"pose": (3, 4), "focal": (2,), "centre": (2,), "size": (2,), "distortion": (6,), "lens": ()}
 """Fields of the cameras, and the shape of each for one view."""
 _INTEGERS = ("size", "lens")
@@ -64,10 +63,10 @@ class Known:
     facts: Facts
 
     def split(self, name: str) -> tuple[int, ...]:
-        """Views of `train`, `test` or `all`; `covered`: at most 8 that are well covered by the training views."""
-        if name == "covered":
-            return tuple(well_covered(self.cameras, self.train, self.facts.space, _SHOWN))
-        return {"train": self.train, "test": self.test, "all": tuple(range(len(self.names)))}[name]
+        """Views of `train`, `test` or `all`; `some`: at most 8 training views, spread evenly."""
+        count = min(_SHOWN, len(self.train))
+        some = tuple(self.train[k * len(self.train) // count] for k in range(count))
+        return {"some": some, "train": self.train, "test": self.test, "all": tuple(range(len(self.names)))}[name]
 
     def views(self, split: str, names: Sequence[str] = ()) -> list[int]:
         """Views by name, or those of a split where none is named.

@@ -4,15 +4,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-import torch
 from tiny_world import World
 
 from benchmarks.__main__ import main
-from benchmarks.peer import read_cameras, read_depths, read_pictures
 from benchmarks.town.write import write_town
-from fprf.rendering.cameras import pixel_grid, project, rays_through
 
 
 def peer(world: World, frames: Path, output: Path, *more: str) -> dict[str, Any]:
@@ -43,15 +39,3 @@ def test_all_that_can_be_known(world: World, night: Path, tmp_path: Path, capsys
     assert document["steadiness"]["sharpness"] > 0.5
     assert document["style"]["style_distance"] > 0 and 0 < document["style"]["structure"] < 1
     assert page.read_text() in capsys.readouterr().out
-
-
-def test_depths_along_the_axis_become_distances(world: World, tmp_path: Path) -> None:
-    frames = read_pictures(world.town / "images", ["0001"])
-    cameras = read_cameras(world.town / "transforms.json", frames)
-    np.save(tmp_path / "0001.npy", np.full((24, 32), 5.0))
-    (depth,) = read_depths(tmp_path, ["0001"], cameras, "axis")
-    pixel = pixel_grid(cameras, 0)
-    view = torch.zeros(len(pixel), dtype=torch.int64)
-    origin, direction = rays_through(cameras, view, pixel)
-    _, ahead = project(cameras, view, origin + direction * depth.flatten()[:, None])
-    assert torch.allclose(ahead, torch.full_like(ahead, 5.0))

@@ -9,30 +9,22 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kornia.color import rgb_to_lab
 from ssim_oracle import noise, ssim_oracle
 from torch import Tensor
 
 from benchmarks.semantic_matching import matching_rate
-from benchmarks.single_image import histogram_matching, reinhard
 from benchmarks.steadiness import published, steadiness
 from benchmarks.style_metrics import (
-    MIXED,
     RegionStatistics,
     delta_e_2000,
     gaussian_distance,
-    srgb_to_lab,
     structure,
-    style_distances,
-    whole_cells,
 )
 from benchmarks.town.layout import build_town
 from benchmarks.town.palettes import palette
 from benchmarks.town.render import geometry, render, walk
 from benchmarks.town.truth import short_path, town_view
 from fprf.errors import DataError
-from fprf.interfaces import Encoder
-from fprf.plugins.encoders.config import BundledContentConfig
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import pinhole
 
@@ -64,12 +56,6 @@ def test_the_published_pairs() -> None:
     assert (found - rows[:, 6]).abs().max() < 5e-5, "as many digits as were published"
 
 
-def test_lab_is_that_of_another_library() -> None:
-    image = torch.rand(1, 3, 40, 50, generator=torch.Generator().manual_seed(0))
-    ours = srgb_to_lab(image[0].permute(1, 2, 0))
-    assert torch.allclose(ours.float(), rgb_to_lab(image)[0].permute(1, 2, 0), atol=0.02)
-
-
 def picture(height: int = 24, width: int = 30, seed: int = 0) -> torch.Tensor:
     """Noise with an edge."""
     return noise(height, width, seed) * torch.where(torch.arange(width) < width // 2, 1.0, 0.3)[:, None]
@@ -86,43 +72,10 @@ def test_structure_is_the_written_out_one(seed: int, height: int, width: int) ->
     assert structure(a, b) == pytest.approx(ssim_oracle(*alike, means=False), abs=1e-6)
 
 
-@given(st.floats(0.05, 0.9), st.floats(0.0, 0.1), st.floats(0.1, 1.0))
-def test_brightness_contrast_and_tint_cost_nothing(contrast: float, brightness: float, red: float) -> None:
-    grey = picture()[..., :1].expand(-1, -1, 3)
-    tinted = (contrast * grey + brightness) * torch.tensor([red, 1.0, 0.5])
-    assert structure(grey, tinted) == pytest.approx(1.0, abs=1e-6)
-
-
-class Pixels(Encoder):
-    """Colours, plain or doubled, at the full size or a smaller one."""
-
-    def __init__(self, gain: float = 1.0, stride: int = 1) -> None:
-        super().__init__()
-        self.gain, self.stride = gain, stride
-
-    @property
-    def identity(self) -> str:
-        return "pixels"
-
-    @property
-    def channels(self) -> int:
-        return 3
-
-    def forward(self, image: Tensor) -> Tensor:
-        return self.gain * torch.nn.functional.avg_pool2d(image, self.stride)
-
-
 def statistics(seed: int, channels: int = 4) -> RegionStatistics:
     draw = np.random.default_rng(seed)
     root = draw.normal(size=(channels, channels))
     return RegionStatistics(100, torch.from_numpy(draw.normal(size=channels)), torch.from_numpy(root @ root.T))
-
-
-def draws(seed: int, mean: float = 0.5, spread: float = 0.1) -> Tensor:
-    return mean + spread * torch.randn(12, 16, 3, generator=torch.Generator().manual_seed(seed))
-
-
-HALVES = (torch.arange(16) >= 8).long().expand(12, 16)
 
 
 @given(st.integers(0, 1000), st.integers(1, 6))
@@ -134,20 +87,6 @@ def test_the_full_distance_is_frechets(seed: int, channels: int) -> None:
     assert gaussian_distance(a, b, full=True) == pytest.approx(math.sqrt(max(0, float(square))), abs=1e-5)
     assert gaussian_distance(a, b, full=True) == pytest.approx(gaussian_distance(b, a, full=True), abs=1e-6)
     assert gaussian_distance(a, a, full=True) < 1e-5
-
-
-def test_no_change_is_one_and_the_reference_itself_is_zero() -> None:
-    plain, style = draws(0), draws(1, mean=0.2, spread=0.2)
-    halfway = (plain + style.mean(dim=(0, 1))) / 2
-    rows = style_distances(
-        {"plain": Pixels(), "doubled": Pixels(2.0)},
-        [(plain, HALVES)],
-        {"none": [(plain, HALVES)], "style": [(style, HALVES)], "half": [(halfway, HALVES)]},
-        [(style, HALVES)],
-    )
-    assert rows["none"] == {"plain": 1.0, "doubled": 1.0, "mean": 1.0}
-    assert rows["style"] == {"plain": 0.0, "doubled": 0.0, "mean": 0.0}
-    assert 0.1 < (rows["half"]["mean"] or 0.0) < 0.9
 
 
 def rate_oracle(a: np.ndarray, b: np.ndarray, la: np.ndarray, lb: np.ndarray, regions: list[int]) -> float:
@@ -177,48 +116,8 @@ def test_the_rate_is_the_written_out_one(seed: int, regions: int, n: int, m: int
     assert found == pytest.approx(rate_oracle(a, b, la, lb, list(range(regions))), abs=1e-12)
 
 
-@settings(max_examples=30, deadline=None)
-@given(st.integers(0, 1000), st.integers(3, 20), st.integers(3, 20), st.integers(1, 3), st.integers(1, 3))
-def test_a_whole_cell_holds_nothing_else(seed: int, height: int, width: int, h: int, w: int) -> None:
-    regions = torch.from_numpy(np.random.default_rng(seed).integers(0, 2, (height, width)))
-    cells = whole_cells(regions, (h, w))
-    for i in range(h):
-        for j in range(w):
-            rows = slice(i * height // h, math.ceil((i + 1) * height / h))
-            columns = slice(j * width // w, math.ceil((j + 1) * width / w))
-            kinds = regions[rows, columns].unique()
-            assert int(cells[i, j]) == (int(kinds[0]) if len(kinds) == 1 else MIXED)
-
-
-@pytest.fixture(scope="module")
-def content() -> Encoder:
-    return BundledContentConfig().build()
-
-
 def colours(count: int, seed: int, low: float = 0.3, high: float = 0.7) -> Tensor:
     return low + (high - low) * torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
-
-
-def lab(x: Tensor) -> Tensor:
-    return rgb_to_lab(x.T.reshape(1, 3, -1, 1))[0, :, :, 0].T
-
-
-@given(st.integers(0, 1000), st.integers(20, 200), st.integers(20, 200))
-def test_reinhard_takes_mean_and_deviation(seed: int, n: int, m: int) -> None:
-    content, style = colours(n, seed), colours(m, seed + 1, 0.4, 0.6)
-    there, found = lab(style), lab(reinhard(content, style))
-    assert torch.allclose(found.mean(0), there.mean(0), atol=0.05)
-    assert torch.allclose(found.std(0, correction=0), there.std(0, correction=0), atol=0.05)
-
-
-@given(st.integers(0, 1000), st.integers(1, 40), st.integers(1, 40))
-def test_ranks_are_those_of_numpys_quantiles(seed: int, n: int, m: int) -> None:
-    content, style = colours(n, seed, 0, 1).double(), colours(m, seed + 1, 0, 1).double()
-    found = histogram_matching(content, style)
-    for channel in range(3):
-        rank = (np.argsort(np.argsort(content[:, channel].numpy())) + 0.5) / n
-        wanted = np.quantile(style[:, channel].numpy(), rank, method="hazen")
-        assert np.allclose(found[:, channel].numpy(), wanted, atol=1e-12)
 
 
 FILM_WIDTH, FILM_HEIGHT, FILM_FRAMES = 96, 72, 8

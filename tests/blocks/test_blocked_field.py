@@ -101,30 +101,6 @@ def test_only_the_blocks_that_points_meet_are_asked() -> None:
     assert counting.asked == {1, 2}
 
 
-@torch.no_grad()
-def jumps(cells: list[Cell], x: float, apart: float) -> list[float]:
-    """Of log density, content and semantics between points `apart` on both sides of a plane; blocks that agree on nothing."""
-    held, router = ResidentMembers(members(cells, spread=1.0)), BlendRouter(cells)
-    field, semantic = BlockedField(held, router), BlockedSemantic(held, router)
-    draw = torch.Generator().manual_seed(0)
-    y, z = torch.rand(400, generator=draw) * 1.2 - 0.6, torch.rand(400, generator=draw) * 0.7 + 0.4
-    view = torch.tensor([[0.0, 1.0, 0.0]]).expand(400, 3)
-    ends = []
-    for shift in (-apart / 2, apart / 2):
-        at = torch.stack([torch.full_like(y, x + shift), y, z], 1)
-        sample = field.density(at)
-        ends.append((sample.density.log()[:, None], field.content(sample.latent, view), semantic(at)))
-    return [float((b - a).abs().amax(1).quantile(0.95)) for a, b in zip(*ends, strict=True)]
-
-
-@pytest.mark.parametrize("face", [2.0, 4.0])
-@pytest.mark.parametrize("beside", [0.0, -0.3, 0.15])
-def test_no_seam_at_any_border(face: float, beside: float) -> None:
-    """A step would stay as points come closer; what is continuous shrinks with their distance."""
-    for far, near in zip(jumps(row(4), face + beside, 4e-3), jumps(row(4), face + beside, 1e-3), strict=True):
-        assert near <= 0.3 * far
-
-
 def test_emission_is_exact_over_thirty_orders_of_magnitude() -> None:
     density = torch.tensor([[1e-30, 3e6], [0.0, 0.0], [1e-30, 3e-30], [5.0, 0.0], [float("inf"), 1.0]])
     weight = torch.tensor([[0.5, 0.5], [0.3, 0.7], [0.5, 0.5], [1e-6, 1 - 1e-6], [0.5, 0.5]])
@@ -256,16 +232,6 @@ def test_blending_is_what_the_windows_say(cells: list[Cell], seed: int) -> None:
     for group in groups:
         assert (group.weight is None) == (len(group.members) == 1)
         assert bool((group.at[1:] > group.at[:-1]).all()), "ascending"
-
-
-def test_a_chart_fills_the_cube_with_the_cell_and_its_border() -> None:
-    for each in UNEVEN:
-        chart = chart_of(each)
-        ends = torch.stack([chart.low, chart.high])
-        assert torch.allclose(chart.locate(ends), torch.tensor([[-1.0] * 3, [1.0] * 3]).double(), atol=1e-9)
-        middle = (each.low + each.high)[None] / 2
-        assert torch.allclose(chart.locate(middle), torch.zeros(1, 3).double(), atol=1e-12)
-        assert bool(chart.inside(middle))
 
 
 def test_surroundings_hold_everything_and_blocks_fill_their_inner_half() -> None:

@@ -36,7 +36,7 @@ def test_cameras_with_pictures_are_a_scene_of_its_own(world: World, tmp_path: Pa
 
 def test_bounds_and_options_reach_the_mesh(world: World, tmp_path: Path) -> None:
     def made(*args: str) -> dict[str, float]:
-        assert export(world, "mesh", *args, "--output", str(tmp_path / "x")) == 0
+        assert export(world, "glb", *args, "--output", str(tmp_path / "x")) == 0
         found: dict[str, float] = json.loads((tmp_path / "x" / "export.json").read_text())
         return found
 
@@ -48,13 +48,9 @@ def test_bounds_and_options_reach_the_mesh(world: World, tmp_path: Path) -> None
 
 def test_one_file_holds_one_look(world: World, tmp_path: Path) -> None:
     style = ["--references", str(world.references[0])]
-    assert export(world, "lut", *style, "--lut-size", "5", "--output", str(tmp_path / "dusk.cube")) == 0
-    lines = (tmp_path / "dusk.cube").read_text().splitlines()
-    assert [path.name for path in tmp_path.iterdir()] == ["dusk.cube"]
-    assert len(lines) == 4 + 5**3 and lines[1] == "LUT_3D_SIZE 5"
-    assert export(world, "mesh", *style, "--output", str(tmp_path / "dusk.ply")) == 0
+    assert export(world, "glb", *style, "--output", str(tmp_path / "dusk.ply")) == 0
     assert len(trimesh.load(tmp_path / "dusk.ply").faces) > 100
-    assert export(world, "mesh", *style, "--styles", f"x={world.references[1]}", "--output", str(tmp_path / "a.glb")) == 2
+    assert export(world, "glb", *style, "--styles", f"x={world.references[1]}", "--output", str(tmp_path / "a.glb")) == 2
 
 
 @pytest.mark.parametrize("most", [50, 10_000])
@@ -76,7 +72,7 @@ def test_splats_are_fitted_to_the_field(world: World, tmp_path: Path) -> None:
     """The longer they are trained the nearer they come to the field's render; a style has the same ones in other colours."""
     more = ["--references", str(world.references[1]), "--fit-cap", "500"]
     assert export(world, "ply", "--fit", "1e-6", "--fit-cap", "500", "--output", str(tmp_path / "begun")) == 0
-    assert export(world, "splats", "spz", *more, "--fit", "0.08", "--output", str(tmp_path)) == 0
+    assert export(world, "ply", "splat", "spz", *more, "--fit", "0.08", "--output", str(tmp_path)) == 0
     trained = world.load()
     cameras, view = trained.known.cameras, trained.known.test[0]
     shown = trained.render(cameras, view).rgb

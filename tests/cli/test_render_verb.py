@@ -73,8 +73,3 @@ def test_an_interrupted_film_goes_on(run: Path, tmp_path: Path, monkeypatch: pyt
     assert cli.main(args) == 0 and film.is_file()
     assert [call.args[0].name for call in write.call_args_list] == [f"0000{k}.png" for k in (0, 1, 2, 2, 3)]
     assert not (tmp_path / "x.frames").exists()
-
-
-def test_a_panorama_is_twice_as_wide_as_high(run: Path, tmp_path: Path) -> None:
-    [picture] = render(run, tmp_path / "around", *ORBIT, "1", "--across", "32", "--lens", "panorama").values()
-    assert picture.shape == (16, 32, 3) and picture.std() > 5

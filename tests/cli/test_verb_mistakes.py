@@ -30,13 +30,11 @@ MISTAKES = """
     export run --fit 0 | --fit
     export run --views 1 | --views
     export run --mesh-edge 0 | --mesh-edge
-    export run --lut-size 1 | --lut-size
     export run --styles A | NAME=
     export run --styles a=absent.png | absent.png
     export run --styles a=x.png b=x.png --output out/one.ply | one file holds one style
     export run cameras --output out/one.splat | holds splat
-    export run lut --output out | --references
-    export run mesh --reach 1e-6 --output out | no view sees a surface
+    export run glb --reach 1e-6 --output out | no view sees a surface
     gallery run | --references
     gallery untested --references A.png --split test | --split test
     gallery run --references empty | no image

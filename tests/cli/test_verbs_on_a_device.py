@@ -15,7 +15,7 @@ from fprf.plugins.weights import read_weights
 
 VIEW = ["--views", "0000"]
 QUICK = ["--clusters", "3"]
-SMALL = ["--side", "16", "--views", "3", "--lut-size", "3", "--fit", "1e-6", "--fit-cap", "50"]
+SMALL = ["--side", "16", "--views", "3", "--fit", "1e-6", "--fit-cap", "50"]
 DEVICE, APPLE = "cuda:0", "mps:0"
 
 
@@ -68,7 +68,7 @@ def references(world: World) -> list[str]:
 
 
 SPIRAL = "--path spiral --frames 2 --resolution 0.5 --show colour depth normals --output OUT"
-EVERYTHING = "ply splat glb cameras lut --images --output OUT"
+EVERYTHING = "ply splat glb cameras --images --output OUT"
 VERBS: dict[str, Callable[[World, Path], list[str]]] = {
     "stylize": lambda world, folder: [*VIEW, *between(world, folder)],
     "render": lambda *_: SPIRAL.split(),

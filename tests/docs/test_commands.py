@@ -51,7 +51,7 @@ SMALL = {
     "--max-memory 500": "--max-memory 5",
 }  # fmt: skip
 """What is named by its place in a larger scene."""
-FEWER = {"render": ["--frames", "2"], "export": ["--fit", "0.01", "--fit-cap", "200", "--lut-size", "5"]}
+FEWER = {"render": ["--frames", "2"], "export": ["--fit", "0.01", "--fit-cap", "200"]}
 FEWER["restyle"] = ["--views", "3", "--size", "64", "48", "--regions", "3"]
 """The tiny model renders few frames, and has barely begun to agree with itself."""
 SCENES = ("my_scene", "SCENE", "DIR", "FOLDER", "scenes/yard", "fox")

@@ -29,7 +29,7 @@ def folder(world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
     if made.exists():
         return made
     styles = [f"{name}={path}" for name, path in zip(("dusk", "snow"), world.references, strict=True)]
-    few = ["--fit", "0.02", "--fit-cap", "400", "--lut-size", "9"]
+    few = ["--fit", "0.02", "--fit-cap", "400"]
     assert cli.main(["export", str(world.run), *few, "--styles", *styles, "--output", str(made)]) == 0
     return made
 
@@ -37,7 +37,6 @@ def folder(world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_all_files_of_one_geometry_agree(folder: Path) -> None:
     made = json.loads((folder / "export.json").read_text())
     first = read_gaussians((folder / "splats.ply").read_bytes()).at
-    assert {path.name for path in (folder / "luts").iterdir()} == {"dusk", "snow"}
     assert len(json.loads((folder / "transforms.json").read_text())["frames"]) == made["cameras"] == 10
     seen = []
     for look in LOOKS:
@@ -56,10 +55,9 @@ def test_all_files_of_one_geometry_agree(folder: Path) -> None:
 
 
 def test_a_folder_takes_the_usual_kinds_or_those_that_are_named(tmp_path: Path) -> None:
-    assert plan([], tmp_path) == (("ply", "splat", "glb", "cameras", "lut"), tmp_path, None)
+    assert plan([], tmp_path) == (("ply", "splat", "glb", "cameras"), tmp_path, None)
     assert plan(["splat", "ply", "splat"], Path("out")) == (("splat", "ply"), Path("out"), None)
-    assert plan(["splats", "mesh", "spz", "glb"], Path("out")).kinds == ("ply", "splat", "glb", "spz")
-    assert plan(["mesh", "compressed.ply"], Path("out")).formats == ("compressed.ply",)
+    assert plan(["glb", "compressed.ply"], Path("out")).formats == ("compressed.ply",)
     assert plan(["glb"], Path("out")).paths("mesh", "dusk", ".ply", ".glb") == [
         Path("out/mesh.dusk.ply"),
         Path("out/mesh.dusk.glb"),
@@ -69,8 +67,8 @@ def test_a_folder_takes_the_usual_kinds_or_those_that_are_named(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("kinds", "name", "kind"),
     [
-        *(([], "a.ply", "ply"), (["mesh"], "a.ply", "glb"), ([], "a.SPLAT", "splat"), ([], "t.json", "cameras")),
-        *(([], "a.compressed.ply", "compressed.ply"), (["sog"], "meta.json", "sog"), (["lut"], "a.cube", "lut")),
+        *(([], "a.ply", "ply"), (["glb"], "a.ply", "glb"), ([], "a.SPLAT", "splat"), ([], "t.json", "cameras")),
+        *(([], "a.compressed.ply", "compressed.ply"), (["sog"], "meta.json", "sog")),
     ],
 )
 def test_a_file_holds_what_its_ending_says(kinds: list[str], name: str, kind: str) -> None:

@@ -82,18 +82,3 @@ def test_they_are_orthonormal(degree: int) -> None:
     assert values.shape == (len(view), degree * degree)
     gram = (values * weight[:, None]).T @ values
     assert (gram - torch.eye(degree * degree, dtype=torch.float64)).abs().max() <= 1e-12
-
-
-@pytest.mark.parametrize("degree", [1, 2, 3, 4])
-def test_each_band_turns_into_itself(degree: int) -> None:
-    """The values of a rotated direction are an orthogonal map of those of the direction, band by band."""
-    view, weight = quadrature()
-    turn, _ = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(degree)))
-    before, after = harmonics(view, degree), harmonics(view @ turn.T, degree)
-    mixing = (after * weight[:, None]).T @ before
-    assert (before @ mixing.T - after).abs().max() <= 1e-12
-    for band in range(degree):
-        inside = slice(band * band, (band + 1) ** 2)
-        outside = mixing[inside].clone()
-        outside[:, inside] = 0
-        assert outside.abs().max() <= 1e-12

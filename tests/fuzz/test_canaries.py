@@ -13,7 +13,7 @@ from test_readers import LATER, NAMES
 import fprf
 from benchmarks.readers import targets
 from fprf.errors import FprfError
-from fprf.plugins.weights import WeightSource, read_tensors
+from fprf.plugins.encoders.vgg import read_tensors
 
 
 @dataclass
@@ -57,7 +57,7 @@ def test_no_reader_runs_what_it_reads(tmp_path: Path, canary: Path) -> None:
         target.file.write_bytes(whole)
     for name in ("new.pt", "old.pt"):
         with pytest.raises(FprfError):
-            read_tensors(tmp_path / name, WeightSource("a network", name, "https://example.org/x", "--flag"))
+            read_tensors(tmp_path / name)
         assert not canary.exists()
 
 

@@ -25,7 +25,6 @@ NAMES = [
     "style.json",
     "config.json",
     "sealed tensors",
-    "style dictionary",
     "checkpoint manifest",
     "archive of arrays",
     "list of photographs",

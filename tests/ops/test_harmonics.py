@@ -1,8 +1,7 @@
-"""Affine maps of view-dependent colours: the compiled form against fp64 at its bound, and what renderers cut."""
+"""Affine maps of view-dependent colours: float32 against fp64 at its bound, and what renderers cut."""
 
 import pytest
 import torch
-from plain_forms import plainly
 from torch import Tensor
 
 from fprf.ops.harmonics import HARMONIC, MAX_COLOUR, Directions, as_drawn, recoloured
@@ -29,25 +28,18 @@ def double(directions: Directions) -> Directions:
 
 @torch.no_grad()
 @pytest.mark.parametrize("bands", [1, 4, 9, 16, 25])
-@pytest.mark.parametrize("count", [1, 5, 1300])
-def test_the_compiled_form_stays_within_the_bound(bands: int, count: int) -> None:
+@pytest.mark.parametrize("count", [0, 1, 1300])
+def test_maps_stay_within_the_bound(bands: int, count: int) -> None:
     """Each number is a sum of 48 products (fitted again) and one of 4, of numbers that the largest input bounds."""
     harmonics, change, weight = inputs(count, bands)
     directions = all_around(bands)
     exact = recoloured(harmonics.double(), change.double(), weight.double(), double(directions))
-    bound = 60 * U * float(harmonics.abs().max()) * (1 + float(change.abs().max()))
-    for form in (recoloured, plainly(recoloured)):
-        found = form(harmonics, change, weight, directions)
-        assert ((found.double() - exact).abs() <= bound).all() and found.shape == harmonics.shape
-        assert torch.equal(found[weight == 0], harmonics[weight == 0])
-
-
-def test_other_types_and_nothing_take_the_plain_form() -> None:
-    harmonics, change, weight = (part.double() for part in inputs(9, 4))
-    directions = double(all_around(4))
     found = recoloured(harmonics, change, weight, directions)
-    assert found.dtype == torch.float64 and torch.equal(found, plainly(recoloured)(harmonics, change, weight, directions))
-    assert recoloured(harmonics[:0].float(), change[:0].float(), weight[:0].float(), all_around(4)).shape == (0, 4, 3)
+    assert exact.dtype == torch.float64 and found.shape == harmonics.shape
+    if count:
+        bound = 60 * U * float(harmonics.abs().max()) * (1 + float(change.abs().max()))
+        assert ((found.double() - exact).abs() <= bound).all()
+    assert torch.equal(found[weight == 0], harmonics[weight == 0])
 
 
 @torch.no_grad()

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).parent
-KERNELS = ("dense", "guided", "harmonics", "mixture", "rasterise", "triplane")
+KERNELS = ("dense", "guided", "rasterise", "triplane")
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from fake_packages import Packages, packages_in
 
-from fprf.plugins import weights
+from fprf.plugins.encoders import vgg
 
 
 @pytest.fixture
@@ -23,6 +23,6 @@ def home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     def refuse(*_: object, **__: object) -> None:
         raise urllib.error.URLError("no network in tests")
 
-    monkeypatch.setattr(weights.urllib.request, "urlopen", refuse)
+    monkeypatch.setattr(vgg.urllib.request, "urlopen", refuse)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     return tmp_path / "home"

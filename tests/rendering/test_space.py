@@ -77,13 +77,6 @@ def test_spacing_keeps_its_relative_accuracy_and_its_order(near: float, far: flo
         assert abs(b - exact) <= 16 * U * exact + 4 * U * min(far, 1.0) * a
 
 
-@pytest.mark.parametrize("kind", ["box", "ndc"])
-def test_spacing_is_even_in_bounded_spaces(kind: Kind) -> None:
-    s = torch.linspace(0, 1, 5)[None].repeat(2, 1)
-    t = space_of(kind).distance(s, torch.tensor([1.0, 0.0]), torch.tensor([3.0, 1.0]))
-    assert torch.allclose(t, torch.tensor([[1.0, 1.5, 2.0, 2.5, 3.0], [0.0, 0.25, 0.5, 0.75, 1.0]]))
-
-
 def forward_rays(count: int, seed: int, origin: float = 0.3, spread: float = 0.4) -> tuple[Tensor, Tensor]:
     draw = torch.Generator().manual_seed(seed)
     o = torch.randn(count, 3, dtype=torch.float64, generator=draw) * origin

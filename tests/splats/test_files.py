@@ -1,6 +1,5 @@
 """Files of Gaussians: byte for byte back where nothing changed, within each format's steps where it is written anew."""
 
-import contextlib
 import gzip
 import json
 import struct
@@ -12,13 +11,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from splat_ball import ball
 
 from fprf.errors import DataError
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import look_at, pinhole
 from fprf.splats.config import endings
-from fprf.splats.files import Capture, read_capture, write_capture, write_gaussians, write_ply_parts
+from fprf.splats.files import Capture, read_capture, write_capture, write_gaussians
 from fprf.splats.files.base import format_of, spatial_order
 from fprf.splats.files.sog import bundle, unbundle
 from fprf.splats.gaussians import Gaussians
@@ -160,37 +158,6 @@ def test_plain_opacities_show_thin_gaussians_as_compensation_does(tmp_path: Path
     assert (heavy - wanted).abs().max() > 0.4
     exact = written(tmp_path / "exact.ply", there, antialiased=True, views=views)
     assert exact.antialiased and torch.equal(exact.gaussians.logits, there.logits)
-
-
-def test_a_ply_in_parts_is_the_same_file_and_goes_on_where_it_was_cut_off(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("fprf.splats.files.ROWS", 64)
-    gaussians, path = ball(300), tmp_path / "parts.ply"
-    whole = written(tmp_path / "whole.ply", gaussians, antialiased=True).data
-
-    def rows_written(key: str, stop: int | None = None, antialiased: bool = True) -> list[int]:
-        """First rows of the parts that were asked for until writing was cut off; the first part says what rows are like."""
-        asked: list[int] = []
-
-        def part(rows: slice) -> Gaussians:
-            if rows.start == stop:
-                raise KeyboardInterrupt
-            asked.append(rows.start)
-            return gaussians.select(rows)
-
-        with contextlib.nullcontext() if stop is None else pytest.raises(KeyboardInterrupt):
-            write_ply_parts(path, part, len(gaussians), key * 64, antialiased=antialiased)
-        return asked[1:]
-
-    assert rows_written("a", 64) == [0]
-    assert rows_written("a", 256) == [0, 64, 128, 192]
-    assert rows_written("a", 256) == [192] and not path.exists()
-    assert rows_written("a") == [192, 256] and path.read_bytes() == whole
-    assert rows_written("b", 256) == [0, 64, 128, 192] and path.read_bytes() == whole
-    # Another key begins anew, and removes what the first one left.
-    assert rows_written("c", antialiased=False) == list(range(0, 300, 64)) and not read_capture(path).antialiased
-    assert sorted(each.name for each in tmp_path.iterdir()) == ["parts.ply", "whole.ply"]
 
 
 def test_a_ply_keeps_header_order_and_what_it_does_not_know(tmp_path: Path) -> None:

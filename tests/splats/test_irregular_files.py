@@ -392,7 +392,7 @@ def test_up_of_the_file_decides_the_views_and_a_flag_before_it(tmp_path: Path) -
     cv2.imwrite(str(style), np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8))
     words = ["restyle", str(tmp_path / "in.ply"), "--references", str(style), "--views", "4", "--size", "64", "48"]
     words += ["--cache", str(tmp_path / "cache"), "--output", str(tmp_path / "out.ply")]
-    from fprf.training.tensorfiles import load_sealed
+    from fprf.io.tensorfiles import load_sealed
 
     for flag, up in (([], [0.0, 0.0, 1.0]), (["--up", "1", "0", "0"], [1.0, 0.0, 0.0])):
         assert cli.main([*words, *flag]) == 0

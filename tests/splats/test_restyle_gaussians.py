@@ -154,13 +154,6 @@ def test_maps_of_matches_heed_places(scene: SplatScene, photographs: list[Path])
     assert torch.allclose(view.match(found.restyle), taken.flatten(0, 1), atol=1e-6)
 
 
-def test_the_digest_of_a_look_is_that_of_its_numbers(scene: SplatScene, photographs: list[Path]) -> None:
-    flags: list[dict[str, object]] = [{}, {"strength": 0.5}, {"clusters": 2}]
-    flags += [{"pin": (f"{place}=snow",)} for place in ("everywhere", "box:0,0,0:1,1,1")]
-    digests = [applied(scene, *photographs, **each).restyle.digest for each in (*flags, {})]
-    assert digests[0] == digests[-1] and len({*digests}) == 5
-
-
 @pytest.mark.parametrize("place", ["box:1,2:3", "box:1,2,3:4,5,nan", "path:0,0,0:1,1,1", "path:0,0,0:1,1,1:-1"])
 def test_a_malformed_place_is_refused(place: str) -> None:
     with pytest.raises(ConfigError):

@@ -283,7 +283,7 @@ def test_verbs_of_a_run(run: Path, tmp_path: Path) -> None:
     assert plain.semantic_encoder == SEMANTICS.build().identity and len(plain.measured()[0].share) > 3
     encoder = RandomConfig(channels=6).build().identity
     assert other.semantic_encoder == other.encoders().semantic.identity == encoder and len(other.measured()[0].share) == 3
-    assert main(["train", str(run / "config.json"), "--semantic.encoder", "vgg16", "--semantic.encoder.weights", "no.pth"]) == 2
+    assert main(["train", str(run / "config.json"), "--semantic.encoder", "vgg19", "--semantic.encoder.weights", "no.pth"]) == 2
 
 
 def test_training_is_watched_and_changes_no_bit(
@@ -354,8 +354,7 @@ def test_styles_on_a_run(run: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
 UNKNOWN = """export RUN splat --fit 1
 export RUN cameras --output x.ply
 render RUN --tone 1
-render RUN --lens panorama
-stylize RUN --references a.png --samples 2
+stylize RUN --references a.png --chunk 2
 train fprf-splats --plan
 bench speed RUN
 train fprf-splats --degree 4"""
@@ -497,8 +496,9 @@ def test_blurred_views_are_shown_in_every_eighth_epoch_alone(config: GaussiansCo
 @pytest.mark.parametrize("k", [(0.0, 0.0, 0.0), (-0.3, 0.1, 0.0), (0.2, -0.05, 0.01)])
 def test_a_pinhole_covers_all_that_a_lens_shows(lens: int, k: tuple[float, float, float]) -> None:
     """No pixel lies outside of the pinhole's image or in its border of two pixels, and some reach that on each side."""
-    cameras = ideal_cameras(torch.eye(3, 4, dtype=torch.float64)[None], 60.0, (80, 64), lens)
-    cameras = replace(cameras, distortion=torch.tensor([[*k, 0.0, 0.001, -0.001]], dtype=torch.float64))
+    cameras = ideal_cameras(torch.eye(3, 4, dtype=torch.float64)[None], 60.0, (80, 64))
+    distortion = torch.tensor([[*k, 0.0, 0.001, -0.001]], dtype=torch.float64)
+    cameras = replace(cameras, distortion=distortion, lens=torch.tensor([lens]))
     camera, place = photographs.cover(cameras, 0, 0.01)
     assert place is not None
     low, high = place.amin((0, 1)), torch.tensor([camera.width, camera.height]) - place.amax((0, 1))

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 import torch
 from photo_files import turned_jpeg
-from safetensors.torch import save_file
 
 from fprf.datamanagers.basis import Basis
-from fprf.errors import CheckpointError, DataError
+from fprf.errors import DataError
 from fprf.ops.guided import upsample
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.style.dictionary import (
@@ -19,8 +18,6 @@ from fprf.style.dictionary import (
     StyleDictionary,
     build_dictionary,
     encode_photograph,
-    load_dictionary,
-    save_dictionary,
     whole_style,
 )
 from fprf.testing.cases import scene
@@ -90,34 +87,6 @@ def test_unusable_references_are_named(refs: list[Reference]) -> None:
         build_dictionary(refs)
     with pytest.raises(DataError):
         build_dictionary([])
-
-
-def test_saved_and_loaded_it_is_the_same_bit_for_bit(tmp_path: Path) -> None:
-    d = build_dictionary([reference("ä b.jpg", seed=1), reference("c", seed=2, weight=2.5)])
-    file = tmp_path / "styles" / "dusk" / "dictionary.safetensors"
-    save_dictionary(file, d)
-    assert equal(load_dictionary(file), d)
-    save_dictionary(file, build_dictionary([reference("other")]))
-    assert load_dictionary(file).names == ("other",)
-    assert [p.name for p in file.parent.iterdir()] == [file.name]
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("mean", torch.zeros(3, 2)),
-        ("mean", torch.full((3, 5), float("nan"))),
-        ("reference", torch.tensor([0, 0, 4])),
-        ("share", torch.tensor([0.5, 0.5, 0.0])),
-        ("blend", 7.0),
-    ],
-)
-def test_whole_files_with_wrong_contents_are_refused(tmp_path: Path, field: str, value: object) -> None:
-    save_dictionary(tmp_path / "d", build_dictionary([reference("a")], clusters=3)._replace(**{field: value}))
-    save_file({"keys": torch.zeros(1, 1)}, tmp_path / "foreign")
-    for name in ("d", "foreign", "absent"):
-        with pytest.raises(CheckpointError, match=name):
-            load_dictionary(tmp_path / name)
 
 
 @pytest.mark.parametrize("clusters", [1, 2, 7, 500])

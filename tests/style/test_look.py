@@ -173,8 +173,9 @@ def test_each_region_is_styled_by_what_it_may_take_from(config: StylizerConfig) 
         part, codes = choose(d, allowed[k])
         alone = config.build(dictionary=part, scene=scene)
         if isinstance(alone, TwoSidedStylizer):
-            only = torch.nn.functional.one_hot(torch.full((300,), k), 3).float()
-            styled, taken = alone.mapped(content, only), alone.table[k]
+            away = content - alone.centre
+            moved = away * alone.matrix[k] if alone.matrix.ndim == 2 else away @ alone.matrix[k]
+            styled, taken = moved + alone.bias[k], alone.table[k]
         else:
             styled, taken = alone(content, semantic), alone.match(semantic)
         out += share[:, k, None] * styled

@@ -12,7 +12,7 @@ from tiny_world import tiny
 from benchmarks.town.write import write_town
 from fprf.blocks.config import GridConfig, LayoutConfig
 from fprf.config import StatisticsConfig, TrainConfig
-from fprf.training import tensorfiles
+from fprf.io import tensorfiles
 from fprf.training.blocks import folder_of
 from fprf.training.driver import train
 

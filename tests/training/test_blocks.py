@@ -13,7 +13,7 @@ from fprf.blocks.config import AdaptiveConfig
 from fprf.blocks.fields import Member
 from fprf.blocks.visibility import make_plan
 from fprf.errors import CheckpointError
-from fprf.training import tensorfiles
+from fprf.io import tensorfiles
 from fprf.training.block_training import RAYS, block_task
 from fprf.training.blocks import BlockCache, Built, folder_of, load_blocks, load_finished, restore, surroundings
 from fprf.training.driver import train

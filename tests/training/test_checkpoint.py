@@ -11,7 +11,8 @@ from safetensors.torch import save_file
 from tiny_world import World, after_one_step, save_checkpoint
 
 from fprf.errors import CheckpointError
-from fprf.training import checkpoint, tensorfiles
+from fprf.io import tensorfiles
+from fprf.training import checkpoint
 from fprf.training.model import build_model
 
 

@@ -12,9 +12,7 @@ from tiny_world import World
 
 from fprf.cli import main as cli
 from fprf.cli.parsing import load_method
-from fprf.config import IncompleteConfig
 from fprf.errors import CheckpointError, PluginError, UsageError
-from fprf.plugins.samplers.config import ProposalConfig, SamplerConfig
 from fprf.training.camera_optimizers import Tones
 from fprf.training.driver import train
 from fprf.training.loading import Trained, load_run
@@ -62,45 +60,21 @@ def test_what_is_missing_is_named_with_what_to_do(moved: Path, tmp_path: Path) -
 
 
 def test_a_run_of_a_method_with_fields_of_its_own(world: World, moved: Path, tmp_path: Path) -> None:
-    """It goes on with its own fields alone, and renders where the method is not installed."""
+    """It goes on with its own fields alone, and needs its method."""
     trained, site = load_run(moved), tmp_path / "site"
     site.mkdir()
     with packages_in(site) as packages:
         packages.install("acme-method", {"fprf.methods": {"acme": "acme_method2:acme"}}, code={"acme_method2": METHOD})
         config = replace(load_method("acme")[0], **vars(trained.config))
         trained.run.save_config(config, "acme")
-        saved = (moved / "config.json").read_text()
         with pytest.raises(UsageError, match=r"a run with knob 2 \(8 is asked\)"):
             train(replace(config, knob=8, output=moved), "acme", quiet=True)  # type: ignore[call-arg]
-    there = load_run(moved)
-    assert isinstance(there.config, IncompleteConfig) and there.method == "acme"
-    assert torch.equal(trained.render(trained.cameras, 0).rgb, there.render(there.cameras, 0).rgb)
-    there.run.save_config(there.config, there.method)
-    assert (moved / "config.json").read_text() == saved
+    with pytest.raises(PluginError, match=r"config\.json: .*acme.*; install acme-method"):
+        load_run(moved)
 
 
 def picture(trained: Trained) -> torch.Tensor:
     return trained.render(trained.known.cameras, 0).rgb
-
-
-def test_trained_parameters_are_kept_and_the_first_model_is_not_touched(world: World) -> None:
-    trained = world.load()
-    before = picture(trained)
-    finer = at_quality(trained, QualityConfig(samples=3.0))
-    own, new = trained.model.state_dict(), finer.model.state_dict()
-    assert own.keys() == new.keys() and all(torch.equal(own[key], new[key]) for key in own)
-    assert not any(p.requires_grad for p in finer.model.parameters())
-    assert not torch.equal(picture(finer), before) and torch.equal(picture(trained), before)
-
-
-def test_samplers_that_do_not_scale_or_that_learn_for_their_number_of_samples(world: World) -> None:
-    trained = world.load()
-    learning = ProposalConfig(samples=(16,), final=8, resolutions=(4,))
-    for sampler, error in ((SamplerConfig(), PluginError), (learning, UsageError)):
-        other = replace(trained, config=replace(trained.config, sampler=sampler))
-        with pytest.raises(error):
-            at_quality(other, QualityConfig(quality="best"))
-        assert at_quality(other, QualityConfig(quality="standard")).model is trained.model
 
 
 def test_eval_takes_it(world: World, tmp_path: Path) -> None:
@@ -112,7 +86,7 @@ def test_eval_takes_it(world: World, tmp_path: Path) -> None:
         metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
         assert metrics["quality"] == name
         kept[name] = metrics["psnr"], metrics["kept_samples_share"]
-    assert kept[None] == kept["standard"] and len(set(kept.values())) == 3
+    assert kept[None] == kept["standard"] != kept["draft"] and kept["best"][0] >= kept["draft"][0]
 
 
 def test_a_reduced_view_is_the_small_one_enlarged(world: World) -> None:
@@ -138,31 +112,23 @@ def lit(world: World) -> Trained:
     return replace(trained, model=Model(trained.model.parts, tones))
 
 
-def shown(trained: Trained, *tone: str) -> tuple[torch.Tensor, torch.Tensor]:
+def shown(trained: Trained, tone: str | None = None) -> tuple[torch.Tensor, torch.Tensor]:
     chosen = at_quality(trained, QualityConfig(tone=tone))
     view = chosen.known.cameras, chosen.known.test[0]
     return chosen.render(*view).rgb, chosen.cached(*view).restyled().rgb
 
 
-def test_colours_are_multiplied_by_a_view_s_light_or_the_mean_of_logarithms_of_several(world: World) -> None:
+def test_colours_are_multiplied_by_a_view_s_light(world: World) -> None:
     trained = lit(world)
     assert trained.model.tones is not None
-    a, b = trained.known.train[:2]
-    log = trained.model.tones(torch.tensor([a, b])).detach().log()
-    for texts, share in (
-        ((trained.known.names[a],), 1.0),
-        ((str(b),), 0.0),
-        ((f"{a}=7",), 1.0),
-        ((str(a), str(b)), 0.5),
-        ((f"{a}=1", f"{b}=3"), 0.25),
-        ((f"{a}=0.5", f"{b}=0"), 1.0),
-    ):
-        wanted = shown(trained)[0] * (share * log[0] + (1 - share) * log[1]).exp()
-        for image in shown(trained, *texts):
-            torch.testing.assert_close(image, wanted.clamp(0, 1), atol=1e-6, rtol=1e-5)
+    view = trained.known.train[1]
+    wanted = (shown(trained)[0] * trained.model.tones(torch.tensor([view]))[0].detach()).clamp(0, 1)
+    for text in (trained.known.names[view], str(view)):
+        for image in shown(trained, text):
+            torch.testing.assert_close(image, wanted, atol=1e-6, rtol=1e-5)
 
 
-@pytest.mark.parametrize("tone", ["nowhere", "0=x", "99", "1=-2", "0", "1=0"])
+@pytest.mark.parametrize("tone", ["nowhere", "1=1", "99", "-1", "0"])
 def test_what_is_no_light_of_a_training_view_is_refused(world: World, tone: str) -> None:
     for trained in (lit(world), world.load()):
         with pytest.raises(UsageError):

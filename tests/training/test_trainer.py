@@ -8,16 +8,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from tiny_world import Altered, Change, World, events, parameters, same, spoilt, stopping, taught, trained_for
 from torch import nn
 
 from fprf.config import TrainConfig
 from fprf.errors import CheckpointError, NumericsError
 from fprf.training import checkpoint
-from fprf.training.driver import Report, Schedule
-from fprf.training.learner import CLEAR_EVERY, SMOOTHING, StepStatistics, clear_denormals, name_fault, unfit_step
+from fprf.training.driver import Report
+from fprf.training.learner import CLEAR_EVERY, clear_denormals
 from fprf.training.model import build_model
 from fprf.training.run import Run
 from fprf.types import Batch
@@ -129,24 +127,6 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_named(world: World, tm
     assert event["step"] == 3 and event["skipped"].startswith("rgb" if kind == "loss" else "the gradient of ")
 
 
-@given(
-    value=st.sampled_from([NAN, INF, -INF, 3e38, -2e19, 0.0, 1e-45, 1e19]),
-    sizes=st.lists(st.integers(1, 40), min_size=1, max_size=6),
-    data=st.data(),
-)
-def test_any_bad_number_anywhere_is_found_and_no_other(value: float, sizes: list[int], data: st.DataObject) -> None:
-    named = [(f"p{i}", nn.Parameter(torch.zeros(size))) for i, size in enumerate(sizes)]
-    for _, parameter in named[1:]:
-        parameter.grad = torch.ones_like(parameter)
-    which = data.draw(st.integers(0, len(sizes) - 1))
-    gradient = torch.ones(sizes[which])
-    gradient[data.draw(st.integers(0, sizes[which] - 1))] = value
-    named[which][1].grad = gradient
-    unfit = bool(unfit_step(torch.zeros(()), [parameter for _, parameter in named]))
-    assert unfit == (not bool(gradient.square().isfinite().all()))
-    assert not unfit or name_fault(torch.zeros(()), {}, named) == f"the gradient of p{which}"
-
-
 def test_a_run_with_skipped_steps_is_the_same_when_it_is_resumed(world: World, tmp_path: Path) -> None:
     """Before and after the interruption."""
     config = replace(world.config, steps=10)
@@ -208,26 +188,6 @@ def test_moments_fade_to_zero_and_not_into_denormals() -> None:
     assert float((plain - cleared).detach().abs().max()) < 1e-12
 
 
-def test_means_and_counts_are_those_of_a_plain_loop() -> None:
-    """Names come and go, and some numbers are not finite."""
-    statistics = StepStatistics(torch.device("cpu"))
-    mean: dict[str, float] = {}
-    seen: dict[str, float] = {}
-    drawn = torch.randn(40, 3, generator=torch.Generator().manual_seed(0)).tolist()
-    for step, (a, b, c) in enumerate(drawn):
-        values = {"a": a, **({"b": NAN if step % 3 == 0 else b} if step > 4 else {}), **({"c": c} if step % 5 == 0 else {})}
-        statistics.add({name: torch.tensor(value) for name, value in values.items()})
-        statistics.count_skipped(torch.tensor(float(step % 3 == 0 and step > 4)))
-        for name, value in values.items():
-            if value == value:
-                number = float(torch.tensor(value))
-                mean[name] = SMOOTHING * mean.get(name, 0.0) + (1 - SMOOTHING) * number
-                seen[name] = SMOOTHING * seen.get(name, 0.0) + (1 - SMOOTHING)
-    assert statistics.means() == pytest.approx({name: value / seen[name] for name, value in mean.items()}, rel=1e-12)
-    assert statistics.faults() == (12, 1, "b")
-    assert statistics.faults() == (12, 1, "")
-
-
 def signalled(at: int, *numbers: int) -> Change:
     def change(step: int, batch: Batch) -> Batch:
         for number in numbers if step == at else ():
@@ -246,18 +206,3 @@ def test_the_first_signal_lets_the_step_end_and_the_second_saves_nothing_doubtfu
     assert checkpoint.steps(run.checkpoints) == [4] and same(before, parameters(run, 4))
     ends = [parameters(trained_for(world, tmp_path / name, config), 9) for name in ("run", "straight")]
     assert same(*ends)
-
-
-@pytest.mark.parametrize(
-    ("steps", "minutes", "step", "seconds", "share"),
-    [
-        (100, None, 25, 1e9, 0.25),
-        (100, None, 999, 0.0, 1.0),
-        (100, 1.0, 25, 12.0, 0.25),
-        (100, 1.0, 25, 30.0, 0.5),
-        (100, 1.0, 0, 61.0, 1.0),
-        (0, None, 0, 0.0, 1.0),
-    ],
-)
-def test_whichever_comes_first_ends(steps: int, minutes: float | None, step: int, seconds: float, share: float) -> None:
-    assert Schedule(steps, minutes).share(step, seconds) == pytest.approx(share, abs=1e-12)

@@ -192,7 +192,7 @@ class MegaNerfConfig(DataParserConfig):
     def build(self) -> DataParser:
         from .meganerf import MegaNerfParser
 
-        return MegaNerfParser(self)
+        return MegaNerfParser()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,7 +225,7 @@ class PolycamConfig(DataParserConfig):
     def build(self) -> DataParser:
         from .polycam import PolycamParser
 
-        return PolycamParser(self)
+        return PolycamParser()
 
 
 @dataclass(frozen=True, kw_only=True)

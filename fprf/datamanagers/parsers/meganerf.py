@@ -13,7 +13,6 @@ from ...errors import DataError
 from ...interfaces import DataParser
 from ..images import IMAGE_SUFFIXES
 from ..scene import Scene
-from .config import MegaNerfConfig
 from .views import View, assemble_scene, read_views, rigid_pose, split_by, stated_size
 
 _LARGEST = 1 << 24
@@ -22,9 +21,6 @@ _LARGEST = 1 << 24
 
 class MegaNerfParser(DataParser):
     """`train` and `val` folders."""
-
-    def __init__(self, config: MegaNerfConfig) -> None:
-        self.config = config
 
     def parse(self, data: Path, downscale: int) -> Scene:
         """The scene at 1/downscale of the delivered size; `val` is held out. Lengths are metres where the capture says."""

@@ -14,16 +14,13 @@ from ...errors import DataError
 from ...interfaces import DataParser
 from ..images import IMAGE_SUFFIXES
 from ..scene import Scene
-from .config import PolycamConfig, keyframes
+from .config import keyframes
 from .files import as_record, read_json
 from .views import View, assemble_scene, read_views, rigid_pose, stated_size
 
 
 class PolycamParser(DataParser):
     """`keyframes/` of a raw export."""
-
-    def __init__(self, config: PolycamConfig) -> None:
-        self.config = config
 
     def parse(self, data: Path, downscale: int) -> Scene:
         """The scene at 1/downscale of its images."""

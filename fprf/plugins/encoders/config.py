@@ -61,59 +61,30 @@ class BundledSemanticConfig(EncoderConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _VggConfig(EncoderConfig):
-    network: ClassVar[str]
-    depth: ClassVar[int]
-    """Convolutions of each of the last three blocks."""
+class Vgg19Config(EncoderConfig):
+    """VGG-19 of ImageNet, the paper's content encoder. Ships up to relu2_1; torchvision's weights are downloaded for more."""
 
     layer: str = "relu2_1"
     """convX_Y or reluX_Y, X in 1..5: up to where the weights reach."""
     weights: Path | None = None
+    """torchvision's vgg19-dcbb9e9d.pth, AdaIN's vgg_normalised.pth, or a safetensors file with torchvision's keys. By default
+    the file that ships up to relu2_1 (the original weights, for which decoders ship), beyond it the download cache."""
     normalise: bool = True
     """Divide every filter by its mean activation on photographs, reflect at borders (AdaIN, FPRF); else plain VGG."""
 
     def __post_init__(self) -> None:
-        if not re.fullmatch(rf"(conv|relu)([12]_[12]|[345]_[1-{self.depth}])", self.layer):
-            name = self.network.upper().replace("VGG", "VGG-")
-            raise ConfigError(
-                f"layer: {self.layer!r} is no layer of {name}; allowed are conv1_1, relu1_1 ... relu5_{self.depth}"
-            )
+        if not re.fullmatch(r"(conv|relu)([12]_[12]|[345]_[1-4])", self.layer):
+            raise ConfigError(f"layer: {self.layer!r} is no layer of VGG-19; allowed are conv1_1, relu1_1 ... relu5_4")
 
     def needs(self) -> tuple[Need, ...]:
-        from ..weights import weights_needed
-        from .vgg import SOURCES, shipped
+        from .vgg import weights_needed
 
-        return weights_needed(SOURCES[self.network], self.weights or shipped(self.network, self.layer))
+        return weights_needed(self.layer, self.weights)
 
     def build(self) -> Encoder:
         from .vgg import build_vgg
 
-        return build_vgg(self.network, self.layer, weights=self.weights, normalise=self.normalise)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Vgg16Config(_VggConfig):
-    """VGG-16 of ImageNet. torchvision's weights are downloaded once, unless named."""
-
-    network: ClassVar[str] = "vgg16"
-    depth: ClassVar[int] = 3
-
-    weights: Path | None = None
-    """torchvision's vgg16-397923af.pth, Caffe's vgg16-00b39a1b.pth, or a safetensors file with their keys. By default the
-    download cache."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Vgg19Config(_VggConfig):
-    """VGG-19 of ImageNet, the paper's content encoder. Ships up to relu2_1; torchvision's weights are downloaded for more."""
-
-    network: ClassVar[str] = "vgg19"
-    depth: ClassVar[int] = 4
-
-    weights: Path | None = None
-    """torchvision's vgg19-dcbb9e9d.pth, Caffe's vgg19-d01eb7cb.pth, AdaIN's vgg_normalised.pth, or a safetensors file with
-    torchvision's keys. By default the file that ships up to relu2_1 (the original weights, for which decoders ship), beyond it
-    the download cache."""
+        return build_vgg(self.layer, weights=self.weights, normalise=self.normalise)
 
 
 def _hub_needs(model: str) -> tuple[Need, ...]:

@@ -1,15 +1,20 @@
-"""VGG-16 and VGG-19 (Simonyan and Zisserman) up to any layer, plain or normalised as AdaIN and FPRF use them.
+"""VGG-19 (Simonyan and Zisserman) up to any layer, plain or normalised as AdaIN and FPRF use it.
 
 Normalised: every filter is divided by its mean activation on photographs, borders are mirrored; features are then O(1).
 Pools round up, so that no pixel is lost: the last cell of an odd axis covers what is left.
 
-Weights come as torchvision, Caffe and Keras have them, or normalised as AdaIN has them. VGG-19 up to relu2_1, the paper's
-content encoder, ships with the package.
+Weights come as torchvision has them, or normalised as AdaIN has them. VGG-19 up to relu2_1, the paper's content encoder, ships
+with the package; torchvision's file is found in the caches or on the public server.
 """
 
+import hashlib
+import json
 import math
+import os
 import re
-from collections.abc import Mapping, Sequence
+import urllib.error
+import urllib.request
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -19,26 +24,20 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ...errors import WeightsError
-from ..weights import WeightSource, find_weights, input_statistics, read_tensors, tensors_hash
+from ..config import Need, absent_file
+from ..weights import IMAGENET_MEAN, IMAGENET_STD, read_weights, tensors_hash
 from .frozen import FrozenEncoder, freeze, reflect_pad, street
 
-
-def _places(depths: Sequence[int]) -> Mapping[str, int]:
-    """Convolution and ReLU take two places, a pool one after each block."""
-    names = [(block, index) for block, depth in enumerate(depths) for index in range(depth)]
-    return {f"{block + 1}_{index + 1}": 2 * at + block for at, (block, index) in enumerate(names)}
-
-
-CONVOLUTIONS: Mapping[str, Mapping[str, int]] = {"vgg16": _places((2, 2, 3, 3, 3)), "vgg19": _places((2, 2, 4, 4, 4))}
-"""Place of each convolution in torchvision's `features`, by network."""
+_NAMES = [f"{block}_{index}" for block, depth in enumerate((2, 2, 4, 4, 4), 1) for index in range(1, depth + 1)]
+CONVOLUTIONS: Mapping[str, int] = {name: 2 * at + int(name[0]) - 1 for at, name in enumerate(_NAMES)}
+"""Place of each convolution in torchvision's `features`: with its ReLU it takes two, a pool one after each block."""
 
 
 class VggEncoder(FrozenEncoder):
-    """One layer of a VGG. `scale` [C] divides the features where they are normalised, None leaves them plain."""
+    """One layer of VGG-19. `scale` [C] divides the features where they are normalised, None leaves them plain."""
 
     def __init__(
         self,
-        network: str,
         layer: str,
         tensors: Mapping[str, Tensor],
         *,
@@ -48,31 +47,29 @@ class VggEncoder(FrozenEncoder):
         source: str,
     ) -> None:
         # Tensors of the convolutions up to the layer, each of which the file must hold.
-        every = list(CONVOLUTIONS[network])
-        names = every[: every.index(layer[4:]) + 1]
+        names = _NAMES[: _NAMES.index(layer[4:]) + 1]
         used = {"mean": mean.float(), "std": std.float()}
-        shown = network.upper().replace("VGG", "VGG-")
         for index, name in enumerate(names):
             for part in ("weight", "bias"):
-                key = f"features.{CONVOLUTIONS[network][name]}.{part}"
+                key = f"features.{CONVOLUTIONS[name]}.{part}"
                 if key not in tensors:
                     held = [f"relu{each}" for each in names[:index]]
                     raise WeightsError(
                         f"{source}: holds no conv{name} ({key} is missing); its layers are "
-                        f"{', '.join(held) or f'none of {shown}'}; choose one of these, or name a file that reaches further "
+                        f"{', '.join(held) or 'none of VGG-19'}; choose one of these, or name a file that reaches further "
                         "with --content.encoder.weights FILE"
                     )
                 value = tensors[key].float()
                 odd = value.ndim != 4 or value.shape[2:] != (3, 3) or not math.isfinite(float(value.sum()))
                 if part == "weight" and odd:
                     found = f"{key} has shape {tuple(value.shape)}"
-                    raise WeightsError(f"{source}: {found}, not that of a 3x3 convolution of {shown}")
+                    raise WeightsError(f"{source}: {found}, not that of a 3x3 convolution of VGG-19")
                 used[f"{part}{index}"] = value
         # What divides the features is part of the identity, as the tensors are.
         channels = len(used[f"bias{len(names) - 1}"])
         used["scale"] = torch.ones(channels) if scale is None else scale.float()
         kind = "plain" if scale is None else "normalised"
-        super().__init__(f"{network}:{layer}:{kind}:{tensors_hash(used)}", channels)
+        super().__init__(f"vgg19:{layer}:{kind}:{tensors_hash(used)}", channels)
         self._names, self._layer, self._normalised = names, layer, scale is not None
         for key, value in used.items():
             self.register_buffer(key, value)
@@ -102,41 +99,120 @@ def vgg_activations(encoder: VggEncoder, images: Annotated[Tensor, "B 3 H W"]) -
 
 
 FLAG = "--content.encoder.weights"
-ORIGIN = "https://download.pytorch.org/models/"
-SOURCES = {
-    "vgg16": WeightSource("VGG-16", "vgg16-397923af.pth", f"{ORIGIN}vgg16-397923af.pth", FLAG),
-    "vgg19": WeightSource("VGG-19", "vgg19-dcbb9e9d.pth", f"{ORIGIN}vgg19-dcbb9e9d.pth", FLAG),
-}
-"""torchvision's files: their names carry the beginning of their own SHA-256."""
-CAFFE_FILES = r"vgg16-00b39a1b\.pth|vgg19-d01eb7cb\.pth"
-"""The original networks under torchvision's names: BGR from 0 to 255 less the mean, which these files do not say."""
+FILE = "vgg19-dcbb9e9d.pth"
+ORIGIN = f"https://download.pytorch.org/models/{FILE}"
+"""torchvision's file: its name carries the beginning of its own SHA-256."""
+CHUNK = 1 << 20
+TIMEOUT_SECONDS = 30
 RAREST = 0.05
 """Mean activation of the rarest filters, as a share of the mean over all: on photographs none of VGG-19 is below that."""
 BUNDLED = Path(__file__).parent / "weights" / "vgg19-relu2_1.safetensors"
 """VGG-19's conv1_1, conv1_2 and conv2_1 (CC BY 4.0, Simonyan and Zisserman), which decoders ship for."""
 BUNDLED_LAYERS = ("1_1", "1_2", "2_1")
-CAFFE_MEAN = (123.68 / 255, 116.779 / 255, 103.939 / 255)
 
 
-def shipped(network: str, layer: str) -> Path | None:
-    """The file of the package that holds the layer; None where none does."""
-    return BUNDLED if network == "vgg19" and layer[4:] in BUNDLED_LAYERS else None
+def _available(layer: str, path: Path | None) -> Path | None:
+    """The named file, else the package's where it holds the layer, else the cached one (fprf's or torch's)."""
+    if path is not None or layer[4:] in BUNDLED_LAYERS:
+        return path or BUNDLED
+    caches = Path.home() / ".cache/fprf/weights", Path.home() / ".cache/torch/hub/checkpoints"
+    return next((folder / FILE for folder in caches if (folder / FILE).is_file()), None)
 
 
-def build_vgg(network: str, layer: str, *, weights: Path | None, normalise: bool) -> VggEncoder:
+def weights_needed(layer: str, path: Path | None) -> tuple[Need, ...]:
+    """Weights that `build_vgg` would have to download, or a named file that is not there."""
+    if _available(layer, path) is not None:
+        return absent_file(path)
+    target = Path.home() / ".cache/fprf/weights" / FILE
+    command = f"curl --create-dirs --output {target} {ORIGIN}, or name a file with {FLAG} FILE"
+    return (Need(f"VGG-19's weights {target}", command, downloaded=True),)
+
+
+def _download() -> Path:
+    """Download torchvision's file into fprf's cache. Raises WeightsError where it is not to be had."""
+    target = Path.home() / ".cache/fprf/weights" / FILE
+    target.parent.mkdir(parents=True, exist_ok=True)
+    # Into a file of its own, whose hash is checked before it takes the name.
+    partial_file = target.with_name(f"{FILE}.{os.getpid()}.partial")
+    try:
+        # The origin is ours, https, and what comes is hashed before it is used.
+        with urllib.request.urlopen(ORIGIN, timeout=TIMEOUT_SECONDS) as response, partial_file.open("wb") as file:  # nosec B310
+            while piece := response.read(CHUNK):
+                file.write(piece)
+        _check_hash(partial_file, FILE)
+        partial_file.replace(target)
+    except (urllib.error.URLError, OSError, TimeoutError) as error:
+        raise WeightsError(
+            f"VGG-19's weights are not here and cannot be downloaded ({error}): put {ORIGIN} (SHA-256 begins with "
+            f"{_expected(FILE)}) into {target.parent}, or name a file with {FLAG} FILE"
+        ) from error
+    finally:
+        partial_file.unlink(missing_ok=True)
+    return target
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and metadata of a safetensors file, or of a file of `torch.save` (which has no metadata), hash checked.
+
+    Raises WeightsError where the file is absent, damaged, or another than its name promises.
+    """
+    if path.suffix == ".safetensors":
+        return read_weights(path)
+    if not path.is_file():
+        raise WeightsError(f"{path}: no such weights file; VGG-19's is {ORIGIN}")
+    # A name with a hash is a promise that is kept before anything is unpacked.
+    _check_hash(path, path.name)
+    try:
+        tensors = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # the unpickler raises whatever the bytes lead it to
+        raise WeightsError(f"{path}: not a file of tensors ({type(error).__name__}); VGG-19's is {ORIGIN}") from error
+    if not isinstance(tensors, dict):
+        raise WeightsError(f"{path}: holds a {type(tensors).__name__}, not named tensors; VGG-19's is {ORIGIN}")
+    return {name: value.float() for name, value in tensors.items() if isinstance(value, Tensor)}, {}
+
+
+def _expected(name: str) -> str | None:
+    """Public files of weights carry the beginning of their own SHA-256 in their names."""
+    match = re.search(r"-([0-9a-f]{8,})\.pth$", name)
+    return match.group(1) if match else None
+
+
+def _check_hash(path: Path, name: str) -> None:
+    expected = _expected(name)
+    if expected is None:
+        return
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if not digest.startswith(expected):
+        raise WeightsError(
+            f"{path}: SHA-256 begins with {digest[:8]}, its name promises {expected}; delete it and fetch {ORIGIN} again"
+        )
+
+
+def input_statistics(metadata: Mapping[str, str], path: Path) -> tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]:
+    """Mean and deviation of a network's input, as the file's metadata says; ImageNet's where it says nothing."""
+    stated = []
+    for key, default in (("mean", IMAGENET_MEAN), ("std", IMAGENET_STD)):
+        try:
+            numbers = json.loads(metadata[key]) if key in metadata else default
+            stated.append(torch.tensor(numbers, dtype=torch.float32).view(3))
+        except (ValueError, RuntimeError, TypeError) as error:
+            found = f"metadata {key!r} is {metadata[key]!r}"
+            raise WeightsError(f"{path}: {found}, not three numbers such as [0.5,0.5,0.5]") from error
+    return stated[0], stated[1]
+
+
+def build_vgg(layer: str, *, weights: Path | None, normalise: bool) -> VggEncoder:
     """The encoder from a file, the package, the cache or the download. Raises WeightsError where none of them serves."""
-    path = find_weights(SOURCES[network], weights or shipped(network, layer))
-    tensors, metadata = read_tensors(path, SOURCES[network])
-    # Whose file it is says what its network wants of the input: AdaIN's RGB as it is, Caffe's BGR less its mean.
+    path = _available(layer, weights) or _download()
+    tensors, metadata = read_tensors(path)
+    # Whose file it is says what its network wants of the input: AdaIN's RGB as it is.
     divided = tensors.get("0.weight", torch.empty(0)).shape == (3, 3, 1, 1)
     if divided:
         tensors, mean, std = _from_adain(tensors), torch.zeros(3), torch.ones(3)
-    elif re.search(CAFFE_FILES, path.name) and "features.0.weight" in tensors:
-        tensors = {**tensors, "features.0.weight": tensors["features.0.weight"].flip(1)}
-        mean, std = torch.tensor(CAFFE_MEAN), torch.full((3,), 1 / 255)
     else:
         mean, std = input_statistics(metadata, path)
-    encoder = partial(VggEncoder, network, layer, tensors, mean=mean, std=std, source=str(path))
+    encoder = partial(VggEncoder, layer, tensors, mean=mean, std=std, source=str(path))
     if not normalise:
         if divided:
             raise WeightsError(
@@ -162,7 +238,7 @@ def _from_adain(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """
     # Their places to torchvision's.
     renamed = {}
-    for at, (name, place) in enumerate(CONVOLUTIONS["vgg19"].items()):
+    for at, (name, place) in enumerate(CONVOLUTIONS.items()):
         theirs = 2 + 3 * at + int(name[0]) - 1
         for part in ("weight", "bias"):
             if f"{theirs}.{part}" in tensors:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from ...checks import at_least, between, positive
@@ -23,10 +23,6 @@ class SamplerConfig(PluginConfig):
         """The sampler, its parameters drawn from the seed."""
         raise NotImplementedError
 
-    def scaled(self, share: float) -> SamplerConfig:
-        """The same sampler with so many times its samples, at least the fewest that it takes; it has learnt the same."""
-        raise NotImplementedError
-
 
 @dataclass(frozen=True, kw_only=True)
 class UniformConfig(SamplerConfig):
@@ -42,9 +38,6 @@ class UniformConfig(SamplerConfig):
         from .samplers import UniformSampler
 
         return UniformSampler(self)
-
-    def scaled(self, share: float) -> UniformConfig:
-        return replace(self, samples=max(1, round(share * self.samples)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +85,3 @@ class ProposalConfig(SamplerConfig):
         from .samplers import ProposalSampler
 
         return ProposalSampler(self, seed=seed)
-
-    def scaled(self, share: float) -> ProposalConfig:
-        samples = tuple(max(2, round(share * n)) for n in self.samples)
-        return replace(self, samples=samples, final=max(1, round(share * self.final)))

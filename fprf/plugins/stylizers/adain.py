@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from ...interfaces import Stylizer
-from ...ops import mixture
 from ...ops.precision import double, full_precision
 from ...style.dictionary import StyleDictionary, code_odds, whole_style
 from ...style.matching import point_shares, score_spread, share_mean, unit
@@ -87,7 +86,7 @@ class AdainStylizer(Stylizer):
             if self.matched:
                 assert semantic is not None, "Want.SEMANTIC was asked for"
                 share = self.match(semantic)
-                styled = mixture.scaled(features, share, self.gain, self.style_mean, centre=self.content_mean)
+                styled = (features - self.content_mean) * (share @ self.gain) + share @ self.style_mean
             else:
                 styled = (features - self.content_mean) * self.gain + self.style_mean
             return styled.to(content)

@@ -17,11 +17,10 @@ import torch
 from torch import Tensor
 
 from ...interfaces import Stylizer
-from ...ops import mixture
 from ...ops.precision import double, full_precision
 from ...style.dictionary import StyleDictionary, choose, code_odds, whole_style
 from ...style.matching import match_keys, unit
-from ...style.scene_style import Membership, SceneStyle, check_fit, own_style
+from ...style.scene_style import Membership, SceneStyle, check_fit, mixed_maps, own_style
 from ...style.statistics import deviation, monge
 from ...types import Want
 from .config import RegionConfig
@@ -129,13 +128,12 @@ class TwoSidedStylizer(Stylizer):
         """`forward`, and the regions that points belong to."""
         with full_precision(content):
             share = self.membership(content[:, :0] if semantic is None else semantic)
-            return self.mapped(content.to(self.centre), share).to(content), share
-
-    def mapped(self, content: Annotated[Tensor, "N C"], share: Annotated[Tensor, "N K"]) -> Annotated[Tensor, "N C"]:
-        """Map points by their shares in the regions."""
-        if self.matrix.ndim == 2:  # gains and biases are mixed before they are applied
-            return mixture.scaled(content, share, self.matrix, self.bias, centre=self.centre)
-        return mixture.affine(content, share, self.matrix, self.bias, centre=self.centre)
+            features = content.to(self.centre)
+            if self.matrix.ndim == 2:  # gains and biases are mixed before they are applied
+                styled = (features - self.centre) * (share @ self.matrix) + share @ self.bias
+            else:
+                styled = mixed_maps(features, share, self.matrix, self.bias, centre=self.centre)
+            return styled.to(content), share
 
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
         with full_precision(semantic):

@@ -1,11 +1,7 @@
 """Files of 3D Gaussians, read, recoloured and written in the formats that are installed (`base.CaptureFormat`)."""
 
-import glob
 import mmap
-import os
-import shutil
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -15,15 +11,13 @@ import torch
 from torch import Tensor
 
 from ...errors import DataError
-from ...io.atomic import unwritable
 from ...rendering.cameras import Cameras
 from ...rendering.local_frame import added_and_beside, read_offset, write_offset
-from ...training.run import lock_folder
 from ...types import Origin
 from ..gaussians import Gaussians, bulk_of
 from ..views import seen_means
-from .base import ROWS, Capture, Data, format_of, pieces, release
-from .ply import ply_head, ply_rows
+from .base import Capture, Data, format_of, pieces, release
+from .ply import ply_pieces
 
 __all__ = ["Capture", "Written", "read_capture", "release", "write_capture", "write_gaussians", "write_ply_parts"]
 
@@ -136,7 +130,6 @@ def write_ply_parts(
     path: Path,
     part: Callable[[slice], Gaussians],
     count: int,
-    key: str,
     *,
     antialiased: bool = False,
     origin: Origin = (0.0, 0.0, 0.0),
@@ -144,36 +137,11 @@ def write_ply_parts(
 ) -> None:
     """Write the .ply of `count` Gaussians, whole or not at all; `part` gives slices of them, and no more is in memory.
 
-    Where writing was cut off, the next call with the same key goes on with what is there. Positions are those of
-    `write_gaussians`. Raises DataError where another process is at it, or the system refuses.
+    Positions are those of `write_gaussians`. Raises DataError where the system refuses.
     """
     added, beside = added_and_beside(origin, local)
-    first = ply_rows(part(slice(0, 1)), added)
-    head, row = ply_head({"vertex": first}, antialiased, count), first.nbytes
-    unfinished = path.with_name(f".{path.stem[:40]}.{key[:16]}")
-    for other in path.parent.glob(f".{glob.escape(path.stem[:40])}.{'[0-9a-f]' * 16}"):
-        if other != unfinished:
-            with suppress(DataError), lock_folder(other):
-                shutil.rmtree(other)
-    with lock_folder(unfinished):
-        rows = unfinished / "rows"
-        try:
-            with rows.open("r+b" if rows.is_file() else "w+b") as file:
-                # All but the last of the whole parts there have reached the disk.
-                begun = max(0, (file.seek(0, os.SEEK_END) - len(head)) // (row * ROWS) - 1)
-                file.seek(0)
-                if not begun:
-                    file.write(head)
-                file.truncate(len(head) + begun * row * ROWS)
-                file.seek(0, os.SEEK_END)
-                for start in range(begun * ROWS, count, ROWS):
-                    file.write(ply_rows(part(slice(start, min(start + ROWS, count))), added).tobytes())
-                    file.flush()
-                    os.fsync(file.fileno())
-            os.replace(rows, path)
-            write_offset(path, beside)
-        except OSError as error:
-            raise unwritable(path, error, len(head) + count * row) from error
+    write_offset(path, beside)
+    format_of(path).write(path, ply_pieces(part, count, antialiased, added))
 
 
 def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N K 3"], views: Cameras | None = None) -> Written:

@@ -10,7 +10,7 @@ compressed  element `chunk`: bounds of positions, ln-scales and, mostly, colours
 """
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar, NamedTuple
@@ -95,10 +95,7 @@ class Ply(CaptureFormat):
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> Iterable[bytes]:
         """Exact; with an origin positions are in the world, float64."""
-        first = ply_rows(gaussians.select(slice(0, 1)), origin)
-        yield ply_head({"vertex": first}, antialiased, len(gaussians))
-        for rows in base.pieces(len(gaussians)):
-            yield ply_rows(gaussians.select(rows), origin).tobytes()
+        return ply_pieces(gaussians.select, len(gaussians), antialiased, origin)
 
     def holds(self, capture: Capture, read_as: CaptureFormat) -> bool:
         """A compressed file may be called .ply: under the same ending it stays what it is."""
@@ -155,6 +152,13 @@ class CompressedPly(Ply):
     def holds(self, capture: Capture, read_as: CaptureFormat) -> bool:
         header = _header(capture.data) if isinstance(read_as, Ply) else None
         return header is not None and header.packed
+
+
+def ply_pieces(part: Callable[[slice], Gaussians], count: int, antialiased: bool, origin: Origin) -> Iterator[bytes]:
+    """The INRIA file of `count` Gaussians, of which `part` gives slices."""
+    yield ply_head({"vertex": ply_rows(part(slice(0, 1)), origin)}, antialiased, count)
+    for rows in base.pieces(count):
+        yield ply_rows(part(rows), origin).tobytes()
 
 
 def ply_rows(gaussians: Gaussians, origin: Origin) -> NDArray[np.void]:

@@ -24,7 +24,6 @@ from fprf.plugins.encoders.config import (
     Dinov2Config,
     EncoderConfig,
     RandomConfig,
-    Vgg16Config,
     Vgg19Config,
 )
 from fprf.plugins.encoders.dinov2 import WEIGHTS as DINOV2
@@ -37,7 +36,6 @@ ENCODERS: dict[str, tuple[Make, int]] = {
     "random": (lambda _: RandomConfig(stride=3), 3),
     "bundled-content": (lambda _: BundledContentConfig(), 2),
     "bundled-semantic": (lambda _: BundledSemanticConfig(), 8),
-    "vgg16": (lambda folder: Vgg16Config(weights=vgg_file(folder), layer="relu2_2"), 2),
     "vgg19-normalised": (lambda folder: Vgg19Config(weights=vgg_file(folder)), 2),
     "vgg19-plain": (lambda folder: Vgg19Config(weights=vgg_file(folder), normalise=False, layer="conv3_1"), 4),
     "dinov2": (lambda _: Dinov2Config(layer=3, stride=5), 5),
@@ -80,7 +78,7 @@ def test_identities_differ_with_settings(tmp_path: Path) -> None:
     configs = [
         one, two, ConcatConfig(),
         RandomConfig(stride=2), RandomConfig(channels=3), BundledContentConfig(), BundledSemanticConfig(),
-        Vgg16Config(weights=file), Vgg19Config(weights=file), Vgg19Config(weights=file, normalise=False),
+        Vgg19Config(weights=file), Vgg19Config(weights=file, normalise=False),
         Vgg19Config(weights=file, layer="conv2_1"), Vgg19Config(weights=other),
         Dinov2Config(layer=3), Dinov2Config(layer=2), Dinov2Config(layer=3, stride=8), Dinov2Config(layer=3, features="keys"),
         ConcatConfig(first=one, second=two), ConcatConfig(first=two, second=one),

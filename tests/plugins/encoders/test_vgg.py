@@ -11,10 +11,10 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from fprf.errors import WeightsError
-from fprf.plugins import weights
-from fprf.plugins.encoders.config import Vgg16Config, Vgg19Config
+from fprf.plugins.encoders import vgg
+from fprf.plugins.encoders.config import Vgg19Config
 from fprf.plugins.encoders.frozen import street
-from fprf.plugins.encoders.vgg import SOURCES, vgg_activations
+from fprf.plugins.encoders.vgg import FILE, ORIGIN, vgg_activations
 
 pytestmark = pytest.mark.usefixtures("home")
 
@@ -37,12 +37,11 @@ def oracle(image: Tensor, layer: str, *, normalise: bool) -> Tensor:
     return found[0] / tensors[f"mean_activation.conv{layer[4:]}"].view(-1, 1, 1) if normalise else found[0]
 
 
-@pytest.mark.parametrize("kind", [Vgg16Config, Vgg19Config])  # up to conv3_1 they are one
 @pytest.mark.parametrize("normalise", [True, False])
 @pytest.mark.parametrize("layer", ["relu1_1", "conv1_2", "relu2_1", "conv3_1"])
-def test_against_float64(tmp_path: Path, layer: str, normalise: bool, kind: type[Vgg19Config]) -> None:
+def test_against_float64(tmp_path: Path, layer: str, normalise: bool) -> None:
     image = torch.rand(3, 7, 5)
-    encoder = kind(layer=layer, weights=vgg_file(tmp_path), normalise=normalise).build()
+    encoder = Vgg19Config(layer=layer, weights=vgg_file(tmp_path), normalise=normalise).build()
     expected = oracle(image, layer, normalise=normalise)
     found = encoder(image[None])[0].double()
     assert found.shape == expected.shape
@@ -67,17 +66,6 @@ def test_without_mean_activations_the_town_gives_them(tmp_path: Path) -> None:
     assert encoder.identity == config.build().identity
     scale = encoder.get_buffer("scale")
     assert float(scale.min()) >= 0.04 * float(scale.mean())
-
-
-def test_caffes_files_are_turned_to_rgb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(weights, "_expected", lambda _: None)
-    tensors = vgg_tensors(means=True)
-    torch.save(tensors, tmp_path / "vgg16-00b39a1b.pth")
-    found = Vgg16Config(layer="conv1_1", weights=tmp_path / "vgg16-00b39a1b.pth", normalise=False).build()
-    image = torch.rand(1, 3, 6, 7)
-    bgr = 255 * image.flip(1) - torch.tensor([103.939, 116.779, 123.68]).view(1, 3, 1, 1)
-    expected = F.conv2d(bgr.double(), tensors["features.0.weight"].double(), tensors["features.0.bias"].double(), padding=1)
-    torch.testing.assert_close(found(image).double(), expected, rtol=1e-4, atol=1e-3)
 
 
 def adain_network() -> nn.Sequential:
@@ -123,12 +111,12 @@ def test_a_download_is_kept_and_used(tmp_path: Path, monkeypatch: pytest.MonkeyP
         calls.append(url)
         return io.BytesIO(buffer.getvalue())
 
-    monkeypatch.setattr(weights.urllib.request, "urlopen", serve)
-    monkeypatch.setattr(weights, "_expected", lambda _: None)
+    monkeypatch.setattr(vgg.urllib.request, "urlopen", serve)
+    monkeypatch.setattr(vgg, "_expected", lambda _: None)
     config = Vgg19Config(layer="relu3_1")
     assert config.build().identity == config.build().identity
-    assert calls == [SOURCES["vgg19"].origin]
-    assert [file.name for file in (tmp_path / "home/.cache/fprf/weights").iterdir()] == [SOURCES["vgg19"].file]
+    assert calls == [ORIGIN]
+    assert [file.name for file in (tmp_path / "home/.cache/fprf/weights").iterdir()] == [FILE]
 
 
 def test_damaged_files_are_one_clear_error_each(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import cv2
 import pytest
 import torch
+from safetensors.torch import load_file
 from tiny_world import World
 from torch import Tensor
 
@@ -15,7 +16,7 @@ from fprf.datamanagers.basis import Basis, fit_basis
 from fprf.interfaces import Stylizer
 from fprf.plugins.stylizers.adain import AdainStylizer
 from fprf.plugins.stylizers.config import LocalAdainConfig
-from fprf.style.dictionary import Reference, build_dictionary, load_dictionary
+from fprf.style.dictionary import Reference, build_dictionary
 from fprf.style.look import Restyle
 from fprf.style.scene_style import SceneStyle, scene_style
 from fprf.training.loading import load_style
@@ -115,9 +116,9 @@ class Transcribed(Stylizer):
 
     def __init__(self, folder: Path, scene: SceneStyle, basis: Basis) -> None:
         super().__init__()
-        codes = load_dictionary(folder / "dictionary.safetensors")
-        self.basis, self.keys = basis, basis.lift(codes.keys.double())
-        self.codes = codes.mean.double(), codes.covariance.double().diagonal(dim1=1, dim2=2).sqrt()
+        codes = {name: table.double() for name, table in load_file(folder / "dictionary.safetensors").items()}
+        self.basis, self.keys = basis, basis.lift(codes["keys"])
+        self.codes = codes["mean"], codes["covariance"].diagonal(dim1=1, dim2=2).sqrt()
         self.own = scene.mean.double(), scene.covariance.double().diagonal().sqrt()
 
     needs = Want.CONTENT | Want.SEMANTIC  # type: ignore[assignment]

@@ -17,7 +17,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from ..errors import CheckpointError
-from ..io.atomic import atomic_path, unwritable
+from .atomic import atomic_path, unwritable
 
 _MANIFEST = "manifest"
 _SYSTEM = re.compile(r"os error (\d+)")
