@@ -46,14 +46,12 @@ class RestyleConfig(StyleConfig, LookConfig):
     """Take exposure and white balance of the references alone: one gain for each channel of the whole scene."""
     each: bool = False
     """Each reference is a style of its own; its name is added to those of the files."""
-    sheet: Path | None = None
-    """A picture (.png .jpg .webp) of views before and after."""
     page: Path | None = None
     """A web page (.html) to walk through the capture before and after; it loads nothing and can be sent."""
     megabytes: float = 16.0
     """Size of that page, at most; Gaussians that show least are left out of it."""
     shown: int = 4
-    """Views on the sheet and the page, at least 1."""
+    """Views on the page, at least 1."""
     explain: bool = False
     """Also list the scene's regions with what each takes: a table, and explain.json and explain.png beside the output."""
     cache: Path | None = None
@@ -77,7 +75,7 @@ class _Restyled(NamedTuple):
 
 
 def run(args: list[str]) -> int:
-    """Look at the captures, or take what the cache knows of them; build each style; write files, sheet and page."""
+    """Look at the captures, or take what the cache knows of them; build each style; write files and page."""
     config, file = read_flags(RestyleConfig(), args, prog="fprf restyle", description=_DESCRIPTION, positional=("captures",))
     outputs = _outputs(config)
     from ..memory import peak
@@ -134,13 +132,13 @@ def run(args: list[str]) -> int:
     for note in dict.fromkeys(note for each in made for note in each.styled.controls.notes):
         print(note)
     if config.explain:
-        parent = (config.output or config.sheet or config.page or Path("x")).parent
+        parent = (config.output or config.page or Path("x")).parent
         for one in made:
             print_explained(parent / one.name, one.styled.controls.regions, one.styled)
         if not made:
             print_explained(parent, Regions(scene, *scene.measured(), file.regions, file.semantic_encoder), None)
-    if config.sheet is not None or config.page is not None:
-        _show(config, scene, made)
+    if config.page is not None:
+        _write_page(config.page, config, scene, made)
     each_seconds = sum(each.seconds for each in made) / max(1, len(made))
     left = "".join(f", {each} left {'out' if written.faulty else 'as they are'}" for each in faults)
     left += "".join(f", {loss}" for loss in written.losses())
@@ -161,8 +159,8 @@ def _outputs(config: RestyleConfig) -> list[Path]:
         raise UsageError(
             "fprf restyle: name a capture, for example fprf restyle scan.ply --references autumn.jpg --output new.ply"
         )
-    if config.output is None and not (config.sheet or config.page or config.explain):
-        raise UsageError("fprf restyle: name what to write, with --output, --sheet, --page or --explain")
+    if config.output is None and not (config.page or config.explain):
+        raise UsageError("fprf restyle: name what to write, with --output, --page or --explain")
     if config.page is not None and config.page.suffix.lower() != ".html":
         raise UsageError(f"--page {config.page}: the page is an .html file; give such a name")
     if not config.references and not config.explain:
@@ -209,7 +207,7 @@ def _with_views(config: RestyleConfig, file: StyleFile) -> StyleFile:
     from ..splats.captures import reference_views
 
     rows: list[tuple[Path, Path, float]] = []
-    beside = config.output or config.sheet or config.page or Path("x")
+    beside = config.output or config.page or Path("x")
     weights, masks = style.weights or (1.0,) * len(style.references), style.masks or (NO_MASK,) * len(style.references)
     for path, mask, weight in zip(style.references, masks, weights, strict=True):
         if path not in scenes:
@@ -240,11 +238,10 @@ def _styles(config: RestyleConfig, file: StyleFile) -> list[tuple[str, StyleFile
     return alone
 
 
-def _show(config: RestyleConfig, scene: "SplatScene", made: Sequence[_Restyled]) -> None:
-    """Write the sheet and the page: views as they are and in each style, evenly taken from the nearer half."""
+def _write_page(path: Path, config: RestyleConfig, scene: "SplatScene", made: Sequence[_Restyled]) -> None:
+    """Write the page: views as they are and in each style, evenly taken from the nearer half."""
     from ..datamanagers.images import load_image
-    from ..io.images import to_uint8, write_image
-    from ..io.sheet import Tile, contact_sheet
+    from ..io.images import to_uint8
     from ..page.writer import Page, PageView, Reference, Style, write_page
     from ..style.config import labels
 
@@ -255,16 +252,6 @@ def _show(config: RestyleConfig, scene: "SplatScene", made: Sequence[_Restyled])
     cameras = scene.cameras.scaled(0.5)
     before = [to_uint8(scene.render(cameras, view).rgb) for view in views]
     after = [[to_uint8(each.scene.render(cameras, view).rgb) for view in views] for each in made]
-    if config.sheet is not None:
-        titles = ["before", *(each.name or "after" for each in made)]
-        tiles = [
-            Tile(pictures[k], (f"view {scene.names[view]}: {title}",))
-            for k, view in enumerate(views)
-            for title, pictures in zip(titles, [before, *after], strict=True)
-        ]
-        write_image(config.sheet, contact_sheet(tiles, len(titles)))
-    if config.page is None:
-        return
     names, styles = labels(config.references), []
     for k, (each, pictures) in enumerate(zip(made, after, strict=True)):
         of = [names[k]] if config.each else each.styled.dictionary.names
@@ -282,4 +269,4 @@ def _show(config: RestyleConfig, scene: "SplatScene", made: Sequence[_Restyled])
         scene=scene,
         start=views[0],
     )
-    write_page(config.page, page, megabytes=config.megabytes)
+    write_page(path, page, megabytes=config.megabytes)

@@ -44,12 +44,12 @@ def highlight(picture: Picture, inside: Annotated[Tensor, "H W"]) -> Picture:
     return np.asarray(cv2.drawContours(mixed, edges, -1, _OUTLINE, 1), dtype=np.uint8)
 
 
-def contact_sheet(tiles: Sequence[Tile], columns: int = _COLUMNS) -> Picture:
-    """The tiles in rows of four, or of as many as are asked for, in their order. Letters beyond ASCII are shown as '?'."""
+def contact_sheet(tiles: Sequence[Tile]) -> Picture:
+    """The tiles in rows of four, in their order. Letters beyond ASCII are shown as '?'."""
     if not tiles:
         return np.full((_GAP, _GAP, 3), _PAPER, dtype=np.uint8)
     drawn = [_tile(tile) for tile in tiles]
-    columns = min(columns, len(drawn))
+    columns = min(_COLUMNS, len(drawn))
     height = max(len(each) for each in drawn)
     rows = math.ceil(len(drawn) / columns)
     page = np.full((rows * (height + _GAP) + _GAP, columns * (_SIDE + _GAP) + _GAP, 3), _PAPER, np.uint8)

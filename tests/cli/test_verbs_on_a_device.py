@@ -1,7 +1,6 @@
 """Verbs with `--device cuda:0`, pretended: the files of the CPU, bit for bit, where both take plain torch."""
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -88,13 +87,3 @@ def test_a_verb_writes_what_the_cpu_writes(world: World, tmp_path: Path, name: s
         args = [name.split()[0], str(world.run), *VERBS[name](world, tmp_path)]
         ran([arg.replace("OUT", str(output)) for arg in args], device)
     same(*outputs)
-
-
-def test_eval_copies_each_frame_once(world: World, tmp_path: Path) -> None:
-    for device in ("cpu", DEVICE):
-        shutil.copytree(world.run, tmp_path / device)
-        waits = ran(["eval", str(tmp_path / device)], device)
-    assert waits == {"aten._to_copy.default": 2, "aten.nonzero.default": 2}, "two views: two copies, two counts of samples"
-    same(tmp_path / "cpu" / "renders", tmp_path / DEVICE / "renders")
-    here, there = (content(tmp_path / device / "metrics.json") for device in ("cpu", DEVICE))
-    assert here == there

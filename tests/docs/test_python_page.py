@@ -1,6 +1,5 @@
 """The code of docs/python.md, word for word, on the tiny run."""
 
-import ast
 import json
 import os
 import re
@@ -60,12 +59,3 @@ def test_every_cell_runs_in_order_on_the_garden(
     assert len(read_capture(Path("night.ply")).gaussians) > 500
     made = {path.name for path in tmp_path.iterdir()}
     assert {"plain.png", "wide.png", "autumn.png", "mine.json", "film.mp4"} <= made
-
-
-def test_the_notebook_is_clean_and_every_import_is_used() -> None:
-    whole = json.loads(NOTEBOOK.read_text("utf-8"))
-    assert whole["nbformat"] == 4 and len(cells("markdown")) >= 5
-    assert not [cell for cell in whole["cells"] if cell.get("outputs") or cell.get("execution_count")], "clear its outputs"
-    tree = ast.parse("\n".join(cells("code")))
-    imported = {alias.name.split(".")[0] for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
-    assert imported <= {"fprf", "torch"}

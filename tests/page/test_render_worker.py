@@ -112,22 +112,3 @@ def test_closing_ends_the_thread_in_the_middle_of_work() -> None:
     threading.Timer(0.05, lambda: place.let(5)).start()
     place.worker.close()
     assert place.closed == [1] and len(place.log) < 10
-
-
-def test_many_threads_ask_at_once(place: Workplace) -> None:
-    place.worker.start()
-    place.let(100_000)
-
-    def ask(client: int) -> None:
-        for request in range(50):
-            place.ask(client, request)
-
-    threads = [threading.Thread(target=ask, args=(client,)) for client in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    until(lambda: all((client, 49, 3) in place.log for client in range(8)))
-    for n in range(8):
-        requests = [request for client, request, _ in place.log if client == n]
-        assert requests == sorted(requests)  # never an older one after a newer one

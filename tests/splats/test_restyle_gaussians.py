@@ -230,14 +230,14 @@ def restyled(folder: Path, photographs: list[Path]) -> list[str]:
     return ["restyle", str(folder / "in.ply"), *SMALL, *kept, "--references", *map(str, photographs)]
 
 
-def test_the_verb_writes_capture_sheet_page_and_style(
+def test_the_verb_writes_capture_page_and_style(
     photographs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made = ball(200)
     made.means[7, 0] = torch.nan
     write_gaussians(tmp_path / "in.ply", made)
     words = restyled(tmp_path, photographs)
-    endings = {"--output": "ply", "--sheet": "png", "--page": "html"}
+    endings = {"--output": "ply", "--page": "html"}
     outputs = [word for flag, ending in endings.items() for word in (flag, str(tmp_path / f"out.{ending}"))]
     assert cli.main([*words, "--each", "true", *outputs, "--explain", "true"]) == 0
     said = capsys.readouterr().out
@@ -245,7 +245,7 @@ def test_the_verb_writes_capture_sheet_page_and_style(
     first, second = (read_capture(tmp_path / f"out-{name}.ply").gaussians for name in ("dusk", "snow"))
     assert torch.equal(first.log_scales, made.log_scales) and torch.equal(first.harmonics[7], made.harmonics[7])
     assert second.colours.nanmean() > first.colours.nanmean() + 0.1, "snow is brighter than dusk"
-    assert cv2.imread(str(tmp_path / "out.png")).shape[1] > 3 * 240 and "dusk" in (tmp_path / "out.html").read_text()
+    assert "dusk" in (tmp_path / "out.html").read_text()
     assert len(list((tmp_path / "cache").iterdir())) == 1
     again = ["--style", str(tmp_path / "out-dusk.style.json"), "--output", str(tmp_path / "again.ply")]
     assert cli.main([*words[: words.index("--references")], *again]) == 0
