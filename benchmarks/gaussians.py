@@ -25,8 +25,8 @@ import torch
 from torch import Tensor
 
 from fprf.ops import backend
-from fprf.ops.rasterise import Pinhole, Rasterised, lift, rasterise
-from fprf.ops.rasterise_training import TrainableGaussians, target_of
+from fprf.ops.rasterise.rendering import Pinhole, Rasterised, lift, rasterise
+from fprf.ops.rasterise.training import TrainableGaussians, target_of
 
 from .common import arguments, report
 

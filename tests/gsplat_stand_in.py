@@ -13,8 +13,8 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from fprf.ops import rasterise_gsplat
 from fprf.ops.harmonics import spherical_harmonics
+from fprf.ops.rasterise import gsplat as rasterise_gsplat
 
 
 class Splats(NamedTuple):

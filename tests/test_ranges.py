@@ -46,7 +46,7 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
     OptimizerConfig: {"rate": [0.0], "final": [1.5], "beta2": [-0.1], "eps": [0.0]},
     RenderConfig: {"budget": [0.6], "train_budget": [-0.1], "chunk": [0], "background": [(0.0, 1.5, 0.0), (0.0, nan, 0.0)]},
     StatisticsConfig: {"rays": [3], "regions": [0]},
-    QualityConfig: {"budget": [0.6, -0.1], "chunk": [0], "resolution": [0.0, 1.5]},
+    QualityConfig: {"max_memory": [0.0], "resolution": [0.0, 1.5]},
     PlanesConfig: PLANES | {"degree": [0, 5]},
     SemanticPlanesConfig: PLANES,
     GridConfig: {"cells": [(0, 1)], "size": [0.0], "margin": [0.0, 0.6]},

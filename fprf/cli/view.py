@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING
 
 from ..checks import at_least, between
 from ..errors import CheckpointError
+from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from ..splats.config import GaussianSemanticsConfig
+from ..style.config import StyleConfig
 from ..training.quality import QualityConfig
 from .parsing import parse
 from .style_flags import say
@@ -39,6 +41,8 @@ class ViewConfig(QualityConfig):
     """Look at a capture from within, as in rooms and streets, or around an object; none = found out."""
     semantic: GaussianSemanticsConfig = GaussianSemanticsConfig()
     """Semantics of a capture; a run has its own."""
+    stylizer: StylizerConfig | None = None
+    """How styles are put onto regions; none = region-tone, as `fprf stylize` and `fprf restyle` have it."""
     references: tuple[Path, ...] = ()
     """Photographs, or folders of them, to begin with: on the shelf, and all in the mix."""
     host: str = "127.0.0.1"
@@ -135,12 +139,10 @@ def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[st
         from ..training.loading import open_run
 
         viewed = view_of_run(open_run(path, config.device, config))
-        return viewed if name is None else replace(viewed, name=name)
-    from ..plugins.stylizers.config import RegionToneConfig
+        return replace(viewed, name=name or viewed.name, style=StyleConfig(stylizer=config.stylizer or RegionToneConfig()))
     from ..splats.config import LookConfig
     from ..splats.files import read_capture
     from ..splats.loading import open_capture
-    from ..style.config import StyleConfig
 
     def progress(done: int, total: int) -> None:
         if done == 0:
@@ -149,5 +151,5 @@ def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[st
     capture, look = read_capture(path), LookConfig(up=config.up, inside=config.inside, semantic=config.semantic)
     scene = open_capture(capture, look, progress=progress)
     name = name or path.resolve().name.partition(".")[0]
-    style = StyleConfig(stylizer=RegionToneConfig(centred=False))
+    style = StyleConfig(stylizer=config.stylizer or RegionToneConfig(centred=False))
     return Viewed(scene, name, 0, root=config.output / name, capture=capture, style=style)

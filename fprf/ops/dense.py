@@ -82,13 +82,11 @@ def runs(x: Annotated[Tensor, "N C"]) -> tuple[Annotated[Tensor, "P"], Annotated
 
     Only on the CPU in float32; elsewhere each row stands for itself.
     """
-    if _fit(x):
-        from . import dense_kernels as kernels
-
-        first, run = torch.empty(len(x), dtype=torch.int64), torch.empty(len(x), dtype=torch.int64)
-        return first[: kernels.runs(x.detach().contiguous().numpy(), first.numpy(), run.numpy())], run
-    every = torch.arange(len(x), device=x.device)
-    return every, every
+    if not _fit(x):
+        every = torch.arange(len(x), device=x.device)
+        return every, every
+    begins = torch.nn.functional.pad((x[1:] != x[:-1]).any(1), (1, 0), value=True)
+    return begins.nonzero()[:, 0], begins.cumsum(0) - 1
 
 
 def _fitted(x: Tensor, rows: int, columns: int) -> Tensor:

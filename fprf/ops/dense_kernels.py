@@ -112,18 +112,3 @@ def network(x, inputs, weights, biases, widths, side, row, out, outputs):
             there[: rows * inputs] = x[first * inputs : (first + rows) * inputs]
             there[rows * inputs : BLOCK * inputs] = np.float32(0)
         _layers(source, at, inputs, weights, biases, widths, side, row, first, rows, here, there, out, outputs)
-
-
-@numba.njit(cache=True, nogil=True)
-def runs(x, first, run):
-    """Number of runs of equal rows of x [N C]; first row of each, and the run of each row."""
-    count = 0
-    for n in range(len(x)):
-        same = n > 0
-        for c in range(x.shape[1]):
-            same = same and x[n, c] == x[n - 1, c]
-        if not same:
-            first[count] = n
-            count += 1
-        run[n] = count - 1
-    return count

@@ -7,7 +7,6 @@ A look says how a scene is coloured: `StyleConfig` holds what the sliders set, `
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count
-from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
 
@@ -32,7 +31,18 @@ _MAX_KEYS = 64
 _SLIDERS = (
     "strength", "bold", "luminance", "clusters", "blend", "stylizer.temperature", "stylizer.smoothness",
 )  # fmt: skip
-"""Fields of `StyleConfig` that the page shows."""
+"""Fields of `StyleConfig` that the page shows, where its stylizer has them."""
+
+
+def _sliders(style: StyleConfig) -> dict[str, float]:
+    """Values of the sliders of a style."""
+    found = {}
+    for name in _SLIDERS:
+        of_stylizer, _, last = name.rpartition(".")
+        config = style.stylizer if of_stylizer else style
+        if hasattr(config, last):
+            found[name] = getattr(config, last)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,6 +220,8 @@ class State:
         look = self.look
         match message:
             case messages.Set():
+                if message.name not in _sliders(look.style):
+                    raise UsageError(f"{message.name}: the stylizer of this scene has no such field")
                 value: Any = int(message.value) if message.name == "clusters" else round(message.value, 4)
                 return replace(self, look=replace(look, style=slots.replace(look.style, message.name, value)))
             case messages.Preset():
@@ -292,7 +304,7 @@ class State:
                 {"card": each.number, "name": each.name, "weight": weights.get(each, 0.0), "colour": colours.get(each)}
                 for each in self.shelf
             ],
-            "look": {name: attrgetter(name)(self.look.style) for name in _SLIDERS},
+            "look": _sliders(self.look.style),
             "map": self.map,
             "picked": region,
             "kept": [name for name, _ in self.kept],

@@ -13,6 +13,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from ..checks import at_least
 from ..errors import UsageError
 from ..types import Origin
 from .camera_path import read_camera_path
@@ -44,9 +45,9 @@ def spiral(cameras: Cameras, frames: int) -> Cameras:
     """A closed spiral of two turns about the most central captured camera, looking at where the optical axes meet.
 
     The radii are the spread of the cameras along the central camera's axes, shrunk until no frame is farther from a
-    captured camera than captured cameras are from each other. Raises UsageError.
+    captured camera than captured cameras are from each other. Raises ConfigError.
     """
-    _at_least("frames", frames, 1)
+    at_least("frames", frames, 1)
     centres = cameras.pose[:, :, 3]
     apart = torch.cdist(centres, centres)
     middle = int(apart.sum(-1).argmin())
@@ -74,7 +75,7 @@ def orbit(cameras: Cameras, frames: int) -> Cameras:
     A full circle where the cameras surround the place, else to and fro within the arc that they cover; closed in both
     cases. The axis is the cameras' mean up, or for cameras that look straight down, against their view. Raises UsageError.
     """
-    _at_least("frames", frames, 1)
+    at_least("frames", frames, 1)
     pose = cameras.pose
     centres, up = pose[:, :, 3], upwards(cameras)
     if float(up.norm()) < 1e-6:
@@ -114,10 +115,9 @@ def interpolate(cameras: Cameras, order: Annotated[Tensor, "M"], frames_between:
     """Through the views of `order`, with `frames_between` new ones in each gap: (M - 1) (frames_between + 1) + 1 frames.
 
     Positions follow a centripetal Catmull-Rom spline, which neither loops nor overshoots; rotations and intrinsics move
-    evenly (SLERP, linear). Every frame has the size of the first view. Raises UsageError.
+    evenly (SLERP, linear). Every frame has the size of the first view. Raises ConfigError.
     """
-    _at_least("frames_between", frames_between, 0)
-    _at_least("the number of views", len(order), 1)
+    at_least("views", len(order), 1)
     # Intrinsics of all views in pixels of the first one: captures mix sizes.
     keys = cameras.select(order)
     keys = keys.resized(keys.size[:1].expand(len(keys), 2))
@@ -159,11 +159,6 @@ def _pinhole(pose: Annotated[Tensor, "F 3 4"], cameras: Cameras, view: int) -> C
     """Frames at `pose` with the focal length and size of a captured view, without its distortion."""
     like = cameras.select(torch.full((len(pose),), view, device=pose.device))
     return replace(like, pose=pose, distortion=torch.zeros_like(like.distortion), lens=torch.full_like(like.lens, PINHOLE))
-
-
-def _at_least(name: str, value: int, low: int) -> None:
-    if value < low:
-        raise UsageError(f"camera path: {name} is {value}; must be at least {low}")
 
 
 def _unit(vector: Tensor) -> Tensor:

@@ -26,9 +26,9 @@ from ..datamanagers.images import load_images
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError
 from ..interfaces import Partition, State
-from ..ops.rasterise import lift
-from ..ops.rasterise_gsplat import usable
-from ..ops.rasterise_training import compile_beside
+from ..ops.rasterise.gsplat import usable
+from ..ops.rasterise.rendering import lift
+from ..ops.rasterise.training import compile_beside
 from ..progress import Display
 from ..rendering.cameras import Cameras
 from ..training import checkpoint

@@ -16,12 +16,12 @@ from torch import Tensor
 
 from ..errors import CheckpointError, DataError
 from ..ops.harmonics import HARMONIC
-from ..ops.rasterise_training import HARMONICS, LOG_SCALES, LOGIT, MEANS, QUATERNION
+from ..ops.rasterise.training import HARMONICS, LOG_SCALES, LOGIT, MEANS, QUATERNION
 
 COUNTS = (1, 4, 9, 16, 25)
 """Harmonics a channel, by degree."""
 _LARGEST, _WIDEST, _FLATTEST = 1e15, 88.0, -30.0
-"""Magnitude from which on nothing is drawn (`ops.rasterise_reference`); ln-scales: the largest whose size is finite in float32,
+"""Magnitude from which on nothing is drawn (`ops.rasterise.reference`); ln-scales: the largest whose size is finite in float32,
 and the smallest that drawing tells from 0."""
 _SAMPLE = 100_000
 """Points, about, of which quantiles are taken."""
@@ -69,7 +69,7 @@ class Gaussians:
 
     @property
     def rows(self) -> Annotated[Tensor, "N R"]:
-        """All parameters of a Gaussian in a row of R = 11 + 3 K, in the columns of `ops.rasterise_training`."""
+        """All parameters of a Gaussian in a row of R = 11 + 3 K, in the columns of `ops.rasterise.training`."""
         parts = (self.means, self.log_scales, self.quaternions, self.logits[:, None])
         return torch.cat([*parts, self.harmonics.flatten(1)], 1)
 

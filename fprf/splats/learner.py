@@ -9,7 +9,7 @@ the place of those that became transparent, and until there are as many as the c
 (Kheradmand et al. 2024) with the halves of Kerbl et al.
 
 Shapes: N Gaussians, M of them that are split, V views, K = (degree + 1)^2 harmonics of a colour channel. A Gaussian is a row
-of R = 11 + 3 K float32 parameters, in the columns that `ops.rasterise_training` names:
+of R = 11 + 3 K float32 parameters, in the columns that `ops.rasterise.training` names:
 
     MEANS        3     in the world
     LOG_SCALES   3     natural logarithms of the standard deviations along the own axes
@@ -33,8 +33,8 @@ from torch import Tensor
 
 from ..interfaces import Figures, SceneLearner, State
 from ..ops.harmonics import HARMONIC
-from ..ops.rasterise_gsplat import GsplatGaussians, Trainable, obstacle, trainable
-from ..ops.rasterise_training import (
+from ..ops.rasterise.gsplat import GsplatGaussians, Trainable, obstacle, trainable
+from ..ops.rasterise.training import (
     HARMONICS,
     LOG_SCALES,
     LOGIT,

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..ops.rasterise import Pinhole
+from ..ops.rasterise.rendering import Pinhole
 from ..rendering.splines import quaternions, rotations
 from .gaussians import Gaussians, from_rows
 from .initial import curve_order

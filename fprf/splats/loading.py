@@ -43,9 +43,8 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
     Raises CheckpointError with what is missing, UsageError for qualities other than a resolution.
     """
     assert isinstance(config, GaussiansConfig)  # by its kind
-    for name in ("budget", "chunk", "max_memory"):
-        if getattr(quality, name):
-            raise UsageError(f"--{name.replace('_', '-')}: is for runs of fields; leave it out")
+    if quality.max_memory:
+        raise UsageError("--max-memory: is for runs of fields; leave it out")
     root, preset = run.root, None if quality.quality is None else PRESETS[quality.quality]
     merged = None if preset is None else preset.merged
     saved, _ = checkpoint.load_latest(run.checkpoints)

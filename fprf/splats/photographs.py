@@ -20,8 +20,8 @@ from ..datamanagers.blur import blurred_views
 from ..datamanagers.images import Image, load_images, load_mask
 from ..datamanagers.scene import Scene
 from ..ops.photometric import WINDOW
-from ..ops.rasterise import Pinhole
-from ..ops.rasterise_training import Floats, Target, target_of
+from ..ops.rasterise.rendering import Pinhole
+from ..ops.rasterise.training import Floats, Target, target_of
 from ..rendering.cameras import Cameras, Intrinsics, directions_of, intrinsics_of, pixel_grid, project, rays_through
 from .config import GaussiansConfig
 

@@ -17,7 +17,7 @@ from ..datamanagers.basis import Basis
 from ..datamanagers.scene import Scene as ParsedScene
 from ..errors import CheckpointError, DataError
 from ..interfaces import Encoder, Scene, SceneView, Stylizer, Values
-from ..ops.rasterise_reference import MIN_ALPHA
+from ..ops.rasterise.reference import MIN_ALPHA
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.cameras import Cameras, pixel_grid
 from ..rendering.renderer import enlarged

@@ -26,7 +26,7 @@ from ..errors import CheckpointError, DataError
 from ..interfaces import Encoder
 from ..ops.backend import compiled
 from ..ops.guided import upsample
-from ..ops.rasterise import lift
+from ..ops.rasterise.rendering import lift
 from ..rendering.cameras import Cameras
 from ..style.scene_style import SceneStyle, region_contacts, scene_style
 from ..style.scene_style import from_tensors as style_from

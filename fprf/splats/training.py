@@ -19,8 +19,8 @@ from torch import Tensor
 
 from ..datamanagers.images import Image
 from ..datamanagers.scene import Scene, find_sightings, sparser
-from ..ops.rasterise_gsplat import Trainable, usable
-from ..ops.rasterise_training import LOG_SCALES, MEANS, compile_beside
+from ..ops.rasterise.gsplat import Trainable, usable
+from ..ops.rasterise.training import LOG_SCALES, MEANS, compile_beside
 from ..training.model import Facts, poses_of, tones_of
 from ..training.prepare import exposure_of, facts_of
 from ..training.run import known_of

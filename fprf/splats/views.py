@@ -19,8 +19,8 @@ from torch import Tensor
 
 from ..errors import DataError
 from ..ops.harmonics import HARMONIC, spherical_harmonics
-from ..ops.rasterise import Pinhole, Rasterised, lift, rasterise
-from ..ops.rasterise_reference import project_reference
+from ..ops.rasterise.reference import project_reference
+from ..ops.rasterise.rendering import Pinhole, Rasterised, lift, rasterise
 from ..rendering.cameras import Cameras
 from ..rendering.local_frame import extent_of
 from ..rendering.paths import look_at, pinhole

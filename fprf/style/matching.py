@@ -22,15 +22,13 @@ The paper matches points with codes by dot products at temperature 1. Three thin
   the weights at which the scene takes them.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
 from ..errors import ConfigError
 from ..ops.precision import double, full_precision
-
-Similarity = Literal["cosine", "dot"]
 
 _FLAT = 1e-6
 """Below this share of what they were computed from, lengths and spreads are float32 rounding."""
@@ -114,7 +112,6 @@ def match_keys(
     prior: Annotated[Tensor, "T"],
     *,
     temperature: float,
-    similarity: Similarity = "cosine",
     whitening: float = 0.0,
     recentred: int = 0,
     centred: bool = True,
@@ -127,7 +124,7 @@ def match_keys(
     `centred` False cosines are taken from the encoder's own zero (`origin`, in the keys' basis; None = 0), without whitening: a
     single thing has no sky, so its mean says nothing about that of a landscape.
 
-    With cosines, moving one side or rotating both changes nothing. Dot products are the paper's, and know no frame.
+    Moving one side or rotating both changes nothing.
     """
     # Shares of each side sum to 1, in float64: the tables are small and decide everything that follows.
     regions, region_share = double(regions), double(region_share) / double(region_share).sum()
@@ -137,10 +134,6 @@ def match_keys(
         """Eq. 5 and 6 at a temperature in units of the scores' own spread."""
         return attention(queries, keys, temperature * score_spread(queries, keys), double(prior))
 
-    # The paper's form: dot products of the semantics as they are.
-    if similarity == "dot":
-        # Softmax does not see what is subtracted from all keys; the smaller numbers round less.
-        return matched(regions, codes - share_mean(codes, code_share))
     # Plain cosines, for single things: both sides are seen from the encoder's zero.
     if not centred:
         zero = torch.zeros_like(regions[0]) if origin is None else double(origin)

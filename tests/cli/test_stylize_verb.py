@@ -87,7 +87,7 @@ def test_a_style_of_another_scene_finds_its_regions_by_their_keys(run: Path, wor
     tensors = load_file(other / "style.safetensors")
     turned = {k: v.flip(0) if k in ("keys", "region_mean", "region_covariance", "share") else v for k, v in tensors.items()}
     tensorfiles.save(other / "style.safetensors", turned, sealed=True)
-    file = ["--style", str(tmp_path / "a" / "style.json"), "--no-matches"]
+    file = ["--style", str(tmp_path / "a" / "style.json"), "--split", "test", "--no-matches"]
     assert cli.main(["stylize", str(other), *file, "--output", str(tmp_path / "b")]) == 0
     a, b = (cv2.imread(str(tmp_path / folder / "0000.png")).astype(int) for folder in "ab")
     assert np.abs(a - b).max() <= 1

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from fprf.ops import rasterise
+from fprf.ops.rasterise import rendering as rasterise
 
 ROUGH = 1.1e-4
 """Relative error of the kernels' exponential."""

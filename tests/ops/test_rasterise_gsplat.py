@@ -19,9 +19,11 @@ from pretend_cuda import CUDA, pretend_cuda
 from test_rasterise import ROUGH, STOP, Tensors, camera, cloud, exact
 from torch import Tensor
 
-from fprf.ops import backend, photometric, rasterise, rasterise_gsplat
-from fprf.ops.rasterise_gsplat import GsplatGaussians, photometric_loss
-from fprf.ops.rasterise_training import TrainableGaussians, target_of
+from fprf.ops import backend, photometric
+from fprf.ops.rasterise import gsplat as rasterise_gsplat
+from fprf.ops.rasterise import rendering as rasterise
+from fprf.ops.rasterise.gsplat import GsplatGaussians, photometric_loss
+from fprf.ops.rasterise.training import TrainableGaussians, target_of
 
 CPU = torch.device("cpu")
 

@@ -5,9 +5,9 @@ import pytest
 import torch
 from test_rasterise import ROUGH, camera, cloud
 
-from fprf.ops import rasterise
-from fprf.ops.rasterise_reference import rasterise_reference, view_colours
-from fprf.ops.rasterise_training import TrainableGaussians, target_of
+from fprf.ops.rasterise import rendering as rasterise
+from fprf.ops.rasterise.reference import rasterise_reference, view_colours
+from fprf.ops.rasterise.training import TrainableGaussians, target_of
 from fprf.training.camera_optimizers import rotated
 
 WIDTH, HEIGHT = 40, 30

@@ -6,11 +6,10 @@ from collections.abc import Callable, Sequence
 import numba
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import settings
 from torch import Tensor
 
-from fprf.ops.triplane import lookup, lookup_reference, rows, split, usable, variation, variation_reference
+from fprf.ops.triplane import lookup, lookup_reference, rows, usable, variation, variation_reference
 
 QUICK = settings(max_examples=20, deadline=None)
 Form = Callable[[Tensor, Tensor, Sequence[int]], Tensor]
@@ -42,20 +41,6 @@ def test_both_forms_stay_within_the_bound(resolutions: tuple[int, ...], channels
         assert ((found.double() - value).abs() <= 32 * U).all()
 
 
-@QUICK
-@given(
-    st.lists(st.floats(-1, 1, width=32), min_size=3, max_size=3),
-    st.lists(st.integers(2, 20), min_size=1, max_size=3),
-    st.sampled_from([5, 8, 16]),
-    st.integers(0, 99),
-)
-def test_any_point_of_any_planes(point: list[float], resolutions: list[int], channels: int, seed: int) -> None:
-    table, points = table_of(resolutions, channels, seed), torch.tensor([point])
-    value = lookup_reference(points.double(), table.double(), resolutions)
-    # A coordinate rounds by 2u r nodes, along each of three axes, and a product changes by at most 2 a node.
-    assert ((lookup(points, table, resolutions).double() - value).abs() <= (32 + 12 * max(resolutions)) * U).all()
-
-
 WILD = (float("nan"), float("inf"), -float("inf"), 1e30, -1e30, 1.0 + 2e-7, -1.0 - 2e-7, 1.0, -1.0, 0.3)
 
 
@@ -77,18 +62,6 @@ def test_no_coordinate_leaves_the_table(channels: int, size: int) -> None:
         (gradient,) = torch.autograd.grad(found.sum(), table)
         assert gradient.shape == table.shape and gradient.isfinite().all()
     assert padded[: size * size].isnan().all() and padded[size * size + total :].isnan().all()
-
-
-@QUICK
-@given(st.integers(1, 12), st.integers(0, 99))
-def test_each_point_stands_alone(count: int, seed: int) -> None:
-    """A point's features are bitwise the same in any batch and from any memory layout; order carries over."""
-    resolutions = (3, 17)
-    table, points = table_of(resolutions, 16, seed), points_of(count, seed)
-    whole = lookup(points, table, resolutions)
-    assert torch.equal(torch.cat([lookup(p[None], table, resolutions) for p in points]), whole)
-    assert torch.equal(lookup(points.flip(0), table, resolutions).flip(0), whole)
-    assert torch.equal(lookup(points.T.contiguous().T, table.T.contiguous().T, resolutions), whole)
 
 
 @pytest.mark.parametrize(("resolutions", "channels", "count"), [((64, 182), 16, 2000), ((16,), 24, 777)])
@@ -133,36 +106,15 @@ def test_one_thread_and_two_give_the_same_bits() -> None:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
-def variation_oracle(table: Tensor, resolutions: Sequence[int]) -> float:
-    """Loops over nodes."""
-    total = 0.0
-    for grid, r in zip(split(table, resolutions), resolutions, strict=True):
-        g = grid.double().numpy()
-        across = down = 0.0
-        for plane, v, u in itertools.product(range(3), range(r), range(r)):
-            if u + 1 < r:
-                across += float(((g[plane, v, u + 1] - g[plane, v, u]) ** 2).sum())
-            if v + 1 < r:
-                down += float(((g[plane, v + 1, u] - g[plane, v, u]) ** 2).sum())
-        total += (across + down) / (3 * r * (r - 1) * g.shape[-1])
-    return total
-
-
-@pytest.mark.parametrize(("resolutions", "channels"), [((2,), 8), ((5, 12), 16), ((3, 4), 5)])
-def test_variation_is_the_sum_over_neighbours(resolutions: tuple[int, ...], channels: int) -> None:
-    table = table_of(resolutions, channels)
-    wanted = variation_oracle(table, resolutions)
-    for form in (variation, variation_reference):
-        assert abs(float(form(table, resolutions)) - wanted) <= 1e-6 * wanted
-
-
 @pytest.mark.parametrize(("resolutions", "channels"), [((2, 3), 8), ((64, 182), 16)])
 @pytest.mark.parametrize("scale", [1.0, -3.5, 0.0])
 def test_gradient_of_variation(resolutions: tuple[int, ...], channels: int, scale: float) -> None:
     table = table_of(resolutions, channels).requires_grad_(True)
     exact_table = table.detach().double().requires_grad_(True)
-    (found,) = torch.autograd.grad(variation(table, resolutions) * scale, table)
-    (exact,) = torch.autograd.grad(variation_reference(exact_table, resolutions) * scale, exact_table)
+    fused, plain = variation(table, resolutions), variation_reference(exact_table, resolutions)
+    assert fused.item() == pytest.approx(plain.item(), rel=1e-6)
+    (found,) = torch.autograd.grad(fused * scale, table)
+    (exact,) = torch.autograd.grad(plain * scale, exact_table)
     assert (found.double() - exact).norm() <= 1e-6 * exact.norm()
     # Opposite neighbours cancel: a constant shift of the planes costs nothing.
     assert abs(float(found.double().sum())) <= 1e-5 * float(found.double().abs().sum()) + 1e-30
@@ -176,45 +128,23 @@ def points_in_cells(count: int, resolution: int, seed: int = 0) -> Tensor:
     return (cell + share) * (2 / (resolution - 1)) - 1
 
 
-def differences(points: Tensor, table: Tensor, resolutions: Sequence[int], grad: Tensor, step: float) -> Tensor:
-    """Central differences in fp64: exact but for rounding, since a product of two linear factors is a parabola on each axis."""
-    columns = []
-    for axis in range(3):
-        move = torch.zeros(3, dtype=torch.float64)
-        move[axis] = step
-        ahead, behind = (lookup_reference(points.double() + way * move, table.double(), resolutions) for way in (1, -1))
-        columns.append(((ahead - behind) * grad).sum(-1) / (2 * step))
-    return torch.stack(columns, -1)
-
-
 def slopes(form: Form, points: Tensor, table: Tensor, resolutions: tuple[int, ...], grad: Tensor) -> Tensor:
     """Gradient of the points for one of the features."""
     given = points.clone().requires_grad_()
     return torch.autograd.grad(form(given, table, resolutions), given, grad)[0]
 
 
-def bound(points: Tensor, table: Tensor, resolutions: Sequence[int], grad: Tensor) -> Tensor:
-    """What rounding may change. A slope is at most 4 + 4 times the product of magnitudes, at quarters of a cell; twenty
-    operations lead to it, then come the sums over channels and scales.
-    """
-    channels = table.shape[1]
-    sizes = lookup_reference(points.double(), table.double().abs(), resolutions) * grad.abs()
-    parts = [0.5 * (r - 1) * part.sum(-1) for r, part in zip(resolutions, sizes.split(channels, -1), strict=True)]
-    return U * (30 + channels / 8 + len(resolutions)) * 8 * torch.stack(parts).sum(0)[:, None]
-
-
 @pytest.mark.parametrize(
     ("resolutions", "channels", "count"), [((9,), 8, 1), ((65,), 16, 500), ((17, 9), 24, 97), ((5, 3), 40, 0)]
 )
-def test_both_forms_are_the_differences(resolutions: tuple[int, ...], channels: int, count: int) -> None:
+def test_slopes_of_points_are_those_of_the_plain_form(resolutions: tuple[int, ...], channels: int, count: int) -> None:
     points, table = points_in_cells(count, resolutions[0]), table_of(resolutions, channels)
     grad = torch.randn(count, len(resolutions) * channels, generator=torch.Generator().manual_seed(3))
-    exact = differences(points, table, resolutions, grad, 1 / 512)
-    assert usable(points, table)
-    for form in (lookup, lookup_reference):
-        found = slopes(form, points, table, resolutions, grad)
-        assert found.dtype == torch.float32 and found.shape == (count, 3)
-        assert ((found - exact).abs() <= bound(points, table, resolutions, grad) + 1e-11).all()
+    exact = slopes(lookup_reference, points.double(), table.double(), resolutions, grad.double())
+    found = slopes(lookup, points, table, resolutions, grad)
+    assert usable(points, table) and found.dtype == torch.float32 and found.shape == (count, 3)
+    # At quarters of a cell; what is left are the roundings of sums over channels and scales.
+    assert (found.double() - exact).norm() <= 1e-5 * exact.norm()
 
 
 @pytest.mark.parametrize("place", [1.5, -1.5, float("nan"), float("inf"), 1e30])

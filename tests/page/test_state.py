@@ -8,6 +8,7 @@ from fprf.errors import ConfigError, UsageError
 from fprf.page.messages import Camera, Card, Keep, Key, Preset, Set
 from fprf.page.state import SHELF, Look, Photograph, State
 from fprf.page.state import Key as Keyframe
+from fprf.plugins.stylizers.config import AdainConfig
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import Reference
 
@@ -54,6 +55,14 @@ def test_sliders_and_presets_change_the_style() -> None:
     shown = moved.described()["look"]
     assert (shown["stylizer.smoothness"], shown["clusters"]) == (3, 7)
     assert moved.changed(Preset(name="gentle")).described()["look"]["strength"] == 0.9
+
+
+def test_a_stylizer_without_a_slider_s_field_has_no_such_slider() -> None:
+    state = State(look=Look(style=StyleConfig(stylizer=AdainConfig())))
+    shown = state.described()["look"]
+    assert "strength" in shown and "stylizer.temperature" not in shown
+    with pytest.raises(UsageError, match=r"stylizer\.temperature: the stylizer of this scene has no such field"):
+        state.changed(Set(name="stylizer.temperature", value=0.5))
 
 
 def test_a_new_photograph_is_the_style_or_joins() -> None:

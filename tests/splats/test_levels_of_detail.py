@@ -6,7 +6,7 @@ import pytest
 import torch
 from splat_ball import ball, equal
 
-from fprf.ops.rasterise import Pinhole
+from fprf.ops.rasterise.rendering import Pinhole
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.levels import make_levels_of_detail
 from fprf.splats.views import draw

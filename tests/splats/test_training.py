@@ -22,8 +22,8 @@ from fprf.datamanagers.scene import Scene
 from fprf.evaluation.metrics import psnr
 from fprf.interfaces import State
 from fprf.io.images import write_image
-from fprf.ops.rasterise import lift
-from fprf.ops.rasterise_training import LOG_SCALES, TrainableGaussians
+from fprf.ops.rasterise.rendering import lift
+from fprf.ops.rasterise.training import LOG_SCALES, TrainableGaussians
 from fprf.plugins.encoders.config import SEMANTICS, RandomConfig
 from fprf.rendering.cameras import Cameras, ideal_cameras, project
 from fprf.splats import initial, photographs, training
@@ -354,7 +354,7 @@ def test_styles_on_a_run(run: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
 UNKNOWN = """export RUN splat --fit 1
 export RUN cameras --output x.ply
 render RUN --tone 1
-stylize RUN --references a.png --chunk 2
+stylize RUN --references a.png --max-memory 2
 train fprf-splats --plan
 bench speed RUN
 train fprf-splats --degree 4"""

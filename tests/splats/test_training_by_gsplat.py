@@ -19,7 +19,7 @@ from fprf.datamanagers.images import load_images
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import Scene
 from fprf.evaluation.metrics import psnr
-from fprf.ops.rasterise_gsplat import GsplatGaussians
+from fprf.ops.rasterise.gsplat import GsplatGaussians
 from fprf.splats.config import GaussiansConfig
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.learner import GaussianLearner

@@ -165,13 +165,6 @@ def test_half_way_from_blue_to_yellow_is_not_green() -> None:
         assert float(mixed[1] - mixed[[0, 2]].max()) <= float(plain[1] - plain[[0, 2]].max()) + 1e-9
 
 
-def test_references_that_show_everything_paint_as_if_there_were_no_light() -> None:
-    colour, semantic, scene = made_scene()
-    both = look_of(scene, reference(MEADOW)), look_of(scene, reference(MEADOW), bold=1.0)
-    lit, painted = (each.colour(Straight(), colour, semantic) for each in both)
-    assert float((lit - painted).abs().max()) < 0.02 < 0.1 < float((painted - colour).abs().max())
-
-
 def test_a_kind_that_a_reference_lacks_keeps_its_own_chroma() -> None:
     """Brick beside a reference without a cast stays as red as the references are colourful."""
     colour, semantic, scene = made_scene()

@@ -21,7 +21,7 @@ from fprf.plugins.stylizers.region import TwoSidedStylizer
 from fprf.style.config import parse_place
 from fprf.style.dictionary import build_dictionary, choose, whole_style
 from fprf.style.light import luma
-from fprf.style.look import Restyle, blend_strength, keep_luminance, place_weight, regional
+from fprf.style.look import Restyle, keep_luminance, place_weight, regional
 from fprf.style.scene_style import Membership, RegionWeight
 from fprf.types import Want
 
@@ -90,12 +90,6 @@ def test_between_two_styles_features_strengths_and_luminances_are_linear(at: flo
     torch.testing.assert_close(mixed.colour(decoder, content, semantic), wanted, rtol=0.0, atol=1e-5)
     expected = torch.cat([(1 - at) * a.match(semantic), at * b.match(semantic)], 1)
     torch.testing.assert_close(mixed.match(semantic), expected)
-
-
-def test_the_ends_are_bitwise_and_the_same_object() -> None:
-    content, styled = torch.randn(7, 3), torch.randn(7, 3)
-    assert blend_strength(content, styled, 0.0) is content
-    assert blend_strength(content, styled, 1.0) is styled
 
 
 @settings(max_examples=200, deadline=None)

@@ -13,7 +13,6 @@ from fprf.style.statistics import (
     group_moments,
     kmeans,
     merge,
-    mix,
     moments,
     monge,
 )
@@ -113,17 +112,6 @@ def test_one_bad_number_among_good_ones_is_refused(feature: float, weight: float
         moments(x, w)
 
 
-def test_weights_are_shares_of_whatever_they_sum_to() -> None:
-    """Half a row's weight is as good as ten rows'; shares of groups need not sum to 1."""
-    x = torch.randn(50, 3, dtype=torch.float64)
-    light, heavy = (covariance(moments(x, torch.full((50,), w))) for w in (0.002, 20.0))
-    torch.testing.assert_close(light, heavy, rtol=1e-12, atol=0.0)
-    means, spreads = torch.randn(4, 3), torch.eye(3).expand(4, 3, 3)
-    share = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
-    for one, other in zip(mix(means, spreads, share), mix(means, spreads, 7 * share), strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-14)
-
-
 def spectrum(c: int, *, rank: int | None = None, decay: float = 2.0, scale: float = 1.0, seed: int = 0) -> torch.Tensor:
     g = torch.Generator().manual_seed(seed)
     q, _ = torch.linalg.qr(torch.randn(c, c, generator=g, dtype=torch.float64))
@@ -204,13 +192,6 @@ def test_weights_count_rows_several_times_and_zero_not_at_all() -> None:
         inside = found.label[:-1] == i
         expected = (weights[inside].double() @ x[inside].double()) / weights[inside].sum()
         torch.testing.assert_close(found.centres[i].double(), expected, rtol=1e-6, atol=1e-6)
-
-
-def test_the_next_centre_is_drawn_by_squared_distance() -> None:
-    """The heavy row comes first; of the others the one twice as far is drawn four times as often (0.8, +- 4 deviations)."""
-    x, weights = torch.tensor([[1.0, 0.0], [0.0, 0.0], [0.0, 2.0]]), torch.tensor([1.0, 1e9, 1.0])
-    far = [bool((kmeans(x, 2, seed=seed, weights=weights).centres[:, 1] > 1.9).any()) for seed in range(300)]
-    assert abs(sum(far) / 300 - 0.8) < 0.1
 
 
 @pytest.mark.parametrize(("value", "weight"), [(float("nan"), 1.0), (0.0, -1.0), (0.0, float("inf"))])

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -16,7 +15,7 @@ from tiny_world import World
 
 from fprf.errors import ConfigError, DataError, UsageError
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig
-from fprf.style.config import NO_MASK, RegionValue, StyleConfig, find_reference, labels, parse_region_value, parse_strength
+from fprf.style.config import NO_MASK, StyleConfig, find_reference, labels, parse_strength
 from fprf.style.files import Keyframe, StyleFile, check_photographs, fade, read_keyframes, read_style, write_style
 from fprf.style.look import blend_strength
 from fprf.style.regions import allowed_references
@@ -130,24 +129,7 @@ def test_what_is_wrong_is_named_with_the_file(tmp_path: Path, text: str, said: s
     assert str(caught.value).startswith(f"{tmp_path / 'style.json'}: ") and said in str(caught.value)
 
 
-def test_pins_exclude_the_others_and_forbidding_leaves_the_rest() -> None:
-    allowed = allowed_references(4, 3, pin={0: {1}, 3: {0, 2}}, forbid=[(1, 2), (3, 0)])
-    assert allowed.tolist() == [[False, True, False], [True, True, False], [True, True, True], [False, False, True]]
-
-
 PHOTOS = [Path("a/autumn.jpg"), Path("b/night.jpg"), Path("b/7.jpg"), Path("c/night.png")]
-
-
-@pytest.mark.parametrize(
-    ("text", "wish"),
-    [
-        ("3=autumn.jpg", RegionValue("3", "autumn.jpg")),
-        ("IMG_0012:120,80=0", RegionValue("IMG_0012:120,80", "0")),
-        ("a=b:mask.png=x.jpg", RegionValue("a=b:mask.png", "x.jpg")),
-    ],
-)
-def test_a_wish_is_split_at_its_last_equals_sign(text: str, wish: RegionValue) -> None:
-    assert parse_region_value("pin", text) == wish and parse_strength("region_strength", "sky=0.5") == ("sky", 0.5)
 
 
 @pytest.mark.parametrize(
@@ -212,13 +194,6 @@ def test_a_fade_lies_between_its_neighbours(frames: list[int], at: int) -> None:
     else:
         assert after == before + 1 and frames[before] <= at < frames[after]
         assert (way == 0) == (at == frames[before])
-
-
-def test_a_fade_is_even_about_its_middle_and_starts_and_ends_without_a_jerk() -> None:
-    ways = [fade([0, 100], at)[2] for at in range(100)] + [1.0]
-    steps = np.diff(ways)
-    assert ways[50] == pytest.approx(0.5) and np.allclose(steps, steps[::-1]) and (steps > 0).all()
-    assert steps[0] < 0.05 * steps.max() and np.abs(np.diff(steps)).max() < 0.05 * steps.max()
 
 
 def test_each_frame_has_its_look(world: World, tmp_path: Path) -> None:

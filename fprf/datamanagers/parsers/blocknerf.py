@@ -8,13 +8,14 @@ A file is a row of records: length (8 bytes), its masked CRC-32C, the bytes, the
 is a protobuf message, read without TensorFlow: features (field 1) map a name to a list of bytes (1), floats (2) or ints (3).
 
 A camera is fitted to each image's rays: a pose, focal lengths, a principal point and OpenCV's k1 k2 p1 p2, to a lattice of the
-rays, by damped least squares on pixels. What is left is told: a rolling shutter's rays come from many places, and one pose is
+rays, by OpenCV's calibration. What is left is told: a rolling shutter's rays come from many places, and one pose is
 only their mean.
 """
 
 import functools
 import hashlib
 import json
+import math
 import os
 import re
 import struct
@@ -185,7 +186,6 @@ def _message_class() -> type[Message]:
     return message
 
 
-Array = NDArray[np.float64]
 _LATTICE = 24
 """Rays along each side that are looked at."""
 
@@ -193,7 +193,7 @@ _LATTICE = 24
 class RayCamera(NamedTuple):
     """A fitted camera; axes are OpenGL's."""
 
-    pose: Array
+    pose: NDArray[np.float64]
     """Camera to world [3 4]."""
     focal: tuple[float, float]
     centre: tuple[float, float]
@@ -216,58 +216,32 @@ def fit_camera(origin: NDArray[np.float32], direction: NDArray[np.float32]) -> R
         raise ValueError("rays without a direction, or too few of them")
     ray /= long
     pixel = grid.astype(np.float64) + 0.5
-    # A pinhole first: the matrix whose products with the rays are the pixels (direct linear transform), and by RQ its parts.
-    middle, side = np.array([width, height]) / 2, max(width, height)
-    unit = np.concatenate([(pixel - middle) / side, np.ones((len(pixel), 1))], 1)
-    none = np.zeros_like(ray)
-    rows = np.block([[ray, none, -unit[:, :1] * ray], [none, ray, -unit[:, 1:2] * ray]])
-    matrix = np.linalg.svd(rows, full_matrices=False)[2][-1].reshape(3, 3)
-    _, lens, turn, *_ = cv2.RQDecomp3x3(matrix * np.sign(matrix[2] @ ray.mean(0)))
-    if not (lens.diagonal() > 1e-9).all():
-        raise ValueError("rays that span no image, or a mirrored one")
-    (fx, fy), (cx, cy) = lens.diagonal()[:2] / lens[2, 2] * side, lens[:2, 2] / lens[2, 2] * side + middle
-    local = ray @ turn.T
-    if not (local[:, 2] > 0.02).all():
-        raise ValueError("rays that look backwards: more than a half space in one image")
-    # Then the lens as well: eleven numbers that the pinhole starts.
-    best, error = _refine(local, pixel, np.array([0.0, 0.0, 0.0, fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0]))
-    turned = cv2.Rodrigues(best[:3])[0] @ turn
+    angle = math.acos(np.clip(ray[0] @ ray[-1], -1, 1))
+    if angle < 1e-6:
+        raise ValueError("rays that span no image")
+    # As many pixels a radian as along the diagonal are where the search begins.
+    focal = np.linalg.norm(pixel[-1] - pixel[0]) / (2 * math.tan(angle / 2))
+    matrix, none = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), np.zeros(5)
+    # Two points on each ray, near and far: only a camera in the rays' own place sees both in one pixel.
+    points, seen = np.concatenate([ray, 2 * ray]).astype(np.float32), np.concatenate([pixel, pixel]).astype(np.float32)
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
+    try:
+        error, matrix, bent, turns, _ = cv2.calibrateCamera([points], [seen], (width, height), matrix, none, flags=flags)
+    except cv2.error as fault:
+        raise ValueError("rays that no lens makes") from fault
+    if not (matrix.diagonal() > 0).all():
+        raise ValueError("rays of a mirrored image")
+    turn = cv2.Rodrigues(turns[0])[0]
     place = origin.reshape(-1, 3).mean(0, dtype=np.float64)
-    axes = np.stack([turned[0], -turned[1], -turned[2]], 1)
-    fx, fy, cx, cy, k1, k2, p1, p2 = best[3:].tolist()
+    axes = np.stack([turn[0], -turn[1], -turn[2]], 1)
+    k1, k2, p1, p2, _ = bent.reshape(-1).tolist()
     return RayCamera(
         np.concatenate([axes, place[:, None]], 1),
-        (fx, fy),
-        (cx, cy),
+        (float(matrix[0, 0]), float(matrix[1, 1])),
+        (float(matrix[0, 2]), float(matrix[1, 2])),
         (k1, k2, 0.0, 0.0, p1, p2),
-        error,
+        float(error),
     )
-
-
-def _refine(local: Array, pixel: Array, value: Array) -> tuple[Array, float]:
-    """Levenberg and Marquardt's steps: eleven numbers, a few hundred rays. The numbers, and what is left of the distances."""
-
-    def miss(value: Array) -> tuple[Array, Array]:
-        """Differences [2N] from the pixels, and their slopes [2N 11], by rotation vector, fx fy cx cy, k1 k2 p1 p2."""
-        fx, fy, cx, cy = value[3:7]
-        matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        pixels, slope = cv2.projectPoints(local[:, None], value[:3], np.zeros(3), matrix, value[7:])
-        error = np.nan_to_num(pixels[:, 0] - pixel, nan=1e6, posinf=1e6, neginf=-1e6)
-        return error.reshape(-1), np.delete(slope, (3, 4, 5), axis=1)  # without those of the translation
-
-    damping, (error, slope) = 1e-3, miss(value)
-    for _ in range(30):
-        # A step of (J^T J + d diag J^T J) x = -J^T e, kept where it helps; the damping d follows.
-        normal = slope.T @ slope
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(11), -slope.T @ error)
-        tried, slope_tried = miss(value + step)
-        gained = 1 - float(tried @ tried) / max(float(error @ error), 1e-300)
-        if gained > 0:
-            value, error, slope = value + step, tried, slope_tried
-        damping *= 0.1 if gained > 0 else 10
-        if 0 < gained < 1e-9 or damping > 1e8:
-            break
-    return value, float(np.sqrt(2 * np.mean(error**2)))
 
 
 _FORMAT = 1
@@ -337,7 +311,7 @@ def _entry(example: Example, folder: Path, held: bool) -> dict[str, Any]:
     )
     try:
         camera = fit_camera(origin, direction)
-    except (ValueError, np.linalg.LinAlgError) as error:
+    except ValueError as error:
         raise DataError(f"{example.where}: its rays are not those of a camera ({error}); leave its file out") from error
     exposure = float(example.numbers("equivalent_exposure", 1)[0])
     if exposure <= 0:

@@ -161,7 +161,10 @@ class Live {
       if (node.weight !== document.activeElement) node.weight.value = row.weight;
       node.weight.hidden = state.shelf.length < 2;
     }
-    for (const slider of document.querySelectorAll("[data-look]")) if (slider !== document.activeElement) slider.value = state.look[slider.dataset.look];
+    for (const slider of document.querySelectorAll("[data-look]")) {
+      slider.parentElement.hidden = !(slider.dataset.look in state.look);  // another stylizer has other fields
+      if (slider !== document.activeElement) slider.value = state.look[slider.dataset.look];
+    }
     at("map").value = state.map;
     at("hint").hidden = !state.shelf.length || Boolean(state.picked);
     this.fillRegion(state.picked, state.shelf);

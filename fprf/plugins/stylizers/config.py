@@ -95,8 +95,6 @@ class RegionConfig(StylizerConfig):
 
     temperature: float = 0.4
     """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
-    similarity: Literal["cosine", "dot"] = "cosine"
-    """Score of a match: cosine of centred features, or their dot product."""
     whitening: float = 0.5
     """Whitening of both sides' semantics before they are scored as cosines, in [0, 1]; 0 = none."""
     recentred: int = 1

@@ -48,7 +48,6 @@ def region_table(scene: SceneStyle, dictionary: StyleDictionary, config: RegionC
     table = match_keys(
         *(scene.keys, scene.share, dictionary.keys, odds, dictionary.weight),
         temperature=config.temperature,
-        similarity=config.similarity,
         whitening=config.whitening,
         recentred=config.recentred,
         centred=config.centred,

@@ -59,19 +59,6 @@ def test_the_contract_that_strangers_sign(made: tuple[EncoderConfig, int]) -> No
     check_encoder(made[0])
 
 
-def test_a_bright_spot_answers_where_it_is(built: tuple[Encoder, int]) -> None:
-    """The centre of the squared changes lies in its cell or beside it; deep networks with random weights look far around."""
-    encoder, stride = built
-    image = torch.full((1, 3, 12 * stride, 12 * stride), 0.5)
-    spot = image.clone()
-    spot[:, :, 4 * stride : 5 * stride, 7 * stride : 8 * stride] = 1
-    energy = (encoder(spot) - encoder(image)).square().sum(1)[0].square()
-    share = energy / energy.sum()
-    cells = torch.arange(12.0)
-    assert abs(float(share.sum(1) @ cells) - 4) < 1.5
-    assert abs(float(share.sum(0) @ cells) - 7) < 1.5
-
-
 def test_identities_differ_with_settings(tmp_path: Path) -> None:
     file, other = vgg_file(tmp_path), vgg_file(tmp_path, normalisation=False)
     one, two = RandomConfig(), RandomConfig(seed=1)
@@ -120,14 +107,6 @@ def test_other_files_are_refused_with_the_command_that_makes_the_right_one(
             config(weights=tmp_path / f"{name}.safetensors").build()
 
 
-def test_the_semantic_encoder_sees_the_whole_image() -> None:
-    encoder = BundledSemanticConfig().build()
-    image = torch.full((1, 3, 256, 256), 0.4)
-    other = image.clone()
-    other[..., 200:] = torch.tensor([0.2, 0.6, 0.1]).view(1, 3, 1, 1)
-    assert not torch.allclose(encoder(image)[..., :4], encoder(other)[..., :4], atol=1e-3)
-
-
 def length(features: Tensor) -> Tensor:
     """Root mean square length about the mean."""
     return (features - features.mean((0, 2, 3), keepdim=True)).square().sum(1).mean().sqrt()
@@ -160,12 +139,6 @@ def test_finer_parts_are_averaged_over_the_cells_of_the_first() -> None:
     torch.testing.assert_close(found, torch.cat([coarse(image) * 1.5, F.avg_pool2d(fine(image), 2) * 0.125], dim=1))
     turned = ConcatEncoder([fine, coarse], (1.0, 1.0), (1.0, 1.0), cells="first")(image)
     torch.testing.assert_close(turned[:, 16:], F.interpolate(coarse(image), (12, 16), mode="bilinear"))
-
-
-def test_the_finest_of_each_axis_counts() -> None:
-    """Cells of 6 and 5 pixels on a strip: neither part decides both axes alone."""
-    encoder = ConcatConfig(first=RandomConfig(stride=6), second=RandomConfig(stride=5), third=RandomConfig(stride=30)).build()
-    assert encoder(torch.rand(1, 3, 31, 7)).shape[2:] == (7, 2)
 
 
 def test_known_units_are_those_measured() -> None:

@@ -4,13 +4,11 @@ import itertools
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from fprf.interfaces import Sampler
 from fprf.plugins.samplers.config import ProposalConfig, SamplerConfig, UniformConfig
-from fprf.plugins.samplers.samplers import ProposalSampler, even_edges
+from fprf.plugins.samplers.samplers import ProposalSampler
 from fprf.rendering.space import Space
 from fprf.rendering.stepfun import interlevel
 from fprf.testing import check_sampler
@@ -45,22 +43,6 @@ def sample(sampler: Sampler, rays: Rays, step: int | None = None, seed: int | No
 )
 def test_the_contract(config: SamplerConfig) -> None:
     check_sampler(config)
-
-
-@settings(max_examples=25, deadline=None)
-@given(st.integers(1, 50), st.one_of(st.none(), st.integers(0, 99)))
-def test_even_edges_pin_their_ends_and_move_together(samples: int, seed: int | None) -> None:
-    generator = None if seed is None else torch.Generator().manual_seed(seed)
-    s = even_edges(rays_of(7), samples, generator)
-    assert s.shape == (7, samples + 1)
-    assert (s[:, 0] == 0).all() and (s[:, -1] == 1).all() and (s.diff(dim=-1) >= 0).all()
-    shift = s - torch.linspace(0, 1, samples + 1)
-    assert shift.abs().max() <= 0.5 / samples + 1e-6
-    if seed is None:
-        assert not shift.any()
-    elif samples > 2:
-        inner = shift[:, 1:-1]
-        assert (inner - inner[:, :1]).abs().max() <= 1e-6 and inner[:, 0].std() > 0
 
 
 @pytest.mark.parametrize("config", [UniformConfig(samples=8), SMALL])

@@ -18,7 +18,7 @@ from fprf.plugins.stylizers.config import (
 )
 from fprf.plugins.stylizers.region import region_table
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
-from fprf.style.matching import Similarity, score_spread, share_mean, unit
+from fprf.style.matching import score_spread, share_mean, unit
 from fprf.style.scene_style import Membership, SceneStyle, own_style
 from fprf.style.statistics import deviation, monge
 from fprf.types import Want
@@ -29,11 +29,9 @@ PAPER = LocalAdainConfig(similarity="dot", centred=False, relative=False, temper
 Config = Callable[..., StylizerConfig]
 
 
-def plain_table(scene: SceneStyle, d: StyleDictionary, temperature: float, similarity: Similarity = "cosine") -> torch.Tensor:
-    q, k = scene.keys.double(), d.keys.double()
-    if similarity == "cosine":
-        q = unit(q, share_mean(q, scene.share.double()))
-        k = unit(k, share_mean(k, d.share.double()))
+def plain_table(scene: SceneStyle, d: StyleDictionary, temperature: float) -> torch.Tensor:
+    q = unit(scene.keys.double(), share_mean(scene.keys.double(), scene.share.double()))
+    k = unit(d.keys.double(), share_mean(d.keys.double(), d.share.double()))
     return torch.softmax(q @ k.T / (temperature * score_spread(q, k)), 1)
 
 

@@ -16,7 +16,7 @@ from typing import Annotated, NamedTuple
 import torch
 from torch import Tensor
 
-from .harmonics import spherical_harmonics
+from ..harmonics import spherical_harmonics
 
 BLUR, MIN_ALPHA, MAX_ALPHA = 0.3, 1 / 255, 0.99
 TILE = 16

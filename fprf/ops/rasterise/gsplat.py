@@ -2,7 +2,7 @@
 
 gsplat computes what `rasterise_reference` defines, with two differences: it cuts alphas at 0.999 instead of 0.99, and a ray
 ends where 1/10000 of the light is left. It is imported when something is drawn, never before. N, K, C, H, W and R are those
-of `rasterise` and `rasterise_training`.
+of `rendering` and `training`.
 """
 
 import functools
@@ -15,17 +15,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .photometric import WINDOW
-from .rasterise_blocks import FIXED
-from .rasterise_kernels import SIDE
-from .rasterise_reference import BLUR, Pinhole
-from .rasterise_training import LOG_SCALES, Floats, Learnt, Target, TrainableGaussians
-from .simd import LANES
+from ..photometric import WINDOW
+from ..simd import LANES
+from .forward_kernels import SIDE
+from .layout import FIXED
+from .reference import BLUR, Pinhole
+from .training import LOG_SCALES, Floats, Learnt, Target, TrainableGaussians
 
 _MOST_LOG, _LARGE = 30.0, 1e15
 """Bounds of logarithms and logits, and of means and quaternions, as in `rasterise_reference`."""
 _BETAS, _EPS = (0.9, 0.99), 1e-15
-"""Decay of Adam's moments, and what keeps 0 / 0 from being NaN: those of `rasterise_gradient_kernels`."""
+"""Decay of Adam's moments, and what keeps 0 / 0 from being NaN: those of `backward_kernels`."""
 _COLUMNS = 3, 3, 4, 1
 """Columns of means, logarithms of scales, quaternions and logits; those of the harmonics follow."""
 _SIGMA, _C1, _C2 = 1.5, 0.01**2, 0.03**2
@@ -233,7 +233,7 @@ class GsplatGaussians:
         return Learnt(float(found[0]), float(found[1]), float(found[2]), of_exposure, found[6:].astype(np.float64))
 
     def _adam(self, gradient: Annotated[Tensor, "N R"], seen: Annotated[Tensor, "N"], rates: Annotated[Tensor, "R"]) -> None:
-        """Move all of a block of LANES where one was seen, as `rasterise_gradient_kernels.adam`; moments of others stay."""
+        """Move all of a block of LANES where one was seen, as `backward_kernels.adam`; moments of others stay."""
         values, first, second, weight = (part[: self.count] for part in (self._values, self._first, self._second, self._weight))
         # Masks that are multiplied with, not indexed by: the host need not know how many there are.
         blocks = torch.nn.functional.pad(seen, (0, -len(seen) % LANES)).view(-1, LANES)

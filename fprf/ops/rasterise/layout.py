@@ -11,8 +11,8 @@ from typing import Any
 import numba
 import numpy as np
 
-from .simd import LANES, load, maximum, splat, square_root
-from .threads import on_threads, take
+from ..simd import LANES, load, maximum, splat, square_root
+from ..threads import on_threads, take
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 FIXED = 11

@@ -1,6 +1,6 @@
 """Compiled forward pass of the rasteriser of 3D Gaussians: projection, tiles, compositing. `rasterise` is their bridge.
 
-Blocks     Parameters of LANES Gaussians, a row each (`rasterise_blocks`).
+Blocks     Parameters of LANES Gaussians, a row each (`layout`).
 Camera     25 numbers: rotation world to camera 0-8, translation 9-11, fx fy cx cy 12-15, place in the world 16-18, limits of
            the tangents (left right top bottom) 19-22, near 23, and 1 for anti-aliasing 24.
 Splats     SLOTS numbers a Gaussian after projection: x y 0-1, A B C D with log2 alpha = A dx^2 + B dx dy + C dy^2 + D 2-5, red
@@ -18,8 +18,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from .rasterise_blocks import BLOCKS, FIXED, MARK, Floats, basis, colour, direction, jit
-from .simd import (
+from ..simd import (
     LANES,
     added_in_fours,
     as_float,
@@ -43,7 +42,8 @@ from .simd import (
     transposed,
     where_greater,
 )
-from .threads import on_threads, take
+from ..threads import on_threads, take
+from .layout import BLOCKS, FIXED, MARK, Floats, basis, colour, direction, jit
 
 _Ints = np.ndarray[Any, np.dtype[np.int32]]
 SLOTS, SIDE = 16, 16

@@ -1,4 +1,4 @@
-"""Compiled backward pass of the rasteriser of 3D Gaussians; blocks, splats and entries are those of `rasterise_kernels`.
+"""Compiled backward pass of the rasteriser of 3D Gaussians; blocks, splats and entries are those of `forward_kernels`.
 
 Of every entry SUMS floats are kept: the sums over its pixels of p, p dx, p dx^2, p dy, p dx dy, p dy^2, where p is
 dL / d ln alpha, then of weight times the gradient of each channel. Slots of one Gaussian lie together, so its sums have one
@@ -12,8 +12,23 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from .rasterise_blocks import BLOCKS, FIXED, Floats, basis, colour, direction, direction_slopes, jit
-from .rasterise_kernels import (
+from ..simd import (
+    LANES,
+    aligned,
+    load,
+    lowest_bit,
+    splat,
+    square_root,
+    stack,
+    store,
+    sums,
+    swapped,
+    traced,
+    transposed,
+    where_greater,
+)
+from ..threads import on_threads, take
+from .forward_kernels import (
     BLUR,
     MAX_ALPHA,
     SIDE,
@@ -29,22 +44,7 @@ from .rasterise_kernels import (
     opacity,
     open_blocks,
 )
-from .simd import (
-    LANES,
-    aligned,
-    load,
-    lowest_bit,
-    splat,
-    square_root,
-    stack,
-    store,
-    sums,
-    swapped,
-    traced,
-    transposed,
-    where_greater,
-)
-from .threads import on_threads, take
+from .layout import BLOCKS, FIXED, Floats, basis, colour, direction, direction_slopes, jit
 
 SUMS = LANES
 GEOMETRY = 6

@@ -3,8 +3,8 @@
 N Gaussians, K harmonics of a colour channel (1, 4, 9 or 16), C feature channels, H W pixels; H16 W16 whole tiles of them.
 
 `rasterise_reference` defines what is computed, in plain torch, for every device and dtype. On the CPU in float32 compiled
-kernels do (`rasterise_blocks`, `rasterise_kernels`, `rasterise_gradient_kernels`), by the steps below; on CUDA in
-float32 gsplat does, where it is installed (`rasterise_gsplat`).
+kernels do (`layout`, `forward_kernels`, `backward_kernels`), by the steps below; on CUDA in
+float32 gsplat does, where it is installed (`gsplat`).
 
     project     mean -> image position and depth, Sigma' = J W Sigma W^T J^T + 0.3 I, colour from its harmonics
     bin         every Gaussian into the tiles of 16 x 16 pixels that it reaches, each tile sorted by depth
@@ -26,9 +26,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import FprfError
-from .backend import compiled
-from .rasterise_reference import Pinhole, rasterise_reference, view_colours
+from ...errors import FprfError
+from ..backend import compiled
+from .reference import Pinhole, rasterise_reference, view_colours
 
 __all__ = ["Pinhole", "Rasterised", "lift", "rasterise"]
 
@@ -125,7 +125,7 @@ def lift(
             )
             (lifted,) = torch.autograd.grad((image[..., :-1] * pixels).sum(), values)
         return lifted
-    from . import rasterise_gradient_kernels as kernels
+    from . import backward_kernels as kernels
 
     tiles = _view(*shape, harmonics, camera, antialiased).tiles
     # Sixteen channels fill the sums of an entry, and cost little more than eight: Gaussians are found, and entries read, once.
@@ -159,7 +159,7 @@ class _Rasterise(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor, grad_passing: Tensor, _: None) -> tuple[Tensor | None, ...]:
-        from . import rasterise_gradient_kernels as kernels
+        from . import backward_kernels as kernels
 
         (tiles, blocks, bands, camera, _), (features, passing) = ctx.view, ctx.saved_tensors
         # Of the first group the sums of the shape, with the gradient of the transmittance, which is to be counted once.
@@ -198,7 +198,7 @@ def _form(*tensors: Tensor) -> Callable[..., tuple[Tensor, Tensor]]:
     """The rasteriser of tensors that are not the CPU kernels': gsplat for float32 where it works, else the plain form."""
     device = tensors[0].device
     if compiled() and device.type == "cuda" and all(x.dtype == torch.float32 for x in tensors):
-        from .rasterise_gsplat import rasterise_gsplat, usable
+        from .gsplat import rasterise_gsplat, usable
 
         if usable(device):
             return rasterise_gsplat
@@ -237,10 +237,10 @@ def _view(
     camera: Pinhole,
     antialiased: bool,
 ) -> _View:
-    from . import rasterise_kernels as kernels
-    from .rasterise_blocks import FIXED, pack
-    from .rasterise_training import camera_array
-    from .simd import LANES, aligned
+    from ..simd import LANES, aligned
+    from . import forward_kernels as kernels
+    from .layout import FIXED, pack
+    from .training import camera_array
 
     # The kernels read blocks of LANES Gaussians, property by property; the last block is padded.
     bands, seen, whole = harmonics.shape[1], camera_array(camera, antialiased), -(-len(means) // LANES) * LANES
@@ -266,7 +266,7 @@ def _composite(
     view: _View, features: Tensor, background: Tensor
 ) -> tuple[Tensor, Tensor, dict[str, int], list[tuple[_Array, _Array]]]:
     """Channels last: colour, depth, features; the transmittance left; counts; and planes and transmittance of each group."""
-    from . import rasterise_kernels as kernels
+    from . import forward_kernels as kernels
 
     # One pass over the sorted lists of Gaussians for each group of channels: a kernel composites 4 or 8 at a time, and the
     # transmittance is the same in all.

@@ -6,7 +6,7 @@ kernels alone. Whoever trains sees rows [N R] of parameters, one a Gaussian, in 
     MEANS 0-2 · LOG_SCALES 3-5 (natural logarithms) · QUATERNION 6-9 (w x y z) · LOGIT 10 (of the opacity)
     HARMONICS 11-R (coefficient after coefficient, red green blue; those of degree 0 first)          R = 11 + 3 K
 
-Numba keeps what it compiled in its cache. `python -m fprf.ops.rasterise_training BANDS PART` puts there what half of a step
+Numba keeps what it compiled in its cache. `python -m fprf.ops.rasterise.training BANDS PART` puts there what half of a step
 needs, in three seconds; a command starts these first and has its kernels when it has read its images.
 """
 
@@ -18,15 +18,15 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from . import photometric
-from . import rasterise_gradient_kernels as backward
-from . import rasterise_kernels as forward
-from .rasterise_blocks import FIXED
-from .rasterise_kernels import SIDE, SLOTS
-from .simd import LANES, aligned
+from .. import photometric
+from ..simd import LANES, aligned
+from . import backward_kernels as backward
+from . import forward_kernels as forward
+from .forward_kernels import SIDE, SLOTS
+from .layout import FIXED
 
 if TYPE_CHECKING:  # it imports torch, which compilation need not wait for
-    from .rasterise_reference import Pinhole
+    from .reference import Pinhole
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 
@@ -90,7 +90,7 @@ def target_of(
 
 
 def camera_array(camera: "Pinhole", antialiased: bool) -> Floats:
-    """A camera as the kernels take it (see `rasterise_kernels`)."""
+    """A camera as the kernels take it (see `forward_kernels`)."""
     fx, fy, cx, cy = (float(camera.intrinsics[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
     pose = camera.world_to_camera.double().cpu()
     turn, shift = pose[:3, :3], pose[:3, 3]
@@ -130,7 +130,7 @@ class TrainableGaussians:
     """At most `room` Gaussians of K harmonics with Adam's moments; rows are those of the module's docstring.
 
     Moments are the first [N R], the second [N R] and the weight in the second [N], 1 - 0.99^k after k steps: what is seen for
-    the first time moves as it would have in the first step (`rasterise_gradient_kernels.adam`).
+    the first time moves as it would have in the first step (`backward_kernels.adam`).
     """
 
     def __init__(self, room: int, bands: int) -> None:
