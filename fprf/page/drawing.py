@@ -22,7 +22,7 @@ from ..errors import UsageError
 from ..interfaces import Scene
 from ..io.atomic import write_json
 from ..io.images import Picture, to_uint8
-from ..io.maps import depth_image, match_image, palette
+from ..io.maps import match_image, palette
 from ..ops.harmonics import HARMONIC
 from ..rendering.camera_path import read_camera_path, write_camera_path
 from ..rendering.cameras import Cameras, ideal_cameras
@@ -71,7 +71,7 @@ def gaussian_colours(scene: SplatScene, packed: Packed, restyler: Restyler, show
     """Colours of Gaussians for browsers; maps have one colour each."""
     styled = restyler.styled(shown.look)
     harmonics = scene.restyled(None if styled is None else styled.restyle).shown.harmonics
-    if shown.map in ("none", "depth") and shown.region is None:
+    if shown.map == "none" and shown.region is None:
         return packed.colours(harmonics, rounds=2)
     # Maps are flat colours in the place of harmonics: what each Gaussian's features match.
     features, solid = scene.found().features.float(), torch.ones(len(scene.gaussians))
@@ -159,21 +159,14 @@ class FieldPainter:
             if whole and sum(part.bytes for part in parts) <= CACHE_BYTES:
                 self._views[client] = (request.camera, parts)
             shape = (size[1], size[0])
-            if request.shown.map == "depth":
-                depth, opacity = torch.cat(rows).view(*shape, 2).unbind(-1)
-                picture = depth_image(depth, opacity)
-            else:
-                picture = to_uint8(torch.cat(rows).view(*shape, 3))
-            self._show(client, "look", picture, whole)
+            self._show(client, "look", to_uint8(torch.cat(rows).view(*shape, 3)), whole)
             if captured:
                 self._show(client, "captured", to_uint8(torch.cat(captured).view(*shape, 3)), whole)
             yield
 
     @torch.inference_mode()
     def _colours(self, part: ViewChunk, styled: Styled | None, shown: Shown) -> Annotated[Tensor, "N 3"]:
-        """A chunk as it is shown; of the map of depths, depth and opacity."""
-        if shown.map == "depth":
-            return torch.stack([part.depth, part.opacity], -1).cpu()
+        """A chunk as it is shown."""
         colours: Tensor = part.colour(self._trained.model.decoder, None if styled is None else styled.restyle).cpu()
         # Without semantics all points are alike: features without channels.
         semantic = part.content[:, :0] if part.semantic is None else part.semantic

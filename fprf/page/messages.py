@@ -80,7 +80,7 @@ class Region(Message, tag="region"):
 class Map(Message, tag="map"):
     """What is shown in the place of colours."""
 
-    map: Literal["none", "matches", "regions", "depth"]
+    map: Literal["none", "matches", "regions"]
 
 
 class Keep(Message, tag="keep"):

@@ -21,7 +21,7 @@ from ..style.dictionary import Reference
 from . import messages
 from .messages import Camera
 
-Map: TypeAlias = Literal["none", "matches", "regions", "depth"]
+Map: TypeAlias = Literal["none", "matches", "regions"]
 RegionAction: TypeAlias = Literal["pin", "forbid", "keep"]
 SHELF = 12
 """Photographs on the shelf; the oldest that no look needs makes room."""

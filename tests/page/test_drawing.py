@@ -6,7 +6,7 @@ import pytest
 from session_helpers import camera_of
 
 from fprf.io.images import Picture, to_uint8
-from fprf.io.maps import depth_image, match_image
+from fprf.io.maps import match_image
 from fprf.page import drawing
 from fprf.page.drawing import FieldPainter, Request
 from fprf.page.restyler import Restyler
@@ -80,9 +80,6 @@ def test_maps_are_what_the_command_line_renders(watched: Watched, restyler: Rest
     wanted = match_image(found.attention, styled.codes.reference, styled.codes.names, found.opacity, found.kept)
     assert np.abs(watched.look(Shown(look, "matches"))[-1][1].astype(int) - wanted).mean() < 0.5
     assert (watched.look(Shown(Look(), "matches"))[-1][1] == 128).all(), "grey without a style"
-    view = render_view(trained.model, trained.known.facts, trained.known.cameras, 2, trained.config.render)
-    depth = watched.look(Shown(look, "depth"))[-1][1]
-    assert np.abs(depth.astype(int) - depth_image(view.depth, view.opacity)).mean() < 1
 
 
 def test_a_picked_region_stands_out(watched: Watched, restyler: Restyler) -> None:
