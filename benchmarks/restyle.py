@@ -194,7 +194,7 @@ def in_scene(
     spent = time.perf_counter() - start
     pictures, seconds = _each(views, lambda view: view.restyled(look).rgb)
     matched = Want.SEMANTIC in look.stylizer.needs
-    return Shown(pictures, [view.match(look) for view in views] if matched else None, spent, seconds)
+    return Shown(pictures, [view.paint(look.match) for view in views] if matched else None, spent, seconds)
 
 
 def one_by_one(

@@ -220,8 +220,13 @@ class SceneView(ABC):
         """The view in a look, or as it was captured."""
 
     @abstractmethod
-    def match(self, restyle: "Restyle") -> Annotated[Tensor, "N T"]:
-        """Mean share of each style code (`Restyle.match`) over what each pixel sees, row after row; 0 where that is nothing."""
+    def paint(self, values: Values) -> Annotated[Tensor, "N X"]:
+        """`Scene.paint` for all N pixels of the view, row after row; without the opacity."""
+
+    @property
+    def bytes(self) -> int:
+        """Memory that it holds beside the scene's own."""
+        return 0
 
 
 class Scene(ABC):

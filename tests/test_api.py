@@ -80,15 +80,6 @@ def test_a_camera_of_ones_own_looks_where_it_should(scene: TrainedScene) -> None
     assert float(camera.focal[0, 1]) == pytest.approx(10 / np.tan(np.radians(25)))
 
 
-def test_a_flight_is_lazy_and_as_long_as_asked(scene: TrainedScene) -> None:
-    cameras = scene.path("spiral", frames=3)
-    film = scene.film(cameras)
-    first = next(film)
-    assert torch.equal(first.rgb, scene.render(cameras.select(torch.tensor([0]))).rgb)
-    assert len(list(film)) == 2
-    assert len(scene.path("dataset", split="test")) == 2
-
-
 def test_mistakes_are_told(scene: TrainedScene, world: World, tmp_path: Path) -> None:
     mistakes: list[tuple[type[FprfError], Callable[[], object]]] = [
         (CheckpointError, lambda: fprf.load(tmp_path)),

@@ -7,11 +7,17 @@ from pathlib import Path
 import pytest
 import torch
 from fake_packages import packages_in
+from session_helpers import Listener, camera_of
 from tiny_world import World
 
 import fprf
 from fprf.cli.main import main
 from fprf.datamanagers.images import load_image
+from fprf.io.images import to_uint8
+from fprf.page.messages import View
+from fprf.page.session import Session, view_of_run
+from fprf.training.loading import open_run
+from fprf.training.quality import QualityConfig
 
 PLANE = '''
 from dataclasses import dataclass, replace
@@ -156,8 +162,8 @@ class PlaneView(SceneView):
     def restyled(self, restyle=None):
         return self.scene.restyled(restyle).render(self.cameras, self.view)
 
-    def match(self, restyle):
-        return restyle.match(self.scene.semantic(self.scene.pixels(self.cameras, self.view)[0]))
+    def paint(self, values):
+        return values(self.scene.semantic(self.scene.pixels(self.cameras, self.view)[0]), None)
 '''
 
 
@@ -192,6 +198,14 @@ def test_every_verb_takes_a_kind_of_scene_from_another_package(run: Path, world:
     assert main(["export", str(run), "cameras", "--images", "--output", str(tmp_path / "files")]) == 0
     assert len(list((tmp_path / "files" / "images").glob("*.png"))) == 10
     assert fprf.load(run).render("0000").rgb.shape == (24, 32, 3)
+    opened, client = open_run(run, "cpu", QualityConfig()), Listener()
+    with Session(view_of_run(opened), client.post, longest=32) as session:
+        session.upload(world.references[0].read_bytes(), "dusk")
+        session.handle("browser", View(camera=camera_of(opened.scene, 0), captured=True))
+        client.until(lambda: len(client.pictures("browser", "captured")) == 2)
+    captured = to_uint8(opened.scene.render(opened.scene.cameras, 0).rgb).astype(float)
+    assert abs(client.pictures("browser", "captured")[-1][..., ::-1] - captured).mean() < 3, "JPEG"
+    assert abs(client.pictures("browser")[-1][..., ::-1] - captured).mean() > 3
 
 
 def test_it_goes_on_like_any_other(run: Path, world: World, tmp_path: Path) -> None:

@@ -35,8 +35,6 @@ class GalleryConfig(StyleConfig, QualityConfig):
     """Run folder."""
     styles: tuple[Path, ...] = ()
     """Style files (style.json), each one more style."""
-    together: bool = True
-    """Also show all photographs as one style."""
     split: Literal["some", "test", "train", "all"] = "some"
     """Views to choose from. some: at most 8 training views, spread evenly; test: those held out from training."""
     most: int = 6
@@ -113,7 +111,7 @@ def _chosen(config: GalleryConfig, together: StyleFile) -> list[tuple[str, Style
         check_photographs(path, file)
         own = path.resolve().parent.name if path.name == "style.json" else path.stem
         chosen.append((f"{own} ({len(chosen) + 1})" if own in dict(chosen) else own, file))
-    if config.together and len(names) > 1:
+    if len(names) > 1:
         chosen.append((" + ".join(names.values()) if len(names) <= 3 else f"all {len(names)}", together))
     if not chosen:
         raise UsageError("fprf gallery: name photographs with --references, or style files with --styles")

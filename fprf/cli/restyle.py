@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from ..checks import at_least, positive
+from ..checks import positive
 from ..errors import UsageError
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from ..progress import Display
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from ..splats.scene import SplatScene
     from ..style.restyle import Styled
 
+_SHOWN = 4
+"""Views on the page."""
 _DESCRIPTION = f"""Restyle finished captures of 3D Gaussians with photographs; their own photographs and cameras are not needed.
 
 Reads and writes {", ".join(endings())} and SOG folders (meta.json, lod-meta.json); the output's ending says which. A
@@ -50,8 +52,6 @@ class RestyleConfig(StyleConfig, LookConfig):
     """A web page (.html) to walk through the capture before and after; it loads nothing and can be sent."""
     megabytes: float = 16.0
     """Size of that page, at most; Gaussians that show least are left out of it."""
-    shown: int = 4
-    """Views on the page, at least 1."""
     explain: bool = False
     """Also list the scene's regions with what each takes: a table, and explain.json and explain.png beside the output."""
     cache: Path | None = None
@@ -60,7 +60,6 @@ class RestyleConfig(StyleConfig, LookConfig):
     def __post_init__(self) -> None:
         StyleConfig.__post_init__(self)
         LookConfig.__post_init__(self)
-        at_least("shown", self.shown, 1)
         positive("megabytes", self.megabytes)
 
 
@@ -246,8 +245,8 @@ def _write_page(path: Path, config: RestyleConfig, scene: "SplatScene", made: Se
     from ..style.config import labels
 
     # Views lie on rings around the scene or within it, the nearer ones first: from these the things can be told.
-    nearer = max(min(config.shown, len(scene.names)), len(scene.names) // 2)
-    most = min(config.shown, nearer)
+    nearer = max(min(_SHOWN, len(scene.names)), len(scene.names) // 2)
+    most = min(_SHOWN, nearer)
     views = sorted({round((k + 0.5) * nearer / most - 0.5) for k in range(most)})
     cameras = scene.cameras.scaled(0.5)
     before = [to_uint8(scene.render(cameras, view).rgb) for view in views]

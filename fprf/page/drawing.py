@@ -1,6 +1,6 @@
-"""What clients see: colours of Gaussians, which their browsers draw, and pictures of fields, which are drawn here.
+"""What clients see: colours of Gaussians, which their browsers draw, and pictures of all other scenes, which are drawn here.
 
-A moving camera must see something at once, a camera at rest everything: a new camera gets a small picture of a field, then the
+A moving camera must see something at once, a camera at rest everything: a new camera gets a small picture, then the
 whole one. What a client's last view holds is kept, so that a slider that is moved while the camera rests costs decoding alone.
 
 Films: keyframes that were set on the page become an mp4 in the run's folder. A film's folder holds what `fprf render` takes:
@@ -9,7 +9,7 @@ these very files, so the same command makes it again, at any size.
 """
 
 import shutil
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -19,10 +19,10 @@ import torch
 from torch import Tensor
 
 from ..errors import UsageError
-from ..interfaces import Scene
+from ..interfaces import Scene, SceneView
 from ..io.atomic import write_json
 from ..io.images import Picture, to_uint8
-from ..io.maps import depth_image, match_image, palette
+from ..io.maps import match_image, palette
 from ..ops.harmonics import HARMONIC
 from ..rendering.camera_path import read_camera_path, write_camera_path
 from ..rendering.cameras import Cameras, ideal_cameras
@@ -32,8 +32,6 @@ from ..style.files import StyleFile, read_keyframes, write_style
 from ..style.look import Restyle
 from ..style.restyle import Styled, keyed_looks
 from ..style.scene_style import RegionWeight
-from ..training.loading import Trained
-from ..training.views import ViewChunk, view_chunks
 from .messages import Camera
 from .pack import Colours, Packed
 from .render_worker import Steps
@@ -42,8 +40,8 @@ from .state import Key, Look, Shown
 
 CACHE_BYTES = 128 << 20
 """Features that are kept of each client's last view."""
-CHUNK = 4096
-"""Rays of a step: after each one a newer request may take over."""
+STRIP = 4096
+"""Pixels of a step, or those of one row: after each one a newer request may take over."""
 _PREVIEW = 6
 """Factor by which the first picture of a new camera is smaller."""
 _MIN_CANVAS, _MAX_CANVAS = 8, 4096
@@ -71,7 +69,7 @@ def gaussian_colours(scene: SplatScene, packed: Packed, restyler: Restyler, show
     """Colours of Gaussians for browsers; maps have one colour each."""
     styled = restyler.styled(shown.look)
     harmonics = scene.restyled(None if styled is None else styled.restyle).shown.harmonics
-    if shown.map in ("none", "depth") and shown.region is None:
+    if shown.map == "none" and shown.region is None:
         return packed.colours(harmonics, rounds=2)
     # Maps are flat colours in the place of harmonics: what each Gaussian's features match.
     features, solid = scene.found().features.float(), torch.ones(len(scene.gaussians))
@@ -122,20 +120,20 @@ def _memberships(restyler: Restyler, semantic: Tensor) -> Annotated[Tensor, "N K
     return share
 
 
-class FieldPainter:
-    """Renders a field for clients; `show` receives a picture, of the look or as captured, and whether it is the last."""
+class ScenePainter:
+    """Renders a scene for clients; `show` receives a picture, of the look or as captured, and whether it is the last."""
 
-    def __init__(self, trained: Trained, restyler: Restyler, show: Callable[[Hashable, str, Picture, bool], None]) -> None:
-        self._trained, self._restyler, self._show = trained, restyler, show
-        # Of each client's last view: its camera, and the features of the whole picture.
-        self._views: dict[Hashable, tuple[Camera, list[ViewChunk]]] = {}
+    def __init__(self, scene: Scene, restyler: Restyler, show: Callable[[Hashable, str, Picture, bool], None]) -> None:
+        self._scene, self._restyler, self._show = scene, restyler, show
+        # Of each client's last view: its camera, and the strips of the whole picture.
+        self._views: dict[Hashable, tuple[Camera, list[SceneView]]] = {}
 
     def forget(self, client: Hashable) -> None:
         """Drop what is kept for a client."""
         self._views.pop(client, None)
 
     def render(self, client: Hashable, request: Request) -> Steps[None]:
-        """Show a small picture of a new camera, then the whole one, a step each chunk of rays."""
+        """Show a small picture of a new camera, then the whole one, a step each strip."""
         kept = self._views.get(client)
         if kept is not None and kept[0] != request.camera:
             del self._views[client]
@@ -147,50 +145,42 @@ class FieldPainter:
         for size in [(width, height)] if kept else [small, (width, height)]:
             rows: list[Tensor] = []
             captured: list[Tensor] = []
-            parts: list[ViewChunk] = []
-            # Features are marched once; another look only decodes them again.
-            for part in kept[1] if kept else _parts(self._trained, cameras_of([request.camera], size), 0):
-                rows.append(self._colours(part, styled, request.shown))
+            strips: list[SceneView] = []
+            # What no look changes is computed once; another look only decodes it again.
+            for strip in kept[1] if kept else _strips(self._scene, cameras_of([request.camera], size)):
+                rows.append(self._colours(strip, styled, request.shown))
                 if request.captured:
-                    captured.append(part.colour(self._trained.model.decoder, None).cpu())
-                parts.append(part)
+                    captured.append(strip.restyled().rgb)
+                strips.append(strip)
                 yield
             whole = size == (width, height)
-            if whole and sum(part.bytes for part in parts) <= CACHE_BYTES:
-                self._views[client] = (request.camera, parts)
-            shape = (size[1], size[0])
-            if request.shown.map == "depth":
-                depth, opacity = torch.cat(rows).view(*shape, 2).unbind(-1)
-                picture = depth_image(depth, opacity)
-            else:
-                picture = to_uint8(torch.cat(rows).view(*shape, 3))
-            self._show(client, "look", picture, whole)
+            if whole and sum(strip.bytes for strip in strips) <= CACHE_BYTES:
+                self._views[client] = (request.camera, strips)
+            self._show(client, "look", to_uint8(torch.cat(rows)), whole)
             if captured:
-                self._show(client, "captured", to_uint8(torch.cat(captured).view(*shape, 3)), whole)
+                self._show(client, "captured", to_uint8(torch.cat(captured)), whole)
             yield
 
-    @torch.inference_mode()
-    def _colours(self, part: ViewChunk, styled: Styled | None, shown: Shown) -> Annotated[Tensor, "N 3"]:
-        """A chunk as it is shown; of the map of depths, depth and opacity."""
-        if shown.map == "depth":
-            return torch.stack([part.depth, part.opacity], -1).cpu()
-        colours: Tensor = part.colour(self._trained.model.decoder, None if styled is None else styled.restyle).cpu()
-        # Without semantics all points are alike: features without channels.
-        semantic = part.content[:, :0] if part.semantic is None else part.semantic
-
-        def match(restyle: Restyle) -> Tensor:
-            return part.mean(restyle.match(semantic)).cpu()
+    def _colours(self, strip: SceneView, styled: Styled | None, shown: Shown) -> Annotated[Tensor, "h W 3"]:
+        """A strip as it is shown."""
+        view = strip.restyled(None if styled is None else styled.restyle)
 
         def memberships() -> Tensor:
-            return part.mean(_memberships(self._restyler, semantic)).cpu()
+            return strip.paint(lambda semantic, _: _memberships(self._restyler, semantic))
 
-        return _mapped(colours, part.opacity.cpu(), shown, styled, match, memberships)
+        def match(restyle: Restyle) -> Tensor:
+            return strip.paint(restyle.match)
+
+        return _mapped(view.rgb.view(-1, 3), view.opacity.view(-1), shown, styled, match, memberships).view_as(view.rgb)
 
 
-def _parts(trained: Trained, cameras: Cameras, view: int) -> Iterable[ViewChunk]:
-    """A view of a field, some rays at a time."""
-    config = replace(trained.config.render, chunk=min(CHUNK, trained.config.render.chunk))
-    return view_chunks(trained.model, trained.known.facts, cameras, view, config)
+def _strips(scene: Scene, cameras: Cameras) -> Iterator[SceneView]:
+    """The first view in strips of some rows each, from the top."""
+    width, height = cameras.size[0].tolist()
+    tall = max(1, STRIP // width)
+    for top in range(0, height, tall):
+        size = torch.tensor([[width, min(tall, height - top)]])
+        yield scene.cached(replace(cameras, centre=cameras.centre - torch.tensor([0.0, top]), size=size), 0)
 
 
 def cameras_of(cameras: Sequence[Camera], size: tuple[int, int] | None = None, longest: int = 640) -> Cameras:
@@ -283,14 +273,13 @@ def film_frames(folder: Path, scene: Scene) -> list[Steps[Picture]]:
     def rendered(number: int) -> Steps[Picture]:
         look = looks(number)
         yield
-        if not isinstance(scene, Trained):
+        if isinstance(scene, SplatScene):
             return to_uint8(scene.restyled(look).render(cameras, number).rgb)
-        # A field takes its time: after each chunk of rays a client may come first.
+        # A scene that is rendered here may take its time: after each strip a client may come first.
         rows = []
-        for part in _parts(scene, cameras, number):
-            rows.append(part.colour(scene.model.decoder, look).cpu())
+        for strip in _strips(scene, cameras.select(torch.tensor([number]))):
+            rows.append(strip.restyled(look).rgb)
             yield
-        width, height = cameras.size[number].tolist()
-        return to_uint8(torch.cat(rows).view(height, width, 3))
+        return to_uint8(torch.cat(rows))
 
     return [rendered(number) for number in range(len(cameras))]

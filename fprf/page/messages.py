@@ -18,6 +18,9 @@ Vector: TypeAlias = tuple[Number, Number, Number]
 Side: TypeAlias = Annotated[float, Meta(ge=1, le=8192)]
 Positive: TypeAlias = Annotated[float, Meta(gt=0, le=1e6)]
 
+Slider: TypeAlias = Literal["strength", "bold", "luminance", "clusters", "blend", "stylizer.temperature", "stylizer.smoothness"]
+"""Fields of `StyleConfig` that the page shows, where its stylizer has them."""
+
 
 class Camera(Struct, forbid_unknown_fields=True, frozen=True):
     """Where a client stands, in the scene's coordinates."""
@@ -44,7 +47,7 @@ class View(Message, tag="view"):
 class Set(Message, tag="set"):
     """A control of the look was moved."""
 
-    name: Literal["strength", "bold", "luminance", "clusters", "blend", "stylizer.temperature", "stylizer.smoothness"]
+    name: Slider
     value: Number
 
 
@@ -80,7 +83,7 @@ class Region(Message, tag="region"):
 class Map(Message, tag="map"):
     """What is shown in the place of colours."""
 
-    map: Literal["none", "matches", "regions", "depth"]
+    map: Literal["none", "matches", "regions"]
 
 
 class Keep(Message, tag="keep"):

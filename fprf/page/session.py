@@ -20,9 +20,9 @@ from ..io.video import write_video
 from ..splats.files import Capture, write_capture, write_gaussians
 from ..splats.scene import SplatScene
 from ..style.config import StyleConfig
-from ..training.loading import LoadedRun, Trained
+from ..training.loading import LoadedRun
 from . import messages
-from .drawing import FPS, FieldPainter, Request, cameras_of, film_frames, gaussian_colours, write_film_files
+from .drawing import FPS, Request, ScenePainter, cameras_of, film_frames, gaussian_colours, write_film_files
 from .pack import colour_header, colour_section, container
 from .render_worker import RenderWorker, Steps
 from .restyler import Restyler, matching_regions
@@ -71,7 +71,7 @@ class Session:
         self._lock = threading.RLock()
         self._requests: dict[Hashable, Request] = {}
         self._photographs: frozenset[Photograph] = frozenset()
-        self._painter: FieldPainter | None = None
+        self._painter: ScenePainter | None = None
         self._worker = RenderWorker(self._on_error)
         self._version = count(1)
         self._colours: dict[str, tuple[int, bytes]] = {}
@@ -87,20 +87,18 @@ class Session:
         self.uploads.close()
 
     def _load(self) -> None:
-        """Prepare what browsers are sent of the scene, or the painter of a field."""
+        """Prepare what browsers are sent of Gaussians, or the painter of any other scene."""
         scene, home = self.viewed.scene, self.viewed.home
         if isinstance(scene, SplatScene):
             # Shapes and captured colours go to browsers once.
             self.packed, head, parts = packed_scene(scene, [scene.gaussians.harmonics], home, level=1)
             self.geometry = container(head, parts)
-        elif isinstance(scene, Trained):
-            self._painter = FieldPainter(scene, self.restyler, self._show)
-            # A camera of a field turns about a point as far away as most cameras are from their middle.
+        else:
+            self._painter = ScenePainter(scene, self.restyler, self._show)
+            # A camera turns about a point as far away as most cameras are from their middle.
             place = scene.cameras.pose[:, :, 3]
             spread = float((place - place.median(dim=0).values).norm(dim=1).quantile(0.9)) or 1.0
             self.geometry = container(about(scene.cameras, home, lambda view: 1.5 * spread), {})
-        else:
-            raise UsageError(f"{self.viewed.name}: the viewer shows runs of fields and Gaussians, not {type(scene).__name__}")
 
     def hello(self) -> list[tuple[str, dict[str, Any]]]:
         """What a new client has to know."""
@@ -114,7 +112,7 @@ class Session:
         """Do what a client asks for. Raises FprfError with what is wrong with it."""
         match message:
             case messages.View():
-                # Browsers draw Gaussians themselves; a field is drawn here.
+                # Browsers draw Gaussians themselves; all else is drawn here.
                 if self._painter is not None:
                     cameras_of([message.camera])  # refused where it is none
                     request = Request(message.camera, self.state.shown, self._longest, message.captured)

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import msgspec
 
@@ -21,23 +21,19 @@ from ..style.dictionary import Reference
 from . import messages
 from .messages import Camera
 
-Map: TypeAlias = Literal["none", "matches", "regions", "depth"]
+Map: TypeAlias = Literal["none", "matches", "regions"]
 RegionAction: TypeAlias = Literal["pin", "forbid", "keep"]
 SHELF = 12
 """Photographs on the shelf; the oldest that no look needs makes room."""
 NOW = "Now"
 """Name of the colours of the present look, beside those of looks that are kept."""
 _MAX_KEYS = 64
-_SLIDERS = (
-    "strength", "bold", "luminance", "clusters", "blend", "stylizer.temperature", "stylizer.smoothness",
-)  # fmt: skip
-"""Fields of `StyleConfig` that the page shows, where its stylizer has them."""
 
 
 def _sliders(style: StyleConfig) -> dict[str, float]:
     """Values of the sliders of a style."""
     found = {}
-    for name in _SLIDERS:
+    for name in get_args(messages.Slider):
         of_stylizer, _, last = name.rpartition(".")
         config = style.stylizer if of_stylizer else style
         if hasattr(config, last):

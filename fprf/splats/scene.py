@@ -235,9 +235,9 @@ class GaussianView(SceneView):
         """Recolour all Gaussians and draw the view."""
         return self.scene.restyled(restyle).render(self.cameras, self.view)
 
-    def match(self, restyle: Restyle) -> Annotated[Tensor, "N T"]:
-        """Draw the shares of the style codes."""
-        return self.scene.paint(self.cameras, self.view, pixel_grid(self.cameras, self.view), restyle.match)[0]
+    def paint(self, values: Values) -> Annotated[Tensor, "N X"]:
+        """Draw them in the place of colours."""
+        return self.scene.paint(self.cameras, self.view, pixel_grid(self.cameras, self.view), values)[0]
 
 
 def look_at_capture(

@@ -151,10 +151,14 @@ class CachedView(SceneView):
         return _on_host(_view_of(self.chunks, self.decoder, restyle, self.size))
 
     @torch.inference_mode()
-    def match(self, restyle: Restyle) -> Annotated[Tensor, "N T"]:
+    def paint(self, values: Values) -> Annotated[Tensor, "N X"]:
         # Where the scene has no semantics all points are alike: features without channels.
         semantics = [chunk.content[:, :0] if chunk.semantic is None else chunk.semantic for chunk in self.chunks]
-        return torch.cat([chunk.mean(restyle.match(at)).cpu() for chunk, at in zip(self.chunks, semantics, strict=True)])
+        return torch.cat([chunk.mean(values(at, None)).cpu() for chunk, at in zip(self.chunks, semantics, strict=True)])
+
+    @property
+    def bytes(self) -> int:
+        return sum(chunk.bytes for chunk in self.chunks)
 
 
 def cache_view(model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig) -> CachedView:

@@ -6,9 +6,9 @@ import pytest
 from session_helpers import camera_of
 
 from fprf.io.images import Picture, to_uint8
-from fprf.io.maps import depth_image, match_image
+from fprf.io.maps import match_image
 from fprf.page import drawing
-from fprf.page.drawing import FieldPainter, Request
+from fprf.page.drawing import Request, ScenePainter
 from fprf.page.restyler import Restyler
 from fprf.page.state import Look, Photograph, Shown
 from fprf.style.config import StyleConfig
@@ -18,7 +18,7 @@ from fprf.training.views import render_view
 Pair = tuple[Photograph, Photograph]
 
 
-class Watched(FieldPainter):
+class Watched(ScenePainter):
     """A painter whose pictures are kept."""
 
     def __init__(self, restyler: Restyler) -> None:
@@ -27,7 +27,7 @@ class Watched(FieldPainter):
 
     def look(self, shown: Shown | None = None, view: int = 2, client: Hashable = 1, captured: bool = False) -> list[Any]:
         self.pictures.clear()
-        camera = camera_of(self._trained, view)
+        camera = camera_of(self._scene, view)
         for _ in self.render(client, Request(camera, shown or Shown(Look()), int(max(camera.size)), captured)):
             pass
         return list(self.pictures)
@@ -57,7 +57,7 @@ def test_another_look_marches_nothing(
     watched.look()
     look = Look(mix=((encoded[0], 1.0),), style=StyleConfig(clusters=2))
     with monkeypatch.context() as patch:
-        patch.setattr(drawing, "view_chunks", None)
+        patch.setattr(drawing, "_strips", None)
         found = watched.look(Shown(look), captured=True)
     assert [(kind, final) for kind, _, final in found] == [("look", True), ("captured", True)]
     for (_, picture, _), each in zip(found, (look, Look()), strict=True):
@@ -80,9 +80,6 @@ def test_maps_are_what_the_command_line_renders(watched: Watched, restyler: Rest
     wanted = match_image(found.attention, styled.codes.reference, styled.codes.names, found.opacity, found.kept)
     assert np.abs(watched.look(Shown(look, "matches"))[-1][1].astype(int) - wanted).mean() < 0.5
     assert (watched.look(Shown(Look(), "matches"))[-1][1] == 128).all(), "grey without a style"
-    view = render_view(trained.model, trained.known.facts, trained.known.cameras, 2, trained.config.render)
-    depth = watched.look(Shown(look, "depth"))[-1][1]
-    assert np.abs(depth.astype(int) - depth_image(view.depth, view.opacity)).mean() < 1
 
 
 def test_a_picked_region_stands_out(watched: Watched, restyler: Restyler) -> None:

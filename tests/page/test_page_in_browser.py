@@ -14,7 +14,6 @@ from chromium import chromium
 from pages import recoloured, seen, street, written
 from splat_ball import ball
 
-from fprf.page.writer import notebook_html
 from fprf.rendering.paths import look_at, pinhole
 from fprf.splats.photographs import camera_of
 from fprf.splats.scene import SplatScene
@@ -187,17 +186,6 @@ def test_a_lost_context_comes_back(page: Any) -> None:
     assert np.abs(pixels(page) - before).mean() < 0.01
 
 
-@pytest.mark.parametrize("width", [400, 1280])
-def test_it_fits_any_width(browser: Any, tmp_path: Path, width: int) -> None:
-    page = opened(browser, written(tmp_path / "page.html", seen(ball(500))), width, 720)
-    assert page.evaluate("() => document.documentElement.scrollWidth") <= width
-    box = page.locator("#canvas").bounding_box()
-    page.set_viewport_size({"width": width * 3 // 4, "height": 500})
-    page.wait_for_function(f"() => fprf.place.canvas.clientHeight < {box['height']}")
-    page.wait_for_function("() => Math.abs(fprf.place.canvas.width - fprf.place.canvas.clientWidth) < 2")
-    assert page.errors == []
-
-
 def test_without_webgl_there_are_pictures(browser: Any, tmp_path: Path) -> None:
     path = written(tmp_path / "page.html", seen(ball(500)))
     page = opened(browser, path, script="HTMLCanvasElement.prototype.getContext = () => null")
@@ -206,12 +194,3 @@ def test_without_webgl_there_are_pictures(browser: Any, tmp_path: Path) -> None:
     page.locator("#wiping").click()
     assert page.evaluate("() => document.querySelector('.still.two').style.clipPath") == "inset(0px 0px 0px 50%)"
     assert page.errors == []
-
-
-def test_a_notebooks_iframe_draws_it(browser: Any, tmp_path: Path) -> None:
-    scene = seen(ball(500, 2))
-    (tmp_path / "notebook.html").write_text(f"<!doctype html>{notebook_html(scene, 'ball', 1, None)}")
-    page = browser.new_page()
-    page.goto((tmp_path / "notebook.html").as_uri())
-    page.frame_locator("iframe").locator(".place.drawn").wait_for(timeout=60_000)
-    page.close()

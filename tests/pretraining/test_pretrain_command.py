@@ -114,34 +114,18 @@ def test_a_resumed_run_ends_where_an_unbroken_one_does(tmp_path: Path) -> None:
     assert not training_folder(output).exists()
 
 
-SMALL = ["--steps", "2", "--batch", "2"]
-
-
-@pytest.mark.parametrize("kind", ["decoder", "content", pytest.param("semantic", marks=pytest.mark.slow)])
-def test_the_same_weights_and_report(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    images = str(photo_folder(tmp_path / "photos", 4))
-    own = {
-        "decoder": ["--encoder", "random", "--encoder.channels", "5", "--pixels", "50", "--style", "0.1", "--content", "0.1",
-                    "--every", "1", "--size", "16", "--style-weights", str(vgg_file(tmp_path))],
-        "content": ["--teachers", str(vgg_file(tmp_path)), "--size", "32", "--crops", "1"],
-        "semantic": ["--teachers", *map(str, teacher_files(tmp_path)), "--size", "32", "--towns", "0"],
-    }[kind]  # fmt: skip
-    found = {}
-    for device in ("cpu", "cuda:0"):
+def test_the_same_weights_and_report_on_a_device(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    own = ["--encoder", "random", "--encoder.channels", "5", "--pixels", "50", "--style", "0.1", "--content", "0.1", "--every",
+           "1", "--size", "16", "--style-weights", str(vgg_file(tmp_path)), "--steps", "2", "--batch", "2"]  # fmt: skip
+    args, found = ["decoder", "--images", str(photo_folder(tmp_path / "photos", 4)), *own], {}
+    for device, within in (("cpu", backend.plain), ("cuda:0", pretend_cuda)):
         output = tmp_path / device.replace(":", "") / "weights.safetensors"
-        train = run if kind == "decoder" else main
-        args = [kind, "--images", images, "--output", str(output), "--device", device, *own, *SMALL]
-        if device == "cpu":
-            with backend.plain():
-                assert train(args) == 0
-        else:
-            with pretend_cuda() as seen:
-                assert train(args) == 0
-            assert seen.uploads, "nothing was on the device"
+        with within() as seen:
+            assert run([*args, "--output", str(output), "--device", device]) == 0
+        assert seen is None or seen.uploads, "nothing was on the device"
         report = json.loads(capsys.readouterr().out)
         found[device] = read_weights(output), {k: v for k, v in report.items() if k not in ("seconds", "weights")}
-    (there, about), report = found["cuda:0"]
-    (here, before), expected = found["cpu"]
+    ((there, about), report), ((here, before), expected) = found["cuda:0"], found["cpu"]
     assert (about, report) == (before, expected)
     assert there.keys() == here.keys() and all(torch.equal(there[name], here[name]) for name in here)
 
