@@ -19,18 +19,19 @@ Rows = Iterable[Iterable[str]]
 
 
 def splat_training(found: Any) -> Rows:
-    """Training of Gaussians: what was trained for how long, and how near it comes."""
-    yield "capture", "wall time", "steps", "Gaussians", "PSNR", "SSIM", "LPIPS", "memory"
+    """Training of Gaussians in some minutes: what was planned, and how near it comes."""
+    yield "capture", "size", "minutes", "steps", "Gaussians", "PSNR", "SSIM", "LPIPS", "memory"
     for row in found.values():
-        size = re.search(r"--downscale (\d+)", row["command"])
+        minutes = re.search(r"--minutes ([\d.]+)", row["command"])
         yield (
-            f"{row['scene']}{'' if size is None or size[1] == '1' else f', 1/{size[1]}'}",
-            f"{row['wall_seconds']:.0f} s",
+            row["scene"],
+            row["size"],
+            "" if minutes is None else minutes[1],
             str(row["steps"]),
             str(row["gaussians"]),
             f"{row['psnr']:.2f} dB",
             f"{row['ssim']:.3f}",
-            f"{row['lpips']:.3f}" if "lpips" in row else "",
+            f"{row['lpips']:.3f}",
             "not measured" if row["peak_rss_mib"] is None else f"{row['peak_rss_mib']:.0f} MiB",
         )
 

@@ -53,9 +53,17 @@ def focus(cameras: Cameras) -> tuple[Annotated[Tensor, "3"], float]:
 def find_space(scene: Scene) -> Space:
     """The space of a scene. Raises DataError where cameras leave it undefined (all of them in one place, no points)."""
     kind = find_kind(scene)
-    if kind == "ndc":
-        return _ndc(scene)
-    return _box(scene) if kind == "box" else _contraction(scene)
+    if kind != "box":
+        return _ndc(scene) if kind == "ndc" else _contraction(scene)
+    position = scene.cameras.pose[:, :, 3]
+    # The point that all cameras look at, or their middle where axes are parallel.
+    centre, certain = focus(scene.cameras)
+    if certain < 1e-4:
+        centre = position.mean(0)
+    distance = float((position - centre).norm(dim=-1).median())
+    if distance <= ROUNDING * float(position.abs().amax()):
+        raise DataError(f"{scene.name}: all cameras stand in one place; capture from several places")
+    return Space("box", _three(centre), _rows(torch.eye(3)), 1 / (BOX_SHARE * distance), 0.0, FAR)
 
 
 def find_kind(scene: Scene) -> Kind:
@@ -138,18 +146,6 @@ def _nearest(scene: Scene) -> float | None:
         return float(scene.depths[:, 0].amin())
     depth = _depths(scene)
     return None if depth is None else float(depth.quantile(0.001 if len(depth) >= 1000 else 0.0))
-
-
-def _box(scene: Scene) -> Space:
-    position = scene.cameras.pose[:, :, 3]
-    # The point that all cameras look at, or their middle where axes are parallel.
-    centre, certain = focus(scene.cameras)
-    if certain < 1e-4:
-        centre = position.mean(0)
-    distance = float((position - centre).norm(dim=-1).median())
-    if distance <= ROUNDING * float(position.abs().amax()):
-        raise DataError(f"{scene.name}: all cameras stand in one place; capture from several places")
-    return Space("box", _three(centre), _rows(torch.eye(3)), 1 / (BOX_SHARE * distance), 0.0, FAR)
 
 
 def _ndc(scene: Scene) -> Space:

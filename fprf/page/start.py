@@ -195,7 +195,7 @@ class Start:
 
     def _call(self, args: Sequence[str]) -> None:
         """Run a verb to its end. Raises DataError with what it says when it fails, `_Left` when it is to be left."""
-        if self._stopped == "leave":
+        if bool(self._stopped):  # not narrowed by mypy: another thread sets it
             raise _Left
         command = [sys.executable, "-m", "fprf", *args]
         with subprocess.Popen(
@@ -209,8 +209,9 @@ class Start:
                     last = line.strip()
                     self._read(last)
         self._process = None
-        # An interrupted training has saved what there was, if there was anything.
-        if self._stopped == "leave" or (self._stopped and newest_step(self._output / self._progress.name / _RUN) < 0):
+        # An interrupted training has saved what there was, if there was anything; nothing else is worth going on with.
+        saved = args[0] == "train" and newest_step(Path(args[args.index("--output") + 1])) >= 0
+        if self._stopped == "leave" or (self._stopped and not saved):
             raise _Left
         if process.returncode and not self._stopped:
             raise DataError(last.removeprefix("error: ") or f"fprf {args[0]} has ended with {process.returncode}")

@@ -6,15 +6,22 @@ Kerbl et al. 2024, a hierarchical 3D Gaussian representation). A view takes of e
 which what was merged lies within a given number of pixels; the others cost it nothing.
 """
 
+import io
 import math
-from dataclasses import dataclass, replace
-from typing import Annotated
+import mmap
+import zipfile
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..io.atomic import atomic_path
 from ..ops.rasterise.rendering import Pinhole
 from ..rendering.splines import quaternions, rotations
 from .gaussians import Gaussians, from_rows
@@ -31,6 +38,16 @@ _TAIL = 0.02
 """Share of the means at either end that does not say how long a chunk is."""
 _SPREAD = 0.9
 """Quantile that says how wide a chunk is, and how far apart is what a level merges."""
+_AT_ONCE = 64
+"""Chunks that are recoloured together."""
+_PART = 1 << 17
+"""Gaussians that are in memory at a time while levels are written."""
+_KEPT = 1 << 28
+"""Bytes of colours that a look keeps of chunks it has drawn."""
+_TABLES = "begin", "spread", "centre", "radius", "core"
+_FILE, _FORMAT, _LENGTH = "rows.bin", 2, 8
+"""File of a run's levels: rows, their order (int32), an .npz archive of the tables, the bytes of that archive as a number of
+this many bytes; all little endian."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,34 +65,83 @@ class Levels:
     """Radius of a ball around all that a chunk shows."""
     core: Annotated[NDArray[np.float64], "B"]
     """Radius of a ball around nearly all means of a chunk."""
-    order: Annotated[Tensor, "N"]
+    order: Annotated[NDArray[np.int32], "N"]
     """Number of the Gaussian in each row of the finest level, chunk after chunk."""
+    mapped: mmap.mmap | None = None
+    """The file that the rows lie in: of its pages none stays in memory."""
 
     def select(self, camera: Pinhole, pixels: float) -> Gaussians:
         """Return the Gaussians that a camera sees, merged where they lie within `pixels`; 0 = nothing is merged."""
-        # The level of each chunk that the camera may see.
+        return self.gather(*self.visible(camera, pixels))
+
+    def visible(self, camera: Pinhole, pixels: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the chunks that a camera sees, in ascending order, and the level of each."""
         local, seen = in_view(camera, self.centre, self.radius)
         fx, fy = float(camera.intrinsics[0, 0]), float(camera.intrinsics[1, 1])
         distance = np.maximum(np.linalg.norm(local, axis=1) - self.core, camera.near)
         fine = self.spread * max(fx, fy) <= pixels * distance[:, None]
         level = np.minimum.accumulate(fine, axis=1).sum(1) - 1
         chunks = np.flatnonzero(seen)
-        first, last = self.begin[chunks, level[chunks]], self.begin[chunks, level[chunks] + 1]
-        parts = [self.rows[a:b] for a, b in zip(first, last, strict=True)] or [self.rows[:0]]
-        return from_rows(torch.from_numpy(np.concatenate(parts)))
+        return chunks, level[chunks]
 
-    def recoloured(self, harmonics: Annotated[Tensor, "N K 3"]) -> "Levels":
-        """The levels of the same Gaussians in other colours, as if they had been made of these."""
-        rows = self.rows.copy()
-        # Rows of a level lie in the order in which they were merged.
-        sizes = np.diff(self.begin, axis=1).ravel()
-        level = np.repeat(np.tile(np.arange(_LEVELS), len(self.begin)), sizes)
-        harmonics = harmonics[self.order]
-        for k in range(_LEVELS):
-            own = level == k
-            rows[own, -harmonics[0].numel() :] = harmonics.flatten(1).numpy()
-            harmonics = _merged_harmonics(harmonics, *_shares(from_rows(torch.from_numpy(rows[own])))[:2]).float()
-        return replace(self, rows=rows)
+    def gather(self, chunks: NDArray[np.int64], level: NDArray[np.int64]) -> Gaussians:
+        """Return the Gaussians of chunks, each at its level."""
+        first, last = self.begin[chunks, level], self.begin[chunks, level + 1]
+        parts = [self.rows[a:b] for a, b in zip(first, last, strict=True)] or [self.rows[:0]]
+        nodes = np.concatenate(parts)
+        if self.mapped is not None and hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
+            self.mapped.madvise(mmap.MADV_DONTNEED)
+        return from_rows(torch.from_numpy(nodes))
+
+
+class StyledLevels:
+    """Levels in other colours: those of a chunk are made when it is first drawn, and kept while there is room.
+
+    What is merged has the mean of the new colours of its Gaussians, as if the levels had been made of these.
+    """
+
+    def __init__(
+        self, levels: Levels, recolour: Callable[[Gaussians, Annotated[Tensor, "M"]], Annotated[Tensor, "M K 3"]]
+    ) -> None:
+        """`recolour` gives harmonics for Gaussians and their numbers in the scene."""
+        self._levels, self._recolour = levels, recolour
+        self._colours: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
+        self._bytes = 0
+
+    def select(self, camera: Pinhole, pixels: float) -> Gaussians:
+        """Return what `Levels.select` would, recoloured."""
+        chunks, level = self._levels.visible(camera, pixels)
+        shown = self._levels.gather(chunks, level)
+        # Recolour what was never drawn, level by level, some chunks together.
+        keys = list(zip(chunks.tolist(), level.tolist(), strict=True))
+        new = np.array([key not in self._colours for key in keys], bool)
+        for k in np.unique(level[new]):
+            here = chunks[new & (level == k)]
+            for first in range(0, len(here), _AT_ONCE):
+                self._add(here[first : first + _AT_ONCE], int(k))
+        # What was drawn last stays longest.
+        parts = [self._colours[key] for key in keys]
+        for key in keys:
+            self._colours.move_to_end(key)
+        while self._bytes > _KEPT:
+            self._bytes -= self._colours.popitem(last=False)[1].nbytes
+        return shown.recoloured(torch.cat(parts)) if parts else shown
+
+    def _add(self, chunks: NDArray[np.int64], level: int) -> None:
+        """Recolour the Gaussians of chunks and merge them up to a level."""
+        # New colours of the finest level; each coarser one has the means of the level before, by the weights of its Gaussians.
+        levels = self._levels
+        gaussians = levels.gather(chunks, np.zeros_like(chunks))
+        index = np.concatenate([levels.order[_CHUNK * chunk : _CHUNK * (chunk + 1)] for chunk in chunks]).astype(np.int64)
+        harmonics = self._recolour(gaussians, torch.from_numpy(index))
+        for k in range(level):
+            if k:
+                gaussians = levels.gather(chunks, np.full_like(chunks, k))
+            harmonics = _merged_harmonics(harmonics, *_shares(gaussians)[:2]).float()
+        sizes = levels.begin[chunks, level + 1] - levels.begin[chunks, level]
+        for chunk, colours in zip(chunks.tolist(), torch.split(harmonics, sizes.tolist()), strict=True):
+            self._colours[chunk, level] = colours.clone()
+            self._bytes += colours.nbytes
 
 
 def in_view(
@@ -136,7 +202,54 @@ def make_levels_of_detail(gaussians: Gaussians) -> Levels:
         centre[chunk] = np.median(means[own], axis=0)
         away = np.linalg.norm(means[own] - centre[chunk], axis=1)
         radius[chunk], core[chunk] = (away + reach[own]).max(), np.quantile(away, _SPREAD)
-    return Levels(np.concatenate(parts), begin, spread, centre, radius, core, order)
+    return Levels(np.concatenate(parts), begin, spread, centre, radius, core, order.numpy().astype(np.int32))
+
+
+def write_levels(folder: Path, gaussians: Gaussians, key: str) -> None:
+    """Write levels of detail that `open_levels` maps, in bounded memory where the Gaussians are mapped from a file themselves.
+
+    Neighbours in memory should be neighbours in space, as the cells of a union are. All lies in one file, which is replaced as
+    a whole. Raises DataError where the system refuses.
+    """
+    columns: list[tuple[NDArray[Any], ...]] = []
+    orders: list[NDArray[np.int32]] = []
+    written = 0
+    with atomic_path(folder / _FILE) as temporary, temporary.open("wb") as file:
+        for first in range(0, len(gaussians), _PART):
+            levels = make_levels_of_detail(gaussians.select(torch.arange(first, min(first + _PART, len(gaussians)))))
+            file.write(levels.rows.tobytes())
+            columns.append((levels.begin + written, levels.spread, levels.centre, levels.radius, levels.core))
+            orders.append(levels.order + np.int32(first))
+            written += len(levels.rows)
+        for order in orders:
+            file.write(order.tobytes())
+        parts = dict(zip(_TABLES, (np.concatenate(column) for column in zip(*columns, strict=True)), strict=True))
+        tables = io.BytesIO()
+        width, count = np.array(levels.rows.shape[1]), np.array(len(gaussians))
+        np.savez(tables, allow_pickle=False, key=np.array(f"{_FORMAT} {key}"), width=width, count=count, **parts)
+        file.write(tables.getvalue() + len(tables.getvalue()).to_bytes(_LENGTH, "little"))
+
+
+def open_levels(folder: Path, key: str) -> Levels | None:
+    """Levels mapped from a file; None where there are none of this key."""
+    try:
+        with (folder / _FILE).open("rb") as file:
+            mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        # From the end: the length of the archive, the archive, and what lies before it.
+        end = len(mapped) - _LENGTH
+        begin = end - int.from_bytes(mapped[end:], "little")
+        if begin < 0:
+            return None
+        with np.load(io.BytesIO(mapped[begin:end])) as tables:
+            if str(tables["key"]) != f"{_FORMAT} {key}":
+                return None
+            parts = {name: tables[name] for name in _TABLES}
+            count = int(tables["count"])
+            rows = np.frombuffer(mapped, np.float32, begin // 4 - count).reshape(-1, int(tables["width"]))
+            order = np.frombuffer(mapped, np.int32, count, begin - 4 * count)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+    return Levels(rows=rows, **parts, order=order, mapped=mapped)
 
 
 def _chunks(position: Annotated[NDArray[np.float64], "N 3"], index: NDArray[np.int64]) -> list[NDArray[np.int64]]:

@@ -26,7 +26,7 @@ from .config import GaussiansConfig, LookConfig
 from .files import Capture
 from .gaussians import from_tensors
 from .learner import MOVES, GaussianLearner
-from .levels import make_levels_of_detail
+from .levels import Levels, make_levels_of_detail, open_levels, write_levels
 from .photographs import load_photographs, make_levels
 from .scene import SplatScene, cache_name, load_scene, look_at_capture, run_scene, scene_tensors
 from .semantics import Semantics, load_semantics, semantics_tensors
@@ -35,6 +35,8 @@ _FIT_RATE, _FIT_STEPS = 2e-3, 120
 """Rate of poses (`GaussiansConfig.poses`) and steps of each view, where poses of views are fitted to a finished scene."""
 _CACHED = 24
 """Captures of which the cache keeps what was found out."""
+_LEVELS, _MANY = "levels", 400_000
+"""Folder of a run; Gaussians from which on levels of detail are kept there and mapped, not made in memory."""
 
 
 def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityConfig) -> LoadedRun[SplatScene]:
@@ -47,7 +49,9 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
         raise UsageError("--max-memory: is for runs of fields; leave it out")
     root, preset = run.root, None if quality.quality is None else PRESETS[quality.quality]
     merged = None if preset is None else preset.merged
-    saved, _ = checkpoint.load_latest(run.checkpoints)
+    # Levels of detail were written from what was verified.
+    key = "" if merged is None else checkpoint.digest(run.checkpoints)
+    saved, _ = checkpoint.load_latest(run.checkpoints, verify=not key or open_levels(root / _LEVELS, key) is None)
     if saved is None:
         raise CheckpointError(f"{root}: no checkpoint yet; go on with `fprf train {root / 'config.json'} --output {root}`")
     # The scene as training left it: its cameras where they were put, in the light that all views have in common.
@@ -65,6 +69,16 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
     def fit(scene: Scene, views: Sequence[int]) -> Annotated[Tensor, "V 6"]:
         return fit_poses(config, replace(scene, cameras=known.cameras), known.facts, whole, tones, views)
 
+    def levels() -> Levels:
+        """Levels of detail; those of many Gaussians lie in a file, written where there is none of this checkpoint."""
+        if len(gaussians) < _MANY:
+            return make_levels_of_detail(gaussians)
+        if open_levels(root / _LEVELS, key) is None:
+            write_levels(root / _LEVELS, gaussians, key)
+        mapped = open_levels(root / _LEVELS, key)
+        assert mapped is not None  # it was just written
+        return mapped
+
     shown = replace(
         whole,
         # What a training has learnt so far is looked at quickly, and not kept.
@@ -74,7 +88,7 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
         tones=tones,
         poses=fit,
         merged=merged,
-        levels=functools.cache(lambda: make_levels_of_detail(gaussians)),
+        levels=functools.cache(levels),
     )
     return LoadedRun(run, run.load_config()[1], known, saved.step, saved.seconds, shown)
 

@@ -30,7 +30,7 @@ from ..types import Origin, View
 from .config import GaussiansConfig, LookConfig
 from .files.base import Data
 from .gaussians import GaussianRows, Gaussians
-from .levels import Levels
+from .levels import Levels, StyledLevels
 from .photographs import cover, distorted
 from .restyle import Colours, region_maps, restyled_harmonics
 from .semantics import Semantics, find_semantics, load_semantics, semantics_tensors, tensor_group
@@ -113,10 +113,18 @@ class SplatScene(Scene):
         return GaussianRows(len(self.gaussians), self.part, self.antialiased)
 
     @cached_property
-    def _detail(self) -> Levels:
+    def _detail(self) -> Levels | StyledLevels:
         """Levels of detail in the scene's look."""
         assert self.levels is not None  # by `merged`
-        return self.levels() if self.look is None else self.levels().recoloured(self.shown.harmonics)
+        levels, look = self.levels(), self.look
+        if look is None:
+            return levels
+        features = self.found().features
+
+        def recolour(gaussians: Gaussians, index: Tensor) -> Tensor:
+            return restyled_harmonics(gaussians.harmonics, gaussians.means, features[index], look)
+
+        return StyledLevels(levels, recolour)
 
     @cached_property
     def seen(self) -> SeenMeans:

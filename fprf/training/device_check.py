@@ -85,22 +85,8 @@ def fast_paths(device: torch.device) -> Iterator[tuple[str, str]]:
 
 def _computed(device: torch.device) -> dict[str, Tensor]:
     """The results to compare, by name, computed on the device."""
+    # A scene of seeded numbers with every part of a large one, and a camera in it.
     encoder = BundledContentConfig().build()
-    config, facts = _tiny(encoder.identity, encoder.channels)
-    model, cameras = build_model(config, facts).to(device), _camera()
-    encoder = encoder.to(device)
-    image = _uniform(3, 48, 64).to(device)
-    with torch.no_grad():
-        features: Tensor = encoder(image[None])[0]
-    results = {"encoder": features, "training step": _gradients(model, cameras, image)}
-    model.requires_grad_(False).eval()
-    look = _restyle(model, features.flatten(1).T, image)
-    for name, restyle in (("render", None), ("restyle", look)):
-        results[name] = render_view(model, facts, cameras, 0, config.render, restyle).rgb
-    return results
-
-
-def _tiny(encoder: str, channels: int) -> tuple[TrainConfig, Facts]:
     config = TrainConfig(
         sampler=ProposalConfig(samples=(16,), final=8, resolutions=(8,)),
         content=ContentConfig(
@@ -111,12 +97,21 @@ def _tiny(encoder: str, channels: int) -> tuple[TrainConfig, Facts]:
     )
     axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     space = Space(kind="contraction", centre=(0.0, 0.0, 0.0), rotation=axes, scale=1.0, near=0.1, far=100.0)
-    return config, Facts(space=space, channels=channels, dim=_DIM, content_encoder=encoder)
-
-
-def _camera() -> Cameras:
+    facts = Facts(space=space, channels=encoder.channels, dim=_DIM, content_encoder=encoder.identity)
+    model = build_model(config, facts).to(device)
     place, target, up = (torch.tensor([x], dtype=torch.float64) for x in ((0.0, -0.4, 0.1), (0.1, 0.5, 0.0), (0.0, 0.0, 1.0)))
-    return pinhole(look_at(place, target, up[0]), width=32, height=24, fov=60.0)
+    cameras = pinhole(look_at(place, target, up[0]), width=32, height=24, fov=60.0)
+    # Features of a picture, a step of training, and the view as it is and in the picture's style.
+    encoder = encoder.to(device)
+    image = _uniform(3, 48, 64).to(device)
+    with torch.no_grad():
+        features: Tensor = encoder(image[None])[0]
+    results = {"encoder": features, "training step": _gradients(model, cameras, image)}
+    model.requires_grad_(False).eval()
+    look = _restyle(model, features.flatten(1).T, image)
+    for name, restyle in (("render", None), ("restyle", look)):
+        results[name] = render_view(model, facts, cameras, 0, config.render, restyle).rgb
+    return results
 
 
 def _gradients(model: Model, cameras: Cameras, image: Annotated[Tensor, "3 H W"]) -> Annotated[Tensor, "P"]:

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import math
 import struct
 import sys
 from dataclasses import replace
@@ -70,18 +71,20 @@ def test_a_glb_has_what_the_extension_demands(tmp_path: Path) -> None:
     assert np.allclose(column("COLOR_0")[:, :3] / 255, made.colours.clamp(0, 1), atol=0.51 / 255)
 
 
+@pytest.mark.parametrize("unit", [0.01, 1.0, 100.0])
 @pytest.mark.parametrize("logarithmic", [False, True])
 @pytest.mark.parametrize(
     ("generator", "space"),
     [(None, None), ("tool 1.0", "srgb_rec709_display"), ("splat-transform 2.{}.1", None), (None, "BT.709")],
 )
 def test_linear_and_logarithmic_sizes_are_told_apart(
-    logarithmic: bool, generator: str | None, space: str | None, tmp_path: Path
+    unit: float, logarithmic: bool, generator: str | None, space: str | None, tmp_path: Path
 ) -> None:
-    """By a negative one, by what wrote the file, or by the draft's colour space."""
+    """By a negative one, by what wrote the file, by the draft's colour space, or by what fits the distances between them."""
     if space == "BT.709" and not logarithmic:
         pytest.skip("no file of a draft has linear sizes")
     made, path = ball(400), tmp_path / "x.glb"
+    made = replace(made, means=made.means * unit, log_scales=made.log_scales - 0.7 + math.log(unit))
     write_gaussians(path, made)
     assert "fprf wrote it" in read_capture(path).notes[0]
     document, body = glb_parts(path.read_bytes())
@@ -95,8 +98,10 @@ def test_linear_and_logarithmic_sizes_are_told_apart(
     found = read_capture(path)
     assert torch.allclose(found.gaussians.log_scales, made.log_scales, atol=1e-5), found.notes
     assert ("review draft" in found.notes[0]) == logarithmic and "\n" not in found.notes[0]
-    told = "splat-transform" if generator and "splat" in generator else "nothing tells otherwise"
-    assert ("negative" if logarithmic else told) in found.notes[0]
+    positive = unit == 100
+    assert not positive or bool((sizes > 0).all())
+    told = {"tool 1.0": "neighbours", None: "BT.709" if space else "neighbours"}.get(generator, "splat-transform")
+    assert ("negative" if logarithmic and not positive else told) in found.notes[0]
 
 
 def test_whole_numbers_of_sizes_are_shares_only_where_they_are_said_to_be(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ has those of PLY files, right down front, under a node that turns them by 180 de
 
 import base64
 import json
+import math
 import re
 import struct
 from collections.abc import Iterable
@@ -40,6 +41,10 @@ _DRAFTS = ("BT.", "Display-P3", "linear")
 """Beginnings of colour-space names of drafts before the review draft, when SCALE was a logarithm; later texts share theirs."""
 _LINEAR_SINCE = (2, 7)
 """Version of splat-transform from which on its .glb has linear sizes (playcanvas/splat-transform#268)."""
+_ASKED = 64
+"""Gaussians whose nearest neighbours are looked for."""
+_TYPICAL = -0.5
+"""ln of the middle axis of Gaussians over the distance to the nearest neighbour: -0.2 to -0.9 in trained captures."""
 
 
 class _Part(NamedTuple):
@@ -59,7 +64,7 @@ class _Part(NamedTuple):
         """Its colours are those of linear light."""
         return str(self.extension.get("colorSpace")).startswith("lin")
 
-    def sizes(self, rows: slice) -> Floats:
+    def sizes(self, rows: slice | NDArray[np.int64]) -> Floats:
         """SCALE of some rows, as it stands in the file."""
         column = self.columns[_SHAPE[2]][rows]
         return column.astype(np.float64) if self.whole else _values(column)
@@ -277,7 +282,30 @@ def _logarithmic(document: dict[str, Any], parts: list[_Part]) -> tuple[bool, st
     for part in parts:
         if str(part.extension.get("colorSpace")).startswith(_DRAFTS):
             return True, f"colorSpace {part.extension['colorSpace']} is that of a draft"
-    return False, "nothing tells otherwise"
+    # Else sizes are held against the distances between neighbours: Gaussians that cover a surface are about as wide.
+    part = max(parts, key=lambda part: len(part.columns["POSITION"]))
+    points = part.columns["POSITION"]
+    some = np.linspace(0, len(points) - 1, _ASKED).astype(np.int64)
+    asked = torch.from_numpy(_values(points[some]))
+    asked = asked[asked.isfinite().all(1)]
+    nearest = torch.full((len(asked),), torch.inf)
+    for rows in base.pieces(len(points)):
+        here = torch.from_numpy(_values(points[rows]))
+        # About the first one, so that float32 keeps the digits of places far from 0.
+        apart = torch.cdist(
+            (asked - asked[:1]).float(), (here - asked[:1]).float(), compute_mode="donot_use_mm_for_euclid_dist"
+        )
+        nearest = torch.minimum(nearest, apart.masked_fill(~(apart > 0), torch.inf).amin(1))
+    nearest = nearest[nearest.isfinite()]
+    middle = np.sort(part.sizes(some), 1)[:, 1]
+    middle = middle[np.isfinite(middle)]
+    if not len(nearest) or not len(middle):
+        return False, "nothing tells otherwise"
+    spacing, number = float(nearest.median().log()), float(np.median(middle))
+    ratios = (math.log(max(number, _LEAST)) - spacing, number - spacing)
+    logarithmic = abs(ratios[1] - _TYPICAL) < abs(ratios[0] - _TYPICAL)
+    shares = [f"{math.exp(min(ratio, 99)):.2g}" for ratio in (ratios[logarithmic], ratios[not logarithmic])]
+    return logarithmic, f"so they are {shares[0]} of the distance between neighbours, not {shares[1]}"
 
 
 def _local(node: dict[str, Any]) -> Floats:
