@@ -31,7 +31,7 @@ class ViewConfig(QualityConfig):
     """The run to show, and access to it."""
 
     run: Path | None = None
-    """Run folder, or a capture of 3D Gaussians: .ply .compressed.ply .splat .spz .sog, or a SOG folder; none = a start page in
+    """Run folder, or a capture of 3D Gaussians: .ply .splat .spz .sog .glb .ksplat, or a SOG folder; none = a start page in
     the browser, which takes photographs, a video, a capture or a run."""
     output: Path = Path("my_scenes")
     """Folder of what the start page makes, with a folder for each scene."""

@@ -64,6 +64,9 @@ def read_style(path: Path) -> StyleFile:
         fields = whole["style"]
         if "fprf" in whole and "bold" not in fields:  # saved before there was light: all was painted
             fields = {**fields, "bold": 1.0}
+        stylizer = fields.get("stylizer")
+        if isinstance(stylizer, dict) and stylizer.get("similarity") == "cosine":  # once a choice, now how it is always done
+            fields = {**fields, "stylizer": {name: value for name, value in stylizer.items() if name != "similarity"}}
         style = from_json(fields, StyleConfig, packages=from_json(whole.get("plugins", {}), dict[str, str]))
         hashes = from_json(whole.get("sha256", {}), dict[str, str])
         regions = from_json(whole.get("regions", {}), dict[str, tuple[float, ...]])

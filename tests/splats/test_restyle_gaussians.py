@@ -151,7 +151,7 @@ def test_maps_of_matches_heed_places(scene: SplatScene, photographs: list[Path])
     dusk = found.codes.reference == found.codes.names.index("dusk.png")
     assert float(taken[..., dusk].abs().max()) == 0 and float(taken.sum(-1).max()) > 0.99
     view = scene.cached(scene.cameras, 0)
-    assert torch.allclose(view.match(found.restyle), taken.flatten(0, 1), atol=1e-6)
+    assert torch.allclose(view.paint(found.restyle.match), taken.flatten(0, 1), atol=1e-6)
 
 
 @pytest.mark.parametrize("place", ["box:1,2:3", "box:1,2,3:4,5,nan", "path:0,0,0:1,1,1", "path:0,0,0:1,1,1:-1"])

@@ -1,6 +1,5 @@
 """Scenes in cells: what each goes on from, what it sees, and their union."""
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -14,10 +13,8 @@ from fprf.blocks.partition import bisect_sightings
 from fprf.cli.main import main
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.images import write_image
-from fprf.plugins.codec import load_config, save_config
 from fprf.splats import cells
 from fprf.splats.cells import CellPart, load_cells, open_cell
-from fprf.splats.config import GaussiansConfig
 from fprf.splats.files import read_capture
 from fprf.splats.learner import MOVES
 from fprf.training.camera_optimizers import Tones
@@ -45,15 +42,6 @@ def part_of(run: Path, data: Path, cell: int) -> CellPart:
     part = open_cell(Task(root=str(run), data=str(data), part=cell, minutes=None))
     assert isinstance(part, CellPart)
     return part
-
-
-def test_a_run_of_before_with_its_rounds_is_read(tmp_path: Path) -> None:
-    file = tmp_path / "config.json"
-    save_config(file, GaussiansConfig(cells=3), "fprf-splats")
-    document = json.loads(file.read_text())
-    document["config"]["rounds"] = 2
-    file.write_text(json.dumps(document))
-    assert load_config(file) == (GaussiansConfig(cells=3), "fprf-splats")
 
 
 def test_the_union_holds_each_cell_s_own(town: Path, tmp_path: Path) -> None:

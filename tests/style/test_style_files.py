@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tiny_world import World
 
 from fprf.errors import ConfigError, DataError, UsageError
-from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionToneConfig
 from fprf.style.config import NO_MASK, StyleConfig, find_reference, labels, parse_strength
 from fprf.style.files import Keyframe, StyleFile, check_photographs, fade, read_keyframes, read_style, write_style
 from fprf.style.look import blend_strength
@@ -215,3 +215,13 @@ def test_each_frame_has_its_look(world: World, tmp_path: Path) -> None:
         rising = looks(at)
         assert rising is not None and [part.strength for part in rising.parts] == strengths
         assert {part.luminance for part in rising.parts} == {0.5}, "luminance does not fade: it is kept throughout"
+
+
+def test_a_style_of_before_names_how_regions_are_matched(tmp_path: Path) -> None:
+    path = tmp_path / "style.json"
+    stylizer = {"type": "region-tone", "temperature": 0.2, "similarity": "cosine"}
+    path.write_text(json.dumps({"format": 1, "style": {"stylizer": stylizer}}))
+    assert read_style(path).style.stylizer == RegionToneConfig(temperature=0.2)
+    path.write_text(json.dumps({"format": 1, "style": {"stylizer": stylizer | {"similarity": "dot"}}}))
+    with pytest.raises(ConfigError, match="similarity"):
+        read_style(path)
