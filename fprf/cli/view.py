@@ -42,7 +42,7 @@ class ViewConfig(QualityConfig):
     semantic: GaussianSemanticsConfig = GaussianSemanticsConfig()
     """Semantics of a capture; a run has its own."""
     stylizer: StylizerConfig | None = None
-    """How styles are put onto regions; none = region-tone, as `fprf stylize` and `fprf restyle` have it."""
+    """Stylizer that puts styles onto regions; none = region-tone, as `fprf stylize` and `fprf restyle` have it."""
     references: tuple[Path, ...] = ()
     """Photographs, or folders of them, to begin with: on the shelf, and all in the mix."""
     host: str = "127.0.0.1"

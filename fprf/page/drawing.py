@@ -1,4 +1,4 @@
-"""What clients see: colours of Gaussians, which their browsers draw, and pictures of all other scenes, which are drawn here.
+"""Pictures and colours for clients: browsers draw Gaussians themselves, every other scene is drawn here.
 
 A moving camera must see something at once, a camera at rest everything: a new camera gets a small picture, then the
 whole one. What a client's last view holds is kept, so that a slider that is moved while the camera rests costs decoding alone.

@@ -135,7 +135,7 @@ class Open(Message, tag="open"):
 
 
 class Stop(Message, tag="stop"):
-    """What is being made is to be ended; a scene that was trained so far is kept and shown."""
+    """End what is being made; a scene that was trained so far is kept and shown."""
 
 
 class Leave(Message, tag="leave"):

@@ -1,4 +1,4 @@
-"""What the page shows, as immutable values: looks, the shelf of photographs, keyframes; and what messages change in them.
+"""State of the page as immutable values: looks, the shelf of photographs, keyframes; and the changes that messages make.
 
 A look says how a scene is coloured: `StyleConfig` holds what the sliders set, `Look.config` is the whole style in the terms of
 `style.json`.
@@ -68,7 +68,7 @@ class Look:
     mix: tuple[tuple[Photograph, float], ...] = ()
     """Photographs with their weights, above 0, in the order of the shelf; none = the scene as it is."""
     style: StyleConfig = StyleConfig()
-    """All else, without references and rules."""
+    """The rest of the style; its references and rules are those of the look."""
     rules: frozenset[RegionRule] = frozenset()
 
     @property
@@ -147,7 +147,7 @@ class Key(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """What is shown of a scene."""
+    """A look, a map and a region to draw."""
 
     look: Look
     map: Map = "none"
@@ -157,7 +157,7 @@ class Shown(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """What the page shows, for all clients alike but for their cameras."""
+    """State that all clients share; each has a camera of its own."""
 
     shelf: tuple[Photograph, ...] = ()
     look: Look = field(default_factory=Look)
@@ -173,7 +173,7 @@ class State:
 
     @property
     def shown(self) -> Shown:
-        """What is shown of the scene."""
+        """The part of the state that is drawn."""
         return Shown(self.look, self.map, None if self.picked is None else self.picked.region)
 
     @property

@@ -159,9 +159,3 @@ class Tones(nn.Module):
             tones.known.copy_(self.gains())
             tones.exponent.copy_(self.exponent).requires_grad_(False)
         return tones
-
-    def mixed(self, views: tuple[int, ...], weights: tuple[float, ...]) -> Annotated[Tensor, "3"]:
-        """Factors between those of some views, weighted; weights sum to 1. Means are taken of logarithms."""
-        factor = self(torch.tensor(views)).log()
-        between: Tensor = (factor * torch.tensor(weights).to(factor)[:, None]).sum(0)
-        return between.exp()
