@@ -6,9 +6,8 @@ import pytest
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from style_cases import points, references, scene_of, setting
+from style_cases import points, references, region_adain, scene_of, setting
 from torch import Tensor
-from two_sided import region_adain
 
 from fprf.interfaces import Decoder, Stylizer
 from fprf.plugins.stylizers.config import (

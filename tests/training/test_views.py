@@ -6,8 +6,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from style_cases import region_adain
 from tiny_world import World
-from two_sided import region_adain
 
 from fprf.config import TrainConfig
 from fprf.evaluation.metrics import psnr

@@ -6,8 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from style_cases import points, scene_of, setting
-from two_sided import region_adain
+from style_cases import points, region_adain, scene_of, setting
 
 from fprf.plugins.stylizers.config import (
     AdainConfig,
