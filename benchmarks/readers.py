@@ -1,10 +1,9 @@
-"""A valid file of each kind that somebody else may hand us, with its reader: what `fuzz` mutates."""
+"""A valid file of each kind that somebody else may hand us, with its reader; mutations of them."""
 
 import json
 import random
 import re
 import struct
-import time
 import tracemalloc
 import zipfile
 from collections.abc import Callable
@@ -19,7 +18,6 @@ import torch
 
 from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers.blocknerf import crc32c, masked, read_examples
-from fprf.datamanagers.parsers.colmap import read_model
 from fprf.datamanagers.parsers.config import (
     ColmapConfig,
     LlffConfig,
@@ -41,8 +39,6 @@ from fprf.style.files import read_style
 from fprf.testing import cases
 from fprf.training import checkpoint
 
-WHOLE_EVERY = 16
-"""Rounds of which one is read to the end, where a reader of the bytes alone is known."""
 WORDS = (b"NaN", b"1e400", b"-1", b"0", b"null", b"true", b"[]", b"{}", b"../../etc/passwd", b"\x00", b"\xff\xfe", b"9" * 40)
 VALUES = (b"0", b"-1", b"1e300", b"1e-300", b"null", b'"x"', b"[]", b"{}", b"true", b"0.5", b"65536", b"1e999", b"123456789012")
 """What stands in the place of a number of a text."""
@@ -59,8 +55,6 @@ class Target(NamedTuple):
     """What is mutated; its folder holds whatever else the reader needs."""
     read: Callable[[], object]
     """To the end: a scene, a config, pixels."""
-    parse: Callable[[], object] | None = None
-    """The bytes alone, where what follows takes most of the time."""
 
 
 class Outcome(NamedTuple):
@@ -72,8 +66,6 @@ class Outcome(NamedTuple):
     """Errors of ours, which are of one line (`FprfError`)."""
     faults: tuple[str, ...]
     """Anything else, by round."""
-    slowest: float
-    """Seconds of the processor for the longest round."""
     memory: int
     """Most bytes that Python held at once in a round, where it was watched; 0 otherwise."""
 
@@ -103,35 +95,30 @@ def mutated(data: bytes, draw: random.Random) -> bytes:
     return bytes(raw)
 
 
-def fuzz(target: Target, rounds: int, seed: int, *, first: int = 0, watch_memory: bool = False, quick: bool = False) -> Outcome:
-    """Read `rounds` mutations of the target's file, from number `first` on; the file is put back at the end.
-
-    `quick` ones go to the reader of the bytes where there is one, and each sixteenth through to the end.
-    """
+def fuzz(target: Target, rounds: int, seed: int, *, watch_memory: bool = False) -> Outcome:
+    """Read `rounds` mutations of the target's file; the file is put back at the end."""
     whole = target.file.read_bytes()
     values = refusals = memory = 0
-    slowest, faults = 0.0, []
+    faults = []
     try:
-        for number in range(first, first + rounds):
+        for number in range(rounds):
             draw = random.Random(f"{target.name} {seed} {number}")  # nosec B311  # no secrets
             target.file.write_bytes(mutated(whole, draw))
             if watch_memory:
                 tracemalloc.start()
-            start = time.process_time()
             try:
-                (target.parse if quick and target.parse and number % WHOLE_EVERY else target.read)()
+                target.read()
                 values += 1
             except FprfError:
                 refusals += 1
             except Exception as error:
                 faults.append(f"{number}: {error!r}"[:300])
-            slowest = max(slowest, time.process_time() - start)
             if watch_memory:
                 memory = max(memory, tracemalloc.get_traced_memory()[1])
                 tracemalloc.stop()
     finally:
         target.file.write_bytes(whole)
-    return Outcome(rounds, values, refusals, tuple(faults), slowest, memory)
+    return Outcome(rounds, values, refusals, tuple(faults), memory)
 
 
 SIDE = 24
@@ -171,9 +158,7 @@ def _colmap(folder: Path, *, binary: bool) -> list[Target]:
         (model / f"{kind}.{suffix}").write_bytes(data)
     parser = ColmapConfig().build()
     return [
-        Target(
-            f"COLMAP {kind}.{suffix}", model / f"{kind}.{suffix}", lambda: parser.parse(folder, 1), lambda: read_model(model)
-        )
+        Target(f"COLMAP {kind}.{suffix}", model / f"{kind}.{suffix}", lambda: parser.parse(folder, 1))
         for kind in ("cameras", "images", "points3D")
     ]
 
