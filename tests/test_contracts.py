@@ -13,17 +13,7 @@ from fprf import testing
 from fprf.blocks.config import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig
 from fprf.datamanagers.config import RayBatchesConfig
 from fprf.fields.config import ContentFieldConfig, PlanesConfig, SemanticPlanesConfig
-from fprf.interfaces import (
-    BlockLayout,
-    ContentField,
-    DataManager,
-    Decoder,
-    Encoder,
-    Executor,
-    LossTerm,
-    Sampler,
-    Stylizer,
-)
+from fprf.interfaces import BlockLayout, ContentField, DataManager, Decoder, Encoder, Executor, LossTerm, Sampler, Stylizer
 from fprf.plugins import registry
 from fprf.plugins.decoders.config import DecoderConfig
 from fprf.plugins.encoders.config import EncoderConfig, RandomConfig

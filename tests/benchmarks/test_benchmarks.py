@@ -12,25 +12,10 @@ import torch
 from tiny_world import World, stage_of
 
 from benchmarks.__main__ import BENCHMARKS, main
-from benchmarks.restyle import (
-    BOUND,
-    FLAT,
-    GLOBAL,
-    GOALS,
-    MATCHED,
-    PLAIN,
-    STYLIZERS,
-)
+from benchmarks.restyle import BOUND, FLAT, GLOBAL, GOALS, MATCHED, PLAIN, STYLIZERS
 from benchmarks.speed import plain_planes
-from benchmarks.subject import (
-    difference,
-    exact,
-    plainly,
-    view_rays,
-)
-from benchmarks.town.truth import (
-    true_views,
-)
+from benchmarks.subject import difference, exact, plainly, view_rays
+from benchmarks.town.truth import true_views
 from benchmarks.town.write import read_truth, write_town
 from fprf.evaluation.metrics import psnr
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig

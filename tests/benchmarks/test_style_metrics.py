@@ -13,12 +13,7 @@ from ssim_oracle import noise, ssim_oracle
 from torch import Tensor
 
 from benchmarks.steadiness import published, steadiness
-from benchmarks.style_metrics import (
-    RegionStatistics,
-    delta_e_2000,
-    gaussian_distance,
-    structure,
-)
+from benchmarks.style_metrics import RegionStatistics, delta_e_2000, gaussian_distance, structure
 from benchmarks.town.layout import build_town
 from benchmarks.town.palettes import palette
 from benchmarks.town.render import geometry, render, walk

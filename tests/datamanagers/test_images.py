@@ -20,14 +20,7 @@ from hypothesis import strategies as st
 from photo_files import HEIC, oriented, turned_jpeg, upright
 from PIL import Image, ImageCms
 
-from fprf.datamanagers.images import (
-    image_names,
-    load_image,
-    load_mask,
-    photographs,
-    read_header,
-    useless_masks,
-)
+from fprf.datamanagers.images import image_names, load_image, load_mask, photographs, read_header, useless_masks
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import DataError
 

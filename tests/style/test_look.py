@@ -10,12 +10,7 @@ from style_cases import points, references, region_adain, scene_of, setting
 from torch import Tensor
 
 from fprf.interfaces import Decoder, Stylizer
-from fprf.plugins.stylizers.config import (
-    AdainConfig,
-    LocalAdainConfig,
-    RegionOtConfig,
-    StylizerConfig,
-)
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, StylizerConfig
 from fprf.plugins.stylizers.region import TwoSidedStylizer
 from fprf.style.config import parse_place
 from fprf.style.dictionary import build_dictionary, choose, whole_style

@@ -11,12 +11,7 @@ from tiny_world import World
 
 from fprf.config import TrainConfig
 from fprf.evaluation.metrics import psnr
-from fprf.plugins.stylizers.config import (
-    AdainConfig,
-    LocalAdainConfig,
-    RegionOtConfig,
-    StylizerConfig,
-)
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, StylizerConfig
 from fprf.rendering.cameras import ideal_cameras, pixel_grid, rays_through
 from fprf.rendering.renderer import march
 from fprf.style.config import StyleConfig

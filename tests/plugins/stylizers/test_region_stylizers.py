@@ -8,13 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from style_cases import points, region_adain, scene_of, setting
 
-from fprf.plugins.stylizers.config import (
-    AdainConfig,
-    LocalAdainConfig,
-    RegionOtConfig,
-    RegionToneConfig,
-    StylizerConfig,
-)
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from fprf.plugins.stylizers.region import region_table
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
 from fprf.style.matching import score_spread, share_mean, unit
