@@ -264,8 +264,8 @@ def by_photographs(short: Short, config: PaperConfig, stylizers: Mapping[str, St
     here, there = matched_regions(observer.cpu(), plain, images, regions=_REGIONS, seed=0)
     styled = {name: [(each[name], where) for each, where in zip(shown, here, strict=True)] for name in stylizers}
     judges = {layer: Vgg19Config(layer=layer).build() for layer in ("relu1_1", "relu2_1")}
-    before, style = list(zip(plain, here, strict=True)), list(zip(images, there, strict=True))
-    distances, row = style_distances(judges, before, styled, style), Row()
+    before, target = list(zip(plain, here, strict=True)), list(zip(images, there, strict=True))
+    distances, row = style_distances(judges, before, styled, target), Row()
     for name, pictures in styled.items():
         kept = [structure(a, b) for a, (b, _) in zip(plain, pictures, strict=True)]
         row |= {f"{name}style_distance": distances[name]["mean"], f"{name}structure": math.fsum(kept) / len(kept)}
