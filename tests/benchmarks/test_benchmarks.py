@@ -9,13 +9,13 @@ from typing import Any
 import cv2
 import pytest
 import torch
-from tiny_world import World, stage_of
+from tiny_world import World
 
 from benchmarks.__main__ import BENCHMARKS, main
 from benchmarks.restyle import BOUND, FLAT, GLOBAL, GOALS, MATCHED, PLAIN, STYLIZERS
 from benchmarks.speed import plain_planes
 from benchmarks.subject import difference, exact, plainly, view_rays
-from benchmarks.town.truth import true_views
+from benchmarks.town.truth import set_stage, town_settings, true_views
 from benchmarks.town.write import read_truth, write_town
 from fprf.evaluation.metrics import psnr
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig
@@ -87,7 +87,8 @@ def test_all_that_can_be_known(world: World, night: Path, tmp_path: Path, capsys
 
 
 def test_the_truth_is_the_town_itself(world: World) -> None:
-    stage = stage_of(world.load(), views=2, frames=8, longest=32)
+    trained = world.load()
+    stage = set_stage(trained, trained.known, town_settings(trained.config), views=2, frames=8, longest=32)
     assert stage.settings.seed == 0 and stage.settings.palette == "day"
     assert len(stage.shown) == len(stage.truth) == 2 and len(stage.passed) == len(stage.path_truth) == 8
     held_out = world.load().known.test

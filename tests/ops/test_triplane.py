@@ -6,12 +6,10 @@ from collections.abc import Callable, Sequence
 import numba
 import pytest
 import torch
-from hypothesis import settings
 from torch import Tensor
 
 from fprf.ops.triplane import lookup, lookup_reference, rows, usable, variation, variation_reference
 
-QUICK = settings(max_examples=20, deadline=None)
 Form = Callable[[Tensor, Tensor, Sequence[int]], Tensor]
 U = 2.0**-24
 """Unit round-off of float32."""

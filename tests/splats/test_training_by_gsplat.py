@@ -85,4 +85,4 @@ def test_auto_trains_where_gsplat_draws(
     events = [json.loads(line)["event"] for line in (said.out + said.err).splitlines() if '"event"' in line]
     assert sum("on cuda:0 by gsplat" in each for each in events) == installed
     assert sum("Gaussians are trained on the CPU" in each and "fprf[cuda]" in each for each in events) == (not installed)
-    assert len(open_run(tmp_path / "run", "cpu").scene.gaussians) >= 300
+    assert len(open_run(tmp_path / "run", "cpu").scene.gaussians) > 100
