@@ -351,12 +351,3 @@ def test_plain_plug_ins_keep_to_the_contract() -> None:
 def test_a_breach_is_told(check: Callable[[Any], None], config: Any, breach: str) -> None:
     with pytest.raises(AssertionError, match=breach):
         check(config)
-
-
-def test_a_parser_is_checked_on_a_real_scene(shared: Any) -> None:
-    from fprf.datamanagers.parsers.config import LlffConfig, TransformsConfig
-
-    scenes = shared / "data" / "scenes"
-    testing.check_parser(TransformsConfig(), scenes / "fox")
-    with pytest.raises(Exception, match="poses_bounds"):
-        testing.check_parser(LlffConfig(), scenes / "fox")

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 from splat_ball import ball, equal, plain_ply
+from test_more_formats import covariances, seen_along
 
 from fprf.cli import main as cli
 from fprf.errors import DataError
-from fprf.ops.harmonics import spherical_harmonics as functions
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.rendering.splines import rotations
 from fprf.splats.config import LookConfig
@@ -278,15 +278,9 @@ def test_a_spz_says_its_axes(number: int, tmp_path: Path) -> None:
     change = axes @ torch.tensor([WAYS[letter] for letter in "RUB"]).double()
     assert torch.allclose(found.means.double(), plain.means.double() @ change.T)
 
-    def covariance(of: Gaussians) -> torch.Tensor:
-        half = rotations(of.quaternions.double()) * of.log_scales.double().exp()[:, None]
-        return half @ half.mT
-
-    assert torch.allclose(covariance(found), change @ covariance(plain) @ change.T, atol=1e-6)
+    assert torch.allclose(covariances(found), change @ covariances(plain) @ change.T, atol=1e-6)
     directions = torch.nn.functional.normalize(torch.randn(50, 3).double(), dim=1)
-    before = torch.einsum("dk,nkc->dnc", functions(directions, 4), plain.harmonics.double())
-    after = torch.einsum("dk,nkc->dnc", functions(directions @ change.T, 4), found.harmonics.double())
-    assert torch.allclose(before, after, atol=1e-5)
+    assert torch.allclose(seen_along(plain, directions), seen_along(found, directions @ change.T), atol=1e-5)
     new = found.harmonics * 0.5
     write_capture(tmp_path / "y.spz", capture, new)
     again = read_capture(tmp_path / "y.spz").gaussians

@@ -45,12 +45,6 @@ def test_a_dozen_large_photographs(minutes: float, size: int) -> None:
     assert planned(replace(CONFIG, minutes=minutes), views=11).downscale == size
 
 
-def test_a_faster_machine_is_given_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    few = planned(replace(CONFIG, minutes=3)).most
-    monkeypatch.setattr(module, "machine_speed", lambda: 8.0)
-    assert planned(replace(CONFIG, minutes=3)).most > few
-
-
 def test_what_is_given_stays() -> None:
     given = replace(CONFIG, minutes=1, downscale=7, cap=12_345, passes=9, steps=77)
     assert planned(given) == given
