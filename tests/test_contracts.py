@@ -26,8 +26,10 @@ from fprf.types import Batch, Cell, FieldSample, Rendered, Sampled, Site, Want
 
 BUILT_IN: list[tuple[Callable[[Any], None], Any]] = [
     (testing.check_encoder, RandomConfig(channels=5, stride=3)),
-    (testing.check_sampler, UniformConfig(samples=4)),
-    (testing.check_sampler, ProposalConfig(samples=(8,), final=4, resolutions=(8,))),
+    (testing.check_sampler, UniformConfig(samples=1)),
+    (testing.check_sampler, UniformConfig(samples=33)),
+    (testing.check_sampler, ProposalConfig(samples=(5,), final=1, resolutions=(4,), channels=3)),
+    (testing.check_sampler, ProposalConfig(samples=(20, 10, 6), final=4, resolutions=(4, 4, 9), padding=1.0)),
     (testing.check_content_field, PlanesConfig(resolutions=(4, 8), channels=2, hidden=8)),
     (testing.check_content_field, PlanesConfig(resolutions=(5,), channels=3, hidden=4, layers=0, degree=1)),
     (testing.check_semantic_field, SemanticPlanesConfig(resolutions=(4, 8), channels=2, hidden=8)),
