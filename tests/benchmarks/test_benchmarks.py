@@ -4,7 +4,6 @@ import importlib.util
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import pytest
@@ -56,28 +55,17 @@ def test_a_mistake_is_one_line(line: str, told: str, world: World, capsys: pytes
     assert lines[1].startswith("error: ") and told in lines[1]
 
 
-def peer(world: World, frames: Path, output: Path, *more: str) -> dict[str, Any]:
-    cameras = str(world.town / "transforms.json")
-    args = ["peer", str(frames), "--cameras", cameras, "--device", "cpu", "--output", str(output), *more]
-    assert main(args) == 0
-    document: dict[str, Any] = json.loads(output.read_text())
-    return document
-
-
-@pytest.fixture(scope="module")
-def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("night") / "town"
-    write_town(folder, seed=0, palette="night", views=10, width=32, height=24)
-    return folder
-
-
-def test_all_that_can_be_known(world: World, night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_peer_s_frames_are_judged_by_all_that_can_be_known(
+    world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The town at night as a peer's restyling of the town by day: exact, and nothing is missing."""
-    images, page = str(world.town / "images"), tmp_path / "page.md"
-    document = peer(
-        world, night / "images", tmp_path / "a.json", "--plain", images, "--depth", str(world.town / "depth"),
-        "--truth", str(night / "images"), "--references", str(world.references[0]), "--page", str(page),
-    )  # fmt: skip
+    write_town(tmp_path / "night", seed=0, palette="night", views=10, width=32, height=24)
+    frames, plain = str(tmp_path / "night" / "images"), str(world.town / "images")
+    page, output = tmp_path / "page.md", tmp_path / "peer.json"
+    words = ["--cameras", str(world.town / "transforms.json"), "--plain", plain, "--depth", str(world.town / "depth")]
+    words += ["--truth", frames, "--references", str(world.references[0]), "--page", str(page), "--output", str(output)]
+    assert main(["peer", frames, *words, "--device", "cpu"]) == 0
+    document = json.loads(output.read_text())
     assert document["frames"] == 10 and document["size"] == [32, 24] and document["missing"] == {}
     assert document["truth"] == {"psnr": 99.0, "cc_psnr": 99.0, "ssim": 1.0, "lpips": 0.0, "delta_e": 0.0}
     assert document["published"]["short"]["pairs"] > 0 and document["published"]["long"]["rmse"] > 0

@@ -228,7 +228,6 @@ def test_other_encoders_references_are_refused() -> None:
 
 BOTH = (region_adain, RegionOtConfig)
 CONFIG = region_adain(whitening=0.0, recentred=0)
-PAPER = LocalAdainConfig(similarity="dot", centred=False, relative=False, temperature=1.0)
 Config = Callable[..., StylizerConfig]
 
 
@@ -317,7 +316,7 @@ def test_a_region_that_no_reference_shows_takes_the_codes_of_one_that_looks_like
     st.integers(1, 12),
     st.sampled_from([0.0, 1e-6, 1.0, 1e4]),
     st.sampled_from([0.0, 1e-6, 1.0, 1e4]),
-    st.sampled_from([AdainConfig(), LocalAdainConfig(), PAPER, region_adain(), RegionOtConfig(), RegionToneConfig()]),
+    st.sampled_from([AdainConfig(), LocalAdainConfig(), FORM, region_adain(), RegionOtConfig(), RegionToneConfig()]),
 )
 def test_never_nan_for_degenerate_scenes_and_styles(
     n: int, regions: int, clusters: int, here: float, there: float, config: StylizerConfig
