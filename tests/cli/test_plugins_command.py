@@ -1,20 +1,11 @@
 """`fprf plugins` lists and checks what is installed; verbs that packages add are parsed and called like built-in ones."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
-from fake_packages import ENCODER, Packages, packages_in
+from fake_packages import ENCODER, Packages
 
 from fprf.cli import main as cli
 from fprf.cli.config import CommandConfig
 from fprf.cli.plugins import faults, run
-
-
-@pytest.fixture
-def packages(tmp_path: Path) -> Iterator[Packages]:
-    with packages_in(tmp_path) as found:
-        yield found
 
 
 def test_built_ins_are_listed_and_load(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,11 +68,10 @@ class CountConfig(CommandConfig):
 
 
 @pytest.fixture
-def counting(tmp_path: Path) -> Iterator[Packages]:
-    with packages_in(tmp_path) as found:
-        point = {CommandConfig.group: {"count": "acme_count:CountConfig"}}
-        found.install("acme-count", point, code={"acme_count": COUNT}, version="0.2")
-        yield found
+def counting(packages: Packages) -> Packages:
+    point = {CommandConfig.group: {"count": "acme_count:CountConfig"}}
+    packages.install("acme-count", point, code={"acme_count": COUNT}, version="0.2")
+    return packages
 
 
 def test_it_is_parsed_and_called_like_a_built_in_one(counting: Packages, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,13 +1,12 @@
 """Formats of files of Gaussians as plug-ins: a stranger's one file and one entry point are enough for every reader and verb."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from fake_packages import packages_in
+from fake_packages import Packages
 from splat_ball import ball
 
 from fprf import testing
@@ -63,11 +62,8 @@ class Toy(CaptureFormat):
 
 
 @pytest.fixture
-def toy(tmp_path: Path) -> Iterator[None]:
-    (tmp_path / "site").mkdir()
-    with packages_in(tmp_path / "site") as packages:
-        packages.install("acme-toy", {"fprf.captures": {"toy": "acme_toy:Toy"}}, code={"acme_toy": CODE})
-        yield
+def toy(packages: Packages) -> None:
+    packages.install("acme-toy", {"fprf.captures": {"toy": "acme_toy:Toy"}}, code={"acme_toy": CODE})
 
 
 @pytest.mark.parametrize("name", ["ply", "compressed.ply", "splat", "spz", "sog", "glb", "gltf", "ksplat", "lod-meta.json"])
