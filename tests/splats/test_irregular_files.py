@@ -21,12 +21,12 @@ from fprf.ops.harmonics import spherical_harmonics as functions
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.rendering.local_frame import read_offset
 from fprf.rendering.splines import rotations
+from fprf.splats.captures import look_at_capture
 from fprf.splats.config import LookConfig
 from fprf.splats.files import Capture, Written, read_capture, write_capture, write_gaussians
 from fprf.splats.files.sog import bundle, unbundle
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.photographs import camera_of
-from fprf.splats.scene import look_at_capture
 from fprf.splats.views import draw, find_views
 
 # How far positions in a unit ball and ln-scales from -6 to -1 may move.
