@@ -105,7 +105,7 @@ class Light(nn.Module):
         allowed: Annotated[Tensor, "K references"],
     ) -> None:
         super().__init__()
-        self.membership, self.bold, self._spread = Membership(scene), bold, _spread(scene)
+        self.membership, self.bold, self._spread = Membership(scene.keys, scene.semantic_mean), bold, _spread(scene)
         self._restricted = not bool(allowed.all())
         self.register_buffer("maps", (maps - torch.eye(4, 3).to(maps)).float())
         self.register_buffer("between", between.float())

@@ -114,7 +114,7 @@ class ColourMaps(nn.Module):
         self, scene: SceneStyle, matrix: Annotated[Tensor, "K 3 3"], bias: Annotated[Tensor, "K 3"], share: float
     ) -> None:
         super().__init__()
-        self.membership = Membership(scene)
+        self.membership = Membership(scene.keys, scene.semantic_mean)
         # The identity is taken out: what is small stays exact, and a map that changes nothing is nothing.
         self.register_buffer("matrix", (share * (matrix - torch.eye(3).to(matrix))).float())
         self.register_buffer("bias", (share * bias).float())

@@ -65,7 +65,7 @@ def match_map(scene: Scene, styled: Styled, view: int, cameras: Cameras | None =
     """Matches of one of the scene's scene_style views, or of `cameras`: geometry and semantics alone are computed."""
     cameras, scene_style, look = scene.cameras if cameras is None else cameras, styled.scene_style, styled.restyle
     device = scene.device
-    belongs = Membership(scene_style).to(device)
+    belongs = Membership(scene_style.keys, scene_style.semantic_mean).to(device)
     centre, units, codes = scene_style.semantic_mean.to(device), styled.codes.units.to(device), len(styled.codes.reference)
 
     def values(semantic: Tensor, points: Tensor | None) -> Tensor:

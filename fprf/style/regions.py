@@ -138,7 +138,7 @@ def memberships(
     scene: Scene, style: SceneStyle, cameras: Cameras, view: int, pixel: Annotated[Tensor, "N 2"]
 ) -> tuple[Annotated[Tensor, "N K"], Annotated[Tensor, "N"]]:
     """Share of what pixels (centres) see that belongs to each region of a scene's style, and their opacity."""
-    belongs = Membership(style).to(scene.device)
+    belongs = Membership(style.keys, style.semantic_mean).to(scene.device)
     return scene.paint(cameras, view, pixel, lambda features, points: belongs(features), semantic=belongs.divided)
 
 

@@ -107,7 +107,7 @@ class TwoSidedStylizer(Stylizer):
         else:
             matrix = (style_sigma / sigma).clamp_max(config.gain)
             bias = style_mean - away * matrix
-        self.membership = Membership(scene)
+        self.membership = Membership(scene.keys, scene.semantic_mean)
         self.register_buffer("centre", scene.mean.float())
         self.register_buffer("table", table.to(scene.mean))
         self.register_buffer("matrix", matrix.to(scene.mean))
