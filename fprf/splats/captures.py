@@ -31,7 +31,7 @@ from ..training.prepare import cache_folder
 from .config import LookConfig
 from .files import Capture, read_capture, release
 from .files.base import pieces
-from .gaussians import Gaussians, bulk_of
+from .gaussians import Gaussians, bulk_of, cells_of
 from .restyle import restyled_harmonics
 from .scene import SplatScene
 from .semantics import Semantics, find_semantics, load_semantics, semantics_tensors, tensor_group
@@ -379,9 +379,3 @@ class Neighbours:
             out[left[found]] = means[at[found]]
             left = left[~found]
         return out
-
-
-def cells_of(places: Annotated[Tensor, "N 3"], low: Annotated[Tensor, "3"], edge: float) -> Annotated[Tensor, "N"]:
-    """Numbers of cells that begin at `low`; places far outside share those at the border."""
-    cell: Tensor = ((places - low) / edge).clamp(-1, 2.0**20).long() + 1
-    return (cell[:, 0] << 42) + (cell[:, 1] << 21) + cell[:, 2]

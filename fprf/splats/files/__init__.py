@@ -23,8 +23,6 @@ __all__ = ["Capture", "Written", "read_capture", "release", "write_capture", "wr
 
 _MAPPED = 1 << 28
 """Bytes from which on files are mapped."""
-_TESTED = 1 << 12
-"""Gaussians of which it is asked at a time whether any can be drawn."""
 
 
 class Written(NamedTuple):
@@ -63,12 +61,12 @@ def read_capture(path: Path) -> Capture:
     release(data)
     if not len(capture.gaussians):
         raise DataError(f"{path}: holds no Gaussian")
-    parts = (capture.gaussians.select(slice(start, start + _TESTED)) for start in range(0, len(capture.gaussians), _TESTED))
-    if not any(bool(part.finite.any()) for part in parts):  # mostly the first part tells
+    finite = capture.gaussians.finite
+    if not bool(finite.any()):
         reasons = " and ".join(capture.gaussians.faults())
         raise DataError(f"{path}: holds no Gaussian that can be drawn, but {reasons}; export the capture again")
     # Far from 0, float32 rounds a capture to a few places along an axis; positions that were float64 have further digits.
-    local = capture.gaussians.means[capture.gaussians.finite].numpy()
+    local = capture.gaussians.means[finite].numpy()
     for axis, away in zip(local.T, np.abs(capture.shift), strict=True):
         step = float(np.spacing(np.float32(away)))
         if not away or step <= 0.05 * bulk_of(local).side or bool((axis == axis[0]).all()):

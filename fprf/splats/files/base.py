@@ -8,6 +8,7 @@ A reader never allocates on a file's word: what a header claims is held against 
 """
 
 import mmap
+import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +37,8 @@ Recolour: TypeAlias = Callable[[Floats, Bools], Iterable[bytes]]
 
 ROWS = 1 << 17
 """Gaussians that are decoded or encoded at a time, so that the intermediate arrays of large files stay small."""
+UNSOUND = (LookupError, TypeError, ValueError, AttributeError, RecursionError, OverflowError, struct.error)
+"""What a document that is no valid index of a format raises where it is taken apart."""
 _EDGE = 1e-6
 """Opacities of exactly 0 and 1 have no logit: both keep this distance, far below a 16-bit step."""
 _MOST = 64.0
@@ -167,6 +170,17 @@ def in_world(table: NDArray[np.void], local: Floats, origin: Origin) -> NDArray[
     for name, column, of in zip("xyz", local.astype(np.float64).T, origin, strict=True):
         out[name] = column + of
     return out
+
+
+def beside(path: Path, name: str) -> bytes:
+    """The content of a file in the folder of another one that names it, or below. Raises DataError where there is none."""
+    file = path.parent / name
+    try:
+        if not file.resolve().is_relative_to(path.parent.resolve()):
+            raise DataError(f"{path}: {name!r} is no file beside it; export the capture again")
+        return file.read_bytes()
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: {name} beside it cannot be read; copy the whole folder") from error
 
 
 def release(data: Data) -> None:
