@@ -13,14 +13,10 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from ..interfaces import Encoder, Stylizer
+from ..interfaces import Encoder
 from ..ops.harmonics import Directions, recoloured, spherical_harmonics
-from ..ops.precision import double
-from ..plugins.stylizers.config import StylizerConfig
-from ..style.dictionary import StyleDictionary
 from ..style.light import luma
-from ..style.look import ColourMaps, Restyle, carried_colours, place_weight
-from ..style.scene_style import SceneStyle, own_style
+from ..style.look import Restyle, place_weight
 
 _DIRECTIONS = 48
 """In which harmonics are evaluated to find where renderers cut their colours."""
@@ -112,17 +108,3 @@ def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tenso
         return painted
     paint = part.light.paint(semantic, belongs)
     return paint[..., None] * painted + part.light.change(semantic, paint, belongs)
-
-
-def region_maps(
-    stylizer: Stylizer, dictionary: StyleDictionary, style: SceneStyle, config: StylizerConfig
-) -> ColourMaps | None:
-    """Carry the colours of each region over to those of the codes that it takes; None where the config asks for none."""
-    if config.colours <= 0:
-        return None
-    # Matched with itself as with the photographs, the scene keeps its colours.
-    mine = own_style(style, dictionary.blend)._replace(origin=dictionary.origin)
-    table = double(config.build(dictionary=mine, scene=style).region_match(style.keys))
-    mean, covariances = table @ double(mine.mean), torch.einsum("kt,tij->kij", table, double(mine.covariance))
-    taken = double(stylizer.region_match(style.keys))
-    return ColourMaps(style, *carried_colours(mean, covariances, taken, dictionary), config.colours)

@@ -14,19 +14,18 @@ from torch import Tensor
 
 from ..datamanagers.basis import Basis
 from ..datamanagers.scene import Scene as ParsedScene
-from ..interfaces import Encoder, Scene, SceneView, Stylizer, Values
-from ..plugins.stylizers.config import StylizerConfig
+from ..interfaces import Encoder, Scene, SceneView, Values
 from ..rendering.cameras import Cameras, pixel_grid
 from ..rendering.renderer import enlarged
-from ..style.dictionary import Encoders, StyleDictionary
-from ..style.look import ColourMaps, Restyle
+from ..style.dictionary import Encoders
+from ..style.look import Restyle
 from ..style.scene_style import SceneStyle
 from ..training.camera_optimizers import Tones
 from ..types import Origin, View
 from .gaussians import GaussianRows, Gaussians
 from .levels import Levels, StyledLevels
 from .photographs import cover, distorted
-from .restyle import Colours, region_maps, restyled_harmonics
+from .restyle import Colours, restyled_harmonics
 from .semantics import Semantics
 from .views import SeenMeans, draw, seen_means
 
@@ -207,17 +206,6 @@ class SplatScene(Scene):
         """Colours in the place of content, and the semantic encoder. Raises WeightsError where weights are missing."""
         found = self.found()
         return Encoders(Colours(), self.encoder(), found.basis, found.style, longest=self.longest)
-
-    def colour_maps(
-        self,
-        stylizer: Stylizer,
-        dictionary: StyleDictionary,
-        style: SceneStyle,
-        config: StylizerConfig,
-        allowed: Annotated[Tensor, "K references"],
-    ) -> ColourMaps | None:
-        """From region to codes; the stylizer knows what is allowed."""
-        return region_maps(stylizer, dictionary, style, config)
 
 
 @dataclass(frozen=True, eq=False)

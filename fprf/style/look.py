@@ -31,7 +31,7 @@ from ..types import Want
 from .config import Place
 from .dictionary import StyleDictionary, blend_codes, choose
 from .light import Light, luma
-from .scene_style import Membership, RegionWeight, SceneStyle, mixed_maps
+from .scene_style import Membership, RegionWeight, SceneStyle, mixed_maps, own_style
 from .statistics import mix, monge, symmetric_root
 
 if TYPE_CHECKING:
@@ -171,6 +171,23 @@ def colour_maps(
     return ColourMaps(scene, *carried_colours(mean, covariances, table, dictionary), share)
 
 
+def region_maps(
+    stylizer: Stylizer, dictionary: StyleDictionary, scene: SceneStyle, config: "StylizerConfig"
+) -> ColourMaps | None:
+    """The maps of scenes whose content is colour (there is no decoder); None where the config asks for none.
+
+    The colours of each region are carried over to those of the codes that it takes.
+    """
+    if config.colours <= 0:
+        return None
+    # Matched with itself as with the photographs, the scene keeps its colours.
+    mine = own_style(scene, dictionary.blend)._replace(origin=dictionary.origin)
+    table = double(config.build(dictionary=mine, scene=scene).region_match(scene.keys))
+    mean, covariances = table @ double(mine.mean), torch.einsum("kt,tij->kij", table, double(mine.covariance))
+    taken = double(stylizer.region_match(scene.keys))
+    return ColourMaps(scene, *carried_colours(mean, covariances, taken, dictionary), config.colours)
+
+
 def carried_colours(
     mean: Annotated[Tensor, "K 3"],
     covariances: Annotated[Tensor, "K 3 3"],
@@ -194,9 +211,14 @@ def carried_colours(
 
 @torch.no_grad()
 def decoded_colours(
-    stylizer: Stylizer, scene: SceneStyle, decoder: Decoder, *, features: float = 1.0
+    stylizer: Stylizer, scene: SceneStyle, decoder: Decoder | None, *, features: float
 ) -> tuple[Annotated[Tensor, "K 3"], Annotated[Tensor, "K 3 3"]]:
-    """Mean and covariance of each region's colours, float64, after the stylizer and the decoder."""
+    """Mean and covariance of each region's colours, float64, after a share of the stylizer's change, and the decoder.
+
+    Without a decoder they are those of the content, unchanged.
+    """
+    if decoder is None:
+        return double(scene.region_mean), double(scene.region_covariance)
     device = next(stylizer.buffers(), scene.mean).device
     draw = torch.randn(_DRAWS // 2, scene.mean.numel(), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     draw = torch.cat([draw, -draw])  # in pairs: the features' mean is met exactly
@@ -211,15 +233,6 @@ def decoded_colours(
         means.append(colour.mean(0))
         covariances.append(torch.cov(colour.T, correction=0))
     return torch.stack(means), torch.stack(covariances)
-
-
-def own_colours(
-    stylizer: Stylizer, scene: SceneStyle, decoder: Decoder | None
-) -> tuple[Annotated[Tensor, "K 3"], Annotated[Tensor, "K 3 3"]]:
-    """Mean and covariance of each region's own colours, float64; without a decoder they are the content."""
-    if decoder is None:
-        return double(scene.region_mean), double(scene.region_covariance)
-    return decoded_colours(stylizer, scene, decoder, features=0.0)
 
 
 def regional(

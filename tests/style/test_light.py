@@ -10,10 +10,10 @@ from fprf.interfaces import Decoder
 from fprf.ops.harmonics import as_drawn
 from fprf.plugins.stylizers.config import RegionToneConfig
 from fprf.splats.gaussians import HARMONIC
-from fprf.splats.restyle import all_around, region_maps, restyled_harmonics
+from fprf.splats.restyle import all_around, restyled_harmonics
 from fprf.style.dictionary import Reference, build_dictionary
 from fprf.style.light import APPLIED, Light, light_maps, light_of, unrivalled
-from fprf.style.look import Restyle
+from fprf.style.look import Restyle, region_maps
 from fprf.style.scene_style import SceneStyle, scene_style
 
 KINDS, EACH = 4, 150
