@@ -54,7 +54,19 @@ def restyled_harmonics(
     directions = all_around(before.shape[1])
     for start in range(0, len(before), _ROWS):
         rows = slice(start, start + _ROWS)
-        change, weight = _change(look, means[rows], semantic[rows].to(means))
+        # The change against the identity, A and below it b of each Gaussian (c' = c + c A + b), and how strongly the look acts.
+        features = semantic[rows].to(means)
+        change, weight = features.new_zeros(len(features), 4, 3), features.new_zeros(len(features))
+        for part in look.parts:
+            if part.share == 0 or part.strength == 0:
+                continue
+            regions = features.new_ones(len(features), 1) if part.regions is None else part.regions(features)
+            acts, added = part.share * part.strength * regions, _added(part, features)
+            for place, other in part.places:  # a later place lies over those before it
+                inside = place_weight(place, means[rows])[:, None]
+                if bool(inside.any()):
+                    added = torch.lerp(added, _added(other, features), inside[..., None])
+            change, weight = change + acts[..., None] * added, weight + acts[:, 0]
         if kept > 0:  # what the map adds to luma is taken back from all channels alike
             change = change - kept * luma(change)
         out[rows] = recoloured(before[rows], change, weight, directions)
@@ -70,25 +82,6 @@ def all_around(bands: int) -> Directions:
     around = torch.stack([flat * turn.cos(), flat * turn.sin(), height], 1)
     values = spherical_harmonics(around, math.isqrt(min(bands, 16)))
     return Directions(values.T.contiguous(), torch.linalg.pinv(values))
-
-
-def _change(
-    look: Restyle, means: Annotated[Tensor, "N 3"], semantic: Annotated[Tensor, "N D"]
-) -> tuple[Annotated[Tensor, "N 4 3"], Annotated[Tensor, "N"]]:
-    """The change of a look against the identity: A and below it b of each Gaussian, c' = c + c A + b, and its strength."""
-    change, weight = semantic.new_zeros(len(semantic), 4, 3), semantic.new_zeros(len(semantic))
-    for part in look.parts:
-        if part.share == 0 or part.strength == 0:
-            continue
-        regions = semantic.new_ones(len(semantic), 1) if part.regions is None else part.regions(semantic)
-        acts = part.share * part.strength * regions
-        added = _added(part, semantic)
-        for place, other in part.places:
-            inside = place_weight(place, means)[:, None]
-            if bool(inside.any()):
-                added = torch.lerp(added, _added(other, semantic), inside[..., None])
-        change, weight = change + acts[..., None] * added, weight + acts[:, 0]
-    return change, weight
 
 
 def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N 4 3"]:

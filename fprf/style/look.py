@@ -24,7 +24,6 @@ import torch
 from torch import Tensor, nn
 
 from ..checks import between
-from ..errors import UsageError
 from ..interfaces import Decoder, Stylizer
 from ..ops.precision import double
 from ..types import Want
@@ -43,24 +42,6 @@ _GAIN = 3.0
 """No direction of colour is amplified more: a flat region's noise must stay unseen."""
 _QUIET = 2e-4
 """Variance added on both sides: a deviation of four 8-bit steps, below which colours have no shape worth carrying over."""
-
-
-def blend_strength(
-    content: Annotated[Tensor, "N C"], styled: Annotated[Tensor, "N C"], strength: float | Annotated[Tensor, "N 1"]
-) -> Annotated[Tensor, "N C"]:
-    """Between the scene's features (strength 0, bit for bit) and the styled ones (strength 1, bit for bit), all finite.
-
-    Raises UsageError for one strength outside [0, 1].
-    """
-    if isinstance(strength, Tensor):
-        return torch.lerp(content, styled, strength.to(content))
-    if not 0.0 <= strength <= 1.0:
-        raise UsageError(f"strength: {strength} must lie in [0, 1]")
-    if strength == 0.0:
-        return content
-    if strength == 1.0:
-        return styled
-    return torch.lerp(content, styled, strength)
 
 
 def keep_luminance(
@@ -108,7 +89,6 @@ class ColourMaps(nn.Module):
 
     matrix: Annotated[Tensor, "K 3 3"]
     bias: Annotated[Tensor, "K 3"]
-    origin: Annotated[Tensor, "3"]
 
     def __init__(
         self, scene: SceneStyle, matrix: Annotated[Tensor, "K 3 3"], bias: Annotated[Tensor, "K 3"], share: float
@@ -118,7 +98,6 @@ class ColourMaps(nn.Module):
         # The identity is taken out: what is small stays exact, and a map that changes nothing is nothing.
         self.register_buffer("matrix", (share * (matrix - torch.eye(3).to(matrix))).float())
         self.register_buffer("bias", (share * bias).float())
-        self.register_buffer("origin", torch.zeros(3))
 
     @property
     def needs(self) -> Want:
@@ -137,7 +116,7 @@ class ColourMaps(nn.Module):
         """
         if belongs is None:
             belongs = self.membership(colour[:, :0] if semantic is None else semantic)
-        change = mixed_maps(colour.to(self.bias), belongs.to(self.bias), self.matrix, self.bias, centre=self.origin)
+        change = mixed_maps(colour.to(self.bias), belongs.to(self.bias), self.matrix, self.bias)
         return (colour + change.to(colour)).clamp(0, 1) - colour
 
 
@@ -228,8 +207,8 @@ def decoded_colours(
         root = symmetric_root(double(scene.region_covariance[k])).cpu()
         points = (double(scene.region_mean[k]).cpu() + draw @ root).float().to(device)
         key = scene.keys[k].to(device).expand(len(points), -1)
-        styled = blend_strength(points, stylizer(points, key if Want.SEMANTIC in stylizer.needs else None), features)
-        colour = double(decoder(styled)).cpu()
+        styled = stylizer(points, key if Want.SEMANTIC in stylizer.needs else None)
+        colour = double(decoder(torch.lerp(points, styled, features))).cpu()
         means.append(colour.mean(0))
         covariances.append(torch.cov(colour.T, correction=0))
     return torch.stack(means), torch.stack(covariances)
@@ -395,7 +374,9 @@ class Restyle:
                 assert semantic is not None, "Want.SEMANTIC was asked for"
                 paint = part.light.paint(semantic, belongs)
                 painted = strength * paint.to(content)
-            styled.append(blend_strength(content, moved, part.features * painted))
+            # At 0 the scene's own features, at 1 the styled ones, both bit for bit.
+            share = part.features * painted
+            styled.append(torch.lerp(content, moved, share.to(content) if isinstance(share, Tensor) else share))
             active.append((part, belongs, strength, painted, paint))
         # Mix the parts by their shares; one alone is left as it is, bit for bit.
         mixed, luminance = styled[0], parts[0].luminance

@@ -125,15 +125,12 @@ def mixed_maps(
     share: Annotated[Tensor, "N K"],
     matrix: Annotated[Tensor, "K C C"],
     bias: Annotated[Tensor, "K C"],
-    *,
-    centre: Annotated[Tensor, "C"],
 ) -> Annotated[Tensor, "N C"]:
-    """sum_k share_k ((x - centre) matrix_k + bias_k): the affine maps of regions, mixed by membership.
+    """sum_k share_k (x matrix_k + bias_k): the affine maps of regions, mixed by membership.
 
-    Within (C + K + 3) u sum_k share_k (|x - centre| |matrix_k| + |bias_k|), u = 2^-24.
+    Within (C + K + 3) u sum_k share_k (|x| |matrix_k| + |bias_k|), u = 2^-24.
     """
     with full_precision(x):
-        x = x - centre
         if len(matrix) == 1:
             return x @ matrix[0] + bias[0]
         mixed = share @ bias

@@ -27,7 +27,7 @@ from ...rendering.cameras import Cameras
 from ...rendering.local_frame import local_origin
 from ...types import Origin
 from ..config import CAPTURES, endings, format_name
-from ..gaussians import Gaussians, bulk_of, from_arrays, morton_order
+from ..gaussians import GaussianRows, Gaussians, bulk_of, from_arrays, morton_order
 
 Data: TypeAlias = bytes | mmap.mmap
 """The content of a file: large ones are mapped. Both are sliced into bytes, and read by np.frombuffer."""
@@ -106,6 +106,10 @@ class CaptureFormat(PluginConfig):
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> Iterable[bytes]:
         """The file of these Gaussians, on the CPU, in pieces. `origin` is to be added to their positions; 0 unless `exact`."""
         raise DataError(f"{type(self).__name__}: files of this format are read, not written; name a .ply, .spz, .sog or .glb")
+
+    def pack_rows(self, rows: GaussianRows, origin: Origin) -> Iterable[bytes]:
+        """`pack` of Gaussians that need not all be in memory."""
+        return self.pack(rows.part(slice(0, rows.count)), rows.antialiased, origin)
 
     def keeps(self, gaussians: Gaussians) -> NDArray[np.bool_] | None:
         """Gaussians [N] that a file holds: all but outliers that would cost the others their precision; None = all."""
