@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from ..blocks.fields import BlockedField, BlockedSampler, BlockedSemantic, Member, Members, ResidentMembers, inherit
 from ..blocks.partition import read_cells
-from ..blocks.routing import BlendRouter, InsetRouter, Router, SingleRouter, chart_of, surroundings_of
+from ..blocks.routing import BlendRouter, InsetRouter, Router, chart_of, surroundings_of, to_single
 from ..config import TrainConfig
 from ..errors import CheckpointError
 from ..interfaces import Decoder
@@ -85,7 +85,7 @@ def surroundings(config: TrainConfig, facts: Facts, cells: Sequence[Cell]) -> Bu
     decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
     member = Member(surroundings_of(cells), *build_fields(config, facts))
     tones, poses = tones_of(facts), poses_of(facts, config.poses)
-    model = assemble(config, facts, ResidentMembers([member]), SingleRouter(), decoder, tones, poses)
+    model = assemble(config, facts, ResidentMembers([member]), to_single, decoder, tones, poses)
     check_parts(config, model.parts, facts.channels, facts.dim)
     return Built(model, member)
 

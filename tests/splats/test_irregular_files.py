@@ -13,11 +13,11 @@ from splat_ball import ball, plain_ply
 
 from fprf.errors import DataError
 from fprf.plugins.encoders.config import BundledSemanticConfig
+from fprf.splats.captures import look_at_capture
 from fprf.splats.config import LookConfig
 from fprf.splats.files import Capture, Written, read_capture, write_capture
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.photographs import camera_of
-from fprf.splats.scene import look_at_capture
 from fprf.splats.views import draw, find_views
 
 # How far positions in a unit ball and ln-scales from -6 to -1 may move.
