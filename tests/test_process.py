@@ -8,7 +8,7 @@ import pytest
 FAULTS = """
 import resource, sys
 if sys.argv[1] == "kept":
-    from fprf.process import keep_memory
+    from fprf.memory import keep_memory
     if not keep_memory():
         print("refused"); sys.exit()
 import numpy

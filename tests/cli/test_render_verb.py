@@ -30,9 +30,9 @@ def test_captured_views_keep_their_names_and_are_those_of_eval(run: Path, tmp_pa
     assert all(np.array_equal(frames[name], plain[name]) for name in frames)
 
 
-def test_a_gif_is_a_file(run: Path, world: World, tmp_path: Path) -> None:
-    render(run, tmp_path / "a.gif", "--path", "spiral", "--frames", "2", "--references", str(world.references[0]))
-    assert (tmp_path / "a.gif").read_bytes().startswith(b"GIF89a") and len(list(tmp_path.iterdir())) == 2
+def test_a_film_is_a_file(run: Path, world: World, tmp_path: Path) -> None:
+    render(run, tmp_path / "a.mp4", "--path", "spiral", "--frames", "2", "--references", str(world.references[0]))
+    assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp" and len(list(tmp_path.iterdir())) == 2
 
 
 def test_several_looks_and_channels_lie_beside_each_other(run: Path, world: World, tmp_path: Path) -> None:

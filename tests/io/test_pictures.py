@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from fprf.errors import DataError, NumericsError
 from fprf.io.images import encode, shrink, srgb_to_linear, to_uint8, write_image
-from fprf.io.maps import depth_image, depth_limits, match_image, match_summary, palette
-from fprf.io.sheet import side_by_side
+from fprf.io.maps import depth_image, depth_limits, match_image, match_summary, palette, side_by_side
 from fprf.io.video import missing_frames
 
 

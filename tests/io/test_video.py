@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fprf.errors import DataError, UsageError
-from fprf.io.video import write_frames, write_video
+from fprf.io.video import write_video
 
 COLOURS = [(230, 40, 40), (40, 200, 60), (30, 60, 220), (240, 240, 240), (10, 10, 10)]
 
@@ -39,18 +39,6 @@ def test_a_film_reads_back(tmp_path: Path, h264: bool, size: tuple[int, int]) ->
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize(("ending", "far"), [(".gif", 12), (".webp", 8), (".apng", 0)])
-def test_animated_pictures_read_back(tmp_path: Path, ending: str, far: int) -> None:
-    path = tmp_path / f"film{ending}"
-    assert write_video(path, flat(48, 64), 24) == ending[1:]
-    read, found = cv2.imdecodeanimation(np.frombuffer(path.read_bytes(), np.uint8))
-    assert read and len(found.frames) == len(COLOURS) and found.loop_count == 0
-    assert sum(found.durations) == pytest.approx(5 / 24 * 1000, abs=5), "roundings do not add up"
-    for frame, colour in zip(found.frames, COLOURS, strict=True):
-        assert np.abs(frame[:, :, 2::-1].mean((0, 1)) - colour).max() <= far, "GIF dithers"
-    assert list(tmp_path.iterdir()) == [path]
-
-
 def test_a_film_plays_while_it_loads_and_says_its_colours(tmp_path: Path) -> None:
     av = pytest.importorskip("av")
     path = tmp_path / "film.mp4"
@@ -76,17 +64,3 @@ def test_wrong_requests_leave_nothing(tmp_path: Path) -> None:
             with pytest.raises(DataError):
                 write_video(tmp_path / "x.mp4", frames, 10, h264=h264)
     assert not list(tmp_path.iterdir())
-
-
-def test_frames_as_pictures_are_exact_and_named(tmp_path: Path) -> None:
-    paths = write_frames(tmp_path / "out", ["0001", "b.c", "x", "y", "z"], flat(5, 7))
-    assert [path.name for path in paths] == ["0001.png", "b.c.png", "x.png", "y.png", "z.png"]
-    assert sorted((tmp_path / "out").iterdir()) == sorted(paths)
-    for path, frame in zip(paths, flat(5, 7), strict=True):
-        assert np.array_equal(cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB), frame)
-
-
-@pytest.mark.parametrize("names", [["../x"], ["a/b"], [""], [".."], ["/x"], ["a", "a"]])
-def test_names_that_leave_the_folder_or_repeat_are_refused(tmp_path: Path, names: list[str]) -> None:
-    with pytest.raises(DataError):
-        write_frames(tmp_path / "out", names, list(flat(4, 4))[: len(names)])
