@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fprf.errors import FprfError, UsageError
-from fprf.process import keep_memory
+from fprf.memory import keep_memory
 
 from .town.write import cached_town
 

@@ -474,7 +474,7 @@ the street and its sky.
   that it was made of). **match inside**: the same without pixels at the border of two classes. **match kind**: of their own
   kind (sky, plants, ground, buildings, lamps, cars).
 - **consistency**: what a method adds to the error between frames of a path, warped by true depth, plus the sharpness that it
-  loses; 0 = as steady and sharp as the unstylised render (`fprf/evaluation/consistency.py`).
+  loses; 0 = as steady and sharp as the unstylised render (`fprf/evaluation/metrics.py`).
 - **style s**: to make the style of the references, once. **view s**: to colour a view whose geometry is there (for `reinhard`,
   `histogram` and `2d`: a rendered picture).
 - **LPIPS**: AlexNet, version 0.1, to the truth; less is nearer. The JSON also has consistency as other papers report it
