@@ -29,7 +29,7 @@ from fprf.training.driver import train
 from fprf.training.loading import open_run
 from fprf.types import Want
 
-from .common import Progress, ReportConfig, console, write_report
+from .common import ReportConfig, console, write_report
 from .report import Column, contact_sheet, markdown, printed, provenance, words
 from .single_image import encoded, flat_look, flat_scene, histogram_matching, reinhard, render_flat
 from .steadiness import published, steadiness
@@ -233,6 +233,8 @@ GOALS: Mapping[str, tuple[str, float, str, str]] = {
 }
 """Goals of the recommended stylizer with three references: figures with their units, and what they are of."""
 JUDGED = "three"
+
+Progress = Callable[[int, int, str], None]
 
 
 class Case(NamedTuple):
