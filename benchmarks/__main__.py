@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fprf.errors import FprfError, UsageError
-from fprf.process import keep_memory
+from fprf.memory import keep_memory
 
 from .town.write import cached_town
 
@@ -33,6 +33,8 @@ class Benchmark(NamedTuple):
 _RUN = "{run} --repeats 1 --rays 256 --device cpu"
 _TRAINED = "a run of fields; without one it trains fprf-lite on the town first"
 BENCHMARKS = {
+    "exports": Benchmark("exported files drawn again, against the scene's own renders", "{run} --views 1", _TRAINED),
+    "fuzz": Benchmark("every reader on a million mutated files", "--rounds 40", "hours for the million; Linux"),
     "fuzz_guided": Benchmark(
         "every reader under libFuzzer", '--minutes 0.2 --only "image, png"', "the package atheris; Linux", ("atheris",)
     ),
@@ -55,6 +57,7 @@ BENCHMARKS = {
         "--method {run}/config.json --data {town} --steps 5 --views 1 --palettes night --device cpu",
         "a scene of --data; VGG-19's weights in the cache where photographs restyle it",
     ),
+    "pareto": Benchmark("time against error, knob by knob", _RUN, _TRAINED),
     "peer": Benchmark(
         "frames of any system, scored by the code that scores ours",
         "{town}/images --cameras {town}/transforms.json --plain {town}/images --depth {town}/depth --truth {town}/images",
@@ -70,10 +73,23 @@ BENCHMARKS = {
         "--steps 20 --side 80",
         "captures; without any, the garden",
     ),
+    "semantic_matching": Benchmark(
+        "which encoder finds like with like, and what its scores say",
+        "--most 1 --seeds 0 --views 1 --size 64 48",
+        "painted triplets in --triplets; without them the town alone",
+    ),
     "speed": Benchmark(
         "training, views and styles against the naive path, with their errors", f"{_RUN} --points 500 --clusters 4", _TRAINED
     ),
     "splat_restyle": Benchmark("time and memory of restyling captures of Gaussians", "--synthetic 2000"),
+    "stress": Benchmark(
+        "every stage on adversarial inputs, against a reference and a bound", f"{_RUN} --mutations 2 --flips 5", _TRAINED
+    ),
+    "styles": Benchmark(
+        "every stylizer on painted photographs and on runs",
+        "{run} --triplets 0 --views 2 --longest 64",
+        "triplets, photographs and VGG-19's weights in --shared; without them a run of the town",
+    ),
     "town": Benchmark(
         "write a town as a scene folder", "{folder}/town --views 2 --width 24 --height 18", "a folder to write into"
     ),

@@ -11,21 +11,24 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from rich.console import Console
 
 from fprf.checks import at_least
-from fprf.cli.parsing import load_method
+from fprf.cli.parsing import load_method, parse
 from fprf.config import TrainConfig, fields_only
 from fprf.errors import FprfError
 from fprf.io.atomic import write_json, write_text
+from fprf.progress import Display
 from fprf.training.driver import train
 
-from .report import provenance
+from .report import Outcome, provenance
 from .town.write import scene_folder
 
 ROOT = Path(__file__).resolve().parents[1]
+SHARED = Path(os.environ.get("FPRF_SHARED", ROOT.parent / "shared"))
+"""Folder with `data` and `weights` that the repository does not hold: $FPRF_SHARED, or `shared` beside the checkout."""
 
 
 def arguments(name: str, about: str | None) -> argparse.ArgumentParser:
@@ -123,9 +126,29 @@ class ReportConfig:
     """Markdown file for them; none = none."""
 
 
+C = TypeVar("C", bound=BenchConfig)
 Progress = Callable[[int, int, str], None]
 _WIDTH = 150
 """Columns of a table that goes to a file."""
+
+
+def bench_run(prog: str, default: C, args: list[str], measure: Callable[[C, Path, Path, Progress], Outcome]) -> int:
+    """Measure the run that the arguments name, or a scene that is trained first; print the tables and write the JSON.
+
+    `measure` gets the config, the run folder, a temporary folder and a function that shows progress.
+    """
+    about = (type(default).__doc__ or "").strip()
+    config = parse(default, args, prog=prog, description=about, positional=("run",))
+    with tempfile.TemporaryDirectory(prefix="fprf-bench-") as made:
+        folder = Path(made)
+        root = config.run or train_run(folder / "run", config.method, config.data, steps=config.steps, device=config.device)
+        with Display() as display:
+            outcome = measure(config, root, folder, display.count)
+        for table in outcome.tables:
+            console().print(table)
+        if config.output is not None:
+            write_json(config.output, outcome.document)
+    return 0
 
 
 def train_run(output: Path, method: str, data: Path | None, *, steps: int, device: str = "cpu") -> Path:

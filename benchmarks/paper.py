@@ -47,7 +47,8 @@ from fprf.training.views import cache_view, render_view
 from .common import Progress, console, field_method, origin
 from .report import Column, printed
 from .restyle import PLAIN, dictionary_of, in_scene
-from .style_metrics import matched_regions, structure, style_distances
+from .style_metrics import matched_regions, structure
+from .styles import Exhibit, judge_exhibit
 from .town.truth import (
     Row,
     code_classes,
@@ -262,14 +263,10 @@ def by_photographs(short: Short, config: PaperConfig, stylizers: Mapping[str, St
     images = [torch.from_numpy(shrink(load_image(path, upright=True), side)).float() / 255 for path in config.references]
     observer = encoders.semantic if encoders.semantic is not None else encoders.content
     here, there = matched_regions(observer.cpu(), plain, images, regions=_REGIONS, seed=0)
-    styled = {name: [(each[name], where) for each, where in zip(shown, here, strict=True)] for name in stylizers}
+    styled = {name: [pictures[name] for pictures in shown] for name in stylizers}
     judges = {layer: Vgg19Config(layer=layer).build() for layer in ("relu1_1", "relu2_1")}
-    before, target = list(zip(plain, here, strict=True)), list(zip(images, there, strict=True))
-    distances, row = style_distances(judges, before, styled, target), Row()
-    for name, pictures in styled.items():
-        kept = [structure(a, b) for a, (b, _) in zip(plain, pictures, strict=True)]
-        row |= {f"{name}style_distance": distances[name]["mean"], f"{name}structure": math.fsum(kept) / len(kept)}
-    return row
+    rows = judge_exhibit(Exhibit(plain, styled, here, images, there), judges)
+    return {f"{name}{key}": rows[name][key] for name in stylizers for key in ("style_distance", "structure")}
 
 
 def styled(short: Short, config: PaperConfig, folder: Path, clusters: int) -> Row:

@@ -1,7 +1,7 @@
 """Frames of any system, read from files and scored by the code that scores ours."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,7 +20,7 @@ from fprf.rendering.cameras import Cameras, grid_rays
 from fprf.training.loading import load_run
 from fprf.training.views import render_view
 
-from .common import Progress, ReportConfig, write_report
+from .common import ReportConfig, write_report
 from .report import provenance, words
 from .steadiness import published, steadiness
 from .style_metrics import matched_regions, mean_scores, structure, style_distances
@@ -139,6 +139,7 @@ REGIONS = 6
 """Regions in which frames and references are compared."""
 _LARGEST = 512
 """References are reduced to this longest side."""
+Progress = Callable[[int, int, str], None]
 
 
 def peer(config: PeerConfig, progress: Progress) -> dict[str, Any]:

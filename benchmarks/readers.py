@@ -1,9 +1,10 @@
-"""A valid file of each kind that somebody else may hand us, with its reader; mutations of them."""
+"""A valid file of each kind that somebody else may hand us, with its reader: what `fuzz` mutates."""
 
 import json
 import random
 import re
 import struct
+import time
 import tracemalloc
 import zipfile
 from collections.abc import Callable
@@ -18,6 +19,7 @@ import torch
 
 from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers.blocknerf import crc32c, masked, read_examples
+from fprf.datamanagers.parsers.colmap import read_model
 from fprf.datamanagers.parsers.config import (
     ColmapConfig,
     LlffConfig,
@@ -39,6 +41,8 @@ from fprf.style.files import read_style
 from fprf.testing import cases
 from fprf.training import checkpoint
 
+WHOLE_EVERY = 16
+"""Rounds of which one is read to the end, where a reader of the bytes alone is known."""
 WORDS = (b"NaN", b"1e400", b"-1", b"0", b"null", b"true", b"[]", b"{}", b"../../etc/passwd", b"\x00", b"\xff\xfe", b"9" * 40)
 VALUES = (b"0", b"-1", b"1e300", b"1e-300", b"null", b'"x"', b"[]", b"{}", b"true", b"0.5", b"65536", b"1e999", b"123456789012")
 """What stands in the place of a number of a text."""
@@ -55,6 +59,8 @@ class Target(NamedTuple):
     """What is mutated; its folder holds whatever else the reader needs."""
     read: Callable[[], object]
     """To the end: a scene, a config, pixels."""
+    parse: Callable[[], object] | None = None
+    """The bytes alone, where what follows takes most of the time."""
 
 
 class Outcome(NamedTuple):
@@ -66,6 +72,8 @@ class Outcome(NamedTuple):
     """Errors of ours, which are of one line (`FprfError`)."""
     faults: tuple[str, ...]
     """Anything else, by round."""
+    slowest: float
+    """Seconds of the processor for the longest round."""
     memory: int
     """Most bytes that Python held at once in a round, where it was watched; 0 otherwise."""
 
@@ -95,30 +103,35 @@ def mutated(data: bytes, draw: random.Random) -> bytes:
     return bytes(raw)
 
 
-def fuzz(target: Target, rounds: int, seed: int, *, watch_memory: bool = False) -> Outcome:
-    """Read `rounds` mutations of the target's file; the file is put back at the end."""
+def fuzz(target: Target, rounds: int, seed: int, *, first: int = 0, watch_memory: bool = False, quick: bool = False) -> Outcome:
+    """Read `rounds` mutations of the target's file, from number `first` on; the file is put back at the end.
+
+    `quick` ones go to the reader of the bytes where there is one, and each sixteenth through to the end.
+    """
     whole = target.file.read_bytes()
     values = refusals = memory = 0
-    faults = []
+    slowest, faults = 0.0, []
     try:
-        for number in range(rounds):
+        for number in range(first, first + rounds):
             draw = random.Random(f"{target.name} {seed} {number}")  # nosec B311  # no secrets
             target.file.write_bytes(mutated(whole, draw))
             if watch_memory:
                 tracemalloc.start()
+            start = time.process_time()
             try:
-                target.read()
+                (target.parse if quick and target.parse and number % WHOLE_EVERY else target.read)()
                 values += 1
             except FprfError:
                 refusals += 1
             except Exception as error:
                 faults.append(f"{number}: {error!r}"[:300])
+            slowest = max(slowest, time.process_time() - start)
             if watch_memory:
                 memory = max(memory, tracemalloc.get_traced_memory()[1])
                 tracemalloc.stop()
     finally:
         target.file.write_bytes(whole)
-    return Outcome(rounds, values, refusals, tuple(faults), memory)
+    return Outcome(rounds, values, refusals, tuple(faults), slowest, memory)
 
 
 SIDE = 24
@@ -158,7 +171,9 @@ def _colmap(folder: Path, *, binary: bool) -> list[Target]:
         (model / f"{kind}.{suffix}").write_bytes(data)
     parser = ColmapConfig().build()
     return [
-        Target(f"COLMAP {kind}.{suffix}", model / f"{kind}.{suffix}", lambda: parser.parse(folder, 1))
+        Target(
+            f"COLMAP {kind}.{suffix}", model / f"{kind}.{suffix}", lambda: parser.parse(folder, 1), lambda: read_model(model)
+        )
         for kind in ("cameras", "images", "points3D")
     ]
 

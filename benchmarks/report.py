@@ -117,6 +117,15 @@ def ratio(slow: Sequence[float], fast: Sequence[float]) -> Spread:
     return spread([a / max(b, 1e-12) for a, b in zip(slow, fast, strict=True)])
 
 
+class Outcome(NamedTuple):
+    """Result of a benchmark."""
+
+    document: dict[str, Any]
+    """For JSON."""
+    tables: list[Table]
+    """For the terminal."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Row:
     """One figure."""

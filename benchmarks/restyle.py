@@ -29,7 +29,7 @@ from fprf.training.driver import train
 from fprf.training.loading import open_run
 from fprf.types import Want
 
-from .common import Progress, ReportConfig, console, write_report
+from .common import ReportConfig, console, write_report
 from .report import Column, contact_sheet, markdown, printed, provenance, words
 from .single_image import encoded, flat_look, flat_scene, histogram_matching, reinhard, render_flat
 from .steadiness import published, steadiness
@@ -233,6 +233,8 @@ GOALS: Mapping[str, tuple[str, float, str, str]] = {
 }
 """Goals of the recommended stylizer with three references: figures with their units, and what they are of."""
 JUDGED = "three"
+
+Progress = Callable[[int, int, str], None]
 
 
 class Case(NamedTuple):
@@ -474,7 +476,7 @@ the street and its sky.
   that it was made of). **match inside**: the same without pixels at the border of two classes. **match kind**: of their own
   kind (sky, plants, ground, buildings, lamps, cars).
 - **consistency**: what a method adds to the error between frames of a path, warped by true depth, plus the sharpness that it
-  loses; 0 = as steady and sharp as the unstylised render (`fprf/evaluation/consistency.py`).
+  loses; 0 = as steady and sharp as the unstylised render (`fprf/evaluation/metrics.py`).
 - **style s**: to make the style of the references, once. **view s**: to colour a view whose geometry is there (for `reinhard`,
   `histogram` and `2d`: a rendered picture).
 - **LPIPS**: AlexNet, version 0.1, to the truth; less is nearer. The JSON also has consistency as other papers report it

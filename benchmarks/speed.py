@@ -3,7 +3,6 @@
 The naive path: plain torch for the planes, every sample through every network, every term at every step.
 """
 
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, replace
@@ -13,19 +12,15 @@ from typing import Annotated, Any
 
 import torch
 import torch.nn.functional as F
-from rich.table import Table
 from torch import Tensor, nn
 
 from fprf.checks import at_least
-from fprf.cli.parsing import parse
 from fprf.config import RenderConfig, TrainConfig
 from fprf.fields.planes import Planes
 from fprf.interfaces import Stylizer
-from fprf.io.atomic import write_json
 from fprf.ops import backend, triplane
 from fprf.plugins import slots
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
-from fprf.progress import Display
 from fprf.rendering.cameras import Cameras
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
@@ -36,8 +31,8 @@ from fprf.training.model import Facts, Model
 from fprf.training.prepare import Prepared
 from fprf.training.views import cache_view, render_view
 
-from .common import BenchConfig, Progress, console, train_run
-from .report import Row, document, ratio, rows_table, spread
+from .common import BenchConfig, bench_run
+from .report import Outcome, Row, document, ratio, rows_table, spread
 from .subject import (
     Subject,
     attempt,
@@ -244,6 +239,7 @@ def _compared(name: str, unit: str, figure: Callable[[float], float], own: Seque
     return Row(name=name, figure=ours.median, low=ours.low, high=ours.high, unit=unit, peer=theirs, ratio=ratio(peer, own))
 
 
+Progress = Callable[[int, int, str], None]
 STYLES: dict[str, StylizerConfig] = {
     "region-tone": RegionToneConfig(),
     "region-ot": RegionOtConfig(),
@@ -254,8 +250,8 @@ BUDGET = 1 / 512
 """The error that skipping may cost: half an 8-bit step."""
 
 
-def speed(config: SpeedConfig, root: Path, folder: Path, progress: Progress) -> tuple[dict[str, Any], Table]:
-    """Training, rendering, restyling, tri-planes: the JSON and the table."""
+def speed(config: SpeedConfig, root: Path, folder: Path, progress: Progress) -> Outcome:
+    """Training, rendering, restyling, tri-planes."""
     subject = find(root, config, folder)
     rows: list[Row] = []
     progress(0, 5, "training")
@@ -275,7 +271,7 @@ def speed(config: SpeedConfig, root: Path, folder: Path, progress: Progress) -> 
     trained = subject.trained
     about = settings(config, trained, missing) | {"view": size_of(test_view(config, trained)), "points": config.points}
     made = document("speed", rows, device=trained.model.device, settings=about, extra={"counters": counters})
-    return made, rows_table("speed, beside the naive path", rows)
+    return Outcome(made, [rows_table("speed, beside the naive path", rows)])
 
 
 def _training(config: SpeedConfig, subject: Subject, prepared: Prepared) -> Row:
@@ -380,14 +376,4 @@ def _restyling(config: SpeedConfig, subject: Subject) -> list[Row]:
 
 def main(argv: list[str]) -> int:
     """`python -m benchmarks speed [RUN]`."""
-    about = (SpeedConfig.__doc__ or "").strip()
-    config = parse(SpeedConfig(), argv, prog="python -m benchmarks speed", description=about, positional=("run",))
-    with tempfile.TemporaryDirectory(prefix="fprf-bench-") as made:
-        folder = Path(made)
-        root = config.run or train_run(folder / "run", config.method, config.data, steps=config.steps, device=config.device)
-        with Display() as display:
-            figures, table = speed(config, root, folder, display.count)
-    console().print(table)
-    if config.output is not None:
-        write_json(config.output, figures)
-    return 0
+    return bench_run("python -m benchmarks speed", SpeedConfig(), argv, speed)

@@ -1,4 +1,4 @@
-"""How pictures differ in style: structure, CIEDE2000 and style distance, of images [H W 3] in [0, 1].
+"""How pictures differ in style: structure, CIEDE2000, style distance and contrast, of images [H W 3] in [0, 1].
 
 Structure is SSIM's second factor, of luminances that are first brought to one mean and deviation, because a style may make a
 picture darker and flatter as a whole:
@@ -10,10 +10,11 @@ a lightness from 0 to 100. A difference of 1 is just visible, 10 is another shad
 
 Style distance: how far a picture's feature statistics are from its references', region by region.
 
-Features of each layer are described in each region by mean and deviation, and two regions are compared by the Fréchet
-(2-Wasserstein) distance of the Gaussians, channel by channel:
+Features of each layer are described in each region by mean and deviation (or, with `full`, by their covariance), and two
+regions are compared by the Fréchet (2-Wasserstein) distance of the Gaussians:
 
-    d² = |μ_a - μ_b|² + |σ_a - σ_b|²
+    d² = |μ_a - μ_b|² + |σ_a - σ_b|²          per channel
+    d² = |μ_a - μ_b|² + tr(C_a + C_b - 2 (C_a^½ C_b C_a^½)^½)                                      with covariances
 
 Regions are averaged by their share of the content and divided by the same for the unstylised picture: 0 = the reference's own
 statistics, 1 = no change. Layers count alike. Use an encoder that took no part in the styling.
@@ -26,6 +27,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -36,7 +38,10 @@ from fprf.interfaces import Encoder
 from fprf.io.images import srgb_to_linear
 from fprf.style.light import luma
 from fprf.style.matching import unit
-from fprf.style.statistics import covariance, kmeans, moments
+from fprf.style.statistics import covariance, kmeans, moments, symmetric_root
+
+_INSIDE = 2
+"""Pixels around one that must be of its region for it to lie inside."""
 
 
 def mean_scores(
@@ -175,7 +180,7 @@ class RegionStatistics(NamedTuple):
 
     cells: int
     mean: Annotated[Tensor, "C"]
-    deviation: Annotated[Tensor, "C"]
+    covariance: Annotated[Tensor, "C C"]
 
 
 @torch.no_grad()
@@ -196,15 +201,80 @@ def region_statistics(encoder: Encoder, pictures: Labelled) -> dict[int, RegionS
     return {kind: _described(cells[label == kind]) for kind in kinds}
 
 
-def gaussian_distance(a: RegionStatistics, b: RegionStatistics) -> float:
-    """The 2-Wasserstein distance of two regions whose channels are independent."""
-    return math.sqrt(float((a.mean - b.mean).square().sum() + (a.deviation - b.deviation).square().sum()))
+class Contrast(NamedTuple):
+    """Contrast of luma inside of a region, away from its borders."""
+
+    pixels: int
+    gradient: float
+    """Mean absolute difference between neighbouring pixels, along rows and columns."""
+    black: float
+    """1 % quantile."""
+    white: float
+    """99 % quantile."""
+
+    @property
+    def range(self) -> float:
+        """From black to white."""
+        return self.white - self.black
+
+
+def region_contrasts(pictures: Labelled) -> dict[int, Contrast]:
+    """Contrast of every region over all pictures together, of pixels no nearer than two to another region."""
+    found: dict[int, list[tuple[Tensor, Tensor]]] = {}
+    for image, regions in pictures:
+        near = F.interpolate(regions[None, None].double(), image.shape[:2], mode="nearest-exact")
+        padded, side = F.pad(near, (_INSIDE,) * 4, mode="replicate"), 2 * _INSIDE + 1
+        inside = (F.max_pool2d(padded, side, 1) == -F.max_pool2d(-padded, side, 1))[0, 0]
+        light = luma(image.flatten(0, 1)).view(image.shape[:2])
+        # Forward differences; the last row and column repeat themselves and are left out.
+        steps = (light[:-1, 1:] - light[:-1, :-1]).abs() + (light[1:, :-1] - light[:-1, :-1]).abs()
+        inside, kinds, light = inside[:-1, :-1], near[0, 0, :-1, :-1].long(), light[:-1, :-1]
+        for kind in sorted(set(kinds[inside].tolist())):
+            here = inside & (kinds == kind)
+            found.setdefault(kind, []).append((light[here], steps[here] / 2))
+    contrasts = {}
+    for kind, parts in sorted(found.items()):
+        values, differences = (torch.cat(each).double().cpu().numpy() for each in zip(*parts, strict=True))
+        black, white = np.quantile(values, (0.01, 0.99)).tolist()
+        contrasts[kind] = Contrast(len(values), float(differences.mean()), black, white)
+    return contrasts
+
+
+def contrast_kept(
+    plain: Mapping[int, Contrast], styled: Mapping[int, Contrast], style: Mapping[int, Contrast]
+) -> dict[str, float | None]:
+    """Shares of the plain picture's mean gradient (`gradient_kept`) and range of luma (`range_kept`) that are left.
+
+    Means over the regions whose range is no less in the style than in the plain picture, by their pixels; None where there is
+    no such region.
+    """
+    kept = [(each, styled[k]) for k, each in plain.items() if k in style and style[k].range >= each.range > 0 < each.gradient]
+    pixels = sum(each.pixels for each, _ in kept)
+    if not pixels:
+        return {"gradient_kept": None, "range_kept": None}
+    return {
+        "gradient_kept": math.fsum(a.pixels * b.gradient / a.gradient for a, b in kept) / pixels,
+        "range_kept": math.fsum(a.pixels * b.range / a.range for a, b in kept) / pixels,
+    }
+
+
+def gaussian_distance(a: RegionStatistics, b: RegionStatistics, *, full: bool = False) -> float:
+    """The 2-Wasserstein distance of two regions: of means and deviations, or with `full` of means and covariances."""
+    apart = float((a.mean - b.mean).square().sum())
+    if not full:
+        deviations = [each.covariance.diagonal().clamp_min(0).sqrt() for each in (a, b)]
+        return math.sqrt(apart + float((deviations[0] - deviations[1]).square().sum()))
+    cross = torch.linalg.svdvals(symmetric_root(a.covariance) @ symmetric_root(b.covariance)).sum()
+    spread = float(a.covariance.trace() + b.covariance.trace() - 2 * cross)
+    return math.sqrt(apart + max(0.0, spread))
 
 
 def relative_distance(
     plain: Mapping[int, RegionStatistics],
     styled: Mapping[int, RegionStatistics],
     style: Mapping[int, RegionStatistics],
+    *,
+    full: bool = False,
 ) -> float | None:
     """Distance to the style over that of the unstylised picture, regions by their share of it; one layer.
 
@@ -215,13 +285,13 @@ def relative_distance(
         for r, before in plain.items()
         if r in styled and r in style and min(before.cells, styled[r].cells, style[r].cells) >= _CELLS
     ]
-    before = sum(plain[r].cells * gaussian_distance(plain[r], style[r]) for r in regions)
-    after = sum(plain[r].cells * gaussian_distance(styled[r], style[r]) for r in regions)
+    before = sum(plain[r].cells * gaussian_distance(plain[r], style[r], full=full) for r in regions)
+    after = sum(plain[r].cells * gaussian_distance(styled[r], style[r], full=full) for r in regions)
     return after / before if before > 0 else None
 
 
 def style_distances(
-    judges: Mapping[str, Encoder], plain: Labelled, styled: Mapping[str, Labelled], style: Labelled
+    judges: Mapping[str, Encoder], plain: Labelled, styled: Mapping[str, Labelled], style: Labelled, *, full: bool = False
 ) -> dict[str, dict[str, float | None]]:
     """For every method of `styled`: the relative distance by judge (a layer each), and their mean as `mean`.
 
@@ -231,7 +301,7 @@ def style_distances(
     for judge, encoder in judges.items():
         before, target = region_statistics(encoder, plain), region_statistics(encoder, style)
         for name, pictures in styled.items():
-            rows[name][judge] = relative_distance(before, region_statistics(encoder, pictures), target)
+            rows[name][judge] = relative_distance(before, region_statistics(encoder, pictures), target, full=full)
     for row in rows.values():
         known = [value for value in row.values() if value is not None]
         row["mean"] = math.fsum(known) / len(known) if known else None
@@ -240,7 +310,7 @@ def style_distances(
 
 def _described(cells: Annotated[Tensor, "N C"]) -> RegionStatistics:
     statistics = moments(cells, torch.ones(len(cells)))
-    return RegionStatistics(len(cells), statistics.mean, covariance(statistics).diagonal().clamp_min(0).sqrt())
+    return RegionStatistics(len(cells), statistics.mean, covariance(statistics))
 
 
 @torch.no_grad()

@@ -13,7 +13,7 @@ from fprf.cli.main import VERBS
 
 ROOT = Path(fprf.__file__).parent
 ORDER = (
-    *("version", "errors", "types", "memory", "checks", "process", "progress", "io", "interfaces", "configs", "outputs"),
+    *("version", "errors", "types", "memory", "checks", "progress", "io", "interfaces", "configs", "outputs"),
     *("ops", "rendering", "datamanagers", "style", "fields", "plugins", "blocks", "testing"),
     *("training", "splats", "pretraining", "reconstruction", "evaluation", "export"),
     *("page", "api", "cli", "__main__"),

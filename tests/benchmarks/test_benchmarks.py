@@ -13,7 +13,7 @@ import pytest
 import torch
 from tiny_world import World
 
-from benchmarks import gpu_rows
+from benchmarks import gpu_rows, stress_operators
 from benchmarks.__main__ import BENCHMARKS, main
 from benchmarks.restyle import BOUND, FLAT, GLOBAL, GOALS, MATCHED, PLAIN, STYLIZERS
 from benchmarks.speed import plain_planes
@@ -57,6 +57,18 @@ def test_a_mistake_is_one_line(line: str, told: str, world: World, capsys: pytes
     lines = [each for each in capsys.readouterr().err.splitlines() if not each.startswith("{")]
     assert len(lines) == 2 and " needs " in lines[0], "needs are said first"
     assert lines[1].startswith("error: ") and told in lines[1]
+
+
+def test_a_worse_formula_breaks_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    """1 - exp(-x) loses thin media: the report must see it."""
+
+    def naive(density: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+        tau = density * (t[:, 1:] - t[:, :-1])
+        return torch.exp(-(tau.cumsum(-1) - tau)) * (1 - torch.exp(-tau))
+
+    monkeypatch.setattr(stress_operators, "transmittance_weights", naive)
+    broken = {row.input for row in stress_operators.weights() if not row.passed}
+    assert "fog of 1e-9 a step, N = 256" in broken
 
 
 def test_a_peer_s_frames_are_judged_by_all_that_can_be_known(

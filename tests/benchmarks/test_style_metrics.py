@@ -1,4 +1,4 @@
-"""Scores of styles and films against their definitions."""
+"""Scores of styles, matches, transfers and films against their definitions."""
 
 import math
 from itertools import pairwise
@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from ssim_oracle import noise, ssim_oracle
 from torch import Tensor
 
+from benchmarks.semantic_matching import matching_rate
 from benchmarks.steadiness import published, steadiness
 from benchmarks.style_metrics import RegionStatistics, delta_e_2000, gaussian_distance, structure
 from benchmarks.town.layout import build_town
@@ -66,15 +67,52 @@ def test_structure_is_the_written_out_one(seed: int, height: int, width: int) ->
     assert structure(a, b) == pytest.approx(ssim_oracle(*alike, means=False), abs=1e-6)
 
 
-@given(st.integers(0, 1000), st.integers(1, 6))
-def test_the_distance_is_frechets_of_independent_channels(seed: int, channels: int) -> None:
-    """Of diagonal covariances C: |μ_a - μ_b|² + tr(C_a + C_b - 2 (C_a C_b)^½)."""
+def statistics(seed: int, channels: int = 4) -> RegionStatistics:
     draw = np.random.default_rng(seed)
-    means, deviations = draw.normal(size=(2, channels)), draw.random((2, channels))
-    a, b = (RegionStatistics(100, *map(torch.from_numpy, each)) for each in zip(means, deviations, strict=True))
-    covariances = deviations**2
-    square = np.square(means[0] - means[1]).sum() + (covariances.sum(0) - 2 * np.sqrt(covariances.prod(0))).sum()
-    assert gaussian_distance(a, b) == pytest.approx(math.sqrt(square)) and gaussian_distance(a, a) == 0
+    root = draw.normal(size=(channels, channels))
+    return RegionStatistics(100, torch.from_numpy(draw.normal(size=channels)), torch.from_numpy(root @ root.T))
+
+
+@given(st.integers(0, 1000), st.integers(1, 6))
+def test_the_full_distance_is_frechets(seed: int, channels: int) -> None:
+    a, b = statistics(seed, channels), statistics(seed + 1, channels)
+    product = np.linalg.eigvals(a.covariance.numpy() @ b.covariance.numpy())
+    cross = np.sqrt(np.maximum(product.real, 0)).sum()
+    square = np.square((a.mean - b.mean).numpy()).sum() + np.trace(a.covariance) + np.trace(b.covariance) - 2 * cross
+    assert gaussian_distance(a, b, full=True) == pytest.approx(math.sqrt(max(0, float(square))), abs=1e-5)
+    assert gaussian_distance(a, b, full=True) == pytest.approx(gaussian_distance(b, a, full=True), abs=1e-6)
+    assert gaussian_distance(a, a, full=True) < 1e-5
+
+
+def rate_oracle(a: np.ndarray, b: np.ndarray, la: np.ndarray, lb: np.ndarray, regions: list[int]) -> float:
+    """Cell by cell, in float64."""
+    centre = np.concatenate([a, b]).mean(0)
+    a, b = a - centre, b - centre
+    hits: dict[int, list[bool]] = {r: [] for r in regions}
+    for x, label in zip(a, la, strict=True):
+        if label not in regions:
+            continue
+        best = {}
+        for r in regions:
+            like = sorted((x @ y / np.linalg.norm(x) / np.linalg.norm(y) for y in b[lb == r]), reverse=True)[:3]
+            best[r] = sum(like) / len(like)
+        hits[label].append(max(best, key=lambda r: best[r]) == label)
+    return float(np.mean([np.mean(hits[r]) for r in regions]))
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), st.integers(2, 4), st.integers(6, 40), st.integers(6, 40))
+def test_the_rate_is_the_written_out_one(seed: int, regions: int, n: int, m: int) -> None:
+    draw = np.random.default_rng(seed)
+    la, lb = (np.concatenate([np.arange(regions), draw.integers(-1, regions, k - regions)]) for k in (n, m))
+    a, b = (draw.normal(size=(len(labels), 5)) + labels[:, None] for labels in (la, lb))
+    tensors = [torch.from_numpy(x) for x in (a, b, la, lb)]
+    found = matching_rate(*tensors, list(range(regions)))
+    assert found == pytest.approx(rate_oracle(a, b, la, lb, list(range(regions))), abs=1e-12)
+
+
+def colours(count: int, seed: int, low: float = 0.3, high: float = 0.7) -> Tensor:
+    return low + (high - low) * torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
 
 
 FILM_WIDTH, FILM_HEIGHT, FILM_FRAMES = 96, 72, 8

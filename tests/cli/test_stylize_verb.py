@@ -109,15 +109,13 @@ def test_explain_lists_regions_and_renders_nothing(run: Path, world: World, caps
 
 
 def test_match_maps_alone(run: Path, world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["--match-only", "--views", "0003", "0001", "--pixels", "--clusters", "2"]
+    words = ["--match-only", "--views", "0003", "0001", "--clusters", "2"]
     made = stylize(run, world, tmp_path / "m", *words)["made"]
-    kinds = ("match.png", "score.png", "confidence.png", "entropy.png", "match.npz")
+    kinds = ("match.png", "score.png", "confidence.png", "entropy.png")
     expected = {f"{view}-{kind}" for view in ("0001", "0003") for kind in kinds}
     assert {p.name for p in (tmp_path / "m").iterdir()} == expected | {"dictionary.safetensors", "style.json"}
     assert made.keys() == MADE - {"seconds_per_view"} and made["matches"].keys() == {"0003", "0001"}
     assert "2 match maps in" in capsys.readouterr().out
-    with np.load(tmp_path / "m" / "0003-match.npz") as file:
-        assert file["reference"].shape == (24, 32)
     stylize(run, world, tmp_path / "both", "--match-only", "--explain")
     assert {"explain.json", "0000-score.png"} < {p.name for p in (tmp_path / "both").iterdir()}
 

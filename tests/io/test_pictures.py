@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 
 from fprf.errors import DataError, NumericsError, UsageError
 from fprf.io.images import encode, shrink, srgb_to_linear, to_uint8, write_image
-from fprf.io.maps import depth_image, depth_limits, match_image, match_summary, palette
-from fprf.io.sheet import side_by_side
-from fprf.io.video import missing_frames, write_frames, write_video
+from fprf.io.maps import depth_image, depth_limits, match_image, match_summary, palette, side_by_side
+from fprf.io.video import missing_frames, write_video
 
 
 def ramp(height: int = 40, width: int = 60) -> np.ndarray:
@@ -216,17 +215,3 @@ def test_wrong_requests_leave_nothing(tmp_path: Path) -> None:
             with pytest.raises(DataError):
                 write_video(tmp_path / "x.mp4", frames, 10, h264=h264)
     assert not list(tmp_path.iterdir())
-
-
-def test_frames_as_pictures_are_exact_and_named(tmp_path: Path) -> None:
-    paths = write_frames(tmp_path / "out", ["0001", "b.c", "x", "y", "z"], plain(5, 7))
-    assert [path.name for path in paths] == ["0001.png", "b.c.png", "x.png", "y.png", "z.png"]
-    assert sorted((tmp_path / "out").iterdir()) == sorted(paths)
-    for path, frame in zip(paths, plain(5, 7), strict=True):
-        assert np.array_equal(cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB), frame)
-
-
-@pytest.mark.parametrize("names", [["../x"], ["a/b"], [""], [".."], ["/x"], ["a", "a"]])
-def test_names_that_leave_the_folder_or_repeat_are_refused(tmp_path: Path, names: list[str]) -> None:
-    with pytest.raises(DataError):
-        write_frames(tmp_path / "out", names, list(plain(4, 4))[: len(names)])

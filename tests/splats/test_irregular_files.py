@@ -17,11 +17,11 @@ from splat_ball import ball, plain_ply
 from fprf.errors import DataError
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.rendering.local_frame import offset_file, read_offset
+from fprf.splats.captures import look_at_capture
 from fprf.splats.config import LookConfig
-from fprf.splats.files import Capture, Written, read_capture, write_capture, write_gaussians, write_ply_parts
-from fprf.splats.gaussians import Gaussians
+from fprf.splats.files import Capture, Written, read_capture, write_capture, write_gaussians
+from fprf.splats.gaussians import GaussianRows, Gaussians
 from fprf.splats.photographs import camera_of
-from fprf.splats.scene import look_at_capture
 from fprf.splats.views import clip_distance, draw, find_views, seen_means
 
 # How far positions in a unit ball and ln-scales from -6 to -1 may move.
@@ -265,7 +265,7 @@ def test_parts_of_a_large_file_are_the_file(tmp_path: Path, monkeypatch: pytest.
     made = ball(50)
     for local in (False, True):
         write_gaussians(tmp_path / "a.ply", made, origin=UTM, local=local)
-        write_ply_parts(tmp_path / "b.ply", made.select, 50, origin=UTM, local=local)
+        write_gaussians(tmp_path / "b.ply", GaussianRows(50, made.select, False), origin=UTM, local=local)
         assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
         assert read_offset(tmp_path / "a.ply") == read_offset(tmp_path / "b.ply") == (UTM if local else (0, 0, 0))
     write_gaussians(tmp_path / "c.ply", made)

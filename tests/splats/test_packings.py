@@ -18,12 +18,12 @@ from fprf.errors import DataError
 from fprf.io.tensorfiles import load_sealed
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.rendering.splines import rotations
+from fprf.splats.captures import look_at_capture
 from fprf.splats.config import LookConfig
 from fprf.splats.files import Capture, read_capture, write_capture, write_gaussians
 from fprf.splats.files.sog import _picture, _webp, bundle, unbundle
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.photographs import camera_of
-from fprf.splats.scene import look_at_capture
 from fprf.splats.views import draw
 
 

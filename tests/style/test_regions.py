@@ -207,7 +207,7 @@ def test_regions_are_the_clusters_and_their_statistics_those_of_the_soft_members
     content, semantic, weights = weighted()
     scene = scene_style(content, semantic, weights, None, 3, 0)
     assert scene.keys.shape == (3, 4)
-    share = Membership(scene)(semantic).double()
+    share = Membership(scene.keys, scene.semantic_mean)(semantic).double()
     for k in range(3):
         w = share[:, k] * weights
         mean = (w[:, None] * content).sum(0) / w.sum()
@@ -236,7 +236,7 @@ def test_any_scene_has_a_finite_style(n: int, regions: int, d: int, spread: floa
     assert all(bool(t.isfinite().all()) for t in scene)
     assert 1 <= len(scene.keys) <= min(n, regions)
     assert bool((scene.share > 0).all())
-    share = Membership(scene)(semantic)
+    share = Membership(scene.keys, scene.semantic_mean)(semantic)
     torch.testing.assert_close(share.sum(1), torch.ones(n), rtol=0.0, atol=1e-6)
 
 

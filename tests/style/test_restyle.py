@@ -16,7 +16,7 @@ from fprf.rendering.cameras import pixel_grid
 from fprf.style.config import NO_MASK, StyleConfig
 from fprf.style.dictionary import Encoders
 from fprf.style.files import StyleFile, write_style
-from fprf.style.match_maps import MatchMap, match_map, summarize, write_pixels
+from fprf.style.match_maps import MatchMap, match_map, summarize
 from fprf.style.restyle import Codes, Styled, apply_style
 from fprf.training.loading import Trained
 from fprf.training.views import paint_pixels, render_view
@@ -169,17 +169,3 @@ def test_summaries_count_what_is_there() -> None:
     assert summary["codes"][0] == {"reference": "a.jpg", "cluster": 0, "share": pytest.approx(1 / 3)}
     assert {(c["reference"], c["cluster"]) for c in summary["codes"][1:]} == {("b.jpg", 0), ("b.jpg", 1)}
     assert summary["regions"] == [{"region": 0, "share": pytest.approx(1 / 3)}, {"region": 1, "share": pytest.approx(2 / 3)}]
-
-
-def test_numbers_of_pixels(tmp_path: Path) -> None:
-    found, codes = made_up()
-    write_pixels(tmp_path / "m.npz", found, codes)
-    with np.load(tmp_path / "m.npz") as file:
-        arrays = {name: file[name] for name in file.files}
-    assert arrays["names"].tolist() == ["a.jpg", "b.jpg"]
-    assert arrays["reference"].tolist() == [[0, 1], [-1, -1]] and arrays["region"].tolist() == [[0, 1], [1, -1]]
-    assert arrays["cluster"][0, 0] == 0 and arrays["cluster"][0, 1] in (0, 1) and arrays["cluster"][1].tolist() == [-1, -1]
-    assert arrays["reference"].dtype == np.int16 and arrays["score"].dtype == np.float32
-    assert np.array_equal(arrays["confidence"], found.confidence)
-    assert np.allclose(arrays["entropy_bits"], found.entropy) and np.allclose(arrays["kept"], [[0, 0], [1, 0]])
-    assert [p.name for p in tmp_path.iterdir()] == ["m.npz"]

@@ -243,7 +243,7 @@ def test_the_map_is_its_definition(config: Config, temperature: float) -> None:
     content, semantic, scene, d = setting(n=600)
     stylizer = config(temperature=temperature, whitening=0.0, recentred=0).build(dictionary=d, scene=scene)
     assert stylizer.needs == Want.CONTENT | Want.SEMANTIC
-    share = Membership(scene)(semantic).double()
+    share = Membership(scene.keys, scene.semantic_mean)(semantic).double()
     own = own_style(scene, d.blend)
     here, there = plain_table(scene, own, temperature), plain_table(scene, d, temperature)
     f, expected = content.double(), torch.zeros(600, 6, dtype=torch.float64)
