@@ -14,9 +14,8 @@ import torch
 from torch import Tensor
 
 from ..blocks.fields import BlockedField
-from ..blocks.partition import write_cells
+from ..blocks.partition import Plan, make_plan, pixel_mask, write_cells
 from ..blocks.routing import chart_of, surroundings_of
-from ..blocks.visibility import Plan, make_plan, pixel_mask
 from ..config import FREE_IN_BLOCKS, TrainConfig, fields_only
 from ..datamanagers.basis import Basis
 from ..datamanagers.features import extract

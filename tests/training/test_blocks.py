@@ -11,7 +11,7 @@ from task_world import world_of_blocks
 
 from fprf.blocks.config import AdaptiveConfig
 from fprf.blocks.fields import Member
-from fprf.blocks.visibility import make_plan
+from fprf.blocks.partition import make_plan
 from fprf.errors import CheckpointError
 from fprf.io import tensorfiles
 from fprf.training.block_training import RAYS, block_task

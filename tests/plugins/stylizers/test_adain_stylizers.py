@@ -3,11 +3,9 @@
 import pytest
 import torch
 from style_cases import points, references, scene_of, setting
-from two_sided import region_adain
 
-from fprf.errors import DataError
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig
-from fprf.style.dictionary import Reference, build_dictionary
+from fprf.style.dictionary import build_dictionary
 from fprf.style.matching import score_spread, share_mean, unit
 from fprf.style.scene_style import own_style
 from fprf.types import Want
@@ -55,11 +53,3 @@ def test_the_scenes_own_style_gives_the_scene() -> None:
     scene = scene_of(content, semantic)
     out = AdainConfig().build(dictionary=own_style(scene), scene=scene)(content, None)
     assert float((out - content).abs().max() / content.abs().max()) < 1e-5
-
-
-def test_other_encoders_references_are_refused() -> None:
-    content, semantic = points()
-    d = build_dictionary([Reference("a", torch.randn(9, 5), torch.randn(9, 4))])
-    for config in (LocalAdainConfig(), region_adain()):
-        with pytest.raises(DataError, match="5 content and 4 semantic channels"):
-            config.build(dictionary=d, scene=scene_of(content, semantic))
