@@ -8,10 +8,9 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
-from ops.plain_forms import plainly
 from torch import Tensor
 
-from fprf.ops import dense, guided, triplane
+from fprf.ops import backend, dense, guided, triplane
 from fprf.rendering import cameras, lens, space, splines, stepfun
 from fprf.rendering.lens import lens_reach
 from fprf.style import dictionary, light, look, matching, scene_style, statistics
@@ -131,7 +130,7 @@ def _code(t: int) -> Made:
 
 CASES = [
     Case("dense.network", _layers, _network, slopes=(0, 1, 2, 3, 4)),
-    Case("dense.network, plain", _layers, plainly(lambda x, *p: dense.network(x, p[0::2], p[1::2])), slopes=(0, 1, 2, 3)),
+    Case("dense.network, plain", _layers, backend.plain()(_network), slopes=(0, 1, 2, 3)),
     Case("dense.runs", lambda n: ((_unit(n, 2) * 2).floor(),), _spelt_out),
     Case("guided.coefficients", lambda n: (_draw(5, max(1, n // 3), n), _unit(n, n, 3)),
          lambda f, g: guided.coefficients(f, g, radius=2, eps=1e-3, stride=2), sizes=(1, 37, 96), tolerance=1e-4),

@@ -132,7 +132,7 @@ def print_explained(output: Path, regions: "Regions", styled: "Styled | None") -
     """Show a scene's regions with what they take: a table on standard output, explain.json and explain.png in `output`."""
     from ..io.atomic import write_json
     from ..io.images import write_image
-    from ..io.sheet import contact_sheet
+    from ..io.maps import contact_sheet
     from ..style.match_maps import explain, region_row, region_tile
 
     explained = explain(regions, styled)

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from ..interfaces import Scene
 from ..io.images import Picture, to_uint8
-from ..io.maps import match_image, match_summary, scale_image, weighted_sum
-from ..io.sheet import Tile, highlight
+from ..io.maps import Tile, highlight, match_image, match_summary, scale_image, weighted_sum
 from ..rendering.cameras import Cameras, pixel_grid
 from .matching import unit
 from .regions import Regions, membership_view, shrunk

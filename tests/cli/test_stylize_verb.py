@@ -14,7 +14,7 @@ from safetensors.torch import load_file
 from tiny_world import World
 
 from fprf.cli import main as cli
-from fprf.cli.style_flags import named_styles, read_flags
+from fprf.cli.style_flags import read_flags
 from fprf.errors import ConfigError, DataError, UsageError
 from fprf.io import tensorfiles
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig
@@ -196,9 +196,3 @@ def test_a_preset_lies_over_the_file_and_below_the_flags(file: Path, capsys: pyt
 def test_every_preset_is_what_its_flags_say(name: str) -> None:
     assert read("RUN", f"--{name}")[1] == read("RUN", *preset_flags(name).split())[1]
     assert with_preset(StyleConfig(), name) != StyleConfig()
-
-
-@pytest.mark.parametrize("text", ["dusk", "=a.jpg", "dusk=", "du sk=a.jpg", "../x=a.jpg"])
-def test_other_forms_of_named_styles_are_refused(text: str) -> None:
-    with pytest.raises(UsageError):
-        named_styles([text], StyleFile(StyleConfig()))

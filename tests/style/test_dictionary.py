@@ -12,14 +12,7 @@ from fprf.datamanagers.basis import Basis
 from fprf.errors import DataError
 from fprf.ops.guided import upsample
 from fprf.plugins.encoders.config import RandomConfig
-from fprf.style.dictionary import (
-    Encoders,
-    Reference,
-    StyleDictionary,
-    build_dictionary,
-    encode_photograph,
-    whole_style,
-)
+from fprf.style.dictionary import Encoders, Reference, StyleDictionary, build_dictionary, encode_photograph, whole_style
 from fprf.testing.cases import scene
 
 

@@ -6,17 +6,11 @@ import pytest
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from style_cases import points, references, scene_of, setting
+from style_cases import points, references, region_adain, scene_of, setting
 from torch import Tensor
-from two_sided import region_adain
 
 from fprf.interfaces import Decoder, Stylizer
-from fprf.plugins.stylizers.config import (
-    AdainConfig,
-    LocalAdainConfig,
-    RegionOtConfig,
-    StylizerConfig,
-)
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, StylizerConfig
 from fprf.plugins.stylizers.region import TwoSidedStylizer
 from fprf.style.config import parse_place
 from fprf.style.dictionary import build_dictionary, choose, whole_style

@@ -214,7 +214,7 @@ def _read_inria(path: Path, data: Data, elements: Mapping[str, _Element]) -> Cap
     # First every property that is needed is looked for; then rows are read, and later recoloured, in pieces.
     vertex = elements.get("vertex")
     if vertex is None:
-        raise DataError(f"{path}: no element `vertex`, or lists before it; not a file of 3D Gaussians")
+        raise DataError(f"{path}: no element `vertex`; not a file of 3D Gaussians")
     known = set(vertex.names())
     # Properties may stand in any order, among any others. 2D Gaussians have no third size, and lie in the plane of the others.
     rest = sum(bool(re.fullmatch(r"f_rest_\d+", name)) for name in known)
@@ -348,10 +348,7 @@ def _header(data: Data) -> _Header | None:
 
 
 def _elements(path: Path, data: Data, header: _Header) -> dict[str, _Element]:
-    """Elements by name, where they lie, up to the first one with lists: what follows the Gaussians is kept, and not read.
-
-    Those of ASCII files lie nowhere yet.
-    """
+    """Elements by name, where they lie; those with lists are passed over. Those of ASCII files lie nowhere yet."""
     form, ascii_rows = header.form, header.form == ["ascii", "1.0"]
     if form not in (["binary_little_endian", "1.0"], ["binary_big_endian", "1.0"]) and not ascii_rows:
         raise DataError(f"{path}: a PLY of format {' '.join(form) or 'unknown'}; export it again as ascii or binary 1.0")
@@ -361,41 +358,75 @@ def _elements(path: Path, data: Data, header: _Header) -> dict[str, _Element]:
     starts, offset, elements = [i for i, words in enumerate(lines) if words[0] == "element"], header.size, {}
     for start, stop in zip(starts, [*starts[1:], len(lines)], strict=False):
         words, properties = lines[start], lines[start + 1 : stop]
-        if any(each[1:2] == ["list"] for each in properties):
-            break
-        kinds = {each[2]: types[each[1]] for each in properties if len(each) == 3 and each[1] in types}
-        if len(words) != 3 or not re.fullmatch(r"\d{1,12}", words[2]) or len(kinds) != len(properties) or not kinds:
+        kinds = [[types[kind] for kind in _kinds(each) if kind in types] for each in properties]
+        names = {each[-1] for each, of in zip(properties, kinds, strict=True) if of and len(of) == len(_kinds(each))}
+        if len(words) != 3 or not re.fullmatch(r"\d{1,12}", words[2]) or len(names) != len(properties) or not names:
             raise DataError(f"{path}: {' '.join(words)!r} or its properties are no valid PLY; export the file again")
-        count, table = int(words[2]), np.dtype([*kinds.items()])
+        count, what = int(words[2]), f"element {words[1]} of {words[2]} rows"
+        if any(len(of) > 1 for of in kinds):
+            if ascii_rows:
+                elements[words[1]] = _Element(np.dtype([]), count, offset)
+                continue
+            if (after := _after_lists(data, offset, count, kinds)) is None and "vertex" not in elements:
+                raise DataError(f"{path}: {what} runs beyond the end of the file; copy it again, it is cut off or damaged")
+            if after is None:
+                break  # what follows the Gaussians may be cut
+            offset = after
+            continue
+        table = np.dtype([(each[-1], of[0]) for each, of in zip(properties, kinds, strict=True)])
         # A number of ASCII takes two bytes at least.
         end = offset + count * (2 * len(kinds) if ascii_rows else table.itemsize)
         if end > len(data) + ascii_rows:
-            raise base.short(path, len(data), end, f"element {words[1]} of {words[2]} rows")
+            raise base.short(path, len(data), end, what)
         elements[words[1]] = _Element(table, count, offset)
         offset = end
     return elements
 
 
 def _from_ascii(path: Path, data: Data, header: _Header, elements: Mapping[str, _Element]) -> tuple[bytes, dict[str, _Element]]:
-    """A little-endian file of the elements of an ASCII one, a line a row."""
+    """A little-endian file of the elements of an ASCII one, a line a row; those with lists are left out."""
     lines = iter(data[header.size :].splitlines())
     tables: dict[str, NDArray[np.void]] = {}
     for name, element in elements.items():
         try:
-            if element.rows:
+            if element.names() and element.rows:
                 # A row is a line; numbers are read as float64 and then rounded to their own type.
                 numbers = np.loadtxt(lines, np.float64, comments=None, max_rows=element.rows, ndmin=2)
                 table = np.empty(element.rows, element.kind)
                 for field, column in zip(element.names(), numbers.T, strict=True):
                     table[field] = column
                 tables[name] = table
-        except ValueError as error:
+            elif not element.names():
+                for _ in range(element.rows):
+                    next(lines)
+        except (ValueError, StopIteration) as error:
             raise DataError(f"{path}: the rows of element {name} are no numbers for its properties ({error})") from error
     # Comments go along, which may say what points up.
     whole = ply_file(tables, comments=[" ".join(words) for words in header.lines if words[0] in ("comment", "obj_info")])
     binary = _header(whole)
     assert binary is not None
     return whole, _elements(path, whole, binary)
+
+
+def _kinds(words: list[str]) -> list[str]:
+    """Types of a property: one, or those of a list's length and values; none where the line is neither."""
+    if len(words) == 5 and words[1] == "list" and words[2] not in ("float", "float32", "double", "float64"):
+        return words[2:4]
+    return words[1:2] if len(words) == 3 else []
+
+
+def _after_lists(data: Data, offset: int, count: int, fields: Sequence[Sequence[str]]) -> int | None:
+    """Where rows with lists end; None where that is beyond the end of the file."""
+    for _ in range(count):
+        for first, *values in fields:
+            kind = np.dtype(first)
+            if offset + kind.itemsize > len(data):
+                return None
+            length = int(np.frombuffer(data, kind, 1, offset)[0]) if values else 0
+            offset += kind.itemsize + max(length, 0) * (np.dtype(values[0]).itemsize if values else 0)
+        if offset > len(data):
+            return None
+    return offset
 
 
 def _up(text: str) -> tuple[float, float, float] | None:

@@ -6,16 +6,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from style_cases import points, scene_of, setting
-from two_sided import region_adain
+from style_cases import points, region_adain, scene_of, setting
 
-from fprf.plugins.stylizers.config import (
-    AdainConfig,
-    LocalAdainConfig,
-    RegionOtConfig,
-    RegionToneConfig,
-    StylizerConfig,
-)
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from fprf.plugins.stylizers.region import region_table
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
 from fprf.style.matching import score_spread, share_mean, unit
