@@ -10,7 +10,7 @@ from parts_world import BlockWorld, done_of, small, world_of_blocks
 
 from fprf.blocks.config import AdaptiveConfig
 from fprf.blocks.fields import Member
-from fprf.blocks.visibility import make_plan
+from fprf.blocks.partition import make_plan
 from fprf.errors import CheckpointError
 from fprf.io import tensorfiles
 from fprf.training.blocks import (
