@@ -343,7 +343,7 @@ def _sized(run: Run, config: RunConfig, display: Display) -> RunConfig:
         width, height = read_scene(config).cameras.size[0].tolist()
         if min(width, height) < _SMALL:
             display.say(
-                f"warning: {width}x{height} pixels are few: --downscale {config.downscale} counts from the images as they "
+                f"warning: {width}x{height} pixels are few: --downscale {config.downscale:g} counts from the images as they "
                 "are delivered, also in a folder images_N; leave it out"
             )
     # Else a run would change its size with the machine or the minutes.
@@ -356,7 +356,7 @@ def _sized(run: Run, config: RunConfig, display: Display) -> RunConfig:
         scene = read_scene(config)
         width, height = scene.cameras.size[scene.train[0] if len(scene.train) else 0].tolist()
         ends = f"{config.minutes:g} minutes" if config.minutes is not None else f"{config.limited(len(scene.train)):,} steps"
-        reduced = f" (1/{config.downscale}; --downscale 1 keeps them whole)" if config.downscale != 1 else ""
+        reduced = f" (1/{config.downscale:.3g}; --downscale 1 keeps them whole)" if config.downscale != 1 else ""
         display.say(f"plan: {len(scene.train)} views at {width}x{height}{reduced}{config.described()}, {ends}")
     return config
 

@@ -366,5 +366,5 @@ def training_summary(run: Run, config: TrainConfig, scene: ParsedScene) -> str:
     if steps < _FEW_STEPS:
         return f"warning: too few steps to judge the scene by: {reached}; go on: {again} {longer}"
     size = config.downscale or 1
-    finer = f"; for more detail: --downscale {size - 1} and another --output" if size > 1 and passes > PASSES else ""
+    finer = f"; for more detail: --downscale {max(size - 1, 1):g} and another --output" if size > 1 and passes > PASSES else ""
     return f"{reached}; to raise it: {again} {longer}{finer}"

@@ -253,7 +253,7 @@ class BlockNerfParser(DataParser):
     def __init__(self, config: BlockNerfConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: int) -> Scene:
+    def parse(self, data: Path, downscale: float) -> Scene:
         """The scene at 1/downscale of the stored size. Raises DataError naming file and record."""
         files = sorted(path for path in data.rglob("*") if is_record(path.name) and path.is_file())
         if not files:

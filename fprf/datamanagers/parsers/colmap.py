@@ -364,7 +364,7 @@ class ColmapParser(DataParser):
     def __init__(self, config: ColmapConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: int, roles: Mapping[str, str] | None = None) -> Scene:
+    def parse(self, data: Path, downscale: float, roles: Mapping[str, str] | None = None) -> Scene:
         """The scene at 1/downscale of the size of the images in the chosen folder.
 
         Of `roles`, train or test by file name, images without one are left out; else every 8th is for testing.

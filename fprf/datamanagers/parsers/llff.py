@@ -24,7 +24,7 @@ class LlffParser(DataParser):
     def __init__(self, config: LlffConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: int) -> Scene:
+    def parse(self, data: Path, downscale: float) -> Scene:
         """The scene at 1/downscale of the images in the chosen folder, whatever size the poses were estimated at."""
         file = data / "poses_bounds.npy"
         rows = read_npy(str(file), read_bytes(file))

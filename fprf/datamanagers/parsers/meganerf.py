@@ -22,7 +22,7 @@ _LARGEST = 1 << 24
 class MegaNerfParser(DataParser):
     """`train` and `val` folders."""
 
-    def parse(self, data: Path, downscale: int) -> Scene:
+    def parse(self, data: Path, downscale: float) -> Scene:
         """The scene at 1/downscale of the delivered size; `val` is held out. Lengths are metres where the capture says."""
         # Metres of a unit of the poses; 1 where nothing is said.
         unit, path = 1.0, data / "coordinates.pt"

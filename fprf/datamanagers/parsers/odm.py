@@ -46,7 +46,7 @@ class OdmParser(DataParser):
     def __init__(self, config: OdmConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: int) -> Scene:
+    def parse(self, data: Path, downscale: float) -> Scene:
         """The scene at 1/downscale of its photographs, with the reconstruction's points where they are there."""
         file = project_file(data)
         if file is None:

@@ -22,7 +22,7 @@ class PhotoTourismParser(DataParser):
     def __init__(self, config: PhotoTourismConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: int) -> Scene:
+    def parse(self, data: Path, downscale: float) -> Scene:
         """The listed photographs. Raises DataError where the table names none of the model's."""
         tables = [data / self.config.list] if self.config.list else sorted(data.glob("*.tsv"))
         if len(tables) != 1:

@@ -22,7 +22,7 @@ from .views import View, assemble_scene, read_views, rigid_pose, stated_size
 class PolycamParser(DataParser):
     """`keyframes/` of a raw export."""
 
-    def parse(self, data: Path, downscale: int) -> Scene:
+    def parse(self, data: Path, downscale: float) -> Scene:
         """The scene at 1/downscale of its images."""
         folders = keyframes(data)
         if not folders:

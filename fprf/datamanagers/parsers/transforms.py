@@ -47,7 +47,7 @@ class TransformsParser(DataParser):
     def __init__(self, config: TransformsConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: int) -> Scene:
+    def parse(self, data: Path, downscale: float) -> Scene:
         """The scene at 1/downscale of the size that the file's intrinsics belong to."""
         # The frames of all files, by name.
         files = self._files(data)
@@ -88,7 +88,7 @@ class TransformsParser(DataParser):
 class GardenParser(DataParser):
     """Reads the scene that ships with the package, whatever folder is named."""
 
-    def parse(self, data: Path, downscale: int) -> Scene:
+    def parse(self, data: Path, downscale: float) -> Scene:
         return TransformsParser(TransformsConfig()).parse(Path(str(resources.files("fprf") / "garden")), downscale)
 
 

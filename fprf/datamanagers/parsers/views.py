@@ -219,7 +219,7 @@ def assemble_scene(
     data: Path,
     views: Sequence[View],
     *,
-    downscale: int,
+    downscale: float,
     split: tuple[Tensor, Tensor] | None = None,
     points: NDArray[np.float64] | None = None,
     seen: NDArray[np.int64] | None = None,
