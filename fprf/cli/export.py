@@ -190,8 +190,8 @@ class _Export:
             return {}
         from ..io.atomic import write_json
         from ..io.images import to_uint8, write_image
-        from ..rendering.camera_path import transforms
         from ..rendering.local_frame import added_and_beside, write_offset
+        from ..rendering.paths import transforms
 
         known, scene = self.opened.known, self.opened.scene.restyled(self.looks[-1].restyle)
         files = [f"images/{name}.png" for name in scene.names]

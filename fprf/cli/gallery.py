@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Literal
 from ..checks import at_least, positive
 from ..errors import FprfError, UsageError
 from ..progress import Display
-from ..style.config import StyleConfig
 from ..style.files import StyleFile, check_photographs, read_style
-from ..training.quality import QualityConfig
-from .style_flags import read_flags
+from .style_flags import StyledRunConfig, read_flags
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
@@ -28,11 +26,9 @@ Each reference is a style of its own; with several of them all together are one 
 
 
 @dataclass(frozen=True, kw_only=True)
-class GalleryConfig(StyleConfig, QualityConfig):
+class GalleryConfig(StyledRunConfig):
     """Views and styles of the page."""
 
-    run: Path = Path()
-    """Run folder."""
     styles: tuple[Path, ...] = ()
     """Style files (style.json), each one more style."""
     split: Literal["some", "test", "train", "all"] = "some"
@@ -47,12 +43,9 @@ class GalleryConfig(StyleConfig, QualityConfig):
     """Size of the page, at most; Gaussians that show least are left out of it."""
     output: Path | None = None
     """The page; by default RUN/gallery.html."""
-    device: str = "auto"
-    """cpu, cuda, mps, or auto."""
 
     def __post_init__(self) -> None:
-        StyleConfig.__post_init__(self)
-        QualityConfig.__post_init__(self)
+        super().__post_init__()
         at_least("most", self.most, 1)
         positive("megabytes", self.megabytes)
 

@@ -11,10 +11,8 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 from ..checks import at_least
 from ..errors import ConfigError, UsageError
 from ..progress import Display
-from ..style.config import StyleConfig
 from ..style.files import read_keyframes
-from ..training.quality import QualityConfig
-from .style_flags import named_styles, read_flags
+from .style_flags import StyledRunConfig, named_styles, read_flags
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
@@ -41,11 +39,9 @@ class Take(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RenderVerbConfig(StyleConfig, QualityConfig):
+class RenderVerbConfig(StyledRunConfig):
     """Settings of `fprf render`."""
 
-    run: Path = Path()
-    """Run folder."""
     output: Path = Path("render.mp4")
     """A film (.mp4), or a folder for numbered frames. Frames that an interrupted render left are not made again."""
     path: str = "interpolate"
@@ -66,12 +62,9 @@ class RenderVerbConfig(StyleConfig, QualityConfig):
     """Layers of each frame, from left to right."""
     format: Literal["png", "jpg"] = "png"
     """Format of frames in a folder."""
-    device: str = "auto"
-    """cpu, cuda, mps, or auto."""
 
     def __post_init__(self) -> None:
-        StyleConfig.__post_init__(self)
-        QualityConfig.__post_init__(self)
+        super().__post_init__()
         at_least("frames", self.frames, 1)
         at_least("fps", self.fps, 1)
         if not self.show:

@@ -3,19 +3,34 @@
 import re
 import sys
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from ..errors import UsageError
 from ..style.config import PRESETS, StyleConfig, preset_flags, with_preset
 from ..style.files import StyleFile, check_photographs, read_style, with_folders
+from ..training.quality import QualityConfig
 from .parsing import parse
 
 C = TypeVar("C", bound=StyleConfig)
 
 _LONGEST = 60
 """Characters of a style's name, which file names carry."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StyledRunConfig(StyleConfig, QualityConfig):
+    """A run and its style, for the verbs that render it."""
+
+    run: Path = Path()
+    """Run folder."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto."""
+
+    def __post_init__(self) -> None:
+        StyleConfig.__post_init__(self)
+        QualityConfig.__post_init__(self)
 
 
 def read_flags(

@@ -6,10 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..progress import Display
-from ..style.config import StyleConfig
 from ..style.files import write_style
-from ..training.quality import QualityConfig
-from .style_flags import read_flags
+from .style_flags import StyledRunConfig, read_flags
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
@@ -32,11 +30,9 @@ everywhere. REFERENCE is a file or its number, from 0 in the order given."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class StylizeConfig(StyleConfig, QualityConfig):
+class StylizeConfig(StyledRunConfig):
     """Views to restyle, and their style."""
 
-    run: Path = Path()
-    """Run folder."""
     style: Path | None = None
     """A style file, such as the style.json of an earlier run, of this scene or another; flags come over it."""
     output: Path | None = None
@@ -53,12 +49,6 @@ class StylizeConfig(StyleConfig, QualityConfig):
     """Also write which reference each pixel takes, as VIEW-match.png."""
     pixels: bool = False
     """Also write each match map as numbers, as VIEW-match.npz."""
-    device: str = "auto"
-    """cpu, cuda, mps, or auto."""
-
-    def __post_init__(self) -> None:
-        StyleConfig.__post_init__(self)
-        QualityConfig.__post_init__(self)
 
 
 def run(args: list[str]) -> int:

@@ -98,7 +98,7 @@ def run(args: list[str]) -> int:
 
                 session = None if config.follow else server.open(load, references, config.pixels)
                 if not is_capture(path):
-                    from ..page.follow import TrainingFollower
+                    from ..page.session import TrainingFollower
 
                     # A run that is in training: the scene is loaded anew with each checkpoint.
                     TrainingFollower(server, path, load, session, references, config.pixels).run(threading.Event())
@@ -113,7 +113,7 @@ def run(args: list[str]) -> int:
 
 
 def _start(server: "ViewerServer", config: ViewConfig, references: Sequence[Path]) -> "Start":
-    from ..page.follow import TrainingFollower
+    from ..page.session import TrainingFollower
     from ..page.start import Start
 
     def show(path: Path, name: str) -> None:

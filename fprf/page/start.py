@@ -1,8 +1,8 @@
 """The start of `fprf view` without a run: photographs, a video or a capture come in, and become a scene that the viewer shows.
 
 Poses and training are `fprf process` and `fprf train` in processes of their own; the page shows the lines that they print, and
-from the first checkpoint on the scene itself (`follow.py`). A scene has one folder: its `files`, the `scene` with their poses,
-and the run folder `run`.
+from the first checkpoint on the scene itself (`session.py`). A scene has one folder: its `files`, the `scene` with
+their poses, and the run folder `run`.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ from .messages import Leave, Make, New, Open, StartRequest, Stop
 from .uploads import SceneFiles, Source, find_source, is_capture, newest_step
 
 if TYPE_CHECKING:
-    from .follow import TrainingFollower
+    from .session import TrainingFollower
 
 METHOD = "fprf-splats"
 _FILES, _SCENE, _RUN = "files", "scene", "run"

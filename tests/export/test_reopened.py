@@ -16,8 +16,8 @@ from tiny_world import World
 from fprf.cli import main as cli
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.export.config import plan
-from fprf.rendering.camera_path import transforms
 from fprf.rendering.cameras import Cameras
+from fprf.rendering.paths import transforms
 
 LOOKS = {"": "plain", ".dusk": "dusk", ".snow": "snow"}
 

@@ -9,7 +9,7 @@ from session_helpers import Listener
 from splat_ball import ball
 from tiny_world import World
 
-from fprf.page.restyler import Restyler
+from fprf.page.drawing import Restyler
 from fprf.page.session import Session, Viewed, view_of_run
 from fprf.page.state import Photograph
 from fprf.training.loading import open_run

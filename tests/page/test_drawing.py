@@ -8,8 +8,8 @@ from session_helpers import camera_of
 from fprf.io.images import Picture, to_uint8
 from fprf.io.maps import match_image
 from fprf.page import drawing
-from fprf.page.drawing import Request, ScenePainter
-from fprf.page.restyler import Restyler
+from fprf.page.drawing import Restyler, ScenePainter
+from fprf.page.messages import View
 from fprf.page.state import Look, Photograph, Shown
 from fprf.style.config import StyleConfig
 from fprf.style.match_maps import match_map
@@ -22,13 +22,13 @@ class Watched(ScenePainter):
     """A painter whose pictures are kept."""
 
     def __init__(self, restyler: Restyler) -> None:
-        super().__init__(restyler.scene, restyler, lambda client, *picture: self.pictures.append(picture))
+        super().__init__(restyler.scene, restyler, lambda client, *picture: self.pictures.append(picture), 32)
         self.pictures: list[tuple[str, Picture, bool]] = []
 
     def look(self, shown: Shown | None = None, view: int = 2, client: Hashable = 1, captured: bool = False) -> list[Any]:
         self.pictures.clear()
         camera = camera_of(self._scene, view)
-        for _ in self.render(client, Request(camera, shown or Shown(Look()), int(max(camera.size)), captured)):
+        for _ in self.render(client, View(camera=camera, captured=captured), shown or Shown(Look())):
             pass
         return list(self.pictures)
 

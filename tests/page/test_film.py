@@ -15,8 +15,7 @@ from fprf.errors import UsageError
 from fprf.io.images import Picture
 from fprf.page import messages
 from fprf.page import session as viewer_session
-from fprf.page.drawing import film_cameras, film_frames, write_film_files
-from fprf.page.restyler import Restyler
+from fprf.page.drawing import Restyler, film_cameras, film_frames, write_film_files
 from fprf.page.session import Session
 from fprf.page.state import Look, Photograph
 from fprf.style.config import StyleConfig

@@ -4,9 +4,8 @@ from pathlib import Path
 import pytest
 
 from fprf.errors import CheckpointError
-from fprf.page.follow import TrainingFollower, training_progress
 from fprf.page.server import Access, ViewerServer
-from fprf.page.session import Viewed, view_of_run
+from fprf.page.session import TrainingFollower, Viewed, training_progress, view_of_run
 from fprf.training.driver import is_watched
 from fprf.training.loading import open_run
 

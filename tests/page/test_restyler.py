@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from fprf.errors import UsageError
-from fprf.page.restyler import Restyler, matching_regions
+from fprf.page.drawing import Restyler, matching_regions
 from fprf.page.state import Look, Photograph
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
