@@ -13,7 +13,7 @@ import logging
 import secrets
 import socket
 import threading
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -279,18 +279,17 @@ class ViewerServer:
         """Show a line on all pages."""
         self.post(None, "said", {"type": "said", "text": text, "bad": False})
 
-    def open(
-        self, load: "Callable[[], Viewed]", references: Sequence[Path] = (), longest: int = 640, *, warm: bool = True
-    ) -> "Session":
-        """Load the scene and show it in the place of what was shown. Raises what `load` raises, and DataError for an
-        unreadable photograph."""
+    def open(self, load: "Callable[[], Viewed]", *, warm: bool = True) -> "Session":
+        """Load a scene and show it in the place of what was shown, prepared for the first photograph if it is to be `warm`.
+
+        Raises what `load` raises, and DataError for an unreadable photograph.
+        """
         from .session import Session
 
         viewed = load()  # while what was open stays open
         self._close_session()
-        made = Session(viewed, self.post, longest=longest, together=len(references) > 1)
-        session = self._opened.enter_context(made)
-        for path in references:
+        session = self._opened.enter_context(Session(viewed, self.post))
+        for path in viewed.references:
             session.upload(path.read_bytes(), path.name)
         if warm:
             session.warm_up()

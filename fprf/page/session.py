@@ -8,7 +8,7 @@ more often.
 
 import json
 import threading
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -67,6 +67,10 @@ class Viewed:
     """Style that looks start from."""
     step: int = 0
     """Step of the checkpoint that it was read from."""
+    references: tuple[Path, ...] = ()
+    """Photographs that are on the shelf at the beginning; several are mixed, and those that come later join them."""
+    pixels: int = 640
+    """Longest side of the sharpest picture."""
 
 
 def view_of_run(opened: LoadedRun[Scene]) -> Viewed:
@@ -78,10 +82,10 @@ def view_of_run(opened: LoadedRun[Scene]) -> Viewed:
 class Session:
     """Use as a context manager, which ends its threads and processes."""
 
-    def __init__(self, viewed: Viewed, post: Post, *, longest: int = 640, together: bool = False) -> None:
-        self.viewed, self._post, self._longest = viewed, post, longest
+    def __init__(self, viewed: Viewed, post: Post) -> None:
+        self.viewed, self._post = viewed, post
         self.restyler = Restyler(viewed.scene)
-        self.state = State(look=Look(style=viewed.style), together=together)
+        self.state = State(look=Look(style=viewed.style), together=len(viewed.references) > 1)
         self.uploads = Uploads()
         self._lock = threading.RLock()
         self._requests: dict[Hashable, messages.View] = {}
@@ -109,7 +113,7 @@ class Session:
             self.packed, head, parts = packed_scene(scene, [scene.gaussians.harmonics], home, level=1)
             self.geometry = container(head, parts)
         else:
-            self._painter = ScenePainter(scene, self.restyler, self._show, self._longest)
+            self._painter = ScenePainter(scene, self.restyler, self._show, self.viewed.pixels)
             # A camera turns about a point as far away as most cameras are from their middle.
             place = scene.cameras.pose[:, :, 3]
             spread = float((place - place.median(dim=0).values).norm(dim=1).quantile(0.9)) or 1.0
@@ -346,21 +350,11 @@ _TAIL = 4096
 class TrainingFollower:
     """Keeps the scene that a server shows at the newest checkpoint of a run.
 
-    `load` opens the run, and `opened` is the session where it is open already; without, it is opened at the first checkpoint,
-    with `references` on the shelf.
+    `load` opens the run, and `opened` is the session where it is open already; without, it is opened at the first checkpoint.
     """
 
-    def __init__(
-        self,
-        server: "ViewerServer",
-        root: Path,
-        load: Callable[[], Viewed],
-        opened: Session | None = None,
-        references: Sequence[Path] = (),
-        pixels: int = 640,
-    ) -> None:
+    def __init__(self, server: "ViewerServer", root: Path, load: Callable[[], Viewed], opened: Session | None = None) -> None:
         self._server, self._root, self._load, self.session = server, root, load, opened
-        self._references, self._pixels = references, pixels
         self._shown = -1 if opened is None else opened.viewed.step
 
     def run(self, ended: threading.Event) -> None:
@@ -380,7 +374,7 @@ class TrainingFollower:
             return
         self._shown = newest
         if self.session is None:
-            self.session = self._server.open(self._load, self._references, self._pixels, warm=False)
+            self.session = self._server.open(self._load, warm=False)
         else:
             self.session.reload(self._load())
         if (progress := training_progress(self._root)) is not None:
