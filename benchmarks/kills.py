@@ -30,7 +30,7 @@ from fprf.datamanagers.config import RayBatchesConfig
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.methods import fprf_lite
 from fprf.plugins.samplers.config import ProposalConfig
-from fprf.training import block_training, driver, prepare, style_pass
+from fprf.training import blocks, driver, prepare, style_pass
 from fprf.training.checkpoint import load
 from fprf.training.checkpoint import steps as saved
 
@@ -38,7 +38,7 @@ from .common import arguments, report
 from .town.write import write_town
 
 KILLED = -9
-PARTS = (block_training, prepare, style_pass, driver)
+PARTS = (blocks, prepare, style_pass, driver)
 """What a training imports when it begins: here already, so that children start at once."""
 SPAN = 0.7
 """Seconds after a process's first save within which it is killed."""

@@ -19,13 +19,7 @@ from fprf.interfaces import Scene, SceneView
 from fprf.io.images import Picture, to_uint8, write_image
 from fprf.methods import fprf_lite
 from fprf.plugins import registry
-from fprf.plugins.stylizers.config import (
-    AdainConfig,
-    LocalAdainConfig,
-    RegionOtConfig,
-    RegionToneConfig,
-    StylizerConfig,
-)
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from fprf.progress import Display
 from fprf.style.config import StyleConfig, labels
 from fprf.style.dictionary import Encoders, StyleDictionary, build_dictionary, encode_photograph

@@ -367,16 +367,17 @@ class TrainConfig(RunConfig):
         progress: Callable[[int, int, str], None] | None = None,
     ) -> "SceneLearner | Partition":
         """Extract the features and build the model; blocks where the scene is cut."""
+        from .blocks.visibility import make_plan
+        from .training.blocks import Blocks
         from .training.learner import FieldLearner
         from .training.prepare import prepare
 
-        if self.blocks.cuts:
-            from .training.block_training import cut
-
-            blocks = cut(self, scene, saved, progress)
-            if blocks is not None:
-                return blocks
-        return FieldLearner(self, prepare(self, scene, saved, progress), device)
+        plan = make_plan(scene, self.blocks) if self.blocks.cuts else None
+        if plan is None or len(plan.cells) == 1:
+            return FieldLearner(self, prepare(self, scene, saved, progress), device)
+        # One basis and one unit of the losses, of all training views, so that features mean the same in each block.
+        prepared = prepare(self, scene, saved, progress, space=plan.space)
+        return Blocks(self, scene, plan, prepared.facts, prepared.basis)
 
     @property
     def trained_on(self) -> str:

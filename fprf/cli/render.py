@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..style.restyle import Styled
     from ..training.loading import LoadedRun
 
-_NO_FOLDERS = (".avi", ".bmp", ".exr", ".gif", ".jpeg", ".jpg", ".m4v", ".mkv", ".mov", ".png", ".tif", ".webm", ".webp")
+_NO_FOLDERS = frozenset({".avi", ".bmp", ".exr", ".jpeg", ".jpg", ".m4v", ".mkv", ".mov", ".mpg", ".png", ".tif", ".webm"})
 """Endings that nobody gives a folder."""
 _PROBES, _PROBE_RESOLUTION = 4, 0.25
 """Frames, and their size, that the range of depths is taken from: one range for a whole film."""
@@ -43,7 +43,8 @@ class RenderVerbConfig(StyledRunConfig):
     """Settings of `fprf render`."""
 
     output: Path = Path("render.mp4")
-    """A film (.mp4), or a folder for numbered frames. Frames that an interrupted render left are not made again."""
+    """A film (.mp4), an animated picture (.gif .webp .apng), or a folder for numbered frames. Frames that an interrupted
+    render left are not made again."""
     path: str = "interpolate"
     """spiral, orbit, interpolate, dataset, or a camera-path JSON file of Nerfstudio."""
     split: Literal["test", "train", "all"] = "all"
@@ -80,12 +81,12 @@ def run(args: list[str]) -> int:
     from ..datamanagers.images import load_image
     from ..io.images import write_image
     from ..io.maps import depth_limits, side_by_side
-    from ..io.video import MAX_FPS, missing_frames, write_video
+    from ..io.video import FILMS, MAX_FPS, missing_frames, write_video
     from ..rendering.paths import make_path
     from ..training.loading import open_run
 
     if config.output.suffix.lower() in _NO_FOLDERS:
-        raise UsageError(f"--output {config.output}: films end in .mp4; give such a name, or a folder for frames")
+        raise UsageError(f"--output {config.output}: films end in {' '.join(FILMS)}; give such a name, or a folder for frames")
     if config.fps > MAX_FPS:
         raise UsageError(f"--fps {config.fps:g}: a film has at most {MAX_FPS} frames a second")
     opened = open_run(config.run, config.device, config)
@@ -95,7 +96,7 @@ def run(args: list[str]) -> int:
     # Captured views keep the stem of their image.
     names = [known.names[view] for view in views] if config.path == "dataset" else [f"{i:05d}" for i in range(len(cameras))]
     takes = _takes(opened.scene, config, file)
-    whole = config.output.suffix.lower() == ".mp4"
+    whole = config.output.suffix.lower() in FILMS
     folder = config.output.with_suffix(".frames") if whole else config.output
     paths = [folder / f"{name}.{'png' if whole else config.format}" for name in names]
     key = _key(opened, config, cameras)

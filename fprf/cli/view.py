@@ -124,9 +124,9 @@ def _load(config: ViewConfig, notify: Callable[[str], None], path: Path, name: s
         style = StyleConfig(stylizer=config.stylizer or RegionToneConfig())
         name = name or viewed.name
         return replace(viewed, name=name, style=style, references=config.references, pixels=config.pixels)
+    from ..splats.captures import open_capture
     from ..splats.config import LookConfig
     from ..splats.files import read_capture
-    from ..splats.loading import open_capture
 
     def progress(done: int, total: int) -> None:
         if done == 0:

@@ -1,10 +1,10 @@
-"""Frames to a film, one in memory at a time, and the frames of a film that are not rendered yet."""
+"""Frames to a film or to numbered pictures, one frame in memory at a time; to an animated picture, all of them."""
 
 import importlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from fractions import Fraction
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from ..errors import DataError, UsageError
-from .atomic import atomic_path, unwritable, write_json
+from .atomic import atomic_path, unwritable, write_bytes, write_json
 from .images import Picture, checked
 from .strict_json import parse_json
 
@@ -20,9 +20,17 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 
-Codec = Literal["h264", "mp4v"]
+Codec = Literal["h264", "mp4v", "gif", "webp", "apng"]
+_ANIMATIONS: dict[str, tuple[Codec, str, list[int]]] = {
+    ".gif": ("gif", ".gif", [cv2.IMWRITE_GIF_QUALITY, 8, cv2.IMWRITE_GIF_DITHER, 1]),
+    ".webp": ("webp", ".webp", [cv2.IMWRITE_WEBP_QUALITY, 84]),
+    ".apng": ("apng", ".png", []),
+}
+"""Animated pictures by ending: their format, the ending that OpenCV knows it by, and its options."""
+FILMS = (".mp4", *_ANIMATIONS)
+"""Endings of the films that can be written."""
 MAX_FPS = 1000
-"""Frames per second of a film, at most."""
+"""Frames per second of a film, at most: animated pictures count whole milliseconds."""
 
 
 def _alike(frames: Iterable[Picture], path: Path) -> Iterator[Picture]:
@@ -58,11 +66,12 @@ def _with_av(av: "ModuleType", path: Path, frames: Iterator[Picture], size: tupl
 def write_video(path: Path, frames: Iterable[Picture], fps: float, *, h264: bool = True) -> Codec:
     """Write an .mp4, whole or not at all: H.264 where PyAV is installed (extra `video`), MPEG-4 part 2 elsewhere.
 
-    Odd sizes gain a repeated row or column. Returns the codec that was used; browsers play "h264" alone. `h264=False` asks for
-    the fallback. Raises UsageError for another ending, DataError for no frames or frames of several sizes.
+    .gif (256 colours a frame, in steps of 10 ms), .webp and .apng (lossless) become animated pictures that start over.
+    Odd sizes gain a repeated row or column. Returns the codec that was used; browsers play all but "mp4v". `h264=False`
+    asks for the fallback. Raises UsageError for another ending, DataError for no frames or frames of several sizes.
     """
-    if path.suffix.lower() != ".mp4":
-        raise UsageError(f"{path}: films end in .mp4; give such a name, or a folder for single pictures")
+    if path.suffix.lower() not in FILMS:
+        raise UsageError(f"{path}: films end in {' '.join(FILMS)}; give such a name, or a folder for single pictures")
     if not 0 < fps <= MAX_FPS:
         raise UsageError(f"{path}: {fps} frames a second; must lie in (0, {MAX_FPS}]")
     rate = Fraction(fps).limit_denominator(1001)
@@ -71,6 +80,8 @@ def write_video(path: Path, frames: Iterable[Picture], fps: float, *, h264: bool
     if first is None:
         raise DataError(f"{path}: no frames to write; the camera path is empty")
     size = (first.shape[1], first.shape[0])
+    if path.suffix.lower() in _ANIMATIONS:
+        return _animated(path, [first, *even], fps)
     # PyAV, unless it is absent or was built without x264, as some distributions do; else OpenCV.
     av = None
     if h264:
@@ -89,6 +100,22 @@ def write_video(path: Path, frames: Iterable[Picture], fps: float, *, h264: bool
         finally:
             writer.release()
         return "mp4v"
+
+
+def _animated(path: Path, frames: list[Picture], fps: float) -> Codec:
+    """Write an animated picture that starts over at its end."""
+    kind, ending, options = _ANIMATIONS[path.suffix.lower()]
+    film = cv2.Animation()
+    film.frames = [cv2.cvtColor(frame, cv2.COLOR_RGB2BGR) for frame in frames]
+    # Each duration is a whole number of milliseconds, and of GIF's hundredths: rounded so that no error adds up.
+    unit = 10 if kind == "gif" else 1
+    ends = [round(1000 * (k + 1) / fps / unit) * unit for k in range(len(frames))]
+    film.durations = [end - start for start, end in pairwise([0, *ends])]
+    done, data = cv2.imencodeanimation(ending, film, options)
+    if not done:
+        raise DataError(f"{path}: OpenCV cannot write it here; write an .mp4, or a folder")
+    write_bytes(path, data.tobytes())
+    return kind
 
 
 _RECORD = ".render.json"

@@ -12,7 +12,6 @@ from torch import Tensor
 from ..config import RunConfig, TrainConfig
 from ..datamanagers.basis import Basis
 from ..datamanagers.bounds import find_space
-from ..datamanagers.features import FeatureStore
 from ..datamanagers.images import WHITE
 from ..datamanagers.parsers.config import parse_scene, recognise
 from ..datamanagers.scene import Scene, at_origin, exposures_differ, find_sightings, with_exposure
@@ -75,10 +74,16 @@ def prepare(
     scene: Scene,
     saved: Facts | None = None,
     progress: Callable[[int, int, str], None] | None = None,
+    *,
+    space: Space | None = None,
 ) -> Prepared:
-    """Everything of a scene of fields but the model; arguments as of `RunConfig.build`."""
+    """Everything of a scene of fields but the model, in a space that is found where none is given.
+
+    Arguments as of `RunConfig.build`.
+    """
     content, semantic = build_encoders(config)
     build_decoder(config, encoder=content.identity, channels=content.channels)  # refused now, not after all the features
+    background = config.render.background or (WHITE if scene.alpha else None)
     # Decodes all images and extracts their features, or finds both in the cache.
     manager = config.datamanager.build(
         scene=scene,
@@ -88,12 +93,22 @@ def prepare(
         cache=cache_folder() / "features",
         seed=config.seed,
         progress=progress,
-        background=scene_background(config, scene),
+        background=background,
     )
-    stores = manager.content_store, manager.semantic_store
     exposure = exposure_of(config.tones, scene, manager.image, saved)
-    facts = field_facts(config, scene, find_space(scene), exposure, (content, semantic), stores)
-    return Prepared(scene, manager, facts, None if stores[1] is None else stores[1].basis)
+    facts = facts_of(scene, background, space=space, exposure=exposure, poses=config.poses > 0)
+    # Scales are the spread of the targets: losses in their units weigh the same with any encoder.
+    contents, semantics = manager.content_store, manager.semantic_store
+    facts = replace(
+        facts,
+        channels=content.channels,
+        dim=0 if semantics is None else semantics.channels,
+        content_encoder=content.identity,
+        semantic_encoder="" if semantic is None else semantic.identity,
+        content_scale=1.0 if contents is None else contents.scale,
+        semantic_scale=1.0 if semantics is None else semantics.scale,
+    )
+    return Prepared(scene, manager, facts, None if semantics is None else semantics.basis)
 
 
 def build_encoders(config: TrainConfig) -> tuple[Encoder, Encoder | None]:
@@ -117,28 +132,6 @@ def build_encoders(config: TrainConfig) -> tuple[Encoder, Encoder | None]:
     content, semantic = built
     assert content is not None
     return content, semantic
-
-
-def field_facts(
-    config: TrainConfig,
-    scene: Scene,
-    space: Space,
-    exposure: tuple[float, ...],
-    encoders: tuple[Encoder, Encoder | None],
-    stores: tuple[FeatureStore | None, FeatureStore | None],
-) -> Facts:
-    """Facts of a scene of fields: encoders and stores of content and semantics."""
-    # Scales are the spread of the targets: losses in their units weigh the same with any encoder.
-    (content, semantic), (content_store, semantic_store) = encoders, stores
-    return replace(
-        facts_of(scene, scene_background(config, scene), space=space, exposure=exposure, poses=config.poses > 0),
-        channels=content.channels,
-        dim=semantic_store.channels if semantic_store is not None else 0,
-        content_encoder=content.identity,
-        semantic_encoder=semantic.identity if semantic is not None else "",
-        content_scale=content_store.scale if content_store is not None else 1.0,
-        semantic_scale=semantic_store.scale if semantic_store is not None else 1.0,
-    )
 
 
 def facts_of(
@@ -191,11 +184,6 @@ def reach_of(scene: Scene, space: Space) -> float:
     if sightings is not None:
         return float(sightings.distance.median())
     return space.near if space.kind == "ndc" else 1 / space.scale
-
-
-def scene_background(config: TrainConfig, scene: Scene) -> tuple[float, float, float] | None:
-    """Colour behind everything: images and renders show the same. None where nothing is assumed."""
-    return config.render.background or (WHITE if scene.alpha else None)
 
 
 def scene_needs(config: RunConfig) -> list[Need]:

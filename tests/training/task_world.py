@@ -12,7 +12,7 @@ import torch
 from fprf.config import RunConfig
 from fprf.splats import cells
 from fprf.splats.config import GaussiansConfig
-from fprf.training import block_training, blocks, checkpoint
+from fprf.training import blocks, checkpoint
 from fprf.training.tasks import Part, Task, train_part
 
 REPORT = Callable[[Any], None]
@@ -65,7 +65,7 @@ class TaskWorld:
 
 
 def world_of_blocks(config: RunConfig, root: Path) -> TaskWorld:
-    return TaskWorld(config, "fprf-lite", root, 3, blocks.folder_of, block_training.open_block)
+    return TaskWorld(config, "fprf-lite", root, 3, blocks.folder_of, blocks.open_block)
 
 
 def small_cells(data: Path, output: Path, **change: Any) -> GaussiansConfig:

@@ -14,8 +14,17 @@ from fprf.blocks.fields import Member
 from fprf.blocks.visibility import make_plan
 from fprf.errors import CheckpointError
 from fprf.io import tensorfiles
-from fprf.training.block_training import RAYS, block_task
-from fprf.training.blocks import BlockCache, Built, folder_of, load_blocks, load_finished, restore, surroundings
+from fprf.training.blocks import (
+    RAYS,
+    BlockCache,
+    Built,
+    block_task,
+    folder_of,
+    load_blocks,
+    load_finished,
+    restore,
+    surroundings,
+)
 from fprf.training.driver import train
 from fprf.training.loading import load_run
 from fprf.training.prepare import read_scene
