@@ -11,7 +11,7 @@ from ..checks import at_least, positive
 from ..errors import FprfError, UsageError
 from ..progress import Display
 from ..style.files import StyleFile, check_photographs, read_style
-from .style_flags import StyledRunConfig, read_flags
+from .style_flags import StyledRunConfig, read_flags, style_name
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
@@ -68,6 +68,7 @@ def run(args: list[str]) -> int:
     most = len(views) if config.views else min(config.most, len(views))
     views = [views[k * len(views) // most] for k in range(most)]
     chosen = _chosen(config, file)
+    # Photographs have one name on the whole page, whichever styles they are in.
     called = _called([*config.references, *(path for _, each in chosen for path in each.style.references)])
     with Display() as display:
         originals = page_views(opened, views, display)
@@ -102,7 +103,7 @@ def _chosen(config: GalleryConfig, together: StyleFile) -> list[tuple[str, Style
     for path in config.styles:
         file = read_style(path)
         check_photographs(path, file)
-        own = path.resolve().parent.name if path.name == "style.json" else path.stem
+        own = style_name(path, ())
         chosen.append((f"{own} ({len(chosen) + 1})" if own in dict(chosen) else own, file))
     if len(names) > 1:
         chosen.append((" + ".join(names.values()) if len(names) <= 3 else f"all {len(names)}", together))

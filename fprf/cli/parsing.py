@@ -186,6 +186,7 @@ def parse(default: C, args: Sequence[str], *, prog: str, description: str, posit
             raise UsageError(f"{prog}: {path.upper()} is missing; `{prog} --help` says what it takes")
     if loose:
         raise UsageError(f"{loose[0]!r}: belongs to no flag; `{prog} --help` lists the flags")
+    # Words become values when all flags are known to exist, so that an unknown one is told first.
     values = {path: every[path].value(words) for path, words in given.items()}
     try:
         return _changed(config, values)

@@ -15,8 +15,8 @@ from .parsing import parse
 
 C = TypeVar("C", bound=StyleConfig)
 
-_LONGEST = 60
-"""Characters of a style's name, which file names carry."""
+_LONGEST, _JOINED = 60, 80
+"""Characters of a style's name that users choose, and of one that is made of those of its photographs: file names carry it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,6 +107,17 @@ def named_styles(texts: Sequence[str], base: StyleFile) -> list[tuple[str, Style
             file = StyleFile(with_folders(style, say))
         styles.append((name, file))
     return styles
+
+
+def style_name(style: Path | None, references: Sequence[Path]) -> str:
+    """Name of a style: that of its file, of a style.json its folder's; without a file the stems of its photographs, joined.
+
+    Cut to what every file system takes.
+    """
+    if style is not None:
+        return style.stem if style.name != "style.json" else style.resolve().parent.name or "style"
+    joined = "+".join(path.stem for path in references)
+    return joined if len(joined) <= _JOINED else f"{joined[:_JOINED]}+{len(references)}"
 
 
 def tidy(name: str) -> str:

@@ -7,15 +7,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ..progress import Display
 from ..style.files import write_style
-from .style_flags import StyledRunConfig, read_flags
+from .style_flags import StyledRunConfig, read_flags, style_name
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
     from ..style.regions import Regions
     from ..style.restyle import Styled
-
-_LONGEST = 80
-"""Characters of a style's default name."""
 
 _SHOWN = 0.1
 """References that a region takes less of are not in the table."""
@@ -60,7 +57,7 @@ def run(args: list[str]) -> int:
     opened = open_run(config.run, config.device, config)
     scene = opened.scene
     views = opened.known.views(config.split, config.views)
-    output = config.output or config.run / "styles" / _name(config)
+    output = config.output or config.run / "styles" / (style_name(config.style, config.references) or "regions")
     if config.explain and not config.references:  # regions alone: no style is built
         print_explained(output, Regions(scene, *scene.measured()), None)
         return 0
@@ -142,11 +139,3 @@ def print_explained(output: Path, regions: "Regions", styled: "Styled | None") -
     write_json(output / "explain.json", {"references": list(names), "regions": [region_row(region) for region in explained]})
     write_image(output / "explain.png", contact_sheet([region_tile(region, names) for region in explained]))
     print(f"the same with pictures in {output / 'explain.png'} and explain.json")
-
-
-def _name(config: StylizeConfig) -> str:
-    """The style file's folder or own name, else the references' stems joined, cut to what every file system takes."""
-    if config.style is not None:
-        return config.style.stem if config.style.name != "style.json" else config.style.resolve().parent.name or "style"
-    joined = "+".join(p.stem for p in config.references) or "regions"
-    return joined if len(joined) <= _LONGEST else f"{joined[:_LONGEST]}+{len(config.references)}"

@@ -78,6 +78,7 @@ def run(args: list[str]) -> int:
         server = stack.enter_context(ViewerServer(access, config.port))
         from ..page.uploads import is_capture
 
+        # `--follow` waits for a run folder that training has not made yet.
         path = config.run
         if path is not None and not (config.follow or is_capture(path) or (path / "config.json").is_file()):
             raise CheckpointError(f"{path}: no config.json here, so it is no run folder; `fprf train` makes one")
