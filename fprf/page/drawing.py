@@ -130,10 +130,7 @@ class Restyler:
         return None if styled is None else styled.restyle
 
     def region_at(self, cameras: Cameras, pixel: tuple[float, float]) -> int | None:
-        """The region at a pixel of the first camera; None where there is nothing. Raises UsageError outside of the view."""
-        width, height = cameras.size[0].tolist()
-        if not (0 <= pixel[0] < width and 0 <= pixel[1] < height):
-            raise UsageError(f"pixel {pixel[0]:.0f},{pixel[1]:.0f}: outside of the view of {width}x{height}")
+        """The region at a pixel of the first camera, which lies within its view; None where there is nothing."""
         # The region of the pixel's strongest membership, by the features that the ray sees.
         place = torch.tensor([pixel], dtype=torch.float64)
         share, opacity = memberships(self.scene, self.encoders.scene_style, cameras, 0, place)
