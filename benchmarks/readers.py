@@ -34,7 +34,7 @@ from fprf.datamanagers.parsers.phototourism import read_list
 from fprf.errors import FprfError
 from fprf.io import tensorfiles
 from fprf.plugins.codec import load_config
-from fprf.rendering.camera_path import read_camera_path
+from fprf.rendering.paths import read_camera_path
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.gaussians import Gaussians
 from fprf.style.files import read_style

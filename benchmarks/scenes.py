@@ -24,7 +24,7 @@ import torch
 
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.atomic import write_json
-from fprf.rendering.camera_path import transforms
+from fprf.rendering.paths import transforms
 from fprf.training.camera_optimizers import rotated
 
 from .common import add_entry, arguments, cost_of

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -194,7 +195,7 @@ def test_every_verb_takes_a_kind_of_scene_from_another_package(run: Path, world:
     assert len(list((tmp_path / "files" / "images").glob("*.png"))) == 10
     assert fprf.load(run).render("0000").rgb.shape == (24, 32, 3)
     opened, client = open_run(run, "cpu", QualityConfig()), Listener()
-    with Session(view_of_run(opened), client.post, longest=32) as session:
+    with Session(replace(view_of_run(opened), pixels=32), client.post) as session:
         session.upload(world.references[0].read_bytes(), "dusk")
         session.handle("browser", View(camera=camera_of(opened.scene, 0), captured=True))
         client.until(lambda: len(client.pictures("browser", "captured")) == 2)

@@ -150,6 +150,7 @@ def self_test(name: str) -> Iterator[Finding]:
 
     device = device_of(name)
     yield Finding("device", f"`--device {name}` is {device}")
+    # Whatever a kernel or driver does wrong is a finding with a way out, not a traceback.
     remedy = f"train and render with --device cpu; update torch and the driver of {device}"
     start = time.perf_counter()
     try:
@@ -196,6 +197,7 @@ def scene_folder(data: Path) -> Iterator[Finding]:
     yield Finding("format", registry.name_of(DataParserConfig.group, type(parser)))
     scene = parse_scene(data, 1, parser)
     count = len(scene.paths)
+    # A capture of many crops has as many sizes: the first three and a number are told.
     sizes = sorted({(int(w), int(h)) for w, h in scene.cameras.size.tolist()})
     shown = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (f" and {len(sizes) - 3} more" if len(sizes) > 3 else "")
     lenses = sorted({("pinhole", "OpenCV", "fisheye")[lens] for lens in scene.cameras.lens.tolist()})
@@ -215,6 +217,7 @@ def scene_folder(data: Path) -> Iterator[Finding]:
     if fault := useless_masks(scene):
         found, _, remedy = fault.partition("; ")
         yield Finding("masks", found, remedy, optional="are white" in found)
+    # Decoding all of a large capture takes minutes: views evenly through it stand for the others.
     broken = []
     for view in range(0, count, -(-count // _LOOKED)):
         try:

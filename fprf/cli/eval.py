@@ -75,6 +75,7 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
 
     opened = open_run(config.run, config.device, config)
     scene, known = opened.scene, opened.known
+    # The photographs are read as training read them, at their own size and about the origin of the run.
     trained = opened.run.load_config()[0]
     trained = replace(trained, data=config.data or trained.data)
     captured = at_origin(read_scene(replace(trained, downscale=1)), known.facts.origin)

@@ -10,7 +10,7 @@ from ..errors import UsageError
 from ..export.config import FIT_MINUTES, KINDS, ExportConfig, Plan, plan
 from ..progress import Display
 from ..splats.config import endings
-from .style_flags import named_styles, read_flags, tidy
+from .style_flags import named_styles, read_flags, style_name, tidy
 
 if TYPE_CHECKING:
     from ..export.mesh import Maps
@@ -32,13 +32,11 @@ def run(args: list[str]) -> int:
     """Render views, fit Gaussians to them or mesh them where that is wanted, write the files."""
     words = ("run", "kinds")
     config, file = read_flags(ExportConfig(), args, prog="fprf export", description=_DESCRIPTION, positional=words)
+    # What is to be written, and under which names, is settled before the run is opened: mistakes cost no time.
     what = plan(config.kinds, config.output or config.run / "exports")
     styles = named_styles(config.styles, file)
-    if config.references:  # the style of the flags, called as its file or its photographs
-        own = "+".join(path.stem for path in config.references)
-        if config.style is not None:
-            own = config.style.resolve().parent.name if config.style.name == "style.json" else config.style.stem
-        styles.insert(0, (tidy(own) or "style", file))
+    if config.references:  # the style of the flags
+        styles.insert(0, (tidy(style_name(config.style, config.references)) or "style", file))
     names = [name for name, _ in styles]
     for name in names:
         if names.count(name) > 1:
@@ -123,12 +121,14 @@ class _Export:
         own = scene.gaussian_rows() is not None
         if not self.what.formats:
             return {}
+        # Gaussians are written as they are, and never fitted to renders of themselves.
         if own and config.fit:
             raise UsageError("--fit: the run is of Gaussians already; leave it out")
         rows = (scene.restyled(look.restyle).gaussian_rows() for look in self.looks) if own else self._fitted()
         for look, gaussians in zip(self.looks, rows, strict=True):
             assert gaussians is not None
             count = gaussians.count
+            # One set of rows serves every format: a look of a fitted field is minutes of work.
             for path in self.what.paths("splats", look.name, *(f".{each}" for each in self.what.formats)):
                 written = write_gaussians(
                     path,
@@ -165,6 +165,7 @@ class _Export:
         from ..export.mesh import build_mesh, vertex_colours, write_mesh
 
         report = partial(self.display.count, what="building the mesh")
+        # Geometry comes from the scene as it is, whatever the style: meshes of all looks have the same vertices.
         mesh = build_mesh(self.plain, edge=self.config.mesh_edge, report=report)
         for look in self.looks:
             colour = vertex_colours(self.plain if look.restyle is None else self.maps(look), mesh)
@@ -178,11 +179,12 @@ class _Export:
             return {}
         from ..io.atomic import write_json
         from ..io.images import to_uint8, write_image
-        from ..rendering.camera_path import transforms
         from ..rendering.local_frame import added_and_beside, write_offset
+        from ..rendering.paths import transforms
 
         known, scene = self.opened.known, self.opened.scene.restyled(self.looks[-1].restyle)
         files = [f"images/{name}.png" for name in scene.names]
+        # Names are those of the captured views, so that a scene folder of renders can be compared with the captured one.
         for view, file in enumerate(files if self.config.images else ()):
             self.display.count(view, len(files), "rendering views")
             write_image(self.what.folder / file, to_uint8(scene.render(scene.cameras, view).rgb))

@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Literal
 from ..checks import at_least, positive
 from ..errors import FprfError, UsageError
 from ..progress import Display
-from ..style.config import StyleConfig
 from ..style.files import StyleFile, check_photographs, read_style
-from ..training.quality import QualityConfig
-from .style_flags import read_flags
+from .style_flags import StyledRunConfig, read_flags, style_name
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
@@ -28,11 +26,9 @@ Each reference is a style of its own; with several of them all together are one 
 
 
 @dataclass(frozen=True, kw_only=True)
-class GalleryConfig(StyleConfig, QualityConfig):
+class GalleryConfig(StyledRunConfig):
     """Views and styles of the page."""
 
-    run: Path = Path()
-    """Run folder."""
     styles: tuple[Path, ...] = ()
     """Style files (style.json), each one more style."""
     split: Literal["some", "test", "train", "all"] = "some"
@@ -47,12 +43,9 @@ class GalleryConfig(StyleConfig, QualityConfig):
     """Size of the page, at most; Gaussians that show least are left out of it."""
     output: Path | None = None
     """The page; by default RUN/gallery.html."""
-    device: str = "auto"
-    """cpu, cuda, mps, or auto."""
 
     def __post_init__(self) -> None:
-        StyleConfig.__post_init__(self)
-        QualityConfig.__post_init__(self)
+        super().__post_init__()
         at_least("most", self.most, 1)
         positive("megabytes", self.megabytes)
 
@@ -75,6 +68,7 @@ def run(args: list[str]) -> int:
     most = len(views) if config.views else min(config.most, len(views))
     views = [views[k * len(views) // most] for k in range(most)]
     chosen = _chosen(config, file)
+    # Photographs have one name on the whole page, whichever styles they are in.
     called = _called([*config.references, *(path for _, each in chosen for path in each.style.references)])
     with Display() as display:
         originals = page_views(opened, views, display)
@@ -109,7 +103,7 @@ def _chosen(config: GalleryConfig, together: StyleFile) -> list[tuple[str, Style
     for path in config.styles:
         file = read_style(path)
         check_photographs(path, file)
-        own = path.resolve().parent.name if path.name == "style.json" else path.stem
+        own = style_name(path, ())
         chosen.append((f"{own} ({len(chosen) + 1})" if own in dict(chosen) else own, file))
     if len(names) > 1:
         chosen.append((" + ".join(names.values()) if len(names) <= 3 else f"all {len(names)}", together))

@@ -74,6 +74,7 @@ def main(args: Sequence[str] | None = None) -> int:
         if isinstance(error, FprfError):
             print(f"error: {error}", file=sys.stderr)
             return 2
+        # Too little memory is nobody's fault: one line says what it took.
         if out_of_memory(error):
             print(f"error: {shortage('fprf', error, 'close other programs, or take a larger --downscale')}", file=sys.stderr)
             return 2

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.markup import escape
@@ -93,35 +93,29 @@ def rows() -> Iterator[Row]:
 
 
 def faults() -> Iterator[tuple[Row, str]]:
-    """Load each plug-in and yield those that cannot be used, with the reason."""
-    for row in rows():
-        try:
-            _check(row)
-        except PluginError as fault:
-            yield row, str(fault)
-
-
-def _check(row: Row) -> None:
-    """Load a plug-in and build its config from defaults. Raises PluginError."""
+    """Load each plug-in, build its config from defaults, and yield those that cannot be used, with the reason."""
+    from ..splats.files.base import CaptureFormat
     from .main import VERBS
 
-    if row.group == METHODS:
-        load_method(row.name)
-        return
-    loaded = registry.load_object(row.group, row.name)
-    if row.group == SCENES:
-        return
-    if row.group == CAPTURES:
-        from ..splats.files.base import CaptureFormat
-
-        registry.make(row.group, row.name, CaptureFormat)
-        return
-    if not (isinstance(loaded, type) and issubclass(loaded, KINDS[row.group])):
-        registry.load(row.group, row.name, KINDS[row.group][0])  # says what it is instead
-        return
-    origin = f"{row.value} from {row.package}"
-    if row.name == "none":
-        raise PluginError(f"{row.group}: 'none' ({origin}) can never be chosen: none empties a slot")
-    if row.group == CommandConfig.group and row.name in VERBS:
-        raise PluginError(f"{row.group}: {row.name!r} ({origin}) is never called: fprf has a verb of that name; rename it")
-    registry.make(row.group, row.name, loaded)
+    for row in rows():
+        origin = f"{row.value} from {row.package}"
+        try:
+            if row.group == METHODS:
+                load_method(row.name)
+            elif row.group == SCENES:  # a function, which has nothing to build before there is a run
+                registry.load_object(row.group, row.name)
+            elif row.group == CAPTURES:
+                registry.make(row.group, row.name, CaptureFormat)
+            else:
+                # Groups of several kinds say which kind it is not of only where it is of none.
+                loaded: Any = registry.load_object(row.group, row.name)
+                if not (isinstance(loaded, type) and issubclass(loaded, KINDS[row.group])):
+                    registry.load(row.group, row.name, KINDS[row.group][0])
+                if row.name == "none":
+                    raise PluginError(f"{row.group}: 'none' ({origin}) can never be chosen: none empties a slot")
+                if row.group == CommandConfig.group and row.name in VERBS:
+                    verb = f"{row.group}: {row.name!r} ({origin})"
+                    raise PluginError(f"{verb} is never called: fprf has a verb of that name; rename it")
+                registry.make(row.group, row.name, loaded)
+        except PluginError as fault:
+            yield row, str(fault)

@@ -6,10 +6,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
-
 from .. import __version__
 from ..errors import UsageError
 from ..progress import Display
@@ -18,6 +14,8 @@ from .parsing import parse
 
 MINUTES = 3
 """Minutes of the printed training command."""
+_NAMED = 12
+"""Images that a step lost that are named one by one, at most."""
 
 _DESCRIPTION = """Find poses for a folder of images or for a video, and make a scene folder that `fprf train` reads.
 
@@ -50,8 +48,7 @@ def run(args: list[str]) -> int:
     matching: str = config.matching
     with Display() as display:
         gather_images(config.source, place, state, config, display.count)
-        lost = lost_files(state)
-        if lost:
+        if lost := lost_files(state):
             display.say(lost)
         # Each step is skipped where `state` says that it was done for the same files and settings.
         find_features(place, state, config, display.count)
@@ -61,31 +58,22 @@ def run(args: list[str]) -> int:
         finally:
             content = report(asdict(state), matching, MatchTables(place.database), models, __version__)
             write_json(place.root / "process.json", content)
-    _print(content, place.root)
-    _check(place.root)
-    return 0
-
-
-def _print(content: dict[str, Any], root: Path) -> None:
-    from ..reconstruction.scene_folder import summary_rows
-
-    console = Console(highlight=False)
     images = content["images"]
-    console.print(
+    print(
         f"{images['posed']} of {images['given']} images have a pose; {content['points']} points, "
         f"{content['error_pixels']:.2f} pixels off; {content['matching']} matching, "
-        f"{sum(content['step_seconds'].values()):.0f} s",
-        soft_wrap=True,
+        f"{sum(content['step_seconds'].values()):.0f} s"
     )
-    rows = summary_rows(content)
-    if rows:
-        table = Table(box=None, show_header=True, pad_edge=False, padding=(0, 3, 0, 0), header_style="dim")
-        for head in ("lost in", "image", "why"):
-            table.add_column(head, overflow="fold")
-        for row in rows:
-            table.add_row(*map(escape, row))
-        console.print(table)
-        console.print(f"all of them in {root / 'process.json'}", soft_wrap=True)
+    # A step that lost many images is one line, with an example.
+    for step in ("choosing", "features", "matching", "mapping"):
+        dropped = [drop for drop in content["dropped"] if drop["step"] == step]
+        for drop in dropped if len(dropped) <= _NAMED else dropped[:1]:
+            count = "" if len(dropped) <= _NAMED else f"{len(dropped)} images, for example "
+            print(f"lost in {step}: {count}{drop['image']}: {drop['reason']}")
+    if content["dropped"]:
+        print(f"all of them in {place.root / 'process.json'}")
+    _check(place.root)
+    return 0
 
 
 def _check(root: Path) -> None:

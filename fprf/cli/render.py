@@ -11,10 +11,8 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 from ..checks import at_least
 from ..errors import ConfigError, UsageError
 from ..progress import Display
-from ..style.config import StyleConfig
 from ..style.files import read_keyframes
-from ..training.quality import QualityConfig
-from .style_flags import named_styles, read_flags
+from .style_flags import StyledRunConfig, named_styles, read_flags
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
@@ -41,11 +39,9 @@ class Take(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RenderVerbConfig(StyleConfig, QualityConfig):
+class RenderVerbConfig(StyledRunConfig):
     """Settings of `fprf render`."""
 
-    run: Path = Path()
-    """Run folder."""
     output: Path = Path("render.mp4")
     """A film (.mp4), an animated picture (.gif .webp .apng), or a folder for numbered frames. Frames that an interrupted
     render left are not made again."""
@@ -67,12 +63,9 @@ class RenderVerbConfig(StyleConfig, QualityConfig):
     """Layers of each frame, from left to right."""
     format: Literal["png", "jpg"] = "png"
     """Format of frames in a folder."""
-    device: str = "auto"
-    """cpu, cuda, mps, or auto."""
 
     def __post_init__(self) -> None:
-        StyleConfig.__post_init__(self)
-        QualityConfig.__post_init__(self)
+        super().__post_init__()
         at_least("frames", self.frames, 1)
         at_least("fps", self.fps, 1)
         if not self.show:
@@ -98,11 +91,13 @@ def run(args: list[str]) -> int:
         raise UsageError(f"--fps {config.fps:g}: a film has at most {MAX_FPS} frames a second")
     opened = open_run(config.run, config.device, config)
     known = opened.known
+    # Spirals, orbits and camera paths bring frames of their own.
     views = known.views(config.split) if config.path in ("interpolate", "dataset") else []
     cameras = make_path(known.cameras, views, config.path, config.frames, opened.scene.origin)
     # Captured views keep the stem of their image.
     names = [known.names[view] for view in views] if config.path == "dataset" else [f"{i:05d}" for i in range(len(cameras))]
     takes = _takes(opened.scene, config, file)
+    # Frames of a film wait in a folder beside it, which goes when the film is whole.
     whole = config.output.suffix.lower() in FILMS
     folder = config.output.with_suffix(".frames") if whole else config.output
     paths = [folder / f"{name}.{'png' if whole else config.format}" for name in names]
@@ -148,6 +143,7 @@ def _panels(
     from ..rendering.cameras import normals
     from ..style.match_maps import match_map, match_picture
 
+    # No style moves anything: depth and normals are those of any look that is rendered already.
     views = [take.scene(frame).render(cameras, frame) for take in takes] if "colour" in config.show else []
     geometry = views[0] if views else scene.render(cameras, frame)
     shown: list[Picture] = []
@@ -174,6 +170,7 @@ def _key(opened: "LoadedRun[Scene]", config: RenderVerbConfig, cameras: "Cameras
     digest.update(repr(sorted(settings.items())).encode() + (opened.run.root / "config.json").read_bytes())
     for tensor in (cameras.pose, cameras.focal, cameras.centre, cameras.size, cameras.distortion, cameras.lens):
         digest.update(tensor.numpy().tobytes())
+    # Files count by their content: a photograph that has changed under its name makes other frames.
     named = [*config.references, *config.masks, config.style, config.between, config.keyframes]
     if config.keyframes is not None:
         named += [key.style for key in read_keyframes(config.keyframes)]

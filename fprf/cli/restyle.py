@@ -158,6 +158,7 @@ def _outputs(config: RestyleConfig) -> list[Path]:
         raise UsageError(
             "fprf restyle: name a capture, for example fprf restyle scan.ply --references autumn.jpg --output new.ply"
         )
+    # Something must be asked for, and have what it needs, before a capture is read.
     if config.output is None and not (config.page or config.explain):
         raise UsageError("fprf restyle: name what to write, with --output, --page or --explain")
     if config.page is not None and config.page.suffix.lower() != ".html":
@@ -168,6 +169,7 @@ def _outputs(config: RestyleConfig) -> list[Path]:
         return []
     from ..splats.files.base import format_of
 
+    # A folder holds a file for each capture under its own name, or a .ply where its format is read alone.
     if config.output.is_dir() or (len(config.captures) > 1 and format_name(config.output) is None):
         outputs = []
         for path in config.captures:
@@ -205,6 +207,7 @@ def _with_views(config: RestyleConfig, file: StyleFile) -> StyleFile:
         raise UsageError(f"--each: {scenes[0]} gives several views, which are one style; leave --each out")
     from ..splats.captures import reference_views
 
+    # Photographs stay; in the place of a capture or run stand its views, with masks of what they show.
     rows: list[tuple[Path, Path, float]] = []
     beside = config.output or config.page or Path("x")
     weights, masks = style.weights or (1.0,) * len(style.references), style.masks or (NO_MASK,) * len(style.references)

@@ -3,19 +3,34 @@
 import re
 import sys
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from ..errors import UsageError
 from ..style.config import PRESETS, StyleConfig, preset_flags, with_preset
 from ..style.files import StyleFile, check_photographs, read_style, with_folders
+from ..training.quality import QualityConfig
 from .parsing import parse
 
 C = TypeVar("C", bound=StyleConfig)
 
-_LONGEST = 60
-"""Characters of a style's name, which file names carry."""
+_LONGEST, _JOINED = 60, 80
+"""Characters of a style's name that users choose, and of one that is made of those of its photographs: file names carry it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StyledRunConfig(StyleConfig, QualityConfig):
+    """A run and its style, for the verbs that render it."""
+
+    run: Path = Path()
+    """Run folder."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto."""
+
+    def __post_init__(self) -> None:
+        StyleConfig.__post_init__(self)
+        QualityConfig.__post_init__(self)
 
 
 def read_flags(
@@ -23,9 +38,8 @@ def read_flags(
 ) -> tuple[C, StyleFile]:
     """The verb's config and the style that it asks for; `--style FILE` gives the values that no flag gives.
 
-    `--gentle`, or another name of `PRESETS`, sets what that preset sets, over the file and below every other flag.
-    A flag of many values may stand several times: `--pin 3=a.jpg --pin 5=b.jpg` is `--pin 3=a.jpg 5=b.jpg`. Folders among
-    the references stand for the images in them. Raises what `parse`, `with_folders` and `read_style` raise, and DataError
+    `--gentle`, or another name of `PRESETS`, sets what that preset sets, over the file and below every other flag. Folders
+    among the references stand for the images in them. Raises what `parse`, `with_folders` and `read_style` raise, and DataError
     where a photograph of the file is no longer the one it was.
     """
     # Defaults from the style file, then from the preset, then every flag over both.
@@ -40,7 +54,7 @@ def read_flags(
     args = [arg for arg in args if arg not in flags]
     meanings = [f"{flag} stands for {preset_flags(name)}; other flags come over it." for flag, name in flags.items()]
     about = "\n\n".join([description, *meanings])
-    config = parse(default, _joined(args, default), prog=prog, description=about, positional=positional)
+    config = parse(default, args, prog=prog, description=about, positional=positional)
     config = with_folders(config, say)
     file = file._replace(style=StyleConfig(**_styles(config)))
     # Who names photographs takes them as they are now.
@@ -57,25 +71,6 @@ def say(text: str) -> None:
 
 def _styles(config: StyleConfig) -> dict[str, Any]:
     return {field.name: getattr(config, field.name) for field in fields(StyleConfig)}
-
-
-def _joined(args: Sequence[str], config: StyleConfig) -> list[str]:
-    """The arguments with each flag of many values once, with all of its values: otherwise the last one alone would count."""
-    many = {f"--{field.name.replace('_', '-')}" for field in fields(config) if isinstance(getattr(config, field.name), tuple)}
-    rest: list[str] = []
-    values: dict[str, list[str]] = {}
-    into = rest
-    for arg in args:
-        key, equals, inline = arg.partition("=")
-        flag = key.replace("_", "-")
-        if flag in many:
-            into = values.setdefault(flag, [])
-            into += [inline] if equals else []
-            continue
-        if arg.startswith("-"):
-            into = rest
-        into.append(arg)
-    return [*rest, *(word for flag, words in values.items() for word in (flag, *words))]
 
 
 def _style_flag(args: Sequence[str]) -> Path | None:
@@ -112,6 +107,17 @@ def named_styles(texts: Sequence[str], base: StyleFile) -> list[tuple[str, Style
             file = StyleFile(with_folders(style, say))
         styles.append((name, file))
     return styles
+
+
+def style_name(style: Path | None, references: Sequence[Path]) -> str:
+    """Name of a style: that of its file, of a style.json its folder's; without a file the stems of its photographs, joined.
+
+    Cut to what every file system takes.
+    """
+    if style is not None:
+        return style.stem if style.name != "style.json" else style.resolve().parent.name or "style"
+    joined = "+".join(path.stem for path in references)
+    return joined if len(joined) <= _JOINED else f"{joined[:_JOINED]}+{len(references)}"
 
 
 def tidy(name: str) -> str:

@@ -6,18 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..progress import Display
-from ..style.config import StyleConfig
 from ..style.files import write_style
-from ..training.quality import QualityConfig
-from .style_flags import read_flags
+from .style_flags import StyledRunConfig, read_flags, style_name
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
     from ..style.regions import Regions
     from ..style.restyle import Styled
-
-_LONGEST = 80
-"""Characters of a style's default name."""
 
 _SHOWN = 0.1
 """References that a region takes less of are not in the table."""
@@ -32,11 +27,9 @@ everywhere. REFERENCE is a file or its number, from 0 in the order given."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class StylizeConfig(StyleConfig, QualityConfig):
+class StylizeConfig(StyledRunConfig):
     """Views to restyle, and their style."""
 
-    run: Path = Path()
-    """Run folder."""
     style: Path | None = None
     """A style file, such as the style.json of an earlier run, of this scene or another; flags come over it."""
     output: Path | None = None
@@ -51,12 +44,6 @@ class StylizeConfig(StyleConfig, QualityConfig):
     """Render nothing; map what each pixel takes: VIEW-match.png, VIEW-score.png, VIEW-confidence.png, VIEW-entropy.png."""
     matches: bool = True
     """Also write which reference each pixel takes, as VIEW-match.png."""
-    device: str = "auto"
-    """cpu, cuda, mps, or auto."""
-
-    def __post_init__(self) -> None:
-        StyleConfig.__post_init__(self)
-        QualityConfig.__post_init__(self)
 
 
 def run(args: list[str]) -> int:
@@ -70,7 +57,7 @@ def run(args: list[str]) -> int:
     opened = open_run(config.run, config.device, config)
     scene = opened.scene
     views = opened.known.views(config.split, config.views)
-    output = config.output or config.run / "styles" / _name(config)
+    output = config.output or config.run / "styles" / (style_name(config.style, config.references) or "regions")
     if config.explain and not config.references:  # regions alone: no style is built
         print_explained(output, Regions(scene, *scene.measured()), None)
         return 0
@@ -152,11 +139,3 @@ def print_explained(output: Path, regions: "Regions", styled: "Styled | None") -
     write_json(output / "explain.json", {"references": list(names), "regions": [region_row(region) for region in explained]})
     write_image(output / "explain.png", contact_sheet([region_tile(region, names) for region in explained]))
     print(f"the same with pictures in {output / 'explain.png'} and explain.json")
-
-
-def _name(config: StylizeConfig) -> str:
-    """The style file's folder or own name, else the references' stems joined, cut to what every file system takes."""
-    if config.style is not None:
-        return config.style.stem if config.style.name != "style.json" else config.style.resolve().parent.name or "style"
-    joined = "+".join(p.stem for p in config.references) or "regions"
-    return joined if len(joined) <= _LONGEST else f"{joined[:_LONGEST]}+{len(config.references)}"

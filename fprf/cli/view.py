@@ -1,9 +1,10 @@
 """`fprf view [RUN|CAPTURE.ply]`: a scene in the browser, or the page that makes one; a photograph dropped on it restyles it."""
 
 import contextlib
+import functools
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,9 +19,7 @@ from .parsing import parse
 from .style_flags import say
 
 if TYPE_CHECKING:
-    from ..page.server import ViewerServer
     from ..page.session import Viewed
-    from ..page.start import Start
 
 _EXIT_TIMEOUT = 15.0
 """Seconds after an interrupt within which all must have ended."""
@@ -79,29 +78,31 @@ def run(args: list[str]) -> int:
         server = stack.enter_context(ViewerServer(access, config.port))
         from ..page.uploads import is_capture
 
+        # `--follow` waits for a run folder that training has not made yet.
         path = config.run
         if path is not None and not (config.follow or is_capture(path) or (path / "config.json").is_file()):
             raise CheckpointError(f"{path}: no config.json here, so it is no run folder; `fprf train` makes one")
-        references: Sequence[Path] = config.references
-        if any(each.is_dir() for each in references):  # decoding needs a library that the page does not wait for
+        if any(each.is_dir() for each in config.references):  # decoding needs a library that the page does not wait for
             from ..datamanagers.images import photographs
 
-            references = photographs(references, say)
+            config = replace(config, references=tuple(photographs(config.references, say)))
         print(server.address, flush=True)
+        load = functools.partial(_load, config, server.notify)
         try:
             if path is None:
-                stack.callback(_start(server, config, references).close)
+                from ..page.start import Start
+
+                start = Start(config.output, server, load)
+                server.show_start(start)
+                stack.callback(start.close)
             else:
-
-                def load() -> "Viewed":
-                    return _load(config, path, None, server.notify)
-
-                session = None if config.follow else server.open(load, references, config.pixels)
+                opening = functools.partial(load, path)
+                session = None if config.follow else server.open(opening)
                 if not is_capture(path):
-                    from ..page.follow import TrainingFollower
+                    from ..page.session import TrainingFollower
 
                     # A run that is in training: the scene is loaded anew with each checkpoint.
-                    TrainingFollower(server, path, load, session, references, config.pixels).run(threading.Event())
+                    TrainingFollower(server, path, opening, session).run(threading.Event())
             threading.Event().wait()
         except KeyboardInterrupt:
             # Whatever a thread is in the middle of, the terminal comes back.
@@ -112,25 +113,7 @@ def run(args: list[str]) -> int:
     return 0
 
 
-def _start(server: "ViewerServer", config: ViewConfig, references: Sequence[Path]) -> "Start":
-    from ..page.follow import TrainingFollower
-    from ..page.start import Start
-
-    def show(path: Path, name: str) -> None:
-        server.open(lambda: _load(config, path, name, server.notify), references, config.pixels)
-
-    def follow(path: Path, name: str) -> TrainingFollower:
-        return TrainingFollower(server, path, lambda: _load(config, path, name, server.notify), None, references, config.pixels)
-
-    def leave() -> None:
-        server.show_start(start)
-
-    start = Start(config.output, show, follow, leave, server.post)
-    leave()
-    return start
-
-
-def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[str], None]) -> "Viewed":
+def _load(config: ViewConfig, notify: Callable[[str], None], path: Path, name: str | None = None) -> "Viewed":
     """The scene of a run or a capture, under its own name where none is given."""
     from ..page.session import Viewed, view_of_run
     from ..page.uploads import is_capture
@@ -139,7 +122,9 @@ def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[st
         from ..training.loading import open_run
 
         viewed = view_of_run(open_run(path, config.device, config))
-        return replace(viewed, name=name or viewed.name, style=StyleConfig(stylizer=config.stylizer or RegionToneConfig()))
+        style = StyleConfig(stylizer=config.stylizer or RegionToneConfig())
+        name = name or viewed.name
+        return replace(viewed, name=name, style=style, references=config.references, pixels=config.pixels)
     from ..splats.captures import open_capture
     from ..splats.config import LookConfig
     from ..splats.files import read_capture
@@ -152,4 +137,5 @@ def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[st
     scene = open_capture(capture, look, progress=progress)
     name = name or path.resolve().name.partition(".")[0]
     style = StyleConfig(stylizer=config.stylizer or RegionToneConfig(centred=False))
-    return Viewed(scene, name, 0, root=config.output / name, capture=capture, style=style)
+    viewed = Viewed(scene, name, 0, root=config.output / name, capture=capture, style=style)
+    return replace(viewed, references=config.references, pixels=config.pixels)

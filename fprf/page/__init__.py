@@ -3,9 +3,8 @@
 - What browsers run: `web/` (`splats.js` draws, `place.js` moves, `page.js` is in every page, the rest in the served one).
 - Gaussians as bytes: `pack.py`. The page as one file: `writer.py`.
 - Who may connect, and with what: `server.py`, `messages.py`. Photographs and files that come: `uploads.py`, `start.py`.
-- What is shown, as values: `state.py`. The scene that is open, its styles and its training: `session.py`, `restyler.py`,
-  `follow.py`.
-- What it shows, drawn step by step: `drawing.py`, in the thread of `render_worker.py`.
+- What is shown, as values: `state.py`. The scene that is open, its photographs and its training: `session.py`.
+- Its styles, and what they show, drawn step by step: `drawing.py`, in the thread of `render_worker.py`.
 """
 
 from importlib.resources import files

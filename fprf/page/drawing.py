@@ -1,4 +1,4 @@
-"""Pictures and colours for clients: browsers draw Gaussians themselves, every other scene is drawn here.
+"""Looks on one scene, and their pictures and colours for clients: browsers draw Gaussians themselves, all else is drawn here.
 
 A moving camera must see something at once, a camera at rest everything: a new camera gets a small picture, then the
 whole one. What a client's last view holds is kept, so that a slider that is moved while the camera rests costs decoding alone.
@@ -9,35 +9,47 @@ these very files, so the same command makes it again, at any size.
 """
 
 import shutil
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ..datamanagers.images import load_image
 from ..errors import UsageError
 from ..interfaces import Scene, SceneView
 from ..io.atomic import write_json
-from ..io.images import Picture, to_uint8
+from ..io.images import Picture, shrink, to_uint8
 from ..io.maps import match_image, palette
 from ..ops.harmonics import HARMONIC
-from ..rendering.camera_path import read_camera_path, write_camera_path
 from ..rendering.cameras import Cameras, ideal_cameras
-from ..rendering.paths import interpolate
+from ..rendering.paths import interpolate, read_camera_path, write_camera_path
 from ..splats.scene import SplatScene
+from ..style.config import labels
+from ..style.dictionary import Encoders, StyleDictionary, build_dictionary, concatenate, encode_photograph
 from ..style.files import StyleFile, read_keyframes, write_style
 from ..style.look import Restyle
-from ..style.restyle import Styled, keyed_looks
-from ..style.scene_style import RegionWeight
-from .messages import Camera
+from ..style.matching import unit
+from ..style.regions import memberships
+from ..style.restyle import Styled, apply_dictionary, keyed_looks
+from ..style.scene_style import RegionWeight, SceneStyle
+from .messages import Camera, View
 from .pack import Colours, Packed
 from .render_worker import Steps
-from .restyler import Restyler
-from .state import Key, Look, Shown
+from .state import Key, Look, Photograph, RegionInfo, Shown
 
+K = TypeVar("K")
+V = TypeVar("V")
+_THUMBNAIL = 128
+"""Longest side in pixels."""
+_CACHED = 24
+"""Dictionaries and styles that are kept for when somebody returns to them."""
+_SOLID = 0.01
+"""Opacity below which there is nothing to point at."""
 CACHE_BYTES = 128 << 20
 """Features that are kept of each client's last view."""
 STRIP = 4096
@@ -54,15 +66,105 @@ _UNSURE = 0.45
 """Brightness of a region's colour where a pixel belongs to many."""
 
 
-class Request(NamedTuple):
-    """A client's request for a picture."""
+class Restyler:
+    """Looks as styles on one scene; runs on the render worker alone. Encoders are opened when they are first needed.
 
-    camera: Camera
-    shown: Shown
-    longest: int
-    """Longest side of the sharpest picture."""
-    captured: bool = False
-    """Show the scene as captured beside."""
+    A photograph is encoded when it comes and clustered once for each number of clusters: a slider costs the stylizer alone.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self._encoders: Encoders | None = None
+        self._stale = False
+        self._photographs = 0
+        self._dictionaries: dict[tuple[Photograph, int, float], StyleDictionary] = {}
+        self._styles: dict[Look, Styled] = {}
+
+    @property
+    def encoders(self) -> Encoders:
+        """Encoders of the scene. Raises WeightsError where those at hand are others."""
+        if self._encoders is None or self._stale:
+            self._encoders = self.scene.encoders()
+            self._stale = False
+        return self._encoders
+
+    def reload(self, scene: Scene) -> SceneStyle | None:
+        """Replace the scene, and with it its style; return the style from before, if there was one."""
+        self.scene, self._stale = scene, True
+        self._styles.clear()
+        return None if self._encoders is None else self._encoders.scene_style
+
+    def encode(self, path: Path, name: str) -> Photograph:
+        """Encode a photograph. Raises DataError for an unreadable one."""
+        reference = encode_photograph(path, self.encoders, name=name)
+        self._photographs += 1
+        return Photograph(self._photographs, name, path, shrink(load_image(path, upright=True), _THUMBNAIL), reference)
+
+    def styled(self, look: Look) -> Styled | None:
+        """The look on the scene; None for the scene as it is. Raises UsageError for rules that contradict each other."""
+        if look.plain:
+            return None
+
+        def made() -> Styled:
+            # Each photograph is clustered once; a mix is their dictionaries side by side under the mix's weights.
+            style = look.config()
+            clusters, blend, parts = style.clusters, style.blend, []
+            for photograph, _ in look.mix:
+                cluster = partial(
+                    build_dictionary, [photograph.reference], clusters=clusters, blend=blend, seed=self.encoders.seed
+                )
+                parts.append(_recalled(self._dictionaries, (photograph, clusters, blend), cluster))
+            dictionary = concatenate(parts, labels(style.references), [weight for _, weight in look.mix])
+            return apply_dictionary(self.scene, StyleFile(style), self.encoders, dictionary)
+
+        return _recalled(self._styles, look, made)
+
+    def retain(self, photographs: Collection[Photograph]) -> None:
+        """Drop what is kept for any other photograph."""
+        self._dictionaries = {key: value for key, value in self._dictionaries.items() if key[0] in photographs}
+        self._styles = {look: value for look, value in self._styles.items() if {*dict(look.mix)} <= {*photographs}}
+
+    def restyle(self, look: Look) -> Restyle | None:
+        """The look for a renderer."""
+        styled = self.styled(look)
+        return None if styled is None else styled.restyle
+
+    def region_at(self, cameras: Cameras, pixel: tuple[float, float]) -> int | None:
+        """The region at a pixel of the first camera, which lies within its view; None where there is nothing."""
+        # The region of the pixel's strongest membership, by the features that the ray sees.
+        place = torch.tensor([pixel], dtype=torch.float64)
+        share, opacity = memberships(self.scene, self.encoders.scene_style, cameras, 0, place)
+        return int(share[0].argmax()) if float(opacity[0]) >= _SOLID else None
+
+    def region_info(self, look: Look, region: int) -> RegionInfo:
+        """Return the style that a region takes in a look."""
+        # A region stands for its points: its key is matched as they are.
+        scene, styled = self.encoders.scene_style, self.styled(look)
+        taken: list[tuple[str, float]] = []
+        if styled is not None:
+            # What the region's key takes of each code, summed by photograph.
+            attention = styled.restyle.match(scene.keys[region : region + 1].to(self.scene.device))[0].cpu()
+            shares = torch.zeros(len(styled.codes.names)).index_add_(0, styled.codes.reference, attention.float())
+            names = [photograph.name for photograph, _ in look.mix]
+            taken = sorted(zip(names, shares.tolist(), strict=True), key=lambda row: -row[1])
+        return RegionInfo(region, float(scene.share[region]), tuple(taken))
+
+
+def _recalled(cache: dict[K, V], key: K, make: Callable[[], V]) -> V:
+    """Return what is kept under a key, or make it; it becomes the last to be dropped."""
+    cache[key] = cache.pop(key) if key in cache else make()
+    while len(cache) > _CACHED:
+        del cache[next(iter(cache))]
+    return cache[key]
+
+
+def matching_regions(before: SceneStyle, now: SceneStyle) -> Annotated[Tensor, "K"]:
+    """For each region of `before` the most similar one of `now`: regions are measured anew, in any order."""
+    if before.keys.shape[1] == 0:
+        return torch.zeros(len(before.keys), dtype=torch.int64)
+    # Cosines about the mean of the features before, as regions are matched to codes.
+    scores = unit(before.keys, before.semantic_mean) @ unit(now.keys, now.semantic_mean).T
+    return scores.argmax(-1)
 
 
 def gaussian_colours(scene: SplatScene, packed: Packed, restyler: Restyler, shown: Shown) -> Colours:
@@ -78,7 +180,7 @@ def gaussian_colours(scene: SplatScene, packed: Packed, restyler: Restyler, show
     def match(restyle: Restyle) -> Tensor:
         return restyle.match(features, scene.gaussians.means)
 
-    mapped = _mapped(colours, solid, shown, styled, match, lambda: _memberships(restyler, features))
+    mapped = _mapped(colours, solid, shown, styled, match, lambda: _shares(restyler, features))
     return packed.colours(((mapped - 0.5) / HARMONIC)[:, None], rounds=0)
 
 
@@ -114,17 +216,22 @@ def _mapped(
     return grey + (colours - grey) * share[:, shown.region, None]
 
 
-def _memberships(restyler: Restyler, semantic: Tensor) -> Annotated[Tensor, "N K"]:
+def _shares(restyler: Restyler, semantic: Tensor) -> Annotated[Tensor, "N K"]:
     style = restyler.encoders.scene_style
     share: Tensor = RegionWeight(style, torch.eye(len(style.share))).to(semantic.device)(semantic.float())
     return share
 
 
 class ScenePainter:
-    """Renders a scene for clients; `show` receives a picture, of the look or as captured, and whether it is the last."""
+    """Renders a scene for clients, at most `longest` pixels a side.
 
-    def __init__(self, scene: Scene, restyler: Restyler, show: Callable[[Hashable, str, Picture, bool], None]) -> None:
-        self._scene, self._restyler, self._show = scene, restyler, show
+    `show` receives a picture, of the look or as captured, and whether it is the last.
+    """
+
+    def __init__(
+        self, scene: Scene, restyler: Restyler, show: Callable[[Hashable, str, Picture, bool], None], longest: int
+    ) -> None:
+        self._scene, self._restyler, self._show, self._longest = scene, restyler, show, longest
         # Of each client's last view: its camera, and the strips of the whole picture.
         self._views: dict[Hashable, tuple[Camera, list[SceneView]]] = {}
 
@@ -132,14 +239,14 @@ class ScenePainter:
         """Drop what is kept for a client."""
         self._views.pop(client, None)
 
-    def render(self, client: Hashable, request: Request) -> Steps[None]:
+    def render(self, client: Hashable, request: View, shown: Shown) -> Steps[None]:
         """Show a small picture of a new camera, then the whole one, a step each strip."""
         kept = self._views.get(client)
         if kept is not None and kept[0] != request.camera:
             del self._views[client]
             kept = None
-        styled = self._restyler.styled(request.shown.look)
-        full = cameras_of([request.camera], longest=request.longest)
+        styled = self._restyler.styled(shown.look)
+        full = cameras_of([request.camera], longest=self._longest)
         width, height = full.size[0].tolist()
         small = (max(1, round(width / _PREVIEW)), max(1, round(height / _PREVIEW)))
         for size in [(width, height)] if kept else [small, (width, height)]:
@@ -148,7 +255,7 @@ class ScenePainter:
             strips: list[SceneView] = []
             # What no look changes is computed once; another look only decodes it again.
             for strip in kept[1] if kept else _strips(self._scene, cameras_of([request.camera], size)):
-                rows.append(self._colours(strip, styled, request.shown))
+                rows.append(self._colours(strip, styled, shown))
                 if request.captured:
                     captured.append(strip.restyled().rgb)
                 strips.append(strip)
@@ -166,7 +273,7 @@ class ScenePainter:
         view = strip.restyled(None if styled is None else styled.restyle)
 
         def memberships() -> Tensor:
-            return strip.paint(lambda semantic, _: _memberships(self._restyler, semantic))
+            return strip.paint(lambda semantic, _: _shares(self._restyler, semantic))
 
         def match(restyle: Restyle) -> Tensor:
             return strip.paint(restyle.match)

@@ -13,7 +13,7 @@ import logging
 import secrets
 import socket
 import threading
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -225,9 +225,12 @@ class ViewerServer:
             fault = f"--host {access.host} --port {port}: cannot listen there ({error.strerror}); choose another port"
             raise UsageError(fault) from error
         self.port: int = listener.getsockname()[1]
+        # A mistake of the page's user is a line in the answer.
+        wrong = {FprfError: lambda request, error: PlainTextResponse(str(error), 400)}
+        app = Starlette(routes=self._routes(), middleware=[Middleware(Guard, access=access)], exception_handlers=wrong)
         # Bounded connections, heads and messages; no proxy is believed, and nothing of a request is logged.
         config = uvicorn.Config(
-            self._make_app(),
+            app,
             loop="asyncio",
             http=_Protocol,
             ws="websockets-sansio",
@@ -279,18 +282,17 @@ class ViewerServer:
         """Show a line on all pages."""
         self.post(None, "said", {"type": "said", "text": text, "bad": False})
 
-    def open(
-        self, load: "Callable[[], Viewed]", references: Sequence[Path] = (), longest: int = 640, *, warm: bool = True
-    ) -> "Session":
-        """Load the scene and show it in the place of what was shown. Raises what `load` raises, and DataError for an
-        unreadable photograph."""
+    def open(self, load: "Callable[[], Viewed]", *, warm: bool = True) -> "Session":
+        """Load a scene and show it in the place of what was shown, prepared for the first photograph if it is to be `warm`.
+
+        Raises what `load` raises, and DataError for an unreadable photograph.
+        """
         from .session import Session
 
         viewed = load()  # while what was open stays open
         self._close_session()
-        made = Session(viewed, self.post, longest=longest, together=len(references) > 1)
-        session = self._opened.enter_context(made)
-        for path in references:
+        session = self._opened.enter_context(Session(viewed, self.post))
+        for path in viewed.references:
             session.upload(path.read_bytes(), path.name)
         if warm:
             session.warm_up()
@@ -324,8 +326,11 @@ class ViewerServer:
         self._opened.close()
 
     def _routes(self) -> list[BaseRoute]:
+        # The stage of any page, with the panel of the served one.
+        stage = Template(read_asset("stage.html")).substitute(still="hidden", ratio="", facts=read_asset("panel.html"))
+        page = Template(read_asset("live.html")).substitute(stage=stage)
         return [
-            Route("/", _asset("text/html", _page)),
+            Route("/", _asset("text/html", lambda: page)),
             Route("/app.js", _asset("text/javascript", lambda: script("live.js", "start.js") + "\nlive();\n")),
             Route("/app.css", _asset("text/css", lambda: read_asset("page.css") + read_asset("live.css"))),
             WebSocketRoute("/live", self._live),
@@ -338,13 +343,6 @@ class ViewerServer:
             Route("/start", self._start_request, methods=["POST"]),
             Route("/start/piece", self._start_piece, methods=["POST"]),
         ]
-
-    def _make_app(self) -> ASGIApp:
-        async def wrong(request: Request, error: Exception) -> Response:
-            return PlainTextResponse(str(error), 400)
-
-        guard = Middleware(Guard, access=self.access)
-        return Starlette(routes=self._routes(), middleware=[guard], exception_handlers={FprfError: wrong})
 
     async def _live(self, socket: WebSocket) -> None:
         if len(self._clients) >= _PAGES:
@@ -466,12 +464,6 @@ def _integer(request: Request, name: str) -> int:
     if not (text.isdigit() and text.isascii() and len(text) <= 12):
         raise UsageError(f"{name}: {text[:20]!r} is no number from 0")
     return int(text)
-
-
-def _page() -> str:
-    """The page's HTML: the stage of any page, with the panel of the served one."""
-    stage = Template(read_asset("stage.html")).substitute(still="hidden", ratio="", facts=read_asset("panel.html"))
-    return Template(read_asset("live.html")).substitute(stage=stage)
 
 
 def _asset(kind: str, text: Callable[[], str]) -> Callable[[Request], Response]:

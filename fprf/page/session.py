@@ -1,15 +1,18 @@
-"""The scene that is viewed: its state (`state.py`), its clients' requests, its photographs and films. Knows no network.
+"""The scene that is viewed: its state (`state.py`), its clients' requests, its photographs, films and training.
 
 Calls come from any thread. What touches the model runs on the render worker; clients learn of the results by messages, of which
-a newer one of the same kind takes the place of one that was not sent yet.
+a newer one of the same kind takes the place of one that was not sent yet. The run folder is the only channel to a training: its
+newest checkpoint is shown, and as long as somebody looks the folder says so (`training.driver.watch`), for which training saves
+more often.
 """
 
+import json
 import threading
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -20,15 +23,27 @@ from ..io.video import write_video
 from ..splats.files import Capture, write_capture, write_gaussians
 from ..splats.scene import SplatScene
 from ..style.config import StyleConfig
+from ..training.driver import watch
 from ..training.loading import LoadedRun
 from . import messages
-from .drawing import FPS, Request, ScenePainter, cameras_of, film_frames, gaussian_colours, write_film_files
+from .drawing import (
+    FPS,
+    Restyler,
+    ScenePainter,
+    cameras_of,
+    film_frames,
+    gaussian_colours,
+    matching_regions,
+    write_film_files,
+)
 from .pack import colour_header, colour_section, container
 from .render_worker import RenderWorker, Steps
-from .restyler import Restyler, matching_regions
 from .state import NOW, Look, Photograph, Shown, State
-from .uploads import Uploads, shown_name
+from .uploads import Uploads, newest_step, shown_name
 from .writer import about, packed_scene
+
+if TYPE_CHECKING:
+    from .server import ViewerServer
 
 Post: TypeAlias = Callable[[Hashable | None, str, "Mapping[str, Any] | bytes"], None]
 """Sends a client, or all (None), a message under the name of its kind."""
@@ -52,6 +67,10 @@ class Viewed:
     """Style that looks start from."""
     step: int = 0
     """Step of the checkpoint that it was read from."""
+    references: tuple[Path, ...] = ()
+    """Photographs that are on the shelf at the beginning; several are mixed, and those that come later join them."""
+    pixels: int = 640
+    """Longest side of the sharpest picture."""
 
 
 def view_of_run(opened: LoadedRun[Scene]) -> Viewed:
@@ -63,13 +82,13 @@ def view_of_run(opened: LoadedRun[Scene]) -> Viewed:
 class Session:
     """Use as a context manager, which ends its threads and processes."""
 
-    def __init__(self, viewed: Viewed, post: Post, *, longest: int = 640, together: bool = False) -> None:
-        self.viewed, self._post, self._longest = viewed, post, longest
+    def __init__(self, viewed: Viewed, post: Post) -> None:
+        self.viewed, self._post = viewed, post
         self.restyler = Restyler(viewed.scene)
-        self.state = State(look=Look(style=viewed.style), together=together)
+        self.state = State(look=Look(style=viewed.style), together=len(viewed.references) > 1)
         self.uploads = Uploads()
         self._lock = threading.RLock()
-        self._requests: dict[Hashable, Request] = {}
+        self._requests: dict[Hashable, messages.View] = {}
         self._photographs: frozenset[Photograph] = frozenset()
         self._painter: ScenePainter | None = None
         self._worker = RenderWorker(self._on_error)
@@ -94,7 +113,7 @@ class Session:
             self.packed, head, parts = packed_scene(scene, [scene.gaussians.harmonics], home, level=1)
             self.geometry = container(head, parts)
         else:
-            self._painter = ScenePainter(scene, self.restyler, self._show)
+            self._painter = ScenePainter(scene, self.restyler, self._show, self.viewed.pixels)
             # A camera turns about a point as far away as most cameras are from their middle.
             place = scene.cameras.pose[:, :, 3]
             spread = float((place - place.median(dim=0).values).norm(dim=1).quantile(0.9)) or 1.0
@@ -115,10 +134,9 @@ class Session:
                 # Browsers draw Gaussians themselves; all else is drawn here.
                 if self._painter is not None:
                     cameras_of([message.camera])  # refused where it is none
-                    request = Request(message.camera, self.state.shown, self._longest, message.captured)
                     with self._lock:
-                        self._requests[client] = request
-                    self._worker.draw(client, self._painter.render(client, request))
+                        self._requests[client] = message
+                    self._worker.draw(client, self._painter.render(client, message, self.state.shown))
             case messages.Pick():
                 # The place is a share of the canvas; its right and lower edges belong to the last pixels.
                 cameras = cameras_of([message.camera], longest=1000)
@@ -256,11 +274,9 @@ class Session:
     def _refresh(self) -> None:
         """Show all clients what is shown now."""
         with self._lock:
-            shown = self.state.shown
             for client, request in self._requests.items():
                 assert self._painter is not None  # Gaussians are drawn by browsers, which request nothing
-                self._requests[client] = request._replace(shown=shown)
-                self._worker.draw(client, self._painter.render(client, self._requests[client]))
+                self._worker.draw(client, self._painter.render(client, request, self.state.shown))
         if isinstance(self.viewed.scene, SplatScene):
             self._worker.run("colours", lambda: self._colour(NOW, self.state.shown))
 
@@ -323,3 +339,58 @@ class Session:
         expected = isinstance(error, FprfError)
         text = str(error) if expected else f"this should not have happened: {type(error).__name__}: {error}"
         self.notify(text, bad=True)
+
+
+_POLL = 0.5
+"""Seconds between looks at a run folder."""
+_TAIL = 4096
+"""Bytes of the end of events.jsonl that hold its last line."""
+
+
+class TrainingFollower:
+    """Keeps the scene that a server shows at the newest checkpoint of a run.
+
+    `load` opens the run, and `opened` is the session where it is open already; without, it is opened at the first checkpoint.
+    """
+
+    def __init__(self, server: "ViewerServer", root: Path, load: Callable[[], Viewed], opened: Session | None = None) -> None:
+        self._server, self._root, self._load, self.session = server, root, load, opened
+        self._shown = -1 if opened is None else opened.viewed.step
+
+    def run(self, ended: threading.Event) -> None:
+        """Follow until the event is set."""
+        while not ended.wait(_POLL):
+            try:
+                self.tick()
+            except (FprfError, OSError) as error:  # the page says so; the next checkpoint may be better
+                self._server.notify(str(error))
+
+    def tick(self) -> None:
+        """Say that somebody looks, and show what is new."""
+        if self._server.pages:
+            watch(self._root)
+        newest = newest_step(self._root)
+        if newest <= self._shown:
+            return
+        self._shown = newest
+        if self.session is None:
+            self.session = self._server.open(self._load, warm=False)
+        else:
+            self.session.reload(self._load())
+        if (progress := training_progress(self._root)) is not None:
+            self.session.trained(progress)
+
+
+def training_progress(root: Path) -> dict[str, Any] | None:
+    """How far a run is, by the last line of its events.jsonl: step, share, psnr, seconds left; None where it does not say."""
+    try:
+        with (root / "events.jsonl").open("rb") as file:
+            file.seek(max(0, file.seek(0, 2) - _TAIL))
+            # The first line of the tail may be cut off; events without a share tell nothing of progress.
+            lines = [json.loads(line) for line in file.read().decode(errors="replace").splitlines()[1:]]
+        last = next(line for line in reversed(lines) if "share" in line)
+        # As long again for each share that is left, at the speed so far.
+        left = last["seconds"] * (1 - last["share"]) / max(last["share"], 1e-3)
+        return {"step": int(last["step"]), "share": last["share"], "psnr": float(last["psnr"]), "seconds_left": round(left)}
+    except (OSError, ValueError, KeyError, StopIteration):
+        return None

@@ -1,8 +1,8 @@
 """The start of `fprf view` without a run: photographs, a video or a capture come in, and become a scene that the viewer shows.
 
 Poses and training are `fprf process` and `fprf train` in processes of their own; the page shows the lines that they print, and
-from the first checkpoint on the scene itself (`follow.py`). A scene has one folder: its `files`, the `scene` with their poses,
-and the run folder `run`.
+from the first checkpoint on the scene itself (`session.py`). A scene has one folder: its `files`, the `scene` with
+their poses, and the run folder `run`.
 """
 
 import contextlib
@@ -12,8 +12,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -23,7 +24,8 @@ from .messages import Leave, Make, New, Open, StartRequest, Stop
 from .uploads import SceneFiles, Source, find_source, is_capture, newest_step
 
 if TYPE_CHECKING:
-    from .follow import TrainingFollower
+    from .server import ViewerServer
+    from .session import Viewed
 
 METHOD = "fprf-splats"
 _FILES, _SCENE, _RUN = "files", "scene", "run"
@@ -59,21 +61,10 @@ class _Left(Exception):
 
 
 class Start:
-    """`output` holds a folder a scene; `show` opens the viewer on a run folder or a capture, `leave` closes it.
+    """`output` holds a folder a scene; `load` opens a run folder or a capture under a name, for the `server` to show."""
 
-    `follow` gives what opens it at the first checkpoint of a run that is trained, and follows it. `post` sends all pages how
-    far it is.
-    """
-
-    def __init__(
-        self,
-        output: Path,
-        show: Callable[[Path, str], None],
-        follow: "Callable[[Path, str], TrainingFollower]",
-        leave: Callable[[], None],
-        post: Callable[[None, str, Mapping[str, Any]], None] = lambda client, kind, message: None,
-    ) -> None:
-        self._output, self._show, self._follow, self._leave, self._post = output.resolve(), show, follow, leave, post
+    def __init__(self, output: Path, server: "ViewerServer", load: "Callable[[Path, str], Viewed]") -> None:
+        self._output, self._server, self._load = output.resolve(), server, load
         self._uploads: dict[str, SceneFiles] = {}
         self._progress = Progress()
         self._lock = threading.Lock()
@@ -128,7 +119,7 @@ class Start:
                 if self._busy:
                     self._interrupt("leave")
                 self._progress = Progress()
-                self._leave()
+                self._server.show_start(self)
         return {}
 
     @property
@@ -149,7 +140,7 @@ class Start:
             self._progress = Progress(name=name, stage="opening", folder=str(folder))
             self._thread = threading.Thread(target=self._make, args=(source, name, minutes), name="fprf-make", daemon=True)
             self._thread.start()
-        self._post(None, "start", self.state())
+        self._server.post(None, "start", self.state())
 
     def _make(self, source: Source, name: str, minutes: float) -> None:
         """Find poses, train, and open the viewer, as far as the source needs it."""
@@ -165,13 +156,13 @@ class Start:
                 self._train(path, root / _RUN, name, minutes)
             else:
                 self._set(stage="opening", what="opening the scene", share=None, detail="")
-                self._show(path, name)
+                self._server.open(partial(self._load, path, name))
             if self._stopped == "leave":
                 raise _Left
             self._set(stage="open")
         except _Left:
             self._progress = Progress()
-            self._leave()
+            self._server.show_start(self)
         except FprfError as error:
             self._set(error=str(error))
         except Exception as error:  # whatever it is, the page goes on and the files are there
@@ -179,7 +170,10 @@ class Start:
 
     def _train(self, data: Path, run: Path, name: str, minutes: float) -> None:
         """Train a scene; from its first checkpoint on the viewer shows it."""
-        follower, ended = self._follow(run, name), threading.Event()
+        from .session import TrainingFollower
+
+        load, ended = partial(self._load, run, name), threading.Event()
+        follower = TrainingFollower(self._server, run, load)
         following = threading.Thread(target=follower.run, args=(ended,), name="fprf-follow", daemon=True)
         following.start()
         try:
@@ -191,7 +185,7 @@ class Start:
         self._set(stage="opening", what="opening the scene", share=None, detail="")
         follower.tick()
         if follower.session is None:  # the last checkpoint could not be shown before
-            self._show(run, name)
+            self._server.open(load)
 
     def _call(self, args: Sequence[str]) -> None:
         """Run a verb to its end. Raises DataError with what it says when it fails, `_Left` when it is to be left."""
@@ -252,7 +246,7 @@ class Start:
 
     def _tell(self, progress: Progress) -> None:
         self._progress = progress
-        self._post(None, "start", self.state())
+        self._server.post(None, "start", self.state())
 
     def _upload(self, name: str) -> SceneFiles:
         if name not in self._uploads:

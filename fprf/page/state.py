@@ -232,53 +232,40 @@ class State:
                     return replace(self, look=look.mixed([(photograph, 1.0)]))
                 return replace(self, look=look.weighted(photograph, message.weight, self.shelf))
             case messages.Region():
-                return self._ruled(message)
+                if message.action == "close":
+                    return replace(self, picked=None)
+                if self.picked is None:
+                    raise UsageError("region: none is picked")
+                # A photograph that a region is to take, or never to take, joins the mix.
+                named = self.photograph(message.card) if message.action in ("pin", "forbid") else None
+                if named is not None and named not in dict(look.mix):
+                    look = look.weighted(named, 1.0, self.shelf)
+                action = None if message.action == "free" else message.action
+                return replace(self, look=look.ruled(self.picked.region, action, named))
             case messages.Keep():
-                return self._kept(message)
+                name, kept = " ".join(message.name.split())[:40], dict(self.kept)
+                if message.action == "restore" and name in kept:
+                    return replace(self, look=kept[name])
+                if not name or name in (NOW, "Captured") or message.action == "restore":
+                    raise UsageError("keep look: give it a name of its own")
+                if len(kept.keys() - {name}) >= _MAX_KEYS:
+                    raise UsageError(f"keep look: at most {_MAX_KEYS} are kept")
+                kept.pop(name, None)  # a look that takes the place of another comes last
+                return replace(self, kept=(*kept.items(), (name, look)))
+            case messages.Key(action="add"):
+                if message.camera is None:
+                    raise UsageError("key: a camera is needed")
+                if len(self.keys) >= _MAX_KEYS:
+                    raise UsageError(f"film: at most {_MAX_KEYS} keys; remove one first")
+                return replace(self, keys=(*self.keys, Key(message.camera, look)))
             case messages.Key():
-                return self._keyed(message)
-
-    def _ruled(self, message: messages.Region) -> "State":
-        """With a rule for the region that is picked, or with none picked."""
-        if message.action == "close":
-            return replace(self, picked=None)
-        if self.picked is None:
-            raise UsageError("region: none is picked")
-        look, photograph = self.look, None
-        if message.action in ("pin", "forbid"):
-            photograph = self.photograph(message.card)
-            if photograph not in dict(look.mix):
-                look = look.weighted(photograph, 1.0, self.shelf)
-        action = None if message.action == "free" else message.action
-        return replace(self, look=look.ruled(self.picked.region, action, photograph))
-
-    def _kept(self, message: messages.Keep) -> "State":
-        """With the look kept under a name, or that of a name in use again."""
-        name, held = " ".join(message.name.split())[:40], dict(self.kept)
-        if message.action == "restore" and name in held:
-            return replace(self, look=held[name])
-        if not name or name in (NOW, "Captured") or message.action == "restore":
-            raise UsageError("keep look: give it a name of its own")
-        if len(held.keys() - {name}) >= _MAX_KEYS:
-            raise UsageError(f"keep look: at most {_MAX_KEYS} are kept")
-        held.pop(name, None)  # a look that takes the place of another comes last
-        return replace(self, kept=(*held.items(), (name, self.look)))
-
-    def _keyed(self, message: messages.Key) -> "State":
-        """With a keyframe more, less, or in another place."""
-        keys, at = list(self.keys), message.at
-        if message.action == "add":
-            if message.camera is None:
-                raise UsageError("key: a camera is needed")
-            if len(keys) >= _MAX_KEYS:
-                raise UsageError(f"film: at most {_MAX_KEYS} keys; remove one first")
-            return replace(self, keys=(*keys, Key(message.camera, self.look)))
-        if not at < len(keys):
-            raise UsageError(f"film: key {at + 1} of {len(keys)}: there is none")
-        key = keys.pop(at)
-        if message.action == "earlier":
-            keys.insert(max(0, at - 1), key)
-        return replace(self, keys=tuple(keys))
+                keys, at = list(self.keys), message.at
+                if not at < len(keys):
+                    raise UsageError(f"film: key {at + 1} of {len(keys)}: there is none")
+                key = keys.pop(at)
+                if message.action == "earlier":
+                    keys.insert(max(0, at - 1), key)
+                return replace(self, keys=tuple(keys))
 
     def described(self) -> dict[str, Any]:
         """The state as the page reads it."""

@@ -261,10 +261,6 @@ def _img(picture: Picture, side: int, alt: str) -> str:
     )
 
 
-def _figure(picture: Picture, name: str, side: int) -> str:
-    return f"<figure>{_img(picture, side, name)}<figcaption>{escape(name)}</figcaption></figure>"
-
-
 def _views(views: Sequence[PageView]) -> str:
     """Photographs beside what the scene shows from their places."""
     rows = "".join(
@@ -287,7 +283,10 @@ def _style(style: Style, views: Sequence[PageView], known: Mapping[str, Referenc
         share = f'<data value="{style.shares[place]:.4f}">{style.shares[place]:.0%}</data>' if style.shares else ""
         image = _img(known[name].image, _REFERENCE, f"Reference {name}")
         rows.append(f"<figure>{image}<figcaption>{chip}<span>{escape(name)}</span>{share}</figcaption></figure>")
-    maps = "".join(_figure(each, view.name, _MAP) for view, each in zip(views, style.matches, strict=False))
+    maps = "".join(
+        f"<figure>{_img(each, _MAP, view.name)}<figcaption>{escape(view.name)}</figcaption></figure>"
+        for view, each in zip(views, style.matches, strict=False)
+    )
     return f"""<article class="style"><h3>{escape(style.name)}</h3>
 <div class="sources">{"".join(rows)}</div>
 {f'<p class="lead">Which reference each place took its style from</p><div class="grid small">{maps}</div>' if maps else ""}

@@ -83,18 +83,6 @@ def choose_frames(scores: Sequence[float], count: int, least: float) -> tuple[li
     return chosen, dict(sorted(dropped.items()))
 
 
-def frame_scores(video: Path, progress: Progress) -> list[float]:
-    """Sharpness of every frame, in their order. Raises DataError where the file holds no frames."""
-    scores: list[float] = []
-    for expected, frame in _frames(video):
-        progress(len(scores), max(expected, len(scores) + 1), "looking for sharp frames")
-        scores.append(sharpness(frame))
-    if not scores:
-        raise DataError(f"{video}: no frame can be decoded; convert it to H.264 in an .mp4, or give a folder of images")
-    progress(len(scores), len(scores), "looking for sharp frames")
-    return scores
-
-
 def save_frames(video: Path, frames: Sequence[int], folder: Path, progress: Progress) -> None:
     """Write some of the frames, as JPEG (95), each whole or not at all; those that are there stay."""
     wanted = {frame for frame in frames if not (folder / _FRAME.format(frame)).is_file()}
@@ -278,19 +266,27 @@ def _from_folder(source: Path, place: SceneFolder, state: State, progress: Progr
 def _from_video(
     source: Path, place: SceneFolder, state: State, config: SfmConfig, progress: Progress
 ) -> dict[str, dict[str, Any]]:
-    """Sharp frames, evenly over time."""
+    """Sharp frames, evenly over time. Raises DataError where the file holds no frames."""
     # A video is told by its size and time: hashing gigabytes takes longer than is worth it.
     about = source.stat()
     key = step_key("frames", about.st_size, about.st_mtime_ns, config.frames, config.blurred)
     if state.done.get("frames") == key and all((place.images / name).is_file() for name in state.images):
         return state.images
-    chosen, dropped = choose_frames(frame_scores(source, progress), config.frames, config.blurred)
+    # How sharp every frame is, before any is chosen: blur is told by the frames around.
+    scores: list[float] = []
+    for expected, frame in _frames(source):
+        progress(len(scores), max(expected, len(scores) + 1), "looking for sharp frames")
+        scores.append(sharpness(frame))
+    if not scores:
+        raise DataError(f"{source}: no frame can be decoded; convert it to H.264 in an .mp4, or give a folder of images")
+    progress(len(scores), len(scores), "looking for sharp frames")
+    chosen, dropped = choose_frames(scores, config.frames, config.blurred)
     save_frames(source, chosen, place.images, progress)
     state.dropped = {f"frame {frame}": reason for frame, reason in dropped.items()}
     state.done["frames"] = key
     frames = {}
-    for frame in chosen:
-        path = place.images / _FRAME.format(frame)
+    for number in chosen:
+        path = place.images / _FRAME.format(number)
         frames[path.name] = _described(path, hashlib.sha256(path.read_bytes()).hexdigest())
     return frames
 

@@ -171,19 +171,3 @@ def report(
             {"image": image, "step": step, "reason": reason} for step, drops in lost.items() for image, reason in drops
         ],
     }
-
-
-def summary_rows(content: Mapping[str, Any], most: int = 12) -> list[tuple[str, str, str]]:
-    """Rows of (step, image, reason) for a table; a step with more than `most` images is told as a number."""
-    rows: list[tuple[str, str, str]] = []
-    many = Counter(drop["step"] for drop in content["dropped"])
-    told = set()
-    # A step that lost many is one row, with an example.
-    for drop in content["dropped"]:
-        step = drop["step"]
-        if many[step] <= most:
-            rows.append((step, drop["image"], drop["reason"]))
-        elif step not in told:
-            told.add(step)
-            rows.append((step, f"{many[step]} images", f"for example {drop['image']}: {drop['reason']}"))
-    return rows

@@ -312,6 +312,7 @@ def reporter(display: Display, run: Run, name: str = "training") -> Callable[[Re
         run.log(
             {
                 "step": event.step,
+                "share": round(event.share, 4),
                 "seconds": round(event.seconds, 2),
                 "psnr": round(event.psnr, 3),
                 "rays_per_second": round(event.rays_per_second),

@@ -1,6 +1,7 @@
 """Fixtures of the viewer's tests."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ from session_helpers import Listener
 from splat_ball import ball
 from tiny_world import World
 
-from fprf.page.restyler import Restyler
+from fprf.page.drawing import Restyler
 from fprf.page.session import Session, Viewed, view_of_run
 from fprf.page.state import Photograph
 from fprf.training.loading import open_run
@@ -34,12 +35,12 @@ def listener() -> Listener:
 @pytest.fixture
 def session(run: Path, listener: Listener) -> Iterator[Session]:
     """A session of a copy of the trained run of fields."""
-    with Session(view_of_run(open_run(run, "cpu")), listener.post, longest=64) as opened:
+    with Session(replace(view_of_run(open_run(run, "cpu")), pixels=64), listener.post) as opened:
         yield opened
 
 
 @pytest.fixture
 def splats(listener: Listener, tmp_path: Path) -> Iterator[Session]:
     """A session of a ball of Gaussians."""
-    with Session(Viewed(seen(ball(400, 2)), "ball", 1, tmp_path / "ball"), listener.post, longest=64) as opened:
+    with Session(Viewed(seen(ball(400, 2)), "ball", 1, tmp_path / "ball", pixels=64), listener.post) as opened:
         yield opened

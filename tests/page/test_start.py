@@ -2,8 +2,7 @@
 
 import shutil
 import sys
-import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,10 @@ from session_helpers import until
 
 from fprf.errors import CheckpointError, DataError, FprfError, UsageError
 from fprf.page import start as start_module
-from fprf.page.follow import TrainingFollower, training_progress
 from fprf.page.messages import Leave, Make, New, Open, Stop
 from fprf.page.server import Access, ViewerServer
-from fprf.page.session import Viewed, view_of_run
+from fprf.page.session import TrainingFollower, Viewed, training_progress, view_of_run
 from fprf.page.start import Start
-from fprf.page.uploads import newest_step
 from fprf.training.driver import is_watched
 from fprf.training.loading import open_run
 
@@ -48,42 +45,33 @@ if args[args.index("--minutes") + 1] != "1":
 
 
 class Shown(Start):
-    """A start that notes what it would open the viewer on, and what it posts."""
+    """A start whose server notes what it is to show, and what is posted."""
 
     def __init__(self, output: Path) -> None:
         self.shown: list[tuple[Path, str]] = []
         self.posted: list[Any] = []
+        self.pages = 0
+        super().__init__(output, self, self.view)  # type: ignore[arg-type]
 
-        def post(client: None, kind: str, message: Any) -> None:
-            self.posted.append(message)
-
-        super().__init__(output, self.view, lambda *place: Follower(self, *place), self.shown.clear, post)  # type: ignore[arg-type,return-value]
-
-    def view(self, path: Path, name: str) -> None:
+    def view(self, path: Path, name: str) -> Any:
         if path.suffix == ".ply":
             raise DataError("of two dimensions")
         self.shown.append((path, name))
+        return self
+
+    def open(self, load: Callable[[], Any], *, warm: bool = True) -> Any:
+        return load()
+
+    def show_start(self, start: Start) -> None:
+        self.shown.clear()
+
+    def post(self, client: None, kind: str, message: Any) -> None:
+        self.posted.append(message)
 
     def reached(self, **wanted: object) -> Any:
         """The state, as soon as it is so."""
         until(lambda: wanted.items() <= self.state().items())
         return self.state()
-
-
-class Follower:
-    """Opens the viewer at the first checkpoint."""
-
-    def __init__(self, page: Shown, run: Path, name: str) -> None:
-        self.page, self.run_folder, self.name, self.session = page, run, name, None
-
-    def run(self, ended: threading.Event) -> None:
-        while not ended.wait(0.01):
-            self.tick()
-
-    def tick(self) -> None:
-        if self.session is None and newest_step(self.run_folder) >= 0:
-            self.page.view(self.run_folder, self.name)
-            self.session: Any = self.page
 
 
 @pytest.fixture

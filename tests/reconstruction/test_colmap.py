@@ -17,7 +17,7 @@ from fprf.cli import main as cli
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.video import write_video
 from fprf.reconstruction.colmap import build_vocabulary, descriptors, sequential_pairs, similar_pairs, vlad_vectors
-from fprf.reconstruction.scene_folder import MatchTables, count_rows, report, summary_rows
+from fprf.reconstruction.scene_folder import MatchTables, count_rows, report
 
 MOST = 2147483647
 
@@ -76,13 +76,12 @@ def test_every_image_has_its_reason(database: Path) -> None:
     models = [{"images": ["a"], **figures}, {"images": ["sub/c", "elsewhere"], **figures}]
     content = report(state, "exhaustive", MatchTables(database), models, "1.0")
     assert content["images"] == {"given": 7, "used": 6, "posed": 1} and content["parts"] == [1, 2]
-    rows = summary_rows(content)
+    rows = [(drop["step"], drop["image"], drop["reason"]) for drop in content["dropped"]]
     told = [("choosing", "x.jpg"), ("features", "apart"), ("features", "b"), ("matching", "lonely"), ("mapping", "sub/c")]
     assert [row[:2] for row in rows] == [*told, ("mapping", "odd")]
     assert rows[0][2] == "the JPEG is truncated" and "no other image" in rows[3][2]
     assert rows[4][2] == "in part 2 (2 images), apart from the rest; take views in between"
     assert rows[5][2] == "fits 2 images, but no pose was found for it"
-    assert [row[1] for row in summary_rows(content, most=1)] == ["x.jpg", "2 images", "lonely", "2 images"]
 
 
 def proper(pairs: list[tuple[int, int]], count: int) -> bool:

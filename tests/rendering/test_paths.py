@@ -13,10 +13,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import DataError, UsageError
-from fprf.rendering.camera_path import read_camera_path, write_camera_path
 from fprf.rendering.cameras import Cameras, ideal_cameras, project
 from fprf.rendering.lens import OPENCV
-from fprf.rendering.paths import interpolate, look_at, make_path, orbit, pinhole, spiral, upwards
+from fprf.rendering.paths import (
+    interpolate,
+    look_at,
+    make_path,
+    orbit,
+    pinhole,
+    read_camera_path,
+    spiral,
+    upwards,
+    write_camera_path,
+)
 from fprf.rendering.splines import catmull_rom, quaternions, rotations, slerp
 
 UP = torch.tensor([0.0, 0, 1], dtype=torch.float64)

@@ -21,8 +21,8 @@ from fprf.io.images import write_image
 from fprf.page.drawing import write_film_files
 from fprf.page.messages import Camera
 from fprf.page.state import Key, Look
-from fprf.rendering.camera_path import read_camera_path
 from fprf.rendering.local_frame import read_offset
+from fprf.rendering.paths import read_camera_path
 from fprf.splats.files import read_capture
 from fprf.splats.photographs import camera_of
 from fprf.splats.scene import SplatScene
