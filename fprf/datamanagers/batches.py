@@ -29,7 +29,7 @@ from ..types import Batch
 from .basis import Basis
 from .config import RayBatchesConfig
 from .features import Progress, extract
-from .images import WHITE, load_image, load_images, load_mask
+from .images import WHITE, load_images, load_mask
 from .scene import Scene, find_sightings
 
 HELD = 512 * 2**20
@@ -170,6 +170,7 @@ class RayBatches(DataManager):
         self.background = background or (WHITE if scene.alpha else None)
         """Colour (RGB in [0, 1]) behind transparent pixels; None for opaque scenes."""
         self._config, self._scene, self._seed = config, scene, seed
+        # Views lie in slots one after the other: pixel p of slot k is number ends[k - 1] + p.
         self._views = scene.train.tolist()
         self._sizes = scene.cameras.size[scene.train]
         self._ends = self._sizes.prod(1).cumsum(0)
@@ -190,6 +191,7 @@ class RayBatches(DataManager):
         sky = self._runs(skies, unmasked=False) if skies else None
         marked, distance = self._marked() if config.depth_share > 0 else (None, None)
         self._source = _Source(self._pixels, scene.train, self._sizes, self._ends, self._chosen, sky, marked, distance)
+        # Features are those of the very pixels above, which are not decoded again for each encoder.
         features = partial(extract, views=self._views, image=self._stored, config=config.guided, progress=progress)
         self.content_store = None if content is None else features(cache / "content", encoder=content)
         self.semantic_store = None if semantic is None else features(cache / "semantic", encoder=semantic, dim=dim, basis=basis)
@@ -249,8 +251,7 @@ class RayBatches(DataManager):
         """One view of the scene as a float image in [0, 1]; held-out ones are read when asked for."""
         if view in self._slots:
             return self._stored(view).float() / 255
-        width, height = self._scene.cameras.size[view].tolist()
-        return torch.from_numpy(load_image(self._scene.paths[view], (width, height), self.background)).float() / 255
+        return torch.from_numpy(load_images(self._scene, self.background, [view])[0]).float() / 255
 
     def _stored(self, view: int) -> Annotated[Tensor, "H W 3"]:
         slot = self._slots[view]

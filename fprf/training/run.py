@@ -291,6 +291,7 @@ def image_hashes(scene: Scene) -> dict[str, str]:
         except OSError as error:
             raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
 
+    # Hashing waits for the disk, so files are read side by side.
     with ThreadPoolExecutor() as pool:
         return dict(zip(view_names(scene.paths), pool.map(of, scene.paths), strict=True))
 

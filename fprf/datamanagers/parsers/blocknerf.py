@@ -46,6 +46,7 @@ def _crc_kernel() -> Callable[[NDArray[np.uint8]], np.uint32]:
     """The loop over bytes, compiled at its first use."""
     import numba
 
+    # The remainder of each byte by the reversed polynomial, bit after bit; then a step of the loop is one look-up.
     table = np.arange(256, dtype=np.uint32)
     for _ in range(8):
         table = np.where(table & 1, (table >> 1) ^ np.uint32(0x82F63B78), table >> 1).astype(np.uint32)
@@ -224,6 +225,7 @@ def fit_camera(origin: NDArray[np.float32], direction: NDArray[np.float32]) -> R
     matrix, none = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), np.zeros(5)
     # Two points on each ray, near and far: only a camera in the rays' own place sees both in one pixel.
     points, seen = np.concatenate([ray, 2 * ray]).astype(np.float32), np.concatenate([pixel, pixel]).astype(np.float32)
+    # k3 stays 0: what two radial and two tangential terms leave is told as the error.
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
     try:
         error, matrix, bent, turns, _ = cv2.calibrateCamera([points], [seen], (width, height), matrix, none, flags=flags)

@@ -8,9 +8,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from fprf.errors import ConfigError, WeightsError
+from fprf.plugins.codec import from_json
 from fprf.plugins.encoders.config import Dinov2Config
 from fprf.plugins.encoders.dinov2 import WEIGHTS, dequantised, load_dinov2
-from fprf.plugins.typed_json import from_json
 from fprf.plugins.weights import IMAGENET_MEAN, IMAGENET_STD, read_weights, write_weights
 from fprf.splats.config import GaussianSemanticsConfig
 
