@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fprf.errors import FprfError, UsageError
-from fprf.process import keep_memory
+from fprf.memory import keep_memory
 
 from .town.write import cached_town
 
@@ -41,11 +41,6 @@ BENCHMARKS = {
     "gaussians": Benchmark("the rasteriser of 3D Gaussians: time and error", "--count 500 --times 2"),
     "kernels": Benchmark("what each compiled kernel brings end to end", "{run} --repeats 1", _TRAINED),
     "kills": Benchmark("training that is killed a hundred times", "--kills 3 --steps 25", "ten minutes; Linux"),
-    "large_scene": Benchmark(
-        "a district of towns in cells: seconds, memory, fidelity, workers of Ray",
-        "--images 24 --towns 2 --size 48 36 --parts 1 --steps 20 --frames 2",
-        "an hour for 16 towns; the extra cluster for --workers",
-    ),
     "mutants": Benchmark(
         "how many small mistakes in the mathematics the tests notice",
         "--only fprf/rendering/splines.py --sample 2",

@@ -48,7 +48,7 @@ if [ "$dry" = 1 ]; then
     time=(--steps 20) again=(--steps 40)
     size=(--rays 500 --repeats 2) points=(--points 2000)
     photographs=("${data[@]}")
-    tests+=(-k "pretended and views" "$root/tests/test_gpu.py")
+    tests+=("$root/tests/test_pretend_cuda.py")
     [ "$long" = 0 ] || long=40
     export OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1
 else
@@ -62,7 +62,7 @@ else
     time=(--minutes "$minutes") again=(--steps "$long")
     size=(--rays 762048 --repeats 5) points=(--points 262144)
     photographs=(--data "$scene" --parser llff --parser.images "$images")
-    tests+=(-k "not pretended" "$root/tests/test_gpu.py" "$root/tests/ops/test_rasterise_gsplat.py")
+    tests+=("$root/tests/test_gpu.py" "$root/tests/ops/test_rasterise_gsplat.py")
 fi
 
 # step NAME SECONDS COMMAND...: run it, note its exit status, print the end of its log where it failed.

@@ -237,7 +237,7 @@ class Changed(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 def compiled_anew(wanted: bool) -> Iterator[None]:
     """What numba keeps is found by a function's own code: a change in what is compiled into it would not be noticed.
 
-    Arrays are held to their bounds, as `tests/ops/test_within_arrays.py` does: else what lies beside them decides.
+    Arrays are held to their bounds, as `tests/ops/test_operator_table.py` does: else what lies beside them decides.
     """
     if not wanted:
         yield

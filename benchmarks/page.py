@@ -37,10 +37,11 @@ from fprf.io.video import write_video
 from fprf.page.writer import Page, PageView, write_page
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.rendering.cameras import Cameras
+from fprf.splats.captures import look_at_capture
 from fprf.splats.config import LookConfig
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.photographs import camera_of
-from fprf.splats.scene import SplatScene, look_at_capture
+from fprf.splats.scene import SplatScene
 from fprf.splats.views import draw
 from fprf.training.loading import open_run
 

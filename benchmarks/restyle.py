@@ -19,13 +19,7 @@ from fprf.interfaces import Scene, SceneView
 from fprf.io.images import Picture, to_uint8, write_image
 from fprf.methods import fprf_lite
 from fprf.plugins import registry
-from fprf.plugins.stylizers.config import (
-    AdainConfig,
-    LocalAdainConfig,
-    RegionOtConfig,
-    RegionToneConfig,
-    StylizerConfig,
-)
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from fprf.progress import Display
 from fprf.style.config import StyleConfig, labels
 from fprf.style.dictionary import Encoders, StyleDictionary, build_dictionary, encode_photograph
@@ -482,7 +476,7 @@ the street and its sky.
   that it was made of). **match inside**: the same without pixels at the border of two classes. **match kind**: of their own
   kind (sky, plants, ground, buildings, lamps, cars).
 - **consistency**: what a method adds to the error between frames of a path, warped by true depth, plus the sharpness that it
-  loses; 0 = as steady and sharp as the unstylised render (`fprf/evaluation/consistency.py`).
+  loses; 0 = as steady and sharp as the unstylised render (`fprf/evaluation/metrics.py`).
 - **style s**: to make the style of the references, once. **view s**: to colour a view whose geometry is there (for `reinhard`,
   `histogram` and `2d`: a rendered picture).
 - **LPIPS**: AlexNet, version 0.1, to the truth; less is nearer. The JSON also has consistency as other papers report it

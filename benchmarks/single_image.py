@@ -16,11 +16,10 @@ from fprf.errors import DataError
 from fprf.interfaces import Decoder, Encoder
 from fprf.ops.guided import upsample
 from fprf.plugins.stylizers.config import StylizerConfig
-from fprf.splats.restyle import region_maps
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import StyleDictionary
 from fprf.style.light import light_of
-from fprf.style.look import Restyle, colour_maps, own_colours
+from fprf.style.look import Restyle, colour_maps, decoded_colours, region_maps
 from fprf.style.scene_style import SceneStyle, scene_style
 from fprf.types import Want
 
@@ -82,7 +81,7 @@ def flat_look(flat: Flat, dictionary: StyleDictionary, config: StylizerConfig, d
     stylizer = config.build(dictionary=dictionary, scene=flat.style).to(device)
     light = None
     if config.light:
-        own = own_colours(stylizer, flat.style, decoder)
+        own = decoded_colours(stylizer, flat.style, decoder, features=0.0)
         light = light_of(flat.style, dictionary, config, own, bold=StyleConfig.bold)
         light = None if light is None else light.to(device)
     if decoder is None:

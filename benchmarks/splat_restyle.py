@@ -21,10 +21,10 @@ from fprf.memory import peak
 from fprf.ops.harmonics import HARMONIC
 from fprf.plugins.encoders.config import SEMANTICS
 from fprf.plugins.stylizers.config import RegionToneConfig
+from fprf.splats.captures import look_at_capture
 from fprf.splats.config import LookConfig
 from fprf.splats.files import read_capture, write_capture, write_gaussians
 from fprf.splats.gaussians import Gaussians
-from fprf.splats.scene import look_at_capture
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.restyle import apply_style

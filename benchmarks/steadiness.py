@@ -4,7 +4,7 @@
 
 Only places that the unstylised render itself shows alike count. Colours are compared as means over windows, since a texture
 finer than a pixel differs in every frame. Sharpness is the steepest change of colour in a neighbourhood over the range of
-colours there. Frames are warped as in `fprf.evaluation.consistency`.
+colours there. Frames are warped as in `fprf.evaluation.metrics`.
 
 `published` is consistency as other papers report it. A blurred or dull film scores well there.
 
@@ -22,8 +22,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from fprf.errors import DataError, NumericsError
-from fprf.evaluation.consistency import warp
-from fprf.evaluation.metrics import lpips
+from fprf.evaluation.metrics import lpips, warp
 from fprf.rendering.cameras import Cameras
 
 SHORT, LONG = 1, 7
@@ -103,7 +102,7 @@ def _errors(plain: Frames, styled: Frames, depths: Sequence[Tensor], cameras: Ca
         within = F.avg_pool2d(valid[None, None].double(), _WINDOW, 1, _WINDOW // 2)[0, 0]
         full = valid & (within >= 0.5)
         counted, pixels = counted + int(full.sum()), pixels + full.numel()
-        moved = warp(styled[b], depths[a], depths[b], cameras, a, b).image
+        moved, _ = warp(styled[b], depths[a], depths[b], cameras, a, b)
         for i, (here, warped) in enumerate(((plain[a], there), (styled[a], moved))):
             first, second = (_window_mean(x, valid, within)[full].double() for x in (here, warped))
             squared[i] += float((first - second).square().sum())

@@ -31,8 +31,7 @@ from fprf.datamanagers.basis import fit_basis
 from fprf.datamanagers.config import GuidedConfig
 from fprf.datamanagers.images import load_image
 from fprf.errors import DataError
-from fprf.evaluation.consistency import consistency
-from fprf.evaluation.metrics import ssim
+from fprf.evaluation.metrics import WarpError, ssim
 from fprf.interfaces import Decoder, Encoder
 from fprf.io.images import shrink, to_uint8, write_image
 from fprf.plugins.decoders.config import MlpDecoderConfig
@@ -354,7 +353,10 @@ def run_figures(root: Path, config: StylesConfig, judges: Mapping[str, Encoder])
                 there = style.classes
             rows = judge_exhibit(Exhibit(plain, styled, regions, style.images, there), judges, full=config.full)
             for name, pictures in styled.items():
-                warped = consistency(pictures, [view.restyled().depth for view in cached], near, pairs)
+                error, depths = WarpError(near), [view.restyled().depth for view in cached]
+                for a, b in pairs:
+                    error.add(a, b, pictures[a], pictures[b], depths[a], depths[b])
+                warped = error.summary()
                 rows[name] |= {"consistency_rmse": warped["rmse"], "consistency_relative": warped["relative"]}
             cases[style.name] = rows
             shown[style.name] = {"reference": style.images[0], **{name: views[0] for name, views in styled.items()}}

@@ -51,14 +51,13 @@ if TYPE_CHECKING:
     from .datamanagers.basis import Basis
     from .datamanagers.features import FeatureStore
     from .datamanagers.scene import Scene as ParsedScene
-    from .plugins.stylizers.config import StylizerConfig
     from .progress import Display
     from .rendering.cameras import Cameras
     from .rendering.renderer import Parts
     from .rendering.space import Space
     from .splats.gaussians import GaussianRows
-    from .style.dictionary import Encoders, StyleDictionary
-    from .style.look import ColourMaps, Restyle
+    from .style.dictionary import Encoders
+    from .style.look import Restyle
     from .style.scene_style import SceneStyle
     from .training.model import Facts
     from .training.run import Run
@@ -321,20 +320,6 @@ class Scene(ABC):
     @abstractmethod
     def encoders(self) -> "Encoders":
         """Encoders for references, in the terms of `measured`. Raises WeightsError where those at hand are others."""
-
-    @abstractmethod
-    def colour_maps(
-        self,
-        stylizer: Stylizer,
-        dictionary: "StyleDictionary",
-        style: "SceneStyle",
-        config: "StylizerConfig",
-        allowed: Annotated[Tensor, "K references"],
-    ) -> "ColourMaps | None":
-        """Change of colours behind a stylizer's change of features; None = no change.
-
-        `allowed` says which references each region may take from, bool.
-        """
 
 
 class State(NamedTuple):

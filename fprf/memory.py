@@ -1,9 +1,13 @@
-"""Recovery from too little memory: take less at once where that gives the same, else say what was needed.
+"""Memory: what is freed is kept; where there is too little, less is taken at once if that gives the same, else told.
 
 Every library says it differently: Python and NumPy raise MemoryError, torch a RuntimeError on the CPU and one of its own on a
 GPU, OpenCV its error -4. None of them is imported here.
+
+By default the system takes what is freed back. A step frees and asks for the same tens of megabytes again, and each page that
+comes back is cleared anew: a tenth of a training step. So freed memory stays with the process, up to `TRIM` bytes.
 """
 
+import ctypes
 import os
 import re
 import sys
@@ -29,8 +33,24 @@ _GPU = re.compile(r"GPU \d+ has a total capacity of [\d.]+ \w+ of which [\d.]+ \
 _ASKED = re.compile(r"(?:allocate|allocate array of|llocate) ([\d.]+) (bytes|KiB|MiB|GiB|TiB)", re.IGNORECASE)
 _UNITS = {"bytes": 1, "kib": 1 << 10, "mib": 1 << 20, "gib": 1 << 30, "tib": 1 << 40}
 _OPENCV_NO_MEMORY = -4
+TRIM = 2**29
+"""Freed memory beyond this goes back to the system."""
+_LARGEST = (2**27, 2**25)
+"""Pieces up to this size come from memory that was freed before; older C libraries refuse more than the second."""
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 _GIB = 1 << 30
 _Found = TypeVar("_Found")
+
+
+def keep_memory() -> bool:
+    """Ask the C library to keep what is freed, unless the user decided otherwise; False where it is not GNU's."""
+    if not sys.platform.startswith("linux") or any(name.startswith("MALLOC_") for name in os.environ):
+        return False
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except AttributeError:
+        return False
+    return any(mallopt(_MMAP_THRESHOLD, size) for size in _LARGEST) and bool(mallopt(_TRIM_THRESHOLD, TRIM))
 
 
 def out_of_memory(error: BaseException) -> bool:

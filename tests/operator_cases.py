@@ -8,10 +8,9 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
-from ops.plain_forms import plainly
 from torch import Tensor
 
-from fprf.ops import dense, guided, triplane
+from fprf.ops import backend, dense, guided, triplane
 from fprf.rendering import cameras, lens, space, splines, stepfun
 from fprf.rendering.lens import lens_reach
 from fprf.style import dictionary, light, look, matching, scene_style, statistics
@@ -131,7 +130,7 @@ def _code(t: int) -> Made:
 
 CASES = [
     Case("dense.network", _layers, _network, slopes=(0, 1, 2, 3, 4)),
-    Case("dense.network, plain", _layers, plainly(lambda x, *p: dense.network(x, p[0::2], p[1::2])), slopes=(0, 1, 2, 3)),
+    Case("dense.network, plain", _layers, backend.plain()(_network), slopes=(0, 1, 2, 3)),
     Case("dense.runs", lambda n: ((_unit(n, 2) * 2).floor(),), _spelt_out),
     Case("guided.coefficients", lambda n: (_draw(5, max(1, n // 3), n), _unit(n, n, 3)),
          lambda f, g: guided.coefficients(f, g, radius=2, eps=1e-3, stride=2), sizes=(1, 37, 96), tolerance=1e-4),
@@ -140,8 +139,8 @@ CASES = [
     Case("guided.apply", lambda n: (_draw(4, 5, 6, 4), 37 * _unit(n, 2), _unit(n, 3)),
          lambda c, p, rgb: guided.apply(c, p, rgb, (37, 37))),
     Case("space.distance", lambda n: (_edges(n, 21), _unit(n) + 0.05, 9 * _unit(n) + 2), _open("contraction").distance),
-    Case("scene_style.mixed_maps", lambda n: (_draw(n, 16), _shares(n, 3), _draw(3, 16, 16), _draw(3, 16), _draw(16)),
-         lambda x, s, m, b, c: scene_style.mixed_maps(x, s, m, b, centre=c), slopes=(0, 2, 3)),
+    Case("scene_style.mixed_maps", lambda n: (_draw(n, 16), _shares(n, 3), _draw(3, 16, 16), _draw(3, 16)),
+         scene_style.mixed_maps, slopes=(0, 2, 3)),
     Case("triplane.lookup", _planes, lambda p, t, w: triplane.lookup(p, t, (8, 16)), slopes=(1,)),
     Case("triplane.lookup_reference", _planes, lambda p, t, w: triplane.lookup_reference(p, t, (8, 16)), slopes=(1,)),
     Case("triplane.variation", lambda n: (_draw(triplane.rows((n,)), 8),), lambda t: triplane.variation(t, (_side(t),)),
@@ -152,8 +151,6 @@ CASES = [
          sizes=(1, 37, 500)),
     Case("statistics.kmeans", lambda n: (_draw(n, 4) + 20 * (_unit(n, 1) * 3).floor(),),
          lambda x: statistics.kmeans(x, 3, seed=0)),
-    Case("look.blend_strength", lambda n: (_draw(n, 9), _draw(n, 9, seed=5), _unit(n, 1)), look.blend_strength,
-         slopes=(0, 1)),
     Case("light.luma", lambda n: (_unit(n, 3),), light.luma, slopes=(0,)),
     Case("look.keep_luminance", lambda n: (_unit(n, 3), _unit(n, 3, seed=5), _unit(n, 1)), look.keep_luminance),
     Case("dictionary.blend_codes", lambda n: (*_code(n), _draw(6), _covariances(1, 6)[0]),
@@ -167,11 +164,6 @@ CASES = [
          lambda q, k, p: matching.attention(q, k, 0.7, p), slopes=(0, 1)),
     Case("matching.point_shares", lambda n: (_draw(n, 8), _draw(7, 8), _draw(8, seed=6)),
          lambda q, k, c: matching.point_shares(q, k, 0.7, centre=c)),
-    Case("scene_style.region_units", lambda n: (_draw(n, 8), _draw(8)), lambda k, c: scene_style.region_units(k, c)[0],
-         sizes=(0, 1, 37, 500)),
-    Case("scene_style.membership",
-         lambda n: (_draw(n, 8), _draw(8, seed=6), torch.nn.functional.normalize(_draw(5, 8), dim=-1)),
-         lambda x, c, u: scene_style.membership(x, c, u, 0.5)),
     Case("statistics.moments", lambda n: (_draw(n, 6) + 100, _unit(n)), _moments),
     Case("statistics.group_moments", lambda n: (_draw(n, 6), _shares(n, 3)), statistics.group_moments),
     Case("statistics.mix", _code, statistics.mix, sizes=(1, 37, 500)),

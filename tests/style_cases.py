@@ -1,10 +1,11 @@
 """Points of three kinds, each with semantics and a style of its own: a scene of them, and references."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from fprf.plugins.stylizers.config import RegionToneConfig
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
 from fprf.style.scene_style import SceneStyle, scene_style
 
@@ -38,3 +39,9 @@ def setting(*weights: float, n: int = 300, clusters: int = 3) -> Setting:
     content, semantic = points(n)
     dictionary = build_dictionary(references(*weights or (1.0, 1.0)), clusters=clusters)
     return Setting(content, semantic, scene_of(content, semantic), dictionary)
+
+
+def region_adain(**fields: Any) -> RegionToneConfig:
+    """Each region's features channel by channel to those of its match, in full."""
+    alone = {"features": 1.0, "colours": 0.0, "light": False, "temperature": 0.4, "smoothness": 0.0}
+    return RegionToneConfig(**{**alone, **fields})

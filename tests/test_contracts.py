@@ -13,17 +13,7 @@ from fprf import testing
 from fprf.blocks.config import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig
 from fprf.datamanagers.config import RayBatchesConfig
 from fprf.fields.config import ContentFieldConfig, PlanesConfig, SemanticPlanesConfig
-from fprf.interfaces import (
-    BlockLayout,
-    ContentField,
-    DataManager,
-    Decoder,
-    Encoder,
-    Executor,
-    LossTerm,
-    Sampler,
-    Stylizer,
-)
+from fprf.interfaces import BlockLayout, ContentField, DataManager, Decoder, Encoder, Executor, LossTerm, Sampler, Stylizer
 from fprf.plugins import registry
 from fprf.plugins.decoders.config import DecoderConfig
 from fprf.plugins.encoders.config import EncoderConfig, RandomConfig
@@ -36,8 +26,10 @@ from fprf.types import Batch, Cell, FieldSample, Rendered, Sampled, Site, Want
 
 BUILT_IN: list[tuple[Callable[[Any], None], Any]] = [
     (testing.check_encoder, RandomConfig(channels=5, stride=3)),
-    (testing.check_sampler, UniformConfig(samples=4)),
-    (testing.check_sampler, ProposalConfig(samples=(8,), final=4, resolutions=(8,))),
+    (testing.check_sampler, UniformConfig(samples=1)),
+    (testing.check_sampler, UniformConfig(samples=33)),
+    (testing.check_sampler, ProposalConfig(samples=(5,), final=1, resolutions=(4,), channels=3)),
+    (testing.check_sampler, ProposalConfig(samples=(20, 10, 6), final=4, resolutions=(4, 4, 9), padding=1.0)),
     (testing.check_content_field, PlanesConfig(resolutions=(4, 8), channels=2, hidden=8)),
     (testing.check_content_field, PlanesConfig(resolutions=(5,), channels=3, hidden=4, layers=0, degree=1)),
     (testing.check_semantic_field, SemanticPlanesConfig(resolutions=(4, 8), channels=2, hidden=8)),
@@ -361,12 +353,3 @@ def test_plain_plug_ins_keep_to_the_contract() -> None:
 def test_a_breach_is_told(check: Callable[[Any], None], config: Any, breach: str) -> None:
     with pytest.raises(AssertionError, match=breach):
         check(config)
-
-
-def test_a_parser_is_checked_on_a_real_scene(shared: Any) -> None:
-    from fprf.datamanagers.parsers.config import LlffConfig, TransformsConfig
-
-    scenes = shared / "data" / "scenes"
-    testing.check_parser(TransformsConfig(), scenes / "fox")
-    with pytest.raises(Exception, match="poses_bounds"):
-        testing.check_parser(LlffConfig(), scenes / "fox")

@@ -1,18 +1,16 @@
-"""Training, views and styles on a CUDA device: a pretended one in every run of the tests, a real one with `pytest -m gpu`.
+"""Training, views and styles on a real CUDA device (`pytest -m gpu`) against the CPU.
 
-Tolerances are those of a real device, where sums have another order and more or fewer samples may be kept. Other tests hold
-the pretended device to tighter ones.
+Tolerances are those of a device where sums have another order and more or fewer samples may be kept. The pretended device,
+held to tighter ones in every run of the tests: `training/test_training_on_a_device.py` and `cli/test_verbs_on_a_device.py`.
 """
 
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from pretend_cuda import CUDA, pretend_cuda
+from pretend_cuda import CUDA
 from tiny_world import World, prepared_for, taught
 
 from fprf.config import TrainConfig
@@ -30,51 +28,14 @@ from fprf.training.style_pass import measure_style
 from fprf.training.views import render_view
 from fprf.types import View
 
+pytestmark = pytest.mark.gpu
 LEVEL = 1 / 255
 
 
-class Device:
-    """A CUDA device, and whether it is a real one."""
-
-    def __init__(self, seen: Any | None) -> None:
-        self.at, self.seen, self.real = CUDA, seen, seen is None
-
-    def watched(self) -> AbstractContextManager[None]:
-        """Nothing within it makes the host wait."""
-        return self._refused() if self.real else self._counted()
-
-    @contextmanager
-    def _refused(self) -> Iterator[None]:
-        torch.cuda.set_sync_debug_mode("error")
-        try:
-            yield
-        finally:
-            torch.cuda.set_sync_debug_mode("default")
-
-    @contextmanager
-    def _counted(self) -> Iterator[None]:
-        assert self.seen is not None
-        before = self.seen.syncs.copy()
-        yield
-        assert not self.seen.syncs - before
-
-
-@pytest.fixture
-def card() -> torch.device:
-    """A real CUDA device."""
+@pytest.fixture(autouse=True)
+def _card() -> None:
     if not torch.cuda.is_available():
         pytest.skip("torch sees no CUDA device")
-    return CUDA
-
-
-@pytest.fixture(params=["pretended", pytest.param("cuda", marks=pytest.mark.gpu)])
-def device(request: pytest.FixtureRequest) -> Iterator[Device]:
-    if request.param == "pretended":
-        with pretend_cuda() as seen:
-            yield Device(seen)
-    else:
-        request.getfixturevalue("card")
-        yield Device(None)
 
 
 def held_out(world: World, root: Path, device: str) -> tuple[View, float]:
@@ -86,45 +47,44 @@ def held_out(world: World, root: Path, device: str) -> tuple[View, float]:
     return drawn, float(-10 * error.log10())
 
 
-def trained(
-    config: TrainConfig, folder: Path, watch: Device | None = None, monkeypatch: pytest.MonkeyPatch | None = None
-) -> Run:
-    """A run that can be loaded; with `watch` no step but the first three, which meet constants, may wait."""
-    prepared, run = prepared_for(config), Run(folder)
+def trained(config: TrainConfig, folder: Path) -> Run:
+    """A run that can be loaded."""
+    prepared, run, reports = prepared_for(config), Run(folder), list[Report]()
     folder.mkdir()
     run.save_config(replace(config, output=None), "fprf-lite")
     run.save_known(prepared.scene, config.data, prepared.facts)
-    if watch is not None and monkeypatch is not None:
-        plain = learner.FieldLearner.step
-
-        def step(loop: learner.FieldLearner, number: int, share: float) -> Any:
-            with watch.watched() if number > 2 else nullcontext():
-                return plain(loop, number, share)
-
-        monkeypatch.setattr(learner.FieldLearner, "step", step)
-        monkeypatch.setattr(driver, "REPORT_SECONDS", 1e9)
-    reports: list[Report] = []
     taught(config, prepared, run, reports.append)
     assert reports[-1].skipped == 0 and all(torch.tensor(value).isfinite() for value in reports[-1].losses.values())
     return run
 
 
-def test_training_ends_where_the_cpu_ends_and_no_step_waits(
-    world: World, tmp_path: Path, device: Device, monkeypatch: pytest.MonkeyPatch
+def test_training_ends_where_the_cpu_ends_no_step_waits_and_memory_does_not_grow(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = replace(world.config, steps=50 if device.real else 6)
-    trained(replace(config, device=str(device.at)), tmp_path / "device", device, monkeypatch)
-    monkeypatch.undo()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(world.folder / "cache"))
+    """But for the first three steps, which meet constants."""
+    config, plain, taken = replace(world.config, steps=50), learner.FieldLearner.step, list[int]()
+
+    def step(loop: learner.FieldLearner, number: int, share: float) -> Any:
+        torch.cuda.reset_peak_memory_stats()
+        torch.cuda.set_sync_debug_mode("error" if number > 2 else "default")
+        try:
+            return plain(loop, number, share)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+            taken.append(torch.cuda.max_memory_allocated())
+
+    with monkeypatch.context() as patch:
+        patch.setattr(learner.FieldLearner, "step", step)
+        patch.setattr(driver, "REPORT_SECONDS", 1e9)
+        trained(replace(config, device=str(CUDA)), tmp_path / "device")
     trained(config, tmp_path / "cpu")
-    _, there = held_out(world, tmp_path / "device", str(device.at))
-    _, here = held_out(world, tmp_path / "cpu", "cpu")
-    assert there == pytest.approx(here, abs=0.3 if device.real else 0.01)
+    (_, there), (_, here) = (held_out(world, tmp_path / name, at) for name, at in (("device", str(CUDA)), ("cpu", "cpu")))
+    assert there == pytest.approx(here, abs=0.3)
+    assert max(taken[40:]) <= 1.1 * max(taken[5:15]) < 512 << 20
 
 
-def test_views_are_those_of_the_cpu(world: World, device: Device) -> None:
-    here, _ = held_out(world, world.run, "cpu")
-    there, _ = held_out(world, world.run, str(device.at))
+def test_views_are_those_of_the_cpu(world: World) -> None:
+    (here, _), (there, _) = (held_out(world, world.run, at) for at in ("cpu", str(CUDA)))
     for name, tolerance in (("rgb", LEVEL / 2), ("opacity", 1e-3)):
         a, b = getattr(here, name), getattr(there, name)
         assert b.device.type == "cpu" and (a - b).abs().max() <= tolerance and (a - b).abs().mean() <= tolerance / 20
@@ -136,35 +96,31 @@ STYLES += [LocalAdainConfig(similarity="dot", centred=False, relative=False, tem
 
 
 @pytest.mark.parametrize("stylizer", STYLES, ids=lambda config: type(config).__name__)
-def test_styles_are_those_of_the_cpu(world: World, device: Device, stylizer: StylizerConfig) -> None:
+def test_styles_are_those_of_the_cpu(world: World, stylizer: StylizerConfig) -> None:
     drawn = []
-    for at in ("cpu", str(device.at)):
+    for at in ("cpu", str(CUDA)):
         run = load_run(world.run, at)
         look = apply_style(run, StyleFile(StyleConfig(references=world.references, stylizer=stylizer, clusters=4))).restyle
         drawn.append(render_view(run.model, run.known.facts, run.known.cameras, 2, run.config.render, look).rgb)
     assert (drawn[0] - drawn[1]).abs().max() <= 4 * LEVEL and (drawn[0] - drawn[1]).abs().mean() <= LEVEL / 10
 
 
-def test_the_scenes_own_style_is_that_of_the_cpu(world: World, device: Device) -> None:
+def test_the_scenes_own_style_is_that_of_the_cpu(world: World) -> None:
     scene = world.prepared.scene
     here, there = (
         to_tensors(measure_style(world.config, load_run(world.run, at).model, scene.cameras, scene.train))
-        for at in ("cpu", str(device.at))
+        for at in ("cpu", str(CUDA))
     )
     for name, value in here.items():
         assert there[name].device.type == "cpu", name
-        if device.real:
-            assert (there[name] - value).norm() <= 1e-3 * (1e-6 + value.norm()), name
-        else:
-            assert (there[name] - value).abs().max() <= 1e-5 * (1 + value.abs().max()), name
+        assert (there[name] - value).norm() <= 1e-3 * (1e-6 + value.norm()), name
 
 
-@pytest.mark.gpu
-def test_planes_of_the_methods_size_are_looked_up(card: torch.device) -> None:
+def test_planes_of_the_methods_size_are_looked_up() -> None:
     """A million points against float64."""
     resolutions, channels, draw = (64, 128, 256, 512), 32, torch.Generator().manual_seed(0)
-    points = torch.empty(2**20, 3).uniform_(-1.1, 1.1, generator=draw).to(card)
-    table = torch.empty(triplane.rows(resolutions), channels).uniform_(-1, 1, generator=draw).to(card)
+    points = torch.empty(2**20, 3).uniform_(-1.1, 1.1, generator=draw).to(CUDA)
+    table = torch.empty(triplane.rows(resolutions), channels).uniform_(-1, 1, generator=draw).to(CUDA)
     found = triplane.lookup(points, table.requires_grad_(True), resolutions)
     (gradient,) = torch.autograd.grad(found.sum(), table)
     wide = table.detach().double().requires_grad_(True)
@@ -175,21 +131,3 @@ def test_planes_of_the_methods_size_are_looked_up(card: torch.device) -> None:
         assert (mine - value).abs().max() <= 4 * 2.0**-24 * (512 * 12 + 3)
         total += torch.autograd.grad(value.sum(), wide)[0]
     assert (gradient - total).norm() <= 1e-4 * total.norm()
-
-
-@pytest.mark.gpu
-def test_memory_does_not_grow_with_the_steps(
-    card: torch.device, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    taken: list[int] = []
-    plain = learner.FieldLearner.step
-
-    def step(loop: learner.FieldLearner, number: int, share: float) -> Any:
-        torch.cuda.reset_peak_memory_stats()
-        result = plain(loop, number, share)
-        taken.append(torch.cuda.max_memory_allocated())
-        return result
-
-    monkeypatch.setattr(learner.FieldLearner, "step", step)
-    trained(replace(world.config, steps=50, device=str(card)), tmp_path / "run")
-    assert max(taken[40:]) <= 1.1 * max(taken[5:15]) < 512 << 20

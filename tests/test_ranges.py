@@ -18,13 +18,7 @@ from fprf.checks import at_least, between, positive
 from fprf.config import LossConfig, OptimizerConfig, RenderConfig, SemanticConfig, StatisticsConfig, TrainConfig
 from fprf.errors import CheckpointError, ConfigError, FprfError
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
-from fprf.plugins.encoders.config import (
-    ConcatConfig,
-    DinoConfig,
-    Dinov2Config,
-    RandomConfig,
-    Vgg19Config,
-)
+from fprf.plugins.encoders.config import ConcatConfig, DinoConfig, Dinov2Config, RandomConfig, Vgg19Config
 from fprf.plugins.executors.config import RayConfig
 from fprf.plugins.samplers.config import ProposalConfig, UniformConfig
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig, RegionToneConfig

@@ -31,7 +31,7 @@ from fprf.datamanagers.images import load_images
 from fprf.interfaces import Figures, Scene, SceneLearner, SceneView, State
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.rendering.cameras import grid_rays
-from fprf.splats.restyle import Colours, region_maps
+from fprf.splats.restyle import Colours
 from fprf.style.dictionary import Encoders
 from fprf.style.scene_style import scene_style
 from fprf.training import checkpoint
@@ -148,9 +148,6 @@ class PlaneScene(Scene):
 
     def encoders(self):
         return Encoders(Colours(), self.encoder, self.measured()[1], self.measured()[0], longest=64)
-
-    def colour_maps(self, stylizer, dictionary, style, config, allowed):
-        return region_maps(stylizer, dictionary, style, config)
 
 
 @dataclass(frozen=True, eq=False)

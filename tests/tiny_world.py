@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import nn
 
-from benchmarks.town.truth import Stage, set_stage, town_settings
 from benchmarks.town.write import write_town
 from fprf.config import StatisticsConfig, TrainConfig
 from fprf.datamanagers.config import RayBatchesConfig
@@ -129,12 +128,6 @@ def make_world(folder: Path) -> World:
     config = tiny(town, folder / "run")
     train_scene(config, "fprf-lite", quiet=True)
     return World(folder, town, folder / "run", references, config, prepared_for(config))
-
-
-def stage_of(trained: Trained, *, views: int, frames: int, longest: int) -> Stage:
-    """The stage of a run of the tiny town."""
-    settings = town_settings(trained.config)
-    return set_stage(trained, trained.known, settings, views=views, frames=frames, longest=longest)
 
 
 def trained_for(

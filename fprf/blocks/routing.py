@@ -1,6 +1,6 @@
 """Routing of points to their blocks. Points are handed out in groups: all points of a group have the same members.
 
-`SingleRouter` sends all points to one member. `InsetRouter` is for training a block: inside its reach the block, outside of it
+`to_single` sends all points to one member. `InsetRouter` is for training a block: inside its reach the block, outside of it
 the surroundings. `BlendRouter` is for rendering: weights of `windows`, whose smooth change from block to block leaves no seam.
 It looks points up in a table of the ground plan, so its cost does not grow with the number of blocks, and names only the blocks
 that the points need: the others are never loaded.
@@ -16,11 +16,10 @@ say. The chart of the surroundings contracts: all blocks together fill the inner
 All points are those of the scene's space, and so are the axes of cells.
 """
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -110,22 +109,16 @@ class Group(NamedTuple):
     """Weight of each member, rows sum to 1; None = there is one alone."""
 
 
-class Router(ABC):
-    """Points to groups; each point is in one of them."""
-
-    @abstractmethod
-    def __call__(self, points: Annotated[Tensor, "N 3"]) -> list[Group]:
-        """The groups of points of the space."""
+Router: TypeAlias = Callable[[Tensor], list[Group]]
+"""Points [N 3] of the space to groups; each point is in one of them."""
 
 
-class SingleRouter(Router):
+def to_single(points: Annotated[Tensor, "N 3"]) -> list[Group]:
     """One member over everything."""
-
-    def __call__(self, points: Annotated[Tensor, "N 3"]) -> list[Group]:
-        return [Group((0,), torch.arange(len(points), device=points.device), None)]
+    return [Group((0,), torch.arange(len(points), device=points.device), None)]
 
 
-class InsetRouter(Router):
+class InsetRouter:
     """Member 0 inside of a chart's box, member 1 outside.
 
     On an accelerator both members are evaluated at all points, one of them with weight 0: the host would have to wait for the
@@ -144,7 +137,7 @@ class InsetRouter(Router):
         return [part for part in parts if len(part.at)]
 
 
-class BlendRouter(Router):
+class BlendRouter:
     """Member z is block z, the last one the surroundings."""
 
     def __init__(self, cells: Sequence[Cell]) -> None:

@@ -11,7 +11,7 @@ times as far as the farthest point that is seen in it or its neighbours, and wit
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
@@ -95,19 +95,19 @@ def site_of(scene: Scene, space: Space) -> Site:
     )
 
 
-class Tiles(NamedTuple):
-    """The rays through the middles of the tiles of M views, in the space; float32 is enough here."""
+def tile_rays(
+    scene: Scene, space: Space, views: Annotated[Tensor, "M"], sightings: Sightings | None
+) -> tuple[
+    Annotated[Tensor, "M 1 1 3"],
+    Annotated[Tensor, "M TILES TILES 3"],
+    Annotated[Tensor, "M TILES TILES"],
+    Annotated[Tensor, "M TILES TILES"],
+]:
+    """Origins and directions of the rays through the middles of the tiles [row, column] of some views, in the space.
 
-    origin: Annotated[Tensor, "M 3"]
-    direction: Annotated[Tensor, "M TILES TILES 3"]
-    reach: Annotated[Tensor, "M TILES TILES"]
-    """Upper bounds of the lengths of rays, space units; inf where nothing is known."""
-    pixels: Annotated[Tensor, "M TILES TILES"]
-    """int64 pixels of each tile; 0 outside of the image."""
-
-
-def tile_rays(scene: Scene, space: Space, views: Annotated[Tensor, "M"], sightings: Sightings | None) -> Tiles:
-    """Tiles [row, column] of some views."""
+    Then upper bounds of their lengths, space units (inf where nothing is known), and the pixels of each tile (int64; 0 outside
+    of the image). Float32 is enough here.
+    """
     cameras = scene.cameras
     size = cameras.size[views].double()
     side = size.amax(1) / TILES
@@ -134,20 +134,8 @@ def tile_rays(scene: Scene, space: Space, views: Annotated[Tensor, "M"], sightin
         far.view(-1).scatter_reduce_(0, at, (sightings.distance[mine] * space.scale).float(), "amax")
         around = F.max_pool2d(far[:, None], 3, stride=1, padding=1)[:, 0]
         reach = torch.where(around > 0, BEYOND * around, reach)
-    return Tiles(
-        rays.origin.view(-1, TILES, TILES, 3)[:, 0, 0],
-        rays.direction.view(-1, TILES, TILES, 3),
-        reach,
-        rows[:, :, None] * columns[:, None, :],
-    )
-
-
-def meets(tiles: Tiles, cell: Cell) -> Annotated[Tensor, "M TILES TILES"]:
-    """True where the rays of a tile meet a block, border included, before they end: the slab test."""
-    chart, origin = chart_of(cell), tiles.origin[:, None, None]
-    enter, leave = slab(origin, tiles.direction, chart.low.to(origin), chart.high.to(origin))
-    enter = enter.clamp_min(0)
-    return (enter <= leave) & (enter <= tiles.reach) & (tiles.pixels > 0)
+    direction = rays.direction.view(-1, TILES, TILES, 3)
+    return rays.origin.view(direction.shape)[:, :1, :1], direction, reach, rows[:, :, None] * columns[:, None, :]
 
 
 def pixel_mask(seen: Annotated[Tensor, "TILES TILES"], size: tuple[int, int]) -> Annotated[Tensor, "H W"]:
@@ -190,8 +178,15 @@ def make_plan(scene: Scene, layout: LayoutConfig) -> Plan:
     cells = layout.build().cut(site_of(scene, space))
     parts: list[tuple[Tensor, Tensor]] = []
     for views in torch.split(scene.train, VIEWS):
-        tiles = tile_rays(scene, space, views, sightings)
-        parts.append((torch.stack([meets(tiles, cell) for cell in cells], 1), tiles.pixels))
+        origin, direction, reach, pixels = tile_rays(scene, space, views, sightings)
+        # Slab test: a block sees a tile whose rays meet it, border included, before they end.
+        met = []
+        for cell in cells:
+            chart = chart_of(cell)
+            enter, leave = slab(origin, direction, chart.low.to(origin), chart.high.to(origin))
+            enter = enter.clamp_min(0)
+            met.append((enter <= leave) & (enter <= reach) & (pixels > 0))
+        parts.append((torch.stack(met, 1), pixels))
     seen, pixels = (torch.cat(column) for column in zip(*parts, strict=True))
     # A block that no pixel sees would learn nothing: it is part of the surroundings.
     used = [block for block in range(len(cells)) if int((seen[:, block] * pixels).sum())]

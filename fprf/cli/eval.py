@@ -67,7 +67,7 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
     from ..datamanagers.scene import at_origin
     from ..evaluation.metrics import judge
     from ..io.atomic import write_json
-    from ..io.video import write_frames
+    from ..io.images import write_image
     from ..training.camera_optimizers import moved_cameras
     from ..training.loading import open_run
     from ..training.prepare import read_scene
@@ -112,7 +112,8 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
     }
     write_json(config.run / "metrics.json", metrics)
     if config.images:
-        write_frames(config.run / "renders" / config.split, [known.names[view] for view in views], images)
+        for view, image in zip(views, images, strict=True):
+            write_image(config.run / "renders" / config.split / f"{known.names[view]}.png", image)
     return metrics
 
 

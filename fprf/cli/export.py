@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from ..errors import UsageError
 from ..export.config import FIT_MINUTES, KINDS, ExportConfig, Plan, plan
 from ..progress import Display
-from ..splats.config import endings, format_name
+from ..splats.config import endings
 from .style_flags import named_styles, read_flags, tidy
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ class _Export:
 
     def gaussians(self) -> dict[str, Any]:
         """Gaussians as they are, or fitted to the scene's own renders; the same in each look, but for their colours."""
-        from ..splats.files import Written, write_gaussians, write_ply_parts
+        from ..splats.files import write_gaussians
 
         config, scene, paths, losses, count = self.config, self.opened.scene, [], dict[str, None](), 0
         own = scene.gaussian_rows() is not None
@@ -130,26 +130,14 @@ class _Export:
             assert gaussians is not None
             count = gaussians.count
             for path in self.what.paths("splats", look.name, *(f".{each}" for each in self.what.formats)):
-                if own and not config.plain and format_name(path) == "ply":  # in parts: of large scenes little is in memory
-                    written = Written()
-                    write_ply_parts(
-                        path,
-                        gaussians.part,
-                        count,
-                        antialiased=gaussians.antialiased,
-                        origin=scene.origin,
-                        local=config.local,
-                    )
-                else:
-                    written = write_gaussians(
-                        path,
-                        gaussians.part(slice(0, count)),
-                        antialiased=gaussians.antialiased,
-                        views=scene.cameras if own else self.views,
-                        plain=config.plain,
-                        origin=scene.origin,
-                        local=config.local,
-                    )
+                written = write_gaussians(
+                    path,
+                    gaussians,
+                    views=scene.cameras if own else self.views,
+                    plain=config.plain,
+                    origin=scene.origin,
+                    local=config.local,
+                )
                 paths.append(path)
                 losses |= dict.fromkeys(f"{path.name}: {loss}" for loss in written.losses())
         return {"gaussians": count, "losses": [*losses]}

@@ -87,8 +87,7 @@ def run(args: list[str]) -> int:
     config, file = read_flags(RenderVerbConfig(), args, prog="fprf render", description=description, positional=("run",))
     from ..datamanagers.images import load_image
     from ..io.images import write_image
-    from ..io.maps import depth_limits
-    from ..io.sheet import side_by_side
+    from ..io.maps import depth_limits, side_by_side
     from ..io.video import FILMS, MAX_FPS, missing_frames, write_video
     from ..rendering.paths import make_path
     from ..training.loading import open_run

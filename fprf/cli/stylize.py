@@ -51,8 +51,6 @@ class StylizeConfig(StyleConfig, QualityConfig):
     """Render nothing; map what each pixel takes: VIEW-match.png, VIEW-score.png, VIEW-confidence.png, VIEW-entropy.png."""
     matches: bool = True
     """Also write which reference each pixel takes, as VIEW-match.png."""
-    pixels: bool = False
-    """Also write each match map as numbers, as VIEW-match.npz."""
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
 
@@ -98,7 +96,7 @@ def run(args: list[str]) -> int:
 def _make(scene: "Scene", output: Path, styled: "Styled", views: list[int], config: StylizeConfig) -> dict[str, Any]:
     """Pictures and match maps of the views; what was matched and how long it took."""
     from ..io.images import to_uint8, write_image
-    from ..style.match_maps import match_map, match_pictures, summarize, write_pixels
+    from ..style.match_maps import match_map, match_pictures, summarize
 
     shown = not config.match_only
     maps = ("match", "score", "confidence", "entropy") if config.match_only else ("match",) if config.matches else ()
@@ -113,7 +111,7 @@ def _make(scene: "Scene", output: Path, styled: "Styled", views: list[int], conf
                 rendering += time.perf_counter() - start
                 write_image(output / f"{name}.png", to_uint8(picture.rgb))
             # Matches are those of the points that the view sees, found apart from its colours.
-            if maps or config.pixels:
+            if maps:
                 start = time.perf_counter()
                 matched = match_map(scene, styled, view)
                 matching += time.perf_counter() - start
@@ -121,8 +119,6 @@ def _make(scene: "Scene", output: Path, styled: "Styled", views: list[int], conf
                 pictures = match_pictures(matched, styled.codes)
                 for which in maps:
                     write_image(output / f"{name}-{which}.png", pictures[which])
-                if config.pixels:
-                    write_pixels(output / f"{name}-match.npz", matched, styled.codes)
         display.count(len(views), len(views), "restyling" if shown else "matching")
     count = max(1, len(views))
     made: dict[str, Any] = {"seconds_per_view": rendering / count} if shown else {}
@@ -136,7 +132,7 @@ def print_explained(output: Path, regions: "Regions", styled: "Styled | None") -
     """Show a scene's regions with what they take: a table on standard output, explain.json and explain.png in `output`."""
     from ..io.atomic import write_json
     from ..io.images import write_image
-    from ..io.sheet import contact_sheet
+    from ..io.maps import contact_sheet
     from ..style.match_maps import explain, region_row, region_tile
 
     explained = explain(regions, styled)

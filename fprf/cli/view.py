@@ -140,9 +140,9 @@ def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[st
 
         viewed = view_of_run(open_run(path, config.device, config))
         return replace(viewed, name=name or viewed.name, style=StyleConfig(stylizer=config.stylizer or RegionToneConfig()))
+    from ..splats.captures import open_capture
     from ..splats.config import LookConfig
     from ..splats.files import read_capture
-    from ..splats.loading import open_capture
 
     def progress(done: int, total: int) -> None:
         if done == 0:

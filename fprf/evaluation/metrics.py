@@ -1,4 +1,4 @@
-"""Renders against photographs: PSNR, SSIM and LPIPS of images [H W 3] in [0, 1], and the report of `fprf eval` on a run.
+"""Renders against photographs and each other: PSNR, SSIM, LPIPS and consistency of images [H W 3] in [0, 1]; `fprf eval`.
 
 PSNR = -10 log10(mean squared error), in decibels. SSIM after Wang et al. 2004: Gaussian window of 11 pixels (σ 1.5),
 K = (0.01, 0.03), dynamic range 1, mean over channels and over the windows that lie wholly inside. LPIPS 0.1 with AlexNet
@@ -7,6 +7,14 @@ K = (0.01, 0.03), dynamic range 1, mean over channels and over the windows that 
     LPIPS(a, b) = Σ_layers mean over pixels of Σ_channels w_c (f_c(a) / |f(a)| - f_c(b) / |f(b)|)²
 
 f: activations of the five convolutions, w ≥ 0: the learned heads. 0 for equal images, about 0.7 for unrelated ones.
+
+Consistency of views: a pixel p of view a is lifted to the world by a's depth and looked up in view b, at p'. It counts where b
+sees the same place: inside b's frame, in front of it, and at the depth that b itself has there (occlusion).
+
+    RMSE = sqrt( Σ_pairs Σ_valid |I_a(p) - I_b(p')|² / (3 Σ_pairs #valid) )
+
+Relative to the contrast of what was compared (a dull image scores well for nothing) it is 0 for perfect agreement, sqrt(2) for
+unrelated colours.
 """
 
 import math
@@ -28,9 +36,9 @@ from ..interfaces import Scene
 from ..io.images import to_uint8
 from ..memory import peak
 from ..plugins.weights import read_weights
+from ..rendering.cameras import Cameras, grid_rays, look_up, project
 from ..training.run import Known
 from ..types import View
-from .consistency import WarpError
 
 PSNR_CAP = 99.0
 """PSNR of identical images, in dB: means over views stay finite. Reached at a mean squared error of 1.3e-10."""
@@ -46,6 +54,8 @@ _EPS = 1e-10
 """Added to lengths, as the authors do: a feature may be 0."""
 _SMALLEST = 31
 """Pixels of a side that the second pooling leaves one of."""
+_SAME_PLACE = 0.02
+"""Share of the distance below which two surfaces count as one. Bilinear depth on a slope is off by far less."""
 
 
 def _pair(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
@@ -180,10 +190,90 @@ def mean_metrics(views: Iterable[Mapping[str, float]]) -> dict[str, float]:
 
     Raises DataError where there is no view; KeyError where the views carry different metrics.
     """
-    rows: Sequence[Mapping[str, float]] = list(views)
+    rows = list(views)
     if not rows:
         raise DataError("no views to average metrics over; the split is empty")
     return {name: math.fsum(row[name] for row in rows) / len(rows) for name in rows[0]}
+
+
+def warp(
+    image_b: Annotated[Tensor, "G F 3"],
+    depth_a: Annotated[Tensor, "H W"],
+    depth_b: Annotated[Tensor, "G F"],
+    cameras: Cameras,
+    a: int,
+    b: int,
+) -> tuple[Annotated[Tensor, "H W 3"], Annotated[Tensor, "H W"]]:
+    """View b as view a would see it, and a mask of where that can be said; 0 elsewhere.
+
+    `image_b` is looked up at the pixels of view a; bilinear, so exact where b's image is linear between pixel centres. Depths
+    are world distances along the unit ray; 0 or not finite = nothing there. Raises DataError for sizes that are not the
+    cameras'.
+    """
+    for view, what, shape in ((b, "image", image_b.shape[:2]), (a, "depth", depth_a.shape), (b, "depth", depth_b.shape)):
+        width, height = cameras.size[view].tolist()
+        if tuple(shape) != (height, width):
+            found = "x".join(str(side) for side in reversed(shape))
+            raise DataError(f"view {view}: the {what} is {found}, its camera {width}x{height}; render at the camera's size")
+    # Lift view a's pixels to the world by its depth, and look at them from view b.
+    origin, direction = grid_rays(cameras, a)
+    depth = depth_a.reshape(-1).to(origin)
+    solid = torch.isfinite(depth) & (depth > 0)
+    points = origin + direction * torch.where(solid, depth, torch.ones_like(depth))[:, None]
+    there, ahead = project(cameras, torch.full((len(points),), b, device=points.device), points)
+    size = cameras.size[b].to(there)
+    # Half a pixel from the border there is no neighbour to interpolate with. The slack is rounding.
+    inside = ((there >= 0.5 - 1e-6) & (there <= size - 0.5 + 1e-6)).all(dim=-1) & (ahead > 0)
+    pixel = torch.where(inside[:, None], there, size / 2)
+    # Where b's own depth differs from the point's distance, something else is in front or the point is not there.
+    distance = (points - cameras.pose[b, :, 3]).norm(dim=-1)
+    met = look_up(torch.where(torch.isfinite(depth_b), depth_b, 0.0)[..., None], pixel)[:, 0]
+    same = (met - distance).abs() <= _SAME_PLACE * distance
+    valid = (solid & inside & same).reshape(depth_a.shape)
+    colour = look_up(image_b, pixel).reshape(*depth_a.shape, 3).to(image_b)
+    return torch.where(valid[..., None], colour, torch.zeros_like(colour)), valid
+
+
+class WarpError:
+    """Consistency over pairs of views of `cameras`, added one by one, so that no more than two renders are held at a time."""
+
+    def __init__(self, cameras: Cameras) -> None:
+        self.cameras = cameras
+        self.squared = self.variation = 0.0
+        self.compared = self.pixels = self.pairs = 0
+
+    def add(
+        self,
+        a: int,
+        b: int,
+        image_a: Annotated[Tensor, "H W 3"],
+        image_b: Annotated[Tensor, "G F 3"],
+        depth_a: Annotated[Tensor, "H W"],
+        depth_b: Annotated[Tensor, "G F"],
+    ) -> None:
+        """Warp view b into view a and compare. Raises DataError for sizes that are not the cameras'."""
+        warped, valid = warp(image_b, depth_a, depth_b, self.cameras, a, b)
+        count = int(valid.sum())
+        self.pixels, self.compared, self.pairs = self.pixels + valid.numel(), self.compared + count, self.pairs + 1
+        if count:
+            here, there = image_a[valid].double(), warped[valid].double()
+            self.squared += float((here - there).square().sum())
+            self.variation += sum(float((colour - colour.mean(dim=0)).square().sum()) for colour in (here, there)) / 2
+
+    def summary(self) -> dict[str, float | int | None]:
+        """Warp error: `rmse` (of [0, 1]), `relative` (to the contrast), `valid_share`, `pairs`.
+
+        The errors are None where no pixel could be compared, `relative` also where all compared colours are alike. Raises
+        NumericsError for colours that are not finite.
+        """
+        if not math.isfinite(self.squared):
+            raise NumericsError("consistency: a render holds colours that are not finite; nothing can be judged by it")
+        return {
+            "rmse": math.sqrt(self.squared / (3 * self.compared)) if self.compared else None,
+            "relative": math.sqrt(self.squared / self.variation) if self.variation > 0 else None,
+            "valid_share": self.compared / self.pixels if self.pixels else 0.0,
+            "pairs": self.pairs,
+        }
 
 
 def judge(

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import DataError, UsageError
 from .atomic import atomic_path, unwritable, write_bytes, write_json
-from .images import Picture, checked, write_image
+from .images import Picture, checked
 from .strict_json import parse_json
 
 if TYPE_CHECKING:
@@ -116,23 +116,6 @@ def _animated(path: Path, frames: list[Picture], fps: float) -> Codec:
         raise DataError(f"{path}: OpenCV cannot write it here; write an .mp4, or a folder")
     write_bytes(path, data.tobytes())
     return kind
-
-
-def write_frames(folder: Path, names: Iterable[str], frames: Iterable[Picture]) -> list[Path]:
-    """Write each frame to FOLDER/NAME.png, whole or not at all each; names are stems such as "0001".
-
-    Raises DataError for a name that leaves the folder or comes twice; ValueError where names and frames differ in number.
-    """
-    written: list[Path] = []
-    for name, frame in zip(names, frames, strict=True):
-        path = folder / f"{name}.png"
-        if path.parent != folder or name in (".", "..", ""):
-            raise DataError(f"{folder}: '{name}' is no plain file name; frames carry names without a folder")
-        if path in written:
-            raise DataError(f"{folder}: two frames are named '{name}'; give every view its own name")
-        write_image(path, frame)
-        written.append(path)
-    return written
 
 
 _RECORD = ".render.json"

@@ -1,34 +1,46 @@
 """Finished captures, one or many and of any size: seen as one scene, recoloured file by file.
 
+What is found out about a capture (views, semantics) is kept in a cache, by the content of its file.
+
 What a style needs to know is found from a sample of the Gaussians of all files together, so that all take the same maps of
 colours. A Gaussian that is not in the sample takes the features of those of the sample in the smallest cell around it that
 holds any. Then each file is read and written once; of the others nothing is in memory.
 """
 
+import functools
 import hashlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated
 
 import torch
 from torch import Tensor
 
-from ..errors import DataError, UsageError
-from ..interfaces import Scene
+from ..errors import CheckpointError, DataError, UsageError
+from ..interfaces import Encoder, Scene
 from ..io.images import to_uint8, write_image
+from ..io.tensorfiles import load_sealed, save
+from ..ops.rasterise.reference import MIN_ALPHA
+from ..rendering.cameras import Cameras
 from ..style.look import ColourMaps, Restyle
 from ..style.restyle import Styled
 from ..training.loading import open_run
+from ..training.prepare import cache_folder
 from .config import LookConfig
 from .files import Capture, read_capture, release
 from .files.base import pieces
-from .gaussians import Gaussians, bulk_of
-from .loading import open_capture
+from .gaussians import Gaussians, bulk_of, cells_of
 from .restyle import restyled_harmonics
-from .scene import SplatScene, look_at_capture
+from .scene import SplatScene
+from .semantics import Semantics, find_semantics, load_semantics, semantics_tensors, tensor_group
+from .views import clip_distance, find_views
 
+_UP = (0.0, -1.0, 0.0)
+"""What points up where nothing says so."""
+_CACHED = 24
+"""Captures of which the cache keeps what was found out."""
 SAMPLE = 2_000_000
 """Gaussians that are looked at, at most: what is in memory of captures of any size, beside the file at hand."""
 _FINEST, _LEVELS = 1024, 12
@@ -41,6 +53,92 @@ _GAP = 0.1
 """Distance between captures that would overlap, as a share of their width, where they are put in a row."""
 _SHARED, _ENOUGH, _ALIKE = 24, 64, 0.4
 """Cells that captures share, at least and enough, and correlation of their brightness there: then they are of one place."""
+
+
+def look_at_capture(
+    gaussians: Gaussians,
+    antialiased: bool,
+    encoder: Encoder,
+    config: LookConfig,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    camera: Cameras | None = None,
+) -> SplatScene:
+    """Find views of Gaussians that are all finite, sizes included. What they show is found when it is first asked for.
+
+    `camera` is the view that the capture was made from, where it is known. Raises DataError where nothing can be seen.
+    """
+    # Mistakes are told before views are sought, which takes seconds.
+    up = torch.tensor(config.up or _UP)
+    if not bool(up.isfinite().all() & (up.norm() > 0)):
+        raise DataError(f"up {config.up}: no direction; give three numbers, not all 0")
+    if float(gaussians.opacities.max()) < MIN_ALPHA:
+        raise DataError(f"all {len(gaussians)} Gaussians are transparent; nothing of the capture can be seen or restyled")
+    cameras = find_views(
+        gaussians,
+        count=config.views,
+        size=config.size,
+        up=up,
+        inside=config.inside,
+        antialiased=antialiased,
+        camera=camera,
+    )
+
+    def found() -> Semantics:
+        near = clip_distance(gaussians)
+        return find_semantics(gaussians, antialiased, encoder, cameras, config.regions, near=near, progress=progress)
+
+    return _scene_of(gaussians, antialiased, cameras, functools.cache(found), encoder)
+
+
+def _scene_of(
+    gaussians: Gaussians, antialiased: bool, cameras: Cameras, found: Callable[[], Semantics], encoder: Encoder
+) -> SplatScene:
+    """The scene of a capture; its views are numbered."""
+    names = tuple(f"{view:02d}" for view in range(len(cameras)))
+    longest, near = int(cameras.size.amax()), clip_distance(gaussians)
+    return SplatScene(gaussians, antialiased, cameras, names, found, lambda: encoder, longest, near)
+
+
+def open_capture(
+    capture: Capture,
+    look: LookConfig,
+    *,
+    cache: Path | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    say: Callable[[str], None] = lambda text: None,
+) -> SplatScene:
+    """A capture as a scene: its Gaussians that can be drawn, with views and features from the cache.
+
+    What points up is as `look` says, else as the file does. Where views and features are absent, views are found here, and
+    features, which are then stored, when they are first asked for. `cache` is the folder; by default the user's own.
+    """
+    look = replace(look, up=look.up or capture.up)
+    folder, encoder = cache or cache_folder() / "captures", look.semantic.encoder.build()
+    # What is found follows from the file, the encoder and how it is looked at. The first number counts the versions of it.
+    digest = hashlib.sha256(capture.data)
+    digest.update(f"10 {encoder.identity} {look.up} {look.inside} {look.views} {look.size} {look.regions}".encode())
+    path = folder / f"{digest.hexdigest()[:32]}.safetensors"
+    gaussians, antialiased = capture.gaussians.drawable(), capture.antialiased
+    if path.is_file():
+        try:
+            tensors = load_sealed(path)
+            cameras, semantics = Cameras(**tensor_group(tensors, "camera")), load_semantics(tensors, len(gaussians))
+        except (CheckpointError, TypeError) as error:
+            say(f"looking again: {error}")
+        else:
+            path.touch()
+            return replace(_scene_of(gaussians, antialiased, cameras, lambda: semantics, encoder), origin=capture.origin)
+    scene = look_at_capture(gaussians, antialiased, encoder, look, progress, capture.camera)
+
+    def found() -> Semantics:
+        semantics = scene.found()
+        views = {f"camera.{field.name}": getattr(scene.views, field.name) for field in fields(Cameras)}
+        save(path, {**views, **semantics_tensors(semantics)}, sealed=True)
+        for old in sorted(folder.glob("*.safetensors"), key=lambda each: each.stat().st_mtime)[:-_CACHED]:
+            old.unlink(missing_ok=True)
+        return semantics
+
+    return replace(scene, found=functools.cache(found), origin=capture.origin)
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,9 +379,3 @@ class Neighbours:
             out[left[found]] = means[at[found]]
             left = left[~found]
         return out
-
-
-def cells_of(places: Annotated[Tensor, "N 3"], low: Annotated[Tensor, "3"], edge: float) -> Annotated[Tensor, "N"]:
-    """Numbers of cells that begin at `low`; places far outside share those at the border."""
-    cell: Tensor = ((places - low) / edge).clamp(-1, 2.0**20).long() + 1
-    return (cell[:, 0] << 42) + (cell[:, 1] << 21) + cell[:, 2]

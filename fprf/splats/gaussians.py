@@ -171,6 +171,12 @@ def bulk_of(points: Annotated[NDArray[Any], "N 3"]) -> Bulk:
     return Bulk(side, apart / (side or 1.0))
 
 
+def cells_of(places: Annotated[Tensor, "N 3"], low: Annotated[Tensor, "3"], edge: float) -> Annotated[Tensor, "N"]:
+    """Numbers of cells that begin at `low`; places far outside share those at the border."""
+    cell: Tensor = ((places - low) / edge).clamp(-1, 2.0**20).long() + 1
+    return (cell[:, 0] << 42) + (cell[:, 1] << 21) + cell[:, 2]
+
+
 def morton_order(cells: Annotated[NDArray[np.int64], "N 3"]) -> NDArray[np.int64]:
     """Indices along a Morton curve (Z-order) of cells, 0 to 1023 a side: neighbours in space follow each other."""
     # Bits of the three coordinates interleaved: each coordinate's are spread to every third place by doubling the gaps.

@@ -1,9 +1,8 @@
-"""Runs of 3D Gaussians, opened from their folder alone (semantics, levels of detail, exposures, poses), and captures."""
+"""Runs of 3D Gaussians, opened from their folder alone: semantics, levels of detail, exposures, poses."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated
 
 import torch
@@ -12,29 +11,27 @@ from torch import Tensor
 from ..config import RunConfig
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError, UsageError
-from ..io.tensorfiles import load_sealed, save
 from ..rendering.cameras import Cameras
 from ..training import checkpoint
 from ..training.camera_optimizers import Poses, Tones, moved_cameras
 from ..training.driver import Schedule, learn
 from ..training.loading import LoadedRun
 from ..training.model import Facts, tones_of
-from ..training.prepare import cache_folder, reach_of
+from ..training.prepare import reach_of
 from ..training.quality import PRESETS, QualityConfig, tone_of
 from ..training.run import Run, in_training
-from .config import GaussiansConfig, LookConfig
-from .files import Capture
-from .gaussians import from_tensors
+from .config import GaussiansConfig
+from .gaussians import Gaussians, from_tensors
 from .learner import MOVES, GaussianLearner
 from .levels import Levels, make_levels_of_detail, open_levels, write_levels
 from .photographs import load_photographs, make_levels
-from .scene import SplatScene, cache_name, load_scene, look_at_capture, run_scene, scene_tensors
-from .semantics import Semantics, load_semantics, semantics_tensors
+from .scene import SplatScene
+from .semantics import Semantics, find_semantics, load_semantics, semantics_tensors
 
 _FIT_RATE, _FIT_STEPS = 2e-3, 120
 """Rate of poses (`GaussiansConfig.poses`) and steps of each view, where poses of views are fitted to a finished scene."""
-_CACHED = 24
-"""Captures of which the cache keeps what was found out."""
+_VIEWS = 32
+"""Training views that semantics are found in, at most."""
 _LEVELS, _MANY = "levels", 400_000
 """Folder of a run; Gaussians from which on levels of detail are kept there and mapped, not made in memory."""
 
@@ -63,11 +60,32 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
         tones.load_state_dict(kept, strict=False)
         tones.requires_grad_(False)
     near, training = float(saved.model.get("near", torch.tensor(0.01))), in_training(root)
-    whole = run_scene(config, known, gaussians, near, quick=training)
+    # What a training has learnt so far is looked at quickly, in few, small views, and not kept.
+    count, side = (_VIEWS // 4, config.semantic_size // 2) if training else (_VIEWS, config.semantic_size)
+    encoder = functools.cache(config.semantic.encoder.build)
+
+    def found() -> Semantics:
+        """Semantics from the run folder; found anew, and kept, where those are of another step, encoder or setting."""
+        wanted = {"step": saved.step, "regions": config.regions, "semantic_size": config.semantic_size}
+        if not training and (root / "style.safetensors").is_file():
+            tensors = run.load_tensors("style")
+            if {name: int(tensors.pop(name, torch.tensor(-1))) for name in wanted} == wanted:
+                kept = load_semantics(tensors, len(gaussians))
+                if kept.encoder == encoder().identity:
+                    return kept
+        every = torch.tensor(known.train)
+        views = known.cameras.select(every[torch.linspace(0, len(every) - 1, min(count, len(every))).round().long()])
+        views = views.scaled(max(1.0, float(views.size.amax()) / side))
+        semantics = find_semantics(gaussians, True, encoder(), views, config.regions, near=near)
+        if not training:
+            marks = {name: torch.tensor(of) for name, of in wanted.items()}
+            run.save_tensors("style", {**semantics_tensors(semantics), **marks})
+        return semantics
+
     resolution = preset.resolution if preset is not None else 1.0
 
     def fit(scene: Scene, views: Sequence[int]) -> Annotated[Tensor, "V 6"]:
-        return fit_poses(config, replace(scene, cameras=known.cameras), known.facts, whole, tones, views)
+        return fit_poses(config, replace(scene, cameras=known.cameras), known.facts, gaussians, near, tones, views)
 
     def levels() -> Levels:
         """Levels of detail; those of many Gaussians lie in a file, written where there is none of this checkpoint."""
@@ -79,10 +97,17 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
         assert mapped is not None  # it was just written
         return mapped
 
-    shown = replace(
-        whole,
-        # What a training has learnt so far is looked at quickly, and not kept.
-        found=whole.found if training else functools.cache(lambda: _semantics(run, saved.step, whole, config)),
+    shown = SplatScene(
+        gaussians,
+        True,
+        known.cameras,
+        known.names,
+        functools.cache(found),
+        encoder,
+        min(side, int(known.cameras.size.amax())),
+        near,
+        config.background,
+        origin=known.facts.origin,
         resolution=resolution if quality.resolution is None else quality.resolution,
         tone=(1.0, 1.0, 1.0) if quality.tone is None else tone_of(tones, known, quality.tone),
         tones=tones,
@@ -100,7 +125,13 @@ def refined(cameras: Cameras, saved: checkpoint.Saved) -> Cameras:
 
 
 def fit_poses(
-    config: GaussiansConfig, scene: Scene, facts: Facts, shown: SplatScene, tones: Tones | None, views: Sequence[int]
+    config: GaussiansConfig,
+    scene: Scene,
+    facts: Facts,
+    gaussians: Gaussians,
+    near: float,
+    tones: Tones | None,
+    views: Sequence[int],
 ) -> Annotated[Tensor, "V 6"]:
     """Turns (radians) and shifts (world units), float64, that bring renders of some views nearest to their photographs.
 
@@ -111,61 +142,10 @@ def fit_poses(
     images, masks, _ = load_photographs(config, scene, list(views))
     others = tuple(sorted(set(range(len(scene.paths))) - set(views)))
     poses = Poses(scene.cameras.pose[:, :, 3], others, reach=reach_of(scene, facts.space), pace=1.0, still=True)
-    levels = make_levels(scene, images, masks, shown.near)
+    levels = make_levels(scene, images, masks, near)
     # A learner of poses alone: the Gaussians are drawn as they are, in the light of each view.
-    config = replace(config, poses=_FIT_RATE, degree=shown.gaussians.degree)
-    learner = GaussianLearner(config, levels, 1.0, len(shown.gaussians), tones=tones, poses=poses, only="poses")
-    learner.start_from(shown.gaussians)
+    config = replace(config, poses=_FIT_RATE, degree=gaussians.degree)
+    learner = GaussianLearner(config, levels, 1.0, len(gaussians), tones=tones, poses=poses, only="poses")
+    learner.start_from(gaussians)
     learn(learner, None, Schedule(_FIT_STEPS * len(views)), lambda report: None)
     return poses.moved_by()
-
-
-def _semantics(run: Run, step: int, scene: SplatScene, config: GaussiansConfig) -> Semantics:
-    """Semantics from the run folder; found anew and kept where those are of another step, encoder or setting."""
-    wanted = {"step": step, "regions": config.regions, "semantic_size": config.semantic_size}
-    if (run.root / "style.safetensors").is_file():
-        tensors = run.load_tensors("style")
-        if {name: int(tensors.pop(name, torch.tensor(-1))) for name in wanted} == wanted:
-            kept = load_semantics(tensors, len(scene.gaussians))
-            if kept.encoder == scene.encoder().identity:
-                return kept
-    semantics = scene.found()
-    run.save_tensors("style", {**semantics_tensors(semantics), **{name: torch.tensor(of) for name, of in wanted.items()}})
-    return semantics
-
-
-def open_capture(
-    capture: Capture,
-    look: LookConfig,
-    *,
-    cache: Path | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-    say: Callable[[str], None] = lambda text: None,
-) -> SplatScene:
-    """A capture as a scene: its Gaussians that can be drawn, with views and features from the cache.
-
-    What points up is as `look` says, else as the file does. Where views and features are absent, views are found here, and
-    features, which are then stored, when they are first asked for. `cache` is the folder; by default the user's own.
-    """
-    look = replace(look, up=look.up or capture.up)
-    folder, encoder = cache or cache_folder() / "captures", look.semantic.encoder.build()
-    path = folder / cache_name(capture.data, encoder.identity, look)
-    gaussians = capture.gaussians.drawable()
-    if path.is_file():
-        try:
-            scene = load_scene(load_sealed(path), gaussians, capture.antialiased, encoder)
-        except CheckpointError as error:
-            say(f"looking again: {error}")
-        else:
-            path.touch()
-            return replace(scene, origin=capture.origin)
-    scene = look_at_capture(gaussians, capture.antialiased, encoder, look, progress, capture.camera)
-
-    def found() -> Semantics:
-        semantics = scene.found()
-        save(path, scene_tensors(scene), sealed=True)
-        for old in sorted(folder.glob("*.safetensors"), key=lambda each: each.stat().st_mtime)[:-_CACHED]:
-            old.unlink(missing_ok=True)
-        return semantics
-
-    return replace(scene, found=functools.cache(found), origin=capture.origin)

@@ -13,14 +13,10 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from ..interfaces import Encoder, Stylizer
+from ..interfaces import Encoder
 from ..ops.harmonics import Directions, recoloured, spherical_harmonics
-from ..ops.precision import double
-from ..plugins.stylizers.config import StylizerConfig
-from ..style.dictionary import StyleDictionary
 from ..style.light import luma
-from ..style.look import ColourMaps, Restyle, carried_colours, place_weight
-from ..style.scene_style import SceneStyle, own_style
+from ..style.look import Restyle, place_weight
 
 _DIRECTIONS = 48
 """In which harmonics are evaluated to find where renderers cut their colours."""
@@ -58,7 +54,19 @@ def restyled_harmonics(
     directions = all_around(before.shape[1])
     for start in range(0, len(before), _ROWS):
         rows = slice(start, start + _ROWS)
-        change, weight = _change(look, means[rows], semantic[rows].to(means))
+        # The change against the identity, A and below it b of each Gaussian (c' = c + c A + b), and how strongly the look acts.
+        features = semantic[rows].to(means)
+        change, weight = features.new_zeros(len(features), 4, 3), features.new_zeros(len(features))
+        for part in look.parts:
+            if part.share == 0 or part.strength == 0:
+                continue
+            regions = features.new_ones(len(features), 1) if part.regions is None else part.regions(features)
+            acts, added = part.share * part.strength * regions, _added(part, features)
+            for place, other in part.places:  # a later place lies over those before it
+                inside = place_weight(place, means[rows])[:, None]
+                if bool(inside.any()):
+                    added = torch.lerp(added, _added(other, features), inside[..., None])
+            change, weight = change + acts[..., None] * added, weight + acts[:, 0]
         if kept > 0:  # what the map adds to luma is taken back from all channels alike
             change = change - kept * luma(change)
         out[rows] = recoloured(before[rows], change, weight, directions)
@@ -74,25 +82,6 @@ def all_around(bands: int) -> Directions:
     around = torch.stack([flat * turn.cos(), flat * turn.sin(), height], 1)
     values = spherical_harmonics(around, math.isqrt(min(bands, 16)))
     return Directions(values.T.contiguous(), torch.linalg.pinv(values))
-
-
-def _change(
-    look: Restyle, means: Annotated[Tensor, "N 3"], semantic: Annotated[Tensor, "N D"]
-) -> tuple[Annotated[Tensor, "N 4 3"], Annotated[Tensor, "N"]]:
-    """The change of a look against the identity: A and below it b of each Gaussian, c' = c + c A + b, and its strength."""
-    change, weight = semantic.new_zeros(len(semantic), 4, 3), semantic.new_zeros(len(semantic))
-    for part in look.parts:
-        if part.share == 0 or part.strength == 0:
-            continue
-        regions = semantic.new_ones(len(semantic), 1) if part.regions is None else part.regions(semantic)
-        acts = part.share * part.strength * regions
-        added = _added(part, semantic)
-        for place, other in part.places:
-            inside = place_weight(place, means)[:, None]
-            if bool(inside.any()):
-                added = torch.lerp(added, _added(other, semantic), inside[..., None])
-        change, weight = change + acts[..., None] * added, weight + acts[:, 0]
-    return change, weight
 
 
 def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N 4 3"]:
@@ -112,17 +101,3 @@ def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tenso
         return painted
     paint = part.light.paint(semantic, belongs)
     return paint[..., None] * painted + part.light.change(semantic, paint, belongs)
-
-
-def region_maps(
-    stylizer: Stylizer, dictionary: StyleDictionary, style: SceneStyle, config: StylizerConfig
-) -> ColourMaps | None:
-    """Carry the colours of each region over to those of the codes that it takes; None where the config asks for none."""
-    if config.colours <= 0:
-        return None
-    # Matched with itself as with the photographs, the scene keeps its colours.
-    mine = own_style(style, dictionary.blend)._replace(origin=dictionary.origin)
-    table = double(config.build(dictionary=mine, scene=style).region_match(style.keys))
-    mean, covariances = table @ double(mine.mean), torch.einsum("kt,tij->kij", table, double(mine.covariance))
-    taken = double(stylizer.region_match(style.keys))
-    return ColourMaps(style, *carried_colours(mean, covariances, taken, dictionary), config.colours)

@@ -4,10 +4,9 @@ The content of such a scene is its colour: a look changes harmonics (`restyle`),
 (`semantics`), and views are drawn by the rasteriser, through a pinhole that covers what a lens shows (`photographs`).
 """
 
-import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
-from functools import cache, cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Annotated
 
 import torch
@@ -15,31 +14,20 @@ from torch import Tensor
 
 from ..datamanagers.basis import Basis
 from ..datamanagers.scene import Scene as ParsedScene
-from ..errors import CheckpointError, DataError
-from ..interfaces import Encoder, Scene, SceneView, Stylizer, Values
-from ..ops.rasterise.reference import MIN_ALPHA
-from ..plugins.stylizers.config import StylizerConfig
+from ..interfaces import Encoder, Scene, SceneView, Values
 from ..rendering.cameras import Cameras, pixel_grid
 from ..rendering.renderer import enlarged
-from ..style.dictionary import Encoders, StyleDictionary
-from ..style.look import ColourMaps, Restyle
+from ..style.dictionary import Encoders
+from ..style.look import Restyle
 from ..style.scene_style import SceneStyle
 from ..training.camera_optimizers import Tones
-from ..training.run import Known
 from ..types import Origin, View
-from .config import GaussiansConfig, LookConfig
-from .files.base import Data
 from .gaussians import GaussianRows, Gaussians
 from .levels import Levels, StyledLevels
 from .photographs import cover, distorted
-from .restyle import Colours, region_maps, restyled_harmonics
-from .semantics import Semantics, find_semantics, load_semantics, semantics_tensors, tensor_group
-from .views import SeenMeans, clip_distance, draw, find_views, seen_means
-
-_UP = (0.0, -1.0, 0.0)
-"""What points up where nothing says so."""
-_VIEWS = 32
-"""Training views that semantics of a run are found in, at most."""
+from .restyle import Colours, restyled_harmonics
+from .semantics import Semantics
+from .views import SeenMeans, draw, seen_means
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,17 +207,6 @@ class SplatScene(Scene):
         found = self.found()
         return Encoders(Colours(), self.encoder(), found.basis, found.style, longest=self.longest)
 
-    def colour_maps(
-        self,
-        stylizer: Stylizer,
-        dictionary: StyleDictionary,
-        style: SceneStyle,
-        config: StylizerConfig,
-        allowed: Annotated[Tensor, "K references"],
-    ) -> ColourMaps | None:
-        """From region to codes; the stylizer knows what is allowed."""
-        return region_maps(stylizer, dictionary, style, config)
-
 
 @dataclass(frozen=True, eq=False)
 class GaussianView(SceneView):
@@ -246,91 +223,3 @@ class GaussianView(SceneView):
     def paint(self, values: Values) -> Annotated[Tensor, "N X"]:
         """Draw them in the place of colours."""
         return self.scene.paint(self.cameras, self.view, pixel_grid(self.cameras, self.view), values)[0]
-
-
-def look_at_capture(
-    gaussians: Gaussians,
-    antialiased: bool,
-    encoder: Encoder,
-    config: LookConfig,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-    camera: Cameras | None = None,
-) -> SplatScene:
-    """Find views of Gaussians that are all finite, sizes included. What they show is found when it is first asked for.
-
-    `camera` is the view that the capture was made from, where it is known. Raises DataError where nothing can be seen.
-    """
-    # Mistakes are told before views are sought, which takes seconds.
-    up = torch.tensor(config.up or _UP)
-    if not bool(up.isfinite().all() & (up.norm() > 0)):
-        raise DataError(f"up {config.up}: no direction; give three numbers, not all 0")
-    if float(gaussians.opacities.max()) < MIN_ALPHA:
-        raise DataError(f"all {len(gaussians)} Gaussians are transparent; nothing of the capture can be seen or restyled")
-    cameras = find_views(
-        gaussians,
-        count=config.views,
-        size=config.size,
-        up=up,
-        inside=config.inside,
-        antialiased=antialiased,
-        camera=camera,
-    )
-
-    def found() -> Semantics:
-        near = clip_distance(gaussians)
-        return find_semantics(gaussians, antialiased, encoder, cameras, config.regions, near=near, progress=progress)
-
-    return captured(gaussians, antialiased, cameras, cache(found), encoder)
-
-
-def captured(
-    gaussians: Gaussians, antialiased: bool, cameras: Cameras, found: Callable[[], Semantics], encoder: Encoder
-) -> SplatScene:
-    """The scene of a capture; its views are numbered."""
-    names = tuple(f"{view:02d}" for view in range(len(cameras)))
-    longest, near = int(cameras.size.amax()), clip_distance(gaussians)
-    return SplatScene(gaussians, antialiased, cameras, names, found, lambda: encoder, longest, near)
-
-
-def run_scene(config: GaussiansConfig, known: Known, gaussians: Gaussians, near: float, *, quick: bool = False) -> SplatScene:
-    """The scene of a run; its semantics are found when they are first asked for, `quick` in few, small views."""
-    encoder = cache(config.semantic.encoder.build)
-    count, side = (_VIEWS // 4, config.semantic_size // 2) if quick else (_VIEWS, config.semantic_size)
-
-    def found() -> Semantics:
-        every = torch.tensor(known.train)
-        views = known.cameras.select(every[torch.linspace(0, len(every) - 1, min(count, len(every))).round().long()])
-        views = views.scaled(max(1.0, float(views.size.amax()) / side))
-        return find_semantics(gaussians, True, encoder(), views, config.regions, near=near)
-
-    longest = min(side, int(known.cameras.size.amax()))
-    return SplatScene(
-        gaussians, True, known.cameras, known.names, cache(found), encoder, longest, near, config.background,
-        origin=known.facts.origin,
-    )  # fmt: skip
-
-
-def scene_tensors(scene: SplatScene) -> dict[str, Tensor]:
-    """Return everything found out about a capture, without its Gaussians: for a file of tensors."""
-    cameras = {f"camera.{field.name}": getattr(scene.views, field.name) for field in fields(Cameras)}
-    return {**cameras, **semantics_tensors(scene.found())}
-
-
-def load_scene(tensors: dict[str, Tensor], gaussians: Gaussians, antialiased: bool, encoder: Encoder) -> SplatScene:
-    """The scene of `scene_tensors`. Raises CheckpointError where they are not of these Gaussians and this encoder."""
-    try:
-        cameras = Cameras(**tensor_group(tensors, "camera"))
-    except TypeError as error:
-        raise CheckpointError(f"what is known of a capture is incomplete ({error})") from error
-    semantics = load_semantics(tensors, len(gaussians))
-    if semantics.encoder != encoder.identity:
-        raise CheckpointError(f"what is known of a capture is of the encoder {semantics.encoder}, not {encoder.identity}")
-    return captured(gaussians, antialiased, cameras, lambda: semantics, encoder)
-
-
-def cache_name(data: Data, encoder: str, config: LookConfig) -> str:
-    """A name for what is found out about a file: by its content, the encoder, and how it is looked at."""
-    # The first number counts the versions of what is found.
-    digest = hashlib.sha256(data)
-    digest.update(f"10 {encoder} {config.up} {config.inside} {config.views} {config.size} {config.regions}".encode())
-    return f"{digest.hexdigest()[:32]}.safetensors"

@@ -31,7 +31,7 @@ from ..rendering.cameras import Cameras
 from ..style.scene_style import SceneStyle, region_contacts, scene_style
 from ..style.scene_style import from_tensors as style_from
 from ..style.scene_style import to_tensors as style_tensors
-from .gaussians import Gaussians, bulk_of
+from .gaussians import Gaussians, bulk_of, cells_of
 from .levels import seen_by
 from .photographs import camera_of
 from .views import OUTLYING, draw
@@ -216,8 +216,7 @@ def _spread(
     edge = _EDGE * float(near.var(0, correction=0).mean().sqrt())
     # Each level divides space into boxes twice as wide; a box counts for at most so many pixels, however much was seen there.
     for level in range(_NEIGHBOURHOODS):
-        box = ((points - near.amin(0)) / max(edge * 2**level, 1e-30)).clamp(-1, 2.0**20).long() + 1
-        _, box = torch.unique((box[:, 0] << 42) + (box[:, 1] << 21) + box[:, 2], return_inverse=True)
+        box = torch.unique(cells_of(points, near.amin(0), max(edge * 2**level, 1e-30)), return_inverse=True)[1]
         weight = sums.new_zeros(int(box.max()) + 1).index_add_(0, box, mass)
         share = weight.clamp_max(_NEIGHBOURS * 0.5**level) / weight.clamp_min(1e-12)
         trust += (weight * share)[box]

@@ -9,13 +9,14 @@ scene (`style.regions`); here is only the grammar.
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from ..checks import at_least, between
 from ..errors import ConfigError, UsageError
+from ..plugins import slots
 from ..plugins.registry import nearest
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 
@@ -194,7 +195,7 @@ class StyleConfig:
                 raise ConfigError(f"{name}: {given} {name} for {len(self.references)} references; give one each, or none")
 
 
-C = TypeVar("C")
+C = TypeVar("C", bound=StyleConfig)
 
 PRESETS: Mapping[str, Mapping[str, float]] = MappingProxyType(
     {
@@ -205,21 +206,16 @@ PRESETS: Mapping[str, Mapping[str, float]] = MappingProxyType(
 
 
 def with_preset(config: C, name: str) -> C:
-    """The config, a dataclass with the fields of `StyleConfig` that the preset sets, with its values.
+    """The config with the values of a preset, but for fields that its stylizer does not have.
 
-    What the config's stylizer does not have is left out. Raises UsageError for an unknown name.
+    Raises UsageError for an unknown name.
     """
     if name not in PRESETS:
         raise UsageError(f"preset {name!r}: no such preset{nearest(name, list(PRESETS))}; there is {', '.join(PRESETS)}")
-
-    def changed(config: Any, path: list[str], value: float) -> Any:
-        first, *rest = path
-        if not hasattr(config, first):
-            return config
-        return replace(config, **{first: changed(getattr(config, first), rest, value) if rest else value})
-
     for path, value in PRESETS[name].items():
-        config = changed(config, path.split("."), value)
+        slot, _, field = path.rpartition(".")
+        if hasattr(getattr(config, slot) if slot else config, field):
+            config = slots.replace(config, path, value)
     return config
 
 

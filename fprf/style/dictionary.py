@@ -211,12 +211,16 @@ def build_dictionary(
 
     A code takes `blend` of its whole image's statistics, and more the further its members fall short of 32. The
     order of the references plays no part: they are sorted by what they hold. Statistics are computed on the samples' device;
-    the tables, a few kB, are on the CPU, where stylizers are built. Raises DataError for no references, one
-    without pixels, sizes that differ, or values that are not finite.
+    the tables, a few kB, are on the CPU, where stylizers are built. Raises DataError for no references, and for values
+    that are not finite.
     """
     at_least("clusters", clusters, 1)
     between("blend", blend, 0.0, 1.0)
-    _check_references(references)
+    if not references:
+        raise DataError("references: none given; name at least one photograph")
+    for r in references:
+        if not bool(r.content.isfinite().all() & r.semantic.isfinite().all()):
+            raise DataError(f"{r.name}: a feature is not finite; the image or the encoder's weights are damaged")
 
     def content_hash(r: Reference) -> str:
         digest = hashlib.sha256()
@@ -333,28 +337,3 @@ def save_dictionary(path: Path, d: StyleDictionary) -> None:
     fields = [name for name in (*_TABLES, "reference", *_OPTIONAL) if getattr(d, name) is not None]
     tensors = {name: getattr(d, name).detach().cpu().contiguous() for name in fields}
     write_bytes(path, save(tensors, metadata={"names": json.dumps(d.names), "blend": repr(d.blend)}))
-
-
-def _check_references(references: Sequence[Reference]) -> None:
-    """Raise DataError for references of which no dictionary can be built."""
-    if not references:
-        raise DataError("references: none given; name at least one photograph")
-    # All must be encoded as the first is.
-    first = references[0]
-    for r in references:
-        if len(r.content) == 0 or len(r.content) != len(r.semantic):
-            raise DataError(
-                f"{r.name}: {len(r.content)} content and {len(r.semantic)} semantic samples; both need the same number, "
-                "at least 1"
-            )
-        if r.content.shape[1] != first.content.shape[1] or r.semantic.shape[1] != first.semantic.shape[1]:
-            raise DataError(
-                f"{r.name}: {r.content.shape[1]} content and {r.semantic.shape[1]} semantic channels, but {first.name} "
-                f"has {first.content.shape[1]} and {first.semantic.shape[1]}; encode all with the scene's encoders"
-            )
-        if r.colour is not None and tuple(r.colour.shape) != (len(r.content), 3):
-            raise DataError(f"{r.name}: colours of shape {tuple(r.colour.shape)}; expected ({len(r.content)}, 3)")
-        if not bool(r.content.isfinite().all() & r.semantic.isfinite().all()):
-            raise DataError(f"{r.name}: a feature is not finite; the image or the encoder's weights are damaged")
-        if not 0 < r.weight < float("inf"):
-            raise DataError(f"{r.name}: weight {r.weight}; a reference's weight must be above 0 and finite")

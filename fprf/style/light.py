@@ -25,7 +25,7 @@ claims. Both are set on painted pairs of photographs (`benchmarks/semantic_match
 matches are right where a right one is as likely as none.
 """
 
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 from torch import Tensor, nn
@@ -78,20 +78,11 @@ def luma(rgb: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 1"]:
     return (rgb * rgb.new_tensor(_LUMA)).sum(-1, keepdim=True)
 
 
-class LightMaps(NamedTuple):
-    """What the light of the references makes of each region, float64."""
-
-    matrix: Annotated[Tensor, "K 3 3"]
-    bias: Annotated[Tensor, "K 3"]
-    between: Annotated[Tensor, "K 3"]
-    """Added to colours half painted, half lit."""
-
-
 class Light(nn.Module):
     """Confidence of points in their match, and the light that they take as far as they have none."""
 
-    matrix: Annotated[Tensor, "K 3 3"]
-    bias: Annotated[Tensor, "K 3"]
+    maps: Annotated[Tensor, "K 4 3"]
+    """A less the identity and below it b of each region, as of `ColourMaps`."""
     between: Annotated[Tensor, "K 3"]
     keys: Annotated[Tensor, "T D"]
     beyond: Annotated[Tensor, "T"]
@@ -106,19 +97,18 @@ class Light(nn.Module):
         self,
         scene: SceneStyle,
         dictionary: StyleDictionary,
-        maps: LightMaps,
+        maps: Annotated[Tensor, "K 4 3"],
+        between: Annotated[Tensor, "K 3"],
         bold: float,
         likeness: Annotated[Tensor, "K"],
         claim: Annotated[Tensor, "K"],
         allowed: Annotated[Tensor, "K references"],
     ) -> None:
         super().__init__()
-        self.membership, self.bold, self._spread = Membership(scene), bold, _spread(scene)
+        self.membership, self.bold, self._spread = Membership(scene.keys, scene.semantic_mean), bold, _spread(scene)
         self._restricted = not bool(allowed.all())
-        # The identity is taken out, as in ColourMaps.
-        self.register_buffer("matrix", (maps.matrix - torch.eye(3).to(maps.matrix)).float())
-        self.register_buffer("bias", maps.bias.float())
-        self.register_buffer("between", maps.between.float())
+        self.register_buffer("maps", (maps - torch.eye(4, 3).to(maps)).float())
+        self.register_buffer("between", between.float())
         self.register_buffer("keys", dictionary.keys.float())
         self.register_buffer("beyond", _beyond(dictionary).float())
         self.register_buffer("middles", _middles(scene, dictionary).float())
@@ -143,9 +133,13 @@ class Light(nn.Module):
             near = cosines(points, self.keys[codes], self.beyond[codes], self.membership.centre, middle)
             if self._restricted:  # of references that are forbidden to their regions, points know nothing
                 near = near - 2 * (belongs @ self.forbidden[:, i, None])
-            own = torch.maximum(own, nearest_mean(near, self.share[codes]))
+            # From the nearest code on, until a twentieth of the reference's pixels is full; the last one counts in part.
+            near, order = near.sort(1, descending=True)
+            size = (self.share[codes] / self.share[codes].sum())[order]
+            taken = (_NEAREST - (size.cumsum(1) - size)).clamp_min(0).minimum(size)
+            own = torch.maximum(own, (taken * near).sum(1) / taken.sum(1))
         likeness = (own[:, None] / self._spread + belongs @ self.region_likeness) / 2
-        return ramp(likeness) * (belongs @ self.claim)
+        return (likeness / SURE).clamp(0, 1) * (belongs @ self.claim)
 
     def paint(
         self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
@@ -164,7 +158,7 @@ class Light(nn.Module):
         """What is added to colours beside the paint: A and below it b of each point, c' = c + c A + b."""
         # A and b of the regions, mixed by membership, as far as points are not painted; u is largest half-way.
         belongs = self._belongs(semantic, belongs)
-        lit = (belongs @ torch.cat([self.matrix, self.bias[:, None]], 1).flatten(1)).view(-1, 4, 3) * (1 - paint)[..., None]
+        lit = (belongs @ self.maps.flatten(1)).view(-1, 4, 3) * (1 - paint)[..., None]
         lit[:, 3] += 4 * paint * (1 - paint) * (belongs @ self.between)
         return lit
 
@@ -181,7 +175,7 @@ class Light(nn.Module):
 
     def _belongs(self, semantic: Tensor, belongs: Tensor | None) -> Annotated[Tensor, "N K"]:
         share: Tensor = self.membership(semantic) if belongs is None else belongs
-        return share.to(self.bias)
+        return share.to(self.maps)
 
 
 def light_of(
@@ -204,7 +198,7 @@ def light_of(
     every = torch.ones(count, len(dictionary.names), dtype=torch.bool) if allowed is None else allowed.cpu()
     mean, covariance = (double(part).cpu() for part in colours)
     likeness, claim = mean.new_zeros(count), mean.new_zeros(count)
-    maps = LightMaps(mean.new_zeros(count, 3, 3), torch.zeros_like(mean), torch.zeros_like(mean))
+    maps, between = mean.new_zeros(count, 4, 3), torch.zeros_like(mean)
     for row in sorted({tuple(row) for row in every.tolist()}):
         # All regions are matched with one choice of references; those that made it take their rows.
         chosen = torch.tensor(row)
@@ -212,10 +206,10 @@ def light_of(
         table = double(config.build(dictionary=part, scene=scene).region_match(scene.keys)).cpu()
         alike, alone = region_likeness(scene, part, table), unrivalled(scene, part, table)
         likeness[rows], claim[rows] = alike[rows], alone[rows]
-        made = light_maps(mean, covariance, double(scene.share), table, part, ramp(alike) * alone)
-        for whole, own in zip(maps, made, strict=True):
-            whole[rows] = own[rows]
-    return Light(scene, dictionary, maps, bold, likeness, claim, every)
+        sure = (alike / SURE).clamp(0, 1) * alone
+        lit, added = light_maps(mean, covariance, double(scene.share), table, part, sure)
+        maps[rows], between[rows] = lit[rows], added[rows]
+    return Light(scene, dictionary, maps, between, bold, likeness, claim, every)
 
 
 def cosines(
@@ -238,15 +232,6 @@ def cosines(
         return unit(x, at) @ unit(keys, at).T * shown
 
     return torch.minimum(seen(centre), seen(middle))
-
-
-def nearest_mean(cosine: Annotated[Tensor, "N T"], share: Annotated[Tensor, "T"]) -> Annotated[Tensor, "N"]:
-    """Mean cosine with the nearest twentieth of a reference's pixels."""
-    # Codes from the nearest on, until a twentieth is full; the last counts in part.
-    near, order = cosine.sort(1, descending=True)
-    size = (share / share.sum())[order]
-    taken = (_NEAREST - (size.cumsum(1) - size)).clamp_min(0).minimum(size)
-    return (taken * near).sum(1) / taken.sum(1)
 
 
 def region_likeness(scene: SceneStyle, dictionary: StyleDictionary, table: Annotated[Tensor, "K T"]) -> Annotated[Tensor, "K"]:
@@ -272,11 +257,6 @@ def _middles(scene: SceneStyle, dictionary: StyleDictionary) -> Annotated[Tensor
         own = dictionary.reference == i
         rows.append((scene.semantic_mean + share_mean(dictionary.keys[own], dictionary.share[own])) / 2)
     return torch.stack(rows)
-
-
-def ramp(likeness: Annotated[Tensor, "..."]) -> Annotated[Tensor, "..."]:
-    """Confidence in [0, 1] that likeness alone gives."""
-    return (likeness / SURE).clamp(0, 1)
 
 
 def unrivalled(scene: SceneStyle, dictionary: StyleDictionary, table: Annotated[Tensor, "K T"]) -> Annotated[Tensor, "K"]:
@@ -308,8 +288,8 @@ def light_maps(
     table: Annotated[Tensor, "K T"],
     dictionary: StyleDictionary,
     sure: Annotated[Tensor, "K"],
-) -> LightMaps:
-    """The affine map of each region by the references' light, float64; see the top of the file."""
+) -> tuple[Annotated[Tensor, "K 4 3"], Annotated[Tensor, "K 3"]]:
+    """The affine map of each region by the references' light (A, below it b), and u, float64; see the top of the file."""
     assert dictionary.colour_mean is not None
     codes, odds = double(dictionary.colour_mean), code_odds(dictionary)
     painted, own, grey = table @ codes, luma(mean)[:, 0], luma(torch.eye(3, dtype=torch.float64))
@@ -347,7 +327,7 @@ def light_maps(
     (red, green), (other_red, other_green) = (lit_mean @ axes.T).unbind(1), (painted @ axes.T).unbind(1)
     opposite = (-red * other_red / red.square().maximum(other_red.square()).clamp_min(1e-12)).clamp(0, 1)
     between = (-opposite * (green + other_green) / 2)[:, None] * axes[1]
-    return LightMaps(contrast[:, None, None] * towards, bias, between)
+    return torch.cat([contrast[:, None, None] * towards, bias[:, None]], 1), between
 
 
 def shared(value: Annotated[Tensor, "N"], weight: Annotated[Tensor, "N"]) -> float:

@@ -24,14 +24,13 @@ import torch
 from torch import Tensor, nn
 
 from ..checks import between
-from ..errors import UsageError
 from ..interfaces import Decoder, Stylizer
 from ..ops.precision import double
 from ..types import Want
 from .config import Place
 from .dictionary import StyleDictionary, blend_codes, choose
 from .light import Light, luma
-from .scene_style import Membership, RegionWeight, SceneStyle, mixed_maps
+from .scene_style import Membership, RegionWeight, SceneStyle, mixed_maps, own_style
 from .statistics import mix, monge, symmetric_root
 
 if TYPE_CHECKING:
@@ -43,24 +42,6 @@ _GAIN = 3.0
 """No direction of colour is amplified more: a flat region's noise must stay unseen."""
 _QUIET = 2e-4
 """Variance added on both sides: a deviation of four 8-bit steps, below which colours have no shape worth carrying over."""
-
-
-def blend_strength(
-    content: Annotated[Tensor, "N C"], styled: Annotated[Tensor, "N C"], strength: float | Annotated[Tensor, "N 1"]
-) -> Annotated[Tensor, "N C"]:
-    """Between the scene's features (strength 0, bit for bit) and the styled ones (strength 1, bit for bit), all finite.
-
-    Raises UsageError for one strength outside [0, 1].
-    """
-    if isinstance(strength, Tensor):
-        return torch.lerp(content, styled, strength.to(content))
-    if not 0.0 <= strength <= 1.0:
-        raise UsageError(f"strength: {strength} must lie in [0, 1]")
-    if strength == 0.0:
-        return content
-    if strength == 1.0:
-        return styled
-    return torch.lerp(content, styled, strength)
 
 
 def keep_luminance(
@@ -108,17 +89,15 @@ class ColourMaps(nn.Module):
 
     matrix: Annotated[Tensor, "K 3 3"]
     bias: Annotated[Tensor, "K 3"]
-    origin: Annotated[Tensor, "3"]
 
     def __init__(
         self, scene: SceneStyle, matrix: Annotated[Tensor, "K 3 3"], bias: Annotated[Tensor, "K 3"], share: float
     ) -> None:
         super().__init__()
-        self.membership = Membership(scene)
+        self.membership = Membership(scene.keys, scene.semantic_mean)
         # The identity is taken out: what is small stays exact, and a map that changes nothing is nothing.
         self.register_buffer("matrix", (share * (matrix - torch.eye(3).to(matrix))).float())
         self.register_buffer("bias", (share * bias).float())
-        self.register_buffer("origin", torch.zeros(3))
 
     @property
     def needs(self) -> Want:
@@ -137,7 +116,7 @@ class ColourMaps(nn.Module):
         """
         if belongs is None:
             belongs = self.membership(colour[:, :0] if semantic is None else semantic)
-        change = mixed_maps(colour.to(self.bias), belongs.to(self.bias), self.matrix, self.bias, centre=self.origin)
+        change = mixed_maps(colour.to(self.bias), belongs.to(self.bias), self.matrix, self.bias)
         return (colour + change.to(colour)).clamp(0, 1) - colour
 
 
@@ -171,6 +150,23 @@ def colour_maps(
     return ColourMaps(scene, *carried_colours(mean, covariances, table, dictionary), share)
 
 
+def region_maps(
+    stylizer: Stylizer, dictionary: StyleDictionary, scene: SceneStyle, config: "StylizerConfig"
+) -> ColourMaps | None:
+    """The maps of scenes whose content is colour (there is no decoder); None where the config asks for none.
+
+    The colours of each region are carried over to those of the codes that it takes.
+    """
+    if config.colours <= 0:
+        return None
+    # Matched with itself as with the photographs, the scene keeps its colours.
+    mine = own_style(scene, dictionary.blend)._replace(origin=dictionary.origin)
+    table = double(config.build(dictionary=mine, scene=scene).region_match(scene.keys))
+    mean, covariances = table @ double(mine.mean), torch.einsum("kt,tij->kij", table, double(mine.covariance))
+    taken = double(stylizer.region_match(scene.keys))
+    return ColourMaps(scene, *carried_colours(mean, covariances, taken, dictionary), config.colours)
+
+
 def carried_colours(
     mean: Annotated[Tensor, "K 3"],
     covariances: Annotated[Tensor, "K 3 3"],
@@ -194,9 +190,14 @@ def carried_colours(
 
 @torch.no_grad()
 def decoded_colours(
-    stylizer: Stylizer, scene: SceneStyle, decoder: Decoder, *, features: float = 1.0
+    stylizer: Stylizer, scene: SceneStyle, decoder: Decoder | None, *, features: float
 ) -> tuple[Annotated[Tensor, "K 3"], Annotated[Tensor, "K 3 3"]]:
-    """Mean and covariance of each region's colours, float64, after the stylizer and the decoder."""
+    """Mean and covariance of each region's colours, float64, after a share of the stylizer's change, and the decoder.
+
+    Without a decoder they are those of the content, unchanged.
+    """
+    if decoder is None:
+        return double(scene.region_mean), double(scene.region_covariance)
     device = next(stylizer.buffers(), scene.mean).device
     draw = torch.randn(_DRAWS // 2, scene.mean.numel(), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     draw = torch.cat([draw, -draw])  # in pairs: the features' mean is met exactly
@@ -206,20 +207,11 @@ def decoded_colours(
         root = symmetric_root(double(scene.region_covariance[k])).cpu()
         points = (double(scene.region_mean[k]).cpu() + draw @ root).float().to(device)
         key = scene.keys[k].to(device).expand(len(points), -1)
-        styled = blend_strength(points, stylizer(points, key if Want.SEMANTIC in stylizer.needs else None), features)
-        colour = double(decoder(styled)).cpu()
+        styled = stylizer(points, key if Want.SEMANTIC in stylizer.needs else None)
+        colour = double(decoder(torch.lerp(points, styled, features))).cpu()
         means.append(colour.mean(0))
         covariances.append(torch.cov(colour.T, correction=0))
     return torch.stack(means), torch.stack(covariances)
-
-
-def own_colours(
-    stylizer: Stylizer, scene: SceneStyle, decoder: Decoder | None
-) -> tuple[Annotated[Tensor, "K 3"], Annotated[Tensor, "K 3 3"]]:
-    """Mean and covariance of each region's own colours, float64; without a decoder they are the content."""
-    if decoder is None:
-        return double(scene.region_mean), double(scene.region_covariance)
-    return decoded_colours(stylizer, scene, decoder, features=0.0)
 
 
 def regional(
@@ -382,7 +374,9 @@ class Restyle:
                 assert semantic is not None, "Want.SEMANTIC was asked for"
                 paint = part.light.paint(semantic, belongs)
                 painted = strength * paint.to(content)
-            styled.append(blend_strength(content, moved, part.features * painted))
+            # At 0 the scene's own features, at 1 the styled ones, both bit for bit.
+            share = part.features * painted
+            styled.append(torch.lerp(content, moved, share.to(content) if isinstance(share, Tensor) else share))
             active.append((part, belongs, strength, painted, paint))
         # Mix the parts by their shares; one alone is left as it is, bit for bit.
         mixed, luminance = styled[0], parts[0].luminance

@@ -4,11 +4,7 @@ The list shows where each region is seen best, how large it is, and what it take
 a view, T style codes, K regions.
 """
 
-import io
 import math
-import zipfile
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import cv2
@@ -17,10 +13,8 @@ import torch
 from torch import Tensor
 
 from ..interfaces import Scene
-from ..io.atomic import write_bytes
 from ..io.images import Picture, to_uint8
-from ..io.maps import match_image, match_summary, scale_image, weighted_sum
-from ..io.sheet import Tile, highlight
+from ..io.maps import Tile, highlight, match_image, match_summary, scale_image, weighted_sum
 from ..rendering.cameras import Cameras, pixel_grid
 from .matching import unit
 from .regions import Regions, membership_view, shrunk
@@ -70,7 +64,7 @@ def match_map(scene: Scene, styled: Styled, view: int, cameras: Cameras | None =
     """Matches of one of the scene's scene_style views, or of `cameras`: geometry and semantics alone are computed."""
     cameras, scene_style, look = scene.cameras if cameras is None else cameras, styled.scene_style, styled.restyle
     device = scene.device
-    belongs = Membership(scene_style).to(device)
+    belongs = Membership(scene_style.keys, scene_style.semantic_mean).to(device)
     centre, units, codes = scene_style.semantic_mean.to(device), styled.codes.units.to(device), len(styled.codes.reference)
 
     def values(semantic: Tensor, points: Tensor | None) -> Tensor:
@@ -116,54 +110,20 @@ def summarize(matched: MatchMap, codes: Codes) -> dict[str, Any]:
     weight = each * (1 - kept)
     styled = float(weight.sum()) or 1.0
     of_code, of_region = weighted_sum(matched.taken, each) / total, weighted_sum(matched.region, each) / total
-    cluster = cluster_numbers(codes)
+    # Codes are numbered within their reference, and listed from the most used on.
+    listed = []
+    for t in of_code.argsort(descending=True).tolist():
+        if float(of_code[t]) >= _LISTED:
+            cluster = int((codes.reference[:t] == codes.reference[t]).sum())
+            listed.append({"reference": codes.names[int(codes.reference[t])], "cluster": cluster, "share": float(of_code[t])})
     return {
         **match_summary(matched.attention, codes.reference, codes.names, weight),
         "score": float((matched.score * weight).sum()) / styled,
         "confidence": float((matched.confidence * weight).sum()) / styled,
         "kept_share": float((kept * each).sum()) / total,
-        "codes": [
-            {"reference": codes.names[int(codes.reference[t])], "cluster": int(cluster[t]), "share": float(of_code[t])}
-            for t in of_code.argsort(descending=True).tolist()
-            if float(of_code[t]) >= _LISTED
-        ],
+        "codes": listed,
         "regions": [{"region": k, "share": float(share)} for k, share in enumerate(of_region) if float(share) >= _LISTED],
     }
-
-
-def write_pixels(path: Path, matched: MatchMap, codes: Codes) -> None:
-    """Write an .npz: reference, cluster, region (int16, -1 where nothing is), score, confidence, entropy_bits, kept, opacity,
-    names.
-    """
-    # The one code that a pixel takes most of; -1 where there is nothing, or where nothing is taken.
-    code = matched.taken.argmax(-1)
-    some, styled = matched.opacity > 0.5, matched.taken.sum(-1) > 0.5
-    arrays = {
-        "reference": torch.where(some & styled, codes.reference[code], -1).short(),
-        "cluster": torch.where(some & styled, cluster_numbers(codes)[code], -1).short(),
-        "region": torch.where(some, matched.region.argmax(-1), -1).short(),
-        "score": matched.score,
-        "confidence": matched.confidence,
-        "entropy_bits": matched.entropy,
-        "kept": matched.kept,
-        "opacity": matched.opacity,
-    }
-    # As np.savez_compressed writes it, but with arrays that hold no pickles, and whole or absent.
-    data = io.BytesIO()
-    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, values in {"names": np.asarray(codes.names), **arrays}.items():
-            with archive.open(f"{name}.npy", "w") as file:
-                np.lib.format.write_array(file, np.asarray(values), allow_pickle=False)
-    write_bytes(path, data.getvalue())
-
-
-def cluster_numbers(codes: Codes) -> Annotated[Tensor, "T"]:
-    """Number of each code within its reference, from 0."""
-    number = torch.zeros_like(codes.reference)
-    for i in range(len(codes.names)):
-        own = codes.reference == i
-        number[own] = torch.arange(int(own.sum()))
-    return number
 
 
 class ReferenceShare(NamedTuple):
@@ -219,9 +179,14 @@ def explain(regions: Regions, styled: Styled | None = None) -> list[ExplainedReg
         seen[view] = picture, share * opacity[..., None]
     rows = []
     for k, view in enumerate(best):
-        picture, share = seen[view]
-        pixel = _middle(share[..., k], scene.cameras.size[view].tolist())
-        rows.append(ExplainedRegion(k, float(style.share[k]), scene.names[view], pixel, highlight(picture, share[..., k])))
+        picture, share = seen[view][0], seen[view][1][..., k]
+        # Blurred membership is highest in the middle; a pixel that belongs to the region itself comes before one beside it.
+        own, reach = share.cpu().numpy(), 2 * (max(share.shape) // 12) + 1
+        smooth = cv2.blur(own, (reach, reach), borderType=cv2.BORDER_CONSTANT)
+        y, x = np.unravel_index(int(np.argmax(smooth * (own > 0.5) + 1e-3 * smooth)), smooth.shape)
+        (width, height), (tall, wide) = scene.cameras.size[view].tolist(), share.shape
+        pixel = int((x + 0.5) * width / wide), int((y + 0.5) * height / tall)
+        rows.append(ExplainedRegion(k, float(style.share[k]), scene.names[view], pixel, highlight(picture, share)))
     if styled is None:
         return rows
     keys, reference, controls = style.keys.to(scene.device), styled.dictionary.reference, styled.controls
@@ -239,16 +204,6 @@ def explain(regions: Regions, styled: Styled | None = None) -> list[ExplainedReg
             restricted=not bool(controls.allowed[k].all()),
         )
     return rows
-
-
-def _middle(share: Annotated[Tensor, "H W"], size: Sequence[int]) -> tuple[int, int]:
-    """Find the pixel, of the full view, about which most of the region lies."""
-    # Blurred membership is highest in the middle; a pixel that belongs to the region itself comes before one beside it.
-    reach = 2 * (max(share.shape) // 12) + 1
-    smooth = cv2.blur(share.cpu().numpy(), (reach, reach), borderType=cv2.BORDER_CONSTANT)
-    y, x = np.unravel_index(int(np.argmax(smooth * (share.cpu().numpy() > 0.5) + 1e-3 * smooth)), smooth.shape)
-    height, width = share.shape
-    return int((x + 0.5) * size[0] / width), int((y + 0.5) * size[1] / height)
 
 
 def region_row(region: ExplainedRegion) -> dict[str, Any]:

@@ -4,7 +4,7 @@ Letters: K regions of the scene, T style codes. A region is named by its number,
 view (`VIEW:X,Y`) or by a mask over one (`VIEW:MASK.png`); the grammar is that of `style.config`.
 """
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -81,17 +81,39 @@ def find_regions(regions: Regions, text: str) -> list[RegionMatch]:
     if text in regions.keys:
         return _alike(regions, text)
     # Longest names first: one view's name may begin with another's.
-    for view in sorted(range(len(names)), key=lambda v: -len(names[v])):
-        if text.startswith(f"{names[view]}:"):
-            rest = text[len(names[view]) + 1 :]
-            pixel = parse_pixel(rest)
-            numbers = _covered(regions, view, Path(rest)) if pixel is None else [_at_pixel(regions, view, *pixel)]
-            return [RegionMatch(k, str(k)) for k in numbers]
-    named = f", a name in the style file ({', '.join(regions.keys)})" if regions.keys else ""
-    raise UsageError(
-        f"region {text!r}: neither a number{named}, nor VIEW:X,Y or VIEW:MASK.png with a view of the run "
-        f"({names[0]} … {names[-1]})"
-    )
+    longest_first = sorted(range(len(names)), key=lambda v: -len(names[v]))
+    view = next((v for v in longest_first if text.startswith(f"{names[v]}:")), None)
+    if view is None:
+        named = f", a name in the style file ({', '.join(regions.keys)})" if regions.keys else ""
+        raise UsageError(
+            f"region {text!r}: neither a number{named}, nor VIEW:X,Y or VIEW:MASK.png with a view of the run "
+            f"({names[0]} … {names[-1]})"
+        )
+    rest = text[len(names[view]) + 1 :]
+    if (pixel := parse_pixel(rest)) is not None:
+        # The region that most of what the pixel sees belongs to.
+        x, y = pixel
+        width, height = regions.scene.cameras.size[view].tolist()
+        if not (0 <= x < width and 0 <= y < height):
+            raise UsageError(f"{text}: outside of the view; x goes from 0 to {width - 1}, y from 0 to {height - 1}")
+        centre = torch.tensor([[int(x) + 0.5, int(y) + 0.5]], dtype=torch.float64)
+        share, opacity = memberships(regions.scene, regions.scene_style, regions.scene.cameras, view, centre)
+        if float(opacity[0]) < _SOLID:
+            raise UsageError(f"{text}: there is nothing at that pixel; choose another")
+        found = {int(share[0].argmax())}
+    else:
+        # Regions of which the mask covers more than half of what the view shows, and the one that fills most of the mask: by
+        # their mass in the view and under the mask, on a small copy of both.
+        share, opacity = membership_view(regions, view, _SIDE)
+        painted = load_mask(Path(rest), upright=True).astype(np.float32)
+        white = torch.from_numpy(np.asarray(cv2.resize(painted, opacity.shape[::-1], interpolation=cv2.INTER_AREA)))
+        mass = (share * opacity[..., None]).flatten(0, 1)
+        inside, total = white.flatten() @ mass, mass.sum(0)
+        if float(inside.sum()) < _SOLID:
+            raise UsageError(f"{rest}: the mask selects nothing of view {names[view]}; paint white what counts")
+        mostly = (inside / total.clamp_min(1e-10) > 0.5) & (inside >= 1)
+        found = {int(inside.argmax()), *mostly.nonzero().flatten().tolist()}
+    return [RegionMatch(k, str(k)) for k in sorted(found)]
 
 
 def _alike(regions: Regions, name: str) -> list[RegionMatch]:
@@ -112,39 +134,11 @@ def _alike(regions: Regions, name: str) -> list[RegionMatch]:
     return [RegionMatch(k, name, float(alike[k])) for k in mine.nonzero().flatten().tolist()]
 
 
-def _at_pixel(regions: Regions, view: int, x: float, y: float) -> int:
-    """Find the region at a pixel of a view."""
-    cameras = regions.scene.cameras
-    name, (width, height) = regions.scene.names[view], cameras.size[view].tolist()
-    if not (0 <= x < width and 0 <= y < height):
-        raise UsageError(f"{name}:{x:g},{y:g}: outside of the view; x goes from 0 to {width - 1}, y from 0 to {height - 1}")
-    centre = torch.tensor([[int(x) + 0.5, int(y) + 0.5]], dtype=torch.float64)
-    share, opacity = memberships(regions.scene, regions.scene_style, cameras, view, centre)
-    if float(opacity[0]) < _SOLID:
-        raise UsageError(f"{name}:{x:g},{y:g}: there is nothing at that pixel; choose another")
-    return int(share[0].argmax())
-
-
-def _covered(regions: Regions, view: int, mask: Path) -> list[int]:
-    """Find regions of which the mask covers more than half of what the view shows, and the one that fills most of the mask."""
-    # Mass of each region in the view, and how much of it lies under the mask, on a small copy of both.
-    share, opacity = membership_view(regions, view, _SIDE)
-    height, width = opacity.shape
-    painted = load_mask(mask, upright=True).astype(np.float32)
-    white = torch.from_numpy(np.asarray(cv2.resize(painted, (width, height), interpolation=cv2.INTER_AREA)))
-    mass = (share * opacity[..., None]).flatten(0, 1)
-    inside, total = white.flatten() @ mass, mass.sum(0)
-    if float(inside.sum()) < _SOLID:
-        raise UsageError(f"{mask}: the mask selects nothing of view {regions.scene.names[view]}; paint white what counts")
-    most = inside / total.clamp_min(1e-10)
-    return sorted({int(inside.argmax()), *((most > 0.5) & (inside >= 1)).nonzero().flatten().tolist()})
-
-
 def memberships(
     scene: Scene, style: SceneStyle, cameras: Cameras, view: int, pixel: Annotated[Tensor, "N 2"]
 ) -> tuple[Annotated[Tensor, "N K"], Annotated[Tensor, "N"]]:
     """Share of what pixels (centres) see that belongs to each region of a scene's style, and their opacity."""
-    belongs = Membership(style).to(scene.device)
+    belongs = Membership(style.keys, style.semantic_mean).to(scene.device)
     return scene.paint(cameras, view, pixel, lambda features, points: belongs(features), semantic=belongs.divided)
 
 
@@ -160,35 +154,6 @@ def shrunk(cameras: Cameras, view: int, size: int) -> Cameras:
     """One view alone, with the longest side at most `size` pixels."""
     one = cameras.select(torch.tensor([view]))
     return one.scaled(max(1.0, float(one.size.amax()) / size))
-
-
-def allowed_references(
-    regions: int,
-    references: int,
-    *,
-    pin: Mapping[int, Set[int]] | None = None,
-    forbid: Sequence[tuple[int, int]] = (),
-) -> Annotated[Tensor, "regions references"]:
-    """References that each region may take codes from, bool: all, but for what the user excludes.
-
-    `pin` maps a region to the only references that it may take from; `forbid` holds (region, reference) pairs that may not
-    meet. Raises UsageError for numbers out of range or a region that is left with nothing.
-    """
-    pin = pin or {}
-    for k, i in (*((k, i) for k, chosen in pin.items() for i in sorted(chosen)), *forbid):
-        if not (0 <= k < regions and 0 <= i < references):
-            raise UsageError(
-                f"region {k} and reference {i}: regions go from 0 to {regions - 1}, references from 0 to {references - 1}"
-            )
-    allowed = torch.ones(regions, references, dtype=torch.bool)
-    for k, chosen in pin.items():
-        allowed[k] = False
-        allowed[k, sorted(chosen)] = True
-    for k, i in forbid:
-        allowed[k, i] = False
-    for k in (~allowed.any(1)).nonzero().flatten().tolist():
-        raise UsageError(f"region {k}: every reference is forbidden; allow one, or keep the region as it is")
-    return allowed
 
 
 class RegionControls(NamedTuple):
@@ -220,12 +185,16 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
     kept = [match for text in style.keep for match in names.find(text)]
     parsed = [parse_strength("region_strength", text) for text in style.region_strength]
     strengths = [(match, value) for text, value in parsed for match in names.find(text)]
-    pinned: dict[int, set[int]] = {}
+    # A pinned region takes from the references that it is pinned to alone, every other one from all that are not forbidden.
+    allowed = torch.ones(len(regions.scene_style.share), len(dictionary.names), dtype=torch.bool)
+    pinned = {match.number for match, _ in pins}
+    allowed[sorted(pinned)] = False
     for match, i in pins:
-        pinned.setdefault(match.number, set()).add(names.order[i])
-    allowed = allowed_references(
-        len(regions.scene_style.share), len(dictionary.names), pin=pinned, forbid=[(f.number, names.order[i]) for f, i in bans]
-    )
+        allowed[match.number, names.order[i]] = True
+    for match, i in bans:
+        allowed[match.number, names.order[i]] = False
+    for k in (~allowed.any(1)).nonzero().flatten().tolist():
+        raise UsageError(f"region {k}: every reference is forbidden; allow one, or keep the region as it is")
     for match in kept:
         if match.number in pinned or match.number in {f.number for f, _ in strengths}:
             raise UsageError(f"region {match.name}: is to be kept, and to be pinned or restyled in part; leave out one of both")

@@ -15,7 +15,7 @@ from .config import NO_MASK, labels
 from .dictionary import Encoders, Reference, StyleDictionary, build_dictionary, encode_photograph
 from .files import Keyframe, StyleFile, check_photographs, fade, read_style
 from .light import light_of
-from .look import Restyle, own_colours, regional
+from .look import Restyle, colour_maps, decoded_colours, region_maps, regional
 from .matching import unit
 from .regions import RegionControls, Regions, region_controls
 from .scene_style import RegionWeight, SceneStyle
@@ -101,10 +101,21 @@ def apply_dictionary(scene: Scene, file: StyleFile, encoders: Encoders, dictiona
         stylizer = regional(dictionary, scene_style, allowed, config)
         check_stylizer(config, stylizer, dictionary, scene_style, affine=scene.decoder is None and config.colours <= 0)
         stylizer = stylizer.to(device)
-        colours = scene.colour_maps(stylizer, dictionary, scene_style, config, allowed)
+        if scene.decoder is None:
+            colours = region_maps(stylizer, dictionary, scene_style, config)
+        else:
+            colours = colour_maps(
+                stylizer,
+                dictionary,
+                scene_style,
+                scene.decoder,
+                features=config.features,
+                share=config.colours,
+                smoothing=config.smoothing(scene_style, allowed),
+            )
         light = None
         if config.light and style.bold < 1:
-            colours_before = own_colours(stylizer, scene_style, scene.decoder)
+            colours_before = decoded_colours(stylizer, scene_style, scene.decoder, features=0.0)
             light = light_of(scene_style, dictionary, config, colours_before, bold=style.bold, allowed=allowed)
         return Restyle(
             stylizer,

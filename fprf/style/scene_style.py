@@ -60,7 +60,7 @@ def scene_style(
 ) -> SceneStyle:
     """The scene's style from weighted points, float32.
 
-    Regions are k-means clusters of the semantics; their statistics are taken over the same soft `membership` by which the
+    Regions are k-means clusters of the semantics; their statistics are taken over the same soft `Membership` by which the
     region stylizers assign points. Contacts are left at 0. Its tables, a few kB, are on the CPU, where stylizers are built,
     whatever the device of the points. `moments` are those of the whole scene, where a longer pass has them already. Raises
     DataError for no weight, NumericsError for values that are not finite.
@@ -79,7 +79,7 @@ def scene_style(
     # K-means compares distances and membership compares directions, so a cluster may win no point. Memberships are taken again
     # without it, as the stylizers will: no region has statistics of nothing.
     while True:
-        belongs = membership(semantic, middle, *region_units(keys, middle))
+        belongs = Membership(keys, middle)(semantic)
         used = belongs.sum(0) > 0
         if bool(used.all()):
             break
@@ -91,31 +91,20 @@ def scene_style(
     return SceneStyle(*(table.float().cpu() for table in measured))
 
 
-def region_units(keys: Annotated[Tensor, "K D"], centre: Annotated[Tensor, "D"]) -> tuple[Annotated[Tensor, "K D"], float]:
-    """Return directions of the regions' keys, and the (absolute) temperature at which points belong to them."""
-    units = unit(keys, centre)
-    return units, _SOFTNESS * score_spread(units, units)
-
-
-def membership(
-    semantic: Annotated[Tensor, "N D"], centre: Annotated[Tensor, "D"], units: Annotated[Tensor, "K D"], temperature: float
-) -> Annotated[Tensor, "N K"]:
-    """Membership of each point in each region: attention without the faintest shares; rows sum to 1."""
-    if len(units) == 1:
-        return semantic.new_ones(len(semantic), 1)
-    return point_shares(semantic, units, temperature, centre=centre, faint=_FAINT)
-
-
 class Membership(nn.Module):
-    """`membership` in the regions of one scene, on the device of the module."""
+    """Membership of points in regions by keys: attention without the faintest shares, on the device of the module.
+
+    Directions are taken from a centre: the mean of the scene's semantics.
+    """
 
     centre: Annotated[Tensor, "D"]
     units: Annotated[Tensor, "K D"]
 
-    def __init__(self, scene: SceneStyle) -> None:
+    def __init__(self, keys: Annotated[Tensor, "K D"], centre: Annotated[Tensor, "D"]) -> None:
         super().__init__()
-        units, self._temperature = region_units(scene.keys, scene.semantic_mean)
-        self.register_buffer("centre", scene.semantic_mean.float())
+        units = unit(keys, centre)
+        self._temperature = _SOFTNESS * score_spread(units, units)
+        self.register_buffer("centre", centre.float())
         self.register_buffer("units", units.float())
 
     @property
@@ -125,7 +114,10 @@ class Membership(nn.Module):
 
     def forward(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N K"]:
         """Rows sum to 1."""
-        return membership(semantic.to(self.units), self.centre, self.units, self._temperature)
+        semantic = semantic.to(self.units)
+        if not self.divided:
+            return semantic.new_ones(len(semantic), 1)
+        return point_shares(semantic, self.units, self._temperature, centre=self.centre, faint=_FAINT)
 
 
 def mixed_maps(
@@ -133,15 +125,12 @@ def mixed_maps(
     share: Annotated[Tensor, "N K"],
     matrix: Annotated[Tensor, "K C C"],
     bias: Annotated[Tensor, "K C"],
-    *,
-    centre: Annotated[Tensor, "C"],
 ) -> Annotated[Tensor, "N C"]:
-    """sum_k share_k ((x - centre) matrix_k + bias_k): the affine maps of regions, mixed by membership.
+    """sum_k share_k (x matrix_k + bias_k): the affine maps of regions, mixed by membership.
 
-    Within (C + K + 3) u sum_k share_k (|x - centre| |matrix_k| + |bias_k|), u = 2^-24.
+    Within (C + K + 3) u sum_k share_k (|x| |matrix_k| + |bias_k|), u = 2^-24.
     """
     with full_precision(x):
-        x = x - centre
         if len(matrix) == 1:
             return x @ matrix[0] + bias[0]
         mixed = share @ bias
@@ -159,7 +148,7 @@ class RegionWeight(nn.Module):
 
     def __init__(self, scene: SceneStyle, values: Annotated[Tensor, "K X"]) -> None:
         super().__init__()
-        self.membership = Membership(scene)
+        self.membership = Membership(scene.keys, scene.semantic_mean)
         self.register_buffer("values", values.float())
 
     def forward(
@@ -178,10 +167,8 @@ def region_contacts(
     Mean over the pairs of -d_k d_l, with d the difference of both ends' memberships, where that is above 0; pairs whose colours
     differ count less. Symmetric, at least 0, with 0 on the diagonal.
     """
-    units, softness = region_units(scene.keys, scene.semantic_mean)
-    ends = [
-        double(membership(part.contiguous().to(units), scene.semantic_mean, units, softness)) for part in semantic.unbind(1)
-    ]
+    belongs = Membership(scene.keys, scene.semantic_mean)
+    ends = [double(belongs(part.contiguous())) for part in semantic.unbind(1)]
     # What one region loses between the ends of a pair, another gains; across an edge of colour it counts little.
     change = ends[0] - ends[1]
     even = torch.exp(-double(colour[:, 0] - colour[:, 1]).abs().amax(1).square() / (2 * _ALIKE**2))

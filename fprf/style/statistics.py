@@ -249,26 +249,19 @@ def _lloyd(points: Tensor, mass: Tensor, centres: Tensor, steps: int) -> tuple[T
 
 def _seed(points: Tensor, mass: Tensor, k: int, generator: torch.Generator) -> Tensor:
     """Draw centres by weight x squared distance to the nearest so far (k-means++); fewer if points run out."""
+    centres: list[Tensor] = []
+    odds, distance = mass, torch.full_like(mass, torch.inf)
     # One number a centre, drawn on the CPU: the same on every device.
-    draws = torch.rand(k, generator=generator, dtype=torch.float64).to(points.device)
-    chosen = _draw(mass, draws[0])
-    centres = [points[chosen]]
-    distance = (points - centres[0]).square().sum(1)
-    for draw in draws[1:]:
-        # No row is left that is not a centre already: fewer clusters than asked for.
+    for draw in torch.rand(k, generator=generator, dtype=torch.float64).to(points.device):
+        # Rounding of the sum cannot land on odds of 0.
+        edges = odds.cumsum(0)
+        index = torch.searchsorted(edges, draw * edges[-1], right=True).clamp_max(len(odds) - 1)
+        centres.append(points[index if bool(odds[index] > 0) else odds.argmax()])
+        distance = distance.minimum((points - centres[-1]).square().sum(1))
         odds = mass * distance
         if not bool(odds.any()):
-            break
-        centres.append(points[_draw(odds, draw)])
-        distance = distance.minimum((points - centres[-1]).square().sum(1))
+            break  # no row is left that is not a centre already: fewer clusters than asked for
     return torch.stack(centres)
-
-
-def _draw(odds: Tensor, draw: Tensor) -> Tensor:
-    """Draw an index by odds, with `draw` in [0, 1). Rounding of the sum cannot land on odds of 0."""
-    edges = odds.cumsum(0)
-    index = torch.searchsorted(edges, draw * edges[-1], right=True).clamp_max(len(odds) - 1)
-    return index if bool(odds[index] > 0) else odds.argmax()
 
 
 def _nearest(points: Tensor, centres: Tensor) -> Tensor:

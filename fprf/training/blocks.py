@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from ..blocks.fields import BlockedField, BlockedSampler, BlockedSemantic, Member, Members, ResidentMembers, inherit
 from ..blocks.partition import read_cells, write_cells
-from ..blocks.routing import BlendRouter, InsetRouter, Router, SingleRouter, chart_of, surroundings_of
+from ..blocks.routing import BlendRouter, InsetRouter, Router, chart_of, surroundings_of, to_single
 from ..blocks.visibility import Plan, pixel_mask
 from ..config import FREE_IN_BLOCKS, TrainConfig, fields_only
 from ..datamanagers.basis import Basis
@@ -103,7 +103,7 @@ def surroundings(config: TrainConfig, facts: Facts, cells: Sequence[Cell]) -> Bu
     decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
     member = Member(surroundings_of(cells), *build_fields(config, facts))
     tones, poses = tones_of(facts), poses_of(facts, config.poses)
-    model = assemble(config, facts, ResidentMembers([member]), SingleRouter(), decoder, tones, poses)
+    model = assemble(config, facts, ResidentMembers([member]), to_single, decoder, tones, poses)
     check_parts(config, model.parts, facts.channels, facts.dim)
     return Built(model, member)
 

@@ -12,12 +12,11 @@ from ..config import RunConfig, TrainConfig, fields_only
 from ..datamanagers.basis import Basis
 from ..datamanagers.scene import Scene as ParsedScene
 from ..errors import CheckpointError, PluginError, WeightsError
-from ..interfaces import Decoder, Scene, Stylizer, Values
+from ..interfaces import Decoder, Scene, Values
 from ..plugins.registry import entry, load_object
-from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.cameras import Cameras
-from ..style.dictionary import Encoders, StyleDictionary
-from ..style.look import ColourMaps, Restyle, colour_maps
+from ..style.dictionary import Encoders
+from ..style.look import Restyle
 from ..style.scene_style import SceneStyle, from_tensors
 from ..types import Origin, View
 from . import checkpoint
@@ -161,19 +160,6 @@ class Trained(Scene):
         device, longest = self.device, int(self.cameras.size.amax())
         moved = None if semantic is None else semantic.to(device)
         return Encoders(content.to(device), moved, basis, style, device, longest, config.datamanager.guided, config.seed)
-
-    def colour_maps(
-        self,
-        stylizer: Stylizer,
-        dictionary: StyleDictionary,
-        style: SceneStyle,
-        config: StylizerConfig,
-        allowed: Annotated[Tensor, "K references"],
-    ) -> ColourMaps | None:
-        decoder, smoothing = self.model.decoder, config.smoothing(style, allowed)
-        return colour_maps(
-            stylizer, dictionary, style, decoder, features=config.features, share=config.colours, smoothing=smoothing
-        )
 
 
 def open_run(root: Path, device: str = "auto", quality: QualityConfig | None = None) -> LoadedRun[Scene]:

@@ -14,12 +14,7 @@ from torch import Tensor
 
 from benchmarks.semantic_matching import matching_rate
 from benchmarks.steadiness import published, steadiness
-from benchmarks.style_metrics import (
-    RegionStatistics,
-    delta_e_2000,
-    gaussian_distance,
-    structure,
-)
+from benchmarks.style_metrics import RegionStatistics, delta_e_2000, gaussian_distance, structure
 from benchmarks.town.layout import build_town
 from benchmarks.town.palettes import palette
 from benchmarks.town.render import geometry, render, walk

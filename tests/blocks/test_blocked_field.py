@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from fprf.blocks.fields import BlockedField, BlockedSampler, BlockedSemantic, Member, ResidentMembers, emission, inherit
-from fprf.blocks.routing import BlendRouter, Chart, Group, InsetRouter, SingleRouter, chart_of, shares, surroundings_of, window
+from fprf.blocks.routing import BlendRouter, Chart, Group, InsetRouter, chart_of, shares, surroundings_of, to_single, window
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.fields.planes import Planes
 from fprf.plugins.samplers.config import ProposalConfig
@@ -156,7 +156,7 @@ def test_the_sampler_asks_the_blocks_where_to_look() -> None:
     for level in range(2):
         itself.fields[level] = Charted(parts[1].sampler.fields[level])
     r = rays()
-    lone = BlockedSampler(SAMPLER.build(seed=9), ResidentMembers([parts[1]]), SingleRouter())
+    lone = BlockedSampler(SAMPLER.build(seed=9), ResidentMembers([parts[1]]), to_single)
     found = lone(r, space=SPACE, step=0, generator=None)
     wanted = itself(r, space=SPACE, step=0, generator=None)
     assert torch.equal(found.t, wanted.t) and len(found.levels) == len(wanted.levels) == 2

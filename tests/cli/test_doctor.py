@@ -154,12 +154,8 @@ def write_scene(folder: Path, points: tuple[float, ...] = (0, 0, 0)) -> Path:
     return folder
 
 
-def findings(folder: Path) -> dict[str, Finding]:
-    return {finding.what: finding for finding in scene_folder(folder)}
-
-
 def test_a_scene_without_faults_has_none(tmp_path: Path) -> None:
-    found = findings(write_scene(tmp_path / "s"))
+    found = _by_name(scene_folder(write_scene(tmp_path / "s")))
     assert set(found) == {"format", "views", "split", "points", "next"}
     assert not any(finding.remedy for finding in found.values())
     assert found["points"].found.startswith("400 ") and "10 of 10" in found["points"].found
@@ -170,15 +166,15 @@ def test_what_was_left_out_is_told(tmp_path: Path) -> None:
     content = json.loads((folder / "transforms.json").read_text())
     content["frames"][3]["fl_x"] = np.nan
     (folder / "transforms.json").write_text(json.dumps(content))
-    found = findings(folder)
+    found = _by_name(scene_folder(folder))
     assert "1 of 12" in found["note"].found and found["views"].found.startswith("11 ")
 
 
 def test_points_that_no_view_sees_are_told(tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "s", points=(0, 0, 50))
-    assert "0 of 10" in findings(folder)["points"].found and findings(folder)["points"].optional
+    assert "0 of 10" in _by_name(scene_folder(folder))["points"].found and _by_name(scene_folder(folder))["points"].optional
     (folder / "points.npz").unlink()
-    assert findings(folder)["points"].found.startswith("none")
+    assert _by_name(scene_folder(folder))["points"].found.startswith("none")
 
 
 @pytest.mark.parametrize("value", [0, 255, 128])
@@ -189,7 +185,7 @@ def test_masks_that_say_nothing_are_told(tmp_path: Path, value: int) -> None:
         mask = np.full((96, 96), value if value != 128 else 0, np.uint8)
         mask[:48] = 255 if value == 128 else value
         Image.fromarray(mask).save(folder / f"masks/{k:02d}.png")
-    mask = findings(folder).get("masks")
+    mask = _by_name(scene_folder(folder)).get("masks")
     assert mask is None if value == 128 else mask is not None and mask.optional == (value == 255)
 
 
@@ -197,4 +193,4 @@ def test_damaged_images_are_named(tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "s")
     data = (folder / "images/06.png").read_bytes()
     (folder / "images/06.png").write_bytes(data[: len(data) // 2])
-    assert "06.png" in findings(folder)["images"].found and not findings(folder)["images"].optional
+    assert "06.png" in _by_name(scene_folder(folder))["images"].found and not _by_name(scene_folder(folder))["images"].optional

@@ -14,7 +14,7 @@ from safetensors.torch import load_file
 from tiny_world import World
 
 from fprf.cli import main as cli
-from fprf.cli.style_flags import named_styles, read_flags
+from fprf.cli.style_flags import read_flags
 from fprf.errors import ConfigError, DataError, UsageError
 from fprf.io import tensorfiles
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig
@@ -109,15 +109,13 @@ def test_explain_lists_regions_and_renders_nothing(run: Path, world: World, caps
 
 
 def test_match_maps_alone(run: Path, world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["--match-only", "--views", "0003", "0001", "--pixels", "--clusters", "2"]
+    words = ["--match-only", "--views", "0003", "0001", "--clusters", "2"]
     made = stylize(run, world, tmp_path / "m", *words)["made"]
-    kinds = ("match.png", "score.png", "confidence.png", "entropy.png", "match.npz")
+    kinds = ("match.png", "score.png", "confidence.png", "entropy.png")
     expected = {f"{view}-{kind}" for view in ("0001", "0003") for kind in kinds}
     assert {p.name for p in (tmp_path / "m").iterdir()} == expected | {"dictionary.safetensors", "style.json"}
     assert made.keys() == MADE - {"seconds_per_view"} and made["matches"].keys() == {"0003", "0001"}
     assert "2 match maps in" in capsys.readouterr().out
-    with np.load(tmp_path / "m" / "0003-match.npz") as file:
-        assert file["reference"].shape == (24, 32)
     stylize(run, world, tmp_path / "both", "--match-only", "--explain")
     assert {"explain.json", "0000-score.png"} < {p.name for p in (tmp_path / "both").iterdir()}
 
@@ -198,9 +196,3 @@ def test_a_preset_lies_over_the_file_and_below_the_flags(file: Path, capsys: pyt
 def test_every_preset_is_what_its_flags_say(name: str) -> None:
     assert read("RUN", f"--{name}")[1] == read("RUN", *preset_flags(name).split())[1]
     assert with_preset(StyleConfig(), name) != StyleConfig()
-
-
-@pytest.mark.parametrize("text", ["dusk", "=a.jpg", "dusk=", "du sk=a.jpg", "../x=a.jpg"])
-def test_other_forms_of_named_styles_are_refused(text: str) -> None:
-    with pytest.raises(UsageError):
-        named_styles([text], StyleFile(StyleConfig()))

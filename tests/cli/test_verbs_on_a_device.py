@@ -56,10 +56,10 @@ def same(here: Path, there: Path) -> None:
 
 
 def between(world: World, folder: Path) -> list[str]:
-    """A style on the way to another, with regions that are kept and pinned, and numbers for every pixel."""
+    """A style on the way to another, with regions that are kept and pinned."""
     style = {"format": 1, "style": {"references": [str(world.references[1])], "clusters": 3}}
     (folder / "other.json").write_text(json.dumps(style))
-    controls = "--keep 0 --pin 1=dusk.png --forbid 2=snow.png --strength 0.7 --luminance 0.5 --at 0.3 --pixels --output OUT"
+    controls = "--keep 0 --pin 1=dusk.png --forbid 2=snow.png --strength 0.7 --luminance 0.5 --at 0.3 --output OUT"
     return [*references(world), "--between", str(folder / "other.json"), *controls.split()]
 
 

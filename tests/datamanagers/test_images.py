@@ -14,20 +14,10 @@ import cv2
 import numpy as np
 import pytest
 from capture_files import Capture, write_image, write_transforms
-from hypothesis import HealthCheck, settings
-from hypothesis import given as examples
-from hypothesis import strategies as st
 from photo_files import HEIC, oriented, turned_jpeg, upright
 from PIL import Image, ImageCms
 
-from fprf.datamanagers.images import (
-    image_names,
-    load_image,
-    load_mask,
-    photographs,
-    read_header,
-    useless_masks,
-)
+from fprf.datamanagers.images import image_names, load_image, load_mask, photographs, read_header, useless_masks
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import DataError
 
@@ -280,20 +270,6 @@ def test_profiles_that_say_nothing_change_nothing(tmp_path: Path) -> None:
         for kept, data in ((said, "with"), (None, "without")):
             (tmp_path / data).write_bytes(saved(image, "TIFF", icc_profile=kept))
         assert np.array_equal(load_image(tmp_path / "with"), load_image(tmp_path / "without")), name
-
-
-@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@examples(st.binary(max_size=200), st.integers(0, 60))
-def test_a_damaged_exif_block_does_no_harm(tmp_path: Path, noise: bytes, cut: int) -> None:
-    """No warning either: warnings are errors here."""
-    plain = saved(PICTURE, "JPEG", **SOUND)
-    exif = Image.Exif()
-    exif[0x0110], exif[0x0112] = "Phone 9", 6
-    block = exif.tobytes()[:cut] + noise
-    path = tmp_path / "a.jpg"
-    path.write_bytes(plain[:2] + b"\xff\xe1" + struct.pack(">H", len(block) + 2) + block + plain[2:])
-    assert np.abs(load_image(path).astype(int) - COLOURS).max() <= 2
-    assert sorted(load_image(path, upright=True).shape[:2]) == [64, 96]
 
 
 def test_heic_comes_upright_and_needs_its_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -31,7 +31,7 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").r
 RUN = ("eval", "stylize", "restyle", "render", "gallery", "export", "plugins", "doctor")
 """Verbs whose commands are run here."""
 PARSED = {
-    "demo": "minutes; tests/cli/test_demo_verb.py runs it small",
+    "demo": "minutes; tests/cli/test_scene_verbs.py runs it small",
     "process": "needs pycolmap; tests/reconstruction/test_colmap.py runs it",
     "train": "minutes; run below with `-m slow`",
     "view": "stays up; tests/page run it",

@@ -2,6 +2,11 @@
 against float64 in values and gradients; nothing written to its inputs.
 """
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 from operator_cases import CASES, Case
@@ -86,3 +91,18 @@ def test_autocast_does_not_lower_the_precision(case: Case) -> None:
     for one, plain, other in zip(found, usual, exact, strict=True):
         assert one.dtype == plain.dtype
         check_close(case, one, other)
+
+
+HERE = Path(__file__).parent
+KERNELS = ("dense", "guided", "rasterise", "triplane")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_no_index_leaves_its_array(tmp_path: Path) -> None:
+    files = [str(HERE / f"test_{name}.py") for name in KERNELS]
+    settings = {"NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *files]
+    done = subprocess.run(command, env=os.environ | settings, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-3000:]
+    assert any(tmp_path.rglob("*.nbc")), "compiled anew, with the checks"

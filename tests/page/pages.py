@@ -9,9 +9,10 @@ import torch
 from fprf.io.images import to_uint8
 from fprf.page.writer import Page, PageView, Reference, Style, write_page
 from fprf.plugins.encoders.config import BundledSemanticConfig
+from fprf.splats.captures import look_at_capture
 from fprf.splats.config import LookConfig
 from fprf.splats.gaussians import Gaussians
-from fprf.splats.scene import SplatScene, look_at_capture
+from fprf.splats.scene import SplatScene
 
 
 def seen(gaussians: Gaussians, antialiased: bool = True, views: int = 4) -> SplatScene:

@@ -1,4 +1,4 @@
-"""The paper's losses against their formulas, and what they are 0 for."""
+"""Photographs, features of the teachers, and the losses of the paper against their formulas."""
 
 from pathlib import Path
 
@@ -6,9 +6,10 @@ import pytest
 import torch
 import torch.nn.functional as F
 from network_files import vgg_convolutions
+from photo_folder import photo_folder
 from safetensors.torch import save_file
 
-from fprf.errors import WeightsError
+from fprf.errors import DataError, WeightsError
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.plugins.encoders.vgg import VggEncoder
 from fprf.pretraining.decoder import (
@@ -19,7 +20,7 @@ from fprf.pretraining.decoder import (
     restyling_losses,
     style_statistics,
 )
-from fprf.pretraining.photos import find_photos, load_photo
+from fprf.pretraining.photos import filtered_at, filtered_whole, find_photos, load_photo, random_pixels, split
 
 PLACES = dict(zip((0, 2, 5, 7, 10, 12, 14, 16, 19), (4, 4, 6, 6, 8, 8, 8, 8, 10), strict=True))
 """Filters of each convolution."""
@@ -91,3 +92,38 @@ def test_gradients_reach_the_decoder_alone(photos: Path) -> None:
     for loss in losses:
         (gradient,) = torch.autograd.grad(loss, [decoder.weight], retain_graph=True)
         assert bool(gradient.isfinite().all()) and float(gradient.abs().sum()) > 0
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return photo_folder(tmp_path_factory.mktemp("photos") / "all", 13)
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_photos_are_found_at_every_depth_in_an_order_of_their_own(folder: Path, tmp_path: Path) -> None:
+    (folder / "notes.txt").write_text("no photograph")
+    found = find_photos([folder])
+    assert sorted(path.name for path in found) == sorted(f"{index}.png" for index in range(13))
+    assert [path.name for path in find_photos([photo_folder(tmp_path / "b", 13)])] == [path.name for path in found]
+    learn, held = split(found)
+    assert len(held) == 1
+    assert not set(learn) & set(held)
+    assert len(learn) + len(held) == 13
+
+
+def test_filtered_pixels_are_those_of_the_whole_image(folder: Path) -> None:
+    photo, encoder = load_photo(find_photos([folder])[0]), RandomConfig(channels=3, stride=2).build()
+    pixels = random_pixels(photo, 40, generator())
+    features, rgb = filtered_at(encoder, photo, pixels)
+    assert torch.equal(rgb, photo[pixels[:, 0], pixels[:, 1]])
+    all_of_them = filtered_whole(encoder, photo).view(*photo.shape[:2], 3)
+    torch.testing.assert_close(features, all_of_them[pixels[:, 0], pixels[:, 1]], rtol=1e-4, atol=1e-5)
+
+
+def test_missing_folders_and_photographs_are_named(tmp_path: Path) -> None:
+    for folder in (tmp_path / "absent", tmp_path):
+        with pytest.raises(DataError, match=folder.name):
+            find_photos([folder])

@@ -65,6 +65,7 @@ def test_a_damaged_exif_block_is_no_fault(tmp_path: Path, noise: bytes, cut: int
     block = block[:cut] + noise + block[cut + len(noise) :]
     rest = whole[start + length - 2 :]
     (tmp_path / "b.jpg").write_bytes(whole[: start - 2] + (len(block) + 2).to_bytes(2, "big") + block + rest)
+    assert sorted(load_image(tmp_path / "b.jpg", upright=True).shape) == [3, 8, 12]
     lens = read_lens(tmp_path / "b.jpg")
     assert isinstance(lens.model, str) and 0 <= lens.focal < np.inf and lens.focal_35 >= 0
     assert json.dumps(lens) == json.dumps(list(lens)), "it goes into a file"

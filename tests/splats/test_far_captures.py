@@ -11,8 +11,8 @@ from moved_scene import UTM
 from splat_ball import ball, plain_ply
 
 from fprf.rendering.local_frame import offset_file, read_offset
-from fprf.splats.files import read_capture, write_capture, write_gaussians, write_ply_parts
-from fprf.splats.gaussians import Gaussians
+from fprf.splats.files import read_capture, write_capture, write_gaussians
+from fprf.splats.gaussians import GaussianRows, Gaussians
 from fprf.splats.views import clip_distance, find_views, seen_means
 
 ENDINGS = {"ply": 1e-6, "splat": 1e-6, "spz": 2e-6, "sog": 1e-4, "compressed.ply": 2e-3}
@@ -50,7 +50,7 @@ def test_parts_of_a_large_file_are_the_file(tmp_path: Path, monkeypatch: pytest.
     made = ball(50)
     for local in (False, True):
         write_gaussians(tmp_path / "a.ply", made, origin=UTM, local=local)
-        write_ply_parts(tmp_path / "b.ply", made.select, 50, origin=UTM, local=local)
+        write_gaussians(tmp_path / "b.ply", GaussianRows(50, made.select, False), origin=UTM, local=local)
         assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
         assert read_offset(tmp_path / "a.ply") == read_offset(tmp_path / "b.ply") == (UTM if local else (0, 0, 0))
     write_gaussians(tmp_path / "c.ply", made)

@@ -12,10 +12,7 @@ from hypothesis import strategies as st
 
 import fprf.splats.plan as module
 from fprf.cli.main import main
-from fprf.splats import photographs
 from fprf.splats.config import GaussiansConfig
-from fprf.splats.photographs import load_photographs, make_levels
-from fprf.training.prepare import read_scene
 
 CONFIG = GaussiansConfig()
 
@@ -48,32 +45,12 @@ def test_a_dozen_large_photographs(minutes: float, size: int) -> None:
     assert planned(replace(CONFIG, minutes=minutes), views=11).downscale == size
 
 
-def test_a_faster_machine_is_given_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    few = planned(replace(CONFIG, minutes=3)).most
-    monkeypatch.setattr(module, "machine_speed", lambda: 8.0)
-    assert planned(replace(CONFIG, minutes=3)).most > few
-
-
 def test_what_is_given_stays() -> None:
     given = replace(CONFIG, minutes=1, downscale=7, cap=12_345, passes=9, steps=77)
     assert planned(given) == given
     assert planned(replace(CONFIG, minutes=60, longest=800)).downscale == 4
     without = planned(replace(CONFIG, steps=100))
     assert without.downscale == 2 and without.most == 60_000 and without.limited(30) == 100
-
-
-def test_targets_made_again_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Photographs that did not fit into what is kept between steps."""
-    config = GaussiansConfig(data=Path("garden"), downscale=8)
-    scene = read_scene(config)
-    images, masks, skies = load_photographs(config, scene, scene.train.tolist())
-    whole = make_levels(scene, images, masks, 0.01, skies)
-    first = [[level[view] for view in level] for level in whole]
-    monkeypatch.setattr(photographs, "_KEPT", 1)
-    for level, before in zip(make_levels(scene, images, masks, 0.01, skies), first, strict=True):
-        for view, old in zip(level, before, strict=True):
-            for a, b in zip(level[view], old, strict=True):
-                assert a is b is None or (a == b if isinstance(a, int) else (a == b).all())  # type: ignore[union-attr]
 
 
 def test_views_are_judged_at_the_size_of_the_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,18 +11,19 @@ import torch
 from splat_ball import ball
 
 from fprf.cli import main as cli
-from fprf.errors import CheckpointError, ConfigError, DataError, UsageError
+from fprf.errors import ConfigError, DataError, UsageError
 from fprf.interfaces import Encoder
 from fprf.ops.harmonics import as_drawn
 from fprf.ops.harmonics import spherical_harmonics as functions
 from fprf.plugins.encoders.config import BundledSemanticConfig, RandomConfig
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
+from fprf.splats.captures import look_at_capture, open_capture
 from fprf.splats.config import LookConfig
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.gaussians import HARMONIC, Gaussians
 from fprf.splats.photographs import camera_of
 from fprf.splats.restyle import all_around
-from fprf.splats.scene import SplatScene, load_scene, look_at_capture, scene_tensors
+from fprf.splats.scene import SplatScene
 from fprf.splats.views import draw, find_views
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile, write_style
@@ -171,12 +172,16 @@ def test_luminance_is_kept_and_styles_mix(scene: SplatScene, photographs: list[P
     assert int(free.sum()) > 50 and torch.allclose(mixed[free], (0.75 * a + 0.25 * b)[free], atol=1e-4)
 
 
-def test_a_scene_that_was_kept_gives_the_same_colours(scene: SplatScene, encoder: Encoder, photographs: list[Path]) -> None:
-    again = load_scene(scene_tensors(scene), scene.gaussians, False, encoder)
-    assert torch.equal(styled(again, photographs[0]), styled(scene, photographs[0]))
-    for gaussians, other in ((ball(10), encoder), (scene.gaussians, RandomConfig().build())):
-        with pytest.raises(CheckpointError):
-            load_scene(scene_tensors(scene), gaussians, False, other)
+def test_what_the_cache_knows_of_a_capture_gives_the_same_colours(photographs: list[Path], tmp_path: Path) -> None:
+    write_gaussians(tmp_path / "a.ply", ball(400))
+    capture, look, said = read_capture(tmp_path / "a.ply"), LookConfig(views=6, size=(96, 72), regions=4), list[str]()
+    first = styled(open_capture(capture, look, cache=tmp_path / "cache"), photographs[0])
+    (kept,) = (tmp_path / "cache").iterdir()
+    for damaged in (False, True):
+        if damaged:
+            kept.write_bytes(kept.read_bytes()[:-1])
+        again = open_capture(capture, look, cache=tmp_path / "cache", say=said.append)
+        assert torch.equal(styled(again, photographs[0]), first) and bool(said) == damaged
 
 
 def test_objects_are_seen_from_around_and_rooms_from_within() -> None:

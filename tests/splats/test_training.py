@@ -3,95 +3,45 @@
 import json
 import math
 import shutil
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from learning import STEPS, stepped
 from splat_ball import equal
 from torch import Tensor
 
 import fprf
-from benchmarks.town.write import write_town
 from fprf.cli.main import main
-from fprf.datamanagers.images import load_image, load_images
+from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import Scene
-from fprf.evaluation.metrics import psnr
 from fprf.interfaces import State
 from fprf.io.images import write_image
 from fprf.ops.rasterise.rendering import lift
 from fprf.ops.rasterise.training import LOG_SCALES, TrainableGaussians
 from fprf.plugins.encoders.config import SEMANTICS, RandomConfig
-from fprf.rendering.cameras import Cameras, ideal_cameras, project
-from fprf.splats import initial, photographs, training
+from fprf.rendering.cameras import Cameras
+from fprf.splats import photographs, training
 from fprf.splats.config import GaussiansConfig
 from fprf.splats.files import read_capture
 from fprf.splats.gaussians import Gaussians, tensors_of
 from fprf.splats.learner import GaussianLearner
 from fprf.splats.photographs import camera_of
-from fprf.splats.training import build, scene_scale
-from fprf.splats.views import draw
+from fprf.splats.training import build
 from fprf.training import checkpoint, driver
 from fprf.training.camera_optimizers import Tones, moved_cameras
 from fprf.training.loading import open_run
 
-STEPS = 260
-
-
-def learnt(
-    config: GaussiansConfig, scene: Scene, begin: int = 0, end: int = STEPS, before: GaussianLearner | None = None
-) -> GaussianLearner:
-    learner = build(config, scene)
-    if before is not None:
-        learner.load(before.state())
-    stepped(learner, end, begin)
-    return learner
-
-
-def stepped(learner: GaussianLearner, end: int, begin: int = 0) -> None:
-    for step in range(begin, end):
-        learner.step(step, step / STEPS)
-        assert not learner.failed
-
-
-@pytest.fixture(scope="module")
-def config(tmp_path_factory: pytest.TempPathFactory) -> GaussiansConfig:
-    town = tmp_path_factory.mktemp("splats") / "town"
-    write_town(town, seed=0, palette="day", views=10, width=32, height=24)
-    small = GaussiansConfig(data=town, initial=300, cap=600, surroundings=50, pixels_per_gaussian=1)
-    return replace(small, relocate_every=20, degree=1)
-
-
-@pytest.fixture(scope="module")
-def scene(config: GaussiansConfig) -> Scene:
-    return parse_scene(config.data, 1, None)
-
-
-@pytest.fixture(scope="module")
-def trained(config: GaussiansConfig, scene: Scene) -> GaussianLearner:
-    return learnt(config, scene)
-
-
-def test_it_learns_views_that_it_has_not_seen(config: GaussiansConfig, scene: Scene, trained: GaussianLearner) -> None:
-    images = load_images(scene)
-
-    def quality(found: Gaussians) -> float:
-        drawn = {view: draw(found, camera_of(scene.cameras, view), antialiased=True).image for view in scene.test.tolist()}
-        truth = {view: torch.from_numpy(images[view]).float() / 255 for view in drawn}
-        return float(np.mean([psnr(image.clamp(0, 1), truth[view]) for view, image in drawn.items()]))
-
-    before = quality(build(config, scene).gaussians())
-    assert quality(trained.gaussians()) > before + 2
-    assert 590 <= len(trained.gaussians()) <= 600
-
 
 def test_it_goes_on_bit_for_bit(config: GaussiansConfig, scene: Scene) -> None:
     asked = replace(config, tones=True, poses=1e-3)
-    half = learnt(asked, scene, 0, 30)
-    assert equal(learnt(asked, scene, 30, 60, half).gaussians(), learnt(asked, scene, 0, 60).gaussians())
+    half, whole, again = (build(asked, scene) for _ in range(3))
+    again.load(stepped(half, 0, 30).state())
+    assert equal(stepped(again, 30, 60).gaussians(), stepped(whole, 0, 60).gaussians())
 
 
 SECOND: dict[str, Any] = {
@@ -108,7 +58,7 @@ def test_every_field_changes_something(config: GaussiansConfig, scene: Scene, tm
         write_image(tmp_path / "mask.png", np.zeros((height, width, 3), np.uint8))
         scene = replace(scene, masks=(tmp_path / "mask.png",) * len(scene.paths))
     end = STEPS if name in ("cap", "grow", "relocate_every", "pixels_per_gaussian") else 3
-    first, second = (learnt(each, scene, 0, end) for each in (config, replace(config, **{name: SECOND[name]})))
+    first, second = (stepped(build(each, scene), 0, end) for each in (config, replace(config, **{name: SECOND[name]})))
     assert not equal(first.gaussians(), second.gaussians())
 
 
@@ -127,7 +77,7 @@ def test_colours_that_no_view_shows_fall_back_to_their_mean(config: GaussiansCon
     start = learner.gaussians()
     faint = replace(start, logits=torch.full_like(start.logits, -20), harmonics=torch.ones_like(start.harmonics))
     learner.start_from(faint)
-    stepped(learner, 100)
+    stepped(learner, 0, 100)
     after = learner.gaussians().harmonics
     assert torch.equal(after[:, 0], faint.harmonics[:, 0])
     assert float(after[:, 1:].min()) == float(after[:, 1:].max()) == pytest.approx(math.exp(-0.06 * 3.96), abs=0.01)
@@ -193,7 +143,7 @@ def test_tones_are_told_from_the_scene(config: GaussiansConfig, scene: Scene) ->
     for level in learner.levels:
         for view, target in level.items():
             target.planes[: 3 * target.area].reshape(3, target.area)[:] *= wanted[view].exp().numpy()[:, None]
-    stepped(learner, STEPS)
+    stepped(learner)
     train = scene.train
     assert learner.tones is not None
     found = learner.tones(train).log().detach()
@@ -209,7 +159,7 @@ def test_poses_that_are_off_are_found(config: GaussiansConfig, scene: Scene) -> 
     turn[scene.test] = 0
     moves = torch.cat([turn, torch.zeros_like(turn)], 1)
     off = replace(scene, cameras=moved_cameras(scene.cameras, moves))
-    learner = learnt(replace(config, poses=5e-3), off)
+    learner = stepped(build(replace(config, poses=5e-3), off))
     assert learner.poses is not None
     found = learner.poses.refined(off.cameras)
     assert torch.equal(found.pose[scene.test], scene.cameras.pose[scene.test])
@@ -231,7 +181,7 @@ def test_nothing_floats_before_a_sky_that_is_masked(config: GaussiansConfig, sce
 
     def before_the_sky(masks: bool) -> float:
         """Weight of all but the surroundings in the upper third of the views."""
-        found = learnt(replace(config, masks=masks), masked).gaussians()
+        found = stepped(build(replace(config, masks=masks), masked)).gaussians()
         sky, seen = torch.from_numpy(above[..., :1] / 255).float(), torch.zeros(len(found), 1)
         for view in scene.train.tolist():
             seen += lift(*list(vars(found).values())[:4], camera_of(scene.cameras, view), sky, antialiased=True)
@@ -370,47 +320,6 @@ def test_what_gaussians_do_not_know_is_refused_in_one_line(
     assert len([text for text in told if text.startswith("error: ")]) == 1
 
 
-def test_a_lens_moves_pixels_where_projection_says(scene: Scene) -> None:
-    """A dot drawn through `cover` and `distorted` lies where the lens maps its place; `undistorted` brings it back."""
-    distortion = torch.zeros(len(scene.paths), 6, dtype=torch.float64)
-    distortion[:, 0] = -0.2
-    cameras = replace(scene.cameras, distortion=distortion, lens=torch.ones_like(scene.cameras.lens))
-    cameras = cameras.resized(torch.tensor([[160, 120]]).expand(len(cameras), 2))
-    pose = cameras.pose[0]
-    local = torch.tensor([0.32, 0.22, -1.0], dtype=torch.float64)
-    place = pose[:, :3] @ local + pose[:, 3]
-    pixel, _ = project(cameras, torch.tensor([0]), place[None])
-    straight, _ = project(replace(cameras, lens=torch.zeros_like(cameras.lens)), torch.tensor([0]), place[None])
-    assert (pixel - straight).norm() > 1
-    turn, size = torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), -4.0)
-    dot = Gaussians(place[None].float(), turn, size, torch.full((1,), 4.0), torch.ones(1, 1, 3))
-    camera, where = photographs.cover(cameras, 0, 0.01)
-    assert where is not None
-    drawn = photographs.distorted(draw(dot, camera).image, where)
-    x, y = torch.meshgrid(torch.arange(160) + 0.5, torch.arange(120) + 0.5, indexing="xy")
-
-    def middle(image: torch.Tensor) -> torch.Tensor:
-        weight = image.sum(-1).clamp_min(0)
-        return torch.stack([(x * weight).sum(), (y * weight).sum()]) / weight.sum()
-
-    assert (middle(drawn) - pixel[0]).norm() < 0.1
-    bytes_ = (drawn.clamp(0, 1) * 255).byte().numpy()
-    back, inside = photographs.undistorted(cameras, 0, bytes_, camera_of(cameras, 0))
-    assert inside is not None and 0.8 < inside.mean() < 1.01
-    assert (middle(torch.from_numpy(back).float()) - straight[0]).norm() < 0.15
-
-
-def test_surroundings_fill_what_no_photograph_shows(scene: Scene) -> None:
-    """All directions have a Gaussian far away: grey photographs give grey surroundings, in and out of view."""
-    images = {view: np.full((24, 32, 3), 102, np.uint8) for view in scene.train.tolist()}
-    points = initial.Points(np.zeros((1, 3)), np.zeros((1, 3), np.float32))
-    far = initial.surroundings(scene, images, points, 200)
-    centre = scene.cameras.pose[scene.train][:, :, 3].mean(0).numpy()
-    direction = (far.position - centre) / np.linalg.norm(far.position - centre, axis=1, keepdims=True)
-    assert np.abs(direction.mean(0)).max() < 0.02 and np.allclose(far.colour, 0.4)
-    assert (np.linalg.norm(far.position - centre, axis=1) > 5 * np.linalg.norm(centre)).all()
-
-
 def after_a_step_of_wide_ones(config: GaussiansConfig, scene: Scene, restored: bool = False) -> tuple[Tensor, Tensor]:
     """Means of the first Gaussians, and their widths after a step that begins with 3000 times as wide ones."""
     learner = build(config, scene)
@@ -458,20 +367,6 @@ def test_the_nearest_of_many_cameras_is_found(scene: Scene, spread: float) -> No
     assert ((torch.from_numpy(widest).double().exp() / 0.25 - apart).abs() <= allowed).all()
 
 
-def test_means_move_by_what_views_see_not_by_how_far_apart_they_are(scene: Scene) -> None:
-    """Two copies of a scene far from each other are learnt at the rate of one."""
-    apart = torch.tensor([1000.0, 0.0, 0.0], dtype=torch.float64)
-    pose = scene.cameras.pose
-    moved = torch.cat([pose[:, :, :3], (pose[:, :, 3] + apart)[:, :, None]], 2)
-    columns = {each.name: torch.cat([getattr(scene.cameras, each.name)] * 2) for each in fields(Cameras)}
-    both = Cameras(**{**columns, "pose": torch.cat([pose, moved])})
-    assert scene.points is not None
-    train = torch.cat([scene.train, scene.train + len(pose)])
-    twice = replace(scene, cameras=both, train=train, points=torch.cat([scene.points, scene.points + apart]), seen=None)
-    assert scene_scale(twice) < 1.5 * scene_scale(replace(scene, seen=None))
-    assert scene_scale(replace(twice, points=None)) > 500
-
-
 def test_blurred_views_are_shown_in_every_eighth_epoch_alone(config: GaussiansConfig, scene: Scene) -> None:
     images = {view: np.zeros((24, 32, 3), np.uint8) for view in scene.train.tolist()}
     level = photographs.make_levels(scene, images, {}, 0.01)[0]
@@ -490,16 +385,3 @@ def test_blurred_views_are_shown_in_every_eighth_epoch_alone(config: GaussiansCo
         for epoch in range(7):
             first = begin + views + epoch * sharp
             assert sorted(shown(range(first, first + sharp))) == sorted(set(level) - level.blurred)
-
-
-@pytest.mark.parametrize("lens", [1, 2])
-@pytest.mark.parametrize("k", [(0.0, 0.0, 0.0), (-0.3, 0.1, 0.0), (0.2, -0.05, 0.01)])
-def test_a_pinhole_covers_all_that_a_lens_shows(lens: int, k: tuple[float, float, float]) -> None:
-    """No pixel lies outside of the pinhole's image or in its border of two pixels, and some reach that on each side."""
-    cameras = ideal_cameras(torch.eye(3, 4, dtype=torch.float64)[None], 60.0, (80, 64))
-    distortion = torch.tensor([[*k, 0.0, 0.001, -0.001]], dtype=torch.float64)
-    cameras = replace(cameras, distortion=distortion, lens=torch.tensor([lens]))
-    camera, place = photographs.cover(cameras, 0, 0.01)
-    assert place is not None
-    low, high = place.amin((0, 1)), torch.tensor([camera.width, camera.height]) - place.amax((0, 1))
-    assert (low >= 2).all() and (high >= 2).all() and (low < 3).all() and (high < 3).all()

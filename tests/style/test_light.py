@@ -10,10 +10,10 @@ from fprf.interfaces import Decoder
 from fprf.ops.harmonics import as_drawn
 from fprf.plugins.stylizers.config import RegionToneConfig
 from fprf.splats.gaussians import HARMONIC
-from fprf.splats.restyle import all_around, region_maps, restyled_harmonics
+from fprf.splats.restyle import all_around, restyled_harmonics
 from fprf.style.dictionary import Reference, build_dictionary
 from fprf.style.light import APPLIED, Light, light_maps, light_of, unrivalled
-from fprf.style.look import Restyle
+from fprf.style.look import Restyle, region_maps
 from fprf.style.scene_style import SceneStyle, scene_style
 
 KINDS, EACH = 4, 150
@@ -121,7 +121,7 @@ def shown_light(colours: Tensor) -> Tensor:
     _, _, scene = made_scene()
     light = lights(look_of(scene, reference(colours, turned=True)))
     grey = torch.full((KINDS, 3), 0.4)
-    return grey + torch.einsum("kc,kcd->kd", grey, light.matrix)
+    return grey + torch.einsum("kc,kcd->kd", grey, light.maps[:, :3])
 
 
 @pytest.mark.parametrize("tint", [(1.15, 1.0, 0.8), (0.8, 1.0, 1.2)])
@@ -142,8 +142,8 @@ def test_the_sky_follows_its_match_and_things_what_all_agree_on() -> None:
     target = torch.tensor([0.05, 0.3, 0.3, 0.9])[:, None].expand(KINDS, 3)
     d = build_dictionary([reference(OWN)], clusters=KINDS)._replace(colour_mean=target)
     even = torch.full((KINDS,), 0.25).double()
-    maps = light_maps(mean, covariance, even, torch.eye(KINDS).double(), d, even)
-    grey = torch.einsum("kc,kcd->kd", mean, maps.matrix) + maps.bias
+    maps, _ = light_maps(mean, covariance, even, torch.eye(KINDS).double(), d, even)
+    grey = torch.einsum("kc,kcd->kd", mean, maps[:, :3]) + maps[:, 3]
     assert float(grey[0, 0]) == pytest.approx(0.05, abs=0.02)
     assert float(grey[1, 0]) < 0.45 and float(grey[3, 0]) < 0.6
 
@@ -154,13 +154,13 @@ def test_half_way_from_blue_to_yellow_is_not_green() -> None:
     there[0], mean[0] = yellow, blue
     d = build_dictionary([reference(OWN)], clusters=KINDS)._replace(colour_mean=there)
     covariance, even = 0.01 * torch.eye(3).double().expand(KINDS, 3, 3), torch.full((KINDS,), 0.25).double()
-    maps = light_maps(mean, covariance, even, torch.eye(KINDS).double(), d, torch.zeros_like(even))
-    lit = mean[0] @ maps.matrix[0] + maps.bias[0]
+    maps, between = light_maps(mean, covariance, even, torch.eye(KINDS).double(), d, torch.zeros_like(even))
+    lit = mean[0] @ maps[0, :3] + maps[0, 3]
     assert float(lit[2]) > float(lit[0]) + 0.2, "it is still blue"
-    assert float(maps.between[0, 1]) < -0.02
+    assert float(between[0, 1]) < -0.02
     for p in torch.linspace(0, 1, 21).tolist():
         plain = p * yellow + (1 - p) * lit
-        mixed = plain + 4 * p * (1 - p) * maps.between[0]
+        mixed = plain + 4 * p * (1 - p) * between[0]
         assert float(mixed[1] - mixed[[0, 2]].max()) < 0.02
         assert float(mixed[1] - mixed[[0, 2]].max()) <= float(plain[1] - plain[[0, 2]].max()) + 1e-9
 

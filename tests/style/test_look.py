@@ -6,17 +6,11 @@ import pytest
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from style_cases import points, references, scene_of, setting
+from style_cases import points, references, region_adain, scene_of, setting
 from torch import Tensor
-from two_sided import region_adain
 
 from fprf.interfaces import Decoder, Stylizer
-from fprf.plugins.stylizers.config import (
-    AdainConfig,
-    LocalAdainConfig,
-    RegionOtConfig,
-    StylizerConfig,
-)
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, StylizerConfig
 from fprf.plugins.stylizers.region import TwoSidedStylizer
 from fprf.style.config import parse_place
 from fprf.style.dictionary import build_dictionary, choose, whole_style
@@ -62,7 +56,7 @@ def test_kept_regions_stay_bit_for_bit_and_the_others_are_styled() -> None:
     stylizer = AdainConfig().build(dictionary=d, scene=scene)
     look = Restyle(stylizer, 1.0, RegionWeight(scene, torch.tensor([[0.0], [1.0], [0.5]])), luminance=0.7)
     assert stylizer.needs == Want.CONTENT and look.needs == Want.CONTENT | Want.SEMANTIC
-    share = Membership(scene)(semantic)
+    share = Membership(scene.keys, scene.semantic_mean)(semantic)
     decoder = Sigmoid()
     colour, plain = look.colour(decoder, content, semantic), decoder(content)
     kept, full = share[:, 0] == 1, share[:, 1] == 1
@@ -84,7 +78,7 @@ def test_between_two_styles_features_strengths_and_luminances_are_linear(at: flo
     mixed = a.mixed(b, at)
     assert mixed.needs == Want.CONTENT | Want.SEMANTIC
     decoder, plain = Sigmoid(), Sigmoid()(content)
-    strength = 0.8, Membership(scene)(semantic) @ torch.tensor([[0.0], [1.0], [1.0]])
+    strength = 0.8, Membership(scene.keys, scene.semantic_mean)(semantic) @ torch.tensor([[0.0], [1.0], [1.0]])
     features = [content + s * (x.stylizer(content, semantic) - content) for x, s in zip((a, b), strength, strict=True)]
     wanted = keep_luminance(decoder(torch.lerp(*features, at)), plain, (1 - at) * 0.2 + at * 0.6)
     torch.testing.assert_close(mixed.colour(decoder, content, semantic), wanted, rtol=0.0, atol=1e-5)
@@ -161,7 +155,7 @@ def test_each_region_is_styled_by_what_it_may_take_from(config: StylizerConfig) 
     made = regional(d, scene, allowed, config)
     assert made.needs == Want.CONTENT | Want.SEMANTIC
     assert isinstance(made, TwoSidedStylizer) == config.handles_allowed_references
-    share = Membership(scene)(semantic)
+    share = Membership(scene.keys, scene.semantic_mean)(semantic)
     out, match = torch.zeros_like(content), torch.zeros(300, len(d.keys))
     for k in range(3):
         part, codes = choose(d, allowed[k])

@@ -7,12 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.style.matching import (
-    attention,
-    match_keys,
-    point_shares,
-    whitener,
-)
+from fprf.style.matching import attention, match_keys, point_shares, whitener
 
 
 def plain_shares(

@@ -6,16 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import NumericsError
-from fprf.style.statistics import (
-    covariance,
-    deviation,
-    empty,
-    group_moments,
-    kmeans,
-    merge,
-    moments,
-    monge,
-)
+from fprf.style.statistics import covariance, deviation, empty, group_moments, kmeans, merge, moments, monge
 
 
 def rows(n: int, c: int, *, scale: float = 1.0, offset: float = 0.0, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:

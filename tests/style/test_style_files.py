@@ -1,14 +1,12 @@
 """Style files, keyframes and what users say of regions and references: there and back, moved, shared, and mistakes."""
 
 import json
-import math
 import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import World
@@ -17,8 +15,6 @@ from fprf.errors import ConfigError, DataError, UsageError
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionToneConfig
 from fprf.style.config import NO_MASK, StyleConfig, find_reference, labels, parse_strength
 from fprf.style.files import Keyframe, StyleFile, check_photographs, fade, read_keyframes, read_style, write_style
-from fprf.style.look import blend_strength
-from fprf.style.regions import allowed_references
 from fprf.style.restyle import keyed_looks
 
 
@@ -156,10 +152,6 @@ def test_labels_are_short_and_different(paths: list[str], names: tuple[str, ...]
 @pytest.mark.parametrize(
     ("kind", "mistake"),
     [
-        *((UsageError, partial(blend_strength, torch.zeros(1, 1), torch.zeros(1, 1), s)) for s in (-0.1, 1.1, math.nan)),
-        *((UsageError, partial(allowed_references, 2, 2, pin=pin)) for pin in ({2: {0}}, {0: {2}})),
-        *((UsageError, partial(allowed_references, 2, 2, forbid=ban)) for ban in ([(0, -1)], [(1, 0), (1, 1)])),
-        (UsageError, partial(allowed_references, 2, 2, pin={1: {0}}, forbid=[(1, 0)])),
         *((ConfigError, partial(parse_strength, "region_strength", text)) for text in ("3=1.5", "3=nan", "3=much")),
         *((UsageError, partial(find_reference, text, PHOTOS)) for text in ("x", "night")),
     ],

@@ -73,10 +73,6 @@ def test_a_run_of_a_method_with_fields_of_its_own(world: World, moved: Path, tmp
         load_run(moved)
 
 
-def picture(trained: Trained) -> torch.Tensor:
-    return trained.render(trained.known.cameras, 0).rgb
-
-
 def test_eval_takes_it(world: World, tmp_path: Path) -> None:
     shutil.copytree(world.run, tmp_path / "run")
     kept = {}

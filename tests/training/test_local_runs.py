@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from block_world import small
 from moved_scene import UTM, moved_scene
 from tiny_world import World, parameters, tiny
 
@@ -112,37 +111,6 @@ def test_gaussians_are_as_good_and_lie_where_the_capture_is(world: World, splats
     again, first = parse_scene(tmp_path / "again", 1, None), parse_scene(utm, 1, None)
     there = [each.cameras.pose[:, :, 3].numpy() + each.origin for each in (again, first)]
     assert np.abs(there[0] - there[1]).max() < 1e-8
-
-
-def test_cells_and_blocks_are_in_the_local_frame(world: World, utm: Path, tmp_path: Path) -> None:
-    town = world.folder / "wide"
-    if not town.exists():
-        from benchmarks.town.write import write_town
-
-        write_town(town, seed=0, palette="day", views=10, width=96, height=72)
-    scores = []
-    for name, data in (("own", town), ("utm", moved_scene(town, tmp_path / "utm", UTM))):
-        words = [
-            "train",
-            "fprf-splats",
-            "--data",
-            str(data),
-            *SPLATS,
-            "--cells",
-            "2",
-            "--output",
-            str(tmp_path / f"{name} cells"),
-        ]
-        assert main(words) == 0
-        train(small(data, tmp_path / f"{name} blocks"), "fprf-lite", quiet=True)
-        scores.append([psnr(tmp_path / f"{name} {kind}") for kind in ("cells", "blocks")])
-    assert scores[1] == pytest.approx(scores[0], abs=0.25)
-    bounds = json.loads((tmp_path / "utm cells" / "cells.json").read_text())["cells"]
-    assert max(abs(x) for cell in bounds for x in (*cell["low"], *cell["high"]) if x is not None) < 1000
-    done = tmp_path / "utm blocks" / "blocks" / "00" / "done.json"
-    stamp = done.stat().st_mtime_ns
-    train(small(tmp_path / "utm", tmp_path / "utm blocks"), "fprf-lite", quiet=True)
-    assert done.stat().st_mtime_ns == stamp, "a finished block stays"
 
 
 def test_paths_and_places_are_given_in_the_capture_s_coordinates(world: World, splats: Path, utm: Path, tmp_path: Path) -> None:

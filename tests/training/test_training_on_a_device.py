@@ -19,6 +19,10 @@ from fprf.interfaces import DataManager
 from fprf.methods import fprf
 from fprf.ops import backend
 from fprf.plugins.samplers.config import UniformConfig
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
+from fprf.style.config import StyleConfig
+from fprf.style.files import StyleFile
+from fprf.style.restyle import apply_style
 from fprf.training import checkpoint, driver, learner
 from fprf.training.driver import Report
 from fprf.training.loading import load_run
@@ -239,6 +243,19 @@ def test_a_block_is_trained_on_a_device(block_world: BlockWorld, tmp_path: Path,
     assert found.keys() == expected.keys()
     for key, value in expected.items():
         assert (found[key] - value).double().norm() <= 1e-5 * value.double().norm(), key
+
+
+STYLIZERS = (AdainConfig(), LocalAdainConfig(), RegionOtConfig(), RegionToneConfig())
+
+
+@pytest.mark.parametrize("stylizer", STYLIZERS, ids=lambda config: type(config).__name__)
+def test_every_stylizer_is_drawn_on_a_device(world: World, stylizer: StylizerConfig) -> None:
+    style, drawn = StyleFile(StyleConfig(references=world.references, stylizer=stylizer, clusters=4)), []
+    for device, within in (("cpu", backend.plain), (str(CUDA), pretend_cuda)):
+        with within():
+            run = load_run(world.run, device)
+            drawn.append(run.restyled(apply_style(run, style).restyle).render(run.cameras, 2).rgb)
+    torch.testing.assert_close(*drawn, rtol=0, atol=1e-4)
 
 
 def test_blocks_of_a_large_scene_are_rendered_on_a_device(block_world: BlockWorld) -> None:

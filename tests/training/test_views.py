@@ -6,17 +6,12 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from style_cases import region_adain
 from tiny_world import World
-from two_sided import region_adain
 
 from fprf.config import TrainConfig
 from fprf.evaluation.metrics import psnr
-from fprf.plugins.stylizers.config import (
-    AdainConfig,
-    LocalAdainConfig,
-    RegionOtConfig,
-    StylizerConfig,
-)
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, StylizerConfig
 from fprf.rendering.cameras import ideal_cameras, pixel_grid, rays_through
 from fprf.rendering.renderer import march
 from fprf.style.config import StyleConfig

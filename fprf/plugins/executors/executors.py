@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from ...errors import PluginError
 from ...interfaces import Executor
-from ...process import keep_memory
+from ...memory import keep_memory
 from .config import RayConfig
 
 Task = TypeVar("Task")

@@ -107,7 +107,7 @@ class TwoSidedStylizer(Stylizer):
         else:
             matrix = (style_sigma / sigma).clamp_max(config.gain)
             bias = style_mean - away * matrix
-        self.membership = Membership(scene)
+        self.membership = Membership(scene.keys, scene.semantic_mean)
         self.register_buffer("centre", scene.mean.float())
         self.register_buffer("table", table.to(scene.mean))
         self.register_buffer("matrix", matrix.to(scene.mean))
@@ -127,11 +127,11 @@ class TwoSidedStylizer(Stylizer):
         """`forward`, and the regions that points belong to."""
         with full_precision(content):
             share = self.membership(content[:, :0] if semantic is None else semantic)
-            features = content.to(self.centre)
+            away = content.to(self.centre) - self.centre
             if self.matrix.ndim == 2:  # gains and biases are mixed before they are applied
-                styled = (features - self.centre) * (share @ self.matrix) + share @ self.bias
+                styled = away * (share @ self.matrix) + share @ self.bias
             else:
-                styled = mixed_maps(features, share, self.matrix, self.bias, centre=self.centre)
+                styled = mixed_maps(away, share, self.matrix, self.bias)
             return styled.to(content), share
 
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:

@@ -1,7 +1,6 @@
 """Files of 3D Gaussians, read, recoloured and written in the formats that are installed (`base.CaptureFormat`)."""
 
 import mmap
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -14,17 +13,14 @@ from ...errors import DataError
 from ...rendering.cameras import Cameras
 from ...rendering.local_frame import added_and_beside, read_offset, write_offset
 from ...types import Origin
-from ..gaussians import Gaussians, bulk_of
+from ..gaussians import GaussianRows, Gaussians, bulk_of
 from ..views import seen_means
 from .base import Capture, Data, format_of, pieces, release
-from .ply import ply_pieces
 
-__all__ = ["Capture", "Written", "read_capture", "release", "write_capture", "write_gaussians", "write_ply_parts"]
+__all__ = ["Capture", "Written", "read_capture", "release", "write_capture", "write_gaussians"]
 
 _MAPPED = 1 << 28
 """Bytes from which on files are mapped."""
-_TESTED = 1 << 12
-"""Gaussians of which it is asked at a time whether any can be drawn."""
 
 
 class Written(NamedTuple):
@@ -63,12 +59,12 @@ def read_capture(path: Path) -> Capture:
     release(data)
     if not len(capture.gaussians):
         raise DataError(f"{path}: holds no Gaussian")
-    parts = (capture.gaussians.select(slice(start, start + _TESTED)) for start in range(0, len(capture.gaussians), _TESTED))
-    if not any(bool(part.finite.any()) for part in parts):  # mostly the first part tells
+    finite = capture.gaussians.finite
+    if not bool(finite.any()):
         reasons = " and ".join(capture.gaussians.faults())
         raise DataError(f"{path}: holds no Gaussian that can be drawn, but {reasons}; export the capture again")
     # Far from 0, float32 rounds a capture to a few places along an axis; positions that were float64 have further digits.
-    local = capture.gaussians.means[capture.gaussians.finite].numpy()
+    local = capture.gaussians.means[finite].numpy()
     for axis, away in zip(local.T, np.abs(capture.shift), strict=True):
         step = float(np.spacing(np.float32(away)))
         if not away or step <= 0.05 * bulk_of(local).side or bool((axis == axis[0]).all()):
@@ -85,7 +81,7 @@ def read_capture(path: Path) -> Capture:
 
 def write_gaussians(
     path: Path,
-    gaussians: Gaussians,
+    gaussians: Gaussians | GaussianRows,
     *,
     antialiased: bool = False,
     views: Cameras | None = None,
@@ -100,9 +96,17 @@ def write_gaussians(
     .splat holds neither view dependence nor whether opacities are compensated (`antialiased`): it gets the means of what
     `views` show, or the colours over all directions where none are given. With `plain` all formats get such opacities, for
     renderers that do not compensate. Where the Gaussians' `origin` is not 0, .ply holds float64 positions in the world; the
-    others, and .ply where `local`, hold those relative to the origin, with a file beside them that says so.
+    others, and .ply where `local`, hold those relative to the origin, with a file beside them that says so. Of rows that are
+    written as .ply, not `plain`, some at a time are in memory; they say themselves whether they are `antialiased`.
     """
     form, faulty, far = format_of(path), False, 0
+    added, beside = added_and_beside(origin, local or not form.exact)
+    if isinstance(gaussians, GaussianRows):
+        if form.exact and not plain:
+            write_offset(path, beside)
+            form.write(path, form.pack_rows(gaussians, added))
+            return Written()
+        antialiased, gaussians = gaussians.antialiased, gaussians.part(slice(0, gaussians.count))
     # What the format cannot hold is left out first, so that it decides nothing about the rest.
     if not form.exact:
         finite = gaussians.finite
@@ -119,29 +123,10 @@ def write_gaussians(
         seen = seen_means(gaussians, views, antialiased=antialiased)
         gaussians = seen.gaussians(gaussians) if bare else seen.plain(gaussians)
         antialiased = False
-    added, beside = added_and_beside(origin, local or not form.exact)
     data = form.pack(gaussians, antialiased, added)
     write_offset(path, beside)
     form.write(path, data)
     return Written(faulty, far, tuple(form.notes(gaussians)))
-
-
-def write_ply_parts(
-    path: Path,
-    part: Callable[[slice], Gaussians],
-    count: int,
-    *,
-    antialiased: bool = False,
-    origin: Origin = (0.0, 0.0, 0.0),
-    local: bool = False,
-) -> None:
-    """Write the .ply of `count` Gaussians, whole or not at all; `part` gives slices of them, and no more is in memory.
-
-    Positions are those of `write_gaussians`. Raises DataError where the system refuses.
-    """
-    added, beside = added_and_beside(origin, local)
-    write_offset(path, beside)
-    format_of(path).write(path, ply_pieces(part, count, antialiased, added))
 
 
 def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N K 3"], views: Cameras | None = None) -> Written:

@@ -8,6 +8,7 @@ A reader never allocates on a file's word: what a header claims is held against 
 """
 
 import mmap
+import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +27,7 @@ from ...rendering.cameras import Cameras
 from ...rendering.local_frame import local_origin
 from ...types import Origin
 from ..config import CAPTURES, endings, format_name
-from ..gaussians import Gaussians, bulk_of, from_arrays, morton_order
+from ..gaussians import GaussianRows, Gaussians, bulk_of, from_arrays, morton_order
 
 Data: TypeAlias = bytes | mmap.mmap
 """The content of a file: large ones are mapped. Both are sliced into bytes, and read by np.frombuffer."""
@@ -36,6 +37,8 @@ Recolour: TypeAlias = Callable[[Floats, Bools], Iterable[bytes]]
 
 ROWS = 1 << 17
 """Gaussians that are decoded or encoded at a time, so that the intermediate arrays of large files stay small."""
+UNSOUND = (LookupError, TypeError, ValueError, AttributeError, RecursionError, OverflowError, struct.error)
+"""What a document that is no valid index of a format raises where it is taken apart."""
 _EDGE = 1e-6
 """Opacities of exactly 0 and 1 have no logit: both keep this distance, far below a 16-bit step."""
 _MOST = 64.0
@@ -104,6 +107,10 @@ class CaptureFormat(PluginConfig):
         """The file of these Gaussians, on the CPU, in pieces. `origin` is to be added to their positions; 0 unless `exact`."""
         raise DataError(f"{type(self).__name__}: files of this format are read, not written; name a .ply, .spz, .sog or .glb")
 
+    def pack_rows(self, rows: GaussianRows, origin: Origin) -> Iterable[bytes]:
+        """`pack` of Gaussians that need not all be in memory."""
+        return self.pack(rows.part(slice(0, rows.count)), rows.antialiased, origin)
+
     def keeps(self, gaussians: Gaussians) -> NDArray[np.bool_] | None:
         """Gaussians [N] that a file holds: all but outliers that would cost the others their precision; None = all."""
         return None
@@ -167,6 +174,17 @@ def in_world(table: NDArray[np.void], local: Floats, origin: Origin) -> NDArray[
     for name, column, of in zip("xyz", local.astype(np.float64).T, origin, strict=True):
         out[name] = column + of
     return out
+
+
+def beside(path: Path, name: str) -> bytes:
+    """The content of a file in the folder of another one that names it, or below. Raises DataError where there is none."""
+    file = path.parent / name
+    try:
+        if not file.resolve().is_relative_to(path.parent.resolve()):
+            raise DataError(f"{path}: {name!r} is no file beside it; export the capture again")
+        return file.read_bytes()
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: {name} beside it cannot be read; copy the whole folder") from error
 
 
 def release(data: Data) -> None:

@@ -33,8 +33,6 @@ _HARMONICS = [f"{_NAME}:SH_DEGREE_{degree}_COEF_{k}" for degree in range(4) for 
 _SHAPE = ("POSITION", f"{_NAME}:ROTATION", f"{_NAME}:SCALE", f"{_NAME}:OPACITY")
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-_UNSOUND = (LookupError, TypeError, ValueError, AttributeError, RecursionError, OverflowError, struct.error)
-"""What a document that is no glTF raises where it is taken apart."""
 _LEAST = 1e-30
 """Sizes are at least this, so that their logarithm is finite."""
 _DRAFTS = ("BT.", "Display-P3", "linear")
@@ -108,7 +106,7 @@ class Gltf(CaptureFormat):
                 *COUNTS,
             ):
                 raise ValueError("harmonics of degrees that are not whole, or differ")
-        except _UNSOUND as error:
+        except base.UNSOUND as error:
             raise DataError(f"{path}: no sound glTF ({error!r}); copy it again, it is damaged or of another kind") from error
         if not parts:
             raise DataError(f"{path}: a glTF without {_NAME} in its scene; it holds no 3D Gaussians")
@@ -212,17 +210,9 @@ def _binary(path: Path, document: dict[str, Any]) -> bytes:
     """The .glb of a .gltf: with its buffers, from base64 or from files in its folder, as one."""
     body, starts = b"", []
     for about in document["buffers"]:
-        content, uri = b"", about["uri"]
-        if uri.startswith("data:"):
-            content = base64.b64decode(uri.partition(",")[2], validate=True)
-        else:
-            file = path.parent / uri
-            if not file.resolve().is_relative_to(path.parent.resolve()):
-                raise DataError(f"{path}: {uri!r} is no file beside it; not a glTF to be read")
-            try:
-                content = file.read_bytes()
-            except OSError as error:
-                raise DataError(f"{path}: {uri} beside it cannot be read; copy the whole folder") from error
+        uri = about["uri"]
+        inside = uri.startswith("data:")
+        content = base64.b64decode(uri.partition(",")[2], validate=True) if inside else base.beside(path, uri)
         starts.append(len(body))
         body += content + bytes(-len(content) % 4)
     # Views keep their order; where each begins counts from the start of the joined buffer.

@@ -17,9 +17,6 @@ from . import base
 from .base import Capture, CaptureFormat, Data
 from .sog import Sog, bundle
 
-_UNSOUND = (LookupError, TypeError, ValueError, AttributeError, RecursionError)
-"""What a document that is no index raises where it is taken apart."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class StreamedSog(CaptureFormat):
@@ -42,23 +39,15 @@ class StreamedSog(CaptureFormat):
                 first, count = level["offset"], level["count"]
                 if not all(isinstance(number, int) and number >= 0 for number in (first, count, level["file"])):
                     raise ValueError(f"a leaf of {count} Gaussians from {first} on")
-                wanted.setdefault(index["filenames"][level["file"]], []).append(slice(first, first + count))
+                wanted.setdefault(str(index["filenames"][level["file"]]), []).append(slice(first, first + count))
             if index.get("environment"):
-                wanted[index["environment"]] = [slice(0, None)]
-            root = path.parent.resolve()
-            files = {name: (path.parent / name, rows) for name, rows in wanted.items()}
-            if any(not file.resolve().is_relative_to(root) for file, _ in files.values()):
-                raise ValueError("a file outside of its folder")
-        except _UNSOUND as error:
+                wanted[str(index["environment"])] = [slice(0, None)]
+        except base.UNSOUND as error:
             raise DataError(f"{path}: no sound lod-meta.json ({error!r}); not a streamed SOG, or it is damaged") from error
         # Files are read one by one; the cache knows the capture by the content of all.
         parts, archives, antialiased = [], {path.name: bytes(data)}, True
-        for name, (file, rows) in files.items():
-            try:
-                content = file.read_bytes()
-            except OSError as error:
-                raise DataError(f"{path}: {name} beside it cannot be read; copy the whole folder") from error
-            chunk = Sog().read(file, content)
+        for name, rows in wanted.items():
+            chunk = Sog().read(path.parent / name, base.beside(path, name))
             most = max(each.stop or 0 for each in rows)
             if most > len(chunk.gaussians):
                 raise DataError(f"{path}: {name} has {len(chunk.gaussians)} Gaussians, not {most}; copy the folder again")

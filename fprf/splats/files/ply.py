@@ -10,7 +10,7 @@ compressed  element `chunk`: bounds of positions, ln-scales and, mostly, colours
 """
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar, NamedTuple
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ...errors import DataError
 from ...rendering.cameras import Cameras, ideal_cameras
 from ...types import Origin
-from ..gaussians import COUNTS, Gaussians
+from ..gaussians import COUNTS, GaussianRows, Gaussians
 from . import base
 from .base import Bools, Capture, CaptureFormat, Data, Floats
 
@@ -95,7 +95,13 @@ class Ply(CaptureFormat):
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> Iterable[bytes]:
         """Exact; with an origin positions are in the world, float64."""
-        return ply_pieces(gaussians.select, len(gaussians), antialiased, origin)
+        return self.pack_rows(GaussianRows(len(gaussians), gaussians.select, antialiased), origin)
+
+    def pack_rows(self, rows: GaussianRows, origin: Origin) -> Iterator[bytes]:
+        """In pieces, of which one at a time is in memory."""
+        yield ply_head({"vertex": ply_rows(rows.part(slice(0, 1)), origin)}, rows.antialiased, rows.count)
+        for some in base.pieces(rows.count):
+            yield ply_rows(rows.part(some), origin).tobytes()
 
     def holds(self, capture: Capture, read_as: CaptureFormat) -> bool:
         """A compressed file may be called .ply: under the same ending it stays what it is."""
@@ -152,13 +158,6 @@ class CompressedPly(Ply):
     def holds(self, capture: Capture, read_as: CaptureFormat) -> bool:
         header = _header(capture.data) if isinstance(read_as, Ply) else None
         return header is not None and header.packed
-
-
-def ply_pieces(part: Callable[[slice], Gaussians], count: int, antialiased: bool, origin: Origin) -> Iterator[bytes]:
-    """The INRIA file of `count` Gaussians, of which `part` gives slices."""
-    yield ply_head({"vertex": ply_rows(part(slice(0, 1)), origin)}, antialiased, count)
-    for rows in base.pieces(count):
-        yield ply_rows(part(rows), origin).tobytes()
 
 
 def ply_rows(gaussians: Gaussians, origin: Origin) -> NDArray[np.void]:

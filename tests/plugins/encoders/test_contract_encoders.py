@@ -12,7 +12,6 @@ from network_files import vgg_file
 from torch import Tensor
 
 from fprf.errors import WeightsError
-from fprf.interfaces import Encoder
 from fprf.plugins.decoders.decoders import FOLDER as DECODERS
 from fprf.plugins.encoders.bundled import CONTENT_KIND, FOLDER, SEMANTIC_KIND
 from fprf.plugins.encoders.composed import UNITS, ConcatEncoder, unit_of
@@ -48,11 +47,6 @@ ENCODERS: dict[str, tuple[Make, int]] = {
 def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[EncoderConfig, int]:
     make, stride = ENCODERS[request.param]
     return make(tmp_path_factory.mktemp("weights")), stride
-
-
-@pytest.fixture(scope="module")
-def built(made: tuple[EncoderConfig, int]) -> tuple[Encoder, int]:
-    return made[0].build(), made[1]
 
 
 def test_the_contract_that_strangers_sign(made: tuple[EncoderConfig, int]) -> None:

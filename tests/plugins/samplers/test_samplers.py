@@ -1,4 +1,4 @@
-"""Samplers: the contract, spacing, annealing, when proposals learn, and what they find."""
+"""Samplers: spacing, annealing, when proposals learn, and what they find."""
 
 import itertools
 
@@ -11,7 +11,6 @@ from fprf.plugins.samplers.config import ProposalConfig, SamplerConfig, UniformC
 from fprf.plugins.samplers.samplers import ProposalSampler
 from fprf.rendering.space import Space
 from fprf.rendering.stepfun import interlevel
-from fprf.testing import check_sampler
 from fprf.types import Rays, Sampled
 
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -29,20 +28,6 @@ def sample(sampler: Sampler, rays: Rays, step: int | None = None, seed: int | No
     generator = None if seed is None else torch.Generator().manual_seed(seed)
     sampled: Sampled = sampler(rays, space=SPACE, step=step, generator=generator)
     return sampled
-
-
-@pytest.mark.parametrize(
-    "config",
-    [
-        UniformConfig(samples=1),
-        UniformConfig(samples=33),
-        SMALL,
-        ProposalConfig(samples=(5,), final=1, resolutions=(4,), channels=3),
-        ProposalConfig(samples=(20, 10, 6), final=4, resolutions=(4, 4, 9), padding=1.0),
-    ],
-)
-def test_the_contract(config: SamplerConfig) -> None:
-    check_sampler(config)
 
 
 @pytest.mark.parametrize("config", [UniformConfig(samples=8), SMALL])

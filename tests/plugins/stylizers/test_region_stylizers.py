@@ -6,16 +6,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from style_cases import points, scene_of, setting
-from two_sided import region_adain
+from style_cases import points, region_adain, scene_of, setting
 
-from fprf.plugins.stylizers.config import (
-    AdainConfig,
-    LocalAdainConfig,
-    RegionOtConfig,
-    RegionToneConfig,
-    StylizerConfig,
-)
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from fprf.plugins.stylizers.region import region_table
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
 from fprf.style.matching import score_spread, share_mean, unit
@@ -41,7 +34,7 @@ def test_the_map_is_its_definition(config: Config, temperature: float) -> None:
     content, semantic, scene, d = setting(n=600)
     stylizer = config(temperature=temperature, whitening=0.0, recentred=0).build(dictionary=d, scene=scene)
     assert stylizer.needs == Want.CONTENT | Want.SEMANTIC
-    share = Membership(scene)(semantic).double()
+    share = Membership(scene.keys, scene.semantic_mean)(semantic).double()
     own = own_style(scene, d.blend)
     here, there = plain_table(scene, own, temperature), plain_table(scene, d, temperature)
     f, expected = content.double(), torch.zeros(600, 6, dtype=torch.float64)

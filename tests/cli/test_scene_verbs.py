@@ -1,0 +1,226 @@
+"""`fprf render`, `gallery`, `eval` and `demo`."""
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+from unittest.mock import DEFAULT, Mock
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from tiny_world import World
+
+import fprf.methods
+from fprf.cli import main as cli
+from fprf.cli.eval import write_scalars
+from fprf.datamanagers.parsers.config import parse_scene
+from fprf.io import images
+from fprf.splats.files import read_capture
+from fprf.training.run import History
+
+CAPTURED = ["--path", "dataset", "--split", "test"]
+ORBIT = ["--path", "orbit", "--frames"]
+
+
+def pictures(folder: Path) -> dict[str, np.ndarray]:
+    return {p.name: cv2.imread(str(p)) for p in sorted(folder.glob("*.png"))}
+
+
+def render(run: Path, output: Path, *words: str) -> dict[str, np.ndarray]:
+    assert cli.main(["render", str(run), *words, "--output", str(output)]) == 0
+    return pictures(output)
+
+
+def test_captured_views_keep_their_names_and_are_those_of_eval(run: Path, tmp_path: Path) -> None:
+    frames = render(run, tmp_path / "frames", *CAPTURED)
+    assert cli.main(["eval", str(run)]) == 0
+    plain = pictures(run / "renders" / "test")
+    assert frames.keys() == plain.keys() == {"0000.png", "0008.png"}
+    assert all(np.array_equal(frames[name], plain[name]) for name in frames)
+
+
+def test_a_gif_is_a_file(run: Path, world: World, tmp_path: Path) -> None:
+    render(run, tmp_path / "a.gif", "--path", "spiral", "--frames", "2", "--references", str(world.references[0]))
+    assert (tmp_path / "a.gif").read_bytes().startswith(b"GIF89a") and len(list(tmp_path.iterdir())) == 2
+
+
+def test_several_looks_and_channels_lie_beside_each_other(run: Path, world: World, tmp_path: Path) -> None:
+    dusk = f"dusk={world.references[0]}"
+    styles = {
+        "one": [dusk], "plain": [], "two": ["plain", dusk], "all": [dusk, "--show", "colour", "depth", "normals", "match"],
+    }  # fmt: skip
+    made = [render(run, tmp_path / name, *CAPTURED, "--styles", *words) for name, words in styles.items()]
+    for one, plain, two, whole in zip(*(each.values() for each in made), strict=True):
+        assert two.shape == (24, 66, 3) and whole.shape == (24, 134, 3)
+        assert np.array_equal(two[:, :32], plain) and np.array_equal(two[:, 34:], one)
+        assert np.array_equal(whole[:, :32], one)
+
+
+def test_frames_that_are_there_are_not_made_again(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "frames"
+    whole = render(run, out, *ORBIT, "4")
+    stamps = {path.name: path.stat().st_mtime_ns for path in out.glob("*.png")}
+    (out / "00002.png").unlink()
+    capsys.readouterr()
+    again = render(run, out, *ORBIT, "4")
+    assert "3 of 4 frames are there already" in capsys.readouterr().out
+    after = {path.name: path.stat().st_mtime_ns for path in out.glob("*.png")}
+    assert [name for name in stamps if stamps[name] != after[name]] == ["00002.png"]
+    assert all(np.array_equal(whole[name], picture) for name, picture in again.items())
+    others = render(run, out, *ORBIT, "4", "--show", "depth")
+    assert "are there already" not in capsys.readouterr().out, "other frames are other frames"
+    assert not any(np.array_equal(whole[name], picture) for name, picture in others.items())
+
+
+def test_an_interrupted_film_goes_on(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    film = tmp_path / "x.mp4"
+    args = ["render", str(run), *ORBIT, "4", "--output", str(film)]
+    write = Mock(wraps=images.write_image, side_effect=[DEFAULT, DEFAULT, KeyboardInterrupt])
+    monkeypatch.setattr(images, "write_image", write)
+    assert cli.main(args) == 130 and not film.exists()
+    write.side_effect = None
+    assert cli.main(args) == 0 and film.is_file()
+    assert [call.args[0].name for call in write.call_args_list] == [f"0000{k}.png" for k in (0, 1, 2, 2, 3)]
+    assert not (tmp_path / "x.frames").exists()
+
+
+def gallery(run: Path, *words: str) -> str:
+    assert cli.main(["gallery", str(run), *words, "--device", "cpu"]) == 0
+    return (run / "gallery.html").read_text("utf-8")
+
+
+def data_of(page: str) -> Any:
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page)
+    assert found is not None
+    return json.loads(found[1])
+
+
+def views(page: str) -> list[str]:
+    """Names of the views, by the match maps of the style of all photographs."""
+    maps = page.partition("Which reference each place")[2].partition("</article>")[0]
+    return re.findall(r"<figcaption>([^<]*)</figcaption>", maps)
+
+
+def test_a_folder_of_photographs_becomes_a_page(run: Path, world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    photos = run.parent / "photos"
+    photos.mkdir()
+    for path in world.references:
+        shutil.copy(path, photos)
+    (photos / "notes.txt").write_text("not a photograph")
+    (photos / "broken.jpg").write_bytes(b"not a photograph")
+    page = gallery(run, "--references", str(photos), "--split", "test")
+    data = data_of(page)
+    assert [style["name"] for style in data["styles"]] == ["Captured", "dusk", "snow", "dusk + snow"]
+    assert [len(rows) for rows in data["stills"].values()] == [2] * 4, "a run of fields is shown in pictures"
+    assert page.count("Which reference each place") == 1, "match maps where there is a choice"
+    assert page.count('alt="Photograph 000') == 2 and "http" not in page.replace("http-equiv", "")
+    told = capsys.readouterr()
+    assert f"2 views in 3 styles: {run / 'gallery.html'}" in told.out
+    assert "broken.jpg: no PNG, JPEG" in told.err, "it is named, and the others are shown"
+
+
+def test_views_are_chosen_evenly_or_by_name(run: Path, world: World) -> None:
+    photo = ["--references", *map(str, world.references)]
+    page = gallery(run, *photo, "--split", "all", "--most", "4")
+    assert views(page) == ["0000", "0002", "0005", "0007"]
+    page = gallery(run, *photo, "--views", "0007", "0001", "--title", "My <town>")
+    assert views(page) == ["0007", "0001"]
+    assert "My &lt;town&gt;" in page
+
+
+def test_style_files_are_styles_of_the_page(run: Path, world: World) -> None:
+    style = run.parent / "mine" / "style.json"
+    style.parent.mkdir()
+    references = [str(path) for path in world.references]
+    style.write_text(json.dumps({"format": 1, "style": {"references": references, "strength": 0.5}}))
+    page = gallery(run, "--styles", str(style), "--views", "0000")
+    assert [style["name"] for style in data_of(page)["styles"]] == ["Captured", "mine"]
+    page = gallery(run, "--references", references[0], "--between", str(style), "--views", "0000")
+    assert [style["name"] for style in data_of(page)["styles"]] == ["Captured", "dusk"], "on the way to another style"
+
+
+KEYS = {
+    "method", "scene", "split", "psnr", "cc_psnr", "ssim", "lpips", "views", "render_seconds", "seconds_per_view",
+    "rays_per_second", "kept_samples_share", "peak_rss_mib", "train_seconds", "train_steps", "consistency", "per_view",
+}  # fmt: skip
+
+
+def test_metrics_table_and_pictures(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["eval", str(run)]) == 0
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics.keys() >= KEYS and "fitted_poses" not in metrics
+    assert (metrics["method"], metrics["split"]) == ("fprf-lite", "test")
+    assert sorted(p.name for p in (run / "renders" / "test").iterdir()) == ["0000.png", "0008.png"]
+    assert cv2.imread(str(run / "renders" / "test" / "0000.png")).shape == (24, 32, 3)
+    table = capsys.readouterr().out
+    assert "psnr" in table and f"{metrics['psnr']:.3f}" in table and "rays/s" in table
+
+
+def test_data_that_has_moved(run: Path, world: World, tmp_path: Path) -> None:
+    config = run / "config.json"
+    config.write_text(config.read_text().replace(str(world.town), str(tmp_path / "gone")))
+    shutil.copytree(world.town, tmp_path / "there")
+    assert cli.main(["eval", str(run), "--data", str(tmp_path / "there"), "--no-images"]) == 0
+
+
+HISTORY = History("", [10, 20], [1.5, 3.0], {"psnr": [12.0, None], "colour": [0.5, 0.25]}, [])
+
+
+def read(folder: Path) -> dict[str, list[tuple[int, float, float]]]:
+    reader = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    events = reader.EventAccumulator(str(folder))
+    events.Reload()
+    return {tag: [(e.step, e.wall_time, e.value) for e in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard", reason="the extra `tensorboard` is not installed")
+    block = HISTORY._replace(name="02")
+    for _ in range(2):  # again, in place of the first
+        assert write_scalars(tmp_path, [HISTORY, block]) == 6
+    assert {path.name for path in tmp_path.iterdir()} == {"training", "02"}
+    found = read(tmp_path / "training")
+    assert found == {"psnr": [(10, 1.5, 12.0)], "colour": [(10, 1.5, 0.5), (20, 3.0, 0.25)]} == read(tmp_path / "02")
+
+
+GARDEN = Path(str(files("fprf") / "garden"))
+
+
+def test_the_demo_from_nothing_to_a_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = replace(fprf.methods.fprf_splats(), steps=10, initial=800, cap=900)
+    monkeypatch.setattr(fprf.methods, "fprf_splats", lambda: small)
+    out = tmp_path / "out"
+    args = ["demo", "--output", str(out), "--minutes", "5", "--downscale", "8"]
+    assert cli.main(args) == 0
+    styles = ["all-together.ply", "autumn.ply", "night.ply", "sunset.ply", "winter.ply"]
+    assert {p.name for p in out.iterdir()} >= {"run", "metrics.json", "garden.html", *styles}
+    plain, *others = [read_capture(out / name).gaussians for name in ("night.ply", "autumn.ply", "winter.ply")]
+    assert all(torch.equal(plain.means, each.means) and not torch.equal(plain.harmonics, each.harmonics) for each in others)
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert (metrics["method"], metrics["scene"], metrics["views"], metrics["train_steps"]) == ("fprf-splats", "garden", 4, 10)
+    assert metrics["total_seconds"] > metrics["new_style_seconds"] > 0
+    page = (out / "garden.html").read_text()
+    assert "CC BY 4.0" in page and not re.findall(r"""(?:src|href)=["'](?!data:|#)""", page), "it loads nothing"
+    assert f"open {out / 'garden.html'}" in capsys.readouterr().out
+
+
+def test_held_out_views_of_the_garden_are_surrounded_by_others() -> None:
+    scene = parse_scene(GARDEN, 1, None)
+    assert len(scene.train) == 21 and scene.points is not None
+    train, test = ([int(view) for view in views] for views in (scene.train, scene.test))
+    assert len(test) == 4 and all({view - 1, view + 1} <= {*train} for view in test)
+
+
+def test_photographs_that_ship_are_credited_and_small() -> None:
+    credits = (GARDEN / "README.md").read_text()
+    references = sorted((GARDEN / "references").iterdir())
+    assert references and all(path.stem in credits for path in references)
+    assert all(max(cv2.imread(str(path)).shape) <= 640 for path in references)
+    assert sum(path.stat().st_size for path in GARDEN.rglob("*") if path.is_file()) < 3e6
