@@ -1,12 +1,7 @@
-"""Configs to plain JSON and back, driven by the type hints, and `config.json`: a config with its method, the version that wrote
-it and the packages of its plug-ins.
+"""Configs to plain JSON and back, driven by the type hints.
 
 Nothing in a file is ever imported: a plug-in is named, and the name is looked up among the installed entry points. One
-that is not installed is kept as data (`Missing`) and fails only when it is built. Duplicate keys, NaN, unknown keys and foreign
-formats are refused.
-
-A method returns a `RunConfig`, of fprf or of its own: a file is read as the class that its method returns, so a method whose
-config has fields of its own must be installed.
+that is not installed is kept as data (`Missing`) and fails only when it is built.
 """
 
 import dataclasses
@@ -14,24 +9,16 @@ import enum
 import json
 import math
 from collections.abc import Mapping
-from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NoReturn, TypeVar, get_args, get_origin
+from typing import Any, Literal, NoReturn, TypeVar, get_args, get_origin
 
-from ..errors import ConfigError, FprfError, PluginError
-from ..io.atomic import write_text
+from ..errors import ConfigError, PluginError
 from ..io.strict_json import parse_json
 from . import registry
 from .config import Need, PluginConfig
 from .slots import hints_of, is_slot, members, slots
 
-if TYPE_CHECKING:
-    from ..config import RunConfig
-
 T = TypeVar("T")
-_METHODS = "fprf.methods"
-_FORMAT, _VERSION = 1, version("fprf")
-_KEYS = ("format", "fprf", "method", "plugins", "config")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -228,62 +215,6 @@ _NAMES = {
 }
 
 
-def save_config(path: Path, config: "RunConfig", method: str) -> None:
-    """Write the config, synced and then renamed into place, so that a reader finds the old file or the new one.
-
-    Raises ConfigError where the config has fields of its own and `method` would not give them back.
-    """
-    from ..config import TrainConfig  # the knob tree is made of plug-in configs, which lie above this module
-
-    packages = packages_of(config)
-    if type(config) is not TrainConfig:
-        if type(method_config(method)) is not type(config):
-            raise ConfigError(f"method {method!r} gives no {type(config).__name__}, so its fields could not be read again")
-        packages["method"] = registry.entry(_METHODS, method).package
-    whole = {"format": _FORMAT, "fprf": _VERSION, "method": method, "plugins": packages, "config": to_json(config)}
-    write_text(path, json.dumps(whole, indent=1, allow_nan=False) + "\n")
-
-
-def load_config(path: Path) -> "tuple[RunConfig, str]":
-    """The config of a file and the name of its method.
-
-    Raises ConfigError naming the file and the field, PluginError where the method is needed and not installed.
-    """
-    from ..config import TrainConfig
-
-    whole = read_json(path)
-    try:
-        _check(whole)
-        fields, method, packages = whole["config"], whole["method"], whole["plugins"]
-        try:
-            kind = type(method_config(method))
-        except PluginError as fault:  # not installed, or broken
-            # Only a method whose package is on record had fields of its own.
-            if "method" in packages:
-                raise PluginError(f"{path}: {fault}; install {packages['method']}") from fault
-            kind = TrainConfig
-        return from_json(fields, kind, packages=packages), method
-    except ConfigError as fault:
-        raise ConfigError(f"{path}: {fault}") from fault
-
-
-def method_config(name: str) -> "RunConfig":
-    """The config that an installed method returns. Raises PluginError naming the method and its package."""
-    from ..config import RunConfig
-
-    method = registry.load_object(_METHODS, name)
-    origin = registry.entry(_METHODS, name).origin
-    try:
-        config = method() if callable(method) else method
-    except FprfError as fault:
-        raise PluginError(f"{_METHODS}: {name!r} ({origin}): {fault}") from fault
-    except (Exception, SystemExit) as fault:  # a stranger's function
-        raise PluginError(f"{_METHODS}: {name!r} ({origin}) failed: {type(fault).__name__}: {fault}") from fault
-    if not isinstance(config, RunConfig):
-        raise PluginError(f"{_METHODS}: {name!r} ({origin}) gives {type(config).__name__}, not a RunConfig")
-    return config
-
-
 def packages_of(config: object) -> dict[str, str]:
     """Name, package and version of what fills every slot, by dotted path."""
     packages = {}
@@ -311,26 +242,3 @@ def read_json(path: Path, name: str = "a config.json") -> Any:
         return parse_json(text)
     except ValueError as fault:
         raise ConfigError(f"{path}: {fault}") from fault
-
-
-def _check(whole: Any) -> None:
-    # The format first: what another one holds is not ours to judge.
-    if not isinstance(whole, dict) or "format" not in whole:
-        raise ConfigError('expected an object with "format": 1, as `fprf train` writes it')
-    if whole["format"] != _FORMAT or type(whole["format"]) is not int:
-        raise ConfigError(
-            f"is of format {whole['format']!r}, written by fprf {whole.get('fprf', '(unknown)')}; "
-            f"fprf {_VERSION} reads format {_FORMAT}: use the version that wrote it"
-        )
-    for key in _KEYS:
-        if key not in whole:
-            raise ConfigError(f"{key!r} is absent; the file is damaged or was edited")
-    for key in whole:
-        if key not in _KEYS:
-            raise ConfigError(f"unknown key {key!r}{registry.nearest(key, list(_KEYS))} (allowed: {', '.join(_KEYS)})")
-    # What is read before the config itself.
-    if not isinstance(whole["method"], str):
-        raise ConfigError(f"method: expected a name, found {whole['method']!r}")
-    plugins = whole["plugins"]
-    if not isinstance(plugins, dict) or not all(isinstance(v, str) for v in plugins.values()):
-        raise ConfigError("plugins: expected an object of texts")

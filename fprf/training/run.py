@@ -35,7 +35,8 @@ from ..errors import CheckpointError, DataError, UsageError
 from ..io import tensorfiles
 from ..io.atomic import unwritable, write_json
 from ..io.strict_json import open_json, parse_json
-from ..plugins.codec import from_json, load_config, save_config
+from ..methods import load_config, save_config
+from ..plugins.codec import from_json
 from ..plugins.registry import nearest
 from ..rendering.cameras import Cameras
 from .model import Facts

@@ -13,8 +13,7 @@ from fprf.cli.parsing import load_method, parse
 from fprf.cli.train import methods
 from fprf.config import TrainConfig
 from fprf.errors import FprfError, PluginError, UsageError
-from fprf.methods import fprf, fprf_lite
-from fprf.plugins.codec import load_config, save_config
+from fprf.methods import fprf, fprf_lite, load_config, save_config
 from fprf.plugins.encoders.config import BundledSemanticConfig, Vgg19Config
 from fprf.plugins.samplers.config import UniformConfig
 from fprf.plugins.slots import replace
