@@ -150,7 +150,6 @@ class FieldLearner(SceneLearner):
         # A loss or gradient that is not finite makes the norm so, and the device needs one comparison.
         norm = torch.nn.utils.get_total_norm([p.grad for p in self.model.parameters() if p.grad is not None])
         unfit = (~(torch.isfinite(loss.detach()) & (norm < LARGEST))).float()
-        self.statistics.count_skipped(unfit)
         with record_function("fprf.optimizer"):
             if self.device.type == "cuda":
                 # The host runs ahead and does not know: the optimiser then changes neither parameters, moments nor its count of
@@ -162,13 +161,12 @@ class FieldLearner(SceneLearner):
                 if (step + 1) % CLEAR_EVERY == 0:
                     clear_denormals(self.optimizer)
         kept = rendered.counts["kept"] / max(1, rendered.counts["samples"])
-        self.statistics.add(parts | {"kept": torch.full((), kept, device=loss.device)})
+        self.statistics.add(parts | {"kept": torch.full((), kept, device=loss.device)}, unfit)
         self.rays += len(batch.rgb)
 
     def figures(self) -> Figures:
         """Running means, corrected for their start; a term that comes every few steps counts when it comes."""
-        before, (self.skipped, failed, names) = self.skipped, self.statistics.faults()
-        means = self.statistics.means()
+        before, (means, self.skipped, failed, names) = self.skipped, self.statistics.read()
         fault = (names or "a gradient") if self.skipped > before else ""
         return Figures(means, self.rays, self.skipped, failed, fault, means.pop("kept", 0.0))
 
@@ -252,8 +250,11 @@ class StepStatistics:
         self._present: dict[tuple[str, ...], Tensor] = {}
 
     @torch.no_grad()
-    def add(self, values: Mapping[str, Tensor]) -> None:
-        """One step's scalars. A name that is absent, or not finite, leaves its mean as it is."""
+    def add(self, values: Mapping[str, Tensor], unfit: Tensor) -> None:
+        """One step's scalars. A name that is absent, or not finite, leaves its mean as it is; `unfit` is 1 where the step was
+        skipped, else 0.
+        """
+        self.skipped, self.failed = self.skipped + unfit, (self.failed + 1) * unfit
         new = [name for name in values if name not in self.names]
         if new:
             self.names += new
@@ -271,21 +272,18 @@ class StepStatistics:
         bad = self.rows[2] + self._present[given] * ~fit
         self.rows = torch.cat([torch.where(fit, means, self.rows[:2]), bad[None]])
 
-    def count_skipped(self, unfit: Tensor) -> None:
-        """Count a step: `unfit` is 1 where it was skipped, else 0."""
-        self.skipped, self.failed = self.skipped + unfit, (self.failed + 1) * unfit
+    def read(self) -> tuple[dict[str, float], int, int, str]:
+        """The means, the steps skipped so far, the last ones in a row, and the names of terms that were not finite since then.
 
-    def means(self) -> dict[str, float]:
-        """The means, corrected for their start; names that never had a finite number are left out. The host waits."""
-        # Both sums began at 0: their quotient is the mean over what was seen.
-        value, weight, _ = self.rows.tolist()
-        return {name: v / w for name, v, w in zip(self.names, value, weight, strict=True) if w > 0}
-
-    def faults(self) -> tuple[int, int, str]:
-        """Steps skipped so far, the last ones in a row, and the names of terms that were not finite since the last call."""
-        skipped, failed, *bad = torch.cat([torch.stack([self.skipped, self.failed]), self.rows[2]]).tolist()
+        Means are corrected for their start, without names that never had a finite number. The host waits for the device once.
+        """
+        counts = torch.stack([self.skipped, self.failed]).to(self.rows.dtype)
+        *numbers, skipped, failed = torch.cat([self.rows.flatten(), counts]).tolist()
         self.rows[2].zero_()
-        return int(skipped), int(failed), ", ".join(name for name, b in zip(self.names, bad, strict=True) if b > 0)
+        # Both sums began at 0: their quotient is the mean over what was seen.
+        value, weight, bad = (numbers[k * len(self.names) : (k + 1) * len(self.names)] for k in range(3))
+        means = {name: v / w for name, v, w in zip(self.names, value, weight, strict=True) if w > 0}
+        return means, int(skipped), int(failed), ", ".join(name for name, b in zip(self.names, bad, strict=True) if b > 0)
 
 
 @torch.no_grad()
