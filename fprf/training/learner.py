@@ -273,7 +273,7 @@ class StepStatistics:
         self.rows = torch.cat([torch.where(fit, means, self.rows[:2]), bad[None]])
 
     def read(self) -> tuple[dict[str, float], int, int, str]:
-        """The means, the steps skipped so far, the last ones in a row, and the names of terms that were not finite since then.
+        """Means, steps skipped so far, the last ones in a row, and names of terms that were not finite since the last call.
 
         Means are corrected for their start, without names that never had a finite number. The host waits for the device once.
         """
