@@ -8,7 +8,8 @@ config has fields of its own must be installed.
 import json
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+
+import msgspec
 
 from .config import ContentConfig, LossConfig, OptimizerConfig, RenderConfig, RunConfig, SemanticConfig, TrainConfig
 from .datamanagers.config import RayBatchesConfig
@@ -24,7 +25,18 @@ from .splats.config import GaussiansConfig
 
 _METHODS = "fprf.methods"
 _FORMAT, _VERSION = 1, version("fprf")
-_KEYS = ("format", "fprf", "method", "plugins", "config")
+
+
+class _ConfigFile(msgspec.Struct, forbid_unknown_fields=True):
+    """Content of config.json."""
+
+    format: int
+    fprf: str
+    """Version that wrote it."""
+    method: str
+    plugins: dict[str, str]
+    """Name, package and version of what fills each slot."""
+    config: object
 
 
 def fprf() -> TrainConfig:
@@ -84,17 +96,24 @@ def load_config(path: Path) -> tuple[RunConfig, str]:
     """
     whole = read_json(path)
     try:
-        _check(whole)
-        fields, method, packages = whole["config"], whole["method"], whole["plugins"]
+        # The format first: what another one holds is not ours to judge.
+        if not isinstance(whole, dict) or "format" not in whole:
+            raise ConfigError('expected an object with "format": 1, as `fprf train` writes it')
+        if whole["format"] != _FORMAT or type(whole["format"]) is not int:
+            raise ConfigError(
+                f"is of format {whole['format']!r}, written by fprf {whole.get('fprf', '(unknown)')}; "
+                f"fprf {_VERSION} reads format {_FORMAT}: use the version that wrote it"
+            )
+        file = msgspec.convert(whole, _ConfigFile)
         try:
-            kind = type(method_config(method))
+            kind = type(method_config(file.method))
         except PluginError as fault:  # not installed, or broken
             # Only a method whose package is on record had fields of its own.
-            if "method" in packages:
-                raise PluginError(f"{path}: {fault}; install {packages['method']}") from fault
+            if "method" in file.plugins:
+                raise PluginError(f"{path}: {fault}; install {file.plugins['method']}") from fault
             kind = TrainConfig
-        return from_json(fields, kind, packages=packages), method
-    except ConfigError as fault:
+        return from_json(file.config, kind, packages=file.plugins), file.method
+    except (ConfigError, msgspec.ValidationError) as fault:
         raise ConfigError(f"{path}: {fault}") from fault
 
 
@@ -111,26 +130,3 @@ def method_config(name: str) -> RunConfig:
     if not isinstance(config, RunConfig):
         raise PluginError(f"{_METHODS}: {name!r} ({origin}) gives {type(config).__name__}, not a RunConfig")
     return config
-
-
-def _check(whole: Any) -> None:
-    # The format first: what another one holds is not ours to judge.
-    if not isinstance(whole, dict) or "format" not in whole:
-        raise ConfigError('expected an object with "format": 1, as `fprf train` writes it')
-    if whole["format"] != _FORMAT or type(whole["format"]) is not int:
-        raise ConfigError(
-            f"is of format {whole['format']!r}, written by fprf {whole.get('fprf', '(unknown)')}; "
-            f"fprf {_VERSION} reads format {_FORMAT}: use the version that wrote it"
-        )
-    for key in _KEYS:
-        if key not in whole:
-            raise ConfigError(f"{key!r} is absent; the file is damaged or was edited")
-    for key in whole:
-        if key not in _KEYS:
-            raise ConfigError(f"unknown key {key!r}{registry.nearest(key, list(_KEYS))} (allowed: {', '.join(_KEYS)})")
-    # What is read before the config itself.
-    if not isinstance(whole["method"], str):
-        raise ConfigError(f"method: expected a name, found {whole['method']!r}")
-    plugins = whole["plugins"]
-    if not isinstance(plugins, dict) or not all(isinstance(v, str) for v in plugins.values()):
-        raise ConfigError("plugins: expected an object of texts")

@@ -123,8 +123,8 @@ def _saved(folder: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     [
         (lambda w: w.pop("format"), 'expected an object with "format": 1'),
         (lambda w: w.update(format=2, fprf="9.0"), "is of format 2, written by fprf 9.0"),
-        (lambda w: w.pop("plugins"), "'plugins' is absent"),
-        (lambda w: w.update(metod="x"), "unknown key 'metod'; did you mean 'method'?"),
+        (lambda w: w.pop("plugins"), "Object missing required field `plugins`"),
+        (lambda w: w.update(metod="x"), "Object contains unknown field `metod`"),
         (lambda w: w["config"].update(stepz=1), "config: TrainConfig has no field 'stepz'; did you mean 'steps'?"),
         (lambda w: w["config"]["loss"].update(rgb="1"), 'config.loss.rgb: expected a number, found "1"'),
         (lambda w: w["config"].update(downscale=0), "config: downscale: 0 must be at least 1"),
