@@ -101,7 +101,7 @@ def test_chunks_follow_the_memory_of_an_accelerator_alone() -> None:
 FAULTS = """
 import resource, sys
 if sys.argv[1] == "kept":
-    from fprf.process import keep_memory
+    from fprf.memory import keep_memory
     if not keep_memory():
         print("refused"); sys.exit()
 import numpy
