@@ -5,7 +5,8 @@ learning with it and is then dropped: so each ray is whole while a block learns 
 does not end up as a veil in it. The block itself starts as what they have learnt of its place (`blocks.fields.inherit`): a
 street of four blocks came out 1.9 dB better after 200 steps each than from seeded planes.
 
-One semantic basis, one unit of each loss and one cache of features, which are mapped from their files, serve all blocks.
+One semantic basis, one unit of each loss and one cache of features, which are mapped from their files, serve all blocks. While
+features are made, the pixels of all training views lie in a mapped file as well, three bytes each.
 
     RUN/blocks.json                      the partition
     RUN/blocks/NN/rays.safetensors       the views and tiles that a block learns from
