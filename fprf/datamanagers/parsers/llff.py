@@ -55,6 +55,7 @@ class LlffParser(DataParser):
             matrix = row[:15].reshape(3, 5)[:, :4]
             turned = np.stack([matrix[:, 1], -matrix[:, 0], matrix[:, 2], matrix[:, 3]], 1)
             where = f"{file}: row {number} ({name})"
+            # The principal point is the middle of the image, as in LLFF.
             size = pixel_size(where, width, height)
             return View(
                 name=name,

@@ -50,6 +50,7 @@ class MegaNerfParser(DataParser):
 
 def _load(path: Path) -> dict[str, Any]:
     """Tensors and numbers by name; nothing else is let in."""
+    # Unpickling may take many times the memory of its file.
     if path.is_file() and path.stat().st_size > _LARGEST:
         raise DataError(f"{path}: larger than {_LARGEST} bytes, so no metadata of one image; copy it again")
     try:

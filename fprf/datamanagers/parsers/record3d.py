@@ -56,6 +56,7 @@ class Record3DParser(DataParser):
             number, name = each
             fx, fy, cx, cy = lenses[number].tolist()
             where, row = f"{file}: poses[{number}]", poses[number]
+            # The file has x y z w, we w x y z.
             turn = quaternion_rotation(where, row[[3, 0, 1, 2]])
             return View(
                 name=name,
