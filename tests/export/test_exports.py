@@ -18,9 +18,9 @@ from fprf.datamanagers.parsers.config import parse_scene
 from fprf.export.config import plan
 from fprf.export.mesh import Maps, Mesh, build_mesh, surface_nets, vertex_colours, write_mesh
 from fprf.io.images import srgb_to_linear
-from fprf.rendering.camera_path import transforms
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.local_frame import read_offset
+from fprf.rendering.paths import transforms
 
 ZERO = (0.0, 0.0, 0.0)
 
