@@ -367,7 +367,7 @@ class TrainConfig(RunConfig):
         progress: Callable[[int, int, str], None] | None = None,
     ) -> "SceneLearner | Partition":
         """Extract the features and build the model; blocks where the scene is cut."""
-        from .blocks.visibility import make_plan
+        from .blocks.partition import make_plan
         from .training.blocks import Blocks
         from .training.learner import FieldLearner
         from .training.prepare import prepare

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numba
 import pytest
 import torch
+from fake_packages import Packages, packages_in
 from hypothesis import HealthCheck, settings
 
 if TYPE_CHECKING:
@@ -69,3 +70,10 @@ def world(_world: "World", monkeypatch: pytest.MonkeyPatch) -> "World":
 def run(world: "World", tmp_path: Path) -> Path:
     """A copy of the trained run, to write to."""
     return shutil.copytree(world.run, tmp_path / "run")
+
+
+@pytest.fixture
+def packages(tmp_path: Path) -> Iterator[Packages]:
+    """A folder on the path into which tests install packages."""
+    with packages_in(tmp_path / "site") as found:
+        yield found

@@ -37,6 +37,7 @@ class Packages:
 @contextlib.contextmanager
 def packages_in(root: Path) -> Iterator[Packages]:
     modules = set(sys.modules)
+    root.mkdir(exist_ok=True)
     sys.path.insert(0, str(root))
     importlib.invalidate_caches()
     registry.forget()

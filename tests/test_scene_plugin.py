@@ -167,9 +167,7 @@ class PlaneView(SceneView):
 
 def trained(world: World, folder: Path) -> Iterator[Path]:
     """Install the package and train a plane; its run folder."""
-    site = folder / "site"
-    site.mkdir()
-    with packages_in(site) as packages:
+    with packages_in(folder / "site") as packages:
         points = {"fprf.methods": {"plane": "acme_plane:plane"}, "fprf.scenes": {"plane": "acme_plane:open_plane"}}
         packages.install("acme-plane", points, code={"acme_plane": PLANE})
         assert main(["train", "plane", "--data", str(world.town), "--output", str(folder / "run"), "--downscale", "1"]) == 0

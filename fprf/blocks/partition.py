@@ -1,9 +1,14 @@
 """A partition of a scene: boxes that are trained apart, of fields (blocks) and of Gaussians (cells), and their file.
 
-Blocks lie in the scene's space and cut it seen from above; what none of them holds is surroundings. Sparse points reach as
-far as the eye does; most of a scene's detail lies where its cameras are. So the region that is cut is the cameras' bounds
-widened by REACH, but no wider than the points there are. A region weighs half by the pixels of the cameras that stand in it
-and half by its share of the sparse points: cameras say where pixels come from, points where they end.
+Blocks lie in the scene's space, the same for all, so that their densities blend as they are, and cut it seen from above; what
+none of them holds is surroundings. Sparse points reach as far as the eye does; most of a scene's detail lies where its cameras
+are. So the region that is cut is the cameras' bounds widened by REACH, but no wider than the points there are. A region weighs
+half by the pixels of the cameras that stand in it and half by its share of the sparse points: cameras say where pixels come
+from, points where they end.
+
+Which tiles of which views a block learns from follows from cameras and sparse points alone, before any image is decoded. A
+tile's rays reach BEYOND times as far as the farthest point that is seen in it or its neighbours, and without end where nothing
+is (the sky).
 
 Cells of Gaussians cover all of space: it is bisected along the principal axes of the reconstruction's points, so that the
 points of each cell were seen about equally often, and outer cells have no end. A cell learns from the windows of photographs
@@ -13,22 +18,27 @@ that show its points and a border around it, so its cost follows from its window
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, TypeVar
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from ..datamanagers.scene import Scene, find_sightings
-from ..errors import ConfigError
+from ..datamanagers.bounds import FAR, NEAR, ROUNDING, axes
+from ..datamanagers.scene import TILES, Scene, Sightings, find_sightings, tile_of
+from ..errors import ConfigError, DataError
 from ..interfaces import BlockLayout
 from ..io.atomic import write_json
 from ..io.strict_json import open_json
 from ..plugins.codec import from_json
+from ..rendering.cameras import Cameras, rays_through
+from ..rendering.space import Space, slab
 from ..types import Cell, Site, Window
-from .config import AdaptiveConfig, GridConfig
+from .config import AdaptiveConfig, GridConfig, LayoutConfig
+from .routing import chart_of
 
 REACH = 1.0
 """Units beyond the cameras that still belong to the region; a unit is the distance that views commonly see."""
@@ -46,6 +56,20 @@ OWN = 0.15
 """Share of the points in a window that are the cell's own, at least."""
 LEAST, ROOM = 64, 6
 """Least width and height of a window; pixels around the points in it."""
+FLAT = 0.3
+"""Cameras spread over a plane if their third extent is below this share of their second ..."""
+WIDE = 0.2
+"""... and that one above this share of the first."""
+NEAREST = 0.001
+"""Share of the sightings that may lie closer than twice the nearest distance that is looked at."""
+SPACINGS = 10.0
+"""Without points views are taken to see this many times the distance to the next camera ..."""
+SOME = 512
+"""... which is measured for about so many of them."""
+BEYOND = 1.25
+"""Rays end at most so many times farther than what is seen around them."""
+VIEWS = 256
+"""Views whose tiles are looked at together: bounds memory, changes nothing."""
 
 State = TypeVar("State")
 Box = tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]
@@ -154,6 +178,159 @@ class AdaptiveLayout(BlockLayout):
             ],
             margin,
         )
+
+
+def level_axes(cameras: Cameras) -> Annotated[Tensor, "3 3"]:
+    """Rows: along the capture, across, up. Over a plane (drones) its normal is up; along a line (streets) the cameras' own."""
+    offset = cameras.pose[:, :, 3] - cameras.pose[:, :, 3].mean(0)
+    _, extent, rows = torch.linalg.svd(offset, full_matrices=True)
+    if len(extent) < 3 or extent[2] > FLAT * extent[1] or extent[1] < WIDE * extent[0]:
+        return axes(cameras)
+    up, along = rows[2], rows[0]
+    upright, ahead = cameras.pose[:, :, 1].mean(0), -cameras.pose[:, :, 2].mean(0)
+    # Cameras stand upright, or look down: one of the two tells which side of the plane the sky is on.
+    if (upright @ up - ahead @ up) < 0:
+        up = -up
+    if offset[-1] @ along < offset[0] @ along:
+        along = -along
+    return torch.stack([along, torch.linalg.cross(up, along), up])
+
+
+def open_space(scene: Scene, sightings: Sightings | None) -> Space:
+    """The space of kind `open`. Raises DataError where all cameras stand in one place and nothing says how far they see."""
+    # A unit is the distance that views commonly see: of points, else as the capture says, else of the cameras' spacing.
+    position = scene.cameras.pose[:, :, 3]
+    centre, turn = position.mean(0), level_axes(scene.cameras)
+    nearest = None
+    if sightings is not None:
+        unit = float(sightings.distance.median())
+        nearest = float(sightings.distance.sort().values[int(NEAREST * len(sightings.distance))])
+    elif scene.depths is not None:
+        unit, nearest = float(scene.depths.prod(-1).sqrt().median()), float(scene.depths[:, 0].amin())
+    else:
+        apart = torch.cdist(position[:: max(1, len(position) // SOME)], position)
+        unit = SPACINGS * float(apart.topk(2, largest=False).values[:, 1].median()) if len(position) > 1 else 0.0
+    if unit <= ROUNDING * max(1.0, float(position.abs().amax())):
+        raise DataError(f"{scene.name}: all cameras stand in one place and there are no points; capture from several places")
+    # Nothing nearer than half of the nearest point is looked at.
+    near = NEAR if nearest is None else min(NEAR, max(1e-3, 0.5 * nearest / unit))
+    first, second, third = ((float(row[0]), float(row[1]), float(row[2])) for row in turn)
+    middle = (float(centre[0]), float(centre[1]), float(centre[2]))
+    return Space("open", middle, (first, second, third), 1 / unit, near, FAR)
+
+
+def site_of(scene: Scene, space: Space) -> Site:
+    """Training cameras and sparse points in the space."""
+    turn = torch.tensor(space.rotation, dtype=torch.float64)
+    centre = torch.tensor(space.centre, dtype=torch.float64)
+    cameras = scene.cameras.select(scene.train)
+    points = scene.points if scene.points is not None else centre.new_zeros(0, 3)
+    return Site(
+        ((cameras.pose[:, :, 3] - centre) @ turn.T) * space.scale,
+        cameras.size.prod(-1),
+        ((points - centre) @ turn.T) * space.scale,
+        1 / space.scale,
+    )
+
+
+def tile_rays(
+    scene: Scene, space: Space, views: Annotated[Tensor, "M"], sightings: Sightings | None
+) -> tuple[
+    Annotated[Tensor, "M 1 1 3"],
+    Annotated[Tensor, "M TILES TILES 3"],
+    Annotated[Tensor, "M TILES TILES"],
+    Annotated[Tensor, "M TILES TILES"],
+]:
+    """Origins and directions of the rays through the middles of the tiles [row, column] of some views, in the space.
+
+    Then upper bounds of their lengths, space units (inf where nothing is known), and the pixels of each tile (int64; 0 outside
+    of the image). Float32 is enough here.
+    """
+    cameras = scene.cameras
+    size = cameras.size[views].double()
+    side = size.amax(1) / TILES
+    low = side[:, None] * torch.arange(TILES, dtype=torch.float64)
+    # Pixel centres (+0.5) in each column and row of tiles, as `tile_of` puts them there.
+    ends = [torch.minimum(low + side[:, None], extent[:, None]) for extent in size.T]
+    columns, rows = (((end - 0.5).ceil() - (low - 0.5).ceil()).clamp_min(0).long() for end in ends)
+    # The ray through the middle of each tile.
+    middle = low + side[:, None] / 2
+    x, y = (torch.minimum(middle, extent[:, None] - 0.5) for extent in size.T)
+    pixel = torch.stack([x[:, None, :].expand(-1, TILES, -1), y[:, :, None].expand(-1, -1, TILES)], -1)
+    which = views[:, None, None].expand(-1, TILES, TILES).reshape(-1)
+    rays = space.rays(*rays_through(cameras, which, pixel.reshape(-1, 2)))
+    # The farthest point that is seen in each tile, then in it or its neighbours; the sky has none.
+    reach = torch.full((len(views), TILES, TILES), torch.inf)
+    if sightings is not None:
+        slot = torch.full((len(cameras),), -1, dtype=torch.int64)
+        slot[views] = torch.arange(len(views))
+        mine = slot[sightings.view] >= 0
+        view, pixels = sightings.view[mine], sightings.pixel[mine]
+        column, row = tile_of(cameras, view, pixels).unbind(1)
+        at = (slot[view] * TILES + row) * TILES + column
+        far = torch.zeros(len(views), TILES, TILES)
+        far.view(-1).scatter_reduce_(0, at, (sightings.distance[mine] * space.scale).float(), "amax")
+        around = F.max_pool2d(far[:, None], 3, stride=1, padding=1)[:, 0]
+        reach = torch.where(around > 0, BEYOND * around, reach)
+    direction = rays.direction.view(-1, TILES, TILES, 3)
+    return rays.origin.view(direction.shape)[:, :1, :1], direction, reach, rows[:, :, None] * columns[:, None, :]
+
+
+def pixel_mask(seen: Annotated[Tensor, "TILES TILES"], size: tuple[int, int]) -> Annotated[Tensor, "H W"]:
+    """The pixels of the tiles that are set, for an image of (width, height)."""
+    width, height = size
+    side = max(size) / TILES
+    column = ((torch.arange(width, dtype=torch.float64) + 0.5) / side).long().clamp(max=TILES - 1)
+    row = ((torch.arange(height, dtype=torch.float64) + 0.5) / side).long().clamp(max=TILES - 1)
+    return seen[row][:, column]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """Z blocks of a scene, T training views."""
+
+    space: Space
+    cells: Sequence[Cell]
+    views: Annotated[Tensor, "T"]
+    """int64 training views of the scene."""
+    seen: Annotated[Tensor, "T Z TILES TILES"]
+    """Tiles of each view that each block learns from."""
+    pixels: Annotated[Tensor, "T TILES TILES"]
+    """int64 pixels of each tile."""
+
+    @property
+    def rays(self) -> Annotated[Tensor, "Z"]:
+        """int64 training pixels of each block."""
+        return torch.stack([(self.seen[:, z] * self.pixels).sum() for z in range(len(self.cells))])
+
+    def views_of(self, block: int) -> Annotated[Tensor, "M"]:
+        """int64 training views that a block learns from."""
+        return self.views[(self.seen[:, block] & (self.pixels > 0)).flatten(1).any(1)]
+
+
+def make_plan(scene: Scene, layout: LayoutConfig) -> Plan:
+    """Cut the scene and find out who sees what. Raises ConfigError where a block would have nothing to learn from."""
+    # Geometry alone: no image is decoded to find out who sees what.
+    sightings = find_sightings(scene)
+    space = open_space(scene, sightings)
+    cells = layout.build().cut(site_of(scene, space))
+    parts: list[tuple[Tensor, Tensor]] = []
+    for views in torch.split(scene.train, VIEWS):
+        origin, direction, reach, pixels = tile_rays(scene, space, views, sightings)
+        # Slab test: a block sees a tile whose rays meet it, border included, before they end.
+        met = []
+        for cell in cells:
+            chart = chart_of(cell)
+            enter, leave = slab(origin, direction, chart.low.to(origin), chart.high.to(origin))
+            enter = enter.clamp_min(0)
+            met.append((enter <= leave) & (enter <= reach) & (pixels > 0))
+        parts.append((torch.stack(met, 1), pixels))
+    seen, pixels = (torch.cat(column) for column in zip(*parts, strict=True))
+    # A block that no pixel sees would learn nothing: it is part of the surroundings.
+    used = [block for block in range(len(cells)) if int((seen[:, block] * pixels).sum())]
+    if not used:
+        raise ConfigError(f"{scene.name}: no training view sees any block of this layout; choose another --blocks")
+    return Plan(space=space, cells=[cells[block] for block in used], views=scene.train, seen=seen[:, used], pixels=pixels)
 
 
 def bisect_sightings(scene: Scene, count: int) -> list[Cell]:

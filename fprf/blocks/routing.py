@@ -170,35 +170,29 @@ class BlendRouter:
         square = torch.where(inside[:, None], at, torch.zeros_like(at)).long()
         kind = self.table.to(points.device)[square[:, 1] * self.columns + square[:, 0]]
         kind = torch.where(inside, kind, torch.zeros_like(kind))
-        # Weigh the members of each set of blocks that is met.
+        # Of each set of blocks that is met only these are weighed, and only those with a say are ever fetched.
         groups = []
         present = torch.bincount(kind, minlength=len(self.sets)).nonzero()[:, 0].tolist()
         for number in present:
             index = (kind == number).nonzero()[:, 0] if len(present) > 1 else torch.arange(len(points), device=points.device)
-            groups += self._share(points, index, self.sets[number])
-        return groups
-
-    def _share(self, points: Tensor, index: Tensor, blocks: tuple[int, ...]) -> list[Group]:
-        """Groups of the points `index` near some blocks: those that each member has alone, then those that several share."""
-        named = (*blocks, len(self.cells))
-        if not blocks:
-            return [Group(named, index, None)]
-        # Only the blocks near these points are weighed, and only those with a say are ever fetched.
-        weight = shares(points[index], [self.cells[block] for block in blocks])
-        weight = torch.where(weight > SLIGHT, weight, torch.zeros_like(weight))
-        most, best = weight.max(-1)
-        alone = most >= weight.sum(-1)
-        groups = []
-        for place, member in enumerate(named):
-            mine = index[alone & (best == place)]
-            if len(mine):
-                groups.append(Group((member,), mine, None))
-        # In borders several have a say: their weights are scaled to 1 once the slight ones are left out.
-        shared = (~alone).nonzero()[:, 0]
-        if len(shared):
-            own = weight[shared]
-            used = (own > 0).any(0).nonzero()[:, 0]
-            own = own[:, used]
-            chosen = tuple(named[place] for place in used.tolist())
-            groups.append(Group(chosen, index[shared], own / own.sum(-1, keepdim=True)))
+            named = (*self.sets[number], len(self.cells))
+            if len(named) == 1:
+                groups.append(Group(named, index, None))
+                continue
+            weight = shares(points[index], [self.cells[block] for block in self.sets[number]])
+            weight = torch.where(weight > SLIGHT, weight, torch.zeros_like(weight))
+            most, best = weight.max(-1)
+            alone = most >= weight.sum(-1)
+            for place, member in enumerate(named):
+                mine = index[alone & (best == place)]
+                if len(mine):
+                    groups.append(Group((member,), mine, None))
+            # In borders several have a say: their weights are scaled to 1 once the slight ones are left out.
+            shared = (~alone).nonzero()[:, 0]
+            if len(shared):
+                own = weight[shared]
+                used = (own > 0).any(0).nonzero()[:, 0]
+                own = own[:, used]
+                chosen = tuple(named[place] for place in used.tolist())
+                groups.append(Group(chosen, index[shared], own / own.sum(-1, keepdim=True)))
         return groups

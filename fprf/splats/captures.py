@@ -49,6 +49,8 @@ _BLACK = 0.055
 """Added to sRGB, it is a power of linear light."""
 _VIEW, _SOLID = (480, 360), 0.95
 """Size of views in the place of photographs; opacity from which on their pixels count."""
+_REFERENCES = 16
+"""Views of a capture that are references, at most."""
 _GAP = 0.1
 """Distance between captures that would overlap, as a share of their width, where they are put in a row."""
 _SHARED, _ENOUGH, _ALIKE = 24, 64, 0.4
@@ -322,9 +324,7 @@ def light_alone(styled: Styled, gain: Annotated[Tensor, "3"] | None = None) -> S
     return styled._replace(restyle=replace(styled.restyle, colours=maps, light=None, places=()))
 
 
-def reference_views(
-    path: Path, look: LookConfig, folder: Path, *, views: int = 16
-) -> tuple[tuple[Path, ...], tuple[Path, ...], tuple[float, ...]]:
+def reference_views(path: Path, look: LookConfig, folder: Path) -> tuple[tuple[Path, ...], tuple[Path, ...], tuple[float, ...]]:
     """Write pictures of views of a capture or of a run into a folder: in the place of photographs, as references.
 
     Returns them, masks of what they show, and the shares of them that show anything. Raises DataError where none does.
@@ -337,7 +337,7 @@ def reference_views(
         # As many views as a capture that takes the style is looked at from: of one place both show alike shares.
         look = replace(look, size=_VIEW, up=look.up or capture.up)
         scene = look_at_capture(gaussians, capture.antialiased, encoder, look, camera=capture.camera)
-    chosen = torch.linspace(0, len(scene.names) - 1, min(views, len(scene.names))).round().long()
+    chosen = torch.linspace(0, len(scene.names) - 1, min(_REFERENCES, len(scene.names))).round().long()
     cameras = scene.cameras.select(chosen)
     pictures, masks, weights = list[Path](), list[Path](), list[float]()
     for view in range(len(cameras)):

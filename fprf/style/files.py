@@ -20,12 +20,13 @@ import hashlib
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+from ..checks import at_least
 from ..errors import ConfigError, DataError
 from ..io.atomic import write_json
 from ..plugins.codec import from_json, packages_of, read_json, to_json
@@ -166,11 +167,15 @@ def _hash(path: Path) -> str:
         raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
 
 
-class Keyframe(NamedTuple):
+@dataclass(frozen=True)
+class Keyframe:
     """A frame, from 0, and its style file; None = the scene as it is."""
 
     frame: int
     style: Path | None
+
+    def __post_init__(self) -> None:
+        at_least("frame", self.frame, 0)
 
 
 def read_keyframes(path: Path) -> tuple[Keyframe, ...]:
@@ -179,19 +184,14 @@ def read_keyframes(path: Path) -> tuple[Keyframe, ...]:
     try:
         if not isinstance(whole, dict) or whole.keys() != {"format", "keyframes"} or whole["format"] != _FORMAT:
             raise ConfigError(f'expected an object with "format": {_FORMAT} and "keyframes", and nothing else')
-        rows = from_json(whole["keyframes"], list[dict[str, int | str | None]])
-        keys = []
-        for number, row in enumerate(rows):
-            frame, style = row.get("frame"), row.get("style")
-            if row.keys() != {"frame", "style"} or not isinstance(frame, int) or frame < 0 or isinstance(style, int):
-                raise ConfigError(f'keyframes.{number}: expected {{"frame": a number from 0, "style": a file or null}}')
-            keys.append(Keyframe(frame, None if style is None else path.parent / style))
-        frames = [key.frame for key in keys]
-        if not keys or len(set(frames)) < len(frames):
+        keys = from_json(whole["keyframes"], list[Keyframe], path="keyframes")
+        if not keys or len({key.frame for key in keys}) < len(keys):
             raise ConfigError("keyframes: at least one is needed, and no two at one frame")
     except ConfigError as fault:
         raise ConfigError(f"{path}: {fault}") from fault
-    return tuple(sorted(keys, key=lambda key: key.frame))
+    # Paths are relative to the file.
+    found = (key if key.style is None else replace(key, style=path.parent / key.style) for key in keys)
+    return tuple(sorted(found, key=lambda key: key.frame))
 
 
 def fade(frames: Sequence[int], at: int) -> tuple[int, int, float]:

@@ -199,12 +199,19 @@ def light_of(
     mean, covariance = (double(part).cpu() for part in colours)
     likeness, claim = mean.new_zeros(count), mean.new_zeros(count)
     maps, between = mean.new_zeros(count, 4, 3), torch.zeros_like(mean)
+    # Cosine of each region with each code, float64: each reference is seen from its own middle.
+    own, keys, centre = double(scene.keys).cpu(), double(dictionary.keys).cpu(), double(scene.semantic_mean).cpu()
+    beyond, cosine = double(_beyond(dictionary)).cpu(), mean.new_zeros(count, len(dictionary.keys))
+    for i, middle in enumerate(double(_middles(scene, dictionary)).cpu()):
+        codes = (dictionary.reference == i).nonzero().squeeze(1)
+        cosine[:, codes] = cosines(own, keys[codes], beyond[codes], centre, middle)
     for row in sorted({tuple(row) for row in every.tolist()}):
         # All regions are matched with one choice of references; those that made it take their rows.
         chosen = torch.tensor(row)
-        part, rows = choose(dictionary, chosen)[0], (every == chosen).all(1)
+        (part, codes), rows = choose(dictionary, chosen), (every == chosen).all(1)
         table = double(config.build(dictionary=part, scene=scene).region_match(scene.keys)).cpu()
-        alike, alone = region_likeness(scene, part, table), unrivalled(scene, part, table)
+        # Likeness is the mean cosine with the codes that a region takes, in spreads of the scene's own regions.
+        alike, alone = (table * cosine[:, codes]).sum(1) / _spread(scene), unrivalled(scene, part, table)
         likeness[rows], claim[rows] = alike[rows], alone[rows]
         sure = (alike / SURE).clamp(0, 1) * alone
         lit, added = light_maps(mean, covariance, double(scene.share), table, part, sure)
@@ -232,18 +239,6 @@ def cosines(
         return unit(x, at) @ unit(keys, at).T * shown
 
     return torch.minimum(seen(centre), seen(middle))
-
-
-def region_likeness(scene: SceneStyle, dictionary: StyleDictionary, table: Annotated[Tensor, "K T"]) -> Annotated[Tensor, "K"]:
-    """Mean cosine of each region with the codes that it takes, float64, in spreads of the scene's own regions."""
-    # Each reference is seen from its own middle; the shares in the table weigh the codes.
-    own, keys, centre = double(scene.keys), double(dictionary.keys), double(scene.semantic_mean)
-    beyond = double(_beyond(dictionary))
-    total = own.new_zeros(len(own))
-    for i, middle in enumerate(double(_middles(scene, dictionary))):
-        codes = (dictionary.reference == i).nonzero().squeeze(1)
-        total = total + (table[:, codes] * cosines(own, keys[codes], beyond[codes], centre, middle)).sum(1)
-    return total / _spread(scene)
 
 
 def _beyond(dictionary: StyleDictionary) -> Annotated[Tensor, "T"]:

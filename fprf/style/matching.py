@@ -27,7 +27,6 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from ..errors import ConfigError
 from ..ops.precision import double, full_precision
 
 _FLAT = 1e-6
@@ -74,10 +73,8 @@ def attention(
 ) -> Annotated[Tensor, "N T"]:
     """R^S (paper, Eq. 6): softmax of scores / temperature (absolute, above 0); rows sum to 1.
 
-    `prior` > 0 multiplies each key's odds. Raises ConfigError for a temperature that is not above 0.
+    `prior` > 0 multiplies each key's odds.
     """
-    if not temperature > 0:
-        raise ConfigError(f"temperature: {temperature} must be above 0")
     r = scores(queries, keys)
     # The best score is subtracted before dividing: tiny temperatures then give -inf beside it, never inf - inf.
     logits = (r - r.amax(1, keepdim=True)) / max(temperature, torch.finfo(r.dtype).tiny)

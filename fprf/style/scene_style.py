@@ -214,17 +214,6 @@ def own_style(scene: SceneStyle, blend: float = BLEND) -> StyleDictionary:
     )
 
 
-def check_fit(dictionary: StyleDictionary, scene: SceneStyle) -> None:
-    """Raise DataError unless references and scene were encoded alike."""
-    style = (dictionary.mean.shape[1], dictionary.keys.shape[1])
-    here = (scene.mean.shape[0], scene.keys.shape[1])
-    if style != here:
-        raise DataError(
-            f"style dictionary: {style[0]} content and {style[1]} semantic channels, but the scene has {here[0]} and "
-            f"{here[1]}; build it with the scene's own encoders"
-        )
-
-
 def to_tensors(scene: SceneStyle) -> dict[str, Tensor]:
     """The fields by name, for a checkpoint."""
     return {name: t.detach().contiguous() for name, t in scene._asdict().items()}

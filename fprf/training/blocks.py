@@ -23,9 +23,8 @@ import torch
 from torch import Tensor, nn
 
 from ..blocks.fields import BlockedField, BlockedSampler, BlockedSemantic, Member, Members, ResidentMembers, inherit
-from ..blocks.partition import read_cells, write_cells
+from ..blocks.partition import Plan, pixel_mask, read_cells, write_cells
 from ..blocks.routing import BlendRouter, InsetRouter, Router, chart_of, surroundings_of, to_single
-from ..blocks.visibility import Plan, pixel_mask
 from ..config import FREE_IN_BLOCKS, TrainConfig, fields_only
 from ..datamanagers.basis import Basis
 from ..datamanagers.scene import Scene

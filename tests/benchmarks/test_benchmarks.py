@@ -1,17 +1,19 @@
-"""The list of benchmarks, each of them the whole way and small, and what the larger ones say of the tiny run."""
+"""The list of benchmarks, each the whole way and small, what the larger ones say of the tiny run; `benchmarks/gpu.sh`."""
 
 import importlib.util
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import pytest
 import torch
 from tiny_world import World
 
-from benchmarks import stress_operators
+from benchmarks import gpu_rows, stress_operators
 from benchmarks.__main__ import BENCHMARKS, main
 from benchmarks.restyle import BOUND, FLAT, GLOBAL, GOALS, MATCHED, PLAIN, STYLIZERS
 from benchmarks.speed import plain_planes
@@ -69,28 +71,17 @@ def test_a_worse_formula_breaks_the_bound(monkeypatch: pytest.MonkeyPatch) -> No
     assert "fog of 1e-9 a step, N = 256" in broken
 
 
-def peer(world: World, frames: Path, output: Path, *more: str) -> dict[str, Any]:
-    cameras = str(world.town / "transforms.json")
-    args = ["peer", str(frames), "--cameras", cameras, "--device", "cpu", "--output", str(output), *more]
-    assert main(args) == 0
-    document: dict[str, Any] = json.loads(output.read_text())
-    return document
-
-
-@pytest.fixture(scope="module")
-def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("night") / "town"
-    write_town(folder, seed=0, palette="night", views=10, width=32, height=24)
-    return folder
-
-
-def test_all_that_can_be_known(world: World, night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_peer_s_frames_are_judged_by_all_that_can_be_known(
+    world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The town at night as a peer's restyling of the town by day: exact, and nothing is missing."""
-    images, page = str(world.town / "images"), tmp_path / "page.md"
-    document = peer(
-        world, night / "images", tmp_path / "a.json", "--plain", images, "--depth", str(world.town / "depth"),
-        "--truth", str(night / "images"), "--references", str(world.references[0]), "--page", str(page),
-    )  # fmt: skip
+    write_town(tmp_path / "night", seed=0, palette="night", views=10, width=32, height=24)
+    frames, plain = str(tmp_path / "night" / "images"), str(world.town / "images")
+    page, output = tmp_path / "page.md", tmp_path / "peer.json"
+    words = ["--cameras", str(world.town / "transforms.json"), "--plain", plain, "--depth", str(world.town / "depth")]
+    words += ["--truth", frames, "--references", str(world.references[0]), "--page", str(page), "--output", str(output)]
+    assert main(["peer", frames, *words, "--device", "cpu"]) == 0
+    document = json.loads(output.read_text())
     assert document["frames"] == 10 and document["size"] == [32, 24] and document["missing"] == {}
     assert document["truth"] == {"psnr": 99.0, "cc_psnr": 99.0, "ssim": 1.0, "lpips": 0.0, "delta_e": 0.0}
     assert document["published"]["short"]["pairs"] > 0 and document["published"]["long"]["rmse"] > 0
@@ -178,3 +169,60 @@ def test_it_runs(name: str, capfd: pytest.CaptureFixture[str]) -> None:
             pytest.skip(f"{package} is not installed")
     assert main([name, "--quick"]) == 0
     assert capfd.readouterr().err.startswith(f"{name} needs ")
+
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "benchmarks" / "results"
+INTERPRETER = """#!PYTHON
+import os, shutil, sys
+from pathlib import Path
+words, kept = sys.argv[1:], Path(os.environ["KEPT"])
+if words[0].endswith("gpu_check.py"):
+    os.execv(sys.executable, [sys.executable, *words])
+if words[1] == "benchmarks.gpu_rows":
+    shutil.copytree(words[2], kept / "work")
+    sys.exit(1)
+with open(kept / "commands", "a") as file:
+    print(*words, sep="\\t", file=file)
+if os.environ["FAILS"] in words:
+    print("this is why")
+    sys.exit(3)
+if "eval" in words:
+    Path(words[3]).mkdir()
+    shutil.copy(kept / "metrics.json", words[3])
+if "speed" in words:
+    shutil.copy(os.environ["RESULTS"] + "/speed_fox.json", words[words.index("--output") + 1])
+"""
+METRICS = {"method": "fprf", "scene": "flower", "train_seconds": 179.0, "train_steps": 9000, "views": 5, "psnr": 26.5}
+
+
+def script(folder: Path, *words: str, fails: str = "nothing") -> tuple[int, list[list[str]]]:
+    """Exit status and commands of the script with an interpreter that runs none of them; its folder is kept."""
+    folder.mkdir(exist_ok=True)
+    stand_in = folder / "python"
+    stand_in.write_text(INTERPRETER.replace("PYTHON", sys.executable, 1))
+    stand_in.chmod(0o755)
+    (folder / "metrics.json").write_text(json.dumps(METRICS))
+    environment = {**os.environ, "PYTHON": str(stand_in), "KEPT": str(folder), "RESULTS": str(RESULTS), "FAILS": fails}
+    command = ["bash", str(ROOT / "benchmarks" / "gpu.sh"), *words]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=folder, timeout=100)
+    asked = folder / "commands"
+    return done.returncode, [line.split("\t") for line in asked.read_text().splitlines()] if asked.is_file() else []
+
+
+def test_a_failed_step_is_reported_and_the_others_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code, commands = script(tmp_path / "run", "--dry", fails="speed")
+    assert code == 1, "what gpu_rows.py says"
+    kinds = ["pytest", "train", "eval", "speed"]
+    assert [next(word for word in command if word in kinds) for command in commands] == [*kinds, "train", "eval"]
+    output = tmp_path / "gpu.json"
+    monkeypatch.setattr(sys, "argv", ["gpu_rows.py", str(tmp_path / "run" / "work"), "--output", str(output)])
+    assert gpu_rows.main() == 1
+    found = json.loads(output.read_text())
+    assert {each["step"]: each["passed"] for each in found["steps"]} == {
+        "tests": True, "train": True, "eval": True, "speed": False, "gaussians": True, "eval-gaussians": True,
+    }  # fmt: skip
+    rows = {row["name"]: row for row in found["rows"]}
+    assert rows["held-out PSNR"]["goal"] == 26 and rows["held-out PSNR"]["goal_is"] == "at least"
+    assert "by the CPU's kernels" in rows["held-out PSNR of 3D Gaussians"]["note"]
+    assert len(rows) == 3 and found["steps"][3]["said"] == "this is why\n"

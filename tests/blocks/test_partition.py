@@ -9,9 +9,8 @@ from block_scenes import drone, street
 from torch import Tensor
 
 from fprf.blocks.config import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig
-from fprf.blocks.partition import bisect_sightings, bounds, read_cells, write_cells
+from fprf.blocks.partition import bisect_sightings, bounds, make_plan, open_space, pixel_mask, read_cells, site_of, write_cells
 from fprf.blocks.routing import shares
-from fprf.blocks.visibility import make_plan, open_space, pixel_mask, site_of
 from fprf.datamanagers.scene import Scene, find_sightings
 from fprf.errors import CheckpointError, ConfigError
 from fprf.splats.cells import scene_in_windows

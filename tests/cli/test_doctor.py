@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from fake_packages import packages_in
+from fake_packages import Packages
 from PIL import Image
 from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import World
@@ -44,20 +44,19 @@ def m():
 """A method with an encoder of the hub."""
 
 
-def test_a_method_says_what_it_needs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_method_says_what_it_needs(packages: Packages, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert run(["fprf-lite"]) == run(["fprf"]) == 0, "what they need ships"
-    with packages_in(tmp_path) as packages:
-        packages.install("acme-m", {"fprf.methods": {"acme-m": "acme_methods:m"}}, code={"acme_methods": METHOD})
-        assert run(["acme-m"]) == 1
-        package, model = (finding for finding in method_needs("acme-m") if finding.what == "needs")
-        assert "transformers" in package.found and package.remedy.startswith("pip install") and not package.optional
-        assert model.remedy == "hf download facebook/dino-vits8" and model.optional, "it is downloaded where there is a network"
-        snapshot = tmp_path / "models--facebook--dino-vits8" / "snapshots" / "1"
-        snapshot.mkdir(parents=True)
-        (snapshot / "config.json").touch()
-        assert [finding for finding in method_needs("acme-m") if finding.what == "needs"] == [package]
+    packages.install("acme-m", {"fprf.methods": {"acme-m": "acme_methods:m"}}, code={"acme_methods": METHOD})
+    assert run(["acme-m"]) == 1
+    package, model = (finding for finding in method_needs("acme-m") if finding.what == "needs")
+    assert "transformers" in package.found and package.remedy.startswith("pip install") and not package.optional
+    assert model.remedy == "hf download facebook/dino-vits8" and model.optional, "it is downloaded where there is a network"
+    snapshot = tmp_path / "models--facebook--dino-vits8" / "snapshots" / "1"
+    snapshot.mkdir(parents=True)
+    (snapshot / "config.json").touch()
+    assert [finding for finding in method_needs("acme-m") if finding.what == "needs"] == [package]
 
 
 def test_the_feature_cache_is_told_and_cleaned(

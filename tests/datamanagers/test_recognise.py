@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 from capture_files import Capture, write_colmap, write_llff, write_transforms
-from fake_packages import packages_in
+from fake_packages import Packages
 
 from fprf.datamanagers.parsers.config import (
     ColmapConfig,
@@ -77,22 +77,20 @@ class ScanConfig(DataParserConfig):
 """
 
 
-def test_a_strangers_parser_recognises_its_folders(tmp_path: Path) -> None:
-    folder, site = tmp_path / "scene", tmp_path / "site"
+def test_a_strangers_parser_recognises_its_folders(packages: Packages, tmp_path: Path) -> None:
+    folder = tmp_path / "scene"
     write_colmap(folder, Capture.make(2))
-    site.mkdir()
-    with packages_in(site) as packages:
-        for name, confidence in (("sure", 0.6), ("even", 0.5), ("faint", 0.2)):
-            answer = f'Recognised({confidence}, "{name}.bin") if (data / "{name}.bin").is_file() else None'
-            points = {"fprf.dataparsers": {name: f"acme_{name}:ScanConfig"}}
-            packages.install(f"acme-{name}", points, code={f"acme_{name}": PARSER.format(answer=answer)})
-        (folder / "faint.bin").touch()
-        assert recognise(folder) == ColmapConfig()
-        (folder / "even.bin").touch()
-        with pytest.raises(DataError, match=r"by 'colmap' \(a model in .*\) and by 'even' \(even\.bin\); choose one with"):
-            recognise(folder)
-        (folder / "sure.bin").touch()
-        assert type(recognise(folder)).__module__ == "acme_sure"
+    for name, confidence in (("sure", 0.6), ("even", 0.5), ("faint", 0.2)):
+        answer = f'Recognised({confidence}, "{name}.bin") if (data / "{name}.bin").is_file() else None'
+        points = {"fprf.dataparsers": {name: f"acme_{name}:ScanConfig"}}
+        packages.install(f"acme-{name}", points, code={f"acme_{name}": PARSER.format(answer=answer)})
+    (folder / "faint.bin").touch()
+    assert recognise(folder) == ColmapConfig()
+    (folder / "even.bin").touch()
+    with pytest.raises(DataError, match=r"by 'colmap' \(a model in .*\) and by 'even' \(even\.bin\); choose one with"):
+        recognise(folder)
+    (folder / "sure.bin").touch()
+    assert type(recognise(folder)).__module__ == "acme_sure"
 
 
 @pytest.mark.parametrize(
@@ -109,20 +107,18 @@ def test_a_strangers_parser_recognises_its_folders(tmp_path: Path) -> None:
     ],
 )
 def test_a_broken_parser_is_named_and_skipped(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], source: str, told: str
+    packages: Packages, tmp_path: Path, capsys: pytest.CaptureFixture[str], source: str, told: str
 ) -> None:
-    folder, site = tmp_path / "scene", tmp_path / "site"
+    folder = tmp_path / "scene"
     write_colmap(folder, Capture.make(2))
-    site.mkdir()
-    with packages_in(site) as packages:
-        packages.install("acme-bad", {"fprf.dataparsers": {"bad": "acme_bad4:ScanConfig"}}, code={"acme_bad4": source})
-        assert recognise(folder) == ColmapConfig()
-        (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith("warning: data parser 'bad' (acme_bad4:ScanConfig from acme-bad 1) is skipped: ")
-        assert told in line
-        (folder / "sparse").rename(folder / "elsewhere")
-        with pytest.raises(DataError, match=r"for Gaussians --parser NAME \(bad, blocknerf"):
-            recognise(folder)
+    packages.install("acme-bad", {"fprf.dataparsers": {"bad": "acme_bad4:ScanConfig"}}, code={"acme_bad4": source})
+    assert recognise(folder) == ColmapConfig()
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("warning: data parser 'bad' (acme_bad4:ScanConfig from acme-bad 1) is skipped: ")
+    assert told in line
+    (folder / "sparse").rename(folder / "elsewhere")
+    with pytest.raises(DataError, match=r"for Gaussians --parser NAME \(bad, blocknerf"):
+        recognise(folder)
 
 
 SCENES = ["blender_lego", "drone_caliterra", "fox", "llff_fern", "llff_flower", "m360_bonsai", "street_lund"]

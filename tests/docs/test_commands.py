@@ -1,14 +1,18 @@
-"""Every command of the README and the documents, on a tiny scene: run, or for the heavy ones parsed to the end.
+"""The commands and the Python of the README and the documents, on a tiny scene: run, or for heavy commands parsed to the end.
 
 A command that is neither stands in `ELSEWHERE` with the reason; nothing else is left out.
 """
 
 import importlib
+import json
+import os
 import re
 import shlex
 import shutil
 import tomllib
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,8 +26,10 @@ from fprf.cli import main as cli
 from fprf.cli.main import VERBS
 from fprf.io.atomic import write_json
 from fprf.io.video import write_video
-from fprf.splats.files import write_gaussians
+from fprf.methods import fprf_splats
+from fprf.splats.files import read_capture, write_gaussians
 from fprf.testing import check_encoder
+from fprf.training.driver import train
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -217,3 +223,48 @@ def test_the_python_of_pages_runs_and_the_plug_in_of_the_readme_keeps_its_contra
         defined: dict[str, Any] = {"__name__": "page"}
         exec(compile(block, page, "exec"), defined)
     check_encoder(defined["ContrastConfig"]())
+
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+PAGE, NOTEBOOK = DOCS / "python.md", DOCS / "tour.ipynb"
+
+
+def test_the_page_runs(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").mkdir()
+    os.symlink(world.run, tmp_path / "runs" / "town-fprf-lite")
+    for name, reference in zip(("autumn.jpg", "night.jpg"), world.references, strict=True):
+        cv2.imwrite(name, cv2.imread(str(reference)))
+    write_gaussians(Path("scan.ply"), ball(200))
+    names: dict[str, object] = {}
+    for block in re.findall(r"^```python\n(.*?)^```", PAGE.read_text("utf-8"), re.DOTALL | re.MULTILINE):
+        exec(compile(block, str(PAGE), "exec"), names)
+    told = capsys.readouterr().out
+    assert "torch.Size([120, 160, 3])" in told and "'autumn.jpg'" in told and "'night.jpg'" in told
+    made = {path.name for path in tmp_path.iterdir()}
+    assert {"autumn.png", "film.mp4", "mine.json", "between-0.png", "between-2.png"} <= made
+    assert "(200, 3) True" in told
+    scans = [f"scan{name}" for name in ("_autumn.spz", "-0.5.ply", "-1.0.ply", "_night.splat", "_grey.ply", ".glb")]
+    assert all(len(read_capture(Path(name)).gaussians) == 200 for name in scans)
+
+
+def cells(kind: str) -> list[str]:
+    return ["".join(cell["source"]) for cell in json.loads(NOTEBOOK.read_text("utf-8"))["cells"] if cell["cell_type"] == kind]
+
+
+def test_every_cell_runs_in_order_on_the_garden(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    few = replace(fprf_splats(), steps=10, initial=800, cap=900, downscale=8)
+    train(replace(few, data=Path(str(files("fprf") / "garden")), output=Path("demo/run")), "fprf-splats", quiet=True)
+    names: dict[str, object] = {}
+    for number, source in enumerate(cells("code"), 1):
+        exec(compile(source, f"cell {number}", "exec"), names)
+    told = capsys.readouterr().out
+    assert "25 captured views" in told and "film.mp4:" in told and "'night.jpg'" in told
+    assert len(read_capture(Path("night.ply")).gaussians) > 500
+    made = {path.name for path in tmp_path.iterdir()}
+    assert {"plain.png", "wide.png", "autumn.png", "mine.json", "film.mp4"} <= made

@@ -1,7 +1,10 @@
-"""A small town, and Gaussians that are trained on it."""
+"""A small town, and Gaussians that are trained on it; a photograph for styles."""
 
 from dataclasses import replace
+from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from benchmarks.town.write import write_town
@@ -21,3 +24,11 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> GaussiansConfig:
 @pytest.fixture(scope="session")
 def scene(config: GaussiansConfig) -> Scene:
     return parse_scene(config.data, 1, None)
+
+
+@pytest.fixture
+def photograph(tmp_path: Path) -> Path:
+    noise = np.random.default_rng(0).integers(0, 120, (64, 96, 3), np.uint8)
+    noise[:32] += 100
+    cv2.imwrite(str(tmp_path / "style.png"), noise)
+    return tmp_path / "style.png"

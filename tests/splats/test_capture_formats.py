@@ -1,13 +1,10 @@
 """Formats of files of Gaussians as plug-ins: a stranger's one file and one entry point are enough for every reader and verb."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 import torch
-from fake_packages import packages_in
+from fake_packages import Packages
 from splat_ball import ball
 
 from fprf import testing
@@ -63,11 +60,8 @@ class Toy(CaptureFormat):
 
 
 @pytest.fixture
-def toy(tmp_path: Path) -> Iterator[None]:
-    (tmp_path / "site").mkdir()
-    with packages_in(tmp_path / "site") as packages:
-        packages.install("acme-toy", {"fprf.captures": {"toy": "acme_toy:Toy"}}, code={"acme_toy": CODE})
-        yield
+def toy(packages: Packages) -> None:
+    packages.install("acme-toy", {"fprf.captures": {"toy": "acme_toy:Toy"}}, code={"acme_toy": CODE})
 
 
 @pytest.mark.parametrize("name", ["ply", "compressed.ply", "splat", "spz", "sog", "glb", "gltf", "ksplat", "lod-meta.json"])
@@ -75,7 +69,7 @@ def test_built_in_formats_keep_to_the_contract(name: str) -> None:
     testing.check_capture_format(registry.make("fprf.captures", name, CaptureFormat))
 
 
-def test_a_strangers_format_is_read_restyled_and_written(toy: None, tmp_path: Path) -> None:
+def test_a_strangers_format_is_read_restyled_and_written(toy: None, photograph: Path, tmp_path: Path) -> None:
     testing.check_capture_format(format_of(Path("x.toy")))
     assert ".toy" in endings() and cli.main(["plugins", "--check"]) == 0
     made, path = ball(300, degree=0), tmp_path / "in.toy"
@@ -86,8 +80,6 @@ def test_a_strangers_format_is_read_restyled_and_written(toy: None, tmp_path: Pa
     check_file("x.toy", path.read_bytes()[:64], path.stat().st_size)
     with pytest.raises(DataError):
         check_file("x.toy", b"other", 60)
-    photograph = tmp_path / "style.png"
-    cv2.imwrite(str(photograph), np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8))
     words = ["restyle", str(path), "--references", str(photograph), "--semantic.encoder", "bundled-semantic", "--regions", "3"]
     words += ["--views", "4", "--size", "64", "48", "--cache", str(tmp_path / "cache")]
     assert cli.main([*words, "--output", str(tmp_path / "out.toy")]) == 0

@@ -6,7 +6,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -27,14 +26,6 @@ from fprf.style.files import StyleFile
 from fprf.style.restyle import apply_style
 
 SMALL = ["--semantic.encoder", "bundled-semantic", "--regions", "4", "--views", "6", "--size", "64", "48"]
-
-
-@pytest.fixture
-def photograph(tmp_path: Path) -> Path:
-    noise = np.random.default_rng(0).integers(0, 120, (64, 96, 3), np.uint8)
-    noise[:32] += 100
-    cv2.imwrite(str(tmp_path / "style.png"), noise)
-    return tmp_path / "style.png"
 
 
 def halves(folder: Path, made: Gaussians) -> list[Path]:

@@ -15,12 +15,13 @@ from test_more_formats import covariances, seen_along
 
 from fprf.cli import main as cli
 from fprf.errors import DataError
+from fprf.io.tensorfiles import load_sealed
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.rendering.splines import rotations
 from fprf.splats.captures import look_at_capture
 from fprf.splats.config import LookConfig
 from fprf.splats.files import Capture, read_capture, write_capture, write_gaussians
-from fprf.splats.files.sog import bundle, unbundle
+from fprf.splats.files.sog import _picture, _webp, bundle, unbundle
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.photographs import camera_of
 from fprf.splats.views import draw
@@ -198,18 +199,12 @@ def test_an_unsound_camera_is_left_alone(tmp_path: Path) -> None:
         assert read_capture(tmp_path / "x.ply").camera is None
 
 
-def test_up_of_the_file_decides_the_views_and_a_flag_before_it(tmp_path: Path) -> None:
+def test_up_of_the_file_decides_the_views_and_a_flag_before_it(photograph: Path, tmp_path: Path) -> None:
     made = ball(300)
     data = headed(plain_ply(made), lambda head: head.replace(b"\nelement", b"\ncomment Vertical axis: 0 0 1\nelement"))
     (tmp_path / "in.ply").write_bytes(data)
-    style = tmp_path / "style.png"
-    import cv2
-
-    cv2.imwrite(str(style), np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8))
-    words = ["restyle", str(tmp_path / "in.ply"), "--references", str(style), "--views", "4", "--size", "64", "48"]
+    words = ["restyle", str(tmp_path / "in.ply"), "--references", str(photograph), "--views", "4", "--size", "64", "48"]
     words += ["--cache", str(tmp_path / "cache"), "--output", str(tmp_path / "out.ply")]
-    from fprf.io.tensorfiles import load_sealed
-
     for flag, up in (([], [0.0, 0.0, 1.0]), (["--up", "1", "0", "0"], [1.0, 0.0, 0.0])):
         assert cli.main([*words, *flag]) == 0
         kept = max((tmp_path / "cache").iterdir(), key=lambda each: each.stat().st_mtime_ns)
@@ -326,8 +321,6 @@ def test_short_codebooks_and_models_of_sog(tmp_path: Path) -> None:
     def read(**changes: object) -> Capture:
         path.write_bytes(bundle(parts | {"meta.json": json.dumps(meta | changes).encode()}))
         return read_capture(path)
-
-    from fprf.splats.files.sog import _picture, _webp
 
     book = np.unique(plain.gaussians.log_scales.numpy())
     index = np.searchsorted(book, plain.gaussians.log_scales.numpy())

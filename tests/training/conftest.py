@@ -3,8 +3,7 @@
 from collections.abc import Iterator
 
 import pytest
-from block_world import BlockWorld, made
-from task_world import TaskWorld, small_cells, world_of_blocks, world_of_cells
+from parts_world import BlockWorld, TaskWorld, made, small_cells, world_of_blocks, world_of_cells
 
 from benchmarks.town.write import write_town
 from fprf.training.driver import train

@@ -6,12 +6,11 @@ from typing import Any
 
 import pytest
 import torch
-from block_world import BlockWorld, done_of, small
-from task_world import world_of_blocks
+from parts_world import BlockWorld, done_of, small, world_of_blocks
 
 from fprf.blocks.config import AdaptiveConfig
 from fprf.blocks.fields import Member
-from fprf.blocks.visibility import make_plan
+from fprf.blocks.partition import make_plan
 from fprf.errors import CheckpointError
 from fprf.io import tensorfiles
 from fprf.training.blocks import (

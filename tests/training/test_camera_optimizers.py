@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from block_world import BlockWorld, small, tensors_of
 from hypothesis import given
 from hypothesis import strategies as st
+from parts_world import BlockWorld, small, tensors_of
 from tiny_world import World, parameters, trained_for
 from torch import Tensor
 

@@ -61,9 +61,8 @@ def test_what_is_missing_is_named_with_what_to_do(moved: Path, tmp_path: Path) -
 
 def test_a_run_of_a_method_with_fields_of_its_own(world: World, moved: Path, tmp_path: Path) -> None:
     """It goes on with its own fields alone, and needs its method."""
-    trained, site = load_run(moved), tmp_path / "site"
-    site.mkdir()
-    with packages_in(site) as packages:
+    trained = load_run(moved)
+    with packages_in(tmp_path / "site") as packages:
         packages.install("acme-method", {"fprf.methods": {"acme": "acme_method2:acme"}}, code={"acme_method2": METHOD})
         config = replace(load_method("acme")[0], **vars(trained.config))
         trained.run.save_config(config, "acme")

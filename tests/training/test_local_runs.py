@@ -10,9 +10,11 @@ import pytest
 import torch
 import trimesh
 from moved_scene import UTM, moved_scene
+from parts_world import small
 from tiny_world import World, parameters, tiny
 
 import fprf
+from benchmarks.town.write import write_town
 from fprf.cli.main import main
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.images import write_image
@@ -150,3 +152,22 @@ def test_paths_and_places_are_given_in_the_capture_s_coordinates(world: World, s
     changed = (recoloured["in"] - recoloured["none"]).abs().amax(1) > 1e-3
     right = gaussians.means[:, 0].double() + origin[0] >= middle
     assert not bool(changed[~right].any()) and float(changed[right].double().mean()) > 0.5
+
+
+def test_cells_and_blocks_are_in_the_local_frame(world: World, utm: Path, tmp_path: Path) -> None:
+    town = world.folder / "wide"
+    if not town.exists():
+        write_town(town, seed=0, palette="day", views=10, width=96, height=72)
+    scores = []
+    for name, data in (("own", town), ("utm", moved_scene(town, tmp_path / "utm", UTM))):
+        cells, blocks = tmp_path / f"{name} cells", tmp_path / f"{name} blocks"
+        assert main(["train", "fprf-splats", "--data", str(data), *SPLATS, "--cells", "2", "--output", str(cells)]) == 0
+        train(small(data, blocks), "fprf-lite", quiet=True)
+        scores.append([psnr(cells), psnr(blocks)])
+    assert scores[1] == pytest.approx(scores[0], abs=0.25)
+    bounds = json.loads((tmp_path / "utm cells" / "cells.json").read_text())["cells"]
+    assert max(abs(x) for cell in bounds for x in (*cell["low"], *cell["high"]) if x is not None) < 1000
+    done = tmp_path / "utm blocks" / "blocks" / "00" / "done.json"
+    stamp = done.stat().st_mtime_ns
+    train(small(tmp_path / "utm", tmp_path / "utm blocks"), "fprf-lite", quiet=True)
+    assert done.stat().st_mtime_ns == stamp, "a finished block stays"

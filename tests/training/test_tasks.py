@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from task_world import TaskWorld
+from parts_world import TaskWorld
 from tiny_world import events, same
 
 from fprf.errors import CheckpointError, DataError

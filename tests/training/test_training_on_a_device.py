@@ -9,9 +9,8 @@ from typing import Any
 
 import pytest
 import torch
-from block_world import BlockWorld, tensors_of, unfinish
+from parts_world import BlockWorld, tensors_of, unfinish, world_of_blocks
 from pretend_cuda import CUDA, pretend_cuda
-from task_world import world_of_blocks
 from tiny_world import Altered, Change, World, events, parameters, prepared_for, spoilt, taught
 
 from fprf.config import TrainConfig

@@ -19,7 +19,7 @@ from ...interfaces import Stylizer
 from ...ops.precision import double, full_precision
 from ...style.dictionary import StyleDictionary, code_odds, whole_style
 from ...style.matching import point_shares, score_spread, share_mean, unit
-from ...style.scene_style import SceneStyle, check_fit
+from ...style.scene_style import SceneStyle
 from ...style.statistics import deviation
 from ...types import Want
 from .config import LocalAdainConfig
@@ -46,8 +46,6 @@ class AdainStylizer(Stylizer):
         odds = code_odds(dictionary).to(dictionary.keys)
         mean, covariance = double(dictionary.mean), double(dictionary.covariance)
         self.matched = config is not None and len(dictionary.keys) > 1 and dictionary.keys.shape[1] > 0
-        if config is not None:
-            check_fit(dictionary, scene)
         if config is not None and self.matched:
             # Both sides, such that their inner products are the scores R (paper, Eq. 5).
             theirs = share_mean(dictionary.keys, odds)

@@ -20,7 +20,7 @@ from ...interfaces import Stylizer
 from ...ops.precision import double, full_precision
 from ...style.dictionary import StyleDictionary, choose, code_odds, whole_style
 from ...style.matching import match_keys, unit
-from ...style.scene_style import Membership, SceneStyle, check_fit, mixed_maps, own_style
+from ...style.scene_style import Membership, SceneStyle, mixed_maps, own_style
 from ...style.statistics import deviation, monge
 from ...types import Want
 from .config import RegionConfig
@@ -85,7 +85,6 @@ class TwoSidedStylizer(Stylizer):
 
     def __init__(self, dictionary: StyleDictionary, scene: SceneStyle, config: RegionConfig) -> None:
         super().__init__()
-        check_fit(dictionary, scene)
         # Both sides are matched, blended and smoothed alike: the scene with itself, then with the references.
         own = own_style(scene, dictionary.blend)._replace(origin=dictionary.origin)
         same, table = region_table(scene, own, config), region_table(scene, dictionary, config)

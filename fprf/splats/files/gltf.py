@@ -234,7 +234,15 @@ def _parts(path: Path, document: dict[str, Any], data: Data | bytearray, start: 
             raise ValueError(f"node {index} is reached twice")
         seen.add(index)
         node = nodes[index]
-        matrix = above @ _local(node)
+        # The node's own matrix, from its parent's frame, or its parts.
+        if "matrix" in node:
+            local = np.array(node["matrix"], np.float64).reshape(4, 4).T
+        else:
+            local, (x, y, z, w) = np.eye(4), node.get("rotation", (0, 0, 0, 1))
+            turn = rotations(torch.tensor([[w, x, y, z]], dtype=torch.float64))[0].numpy()
+            local[:3, :3] = turn * node.get("scale", (1, 1, 1))
+            local[:3, 3] = node.get("translation", (0, 0, 0))
+        matrix = above @ local
         waiting += [(child, matrix) for child in node.get("children", [])]
         for primitive in document["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []:
             extension = primitive.get("extensions", {}).get(_NAME)
@@ -296,16 +304,6 @@ def _logarithmic(document: dict[str, Any], parts: list[_Part]) -> tuple[bool, st
     logarithmic = abs(ratios[1] - _TYPICAL) < abs(ratios[0] - _TYPICAL)
     shares = [f"{math.exp(min(ratio, 99)):.2g}" for ratio in (ratios[logarithmic], ratios[not logarithmic])]
     return logarithmic, f"so they are {shares[0]} of the distance between neighbours, not {shares[1]}"
-
-
-def _local(node: dict[str, Any]) -> Floats:
-    """The matrix [4 4] of a node, from its parent's frame."""
-    if "matrix" in node:
-        return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    matrix, (x, y, z, w) = np.eye(4), node.get("rotation", (0, 0, 0, 1))
-    matrix[:3, :3] = rotations(torch.tensor([[w, x, y, z]], dtype=torch.float64))[0].numpy() * node.get("scale", (1, 1, 1))
-    matrix[:3, 3] = node.get("translation", (0, 0, 0))
-    return matrix
 
 
 def _column(document: dict[str, Any], data: Data | bytearray, start: int, index: int) -> NDArray[Any]:

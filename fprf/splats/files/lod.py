@@ -5,10 +5,9 @@ of coarser levels alone are not opened. `environment` is one more SOG, which is 
 """
 
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -34,8 +33,13 @@ class StreamedSog(CaptureFormat):
                 raise ValueError(f"version {index['version']!r}; version 1 is read")
             # Of each leaf the rows of its finest level, by the file that has them.
             wanted: dict[str, list[slice]] = {}
-            for leaf in _leaves(index["tree"]):
-                level = leaf["lods"][min(leaf["lods"], key=int)]
+            waiting = [index["tree"]]
+            while waiting:
+                node = waiting.pop()
+                waiting += reversed(node.get("children", []))
+                if not node.get("lods"):
+                    continue
+                level = node["lods"][min(node["lods"], key=int)]
                 first, count = level["offset"], level["count"]
                 if not all(isinstance(number, int) and number >= 0 for number in (first, count, level["file"])):
                     raise ValueError(f"a leaf of {count} Gaussians from {first} on")
@@ -62,13 +66,3 @@ class StreamedSog(CaptureFormat):
         sections = [(len(part[0]), lambda rows, part=part: tuple(each[rows] for each in part)) for part in parts]
         gaussians, shift = base.decoded(parts[0][-1].shape[1], *sections)
         return Capture(path, gaussians, antialiased, bundle(archives), lambda harmonics, changed: (), shift=shift)
-
-
-def _leaves(root: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """The leaves of a tree that have Gaussians."""
-    waiting = [root]
-    while waiting:
-        node = waiting.pop()
-        waiting += reversed(node.get("children", []))
-        if node.get("lods"):
-            yield node

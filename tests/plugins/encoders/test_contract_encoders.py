@@ -31,26 +31,21 @@ from fprf.plugins.weights import read_weights, write_weights
 from fprf.testing import check_encoder
 
 Make = Callable[[Path], EncoderConfig]
-ENCODERS: dict[str, tuple[Make, int]] = {
-    "random": (lambda _: RandomConfig(stride=3), 3),
-    "bundled-content": (lambda _: BundledContentConfig(), 2),
-    "bundled-semantic": (lambda _: BundledSemanticConfig(), 8),
-    "vgg19-normalised": (lambda folder: Vgg19Config(weights=vgg_file(folder)), 2),
-    "vgg19-plain": (lambda folder: Vgg19Config(weights=vgg_file(folder), normalise=False, layer="conv3_1"), 4),
-    "dinov2": (lambda _: Dinov2Config(layer=3, stride=5), 5),
-    "dinov2-keys": (lambda _: Dinov2Config(layer=2, features="keys", stride=20), 20),
-    "concat": (lambda _: ConcatConfig(first=RandomConfig(stride=8), second=RandomConfig(stride=4, channels=3)), 4),
+ENCODERS: dict[str, Make] = {
+    "random": lambda _: RandomConfig(stride=3),
+    "bundled-content": lambda _: BundledContentConfig(),
+    "bundled-semantic": lambda _: BundledSemanticConfig(),
+    "vgg19-normalised": lambda folder: Vgg19Config(weights=vgg_file(folder)),
+    "vgg19-plain": lambda folder: Vgg19Config(weights=vgg_file(folder), normalise=False, layer="conv3_1"),
+    "dinov2": lambda _: Dinov2Config(layer=3, stride=5),
+    "dinov2-keys": lambda _: Dinov2Config(layer=2, features="keys", stride=20),
+    "concat": lambda _: ConcatConfig(first=RandomConfig(stride=8), second=RandomConfig(stride=4, channels=3)),
 }
 
 
-@pytest.fixture(scope="module", params=ENCODERS)
-def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[EncoderConfig, int]:
-    make, stride = ENCODERS[request.param]
-    return make(tmp_path_factory.mktemp("weights")), stride
-
-
-def test_the_contract_that_strangers_sign(made: tuple[EncoderConfig, int]) -> None:
-    check_encoder(made[0])
+@pytest.mark.parametrize("name", ENCODERS)
+def test_the_contract_that_strangers_sign(name: str, tmp_path: Path) -> None:
+    check_encoder(ENCODERS[name](tmp_path))
 
 
 def test_identities_differ_with_settings(tmp_path: Path) -> None:

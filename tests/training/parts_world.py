@@ -1,19 +1,82 @@
-"""Small runs in parts, of both kinds: three blocks of fields, two cells of Gaussians."""
+"""Scenes in parts: a town in three blocks, trained for six steps, and in two cells; their parts as tasks."""
 
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from tiny_world import tiny
 
-from fprf.config import RunConfig
+from benchmarks.town.write import write_town
+from fprf.blocks.config import GridConfig, LayoutConfig
+from fprf.config import RunConfig, StatisticsConfig, TrainConfig
+from fprf.io import tensorfiles
 from fprf.splats import cells
 from fprf.splats.config import GaussiansConfig
 from fprf.training import blocks, checkpoint
+from fprf.training.blocks import folder_of
+from fprf.training.driver import train
 from fprf.training.tasks import Part, Task, train_part
+
+STEPS = 6
+BLOCKS = GridConfig(cells=(3, 1))
+
+
+@dataclass(frozen=True)
+class BlockWorld:
+    """Read it, never write to it."""
+
+    folder: Path
+    config: TrainConfig
+
+    @property
+    def root(self) -> Path:
+        return self.folder / "run"
+
+
+def small(town: Path, output: Path, blocks: LayoutConfig = BLOCKS, steps: int = STEPS) -> TrainConfig:
+    config = tiny(town, output)
+    return replace(
+        config,
+        blocks=blocks,
+        steps=steps,
+        datamanager=replace(config.datamanager, rays=128),
+        sampler=replace(config.sampler, samples=(12,), anneal_steps=4),
+        content=replace(config.content, field=replace(config.content.field, resolutions=(8,), hidden=16)),
+        optimizer=replace(config.optimizer, warm_up=2),
+        statistics=StatisticsConfig(rays=512, regions=3),
+    )
+
+
+def made(folder: Path) -> TrainConfig:
+    """Train it in `folder / "run"`."""
+    town = folder / "town"
+    write_town(town, seed=0, palette="day", views=12, width=32, height=24)
+    config = small(town, folder / "run")
+    train(config, "fprf-lite", quiet=True)
+    return config
+
+
+def tensors_of(root: Path, name: str) -> dict[str, torch.Tensor]:
+    """The finished tensors of a block."""
+    return {k: t.clone() for k, t in tensorfiles.read(root / "blocks" / name / "block.safetensors").items()}
+
+
+def done_of(root: Path, name: str) -> dict[str, Any]:
+    document: dict[str, Any] = json.loads((root / "blocks" / name / "done.json").read_text())
+    return document
+
+
+def unfinish(root: Path, block: int) -> Path:
+    """The folder of a block, as it was before its first step."""
+    folder = folder_of(root, block)
+    shutil.rmtree(folder / "checkpoints")
+    (folder / "done.json").unlink()
+    return folder
+
 
 REPORT = Callable[[Any], None]
 
