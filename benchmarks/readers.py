@@ -33,7 +33,7 @@ from fprf.datamanagers.parsers.files import read_npz
 from fprf.datamanagers.parsers.phototourism import read_list
 from fprf.errors import FprfError
 from fprf.io import tensorfiles
-from fprf.plugins.codec import load_config
+from fprf.methods import load_config
 from fprf.rendering.paths import read_camera_path
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.gaussians import Gaussians
@@ -245,8 +245,7 @@ def _style(folder: Path) -> Target:
 
 
 def _config(folder: Path) -> Target:
-    from fprf.methods import fprf_lite
-    from fprf.plugins.codec import save_config
+    from fprf.methods import fprf_lite, save_config
 
     folder.mkdir()
     save_config(folder / "config.json", fprf_lite(), "fprf-lite")

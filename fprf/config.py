@@ -204,9 +204,9 @@ class RunConfig:
     """Scene folder, which must be named; `garden` is the embedded one."""
     output: Path | None = None
     """Run folder; by default runs/SCENE-METHOD. A folder with a run in it is resumed."""
-    downscale: int | None = None
-    """Factor by which the delivered images are reduced; none = found from their size and number, the rays of the training and
-    the device (docs/formats.md), and saved with the run."""
+    downscale: int | float | None = None
+    """Factor, at least 1, by which the delivered images are reduced; none = found from their size and number, the rays of the
+    training and the device (docs/formats.md), and saved with the run."""
     steps: int = 30_000
     """Optimiser steps."""
     minutes: float | None = None

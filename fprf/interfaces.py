@@ -448,7 +448,7 @@ class DataParser(ABC):
     """A scene folder to a `datamanagers.scene.Scene`. Decodes no image."""
 
     @abstractmethod
-    def parse(self, data: Path, downscale: int) -> "ParsedScene":
+    def parse(self, data: Path, downscale: float) -> "ParsedScene":
         """The scene at 1/downscale of the delivered size. Raises DataError with file, finding and remedy."""
 
 

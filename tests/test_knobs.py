@@ -16,10 +16,10 @@ from fprf.config import TrainConfig
 from fprf.datamanagers.batches import RayBatches
 from fprf.io.images import write_image
 from fprf.methods import fprf_lite
+from fprf.plugins.codec import leaves
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.plugins.slots import replace as replaced
 from fprf.plugins.slots import slots
-from fprf.plugins.typed_json import leaves
 from fprf.training import checkpoint
 from fprf.training.model import build_model
 from fprf.training.style_pass import measure_style

@@ -11,9 +11,9 @@ from fprf import __version__
 from fprf.cli.parsing import flags_of, load_method, parse
 from fprf.cli.plugins import KINDS
 from fprf.fields.config import PlanesConfig
-from fprf.methods import fprf
+from fprf.methods import fprf, load_config, save_config
 from fprf.plugins import registry
-from fprf.plugins.codec import from_json, load_config, save_config, to_json
+from fprf.plugins.codec import from_json, to_json
 from fprf.plugins.encoders.config import SEMANTICS, Vgg19Config
 from fprf.plugins.samplers.config import ProposalConfig
 from fprf.plugins.slots import replace, slots

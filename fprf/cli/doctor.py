@@ -172,7 +172,7 @@ def self_test(name: str) -> Iterator[Finding]:
 
 def method_needs(name: str) -> Iterator[Finding]:
     """Packages and weights that training by a method needs. Raises PluginError for a method that cannot be loaded."""
-    from ..plugins.codec import method_config
+    from ..methods import method_config
 
     config = method_config(name)
     for need in config.needs():

@@ -14,8 +14,9 @@ from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_origin
 
 from ..errors import ConfigError, UsageError
+from ..methods import load_config, method_config
 from ..plugins import registry
-from ..plugins.codec import Missing, load_config, method_config
+from ..plugins.codec import Missing
 from ..plugins.slots import Slot, hints_of, is_slot, members, resolve, slots
 
 if TYPE_CHECKING:

@@ -11,7 +11,6 @@ from typing import Annotated, NamedTuple
 import torch
 from torch import Tensor
 
-from ..checks import at_least
 from ..errors import DataError, NumericsError
 
 
@@ -66,7 +65,6 @@ def fit_basis(samples: Annotated[Tensor, "N I"], dim: int) -> Basis:
     """The min(dim, I) directions of most variance; with all of them, a rotation. The sign is such that each column's
     largest entry is positive. Raises DataError without samples, NumericsError where one is not finite.
     """
-    at_least("semantic.dim", dim, 1)
     if samples.ndim != 2 or not samples.numel():
         raise DataError(f"basis: samples {tuple(samples.shape)}; at least one feature vector [N I] is needed")
     if not torch.isfinite(samples).all():

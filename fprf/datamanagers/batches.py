@@ -29,7 +29,7 @@ from ..types import Batch
 from .basis import Basis
 from .config import RayBatchesConfig
 from .features import Progress, extract
-from .images import WHITE, load_image, load_images, load_mask
+from .images import WHITE, load_images, load_mask
 from .scene import Scene, find_sightings
 
 HELD = 512 * 2**20
@@ -133,8 +133,8 @@ class _Source(NamedTuple):
     """int64 width and height of each."""
     ends: Annotated[Tensor, "T"]
     """int64 pixels up to the end of each."""
-    chosen: PixelRuns | None
-    """Pixels that may be drawn; None = all."""
+    chosen: PixelRuns
+    """Pixels that may be drawn."""
     sky: PixelRuns | None
     marked: Annotated[Tensor, "O"] | None
     """int64 pixels that show a point of the reconstruction; None = none do."""
@@ -170,6 +170,7 @@ class RayBatches(DataManager):
         self.background = background or (WHITE if scene.alpha else None)
         """Colour (RGB in [0, 1]) behind transparent pixels; None for opaque scenes."""
         self._config, self._scene, self._seed = config, scene, seed
+        # Views lie in slots one after the other: pixel p of slot k is number ends[k - 1] + p.
         self._views = scene.train.tolist()
         self._sizes = scene.cameras.size[scene.train]
         self._ends = self._sizes.prod(1).cumsum(0)
@@ -184,12 +185,14 @@ class RayBatches(DataManager):
                 filled += len(rows)
         # Pixels that may be drawn, those of sky, and those that show points.
         masks, skies = (scene.masks, scene.sky_masks) if config.masks else ((), ())
-        self._chosen = None if seen is None and not masks else self._runs(masks, unmasked=True, seen=seen)
-        if self._chosen is not None and not len(self._chosen):
+        every = PixelRuns(torch.zeros(1, dtype=torch.int64), self._ends[-1:])
+        self._chosen = self._runs(masks, unmasked=True, seen=seen) if masks or seen is not None else every
+        if not len(self._chosen):
             raise DataError(f"{scene.name}: none of {len(self._views)} training views shows what is to be learnt")
         sky = self._runs(skies, unmasked=False) if skies else None
         marked, distance = self._marked() if config.depth_share > 0 else (None, None)
         self._source = _Source(self._pixels, scene.train, self._sizes, self._ends, self._chosen, sky, marked, distance)
+        # Features are those of the very pixels above, which are not decoded again for each encoder.
         features = partial(extract, views=self._views, image=self._stored, config=config.guided, progress=progress)
         self.content_store = None if content is None else features(cache / "content", encoder=content)
         self.semantic_store = None if semantic is None else features(cache / "semantic", encoder=semantic, dim=dim, basis=basis)
@@ -199,10 +202,8 @@ class RayBatches(DataManager):
         source = self._source
         device = source.pixels.device
         # Pixels among all that may be drawn.
-        room = len(source.pixels) if source.chosen is None else len(source.chosen)
         generator = generator_of(self._seed, step, device)
-        at = torch.randint(room, (self._config.rays,), generator=generator, device=device)
-        at = at if source.chosen is None else source.chosen.pick(at)
+        at = source.chosen.pick(torch.randint(len(source.chosen), (self._config.rays,), generator=generator, device=device))
         distance = None
         if source.marked is not None and source.distance is not None:
             # Some through sparse points, as the last rays: the first ones carry semantics, which must stay an even sample.
@@ -249,8 +250,7 @@ class RayBatches(DataManager):
         """One view of the scene as a float image in [0, 1]; held-out ones are read when asked for."""
         if view in self._slots:
             return self._stored(view).float() / 255
-        width, height = self._scene.cameras.size[view].tolist()
-        return torch.from_numpy(load_image(self._scene.paths[view], (width, height), self.background)).float() / 255
+        return torch.from_numpy(load_images(self._scene, self.background, [view])[0]).float() / 255
 
     def _stored(self, view: int) -> Annotated[Tensor, "H W 3"]:
         slot = self._slots[view]
@@ -291,5 +291,5 @@ class RayBatches(DataManager):
         slot, pixel = slots[sightings.view], sightings.pixel.long()
         width, height = self._sizes[slot].unbind(1)
         at = self._ends[slot] - width * height + pixel[:, 1] * width + pixel[:, 0]
-        kept = torch.ones(len(at), dtype=torch.bool) if self._chosen is None else self._chosen.holds(at)
+        kept = self._chosen.holds(at)
         return (at[kept], sightings.distance[kept].float()) if bool(kept.any()) else (None, None)

@@ -35,6 +35,7 @@ _FEWEST = 3
 
 def detail(image: Image, scales: int) -> Annotated[NDArray[np.float64], "K"]:
     """Ratios r_k of an RGB image [H W 3], k < K = `scales`; NaN where nothing is to be seen, and where it is too small."""
+    # A pyramid of halved sizes: the variance of the Laplacian at each is the detail that is left there.
     grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY).astype(np.float32)
     energy = np.full(scales + _APART, np.nan)
     for k in range(scales + _APART):
@@ -43,6 +44,7 @@ def detail(image: Image, scales: int) -> Annotated[NDArray[np.float64], "K"]:
         if min(grey.shape) < _SMALLEST:
             break
         energy[k] = cv2.Laplacian(grey, cv2.CV_32F).var(dtype=np.float64)
+    # In a flat picture there is no coarse detail to compare with, and the ratio says nothing.
     coarse = energy[_APART:]
     ratio = np.full(scales, np.nan)
     np.divide(energy[:scales], coarse, out=ratio, where=coarse > 1e-3)

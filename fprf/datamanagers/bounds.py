@@ -159,6 +159,7 @@ def _ndc(scene: Scene) -> Space:
     rotation = torch.stack([right, torch.linalg.cross(back, right), back])
     nearest = _nearest(scene)
     assert nearest is not None  # find_kind asked
+    # One frustum for all: the mean camera's, from a tenth before the nearest point on.
     size = cameras.size.double().mean(0)
     fx, fy = (2 * cameras.focal.mean(0) / size).tolist()
     centre = _three(pose[:, :, 3].mean(0))

@@ -174,6 +174,7 @@ class FeatureStore:
         checked, since the host would wait.
         """
         if self._packed is not None and view.device == self._packed[1].device:
+            # On the device everything is there already, and the host does not look at the views.
             packed, numbers = self._packed
             return guided.apply_packed(packed, numbers[view], pixel, rgb, grey=GREY)
         from ..ops import guided_kernels as kernels
@@ -184,6 +185,7 @@ class FeatureStore:
         missing = asked[self._slots[slot] != asked]
         if len(missing):
             raise DataError(f"feature store: view {int(missing.min())} has no features; {len(self._coefs)} training views have")
+        # The kernel takes contiguous float32 on the CPU, colours about mid-grey as they are stored.
         positions, colours = (x.detach().cpu().float().contiguous() for x in (pixel, rgb))
         out = torch.empty(len(view), self.channels)
         tensors = slot, self._address, self._shape, self._scale, self._centre, positions, colours - GREY, out
@@ -261,6 +263,7 @@ def _device(encoder: Encoder) -> torch.device:
 def _encode(encoder: Encoder, pixels: Annotated[Tensor, "H W 3"], view: int) -> Annotated[Tensor, "C h w"]:
     image = (pixels.float() / 255).permute(2, 0, 1)[None]
     features: Tensor = encoder(image.to(_device(encoder)))
+    # An encoder may be a stranger's: its mistakes are told here, not met as a strange scene.
     if features.ndim != 4 or features.shape[:2] != (1, encoder.channels) or not features.numel():
         raise PluginError(
             f"encoder {encoder.identity}: features {tuple(features.shape)} of one image; "
@@ -303,6 +306,7 @@ def _basis(
     remembered: dict[int, Tensor],
 ) -> Basis:
     """Fitted on cells drawn from up to BASIS_VIEWS views, spread evenly; kept in a file of its own."""
+    # The basis depends on these views alone, so it is kept under the hash of theirs.
     views = list(prints)
     chosen = views[:: max(1, -(-len(views) // BASIS_VIEWS))]
     key = digest("basis", str(dim), str(BASIS_CELLS), encoder.identity, *(prints[view] for view in chosen))

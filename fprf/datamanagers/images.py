@@ -192,6 +192,7 @@ def load_mask(path: Path, size: tuple[int, int] | None = None, *, upright: bool 
 
 def useless_masks(scene: "Scene") -> str:
     """Describe masks that leave no pixel of any view, or every pixel of all; empty for others and without masks."""
+    # Masks of one colour, all of the same, mean that white and black were swapped, or that nothing was painted.
     first = None
     for path in scene.masks:
         share = 1.0 if path is None else float(load_mask(path).mean())
@@ -233,6 +234,7 @@ def image_names(folder: Path) -> list[str]:
         entries = os.listdir(folder)
     except OSError as error:
         raise DataError(f"{folder}: no such image folder ({error.strerror}); name it or put the images there") from error
+    # Hidden files are what other systems leave behind, such as ._0001.jpg.
     names = sorted(n for n in entries if Path(n).suffix.lower() in IMAGE_SUFFIXES and not n.startswith("."))
     if not names:
         raise DataError(

@@ -17,18 +17,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .backend import compiled
+from .backend import compiled_for
 
 Floats = np.ndarray[tuple[int], np.dtype[np.float32]]
 
 
 def usable(*tensors: Tensor) -> bool:
     """Return whether kernels without gradients apply: float32 on the CPU, not empty, gradients disabled, numba installed."""
-    return all(_fit(x) for x in tensors) and not torch.is_grad_enabled()
-
-
-def _fit(x: Tensor) -> bool:
-    return compiled() and x.device.type == "cpu" and x.dtype == torch.float32 and x.numel() > 0
+    return compiled_for(*tensors) and all(x.numel() > 0 for x in tensors) and not torch.is_grad_enabled()
 
 
 def array(x: Tensor) -> Floats:
@@ -82,7 +78,7 @@ def runs(x: Annotated[Tensor, "N C"]) -> tuple[Annotated[Tensor, "P"], Annotated
 
     Only on the CPU in float32; elsewhere each row stands for itself.
     """
-    if not _fit(x):
+    if not (compiled_for(x) and x.numel() > 0):
         every = torch.arange(len(x), device=x.device)
         return every, every
     begins = torch.nn.functional.pad((x[1:] != x[:-1]).any(1), (1, 0), value=True)

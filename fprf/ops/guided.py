@@ -22,7 +22,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..checks import at_least
 from ..errors import DataError
 from .precision import float64_device, full_precision
 
@@ -55,13 +54,8 @@ def coefficients(
     """A (three numbers) and b of every channel, float32, in ceil(H / stride) x ceil(W / stride) equal cells of the image.
 
     `radius` in pixels (>= 0), `eps` in squared colour units (>= 1e-6: below, float32 features no longer carry the answer).
-    Raises ConfigError for those out of range, DataError for shapes that do not fit.
+    Raises DataError for shapes that do not fit.
     """
-    at_least("guided.radius", radius, 0)
-    at_least("guided.eps", eps, 1e-6)
-    at_least("guided.stride", stride, 1)
-    if fineness != math.inf:
-        at_least("guided.fineness", fineness, 1.0)
     if features.ndim != 3 or guide.ndim != 3 or guide.shape[-1] != 3 or min(features.shape + guide.shape) < 1:
         raise DataError(
             f"guided filter: features {tuple(features.shape)} and guide {tuple(guide.shape)}; "

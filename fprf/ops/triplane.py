@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .backend import compiled
+from .backend import compiled_for
 from .dense import array
 
 AXES = ((0, 1), (0, 2), (1, 2))
@@ -77,8 +77,7 @@ def variation_reference(table: Annotated[Tensor, "rows F"], resolutions: Sequenc
 
 def usable(points: Tensor, table: Tensor) -> bool:
     """Return whether kernels apply: float32 on the CPU, whole vectors of channels, and numba is installed."""
-    on_cpu = points.device.type == "cpu" and table.device.type == "cpu"
-    return compiled() and on_cpu and points.dtype == table.dtype == torch.float32 and table.shape[1] % _LANES == 0
+    return compiled_for(points, table) and table.shape[1] % _LANES == 0
 
 
 def lookup(

@@ -1,88 +1,218 @@
-"""`config.json`: a config with its method, the version that wrote it and the packages of its plug-ins.
+"""Configs to plain JSON and back, driven by the type hints.
 
-Strict: duplicate keys, NaN, unknown keys and foreign formats are refused. Written whole or not at all.
-
-A method returns a `RunConfig`, of fprf or of its own: a file is read as the class that its method returns, so a method whose
-config has fields of its own must be installed.
+Nothing in a file is ever imported: a plug-in is named, and the name is looked up among the installed entry points. One
+that is not installed is kept as data (`Missing`) and fails only when it is built.
 """
 
+import dataclasses
+import enum
 import json
-from importlib.metadata import version
+import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal, NoReturn, TypeVar, get_args, get_origin
 
-from ..errors import ConfigError, FprfError, PluginError
-from ..io.atomic import write_text
+from ..errors import ConfigError, PluginError
 from ..io.strict_json import parse_json
 from . import registry
-from .slots import slots
-from .typed_json import Missing as Missing
-from .typed_json import from_json as from_json
-from .typed_json import to_json as to_json
+from .config import Need, PluginConfig
+from .slots import hints_of, is_slot, members, slots
 
-if TYPE_CHECKING:
-    from ..config import RunConfig
-
-_METHODS = "fprf.methods"
-
-_FORMAT, _VERSION = 1, version("fprf")
-_KEYS = ("format", "fprf", "method", "plugins", "config")
+T = TypeVar("T")
 
 
-def save_config(path: Path, config: "RunConfig", method: str) -> None:
-    """Write the config, synced and then renamed into place, so that a reader finds the old file or the new one.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Missing(PluginConfig):
+    """Stands where a plug-in was that cannot be loaded here; keeps its data, and fails when it is built."""
 
-    Raises ConfigError where the config has fields of its own and `method` would not give them back.
+    slot: str
+    """Dotted path of the slot."""
+    kind: str
+    """Entry-point group."""
+    name: str
+    """Name of the plug-in."""
+    data: str
+    """Its fields, as JSON text."""
+    package: str
+    """The package that provided it when the file was written, as the file says; may be empty."""
+    reason: str
+    """Reason why it cannot be loaded."""
+
+    def needs(self) -> tuple[Need, ...]:
+        return (Need(self.reason, self._remedy()),)
+
+    def build(self, *args: object, **kwargs: object) -> NoReturn:
+        """Raise PluginError: takes what any kind's `build` takes."""
+        raise PluginError(f"{self.slot}: {self.reason}; {self._remedy()}")
+
+    def _remedy(self) -> str:
+        package = self.package or "the package that provides it"
+        return f"install {package}, or choose another with --{self.slot} NAME"
+
+
+def to_json(config: object) -> Any:
+    """A config as dicts, lists, strings and numbers; a plug-in carries its name as `type`."""
+    return _encode(config, type(config), "config")
+
+
+def leaves(config: object) -> dict[str, Any]:
+    """Every field of a config tree as JSON by its dotted path. A plug-in's path gives its name; without one there, null."""
+    values: dict[str, Any] = {}
+
+    def walk(tree: Any, path: str) -> None:
+        if not isinstance(tree, dict):
+            values[path] = tree
+            return
+        for name, value in tree.items():
+            walk(value, path if name == "type" else f"{path}.{name}".lstrip("."))
+
+    walk(to_json(config), "")
+    return values
+
+
+def from_json(data: Any, kind: type[T], *, packages: Mapping[str, str] | None = None, path: str = "config") -> T:
+    """The config of that type. Raises ConfigError naming the field by its dotted path, of which `path` is the start.
+
+    A key that is absent takes the code's default; an unknown one is refused. `packages` says by dotted path which
+    package each plug-in came from, for the message about a missing one.
     """
-    from ..config import TrainConfig  # the knob tree is made of plug-in configs, which lie above this module
-
-    packages = packages_of(config)
-    if type(config) is not TrainConfig:
-        if type(method_config(method)) is not type(config):
-            raise ConfigError(f"method {method!r} gives no {type(config).__name__}, so its fields could not be read again")
-        packages["method"] = registry.entry(_METHODS, method).package
-    whole = {"format": _FORMAT, "fprf": _VERSION, "method": method, "plugins": packages, "config": to_json(config)}
-    write_text(path, json.dumps(whole, indent=1, allow_nan=False) + "\n")
+    value: T = _read(data, kind, path, packages or {})
+    return value
 
 
-def load_config(path: Path) -> "tuple[RunConfig, str]":
-    """The config of a file and the name of its method.
+def _encode(value: Any, hint: Any, path: str) -> Any:
+    if isinstance(value, Missing):
+        return {"type": value.name, **json.loads(value.data)}
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        # In a slot a config carries the name that it is installed under.
+        kind = next(filter(is_slot, members(hint)), None)
+        tag = {"type": registry.name_of(kind.group, type(value))} if kind else {}
+        hints = hints_of(type(value))
+        names = [f.name for f in dataclasses.fields(value)]
+        if kind and "type" in names:
+            raise ConfigError(f"{path}: {type(value).__name__} has a field `type`, which names the plug-in; rename it")
+        return tag | {name: _encode(getattr(value, name), hints[name], f"{path}.{name}") for name in names}
+    if isinstance(value, enum.Enum):
+        return value.value
+    if isinstance(value, Path):
+        return value.as_posix()
+    if isinstance(value, tuple | list):
+        hint = next((h for h in members(hint) if get_origin(h) in (tuple, list)), tuple[Any, ...])
+        return [_encode(v, h, f"{path}.{i}") for i, (v, h) in enumerate(zip(value, _items(hint, len(value)), strict=True))]
+    if isinstance(value, Mapping):
+        hint = next((h for h in members(hint) if get_origin(h) is dict), dict[str, Any])
+        return {str(k): _encode(v, get_args(hint)[1], f"{path}.{k}") for k, v in value.items()}
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{path}: {value} is not a finite number and cannot be saved")
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise ConfigError(f"{path}: {type(value).__name__} cannot be saved; use numbers, text, paths, tuples")
 
-    Raises ConfigError naming the file and the field, PluginError where the method is needed and not installed.
-    """
-    from ..config import TrainConfig
 
-    whole = read_json(path)
-    try:
-        _check(whole)
-        fields, method, packages = whole["config"], whole["method"], whole["plugins"]
+def _read(data: Any, hint: Any, path: str, packages: Mapping[str, str]) -> Any:
+    if hint is Any:
+        return data
+    # Of a union the first kind that the value is of; where it is of none, what each of them expected is told.
+    choices = [h for h in members(hint) if h is not type(None)]
+    if data is None and len(choices) < len(members(hint)):
+        return None
+    if len(choices) > 1:
+        faults = []
+        for choice in choices:
+            try:
+                return _read(data, choice, path, packages)
+            except ConfigError as fault:
+                faults.append(str(fault).removeprefix(f"{path}: "))
+        raise ConfigError(f"{path}: {', nor '.join(faults)}")
+    hint = choices[0]
+    origin, args = get_origin(hint), get_args(hint)
+    if is_slot(hint):
+        # A plug-in is named; one that cannot be loaded is kept as data.
+        fields = dict(_expect(data, dict, path))
+        name = fields.pop("type", None)
+        if not isinstance(name, str):
+            raise ConfigError(f'{path}: expected the plug-in\'s name as "type", found {name!r}')
         try:
-            kind = type(method_config(method))
-        except PluginError as fault:  # not installed, or broken
-            # Only a method whose package is on record had fields of its own.
-            if "method" in packages:
-                raise PluginError(f"{path}: {fault}; install {packages['method']}") from fault
-            kind = TrainConfig
-        return from_json(fields, kind, packages=packages), method
-    except ConfigError as fault:
+            chosen = registry.load(hint.group, name, hint)
+        except PluginError as reason:
+            slot, text = path.partition(".")[2], json.dumps(fields, allow_nan=False)
+            package = packages.get(slot, "").removeprefix(f"{name} ")
+            return Missing(slot=slot, kind=hint.group, name=name, data=text, package=package, reason=str(reason))
+        return _read_fields(fields, chosen, path, packages)
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        return _read_fields(_expect(data, dict, path), hint, path, packages)
+    # Containers, item by item.
+    if origin in (tuple, list):
+        items = _expect(data, list, path)
+        hints = _items(hint, len(items))
+        if len(items) != len(hints):
+            raise ConfigError(f"{path}: expected {len(hints)} values, found {len(items)}")
+        return origin(_read(v, h, f"{path}.{i}", packages) for i, (v, h) in enumerate(zip(items, hints, strict=True)))
+    if origin is dict:
+        return {k: _read(v, args[1], f"{path}.{k}", packages) for k, v in _expect(data, dict, path).items()}
+    if origin is Literal or (isinstance(hint, type) and issubclass(hint, enum.Enum)):
+        allowed = {value: value for value in args} if origin is Literal else {each.value: each for each in hint}
+        for value, meant in allowed.items():
+            if type(value) is type(data) and value == data:  # True == 1
+                return meant
+        raise ConfigError(f"{path}: {data!r} is not one of {', '.join(map(repr, allowed))}")
+    # Plain values.
+    if hint is Path:
+        return Path(_expect(data, str, path))
+    if hint is float:
+        number = _expect(data, (float, int), path)
+        try:
+            value = float(number)
+        except OverflowError:
+            value = math.inf
+        if not math.isfinite(value):
+            raise ConfigError(f"{path}: expected a finite number, found one beyond the range of float64")
+        return value
+    if hint in (bool, int, str):
+        return _expect(data, hint, path)
+    raise ConfigError(f"{path}: a field of type {hint} cannot be read from a file")
+
+
+def _read_fields(data: dict[str, Any], cls: type, path: str, packages: Mapping[str, str]) -> Any:
+    """A dataclass of the fields in an object."""
+    hints = hints_of(cls)
+    names = [f.name for f in dataclasses.fields(cls) if f.init]
+    for key in data:
+        if key not in names:
+            raise ConfigError(
+                f"{path}: {cls.__name__} has no field {key!r}{registry.nearest(key, names)} "
+                f"(its fields: {', '.join(names) or 'none'})"
+            )
+    values = {key: _read(value, hints[key], f"{path}.{key}", packages) for key, value in data.items()}
+    try:
+        return cls(**values)
+    except (ConfigError, TypeError) as fault:  # out of its range, or a field without a default is absent
         raise ConfigError(f"{path}: {fault}") from fault
 
 
-def method_config(name: str) -> "RunConfig":
-    """The config that an installed method returns. Raises PluginError naming the method and its package."""
-    from ..config import RunConfig
+def _items(hint: Any, count: int) -> tuple[Any, ...]:
+    """Types of the items of `tuple[A, B]`, `tuple[A, ...]` or `list[A]`."""
+    args = get_args(hint)
+    return (args[0],) * count if get_origin(hint) is list or args[-1] is Ellipsis else args
 
-    method = registry.load_object(_METHODS, name)
-    origin = registry.entry(_METHODS, name).origin
-    try:
-        config = method() if callable(method) else method
-    except FprfError as fault:
-        raise PluginError(f"{_METHODS}: {name!r} ({origin}): {fault}") from fault
-    except (Exception, SystemExit) as fault:  # a stranger's function
-        raise PluginError(f"{_METHODS}: {name!r} ({origin}) failed: {type(fault).__name__}: {fault}") from fault
-    if not isinstance(config, RunConfig):
-        raise PluginError(f"{_METHODS}: {name!r} ({origin}) gives {type(config).__name__}, not a RunConfig")
-    return config
+
+def _expect(data: Any, kind: type | tuple[type, ...], path: str) -> Any:
+    """The datum itself if it is exactly of that type: a bool is no int, 1.0 is no int, "5" is no number."""
+    kinds = kind if isinstance(kind, tuple) else (kind,)
+    if type(data) not in kinds:
+        text = json.dumps(data)
+        raise ConfigError(f"{path}: expected {_NAMES[kinds[0]]}, found {text if len(text) <= 60 else f'{text[:57]}...'}")
+    return data
+
+
+_NAMES = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "a text",
+    dict: "an object",
+    list: "a list",
+}
 
 
 def packages_of(config: object) -> dict[str, str]:
@@ -112,26 +242,3 @@ def read_json(path: Path, name: str = "a config.json") -> Any:
         return parse_json(text)
     except ValueError as fault:
         raise ConfigError(f"{path}: {fault}") from fault
-
-
-def _check(whole: Any) -> None:
-    # The format first: what another one holds is not ours to judge.
-    if not isinstance(whole, dict) or "format" not in whole:
-        raise ConfigError('expected an object with "format": 1, as `fprf train` writes it')
-    if whole["format"] != _FORMAT or type(whole["format"]) is not int:
-        raise ConfigError(
-            f"is of format {whole['format']!r}, written by fprf {whole.get('fprf', '(unknown)')}; "
-            f"fprf {_VERSION} reads format {_FORMAT}: use the version that wrote it"
-        )
-    for key in _KEYS:
-        if key not in whole:
-            raise ConfigError(f"{key!r} is absent; the file is damaged or was edited")
-    for key in whole:
-        if key not in _KEYS:
-            raise ConfigError(f"unknown key {key!r}{registry.nearest(key, list(_KEYS))} (allowed: {', '.join(_KEYS)})")
-    # What is read before the config itself.
-    if not isinstance(whole["method"], str):
-        raise ConfigError(f"method: expected a name, found {whole['method']!r}")
-    plugins = whole["plugins"]
-    if not isinstance(plugins, dict) or not all(isinstance(v, str) for v in plugins.values()):
-        raise ConfigError("plugins: expected an object of texts")

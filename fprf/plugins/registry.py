@@ -157,23 +157,16 @@ def _scan() -> tuple[Mapping[str, Mapping[str, tuple[Entry, ...]]], tuple[str, .
     seen: set[str] = set()
     for distribution in distributions():
         try:
-            # Name and version are looked for in the text: to parse it whole takes ten times as long, per package.
-            text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
-            name, version = (re.search(rf"^{key}: *(\S+)", text, re.MULTILINE) for key in ("Name", "Version"))
-            package = f"{name[1]} {version[1]}" if name and version else f"{distribution.name} {distribution.version}"
-            ours = f"[{_PREFIX}" in (distribution.read_text("entry_points.txt") or "")
-            points = list(distribution.entry_points) if ours else []
-        except Exception as error:  # whatever a damaged file makes the reader raise
-            try:
-                text = distribution.read_text("entry_points.txt") or ""
-            except Exception:  # the file itself is the damaged one: it may be about us
-                text = f"[{_PREFIX}"
-            if f"[{_PREFIX}" in text:
-                place, reason = distribution.locate_file(""), f"{type(error).__name__}: {error}"
-                complaints.append(f"{place}: a package's entry points cannot be read ({reason})")
+            # Of most packages this one file is read: metadata of hundreds would take a second to parse.
+            if f"[{_PREFIX}" not in (distribution.read_text("entry_points.txt") or ""):
+                continue
+            package, points = f"{distribution.name} {distribution.version}", list(distribution.entry_points)
+        except Exception as error:  # whatever a damaged file makes the reader raise: it may be about us
+            place, reason = distribution.locate_file(""), f"{type(error).__name__}: {error}"
+            complaints.append(f"{place}: a package's entry points cannot be read ({reason})")
             continue
         # Of several copies on sys.path the first one counts.
-        spelling = re.sub(r"[-_.]+", "-", package.partition(" ")[0]).lower()
+        spelling = re.sub(r"[-_.]+", "-", distribution.name).lower()
         if spelling in seen:
             continue
         seen.add(spelling)

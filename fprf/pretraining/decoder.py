@@ -20,8 +20,7 @@ from ..errors import WeightsError
 from ..interfaces import Decoder, Encoder
 from ..ops.precision import double
 from ..plugins.decoders.decoders import DECODER_KIND, MlpDecoder, load_decoder
-from ..plugins.encoders.config import Vgg19Config
-from ..plugins.encoders.frozen import reflect_pad
+from ..plugins.encoders.vgg import VggEncoder, build_vgg
 from ..plugins.weights import write_weights
 from ..style.statistics import deviation
 from ..training.prepare import device_of
@@ -31,7 +30,6 @@ from .photos import filtered_at, filtered_crop, filtered_whole, find_photos, loa
 
 Report = dict[str, float | int | str]
 Decode = Callable[[Annotated[Tensor, "N C"]], Annotated[Tensor, "N 3"]]
-NAMES = ("1_1", "1_2", "2_1", "2_2", "3_1", "3_2", "3_3", "3_4", "4_1")
 CONTENT = 1
 """Index of the activations that the content loss compares: relu2_1, the paper's layer."""
 EPS = 1e-4
@@ -41,54 +39,37 @@ EPS = 1e-4
 class StyleNetwork(nn.Module):
     """VGG-19 that gradients pass through, frozen. `unit` divides the activations of each layer: 1 until measured."""
 
-    def __init__(self, tensors: Sequence[tuple[Tensor, Tensor]], mean: Annotated[Tensor, "3"], std: Annotated[Tensor, "3"]):
+    def __init__(self, encoder: VggEncoder) -> None:
         super().__init__()
-        self.register_buffer("mean", mean.view(-1, 1, 1))
-        self.register_buffer("std", std.view(-1, 1, 1))
-        self._names = NAMES[: len(tensors)]
-        self._taps = {"1_1", "2_1", "3_1", self._names[-1]}
-        for name, (weight, bias) in zip(self._names, tensors, strict=True):
-            self.register_buffer(f"weight{name}", weight)
-            self.register_buffer(f"bias{name}", bias)
-            if name in self._taps:
-                self.register_buffer(f"unit{name}", torch.ones(len(bias), 1, 1))
-
-    @property
-    def layers(self) -> list[str]:
+        self.encoder = encoder
+        tapped = {"1_1", "2_1", "3_1", encoder.names[-1]}
+        self._places = [place for place, name in enumerate(encoder.names) if name in tapped]
+        self.layers = [f"relu{encoder.names[place]}" for place in self._places]
         """Names of the activations that `forward` gives."""
-        return [f"relu{name}" for name in self._names if name in self._taps]
+        for place, layer in zip(self._places, self.layers, strict=True):
+            self.register_buffer(f"unit_{layer}", torch.ones(len(encoder.get_buffer(f"bias{place}")), 1, 1))
 
     def forward(self, images: Annotated[Tensor, "B 3 H W"]) -> list[Annotated[Tensor, "B C h w"]]:
         """Activations of sRGB images in [0, 1], at every layer of `layers`."""
-        activations = []
-        x = (images - self.get_buffer("mean")) / self.get_buffer("std")
-        for name in self._names:
-            if name in ("2_1", "3_1", "4_1"):
-                x = F.max_pool2d(x, 2, ceil_mode=True)
-            x = F.relu(F.conv2d(reflect_pad(x), self.get_buffer(f"weight{name}"), self.get_buffer(f"bias{name}")))
-            if name in self._taps:
-                activations.append(x / self.get_buffer(f"unit{name}"))
-        return activations
+        found = [x for place, x in enumerate(self.encoder.activations(images)) if place in self._places]
+        return [x / self.get_buffer(f"unit_{layer}") for x, layer in zip(found, self.layers, strict=True)]
 
     @torch.no_grad()
     def measure(self, images: Sequence[Annotated[Tensor, "3 H W"]]) -> None:
         """Take each filter's mean deviation over the images as its unit; filters that hardly fire are not blown up."""
         deviations = [[double(x[0]).std((1, 2), correction=0) for x in self(image[None])] for image in images]
         for layer, own_deviations in zip(self.layers, zip(*deviations, strict=True), strict=True):
-            unit = self.get_buffer(f"unit{layer.removeprefix('relu')}")
+            unit = self.get_buffer(f"unit_{layer}")
             own = torch.stack(own_deviations).mean(0).to(unit) * unit[:, 0, 0]
             unit.copy_(own.clamp_min(0.01 * float(own.mean()))[:, None, None])
 
 
 def load_style_network(weights: Path | None) -> StyleNetwork:
     """The network from a file of VGG-19's weights (None = the download that `vgg19` uses). Raises WeightsError."""
-    count = len(NAMES)
     try:
-        encoder = Vgg19Config(layer="relu4_1", weights=weights, normalise=False).build()
+        return StyleNetwork(build_vgg("relu4_1", weights=weights, normalise=True))
     except WeightsError:  # they may end before it
-        encoder, count = Vgg19Config(layer="relu3_4", weights=weights, normalise=False).build(), count - 1
-    tensors = [(encoder.get_buffer(f"weight{i}"), encoder.get_buffer(f"bias{i}")) for i in range(count)]
-    return StyleNetwork(tensors, encoder.get_buffer("mean"), encoder.get_buffer("std"))
+        return StyleNetwork(build_vgg("relu3_4", weights=weights, normalise=True))
 
 
 def style_statistics(activations: Sequence[Annotated[Tensor, "B C h w"]]) -> list[Annotated[Tensor, "B 2C"]]:

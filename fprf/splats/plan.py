@@ -52,14 +52,14 @@ def plan(config: "GaussiansConfig", scene: "Scene") -> "GaussiansConfig":
         budget = max(1.0, 60 * config.minutes - _START) * speed
         config = replace(config, steps=_NO_END if config.steps == type(config).steps else config.steps)
     # The largest size at which the time is enough for some passes over the photographs.
-    size = config.downscale or max(1, math.ceil(longest / config.longest))
+    size = config.downscale or max(1, longest / config.longest)
     while True:
         found = _of_size(config, pixels / size**2)
         each, steps = _seconds(found, pixels / size**2, _FEWEST), found.limited(views)
         enough = steps * each <= _PATIENCE * speed if budget is None else budget / each >= max(_STEPS, _PASSES * views)
         if enough or config.downscale is not None or pixels / (size + 1) ** 2 < _LEAST:
             break
-        size += 1
+        size = math.floor(size) + 1
     seconds = steps * each if budget is None else min(budget, steps * each)
     cap = config.cap
     if cap is None:

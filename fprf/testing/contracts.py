@@ -37,6 +37,7 @@ from ..interfaces import (
     Stylizer,
 )
 from ..ops.harmonics import HARMONIC
+from ..plugins.codec import from_json, to_json
 from ..plugins.config import Need, PluginConfig
 from ..plugins.decoders.config import DecoderConfig
 from ..plugins.encoders.config import EncoderConfig, RandomConfig
@@ -44,7 +45,6 @@ from ..plugins.executors.config import ExecutorConfig
 from ..plugins.losses.config import LossTermConfig
 from ..plugins.samplers.config import SamplerConfig
 from ..plugins.stylizers.config import StylizerConfig
-from ..plugins.typed_json import from_json, to_json
 from ..rendering.renderer import render_rays
 from ..types import Batch, Rays, Rendered, Sampled, Want
 from . import cases

@@ -5,7 +5,8 @@ learning with it and is then dropped: so each ray is whole while a block learns 
 does not end up as a veil in it. The block itself starts as what they have learnt of its place (`blocks.fields.inherit`): a
 street of four blocks came out 1.9 dB better after 200 steps each than from seeded planes.
 
-One semantic basis, one unit of each loss and one cache of features, which are mapped from their files, serve all blocks.
+One semantic basis, one unit of each loss and one cache of features, which are mapped from their files, serve all blocks. While
+features are made, the pixels of all training views lie in a mapped file as well, three bytes each.
 
     RUN/blocks.json                      the partition
     RUN/blocks/NN/rays.safetensors       the views and tiles that a block learns from
@@ -40,7 +41,7 @@ from .checkpoint import misfit
 from .driver import Schedule
 from .learner import FieldLearner, finish
 from .model import Facts, Model, build_decoder, build_fields, poses_of, tones_of
-from .prepare import Prepared, build_encoders, cache_folder, device_of, read_scene
+from .prepare import device_of, prepare, read_scene
 from .run import Run
 from .tasks import WHOLE, Done, Part, Task, digest_of, read_done, renumber, task_of, train_all
 
@@ -302,19 +303,9 @@ class Block(Part):
             width, height = scene.cameras.size[view].tolist()
             return pixel_mask(self.rays["seen"][slots[view]].bool(), (width, height))
 
-        content, semantic = build_encoders(config)
-        manager = config.datamanager.build(
-            scene=scene,
-            content=content,
-            semantic=semantic if facts.dim else None,
-            dim=config.semantic.dim,
-            cache=cache_folder() / "features",
-            seed=config.seed,
-            basis=Basis.from_tensors(self.run.load_tensors("basis")) if facts.dim else None,
-            seen=seen,
-            background=facts.background,
-        )
-        return FieldLearner(config, Prepared(scene, manager, facts, None), device_of(config.device), built.model, lead=lead)
+        basis = Basis.from_tensors(self.run.load_tensors("basis")) if facts.dim else None
+        prepared = prepare(config, scene, facts, space=facts.space, basis=basis, seen=seen)._replace(facts=facts)
+        return FieldLearner(config, prepared, device_of(config.device), built.model, lead=lead)
 
     def keep(self, learner: Learner) -> dict[str, Any]:
         """Write the block's fields, and what was learnt with them."""
@@ -327,6 +318,7 @@ class Block(Part):
 def open_block(task: Task) -> Block:
     """The block of a task. Raises ConfigError where the images are not those of the run."""
     root, block = Path(task.root), task.part
+    # All but its number and its share of the time is read from the run folder.
     run, folder = Run(root), folder_of(root, block)
     config, facts = fields_only(run.load_config()[0], root), run.load_known().facts
     # A worker may see the scene at another path; views are numbers, so it must be the same scene.

@@ -47,6 +47,7 @@ class Poses(nn.Module):
         self.offset = nn.Parameter(torch.zeros(views, 6))
         self.register_buffer("known", torch.zeros(views, 6))
         self.register_buffer("learned", learned.nonzero()[:, 0], persistent=False)
+        # The seven directions of the gauge, in the units of the parameters.
         gauge = _gauge(centres[learned].double() / reach).float()
         self.register_buffer("gauge", gauge[:, :0] if still else gauge, persistent=False)
 
@@ -135,6 +136,7 @@ class Tones(nn.Module):
         views = len(exposure)
         self.gain = nn.Parameter(torch.zeros(views, 3))
         self.exponent = nn.Parameter(torch.tensor(GAMMA))
+        # Held-out views have no gain: nothing says what it would be.
         learned = torch.ones(views, 1)
         learned[list(held)] = 0
         self.register_buffer("exposure", exposure.float(), persistent=False)

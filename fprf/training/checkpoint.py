@@ -132,6 +132,7 @@ def _read(root: Path, step: int) -> _Manifest:
 
 def load_latest(root: Path, *, verify: bool = True) -> tuple[Saved | None, list[str]]:
     """The newest intact checkpoint, and a line for every newer one that was damaged. Raises where all are damaged."""
+    # From the newest backwards, since a disk that failed has mostly failed at the last one.
     damaged: list[str] = []
     for step in reversed(steps(root)):
         try:

@@ -67,6 +67,7 @@ def compare(device: torch.device) -> list[Outcome]:
 
 def fast_paths(device: torch.device) -> Iterator[tuple[str, str]]:
     """Name and description of the kernels and the precision that a device uses, and of its free memory."""
+    # Where the networks are compiled, everything is.
     probe = torch.zeros(1, 3, device=device)
     with torch.no_grad():
         compiled = dense.usable(probe)

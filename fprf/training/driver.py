@@ -22,14 +22,16 @@ from typing import Any, NamedTuple
 
 from ..config import RunConfig
 from ..datamanagers.images import useless_masks
-from ..errors import CheckpointError, NumericsError, UsageError
+from ..datamanagers.parsers.config import recognise
+from ..errors import CheckpointError, DataError, NumericsError, UsageError
 from ..interfaces import Figures, Learner, Partition
 from ..io.atomic import remove_unfinished
 from ..memory import out_of_memory, shortage
-from ..plugins.typed_json import leaves
+from ..plugins.codec import leaves
+from ..plugins.config import Need
 from ..progress import LINE_SECONDS, Display
 from . import checkpoint
-from .prepare import device_of, planned, read_scene, scene_needs
+from .prepare import device_of, planned, read_scene
 from .run import Run, check_images, image_hashes, lock_folder, save_image_hashes
 
 REPORT_SECONDS = 0.5
@@ -230,6 +232,7 @@ def learn(
 
 def _resume(learner: Learner, run: Run) -> checkpoint.Saved | None:
     """Load the newest intact checkpoint into the learner; None where the run has none yet."""
+    # What a killed process left half written goes first; a damaged checkpoint is passed over, and logged.
     checkpoint.tidy(run.checkpoints)
     saved, damaged = checkpoint.load_latest(run.checkpoints)
     for line in damaged:
@@ -327,10 +330,17 @@ def reporter(display: Display, run: Run, name: str = "training") -> Callable[[Re
 
 def _check_needs(config: RunConfig, method: str, display: Display) -> None:
     """Raise UsageError where something is missing that nothing downloads, after showing all that is missing."""
-    missing = config.needs()
-    if config.data is not None and all(need.downloaded for need in missing):
+    needs = config.needs()
+    if config.data is not None and all(need.downloaded for need in needs):
         return  # where the scene cannot be read its parser says so
-    needs = [*scene_needs(config), *missing]
+    # Something is: then whether some parser reads the scene folder is told as well, before it is mended.
+    if config.data is None:
+        needs.insert(0, Need("no scene is named", "give --data FOLDER, or --data garden for the embedded scene"))
+    elif config.scene_parser is None:
+        try:
+            recognise(config.data)
+        except DataError as fault:
+            needs.insert(0, Need("the scene", str(fault)))
     if len(needs) > 1:
         for need in needs:
             display.say(f"missing: {need.what}: {need.remedy}")
@@ -344,7 +354,7 @@ def _sized(run: Run, config: RunConfig, display: Display) -> RunConfig:
         width, height = read_scene(config).cameras.size[0].tolist()
         if min(width, height) < _SMALL:
             display.say(
-                f"warning: {width}x{height} pixels are few: --downscale {config.downscale} counts from the images as they "
+                f"warning: {width}x{height} pixels are few: --downscale {config.downscale:g} counts from the images as they "
                 "are delivered, also in a folder images_N; leave it out"
             )
     # Else a run would change its size with the machine or the minutes.
@@ -357,7 +367,7 @@ def _sized(run: Run, config: RunConfig, display: Display) -> RunConfig:
         scene = read_scene(config)
         width, height = scene.cameras.size[scene.train[0] if len(scene.train) else 0].tolist()
         ends = f"{config.minutes:g} minutes" if config.minutes is not None else f"{config.limited(len(scene.train)):,} steps"
-        reduced = f" (1/{config.downscale}; --downscale 1 keeps them whole)" if config.downscale != 1 else ""
+        reduced = f" (1/{config.downscale:.3g}; --downscale 1 keeps them whole)" if config.downscale != 1 else ""
         display.say(f"plan: {len(scene.train)} views at {width}x{height}{reduced}{config.described()}, {ends}")
     return config
 
@@ -375,6 +385,7 @@ def _check_same(run: Run, config: RunConfig) -> None:
     if changed:
         shown = [f"{name} {theirs.get(name, '-')} ({mine.get(name, '-')} is asked)" for name in changed[:_SHOWN]]
         more = f" and {len(changed) - _SHOWN} others" if len(changed) > _SHOWN else ""
+        # The first free name after this one, so that the line can be copied.
         other = next(path for k in range(2, 1000) if not (path := run.root.with_name(f"{run.root.name}-{k}")).exists())
         raise UsageError(
             f"{run.root}: holds a run with {', '.join(shown)}{more}; go on with it by its own values, or begin another with "

@@ -9,11 +9,11 @@ Letters: R rays of a batch, S samples of a ray.
 
 import math
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.profiler import record_function
 
 from ..config import PASSES, OptimizerConfig, TrainConfig
@@ -46,7 +46,6 @@ FAINT_SECOND = 1e-36
 """Second moments below are cleared. Their root, 1e-18, is far below any useful eps."""
 LARGEST = 1.8e19
 """Norm of a gradient that Adam can square in float32 (3.4e38)."""
-_NAMED = 3
 _FEW_STEPS = 600
 """Fewer are too few to judge by: a garden of ten views shows streaks on held-out ones after 350, at 19.8 dB on the training
 views; flower and fox are at 22.9 and 27.1 dB on held-out views after 754 and 775."""
@@ -74,9 +73,6 @@ class FieldLearner(SceneLearner):
         adam = config.optimizer
         betas = 0.9, adam.beta2
         self.optimizer = torch.optim.Adam(self.model.learned(), lr=adam.rate, betas=betas, eps=adam.eps, fused=True)
-        # On CUDA the host runs ahead of the device: what it must know of a step is read with the figures.
-        self.deferred = device.type == "cuda"
-        """True where the host reads faults only with the figures."""
         self.tf32 = config.precision == "tf32" and device.type == "cuda"
         self.half = config.precision == "bfloat16" and device.type != "cpu"
         # A mistake in the config is told before features are moved and steps are taken.
@@ -93,8 +89,7 @@ class FieldLearner(SceneLearner):
             self.through.to(device)
         self.background = background_of(prepared.facts, device)
         self.statistics = StepStatistics(device)
-        self.rays = self.skipped = self.failed = 0
-        self.fault = ""
+        self.rays = self.skipped = 0
 
     @property
     def device(self) -> torch.device:
@@ -114,7 +109,7 @@ class FieldLearner(SceneLearner):
         with record_function("fprf.batch"):
             drawn = self.batches(step)
             here = drawn._replace(pixel=drawn.pixel.float()) if self.device.type == "mps" else drawn  # which has no float64
-            batch = Batch._make(x if x is None else x.to(self.device, non_blocking=self.deferred) for x in here)
+            batch = Batch._make(x if x is None else x.to(self.device, non_blocking=self.device.type == "cuda") for x in here)
             rays, ends = self._rays(drawn if self.through.device.type == "cpu" else batch)
         for group in self.optimizer.param_groups:
             group["lr"] = rate(self.config.optimizer, step, share)
@@ -152,46 +147,34 @@ class FieldLearner(SceneLearner):
         self.optimizer.zero_grad(set_to_none=True)
         with record_function("fprf.backward"):
             loss.backward()  # type: ignore[no-untyped-call]
-        self._optimise(loss, parts, step)
-        kept = rendered.counts["kept"] / max(1, rendered.counts["samples"])
-        self.statistics.add(parts | {"kept": torch.full((), kept, device=loss.device)})
-        self.rays += len(batch.rgb)
-
-    def _optimise(self, loss: Tensor, parts: Mapping[str, Tensor], step: int) -> None:
-        """Take Adam's step, unless the loss or a gradient is not finite."""
-        unfit = unfit_step(loss, self.model.parameters())
-        if self.deferred:
-            # As torch's GradScaler does: the optimiser then changes neither parameters, moments nor its count of steps.
-            self.optimizer.found_inf = unfit  # type: ignore[attr-defined]
-            self.statistics.count_skipped(unfit)
-        elif bool(unfit):
-            self.fault = name_fault(loss, parts, self.model.named_parameters())
-            self.skipped, self.failed = self.skipped + 1, self.failed + 1
-            return
+        # A loss or gradient that is not finite makes the norm so, and the device needs one comparison.
+        norm = torch.nn.utils.get_total_norm([p.grad for p in self.model.parameters() if p.grad is not None])
+        unfit = (~(torch.isfinite(loss.detach()) & (norm < LARGEST))).float()
         with record_function("fprf.optimizer"):
-            self.optimizer.step()
-        if not self.deferred:
-            self.failed = 0
-            if (step + 1) % CLEAR_EVERY == 0:
-                clear_denormals(self.optimizer)
+            if self.device.type == "cuda":
+                # The host runs ahead and does not know: the optimiser then changes neither parameters, moments nor its count of
+                # steps, as with torch's GradScaler.
+                self.optimizer.found_inf = unfit  # type: ignore[attr-defined]
+                self.optimizer.step()
+            elif not bool(unfit):
+                self.optimizer.step()
+                if (step + 1) % CLEAR_EVERY == 0:
+                    clear_denormals(self.optimizer)
+        kept = rendered.counts["kept"] / max(1, rendered.counts["samples"])
+        self.statistics.add(parts | {"kept": torch.full((), kept, device=loss.device)}, unfit)
+        self.rays += len(batch.rgb)
 
     def figures(self) -> Figures:
         """Running means, corrected for their start; a term that comes every few steps counts when it comes."""
-        if self.deferred:
-            skipped, self.failed, names = self.statistics.faults()
-            self.fault = (names or "a gradient") if skipped > self.skipped else ""
-            self.skipped = skipped
-        means = self.statistics.means()
-        kept, fault = means.pop("kept", 0.0), self.fault
-        self.fault = ""
-        return Figures(means, self.rays, self.skipped, self.failed, fault, kept)
+        before, (means, self.skipped, failed, names) = self.skipped, self.statistics.read()
+        fault = (names or "a gradient") if self.skipped > before else ""
+        return Figures(means, self.rays, self.skipped, failed, fault, means.pop("kept", 0.0))
 
     def state(self) -> State:
         return State(self.model.state_dict(), checkpoint.moments_of(self.optimizer))
 
     def load(self, state: State) -> None:
         checkpoint.restore(state, self.model, self.optimizer)
-        self.failed = 0
         self.statistics.failed.zero_()
 
     def begin(self, run: Run) -> str:
@@ -207,6 +190,7 @@ class FieldLearner(SceneLearner):
 
     def _rays(self, batch: Batch) -> tuple[Rays, Tensor | None]:
         """The rays of a batch, and their parameters at its known distances."""
+        # Rays are made in float64 in the world, then moved to the space of the field.
         there, space = self.through.device, self.model.space
         origin, direction = self.through(batch.view.to(there), batch.pixel.to(there))
         ends = None
@@ -224,32 +208,26 @@ class Batches:
 
     def __init__(self, manager: DataManager, device: torch.device) -> None:
         self.manager, self.device = manager, device
-        self._thread: ThreadPoolExecutor | None = None
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="fprf-batches")  # it starts with its first task
         self._next: tuple[int, Future[Batch]] | None = None
 
     def __call__(self, step: int) -> Batch:
         """The batch of a step, as the manager draws it, or in pinned memory."""
         if self._next is None:
-            batch = self.manager.batch(step)
-            if batch.rgb.device.type != "cpu" or self.device.type == "cpu":
-                return batch
-        elif self._next[0] == step:
-            batch = self._next[1].result()
-        else:  # after going back
-            batch = self._later(step).result()
-        self._next = (step + 1, self._later(step + 1))
+            batch = self._draw(step)
+        else:  # after going back it is another step than the one that was drawn ahead
+            ahead, later = self._next
+            batch = (later if ahead == step else self._thread.submit(self._draw, step)).result()
+        if batch.rgb.device.type == "cpu" and self.device.type != "cpu":
+            self._next = (step + 1, self._thread.submit(self._draw, step + 1))
         return batch
 
-    def _later(self, step: int) -> "Future[Batch]":
-        """Have the thread draw the batch of a step; for CUDA into pinned memory, from where copies need not be waited for."""
-
-        def draw() -> Batch:
-            batch = self.manager.batch(step)
-            return Batch._make(x if x is None or self.device.type != "cuda" else x.pin_memory() for x in batch)
-
-        if self._thread is None:
-            self._thread = ThreadPoolExecutor(1, thread_name_prefix="fprf-batches")
-        return self._thread.submit(draw)
+    def _draw(self, step: int) -> Batch:
+        batch = self.manager.batch(step)
+        if self.device.type != "cuda" or batch.rgb.device.type != "cpu":
+            return batch
+        # From pinned memory copies to the device need not be waited for.
+        return Batch._make(None if x is None else x.pin_memory() for x in batch)
 
 
 def rate(config: OptimizerConfig, step: int, share: float) -> float:
@@ -258,24 +236,6 @@ def rate(config: OptimizerConfig, step: int, share: float) -> float:
     warm = min(1.0, (step + 1) / max(1, config.warm_up))
     cosine = 0.5 * (1 + math.cos(math.pi * share))
     return config.rate * warm * late * (config.final + (1 - config.final) * cosine)
-
-
-def name_fault(loss: Tensor, parts: Mapping[str, Tensor], parameters: Iterable[tuple[str, nn.Parameter]]) -> str:
-    """Names of the loss terms that are not finite, else of the parameters whose gradient is not, or is too large to square."""
-    if not bool(torch.isfinite(loss)):
-        bad = [name for name, value in parts.items() if not bool(torch.isfinite(value))]
-        return ", ".join(bad) or "the sum of the loss terms"
-    bad = [name for name, p in parameters if p.grad is not None and not bool(p.grad.norm() < LARGEST)]
-    more = f" and {len(bad) - _NAMED} more" if len(bad) > _NAMED else ""
-    return f"the gradient of {', '.join(bad[:_NAMED]) or 'all parameters together'}{more}"
-
-
-@torch.no_grad()
-def unfit_step(loss: Tensor, parameters: Iterable[nn.Parameter]) -> Tensor:
-    """1 where the loss or a gradient is not finite, or too large to be squared, else 0: float32, on the loss's device."""
-    # Any number that is not finite makes the norm so, and the device needs one comparison.
-    norm = torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
-    return (~(torch.isfinite(loss) & (norm < LARGEST))).float()
 
 
 class StepStatistics:
@@ -290,8 +250,11 @@ class StepStatistics:
         self._present: dict[tuple[str, ...], Tensor] = {}
 
     @torch.no_grad()
-    def add(self, values: Mapping[str, Tensor]) -> None:
-        """One step's scalars. A name that is absent, or not finite, leaves its mean as it is."""
+    def add(self, values: Mapping[str, Tensor], unfit: Tensor) -> None:
+        """One step's scalars. A name that is absent, or not finite, leaves its mean as it is; `unfit` is 1 where the step was
+        skipped, else 0.
+        """
+        self.skipped, self.failed = self.skipped + unfit, (self.failed + 1) * unfit
         new = [name for name in values if name not in self.names]
         if new:
             self.names += new
@@ -309,21 +272,18 @@ class StepStatistics:
         bad = self.rows[2] + self._present[given] * ~fit
         self.rows = torch.cat([torch.where(fit, means, self.rows[:2]), bad[None]])
 
-    def count_skipped(self, unfit: Tensor) -> None:
-        """Count a step: `unfit` is 1 where it was skipped, else 0."""
-        self.skipped, self.failed = self.skipped + unfit, (self.failed + 1) * unfit
+    def read(self) -> tuple[dict[str, float], int, int, str]:
+        """Means, steps skipped so far, the last ones in a row, and names of terms that were not finite since the last call.
 
-    def means(self) -> dict[str, float]:
-        """The means, corrected for their start; names that never had a finite number are left out. The host waits."""
-        # Both sums began at 0: their quotient is the mean over what was seen.
-        value, weight, _ = self.rows.tolist()
-        return {name: v / w for name, v, w in zip(self.names, value, weight, strict=True) if w > 0}
-
-    def faults(self) -> tuple[int, int, str]:
-        """Steps skipped so far, the last ones in a row, and the names of terms that were not finite since the last call."""
-        skipped, failed, *bad = torch.cat([torch.stack([self.skipped, self.failed]), self.rows[2]]).tolist()
+        Means are corrected for their start, without names that never had a finite number. The host waits for the device once.
+        """
+        counts = torch.stack([self.skipped, self.failed]).to(self.rows.dtype)
+        *numbers, skipped, failed = torch.cat([self.rows.flatten(), counts]).tolist()
         self.rows[2].zero_()
-        return int(skipped), int(failed), ", ".join(name for name, b in zip(self.names, bad, strict=True) if b > 0)
+        # Both sums began at 0: their quotient is the mean over what was seen.
+        value, weight, bad = (numbers[k * len(self.names) : (k + 1) * len(self.names)] for k in range(3))
+        means = {name: v / w for name, v, w in zip(self.names, value, weight, strict=True) if w > 0}
+        return means, int(skipped), int(failed), ", ".join(name for name, b in zip(self.names, bad, strict=True) if b > 0)
 
 
 @torch.no_grad()
@@ -366,5 +326,5 @@ def training_summary(run: Run, config: TrainConfig, scene: ParsedScene) -> str:
     if steps < _FEW_STEPS:
         return f"warning: too few steps to judge the scene by: {reached}; go on: {again} {longer}"
     size = config.downscale or 1
-    finer = f"; for more detail: --downscale {size - 1} and another --output" if size > 1 and passes > PASSES else ""
+    finer = f"; for more detail: --downscale {max(size - 1, 1):g} and another --output" if size > 1 and passes > PASSES else ""
     return f"{reached}; to raise it: {again} {longer}{finer}"

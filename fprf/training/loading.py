@@ -114,6 +114,7 @@ class Trained(Scene):
         self, captured: ParsedScene, views: Sequence[int], progress: Callable[[int, int, str], None]
     ) -> Annotated[Tensor, "V 6"]:
         facts, moves = self.known.facts, torch.zeros(len(self.names), 6, dtype=torch.float64)
+        # Shifts are counted in what views commonly see, as in training, where poses are learnt.
         reach = facts.reach if facts.centres else reach_of(captured, facts.space)
         for done, view in enumerate(views):
             progress(done, len(views), "fitting poses")

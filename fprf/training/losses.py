@@ -34,6 +34,7 @@ def extra_term(config: LossConfig) -> LossTerm | None:
 
 def check_penalties(config: LossConfig, model: Model) -> None:
     """Raise ConfigError where a weight is given to an unknown penalty, PluginError where a penalty has the name of a term."""
+    # The two of the planes have fields of their own in the config, and need not be named.
     names = model.penalty_names
     for name, _ in config.penalties:
         if name not in names:

@@ -13,11 +13,10 @@ from ..config import RunConfig, TrainConfig
 from ..datamanagers.basis import Basis
 from ..datamanagers.bounds import find_space
 from ..datamanagers.images import WHITE
-from ..datamanagers.parsers.config import parse_scene, recognise
+from ..datamanagers.parsers.config import parse_scene
 from ..datamanagers.scene import Scene, at_origin, exposures_differ, find_sightings, with_exposure
-from ..errors import DataError, PluginError, UsageError, WeightsError
-from ..interfaces import DataManager, Encoder
-from ..plugins.config import Need
+from ..errors import PluginError, UsageError
+from ..interfaces import DataManager
 from ..rendering.space import Space
 from .model import Facts, build_decoder
 
@@ -76,12 +75,16 @@ def prepare(
     progress: Callable[[int, int, str], None] | None = None,
     *,
     space: Space | None = None,
+    basis: Basis | None = None,
+    seen: Callable[[int], Annotated[Tensor, "H W"]] | None = None,
 ) -> Prepared:
     """Everything of a scene of fields but the model, in a space that is found where none is given.
 
-    Arguments as of `RunConfig.build`.
+    Arguments as of `RunConfig.build` and `DataManagerConfig.build`. Raises WeightsError where an encoder or a decoder lacks
+    its weights.
     """
-    content, semantic = build_encoders(config)
+    device, encoder = device_of(config.device), config.semantic.encoder
+    content, semantic = config.content.encoder.build().to(device), None if encoder is None else encoder.build().to(device)
     build_decoder(config, encoder=content.identity, channels=content.channels)  # refused now, not after all the features
     background = config.render.background or (WHITE if scene.alpha else None)
     # Decodes all images and extracts their features, or finds both in the cache.
@@ -93,6 +96,8 @@ def prepare(
         cache=cache_folder() / "features",
         seed=config.seed,
         progress=progress,
+        basis=basis,
+        seen=seen,
         background=background,
     )
     exposure = exposure_of(config.tones, scene, manager.image, saved)
@@ -109,29 +114,6 @@ def prepare(
         semantic_scale=1.0 if semantics is None else semantics.scale,
     )
     return Prepared(scene, manager, facts, None if semantics is None else semantics.basis)
-
-
-def build_encoders(config: TrainConfig) -> tuple[Encoder, Encoder | None]:
-    """The content encoder and the semantic one, if there is one, on the device of the config.
-
-    Raises WeightsError with what both of them lack.
-    """
-    # Both are tried, so that one message names all files that are missing.
-    device = device_of(config.device)
-    built: list[Encoder | None] = []
-    faults: list[WeightsError] = []
-    for encoder in (config.content.encoder, config.semantic.encoder):
-        try:
-            built.append(None if encoder is None else encoder.build().to(device))
-        except WeightsError as fault:
-            faults.append(fault)
-    if len(faults) > 1:
-        raise WeightsError("; ".join(map(str, faults))) from faults[0]
-    if faults:
-        raise faults[0]
-    content, semantic = built
-    assert content is not None
-    return content, semantic
 
 
 def facts_of(
@@ -184,16 +166,3 @@ def reach_of(scene: Scene, space: Space) -> float:
     if sightings is not None:
         return float(sightings.distance.median())
     return space.near if space.kind == "ndc" else 1 / space.scale
-
-
-def scene_needs(config: RunConfig) -> list[Need]:
-    """A scene folder that some parser reads."""
-    if config.data is None:
-        return [Need("no scene is named", "give --data FOLDER, or --data garden for the embedded scene")]
-    if config.scene_parser is not None:
-        return []
-    try:
-        recognise(config.data)
-    except DataError as fault:
-        return [Need("the scene", str(fault))]
-    return []

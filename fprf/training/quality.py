@@ -74,6 +74,7 @@ def tone_of(tones: "Tones | None", known: "Known", text: str) -> tuple[float, fl
     """Factors of a training view, by name, or by number where no name is alike. Raises UsageError for others."""
     if tones is None:
         raise UsageError("tone: this run has learnt no tones; train it with --tones true, or leave --tone out")
+    # Names of views may be numbers themselves: a name comes before a number.
     view = known.names.index(text) if text in known.names else int(text) if text.isdecimal() else -1
     if view not in known.train:
         few = ", ".join(known.names[k] for k in known.train[:3])

@@ -20,7 +20,7 @@ import os
 import socket
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -35,7 +35,8 @@ from ..errors import CheckpointError, DataError, UsageError
 from ..io import tensorfiles
 from ..io.atomic import unwritable, write_json
 from ..io.strict_json import open_json, parse_json
-from ..plugins.codec import from_json, load_config, save_config
+from ..methods import load_config, save_config
+from ..plugins.codec import from_json
 from ..plugins.registry import nearest
 from ..rendering.cameras import Cameras
 from .model import Facts
@@ -228,37 +229,31 @@ def _locked(folder: Path) -> int | None:
     """Take the lock of a folder; None where its holder removed the file in between."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        with ExitStack() as opened:
+            handle = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            opened.callback(os.close, handle)
+            # The kernel releases the lock of a process that dies; file systems without locks hold nothing.
+            if fcntl is not None:
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except OSError as error:
+                    if error.errno in (errno.EAGAIN, errno.EACCES):
+                        note = os.pread(handle, _NOTE, 0).decode(errors="replace").strip()
+                        who = note if note.isprintable() and note else "another process"
+                        line = f"{folder}: {who} is training here; wait for it, end it, or choose another --output"
+                        raise DataError(line) from error
+                else:
+                    os.ftruncate(handle, 0)
+                    os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+            # Somebody may hold a file of this name that is not this one any more.
+            with suppress(FileNotFoundError):
+                if os.fstat(handle).st_ino == os.stat(folder / LOCK).st_ino:
+                    opened.pop_all()  # it stays open
+                    return handle
     except FileExistsError as error:
         raise DataError(f"{folder}: is a file, not a folder; choose another --output") from error
     except OSError as error:
         raise unwritable(folder, error) from error
-    try:
-        # The kernel releases the lock of a process that dies; file systems without locks hold nothing.
-        if fcntl is not None:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                if error.errno in (errno.EAGAIN, errno.EACCES):
-                    note = os.pread(handle, _NOTE, 0).decode(errors="replace").strip()
-                    who = note if note.isprintable() and note else "another process"
-                    line = f"{folder}: {who} is training here; wait for it, end it, or choose another --output"
-                    raise DataError(line) from error
-            else:
-                os.ftruncate(handle, 0)
-                os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
-        # Somebody may hold a file of this name that is not this one any more.
-        if os.fstat(handle).st_ino == os.stat(folder / LOCK).st_ino:
-            return handle
-    except FileNotFoundError:
-        pass
-    except OSError as error:
-        os.close(handle)
-        raise unwritable(folder, error) from error
-    except BaseException:
-        os.close(handle)
-        raise
-    os.close(handle)
     return None
 
 
@@ -291,6 +286,7 @@ def image_hashes(scene: Scene) -> dict[str, str]:
         except OSError as error:
             raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
 
+    # Hashing waits for the disk, so files are read side by side.
     with ThreadPoolExecutor() as pool:
         return dict(zip(view_names(scene.paths), pool.map(of, scene.paths), strict=True))
 

@@ -15,7 +15,7 @@ from fprf.datamanagers import features as store_files
 from fprf.datamanagers.basis import Basis, fit_basis
 from fprf.datamanagers.config import GuidedConfig
 from fprf.datamanagers.features import FeatureStore, extract
-from fprf.errors import ConfigError, DataError, NumericsError, PluginError
+from fprf.errors import DataError, NumericsError, PluginError
 from fprf.interfaces import Encoder
 from fprf.io import tensorfiles
 from fprf.ops import guided
@@ -240,8 +240,6 @@ def test_a_plane_is_found_under_a_large_offset() -> None:
 
 
 def test_what_cannot_be_fitted_or_read_is_named() -> None:
-    with pytest.raises(ConfigError, match=r"semantic\.dim"):
-        fit_basis(torch.randn(3, 3), 0)
     with pytest.raises(DataError, match="at least one"):
         fit_basis(torch.zeros(0, 3), 1)
     with pytest.raises(NumericsError, match="not finite"):

@@ -13,11 +13,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from capture_files import Capture, write_image, write_transforms
 from photo_files import HEIC, oriented, turned_jpeg, upright
 from PIL import Image, ImageCms
 
-from fprf.datamanagers.images import image_names, load_image, load_mask, photographs, read_header, useless_masks
+from fprf.datamanagers.images import image_names, load_image, load_images, load_mask, photographs, read_header, useless_masks
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import DataError
 
@@ -426,3 +427,14 @@ def test_masks_that_leave_nothing_or_everything_are_told(tmp_path: Path) -> None
                 cv2.imwrite(str(path), np.full((8, 8), value, np.uint8))
         found = useless_masks(replace(scene, masks=tuple(paths)))
         assert said in found and bool(said) == bool(found)
+
+
+def test_sizes_need_not_be_whole_parts(tmp_path: Path) -> None:
+    write_transforms(tmp_path, Capture.make(3))
+    whole, part = (parse_scene(tmp_path, by, None).cameras for by in (1, 1.7))
+    assert torch.equal(part.size, (whole.size / 1.7).round().long())
+    # Whole pixels are a little wider or taller than asked for, and the lens goes with them.
+    torch.testing.assert_close(part.focal / whole.focal, part.size.double() / whole.size)
+    torch.testing.assert_close(part.centre / whole.centre, part.size.double() / whole.size)
+    images = load_images(parse_scene(tmp_path, 1.7, None), (0.0, 0.0, 0.0), [0, 1, 2])
+    assert [image.shape[1::-1] for image in images] == [tuple(size) for size in part.size.tolist()]

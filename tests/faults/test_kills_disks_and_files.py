@@ -199,7 +199,7 @@ if sys.argv[3] == "8m":
 from benchmarks.kills import tiny
 from dataclasses import replace
 from fprf.cli import main as cli
-from fprf.plugins.codec import save_config
+from fprf.methods import save_config
 config = Path(sys.argv[2]).parent / "config.json"
 save_config(config, replace(tiny(town, 40), output=folder / "run"), "fprf-lite")
 code = cli.main(["train", str(config)])

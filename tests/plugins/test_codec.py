@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from fprf.cli.parsing import load_method, parse
 from fprf.errors import ConfigError, PluginError
-from fprf.methods import fprf
+from fprf.methods import fprf, load_config, save_config
 from fprf.plugins import registry
-from fprf.plugins.codec import Missing, from_json, load_config, save_config, to_json
+from fprf.plugins.codec import Missing, from_json, to_json
 from fprf.plugins.encoders.config import EncoderConfig, RandomConfig
 from fprf.plugins.slots import replace
 
@@ -123,8 +123,8 @@ def _saved(folder: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     [
         (lambda w: w.pop("format"), 'expected an object with "format": 1'),
         (lambda w: w.update(format=2, fprf="9.0"), "is of format 2, written by fprf 9.0"),
-        (lambda w: w.pop("plugins"), "'plugins' is absent"),
-        (lambda w: w.update(metod="x"), "unknown key 'metod'; did you mean 'method'?"),
+        (lambda w: w.pop("plugins"), "Object missing required field `plugins`"),
+        (lambda w: w.update(metod="x"), "Object contains unknown field `metod`"),
         (lambda w: w["config"].update(stepz=1), "config: TrainConfig has no field 'stepz'; did you mean 'steps'?"),
         (lambda w: w["config"]["loss"].update(rgb="1"), 'config.loss.rgb: expected a number, found "1"'),
         (lambda w: w["config"].update(downscale=0), "config: downscale: 0 must be at least 1"),

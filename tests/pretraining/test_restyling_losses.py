@@ -11,6 +11,7 @@ from safetensors.torch import save_file
 
 from fprf.errors import DataError, WeightsError
 from fprf.plugins.encoders.config import RandomConfig
+from fprf.plugins.encoders.vgg import VggEncoder
 from fprf.pretraining.decoder import (
     CONTENT,
     StyleNetwork,
@@ -26,9 +27,9 @@ PLACES = dict(zip((0, 2, 5, 7, 10, 12, 14, 16, 19), (4, 4, 6, 6, 8, 8, 8, 8, 10)
 
 
 def network() -> StyleNetwork:
-    made = iter(vgg_convolutions(dict(list(PLACES.items())[:8]), seed=1, biased=False).values())
-    tensors = list(zip(made, made, strict=True))
-    return StyleNetwork(tensors, torch.full((3,), 0.45), torch.full((3,), 0.25))
+    tensors = vgg_convolutions(dict(list(PLACES.items())[:8]), seed=1, biased=False)
+    mean, std = torch.full((3,), 0.45), torch.full((3,), 0.25)
+    return StyleNetwork(VggEncoder("relu3_4", tensors, mean=mean, std=std, scale=torch.ones(1), source="seeded"))
 
 
 def test_layers_end_where_the_weights_do(tmp_path: Path) -> None:
@@ -53,7 +54,7 @@ def test_activations_are_the_convolutions_in_float64() -> None:
         if name in ("2_1", "3_1"):
             x = F.max_pool2d(x, 2, ceil_mode=True)
         padded = F.pad(x, (1, 1, 1, 1), mode="reflect")
-        x = F.conv2d(padded, net.get_buffer(f"weight{name}").double()).clamp_min(0)
+        x = F.conv2d(padded, net.encoder.get_buffer(f"weight{i}").double()).clamp_min(0)
         if i in (0, 2, 4, 7):
             expected.append(x)
     for found, wanted in zip(net(image), expected, strict=True):

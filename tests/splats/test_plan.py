@@ -39,18 +39,18 @@ def test_more_time_never_plans_less(minutes: float, more: float, width: int, hei
         assert each.most * CONFIG.pixels_per_gaussian <= max(views * width * height / (each.downscale or 1) ** 2, 20)
 
 
-@pytest.mark.parametrize(("minutes", "size"), [(0.5, 4), (3, 2), (10, 2)])
-def test_a_dozen_large_photographs(minutes: float, size: int) -> None:
-    """Ten minutes are enough for 1416 x 1064, half a minute is not."""
+@pytest.mark.parametrize(("minutes", "size"), [(0.5, 4), (1, 3), (3, 1.77), (10, 1.77)])
+def test_a_dozen_large_photographs(minutes: float, size: float) -> None:
+    """Ten minutes are enough for 1600 pixels, half a minute is not."""
     assert planned(replace(CONFIG, minutes=minutes), views=11).downscale == size
 
 
 def test_what_is_given_stays() -> None:
     given = replace(CONFIG, minutes=1, downscale=7, cap=12_345, passes=9, steps=77)
     assert planned(given) == given
-    assert planned(replace(CONFIG, minutes=60, longest=800)).downscale == 4
+    assert planned(replace(CONFIG, minutes=60, longest=800)).downscale == 3.54
     without = planned(replace(CONFIG, steps=100))
-    assert without.downscale == 2 and without.most == 60_000 and without.limited(30) == 100
+    assert without.downscale == 1.77 and without.most == 60_000 and without.limited(30) == 100
 
 
 def test_views_are_judged_at_the_size_of_the_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,8 +18,7 @@ from fprf.datamanagers.scene import Scene
 from fprf.errors import CheckpointError, FprfError
 from fprf.io import tensorfiles
 from fprf.io.atomic import write_json
-from fprf.methods import fprf_lite
-from fprf.plugins.codec import save_config
+from fprf.methods import fprf_lite, save_config
 from fprf.rendering.space import Space
 from fprf.splats import cells
 from fprf.splats.cells import Cells, load_cells

@@ -19,10 +19,10 @@ import math
 import os
 import re
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -46,6 +46,7 @@ def _crc_kernel() -> Callable[[NDArray[np.uint8]], np.uint32]:
     """The loop over bytes, compiled at its first use."""
     import numba
 
+    # The remainder of each byte by the reversed polynomial, bit after bit; then a step of the loop is one look-up.
     table = np.arange(256, dtype=np.uint32)
     for _ in range(8):
         table = np.where(table & 1, (table >> 1) ^ np.uint32(0x82F63B78), table >> 1).astype(np.uint32)
@@ -96,41 +97,37 @@ message_type { name: "Example" field { name: "features" number: 1 type: TYPE_MES
 """
 """tf.train.Example and what it consists of; a map is a list of entries in the file."""
 
-Feature: TypeAlias = "list[bytes] | NDArray[np.float32] | NDArray[np.int64]"
-
 
 class Example(NamedTuple):
     """One record, taken apart."""
 
     where: str
     """File and number of the record, to open messages with."""
-    features: dict[str, Feature]
+    features: dict[str, tuple[str, Sequence[Any]]]
+    """Each is of bytes, of floats or of integers, and has so many of them."""
 
     def blob(self, name: str) -> bytes:
         """The one byte string of a feature. Raises DataError."""
-        value = self.features.get(name)
-        if not isinstance(value, list) or len(value) != 1:
-            raise self._wrong(name, "one byte string")
-        return value[0]
+        return bytes(self._values(name, "bytes", 1)[0])
 
     def integer(self, name: str) -> int:
         """The one integer of a feature. Raises DataError."""
-        value = self.features.get(name)
-        if not isinstance(value, np.ndarray) or value.dtype != np.int64 or len(value) != 1:
-            raise self._wrong(name, "one integer")
-        return int(value[0])
+        return int(self._values(name, "integers", 1)[0])
 
     def numbers(self, name: str, count: int) -> NDArray[np.float32]:
         """The floats of a feature, so many of them. Raises DataError, also where one is not finite."""
-        data = self.features.get(name)
-        if not isinstance(data, np.ndarray) or data.dtype != np.float32 or len(data) != count or not np.isfinite(data).all():
-            raise self._wrong(name, f"{count} finite floats")
-        return data.astype(np.float32)
+        numbers = np.array(self._values(name, "floats", count), np.float32)
+        if not np.isfinite(numbers).all():
+            raise DataError(f"{self.where}: {name} holds numbers that are not finite; download the file again")
+        return numbers
 
-    def _wrong(self, name: str, wanted: str) -> DataError:
-        value = self.features.get(name)
-        actual = "nothing" if value is None else f"{len(value)} {'byte strings' if isinstance(value, list) else value.dtype}"
-        return DataError(f"{self.where}: {name} holds {actual}, {wanted} is needed; download the file again")
+    def _values(self, name: str, kind: str, count: int) -> Sequence[Any]:
+        held, values = self.features.get(name, (kind, ()))
+        if held != kind or len(values) != count:
+            raise DataError(
+                f"{self.where}: {name} holds {len(values)} {held}, {count} {kind} are needed; download the file again"
+            )
+        return values
 
 
 def read_records(path: Path) -> Iterator[bytes]:
@@ -164,16 +161,11 @@ def read_examples(path: Path) -> Iterator[Example]:
             message: Any = _message_class().FromString(data)
         except DecodeError as error:
             raise DataError(f"{where}: no tf.train.Example ({error}); convert the capture again") from error
-        # Lists of one of three types, by name.
-        features: dict[str, Feature] = {}
+        # Lists of one of three types, by name; one of none is of no bytes.
+        features: dict[str, tuple[str, Sequence[Any]]] = {}
         for entry in message.features.feature:
-            kind = entry.value.WhichOneof("kind")
-            if kind == "floats":
-                features[entry.key] = np.array(entry.value.floats.value, np.float32)
-            elif kind == "integers":
-                features[entry.key] = np.array(entry.value.integers.value, np.int64)
-            else:
-                features[entry.key] = list(entry.value.bytes.value)
+            kind = entry.value.WhichOneof("kind") or "bytes"
+            features[entry.key] = kind, getattr(entry.value, kind).value
         yield Example(where, features)
 
 
@@ -224,6 +216,7 @@ def fit_camera(origin: NDArray[np.float32], direction: NDArray[np.float32]) -> R
     matrix, none = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), np.zeros(5)
     # Two points on each ray, near and far: only a camera in the rays' own place sees both in one pixel.
     points, seen = np.concatenate([ray, 2 * ray]).astype(np.float32), np.concatenate([pixel, pixel]).astype(np.float32)
+    # k3 stays 0: what two radial and two tangential terms leave is told as the error.
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
     try:
         error, matrix, bent, turns, _ = cv2.calibrateCamera([points], [seen], (width, height), matrix, none, flags=flags)
@@ -253,7 +246,7 @@ class BlockNerfParser(DataParser):
     def __init__(self, config: BlockNerfConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: int) -> Scene:
+    def parse(self, data: Path, downscale: float) -> Scene:
         """The scene at 1/downscale of the stored size. Raises DataError naming file and record."""
         files = sorted(path for path in data.rglob("*") if is_record(path.name) and path.is_file())
         if not files:

@@ -147,6 +147,7 @@ _FEATURE = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 def _cameras_bin(path: Path) -> Iterator[tuple[str, int, ColmapCamera]]:
     file = _Bytes(path)
     for _ in range(file.count(_CAMERA.size, "cameras")):
+        # Models are numbers in these files, and their count of parameters follows from them.
         id_, model, width, height = file.take(_CAMERA, "a camera")
         if not 0 <= model < len(MODELS):
             raise file.error(f"camera model {model} is unknown, 0 to {len(MODELS) - 1} are known; {_undistort(path.parent)}")
@@ -321,6 +322,7 @@ def cloud_of_model(
 
 def read_cloud(path: Path, views: int) -> Cloud:
     """`xyz` and, where there is one, `seen` of a points.npz; points that are not finite are left out."""
+    # Points of no finite place are left out, and with them the pairs that name them.
     xyz = read_npz(path, "xyz")
     if xyz.ndim != 2 or xyz.shape[1] != 3:
         raise DataError(f"{path}: xyz has shape {xyz.shape}, not [P 3]; write it again or remove the file")
@@ -364,7 +366,7 @@ class ColmapParser(DataParser):
     def __init__(self, config: ColmapConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: int, roles: Mapping[str, str] | None = None) -> Scene:
+    def parse(self, data: Path, downscale: float, roles: Mapping[str, str] | None = None) -> Scene:
         """The scene at 1/downscale of the size of the images in the chosen folder.
 
         Of `roles`, train or test by file name, images without one are left out; else every 8th is for testing.

@@ -307,7 +307,7 @@ def recognise(data: Path) -> DataParserConfig:
     )
 
 
-def parse_scene(data: Path, downscale: int, parser: DataParserConfig | None) -> Scene:
+def parse_scene(data: Path, downscale: float, parser: DataParserConfig | None) -> Scene:
     """The scene of a folder at 1/downscale of its size, by the parser that is named or, without one, recognised.
 
     Where the capture lies far from 0 the scene is in a local frame, whatever the parser (`Scene.origin`).

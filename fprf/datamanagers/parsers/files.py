@@ -47,6 +47,7 @@ def read_json(path: Path) -> Json:
     """The JSON value of a file (see `parse_json`), numbers that are not finite included, however they are written."""
     data = read_bytes(path)
     try:
+        # Strict first: only where that fails is the text searched for what C++ writes instead of numbers.
         text = data.decode("utf-8-sig")
         try:
             value: Json = parse_json(text, nan=True)
@@ -127,6 +128,7 @@ def read_ply_points(path: Path) -> tuple[NDArray[np.float64] | None, list[str]]:
     from trimesh.exchange.ply import load_ply
 
     try:
+        # All kinds of PLY have one reader, which is tried on any bytes.
         points = np.array(load_ply(io.BytesIO(read_bytes(path)))["vertices"], dtype=np.float64).reshape(-1, 3)
     except DataError as fault:
         return None, [f"points are not read: {fault}"]

@@ -24,7 +24,7 @@ class LlffParser(DataParser):
     def __init__(self, config: LlffConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: int) -> Scene:
+    def parse(self, data: Path, downscale: float) -> Scene:
         """The scene at 1/downscale of the images in the chosen folder, whatever size the poses were estimated at."""
         file = data / "poses_bounds.npy"
         rows = read_npy(str(file), read_bytes(file))
@@ -55,6 +55,7 @@ class LlffParser(DataParser):
             matrix = row[:15].reshape(3, 5)[:, :4]
             turned = np.stack([matrix[:, 1], -matrix[:, 0], matrix[:, 2], matrix[:, 3]], 1)
             where = f"{file}: row {number} ({name})"
+            # The principal point is the middle of the image, as in LLFF.
             size = pixel_size(where, width, height)
             return View(
                 name=name,

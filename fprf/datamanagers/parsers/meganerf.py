@@ -22,7 +22,7 @@ _LARGEST = 1 << 24
 class MegaNerfParser(DataParser):
     """`train` and `val` folders."""
 
-    def parse(self, data: Path, downscale: int) -> Scene:
+    def parse(self, data: Path, downscale: float) -> Scene:
         """The scene at 1/downscale of the delivered size; `val` is held out. Lengths are metres where the capture says."""
         # Metres of a unit of the poses; 1 where nothing is said.
         unit, path = 1.0, data / "coordinates.pt"
@@ -50,6 +50,7 @@ class MegaNerfParser(DataParser):
 
 def _load(path: Path) -> dict[str, Any]:
     """Tensors and numbers by name; nothing else is let in."""
+    # Unpickling may take many times the memory of its file.
     if path.is_file() and path.stat().st_size > _LARGEST:
         raise DataError(f"{path}: larger than {_LARGEST} bytes, so no metadata of one image; copy it again")
     try:

@@ -46,11 +46,12 @@ class OdmParser(DataParser):
     def __init__(self, config: OdmConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: int) -> Scene:
+    def parse(self, data: Path, downscale: float) -> Scene:
         """The scene at 1/downscale of its photographs, with the reconstruction's points where they are there."""
         file = project_file(data)
         if file is None:
             raise DataError(f"{data}: neither {' nor '.join(ODM_FILES)}; give the folder of an ODM project")
+        # A whole project brings points; a report has poses alone.
         shots, points = _reconstruction(file) if file.name == "reconstruction.json" else (_shots(data, file), None)
         folder = path_inside(data, "parser.images", self.config.images)[1]
         files = NamedFiles(folder)
@@ -102,6 +103,7 @@ def _shots(data: Path, file: Path) -> list[_Shot]:
 def _view(where: str, name: str, path: Path, shot: _Shot) -> View:
     width, height = image_size(path)
     camera, longest = shot.camera, max(width, height)
+    # Another size is fine, another shape means that the photographs were cropped or turned.
     own = camera.number("width"), camera.number("height")
     if None not in own and abs((own[0] or 0) * height - (own[1] or 0) * width) > 2 * longest:
         raise DataError(f"{path}: {width}x{height} pixels is not the shape of its camera; restore the image")

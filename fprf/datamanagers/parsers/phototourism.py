@@ -22,8 +22,9 @@ class PhotoTourismParser(DataParser):
     def __init__(self, config: PhotoTourismConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: int) -> Scene:
+    def parse(self, data: Path, downscale: float) -> Scene:
         """The listed photographs. Raises DataError where the table names none of the model's."""
+        # The table says which photographs are used; their poses are those of the model beside it.
         tables = [data / self.config.list] if self.config.list else sorted(data.glob("*.tsv"))
         if len(tables) != 1:
             raise DataError(f"{data}: {len(tables)} tables *.tsv; exactly one is needed, or its name in parser.list")

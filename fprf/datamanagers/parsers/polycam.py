@@ -22,7 +22,7 @@ from .views import View, assemble_scene, read_views, rigid_pose, stated_size
 class PolycamParser(DataParser):
     """`keyframes/` of a raw export."""
 
-    def parse(self, data: Path, downscale: int) -> Scene:
+    def parse(self, data: Path, downscale: float) -> Scene:
         """The scene at 1/downscale of its images."""
         folders = keyframes(data)
         if not folders:
@@ -51,6 +51,7 @@ class PolycamParser(DataParser):
 
 def _view(frame: tuple[Path, Path]) -> View:
     image, file = frame
+    # t_RC is row R and column C of the pose; everything else has its plain name.
     record = as_record(file, read_json(file))
     rows = [[record.needed(f"t_{row}{column}") for column in range(4)] for row in range(3)]
     fx, fy, cx, cy = (record.needed(key) for key in ("fx", "fy", "cx", "cy"))

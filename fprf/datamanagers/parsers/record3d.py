@@ -27,7 +27,7 @@ class Record3DParser(DataParser):
     def __init__(self, config: Record3DConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: int) -> Scene:
+    def parse(self, data: Path, downscale: float) -> Scene:
         """The scene at 1/downscale of its images: at most `frames` of them, evenly through the recording."""
         files = recording(data)
         if files is None:
@@ -56,6 +56,7 @@ class Record3DParser(DataParser):
             number, name = each
             fx, fy, cx, cy = lenses[number].tolist()
             where, row = f"{file}: poses[{number}]", poses[number]
+            # The file has x y z w, we w x y z.
             turn = quaternion_rotation(where, row[[3, 0, 1, 2]])
             return View(
                 name=name,

@@ -47,7 +47,7 @@ class TransformsParser(DataParser):
     def __init__(self, config: TransformsConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: int) -> Scene:
+    def parse(self, data: Path, downscale: float) -> Scene:
         """The scene at 1/downscale of the size that the file's intrinsics belong to."""
         # The frames of all files, by name.
         files = self._files(data)
@@ -73,6 +73,7 @@ class TransformsParser(DataParser):
     def _files(self, data: Path) -> list[tuple[Path, str]]:
         if self.config.file:
             return [(path_inside(data, "parser.file", self.config.file)[1], "")]
+        # Nerfstudio's file before Blender's pair, and any other name only where there is no doubt.
         single = data / "transforms.json"
         train, test = data / "transforms_train.json", data / "transforms_test.json"
         if single.is_file():
@@ -88,7 +89,7 @@ class TransformsParser(DataParser):
 class GardenParser(DataParser):
     """Reads the scene that ships with the package, whatever folder is named."""
 
-    def parse(self, data: Path, downscale: int) -> Scene:
+    def parse(self, data: Path, downscale: float) -> Scene:
         return TransformsParser(TransformsConfig()).parse(Path(str(resources.files("fprf") / "garden")), downscale)
 
 
@@ -167,6 +168,7 @@ def _focal(record: Record, size: tuple[int, int]) -> tuple[float, float]:
 
 
 def _lens(record: Record) -> tuple[tuple[float, float, float, float, float, float], int]:
+    # Terms beyond six are those of lenses that cannot be represented: `lens_of` refuses them unless they are 0.
     k = [record.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
     others = [record.number(key) or 0.0 for key in ("k5", "k6")]
     model = record.text("camera_model")

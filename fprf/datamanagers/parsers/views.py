@@ -202,6 +202,7 @@ def rigid_pose(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
         raise UnusableView(where)
     if matrix.shape == (4, 4) and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise DataError(f"{where}: the pose's last row is {matrix[3].tolist()}; write 0 0 0 1, or leave that row out")
+    # Scale, shear or a mirroring would go unnoticed until renders are wrong.
     rotation = matrix[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
@@ -219,7 +220,7 @@ def assemble_scene(
     data: Path,
     views: Sequence[View],
     *,
-    downscale: int,
+    downscale: float,
     split: tuple[Tensor, Tensor] | None = None,
     points: NDArray[np.float64] | None = None,
     seen: NDArray[np.int64] | None = None,

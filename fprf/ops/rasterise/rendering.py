@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from ...errors import FprfError
-from ..backend import compiled
+from ..backend import compiled, compiled_for
 from .reference import Pinhole, rasterise_reference, view_colours
 
 __all__ = ["Pinhole", "Rasterised", "lift", "rasterise"]
@@ -75,7 +75,7 @@ def rasterise(
     shape = (means, quaternions, log_scales)
     given = (*shape, logits, harmonics, features, background)
     counts: dict[str, int] = {}
-    if not _fits(*given):
+    if not compiled_for(*given):
         colours, fine = view_colours(means, harmonics, camera)
         logits = torch.where(fine, logits, torch.nan)  # what is not finite is not drawn
         behind = torch.cat([background, features.new_zeros(features.shape[1])])
@@ -113,7 +113,7 @@ def lift(
         raise FprfError(f"pixels {tuple(pixels.shape)}: a camera of {camera.height} x {camera.width} has other ones")
     pixels, channels = pixels.detach(), pixels.shape[-1]
     shape = (means.detach(), quaternions.detach(), log_scales.detach(), logits.detach())
-    if not _fits(*shape, pixels):
+    if not compiled_for(*shape, pixels):
         # Rendering is linear in the values, so their gradient for given pixels is its transpose.
         with torch.inference_mode(False), torch.enable_grad():
             # Tensors of inference can't take part in a gradient: copies can.
@@ -187,11 +187,6 @@ class _Rasterise(torch.autograd.Function):
         shape = rows[:, :3], rows[:, 6:10], rows[:, 3:6], rows[:, 10], rows[:, 11:].reshape(-1, bands, 3)
         of_background = (grad[..., :3] * passing[..., None]).sum((0, 1))
         return *shape, torch.from_numpy(of_features)[:, : features.shape[1]], of_background, None, None
-
-
-def _fits(*tensors: Tensor) -> bool:
-    """Float32 on the CPU, and numba is installed."""
-    return compiled() and all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
 
 
 def _form(*tensors: Tensor) -> Callable[..., tuple[Tensor, Tensor]]:

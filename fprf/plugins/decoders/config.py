@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
+from ..codec import Missing, leaves
 from ..config import Need, PluginConfig, absent_file
 from ..encoders.config import EncoderConfig
 from ..registry import name_of
-from ..slots import hints_of, is_slot, members
-from ..typed_json import Missing
 
 if TYPE_CHECKING:
     from ...interfaces import Decoder
@@ -62,37 +59,17 @@ def pretrain_line(encoder: EncoderConfig | Missing, output: Path = Path("decoder
 
     DIR stands for folders of photographs, which nobody else can know.
     """
-    flags = _chosen(encoder, EncoderConfig.group, "--encoder")
-    return f"fprf pretrain decoder {shlex.join(flags)} --images DIR --output {shlex.quote(str(output))}"
-
-
-def _chosen(config: PluginConfig, group: str, path: str) -> list[str]:
-    if isinstance(config, Missing):
-        plain = {name: value for name, value in json.loads(config.data).items() if not isinstance(value, dict)}
-        words = [word for name, value in plain.items() for word in _spelled(f"{path}.{name.replace('_', '-')}", value)]
-        return [path, config.name, *words]
-    # Fields that differ from the defaults; a slot brings the fields of what fills it.
-    kind = type(config)
-    default, hints = kind(), hints_of(kind)
-    flags = [path, name_of(group, kind)]
-    for field in dataclasses.fields(config):
-        value, flag = getattr(config, field.name), f"{path}.{field.name.replace('_', '-')}"
-        slot = next(filter(is_slot, members(hints[field.name])), None)
-        if value == getattr(default, field.name):
+    # A slot's path names what fills it; where that is not the default's plug-in, all of its fields are written.
+    own, default = leaves(encoder), {} if isinstance(encoder, Missing) else leaves(type(encoder)())
+    name = own.pop("", None) or name_of(EncoderConfig.group, type(encoder))
+    words, written = ["fprf", "pretrain", "decoder", "--encoder", name], tuple[str, ...]()
+    for path, value in own.items():
+        if path in default and default[path] == value and not path.startswith(written):
             continue
-        if slot is not None and value is not None:
-            flags += _chosen(value, slot.group, flag)
+        written += (f"{path}.",)
+        head, _, field = f"--encoder.{path.replace('_', '-')}".rpartition(".")
+        if isinstance(value, bool):
+            words.append(f"{head}.{'' if value else 'no-'}{field}")
         else:
-            flags += _spelled(flag, value)
-    return flags
-
-
-def _spelled(flag: str, value: Any) -> list[str]:
-    if isinstance(value, bool):
-        head, _, name = flag.rpartition(".")
-        return [flag if value else f"{head}.no-{name}"]
-    if value is None:
-        return [flag, "none"]
-    if isinstance(value, tuple | list):
-        return [flag, *map(str, value)]
-    return [flag, str(value)]
+            words += [f"{head}.{field}", *map(str, value if isinstance(value, list) else ["none" if value is None else value])]
+    return f"{shlex.join(words)} --images DIR --output {shlex.quote(str(output))}"

@@ -14,7 +14,7 @@ import os
 import re
 import urllib.error
 import urllib.request
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -70,7 +70,7 @@ class VggEncoder(FrozenEncoder):
         used["scale"] = torch.ones(channels) if scale is None else scale.float()
         kind = "plain" if scale is None else "normalised"
         super().__init__(f"vgg19:{layer}:{kind}:{tensors_hash(used)}", channels)
-        self._names, self._layer, self._normalised = names, layer, scale is not None
+        self.names, self._layer, self._normalised = names, layer, scale is not None
         for key, value in used.items():
             self.register_buffer(key, value)
         freeze(self)
@@ -78,16 +78,23 @@ class VggEncoder(FrozenEncoder):
     @torch.no_grad()
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features at stride 1, 2, 4, 8 or 16, by the block of the layer."""
+        x = image
+        for x in self.activations(image):  # noqa: B007  # only the last one counts, and the others need not be kept
+            pass
+        return x / self._column("scale", x)
+
+    def activations(self, image: Annotated[Tensor, "B 3 H W"]) -> Iterator[Annotated[Tensor, "B K h w"]]:
+        """What each convolution finds, layer after layer and undivided; gradients pass through."""
         x = (image - self._column("mean", image)) / self._column("std", image)
         # A pool before each block but the first, and the last ReLU only if the layer is one.
-        for index, name in enumerate(self._names):
+        for index, name in enumerate(self.names):
             if index and name.endswith("_1"):
                 x = F.max_pool2d(x, 2, ceil_mode=True)
             x = reflect_pad(x) if self._normalised else F.pad(x, (1, 1, 1, 1))
             x = F.conv2d(x, self.get_buffer(f"weight{index}").to(x), self.get_buffer(f"bias{index}").to(x))
-            if index < len(self._names) - 1 or self._layer.startswith("relu"):
+            if index < len(self.names) - 1 or self._layer.startswith("relu"):
                 x = F.relu(x)
-        return x / self._column("scale", x)
+            yield x
 
     def _column(self, name: str, like: Tensor) -> Tensor:
         return self.get_buffer(name).to(like).view(1, -1, 1, 1)

@@ -35,9 +35,9 @@ class UniformConfig(SamplerConfig):
         at_least("sampler.samples", self.samples, 1)
 
     def build(self, *, seed: int) -> Sampler:
-        from .samplers import UniformSampler
+        from .samplers import ProposalSampler
 
-        return UniformSampler(self)
+        return ProposalSampler(ProposalConfig(samples=(), resolutions=(), final=self.samples), seed=seed)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,10 +75,10 @@ class ProposalConfig(SamplerConfig):
         # A level is a pair of samples and a resolution.
         for n in (*self.samples, *self.resolutions):
             at_least("sampler.samples and resolutions", n, 2)
-        if not 1 <= len(self.samples) == len(self.resolutions):
+        if len(self.samples) != len(self.resolutions):
+            levels, resolutions = len(self.samples), len(self.resolutions)
             raise ConfigError(
-                f"sampler.samples: {len(self.samples)} levels but {len(self.resolutions)} in sampler.resolutions; "
-                "name as many of each, at least one"
+                f"sampler.samples: {levels} levels but {resolutions} in sampler.resolutions; name as many of each"
             )
 
     def build(self, *, seed: int) -> Sampler:

@@ -1,4 +1,4 @@
-"""Proposal sampling (mip-NeRF 360: each level's density says where the next level looks) and even spacing."""
+"""Proposal sampling (mip-NeRF 360): each level's density says where the next level looks."""
 
 import torch
 from torch import Tensor, nn
@@ -8,44 +8,14 @@ from ...interfaces import Sampler
 from ...rendering.space import Space
 from ...rendering.stepfun import midpoints, resample, transmittance_weights
 from ...types import Level, Rays, Sampled
-from .config import ProposalConfig, UniformConfig
-
-
-def even_edges(rays: Rays, samples: int, generator: torch.Generator | None) -> Tensor:
-    """Edges s [R samples+1] at even steps; with a generator the inner ones move together by up to half a step a ray."""
-    # The ends stay on near and far.
-    s = torch.linspace(0, 1, samples + 1, dtype=rays.origin.dtype, device=rays.origin.device).expand(len(rays.near), -1)
-    if generator is None:
-        return s
-    shift = torch.rand((len(s), 1), generator=generator, dtype=s.dtype, device=s.device) - 0.5
-    return torch.cat([s[:, :1], s[:, 1:-1] + shift / samples, s[:, -1:]], 1)
-
-
-class UniformSampler(Sampler):
-    """No proposal, no parameters."""
-
-    def __init__(self, config: UniformConfig) -> None:
-        super().__init__()
-        self.samples = config.samples
-
-    def forward(
-        self,
-        rays: Rays,
-        *,
-        space: Space,
-        step: int | None,
-        generator: torch.Generator | None,
-    ) -> Sampled:
-        s = even_edges(rays, self.samples, generator)
-        return Sampled(s, space.distance(s, rays.near, rays.far))
-
-    def penalties(self) -> dict[str, Tensor]:
-        """None."""
-        return {}
+from .config import ProposalConfig
 
 
 class ProposalSampler(Sampler):
-    """Coarse to fine. Proposals learn from the interlevel loss alone, ever more rarely after the warm-up."""
+    """Coarse to fine. Proposals learn from the interlevel loss alone, ever more rarely after the warm-up.
+
+    Without any level samples lie at even steps.
+    """
 
     def __init__(self, config: ProposalConfig, *, seed: int) -> None:
         super().__init__()
@@ -65,11 +35,15 @@ class ProposalSampler(Sampler):
         generator: torch.Generator | None,
     ) -> Sampled:
         """Edges for the content field, and the levels that proposed them where they learn in this step."""
-        # From even edges, each level's weights say where the next one looks (mip-NeRF 360, section 3).
+        # Even steps at first; with a generator the edges within move together by up to half a step a ray.
+        first, *counts = *self.config.samples, self.config.final
+        s = torch.linspace(0, 1, first + 1, dtype=rays.near.dtype, device=rays.near.device).expand(len(rays.near), -1)
+        if generator is not None:
+            shift = torch.rand((len(s), 1), generator=generator, dtype=s.dtype, device=s.device) - 0.5
+            s = torch.cat([s[:, :1], s[:, 1:-1] + shift / first, s[:, -1:]], 1)
+        # Then each level's weights say where the next one looks (mip-NeRF 360, section 3).
         learns = step is not None and self.learns(step)
         sharpness = 1.0 if step is None else self.sharpness(step)
-        counts = (*self.config.samples[1:], self.config.final)
-        s = even_edges(rays, self.config.samples[0], generator)
         levels = []
         for field, count in zip(self.levels, counts, strict=True):
             with torch.set_grad_enabled(learns):
@@ -86,12 +60,12 @@ class ProposalSampler(Sampler):
         return Sampled(s, space.distance(s, rays.near, rays.far), tuple(levels))
 
     def penalties(self) -> dict[str, Tensor]:
-        """'proposal_variation' of all levels' planes."""
+        """'proposal_variation' of all levels' planes; none without levels."""
         parts = []
         for field in self.levels:
             assert isinstance(field, ProposalField)
             parts.append(field.planes.variation())
-        return {"proposal_variation": torch.stack(parts).sum()}
+        return {"proposal_variation": torch.stack(parts).sum()} if parts else {}
 
     def learns(self, step: int) -> bool:
         """Every step at first, every `update_every` steps after the warm-up, evenly rarer between."""

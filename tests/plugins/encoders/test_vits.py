@@ -10,10 +10,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from fprf.errors import ConfigError, WeightsError
+from fprf.plugins.codec import from_json
 from fprf.plugins.encoders.config import DinoConfig, Dinov2Config, Dinov3Config, EncoderConfig
 from fprf.plugins.encoders.dinov2 import WEIGHTS, dequantised, load_dinov2
 from fprf.plugins.encoders.vit import VitEncoder
-from fprf.plugins.typed_json import from_json
 from fprf.plugins.weights import IMAGENET_MEAN, IMAGENET_STD, read_weights, write_weights
 from fprf.splats.config import GaussianSemanticsConfig
 from fprf.testing import check_encoder
