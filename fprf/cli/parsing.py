@@ -1,16 +1,16 @@
-"""Arguments to a config: slots first, then every field as a flag. Help is tyro's, which is imported for it alone."""
+"""Arguments to a config: slots first, then every field as a flag, by tyro."""
 
 import contextlib
 import dataclasses
 import difflib
 import enum
-import math
+import io
 import os
 import re
 import shutil
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_origin
 
 from ..errors import ConfigError, UsageError
@@ -27,7 +27,9 @@ C = TypeVar("C")
 
 _COLUMNS = 100
 """Widest help text: a page, not a wide screen."""
-_SCALARS = {bool: "True or False", int: "a whole number", float: "a number", str: "a text", Path: "a path", NoneType: "none"}
+_TRUTHS = (["True"], ["False"], ["true"], ["false"])
+_NONES = (["none"], ["None"])
+_SCALARS = {bool: "True or False", int: "a whole number", float: "a number", str: "a text", Path: "a path", type(None): "none"}
 
 
 class Flag(NamedTuple):
@@ -37,6 +39,8 @@ class Flag(NamedTuple):
     """Dotted field names."""
     kinds: tuple[Any, ...]
     """The types that it takes, None last."""
+    owner: Any
+    """The config that holds it."""
 
     @property
     def text(self) -> str:
@@ -44,19 +48,9 @@ class Flag(NamedTuple):
         return f"--{_dashed(self.path)}"
 
     @property
-    def most(self) -> float:
-        """Words that it takes, at most."""
-        return max(map(_width, self.kinds))
-
-    def value(self, words: Sequence[str]) -> Any:
-        """The value that words on the command line mean. Raises UsageError."""
-        if not words and bool in self.kinds:
-            return True
-        for kind in sorted(self.kinds, key=lambda kind: kind is not NoneType):  # None first: `none` is a text as well
-            with contextlib.suppress(ValueError, KeyError, TypeError):
-                return _convert(words, kind)
-        takes = " or ".join(map(_words, self.kinds))
-        raise UsageError(f"{' '.join([self.text, *words])}: {'it takes' if words else 'needs a value:'} {takes}")
+    def takes(self) -> str:
+        """Its values in words."""
+        return " or ".join(map(_words, self.kinds))
 
 
 def flags_of(config: Any, prefix: str = "") -> dict[str, Flag]:
@@ -67,42 +61,56 @@ def flags_of(config: Any, prefix: str = "") -> dict[str, Flag]:
         if dataclasses.is_dataclass(value):
             flags |= flags_of(value, f"{path}.")
         elif not any(is_slot(each) for each in members(hint)):
-            flag = Flag(path, tuple(sorted(members(hint), key=lambda kind: kind is NoneType)))
+            flag = Flag(path, tuple(sorted(members(hint), key=lambda kind: kind is type(None))), config)
             flags[flag.text] = flag
     return flags
 
 
-def _width(kind: Any) -> float:
-    """Words that a value of a type takes; infinite for any number."""
-    origin, args = get_origin(kind), get_args(kind)
-    if origin in (list, dict) or args[-1:] == (Ellipsis,):
-        return math.inf
-    return sum(map(_width, args)) if origin is tuple else 1
+def spell(args: Sequence[str], flags: dict[str, Flag]) -> list[str]:
+    """The arguments as tyro spells them.
+
+    `none` is None, `true` is True, a bare `--path.switch` is `--path.switch True`, `--path.no-switch` is its opposite.
+    """
+    spelled: list[str] = []
+    for at, arg in enumerate(args):
+        key, equals, inline = arg.partition("=")
+        flag = flags.get(_dashed(key))
+        opposite = flags.get(re.sub(r"(^--|\.)no-(?=[^.]*$)", r"\1", _dashed(arg)))
+        before = flags.get(_dashed(args[at - 1])) if at else None
+        if flag and equals:  # --field=VALUE
+            spelled.append(f"{key}={_literal(inline, flag)}")
+        elif flag and bool in flag.kinds:  # --switch, --switch true
+            values = (*_TRUTHS, *_NONES) if type(None) in flag.kinds else _TRUTHS
+            spelled += [arg] if args[at + 1 : at + 2] in values else [arg, "True"]
+        elif not flag and opposite and bool in opposite.kinds:  # --no-switch
+            spelled += [opposite.text, "False"]
+        elif before and not arg.startswith("--"):  # the value of the flag before it
+            spelled.append(_literal(arg, before))
+        else:
+            spelled.append(arg)
+    return spelled
 
 
-def _convert(words: Sequence[str], kind: Any) -> Any:
-    """The value of a type that words mean. Raises ValueError, KeyError or TypeError where they mean none."""
-    origin, args = get_origin(kind), get_args(kind)
-    if origin is dict:
-        return dict(_convert(words, tuple[tuple[args], ...]))  # type: ignore[valid-type]  # a word each for key and value
-    if origin in (tuple, list):
-        # Of any number, as many items as the words are enough for; an item may be of several words itself.
-        if origin is list or args[-1] is Ellipsis:
-            args = (args[0],) * math.ceil(len(words) / _width(args[0]))
-        items, rest = [], list(words)
-        for arg in args:
-            width = int(_width(arg))
-            items.append(_convert(rest[:width], arg))
-            del rest[:width]
-        if rest:
-            raise ValueError(rest)
-        return origin(items)
-    (word,) = words
-    if origin is Literal:
-        return {str(value): value for value in args}[word]
-    if kind is bool or kind is NoneType:
-        return ({"true": True, "false": False} if kind is bool else {"none": None})[word.lower()]
-    return kind[word] if issubclass(kind, enum.Enum) else kind(word)
+def explain(refusal: str, config: Any, args: Sequence[str], *, positional: Sequence[str], prog: str) -> str:
+    """One line for what tyro refused: an unknown flag, a value that does not fit, a value too many or too few."""
+    flags = flags_of(config)
+    # An unknown flag first: it is named whatever else is wrong.
+    for arg in args:
+        key = arg.partition("=")[0]
+        if re.match(r"--[a-zA-Z]", key) and _dashed(key) not in flags:
+            return _unknown(key, config, flags, prog)
+    # The text of the box, without its frame and colours, in one line.
+    text = re.sub(r"\x1b\[[0-9;]*m", "", refusal)
+    text = " ".join(re.sub(r"[╭╮╰╯│─]|-{3,}", " ", text).split())
+    for flag in flags.values():
+        if re.search(rf"(?<![\w.-]){re.escape(flag.text)}(?![\w.-])", text):
+            given = _given(flag, args)
+            return f"{' '.join([flag.text, *given])}: {'it takes' if given else 'needs a value:'} {flag.takes}"
+    if "equired" in text and positional:
+        return f"{prog}: {positional[0].upper()} is missing; `{prog} --help` says what it takes"
+    if stray := re.search(r"Unrecognized options: (.*?)(?: Perhaps | For full |$)", text):
+        return f"{stray[1]!r}: belongs to no flag; `{prog} --help` lists the flags"
+    return text
 
 
 def _unknown(key: str, config: Any, flags: dict[str, Flag], prog: str) -> str:
@@ -119,12 +127,34 @@ def _unknown(key: str, config: Any, flags: dict[str, Flag], prog: str) -> str:
     return f"{key}: no such flag{f'; did you mean {close[0]}?' if close else lists}"
 
 
+def _given(flag: Flag, args: Sequence[str]) -> list[str]:
+    """The values that the user gave to the flag, the last time that it stands there."""
+    values: list[str] = []
+    inside = False
+    for arg in args:
+        key, equals, inline = arg.partition("=")
+        if arg.startswith("--"):
+            inside = _dashed(key) == flag.text
+            values = ([inline] if equals else []) if inside else values
+        elif inside:
+            values.append(arg)
+    several = any(get_origin(kind) in (tuple, list, dict) for kind in flag.kinds)
+    return values if several else values[:1]
+
+
+def _literal(value: str, flag: Flag) -> str:
+    if value == "none" and type(None) in flag.kinds:
+        return "None"
+    if value in ("true", "false") and bool in flag.kinds:
+        return value.capitalize()
+    return value
+
+
 def _dashed(key: str) -> str:
     return key.replace("_", "-")
 
 
 def _words(hint: Any) -> str:
-    """A type in words."""
     args = get_args(hint)
     if get_origin(hint) is Literal:
         return " or ".join(map(str, args))
@@ -140,74 +170,34 @@ def _words(hint: Any) -> str:
 def parse(default: C, args: Sequence[str], *, prog: str, description: str, positional: tuple[str, ...] = ()) -> C:
     """The default, a frozen dataclass tree, changed by the arguments.
 
-    `--path.to.slot NAME` chooses a plug-in, `--path.to.field VALUE` sets a field, in any order and also with `=`. `none`
-    empties what may be None; a bare `--path.switch` is true, `--path.no-switch` false. A flag of any number of values takes
-    those of all places where it stands. Fields named in `positional` are given without a flag, in that order, and must be given
-    unless they are None or empty. `--help` prints all of it and exits. Raises UsageError, PluginError or ConfigError with one
-    line.
+    `--path.to.slot NAME` chooses a plug-in, `--path.to.field VALUE` sets a field, in any order and also with `=`;
+    `none` empties whatever may be None. Fields named in `positional` are given without a flag, in that order, and must
+    be given. `--help` prints all of it and exits. Raises UsageError, PluginError or ConfigError with one line.
     """
     # Slots first: what fills them decides which flags there are.
     config, rest = resolve(default, args)
     for slot in slots(config):
         if isinstance(slot.value, Missing):
             slot.value.build()
-    if {"-h", "--help"} & {*rest}:
-        _print_help(config, prog, description, positional)
-    every = {flag.path: flag for flag in flags_of(config).values()}
-    flags = {flag.text: flag for flag in every.values() if flag.path not in positional}
-    # The words of each flag; those that no flag takes are the positional fields'.
-    given: dict[str, list[str]] = {}
-    loose: list[str] = []
-    into, room, switch = loose, 0.0, False
-    for arg in rest:
-        key, equals, inline = arg.partition("=")
-        if arg.startswith("--"):
-            flag = flags.get(_dashed(key))
-            opposite = flags.get(re.sub(r"(^--|\.)no-(?=[^.]*$)", r"\1", _dashed(arg)))
-            if flag is None and opposite is not None and bool in opposite.kinds:
-                given[opposite.path], room = ["false"], 0.0
-                continue
-            if flag is None:
-                raise UsageError(_unknown(key, config, flags, prog))
-            into = [*(given.get(flag.path, ()) if flag.most == math.inf else ()), *([inline] if equals else [])]
-            given[flag.path] = into
-            room, switch = flag.most - (1 if equals else 0), bool in flag.kinds
-        elif room > 0 and not (switch and arg.lower() not in ("true", "false", "none")):
-            into.append(arg)
-            room -= 1
-        else:
-            loose.append(arg)
-            room = 0.0
-    for path in positional:
-        most = every[path].most
-        count = len(loose) if most == math.inf else int(most)
-        if loose:
-            given[path], loose = loose[:count], loose[count:]
-        elif getattr(config, path) not in (None, ()):
-            raise UsageError(f"{prog}: {path.upper()} is missing; `{prog} --help` says what it takes")
-    if loose:
-        raise UsageError(f"{loose[0]!r}: belongs to no flag; `{prog} --help` lists the flags")
-    # Words become values when all flags are known to exist, so that an unknown one is told first.
-    values = {path: every[path].value(words) for path, words in given.items()}
+    flags = {text: flag for text, flag in flags_of(config).items() if flag.path not in positional}
+    rest = spell(rest, flags)
+    # What tyro says of a mistake is a box of many lines; ours is one.
+    heard = io.StringIO()
     try:
-        return _changed(config, values)
+        with contextlib.redirect_stderr(heard), _page_width():
+            parsed = _tyro(config, rest, prog=prog, description=description, positional=positional)
+    except SystemExit as end:
+        if not end.code:
+            raise
+        raise UsageError(explain(heard.getvalue(), config, rest, positional=positional, prog=prog)) from None
     except ConfigError as fault:
         # A range error names its field; here the flag that caused it, where the arguments tell which.
         field, _, reason = str(fault).partition(": ")
-        fits = [every[path].text for path in values if f".{path}".endswith(f".{field}")]
+        given = {_dashed(arg.partition("=")[0]) for arg in rest if arg.startswith("--")}
+        fits = [text for text, flag in flags.items() if text in given and f".{flag.path}".endswith(f".{field}")]
         raise ConfigError(f"{fits[0]}: {reason}" if len(fits) == 1 and reason else str(fault)) from fault
-
-
-def _changed(config: C, values: dict[str, Any], prefix: str = "") -> C:
-    """A config tree with other leaves, by their paths; each dataclass is made once, since its checks see all of its fields."""
-    changes = {}
-    for field in dataclasses.fields(config):  # type: ignore[arg-type]  # a dataclass by contract
-        path, value = f"{prefix}{field.name}", getattr(config, field.name)
-        if path in values:
-            changes[field.name] = values[path]
-        elif any(each.startswith(f"{path}.") for each in values):
-            changes[field.name] = _changed(value, values, f"{path}.")
-    return dataclasses.replace(config, **changes)  # type: ignore[type-var]
+    sys.stderr.write(heard.getvalue())
+    return parsed
 
 
 def load_method(name: str) -> "tuple[RunConfig, str]":
@@ -219,38 +209,49 @@ def load_method(name: str) -> "tuple[RunConfig, str]":
     return method_config(name), name
 
 
-def _print_help(config: Any, prog: str, description: str, positional: tuple[str, ...]) -> None:
-    """Print every flag and exit; fields that are positional are marked as such in a copy of the config's class."""
+def _tyro(config: C, args: list[str], *, prog: str, description: str, positional: tuple[str, ...]) -> C:
     import tyro
 
     tyro.extras.set_accent_color("cyan")
-    kind, hints, marked = type(config), hints_of(type(config)), []
-    for name in positional:
-        hint = None if getattr(config, name) in (None, ()) else "(required)"
-        arg = tyro.conf.arg(metavar=name.upper(), help_behavior_hint=hint)
-        marked.append((name, Annotated[hints[name], tyro.conf.Positional, arg]))
-    unchecked = {"__post_init__": lambda self: None, "__doc__": kind.__doc__}
-    copy = dataclasses.make_dataclass(kind.__name__, marked, bases=(kind,), namespace=unchecked, frozen=True, kw_only=True)
-    shown = copy(**{field.name: getattr(config, field.name) for field in dataclasses.fields(config)})
-    chosen = _slot_flags(list(slots(config)))
+    shown, chosen = _with_positional(config, positional), _slot_flags(list(slots(config)))
 
-    def main(config: Any, plug_ins: Any) -> None:
-        """Only its arguments count."""
+    def main(config: Any, plug_ins: Any) -> Any:
+        return config
 
     main.__defaults__ = (shown, chosen)
     main.__annotations__ = {  # name="" and not OmitArgPrefixes for the config: that one strips every nested prefix
-        "config": Annotated[copy, tyro.conf.arg(name="")],
+        "config": Annotated[type(shown), tyro.conf.arg(name="")],
         "plug_ins": Annotated[type(chosen), tyro.conf.arg(name="plug-in"), tyro.conf.OmitArgPrefixes],
     }
-    # Help is set for a page, not for a wide screen; tyro asks the environment for the width.
-    before = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = str(min(_COLUMNS, shutil.get_terminal_size((_COLUMNS, 24)).columns))
     markers = (tyro.conf.AvoidSubcommands, tyro.conf.FlagConversionOff)
-    try:
-        tyro.cli(main, args=["--help"], prog=prog, description=description, config=markers)
-    finally:
-        del os.environ["COLUMNS"]
-        os.environ |= {} if before is None else {"COLUMNS": before}
+    parsed = tyro.cli(main, args=args, prog=prog, description=description, config=markers)
+    # Back to the config's own class, which checks the ranges.
+    values = {field.name: getattr(parsed, field.name) for field in dataclasses.fields(parsed)}
+    return type(config)(**values)
+
+
+def _with_positional(config: Any, names: tuple[str, ...]) -> Any:
+    """The config with some fields marked as positional, in a subclass that checks nothing yet; None and () can be left out."""
+    import tyro
+
+    if not names:
+        return config
+    hints, optional = hints_of(type(config)), (None, ())
+    marked = []
+    for name in names:
+        hint = None if getattr(config, name) in optional else "(required)"
+        arg = tyro.conf.arg(metavar=name.upper(), help_behavior_hint=hint)
+        marked.append((name, Annotated[hints[name], tyro.conf.Positional, arg]))
+    kind = dataclasses.make_dataclass(
+        type(config).__name__,
+        marked,
+        bases=(type(config),),
+        namespace={"__post_init__": lambda self: None, "__doc__": type(config).__doc__},
+        frozen=True,
+        kw_only=True,
+    )
+    values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    return kind(**values | {name: tyro.MISSING for name in names if values[name] not in optional})
 
 
 def _slot_flags(filled: list[Slot]) -> Any:
@@ -275,3 +276,17 @@ def _filled_by(slot: Slot) -> str:
 def first_line(documented: object) -> str:
     """The first line of a docstring."""
     return (documented.__doc__ or "").strip().partition("\n")[0]
+
+
+@contextlib.contextmanager
+def _page_width() -> Iterator[None]:
+    """Help is set for a page, not for a wide screen; tyro asks the environment for the width."""
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = str(min(_COLUMNS, shutil.get_terminal_size((_COLUMNS, 24)).columns))
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["COLUMNS"]
+        else:
+            os.environ["COLUMNS"] = before

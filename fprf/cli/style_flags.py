@@ -38,8 +38,9 @@ def read_flags(
 ) -> tuple[C, StyleFile]:
     """The verb's config and the style that it asks for; `--style FILE` gives the values that no flag gives.
 
-    `--gentle`, or another name of `PRESETS`, sets what that preset sets, over the file and below every other flag. Folders
-    among the references stand for the images in them. Raises what `parse`, `with_folders` and `read_style` raise, and DataError
+    `--gentle`, or another name of `PRESETS`, sets what that preset sets, over the file and below every other flag.
+    A flag of many values may stand several times: `--pin 3=a.jpg --pin 5=b.jpg` is `--pin 3=a.jpg 5=b.jpg`. Folders among
+    the references stand for the images in them. Raises what `parse`, `with_folders` and `read_style` raise, and DataError
     where a photograph of the file is no longer the one it was.
     """
     # Defaults from the style file, then from the preset, then every flag over both.
@@ -54,7 +55,7 @@ def read_flags(
     args = [arg for arg in args if arg not in flags]
     meanings = [f"{flag} stands for {preset_flags(name)}; other flags come over it." for flag, name in flags.items()]
     about = "\n\n".join([description, *meanings])
-    config = parse(default, args, prog=prog, description=about, positional=positional)
+    config = parse(default, _joined(args, default), prog=prog, description=about, positional=positional)
     config = with_folders(config, say)
     file = file._replace(style=StyleConfig(**_styles(config)))
     # Who names photographs takes them as they are now.
@@ -71,6 +72,25 @@ def say(text: str) -> None:
 
 def _styles(config: StyleConfig) -> dict[str, Any]:
     return {field.name: getattr(config, field.name) for field in fields(StyleConfig)}
+
+
+def _joined(args: Sequence[str], config: StyleConfig) -> list[str]:
+    """The arguments with each flag of many values once, with all of its values: otherwise the last one alone would count."""
+    many = {f"--{field.name.replace('_', '-')}" for field in fields(config) if isinstance(getattr(config, field.name), tuple)}
+    rest: list[str] = []
+    values: dict[str, list[str]] = {}
+    into = rest
+    for arg in args:
+        key, equals, inline = arg.partition("=")
+        flag = key.replace("_", "-")
+        if flag in many:
+            into = values.setdefault(flag, [])
+            into += [inline] if equals else []
+            continue
+        if arg.startswith("-"):
+            into = rest
+        into.append(arg)
+    return [*rest, *(word for flag, words in values.items() for word in (flag, *words))]
 
 
 def _style_flag(args: Sequence[str]) -> Path | None:
