@@ -37,7 +37,7 @@ from fprf.style.look import Restyle
 from fprf.style.restyle import apply_style
 from fprf.style.scene_style import to_tensors
 from fprf.training.driver import Report, learn, schedule_of
-from fprf.training.learner import FieldLearner
+from fprf.training.field_learner import FieldLearner
 from fprf.training.loading import Trained
 from fprf.training.prepare import device_of, prepare, read_scene
 from fprf.training.run import Run

@@ -19,7 +19,7 @@ from fprf.ops import backend
 from fprf.rendering.cameras import Cameras, PixelRays
 from fprf.rendering.renderer import Parts, march, render_rays
 from fprf.style.look import Restyle
-from fprf.training.learner import FieldLearner
+from fprf.training.field_learner import FieldLearner
 from fprf.training.loading import Trained, load_run
 from fprf.training.model import Facts, Model, background_of, build_model
 from fprf.training.prepare import Prepared, prepare, read_scene

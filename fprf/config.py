@@ -369,7 +369,7 @@ class TrainConfig(RunConfig):
         """Extract the features and build the model; blocks where the scene is cut."""
         from .blocks.partition import make_plan
         from .training.blocks import Blocks
-        from .training.learner import FieldLearner
+        from .training.field_learner import FieldLearner
         from .training.prepare import prepare
 
         plan = make_plan(scene, self.blocks) if self.blocks.cuts else None

@@ -11,11 +11,11 @@ contract in `fprf.testing` checks an implementation, and fails with one sentence
                 Decoder          content [N C] -> colours [N 3]              check_decoder
                 LossTerm         render, batch -> scalar                     check_loss_term
     styles      Stylizer         content [N C], semantic [N D] -> [N C]      check_stylizer
-    captures    DataParser       folder -> scene                             check_parser
+    photographs DataParser       folder -> scene                             check_parser
                 DataManager      step -> batch of R pixels                   check_data_manager
     scale       BlockLayout      site -> cells                               check_layout
                 Executor         tasks -> results                            check_executor
-    files       CaptureFormat    bytes <-> Gaussians                         check_capture_format
+    Gaussians   CaptureFormat    bytes <-> Gaussians                         check_capture_format
     scenes      Scene, SceneView, SceneLearner, Partition: a kind of scene, built by `RunConfig.build`
 
 `CaptureFormat` is in `fprf/splats/files/base.py`, since it speaks of Gaussians; all others are below. To add
@@ -276,7 +276,8 @@ class Scene(ABC):
     def paint(
         self, cameras: "Cameras", view: int, pixel: Annotated[Tensor, "R 2"], values: Values, *, semantic: bool = True
     ) -> tuple[Annotated[Tensor, "R X"], Annotated[Tensor, "R"]]:
-        """Means over what each pixel sees of anything that follows from semantics, and the opacity.
+        """Composite anything that follows from semantics, such as shares of regions for a map: means over what each pixel sees,
+        and the opacity.
 
         Pixels that see nothing get 0. `values` is given features without channels where the scene has no semantics or
         `semantic` is false, and positions where styles of this kind of scene may differ from place to place.

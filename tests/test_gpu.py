@@ -20,7 +20,8 @@ from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.restyle import apply_style
 from fprf.style.scene_style import to_tensors
-from fprf.training import driver, learner
+from fprf.training import driver
+from fprf.training import field_learner as learner
 from fprf.training.driver import Report
 from fprf.training.loading import load_run
 from fprf.training.run import Run

@@ -23,7 +23,7 @@ from fprf.rendering.cameras import PixelRays
 from fprf.training import checkpoint
 from fprf.training.driver import Report, learn, schedule_of
 from fprf.training.driver import train as train_scene
-from fprf.training.learner import FieldLearner
+from fprf.training.field_learner import FieldLearner
 from fprf.training.loading import Trained, load_run
 from fprf.training.model import Model, build_model
 from fprf.training.prepare import Prepared, device_of, prepare, read_scene

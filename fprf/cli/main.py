@@ -3,7 +3,8 @@
 Packages add verbs in the entry-point group `fprf.commands` (`cli/config.py`); a built-in verb takes precedence over one
 of the same name.
 
-Exit codes: 0 done, 1 our fault, 2 the user's mistake (one line on standard error), 130 interrupted.
+Exit codes: 0 done, 1 our fault, 2 what the user can mend (a mistake, too little memory; one line on standard error),
+130 interrupted, 141 where nobody reads the output any more.
 """
 
 import importlib
@@ -28,7 +29,7 @@ _SPINS, _BLOCK_MS = "1000", "0"
 
 
 class Verb(NamedTuple):
-    """One command: `fprf.cli.NAME` with `run(args) -> exit code`."""
+    """A command's line in `fprf --help`; its code is `fprf.cli.NAME`, with `run(args) -> exit code`."""
 
     usage: str
     summary: str

@@ -20,7 +20,7 @@ from ..splats.gaussians import Gaussians
 from ..splats.initial import Points
 from ..splats.learner import GaussianLearner
 from ..splats.photographs import make_levels
-from ..splats.training import find_near, scene_scale
+from ..splats.setup import find_near, scene_scale
 from ..style.look import Restyle
 from ..training.driver import Report, Schedule, learn
 from .mesh import Maps

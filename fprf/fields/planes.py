@@ -21,8 +21,9 @@ from ..ops.harmonics import spherical_harmonics
 from ..types import FieldSample
 from .config import PlanesConfig, SemanticPlanesConfig
 
-LIMIT = 15.0
-"""exp(15) = 3e6 per space unit is opaque within a micro-unit; beyond it only the gradient could overflow."""
+MAX_LOG_DENSITY = 15.0
+"""exp(15) = 3e6 per space unit is opaque within a micro-unit: above it nothing looks different, and gradients of exp would
+overflow."""
 
 
 class _Exp(torch.autograd.Function):
@@ -31,12 +32,12 @@ class _Exp(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
         ctx.save_for_backward(x)
-        return x.clamp(max=LIMIT).exp()
+        return x.clamp(max=MAX_LOG_DENSITY).exp()
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Tensor:
         (x,) = ctx.saved_tensors
-        result: Tensor = grads[0] * x.clamp(-LIMIT, LIMIT).exp()
+        result: Tensor = grads[0] * x.clamp(-MAX_LOG_DENSITY, MAX_LOG_DENSITY).exp()
         return result
 
 
@@ -116,7 +117,7 @@ class PlanesField(ContentField):
         self.to_density = linear(self.planes.out, 1, generator=generator)
         inputs = self.planes.out + config.degree**2
         self.to_content = mlp(inputs, config.hidden, config.layers, channels, generator=generator)
-        # Decoders expect features of about their training scale; zero start would stall behind a frozen decoder.
+        # `to_content` begins at unit variance: from 0 a frozen decoder would pass no gradient. The offset only learns the mean.
         self.offset = nn.Parameter(torch.zeros(channels))
 
     def density(self, points: Annotated[Tensor, "N 3"]) -> FieldSample:

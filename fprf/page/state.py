@@ -218,7 +218,9 @@ class State:
             case messages.Set():
                 if message.name not in _sliders(look.style):
                     raise UsageError(f"{message.name}: the stylizer of this scene has no such field")
-                value: Any = int(message.value) if message.name == "clusters" else round(message.value, 4)
+                # The page sends numbers; whole ones stay whole in the config.
+                before = _sliders(look.style)[message.name]
+                value: Any = int(message.value) if isinstance(before, int) else round(message.value, 4)
                 return replace(self, look=replace(look, style=slots.replace(look.style, message.name, value)))
             case messages.Preset():
                 return replace(self, look=replace(look, style=with_preset(look.style, message.name)))

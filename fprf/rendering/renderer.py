@@ -84,7 +84,8 @@ def march(
         sampled = parts.sampler(_detached(rays), space=space, step=step, generator=generator)
         # A camera samples what is near it far more densely than any other camera does, and could explain its own image by a
         # veil there. Scaling gradients by the square of the distance makes every piece of space count alike (Philip and
-        # Deschaintre 2023); beyond a few times the nearest distance that is no longer needed.
+        # Deschaintre 2023); beyond a few times the nearest distance that is no longer needed. In a box, and in normalised
+        # device coordinates, no camera stands amid the samples.
         scaled = step is not None and space.kind in ("contraction", "open")
         # Densities at the middle of each step, in the unit cube, where the fields live.
         middle = midpoints(sampled.t)
@@ -188,13 +189,13 @@ def render_rays(
     kept, count = marched.kept, len(rays.near)
     rgb = content = semantic = None
     if want & (Want.COLOUR | Want.CONTENT):
-        # Content features of the kept samples: rendered as they are, or as colours, which a style may change before.
+        # Content features of the kept samples: composited as they are, or decoded to colours, after the style.
         features = parts.field.content(kept.latent, kept.view)
         if kept.gradient_scale is not None:
             features = scale_gradient(features, kept.gradient_scale[:, None])
         if Want.CONTENT in want:
-            still = kept if content_moves_density else kept._replace(weight=kept.weight.detach())
-            content = composite(still, features, count)
+            fixed = kept if content_moves_density else kept._replace(weight=kept.weight.detach())
+            content = composite(fixed, features, count)
         if Want.COLOUR in want:
             # Semantics are evaluated only where the style tells places apart by them.
             backdrop = 0.0 if background is None else marched.transmittance[:, None] * background

@@ -46,7 +46,7 @@ from .learner import CPU, MOVES, GaussianLearner, Stage, left_out
 from .levels import in_view
 from .loading import refined
 from .photographs import covering, load_photographs, make_levels
-from .training import build, light_and_poses, limit_widths, scene_scale
+from .setup import build, light_and_poses, limit_widths, scene_scale
 
 Number = TypeVar("Number", bound=np.generic)
 _FORMAT = 6

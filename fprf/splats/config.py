@@ -155,7 +155,7 @@ class GaussiansConfig(RunConfig):
             from .cells import Cells
 
             return Cells(self, scene, saved, device=device)
-        from .training import build
+        from .setup import build
 
         return build(self, scene, saved, progress, device=device)
 

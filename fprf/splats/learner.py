@@ -275,22 +275,22 @@ class GaussianLearner(SceneLearner):
         # The chance of a split: opacity times error, so that neither haze nor what is right already becomes more.
         opacity = 1 / (1 + np.exp(-model.read(LOGIT)[:, 0].astype(np.float64)))
         chance = np.nan_to_num(error * opacity)
-        # What is transparent, or shows almost only in the sky and so floats before it, can be had.
-        spare = (opacity < _DEAD) | (sky > _SKY * np.maximum(seen, _SEEN))
+        # Used again elsewhere: what is transparent, and what shows almost only in the sky and so floats before it.
+        reusable = (opacity < _DEAD) | (sky > _SKY * np.maximum(seen, _SEEN))
         if self.inside is not None:
             inside = self.inside(torch.from_numpy(model.read(MEANS))).numpy()
-            chance, spare = chance * inside, spare & inside
-        dead = np.flatnonzero(spare)
-        chance[dead] = 0
+            chance, reusable = chance * inside, reusable & inside
+        reused = np.flatnonzero(reusable)
+        chance[reused] = 0
         # The number grows evenly on a logarithmic scale: begun (cap / begun)^(share / grow).
         cap = max(self.config.most, self.begun)
         wanted = int(self.begun * (cap / self.begun) ** min(1.0, share / self.config.grow))
         more = max(wanted - model.count, 0)
-        # One half stays in its place, the other takes that of a dead one, or a new one at the end.
-        many = min(len(dead) + more, int(np.count_nonzero(chance)))
+        # One half stays in its place, the other takes that of one that is used again, or a new one at the end.
+        many = min(len(reused) + more, int(np.count_nonzero(chance)))
         if many > 0:
             picked = draw.choice(model.count, many, replace=False, p=chance / chance.sum())
-            to = np.concatenate([dead, np.arange(model.count, model.count + more)])[:many]
+            to = np.concatenate([reused, np.arange(model.count, model.count + more)])[:many]
             model.split(picked, to, *halves(model.read(index=picked), opacity[picked]))
         # Neighbours in space drift apart in memory, and tiles slow down.
         if (step + 1) % (_SORT_EVERY * self.config.relocate_every) == 0 or more > 0.3 * model.count:
@@ -337,8 +337,8 @@ class GaussianLearner(SceneLearner):
         light = ", tones" if self.tones is not None else ""
         where = "" if self.device == CPU else f", on {self.device} by gsplat"
         limit = passes if most < self.config.steps else ""
-        begun = f", {self.model.count} Gaussians at {self.origin}{light}{where}{blur}{limit}"
-        return begun + left_out(self.asked)
+        line = f", {self.model.count} Gaussians at {self.origin}{light}{where}{blur}{limit}"
+        return line + left_out(self.asked)
 
 
 def left_out(device: torch.device) -> str:

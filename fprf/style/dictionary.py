@@ -91,7 +91,8 @@ class Reference(NamedTuple):
     colour: Annotated[Tensor, "N 3"] | None = None
     """The samples' own colours, sRGB in [0, 1]; None where nobody will ask."""
     beyond: Annotated[Tensor, "N"] | None = None
-    """Squared length of semantics outside of the scene's basis (`Basis.beyond`); None = 0."""
+    """Squared length that semantics lose by projection on the scene's basis (`Basis.beyond`): large for what the scene does
+    not show. None = 0."""
 
 
 @torch.inference_mode()
@@ -251,17 +252,17 @@ def _codes_of(r: Reference, clusters: int, blend: float, seed: int) -> StyleDict
     label, keys = r.semantic.new_zeros(len(r.semantic), dtype=torch.int64), r.semantic[:1].float()
     if r.semantic.shape[1] > 0:
         keys, label = kmeans(r.semantic, clusters, seed=seed)
-    # Codes with few members say little: the fewer, the more of the whole image they take. `at` [T] is that share: `blend` for
-    # codes of _FEW_MEMBERS or more, rising to 1 for a code without any.
+    # Codes with few members say little: the fewer, the more of the whole image they take. `whole_share` [T] is that: `blend`
+    # for codes of _FEW_MEMBERS or more, rising to 1 for a code without any.
     member = double(torch.nn.functional.one_hot(label, len(keys)))
     share = member.sum(0) / len(label)
-    at = 1 - (1 - blend) * (share * len(label) / _FEW_MEMBERS).clamp_max(1.0)
+    whole_share = 1 - (1 - blend) * (share * len(label) / _FEW_MEMBERS).clamp_max(1.0)
 
     def statistics(features: Annotated[Tensor, "N C"]) -> tuple[Annotated[Tensor, "T C"], Annotated[Tensor, "T C C"]]:
         """Mean M and covariance Sigma of each code (paper, Eq. 6), blended with those of the whole image."""
         whole = moments(features, features.new_ones(len(features)))
         mean, covariances, _ = group_moments(features, member)
-        return blend_codes(mean, covariances, whole.mean, covariance(whole), at)
+        return blend_codes(mean, covariances, whole.mean, covariance(whole), whole_share)
 
     # Of content features always; of colours, and of what lies beyond, where the reference brings them.
     tables = dict(zip(("mean", "covariance"), statistics(r.content), strict=True))
@@ -286,8 +287,8 @@ def blend_codes(
     blend: Annotated[Tensor, "T"],
 ) -> tuple[Annotated[Tensor, "T C"], Annotated[Tensor, "T C C"]]:
     """Local statistics x (1 - blend) + whole x blend, code by code (released code, `blending_ratio`)."""
-    at = blend[:, None]
-    return (1 - at) * mean + at * whole_mean, (1 - at[..., None]) * covariances + at[..., None] * whole_covariance
+    whole = blend[:, None]
+    return (1 - whole) * mean + whole * whole_mean, (1 - whole[..., None]) * covariances + whole[..., None] * whole_covariance
 
 
 def whole_style(d: StyleDictionary) -> tuple[Annotated[Tensor, "C"], Annotated[Tensor, "C C"]]:

@@ -15,7 +15,8 @@ The paper matches points with codes by dot products at temperature 1. Three thin
 - Whitening: a few directions hold most of the variance on either side (sky against ground), so cosines say little of the rest.
   Both sides are partly whitened, each by its own scatter,
 
-      x'  =  (C / c + s I)^(-w/2) (x - m)        C the scatter of its keys, c its mean variance, w the share of whitening.
+      x'  =  (C / c + s I)^(-w/2) (x - m)        C the scatter of its keys, m their mean, c their mean variance,
+                                                 s = `_RIDGE`, w the share of whitening.
 
 - Recentring: the mean of the references depends on what they were pointed at: three photographs, two of façades, have a mean
   that looks like a façade, from which trees point elsewhere than they do in the scene. So the codes' mean is taken again with
@@ -92,7 +93,8 @@ def point_shares(
 ) -> Annotated[Tensor, "N T"]:
     """`attention` of the directions of points from a centre (None: of the points as they are), as renderers ask for it.
 
-    Shares below `faint` of a point's largest become 0. Rows sum to 1. Within 4 (D + 4) u / temperature of the exact shares.
+    Shares below `faint` of a point's largest become 0. Rows sum to 1. Rounding errors are at most
+    4 (D + 4) u / temperature, u the unit roundoff of the points' type.
     """
     share = attention(x if centre is None else unit(x, centre), keys, temperature, prior)
     if faint > 0:

@@ -39,7 +39,7 @@ from ..types import Cell
 from .camera_optimizers import Poses, Tones
 from .checkpoint import misfit
 from .driver import Schedule
-from .learner import FieldLearner, finish
+from .field_learner import FieldLearner, finish
 from .model import Facts, Model, build_decoder, build_fields, poses_of, tones_of
 from .prepare import device_of, prepare, read_scene
 from .run import Run

@@ -158,9 +158,10 @@ def learn(
     """
     # All draws are functions of (seed, step): a resumed training is bit for bit the one that never stopped.
     saved = None if run is None else _resume(learner, run)
-    step, before = (saved.step, saved.seconds) if saved is not None else (0, spent)
-    # `step` steps are made, `clock` seconds used; `went_back` is the step that faults led back to last.
-    first, clock, went_back = step, before, -1
+    step, seconds_before = (saved.step, saved.seconds) if saved is not None else (0, spent)
+    # `step` steps are made, `clock` seconds used.
+    first, clock = step, seconds_before
+    went_back = -1  # the step that faults led back to last
     begun = last_report = last_saved = time.perf_counter()
     pause = longest = 60 * schedule.checkpoint_minutes
     cost = 0.1  # seconds of a checkpoint, until one is measured
@@ -190,7 +191,7 @@ def learn(
                 now = time.perf_counter()
                 due = now - last_report > REPORT_SECONDS
                 # An accelerator works ahead of the host, which waits for it only twice a second and at the end.
-                if due or learner.device.type == "cpu" or schedule.share(step + 1, before + now - begun) >= 1:
+                if due or learner.device.type == "cpu" or schedule.share(step + 1, seconds_before + now - begun) >= 1:
                     # The only place where the host waits; faults of all steps since the last look come with it.
                     figures = learner.figures()
                     if figures.fault and run is not None:
@@ -199,7 +200,7 @@ def learn(
                         went_back = step = _go_back(learner, run, figures, step, went_back)
                         continue
                 # The clock goes on from that of earlier starts, so that a time limit holds for all of them.
-                step, clock = step + 1, before + now - begun
+                step, clock = step + 1, seconds_before + now - begun
                 if due and figures is not None:
                     last_report = now
                     report(measured(figures, schedule.share(step, clock)))
@@ -274,7 +275,8 @@ def is_watched(root: Path) -> bool:
 
 
 class _SignalHandler:
-    """SIGINT and SIGTERM held back inside the block, and as before after it. Other threads than the first cannot, and don't."""
+    """SIGINT and SIGTERM held back inside the block, and as before after it. Python lets only the main thread set
+    handlers; in any other this changes nothing."""
 
     def __init__(self) -> None:
         self.asked = False

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from fprf.fields.config import PlanesConfig
-from fprf.fields.planes import LIMIT, PlanesField, density
+from fprf.fields.planes import MAX_LOG_DENSITY, PlanesField, density
 from fprf.ops.harmonics import spherical_harmonics as harmonics
 
 SMALL = PlanesConfig(resolutions=(4, 9), channels=8, hidden=16)
@@ -51,7 +51,7 @@ def test_it_is_exp_below_the_cap(raw: float) -> None:
     slack = U * (abs(raw - 1) + 4)
     assert abs(value.item() - exact) <= slack * exact + 1e-38
     (gradient,) = torch.autograd.grad(value.sum(), x)
-    wanted = math.exp(max(raw - 1, -LIMIT))
+    wanted = math.exp(max(raw - 1, -MAX_LOG_DENSITY))
     assert abs(gradient.item() - wanted) <= (slack + 4 * U) * wanted
 
 
@@ -60,9 +60,9 @@ def test_extremes_are_finite(raw: float) -> None:
     x = torch.tensor([raw], requires_grad=True)
     value = density(x)
     (gradient,) = torch.autograd.grad(value.sum(), x)
-    assert 0 <= value.item() <= math.exp(LIMIT) * 1.00001
+    assert 0 <= value.item() <= math.exp(MAX_LOG_DENSITY) * 1.00001
     # A dense point can become thin again, and empty space can fill: the gradient dies at neither end.
-    assert math.exp(-LIMIT) * 0.9999 <= gradient.item() <= math.exp(LIMIT) * 1.00001
+    assert math.exp(-MAX_LOG_DENSITY) * 0.9999 <= gradient.item() <= math.exp(MAX_LOG_DENSITY) * 1.00001
 
 
 def quadrature() -> tuple[Tensor, Tensor]:

@@ -25,13 +25,14 @@ from fprf.ops.rasterise.rendering import lift
 from fprf.ops.rasterise.training import LOG_SCALES, TrainableGaussians
 from fprf.plugins.encoders.config import SEMANTICS, RandomConfig
 from fprf.rendering.cameras import Cameras
-from fprf.splats import photographs, training
+from fprf.splats import photographs
+from fprf.splats import setup as training
 from fprf.splats.config import GaussiansConfig
 from fprf.splats.files import read_capture
 from fprf.splats.gaussians import Gaussians, tensors_of
 from fprf.splats.learner import GaussianLearner
 from fprf.splats.photographs import camera_of
-from fprf.splats.training import build
+from fprf.splats.setup import build
 from fprf.training import checkpoint, driver
 from fprf.training.camera_optimizers import Tones, moved_cameras
 from fprf.training.loading import open_run

@@ -17,7 +17,7 @@ from fprf.datamanagers.scene import Scene
 from fprf.ops.rasterise.gsplat import GsplatGaussians
 from fprf.splats.config import GaussiansConfig
 from fprf.splats.learner import GaussianLearner
-from fprf.splats.training import build
+from fprf.splats.setup import build
 from fprf.training.loading import open_run
 
 

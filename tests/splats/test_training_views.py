@@ -17,7 +17,7 @@ from fprf.splats.config import GaussiansConfig
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.initial import initial_points
 from fprf.splats.photographs import camera_of, load_photographs, make_levels
-from fprf.splats.training import scene_scale
+from fprf.splats.setup import scene_scale
 from fprf.splats.views import draw
 from fprf.training.prepare import read_scene
 

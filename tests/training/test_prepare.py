@@ -12,7 +12,7 @@ from tiny_world import World, prepared_for
 
 from fprf.errors import PluginError, UsageError
 from fprf.methods import fprf_lite
-from fprf.training.learner import training_summary
+from fprf.training.field_learner import training_summary
 from fprf.training.model import build_model
 from fprf.training.prepare import device_of, exposure_of, planned, read_scene
 from fprf.training.run import Run

@@ -25,7 +25,7 @@ from fprf.splats.cells import Cells, load_cells
 from fprf.splats.config import GaussiansConfig
 from fprf.training import blocks, checkpoint
 from fprf.training.blocks import load_blocks, load_finished
-from fprf.training.learner import training_summary
+from fprf.training.field_learner import training_summary
 from fprf.training.model import Facts
 from fprf.training.run import Run, check_images, image_hashes, read_history, save_image_hashes
 from fprf.training.tasks import WHOLE, begin, read_done, renumber, task_of

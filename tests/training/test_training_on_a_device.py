@@ -22,7 +22,8 @@ from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionO
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.restyle import apply_style
-from fprf.training import checkpoint, driver, learner
+from fprf.training import checkpoint, driver
+from fprf.training import field_learner as learner
 from fprf.training.driver import Report
 from fprf.training.loading import load_run
 from fprf.training.model import build_model

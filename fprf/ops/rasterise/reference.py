@@ -79,13 +79,13 @@ def project_reference(
     means, quaternions = (torch.where(fine[:, None], x, torch.ones_like(x)) for x in (means, quaternions))
     log_scales = torch.where(fine[:, None], log_scales, torch.zeros_like(log_scales)).clamp(-_MOST_LOG, _MOST_LOG)
     logits = torch.where(fine, logits, torch.zeros_like(logits)).clamp(-_MOST_LOG, _MOST_LOG)
-    # Tangents of the means, those of J limited.
+    # Tangents of the means. Far outside the image J would explode: its tangents alone are limited, the means are not.
     x, y, depth = (means @ world[:3, :3].T + world[:3, 3]).unbind(-1)
     z = torch.where(depth > camera.near, depth, torch.ones_like(depth))
     u, v = x / z, y / z
     beyond_u, beyond_v = 0.15 * camera.width / fx, 0.15 * camera.height / fy
-    near_u = u.clamp(-cx / fx - beyond_u, (camera.width - cx) / fx + beyond_u)
-    near_v = v.clamp(-cy / fy - beyond_v, (camera.height - cy) / fy + beyond_v)
+    limited_u = u.clamp(-cx / fx - beyond_u, (camera.width - cx) / fx + beyond_u)
+    limited_v = v.clamp(-cy / fy - beyond_v, (camera.height - cy) / fy + beyond_v)
     # Rows of J W R S: the half axes in pixels, whose products are the covariance.
     qw, qx, qy, qz = torch.nn.functional.normalize(quaternions, dim=-1, eps=1e-12).unbind(-1)
     rows = [
@@ -94,24 +94,25 @@ def project_reference(
         2 * (qx * qz - qw * qy), 2 * (qy * qz + qw * qx), 1 - 2 * (qx * qx + qy * qy),
     ]  # fmt: skip
     axes = world[:3, :3] @ torch.stack(rows, -1).view(-1, 3, 3) * log_scales.exp()[:, None]
-    across = (fx / z)[:, None] * (axes[:, 0] - near_u[:, None] * axes[:, 2])
-    down = (fy / z)[:, None] * (axes[:, 1] - near_v[:, None] * axes[:, 2])
+    across = (fx / z)[:, None] * (axes[:, 0] - limited_u[:, None] * axes[:, 2])
+    down = (fy / z)[:, None] * (axes[:, 1] - limited_v[:, None] * axes[:, 2])
     fine = fine & (across.square().sum(-1) + down.square().sum(-1) < _HUGE)
     across, down = (torch.where(fine[:, None], x, torch.ones_like(x)) for x in (across, down))
     xx, yy, xy = across.square().sum(-1), down.square().sum(-1), (across * down).sum(-1)
     # The determinant as the square of a cross product: xx yy - xy^2 would lose the digits of thin ellipses.
-    sharp = torch.linalg.cross(across, down).square().sum(-1)
-    whole = sharp + BLUR * (xx + yy) + BLUR**2
+    det_sharp = torch.linalg.cross(across, down).square().sum(-1)
+    det_blurred = det_sharp + BLUR * (xx + yy) + BLUR**2
     opacity = torch.sigmoid(logits)
     if antialiased:
-        opacity = opacity * (sharp / whole + 1e-8).sqrt()
+        opacity = opacity * (det_sharp / det_blurred + 1e-8).sqrt()  # + 1e-8: the root has a finite slope at 0
     covariance = torch.stack([xx + BLUR, xy, yy + BLUR], -1)
     mean = torch.stack([fx * u + cx, fy * v + cy], -1)
     # Where alpha falls to 1/255: x^T Sigma^-1 x = 2 ln(255 o).
     reach = 2 * (opacity.detach() / MIN_ALPHA).clamp_min(1e-30).log()
     extent = (reach.clamp_min(0)[:, None] * covariance.detach()[:, ::2]).sqrt()
     seen = fine & (depth > camera.near) & (reach > 0)
-    return Projected(mean, covariance, whole, depth, opacity, torch.where(seen[:, None], extent, -torch.ones_like(extent)))
+    extent = torch.where(seen[:, None], extent, -torch.ones_like(extent))
+    return Projected(mean, covariance, det_blurred, depth, opacity, extent)
 
 
 def rasterise_reference(
