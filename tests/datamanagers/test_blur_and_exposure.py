@@ -10,10 +10,10 @@ import torch
 from tiny_world import World
 from torch import Tensor
 
-from fprf.datamanagers.blur import blurred_views, detail
 from fprf.datamanagers.images import Image
 from fprf.datamanagers.scene import GAMMA, Scene, exposures_differ, find_sightings, with_exposure
 from fprf.rendering.cameras import Cameras, ideal_cameras
+from fprf.splats.photographs import blurred_views, detail
 
 VIEWS, SIDE = 12, 128
 
