@@ -25,7 +25,7 @@ _GROUP = "fprf.commands"
 _PIPE_CLOSED = 141
 """Exit status of a program that SIGPIPE ended."""
 _SPINS, _BLOCK_MS = "1000", "0"
-"""How long a thread that waits for others spins: rounds of GNU's OpenMP, some 20 microseconds; milliseconds of LLVM's."""
+"""Spinning of a thread that waits for others: rounds of GNU's OpenMP, some 20 microseconds; milliseconds of LLVM's."""
 
 
 class Verb(NamedTuple):

@@ -382,7 +382,7 @@ class TrainingFollower:
 
 
 def training_progress(root: Path) -> dict[str, Any] | None:
-    """How far a run is, by the last line of its events.jsonl: step, share, psnr, seconds left; None where it does not say."""
+    """Progress of a run, by the last line of its events.jsonl: step, share, psnr, seconds left; None where it does not say."""
     try:
         with (root / "events.jsonl").open("rb") as file:
             file.seek(max(0, file.seek(0, 2) - _TAIL))

@@ -38,7 +38,7 @@ from .semantics import Semantics, find_semantics, load_semantics, semantics_tens
 from .views import clip_distance, find_views
 
 _UP = (0.0, -1.0, 0.0)
-"""What points up where nothing says so."""
+"""Direction that points up where nothing says so."""
 _CACHED = 24
 """Captures of which the cache keeps what was found out."""
 SAMPLE = 2_000_000

@@ -240,7 +240,7 @@ def make_levels(
 
 
 def detail(image: Image, scales: int) -> Annotated[NDArray[np.float64], "K"]:
-    """How sharp an RGB image [H W 3] is at scales k < K = `scales`; NaN where nothing is to be seen, and where it is too small.
+    """Sharpness of an RGB image [H W 3] at scales k < K = `scales`; NaN where nothing is to be seen, and where it is too small.
 
     Blur takes the finest detail of a photograph and leaves the coarse. So their ratio,
 

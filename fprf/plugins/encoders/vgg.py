@@ -84,7 +84,7 @@ class VggEncoder(FrozenEncoder):
         return x / self._column("scale", x)
 
     def activations(self, image: Annotated[Tensor, "B 3 H W"]) -> Iterator[Annotated[Tensor, "B K h w"]]:
-        """What each convolution finds, layer after layer and undivided; gradients pass through."""
+        """Activations of each convolution, layer after layer and undivided; gradients pass through."""
         x = (image - self._column("mean", image)) / self._column("std", image)
         # A pool before each block but the first, and the last ReLU only if the layer is one.
         for index, name in enumerate(self.names):

@@ -38,7 +38,7 @@ Recolour: TypeAlias = Callable[[Floats, Bools], Iterable[bytes]]
 ROWS = 1 << 17
 """Gaussians that are decoded or encoded at a time, so that the intermediate arrays of large files stay small."""
 UNSOUND = (LookupError, TypeError, ValueError, AttributeError, RecursionError, OverflowError, struct.error)
-"""What a document that is no valid index of a format raises where it is taken apart."""
+"""Errors that a document raises, as it is taken apart, that is no valid index of a format."""
 _EDGE = 1e-6
 """Opacities of exactly 0 and 1 have no logit: both keep this distance, far below a 16-bit step."""
 _MOST = 64.0
