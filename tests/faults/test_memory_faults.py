@@ -75,7 +75,7 @@ print(json.dumps({"tried": tries, "apart": [float((a - b).abs().max() / b.abs().
 """
 
 TRAIN = """
-from fprf.training import learner
+from fprf.training import field_learner as learner
 before, keep = learner.FieldLearner.step, []
 
 def step(self, step, share):
