@@ -57,9 +57,10 @@ def plan(config: "GaussiansConfig", scene: "Scene") -> "GaussiansConfig":
         found = _of_size(config, pixels / size**2)
         each, steps = _seconds(found, pixels / size**2, _FEWEST), found.limited(views)
         enough = steps * each <= _PATIENCE * speed if budget is None else budget / each >= max(_STEPS, _PASSES * views)
-        if enough or config.downscale is not None or pixels / (size + 1) ** 2 < _LEAST:
+        smaller = math.floor(size) + 1
+        if enough or config.downscale is not None or pixels / smaller**2 < _LEAST:
             break
-        size = math.floor(size) + 1
+        size = smaller
     seconds = steps * each if budget is None else min(budget, steps * each)
     cap = config.cap
     if cap is None:
