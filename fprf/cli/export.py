@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import UsageError
@@ -44,9 +45,13 @@ def run(args: list[str]) -> int:
     if what.single is not None and len(styles) > 1:
         raise UsageError(f"--output {what.single}: one file holds one style, {len(styles)} are asked for; name a folder")
     from ..io.atomic import write_json
+    from ..splats.files.base import format_of
     from ..style.restyle import apply_style
     from ..training.loading import open_run
 
+    for kind in what.formats:
+        if not format_of(Path(f"splats.{kind}")).writes:
+            raise UsageError(f"fprf export: {kind} is read, not written; name ply, splat, spz, sog or glb")
     start = time.perf_counter()
     opened = open_run(config.run, config.device)
     # All looks share one geometry; a single file holds the last of them.

@@ -25,11 +25,12 @@ _SHOWN = 4
 """Views on the page."""
 _DESCRIPTION = f"""Restyle finished captures of 3D Gaussians with photographs; their own photographs and cameras are not needed.
 
-Reads and writes {", ".join(endings())} and SOG folders (meta.json, lod-meta.json); the output's ending says which. A
-reference may also be a capture or a run: views of it stand for photographs. In the
-format that was read everything but colours is kept bit for bit. REGION is a region's number (--explain lists them), its name
-in a style file, VIEW:X,Y (a pixel of a view) or VIEW:MASK.png; in --pin also a place: box:X,Y,Z:X,Y,Z:BORDER,
-path:X,Y,Z:X,Y,Z:WIDTH,BORDER or everywhere. REFERENCE is a file or its number, from 0 in the order given."""
+Takes {", ".join(endings())} (.ksplat is read alone, .usdz written alone) and SOG folders (meta.json,
+lod-meta.json); the output's ending says which is written. A reference may also be a capture or a run: views of it stand for
+photographs. In the format that was read everything but colours is kept bit for bit. REGION is a region's number (--explain
+lists them), its name in a style file, VIEW:X,Y (a pixel of a view) or VIEW:MASK.png; in --pin also a place:
+box:X,Y,Z:X,Y,Z:BORDER, path:X,Y,Z:X,Y,Z:WIDTH,BORDER or everywhere. REFERENCE is a file or its number, from 0 in the order
+given."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -250,7 +250,7 @@ def check_file(name: str, head: bytes, size: int) -> None:
         check_photograph(head, name)
         return
     # Poses and descriptions of captures in parts are JSON alike; any other capture is known by its format.
-    capture = suffix != ".json" and format_name(Path(name)) is not None
+    capture = suffix != ".json" and format_name(Path(name)) is not None and format_of(Path(name)).reads
     # What each ending must begin with; one that is not in here is not taken.
     whole = {
         **({suffix: format_of(Path(name)).recognises(head, size)} if capture else {}),

@@ -22,7 +22,7 @@ from ..errors import CheckpointError, DataError, UsageError
 from ..interfaces import Encoder, Scene
 from ..io.images import to_uint8, write_image
 from ..io.tensorfiles import load_sealed, save
-from ..ops.rasterise.reference import MIN_ALPHA
+from ..ops.rasterise import MIN_ALPHA
 from ..rendering.cameras import Cameras
 from ..style.look import ColourMaps, Restyle
 from ..style.restyle import Styled

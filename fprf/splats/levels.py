@@ -32,7 +32,8 @@ _CHUNK, _GROUP, _LEVELS = 512, 4, 4
 _DEVIATIONS = 3.0
 """How far a Gaussian reaches, in standard deviations."""
 _FARTHEST, _WIDENED = 3.5, 2.0
-"""Reach in standard deviations where nothing may be left out, down to opacities of 1/255; pixels that drawing widens it by."""
+"""Reach in standard deviations where nothing may be left out, at least sqrt(-2 log MIN_ALPHA) (`ops.rasterise`); pixels that
+drawing widens it by."""
 _OPAQUE = 0.995
 _TAIL = 0.02
 """Share of the means at either end that does not say how long a chunk is."""

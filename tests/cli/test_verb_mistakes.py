@@ -27,6 +27,7 @@ MISTAKES = """
     eval other | its images are not those of the run
     eval untested | --split test
     export run plx | 'plx'
+    export run ksplat | ksplat is read, not written
     export run --fit 0 | --fit
     export run --views 1 | --views
     export run --mesh-edge 0 | --mesh-edge

@@ -28,9 +28,8 @@ from ..simd import (
     where_greater,
 )
 from ..threads import on_threads, take
+from . import BLUR, MAX_ALPHA
 from .forward_kernels import (
-    BLUR,
-    MAX_ALPHA,
     SIDE,
     SLOTS,
     TILE,

@@ -43,14 +43,12 @@ from ..simd import (
     where_greater,
 )
 from ..threads import on_threads, take
+from . import BLUR, MAX_ALPHA, MIN_ALPHA
 from .layout import BLOCKS, FIXED, MARK, Floats, basis, colour, direction, jit
 
 _Ints = np.ndarray[Any, np.dtype[np.int32]]
 SLOTS, SIDE = 16, 16
 """Numbers of a splat; pixels of a tile's side."""
-BLUR = 0.3
-"""Variance in pixels that every projected Gaussian gets: the footprint of a pixel."""
-MIN_ALPHA, MAX_ALPHA = 1 / 255, 0.99
 STOP = 1e-3
 """Blocks of a tile through which no more than this share of light passes are left alone."""
 FAINT, BEHIND, OUTSIDE, INVALID = 0, 1, 2, 3

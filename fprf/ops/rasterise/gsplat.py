@@ -17,9 +17,10 @@ from torch import Tensor
 
 from ..photometric import WINDOW
 from ..simd import LANES
+from . import BLUR
 from .forward_kernels import SIDE
 from .layout import FIXED
-from .reference import BLUR, Pinhole
+from .reference import Pinhole
 from .training import LOG_SCALES, Floats, Learnt, Target, TrainableGaussians
 
 _MOST_LOG, _LARGE = 30.0, 1e15

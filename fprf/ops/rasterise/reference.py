@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from ..harmonics import spherical_harmonics
+from . import BLUR, MAX_ALPHA, MIN_ALPHA
 
-BLUR, MIN_ALPHA, MAX_ALPHA = 0.3, 1 / 255, 0.99
 TILE = 16
 _MOST_LOG, _HUGE, _LARGE = 30.0, 1e16, 1e15
 
