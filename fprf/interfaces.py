@@ -188,7 +188,7 @@ class Stylizer(nn.Module, ABC):
     def shared(
         self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
     ) -> tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N K"] | None]:
-        """`forward`, and the points' shares of the scene's regions (`style.scene_style.membership`), if it has found them.
+        """`forward`, and the points' shares of the scene's regions (`style.scene_style.Membership`), if it has found them.
 
         What follows, such as strengths and colours by region, then need not find them again.
         """

@@ -113,7 +113,9 @@ def load_config(path: Path) -> tuple[RunConfig, str]:
                 raise PluginError(f"{path}: {fault}; install {file.plugins['method']}") from fault
             kind = TrainConfig
         return from_json(file.config, kind, packages=file.plugins), file.method
-    except (ConfigError, msgspec.ValidationError) as fault:
+    except msgspec.ValidationError as fault:
+        raise ConfigError(f"{path}: {fault}; the file is damaged or was edited") from fault
+    except ConfigError as fault:
         raise ConfigError(f"{path}: {fault}") from fault
 
 

@@ -34,9 +34,8 @@ class DemoConfig:
     """Folder for everything that the demo makes."""
     minutes: float = 1.15
     """Training time."""
-    downscale: int = 1
+    downscale: int | float = 1
     """The photographs, 356x634, are reduced by this factor."""
-
     megabytes: float = 4.0
     """Size of the page, at most; Gaussians that show least are left out of it."""
 

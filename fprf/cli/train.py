@@ -42,7 +42,7 @@ def run(args: list[str]) -> int:
     if VIEW not in args:
         train(config, method, changed_images=changed)
         return 0
-    # The viewer reads the run folder alone, in a process of its own: it cannot slow down or stop the training.
+    # The viewer reads the run folder alone, in a process of its own: it cannot stop the training.
     with viewed(config.output or default_output(config, method)):
         train(config, method, changed_images=changed)
     return 0

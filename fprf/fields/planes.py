@@ -117,7 +117,7 @@ class PlanesField(ContentField):
         self.to_density = linear(self.planes.out, 1, generator=generator)
         inputs = self.planes.out + config.degree**2
         self.to_content = mlp(inputs, config.hidden, config.layers, channels, generator=generator)
-        # `to_content` begins at unit variance: from 0 a frozen decoder would pass no gradient. The offset only learns the mean.
+        # Decoders expect features of about their training scale: the offset learns their mean.
         self.offset = nn.Parameter(torch.zeros(channels))
 
     def density(self, points: Annotated[Tensor, "N 3"]) -> FieldSample:

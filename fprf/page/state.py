@@ -16,6 +16,7 @@ from ..errors import UsageError
 from ..io.images import Picture
 from ..io.maps import palette
 from ..plugins import slots
+from ..plugins.slots import hints_of
 from ..style.config import StyleConfig, with_preset
 from ..style.dictionary import Reference
 from . import messages
@@ -218,9 +219,10 @@ class State:
             case messages.Set():
                 if message.name not in _sliders(look.style):
                     raise UsageError(f"{message.name}: the stylizer of this scene has no such field")
-                # The page sends numbers; whole ones stay whole in the config.
-                before = _sliders(look.style)[message.name]
-                value: Any = int(message.value) if isinstance(before, int) else round(message.value, 4)
+                # The page sends numbers; those of fields of whole numbers become whole.
+                *slot, name = message.name.split(".")
+                whole = hints_of(type(getattr(look.style, slot[0]) if slot else look.style))[name] is int
+                value: Any = int(message.value) if whole else round(message.value, 4)
                 return replace(self, look=replace(look, style=slots.replace(look.style, message.name, value)))
             case messages.Preset():
                 return replace(self, look=replace(look, style=with_preset(look.style, message.name)))

@@ -176,7 +176,11 @@ def _read(data: Any, hint: Any, path: str, packages: Mapping[str, str]) -> Any:
 def _read_fields(data: dict[str, Any], cls: type, path: str, packages: Mapping[str, str]) -> Any:
     """A dataclass of the fields in an object."""
     hints = hints_of(cls)
-    names = [f.name for f in dataclasses.fields(cls) if f.init]
+    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
+    names = list(fields)
+    for name, field in fields.items():
+        if name not in data and field.default is field.default_factory is dataclasses.MISSING:
+            raise ConfigError(f"{path}: has no {name!r} (needed of {cls.__name__}: {', '.join(names)})")
     for key in data:
         if key not in names:
             raise ConfigError(
@@ -186,7 +190,7 @@ def _read_fields(data: dict[str, Any], cls: type, path: str, packages: Mapping[s
     values = {key: _read(value, hints[key], f"{path}.{key}", packages) for key, value in data.items()}
     try:
         return cls(**values)
-    except (ConfigError, TypeError) as fault:  # out of its range, or a field without a default is absent
+    except (ConfigError, TypeError) as fault:  # out of its range
         raise ConfigError(f"{path}: {fault}") from fault
 
 

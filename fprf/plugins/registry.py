@@ -9,6 +9,7 @@ import sys
 from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, distributions
+from importlib.metadata import distribution as find_distribution
 from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
@@ -160,14 +161,14 @@ def _scan() -> tuple[Mapping[str, Mapping[str, tuple[Entry, ...]]], tuple[str, .
             # Of most packages this one file is read: metadata of hundreds would take a second to parse.
             if f"[{_PREFIX}" not in (distribution.read_text("entry_points.txt") or ""):
                 continue
-            package, points = f"{distribution.name} {distribution.version}", list(distribution.entry_points)
+            name, points = distribution.name, list(distribution.entry_points)
+            spelling, package = re.sub(r"[-_.]+", "-", name).lower(), f"{name} {distribution.version}"
+            # Of several copies on sys.path the first one counts, be it one without entry points of ours.
+            if spelling in seen or find_distribution(name).locate_file("") != distribution.locate_file(""):
+                continue
         except Exception as error:  # whatever a damaged file makes the reader raise: it may be about us
             place, reason = distribution.locate_file(""), f"{type(error).__name__}: {error}"
             complaints.append(f"{place}: a package's entry points cannot be read ({reason})")
-            continue
-        # Of several copies on sys.path the first one counts.
-        spelling = re.sub(r"[-_.]+", "-", distribution.name).lower()
-        if spelling in seen:
             continue
         seen.add(spelling)
         for point in points:

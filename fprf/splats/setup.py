@@ -1,4 +1,4 @@
-"""Build a `GaussianLearner` from photographs: them at all scales, first points, limits of widths.
+"""Build a `GaussianLearner` from photographs: their levels of size, first points, limits of widths.
 
 Shapes: N Gaussians, P points, V views, M training views. World axes and units are the capture's own, relative to its origin.
 Lengths that are needed before anything is learnt follow from the cameras and the sparse points:

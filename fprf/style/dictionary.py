@@ -220,6 +220,10 @@ def build_dictionary(
     if not references:
         raise DataError("references: none given; name at least one photograph")
     for r in references:
+        if not 0 < len(r.content) == len(r.semantic):
+            raise DataError(
+                f"{r.name}: {len(r.content)} samples of content, {len(r.semantic)} of semantics; as many of both, at least 1"
+            )
         if not bool(r.content.isfinite().all() & r.semantic.isfinite().all()):
             raise DataError(f"{r.name}: a feature is not finite; the image or the encoder's weights are damaged")
 

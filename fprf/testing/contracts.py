@@ -283,7 +283,7 @@ def check_layout(config: LayoutConfig) -> None:
 def check_parser(config: DataParserConfig, data: Path) -> None:
     """A scene of `data`, a folder of that format: rigid poses, cameras that fit the paths, disjoint splits."""
     parser, name = _built(config, DataParser, config.build)
-    scene, half = parser.parse(data, 1), parser.parse(data, 2)
+    scene, *smaller = (parser.parse(data, downscale) for downscale in (1, 2, 2.5))
     count, cameras = len(scene.paths), scene.cameras
     require(count > 0 and len(cameras) == count, f"{name}: {count} paths but {len(cameras)} cameras")
     require(cameras.pose.dtype == torch.float64 and tuple(cameras.pose.shape) == (count, 3, 4), f"{name}: pose [V 3 4] fp64")
@@ -296,7 +296,9 @@ def check_parser(config: DataParserConfig, data: Path) -> None:
     views = torch.cat([scene.train, scene.test])
     require(len(set(views.tolist())) == len(views), f"{name}: a view must not be in train and test")
     require(len(scene.train) > 0 and 0 <= int(views.min()) <= int(views.max()) < count, f"{name}: splits must index views")
-    require(bool((half.cameras.size - scene.cameras.size / 2).abs().max() <= 1), f"{name}: downscale=2 must halve the size")
+    for downscale, other in zip((2, 2.5), smaller, strict=True):
+        fits = bool((other.cameras.size - scene.cameras.size / downscale).abs().max() <= 1)
+        require(fits, f"{name}: downscale={downscale} must divide the size by it")
     require(parser.parse(data, 1).paths == scene.paths, f"{name}: the order of the views must be the same each time")
     # Recognition looks at every folder that a user names: it must not claim what it cannot read.
     known = config.recognises(data)

@@ -167,7 +167,7 @@ class FieldLearner(SceneLearner):
     def figures(self) -> Figures:
         """Running means, corrected for their start; a term that comes every few steps counts when it comes."""
         before, (means, self.skipped, failed, names) = self.skipped, self.statistics.read()
-        fault = (names or "a gradient") if self.skipped > before else ""
+        fault = (names or "the loss or a gradient") if self.skipped > before else ""
         return Figures(means, self.rays, self.skipped, failed, fault, means.pop("kept", 0.0))
 
     def state(self) -> State:

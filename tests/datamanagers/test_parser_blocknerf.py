@@ -236,12 +236,12 @@ def test_rays_of_no_camera_are_refused_unless_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "change, said",
     [
-        ({"height": [25]}, "ray_origins holds 2304 floats, 2400 floats"),
+        ({"height": [25]}, "ray_origins holds 2304 floats, needed: 2400 floats"),
         ({"height": [2]}, "an image of 32x2 pixels"),
         ({"ray_dirs": np.zeros(24 * 32 * 3, np.float32)}, "its rays are not those of a camera"),
         ({"equivalent_exposure": np.array([0.0], np.float32)}, "equivalent_exposure is 0.0"),
-        ({"image": [1]}, "image holds 1 integers, 1 bytes"),
-        ({"cam_idx": b"x"}, "cam_idx holds 1 bytes"),
+        ({"image": [1]}, "image holds 1 integers, needed: 1 byte strings"),
+        ({"cam_idx": b"x"}, "cam_idx holds 1 byte strings, needed: 1 integers"),
     ],
 )
 def test_records_that_cannot_be_are_named(tmp_path: Path, change: dict[str, object], said: str) -> None:

@@ -199,7 +199,7 @@ def test_built_in_and_plain_parsers_pass(tmp_path: Path) -> None:
         ("split", AssertionError, "train and test"),
         ("paths", AssertionError, "8 paths but 9 cameras"),
         ("order", AssertionError, "the same each time"),
-        ("size", AssertionError, "must halve the size"),
+        ("size", AssertionError, "must divide the size"),
         ("anything", AssertionError, "must not recognise a folder that is absent"),
         ("surer", AssertionError, r"in \(0, 1\]"),
         ("absent", FileNotFoundError, "no-such-folder"),

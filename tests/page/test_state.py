@@ -65,6 +65,8 @@ def test_sliders_and_presets_change_the_style() -> None:
     moved = STATE.changed(Set(name="stylizer.smoothness", value=3)).changed(Set(name="clusters", value=7.0))
     shown = moved.described()["look"]
     assert (shown["stylizer.smoothness"], shown["clusters"]) == (3, 7)
+    whole = State(look=Look(style=StyleConfig(strength=1)))  # a whole number in a field of any numbers
+    assert whole.changed(Set(name="strength", value=0.4)).described()["look"]["strength"] == 0.4
     assert moved.changed(Preset(name="gentle")).described()["look"]["strength"] == 0.9
 
 

@@ -2,10 +2,11 @@
 
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar
 
 import pytest
-from fake_packages import ENCODER, Packages
+from fake_packages import ENCODER, Packages, packages_in
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -62,8 +63,19 @@ def test_damaged_metadata_hurts_nobody_else(packages: Packages) -> None:
     packages.raw("acme-damaged", "[fprf.encoders]\nno equals sign here\n")
     packages.raw("acme-foreign", "[console_scripts]\nno equals sign here\n")
     assert "vgg19" in registry.installed(GROUP)
-    complaints = registry.unreadable()
-    assert len(complaints) == 1 and str(packages.root) in complaints[0]
+    assert [str(packages.root) in each for each in registry.unreadable()] == [True]
+    # An installation that was cut off leaves no name.
+    packages.raw("acme-nameless", "[fprf.encoders]\nnameless = acme:Config\n")
+    (packages.root / "acme_nameless-1.dist-info" / "METADATA").unlink()
+    assert "vgg19" in registry.installed(GROUP) and len(registry.unreadable()) == 2
+
+
+def test_of_several_copies_the_first_counts(packages: Packages, tmp_path: Path) -> None:
+    packages.raw("acme-copied", "[fprf.encoders]\nolder = acme:Config\n")
+    assert "older" in registry.installed(GROUP)
+    with packages_in(tmp_path / "nearer") as nearer:
+        nearer.raw("Acme_Copied", "", version="2")
+        assert "older" not in registry.installed(GROUP)
 
 
 @given(st.text(max_size=20).filter(lambda name: name not in registry.installed(GROUP)))

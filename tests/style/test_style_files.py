@@ -164,7 +164,7 @@ def test_what_cannot_be_is_refused(kind: type[Exception], mistake: Callable[[], 
 PLAIN = {"frame": 1, "style": None}
 
 
-@pytest.mark.parametrize("rows", [[], [PLAIN, PLAIN], [PLAIN | {"frame": -1}], [PLAIN, 3], {}])
+@pytest.mark.parametrize("rows", [[], [PLAIN, PLAIN], [PLAIN | {"frame": -1}], [PLAIN, 3], [{"frame": 1}], {}])
 def test_what_is_wrong_with_the_file_is_told(tmp_path: Path, rows: object) -> None:
     file = tmp_path / "k.json"
     file.write_text(json.dumps({"format": 1, "keyframes": [PLAIN]}))

@@ -104,11 +104,11 @@ class Example(NamedTuple):
     where: str
     """File and number of the record, to open messages with."""
     features: dict[str, tuple[str, Sequence[Any]]]
-    """Each is of bytes, of floats or of integers, and has so many of them."""
+    """By name what each holds (byte strings, floats or integers), and these."""
 
     def blob(self, name: str) -> bytes:
         """The one byte string of a feature. Raises DataError."""
-        return bytes(self._values(name, "bytes", 1)[0])
+        return bytes(self._values(name, "byte strings", 1)[0])
 
     def integer(self, name: str) -> int:
         """The one integer of a feature. Raises DataError."""
@@ -125,7 +125,8 @@ class Example(NamedTuple):
         held, values = self.features.get(name, (kind, ()))
         if held != kind or len(values) != count:
             raise DataError(
-                f"{self.where}: {name} holds {len(values)} {held}, {count} {kind} are needed; download the file again"
+                f"{self.where}: {name} holds {f'{len(values)} {held}' if len(values) else 'nothing'}, needed: {count} {kind}; "
+                "download the file again"
             )
         return values
 
@@ -161,11 +162,11 @@ def read_examples(path: Path) -> Iterator[Example]:
             message: Any = _message_class().FromString(data)
         except DecodeError as error:
             raise DataError(f"{where}: no tf.train.Example ({error}); convert the capture again") from error
-        # Lists of one of three types, by name; one of none is of no bytes.
+        # Each feature is a list of one of three types, by its name; without one it is empty.
         features: dict[str, tuple[str, Sequence[Any]]] = {}
         for entry in message.features.feature:
             kind = entry.value.WhichOneof("kind") or "bytes"
-            features[entry.key] = kind, getattr(entry.value, kind).value
+            features[entry.key] = "byte strings" if kind == "bytes" else kind, getattr(entry.value, kind).value
         yield Example(where, features)
 
 

@@ -102,7 +102,7 @@ def write_gaussians(
     form, faulty, far = format_of(path), False, 0
     added, beside = added_and_beside(origin, local or not form.exact)
     if isinstance(gaussians, GaussianRows):
-        if form.exact and not plain:
+        if form.exact and form.view_dependent and not plain:
             write_offset(path, beside)
             form.write(path, form.pack_rows(gaussians, added))
             return Written()
