@@ -1,4 +1,4 @@
-"""Write the tables of the documents from the results: what stands between `<!-- table: NAME -->` and `<!-- end -->`.
+"""Write the tables of the documents from the results, between `<!-- table: NAME -->` and `<!-- end -->`, and a drawing.
 
     python -m benchmarks tables [--check]
 
@@ -12,8 +12,11 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from .curves import drawing
+
 RESULTS = Path(__file__).resolve().parent / "results"
 DOCS = RESULTS.parents[1] / "docs"
+CURVES = DOCS / "images" / "minutes.svg"
 PLACE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 Rows = Iterable[Iterable[str]]
 
@@ -102,13 +105,19 @@ def filled(page: str, results: Path = RESULTS) -> str:
     return PLACE.sub(table, page)
 
 
+def drawn(results: Path = RESULTS) -> str:
+    """The drawing of `docs/images/minutes.svg`."""
+    return drawing(json.loads((results / "splat_training.json").read_text("utf-8")))
+
+
 def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks tables", description=__doc__)
     parser.add_argument("--check", action="store_true", help="write nothing; end with 1 where a page differs")
     asked = parser.parse_args(argv)
-    old = [path for path in sorted(DOCS.glob("*.md")) if filled(path.read_text("utf-8")) != path.read_text("utf-8")]
+    made = {path: filled(path.read_text("utf-8")) for path in sorted(DOCS.glob("*.md"))} | {CURVES: drawn()}
+    old = [path for path, text in made.items() if not path.is_file() or path.read_text("utf-8") != text]
     for path in old:
         print(path.name)
         if not asked.check:
-            path.write_text(filled(path.read_text("utf-8")), "utf-8")
+            path.write_text(made[path], "utf-8")
     return int(asked.check and bool(old))

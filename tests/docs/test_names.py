@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.tables import DOCS, filled
+from benchmarks.tables import CURVES, DOCS, drawn, filled
 from fprf.cli import main as cli
 from fprf.cli.main import VERBS
 
@@ -89,6 +89,10 @@ def test_flags_exist(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=lambda page: page.stem)
 def test_tables_are_those_of_the_results(page: Path) -> None:
     assert filled(page.read_text("utf-8")) == page.read_text("utf-8"), "python -m benchmarks tables"
+
+
+def test_the_drawing_is_that_of_the_results() -> None:
+    assert drawn() == CURVES.read_text("utf-8"), "python -m benchmarks tables"
 
 
 MISSING = "the extra `docs` is not installed: pip install -e '.[docs]'"
