@@ -276,7 +276,7 @@ def is_watched(root: Path) -> bool:
 
 class _SignalHandler:
     """SIGINT and SIGTERM held back inside the block, and as before after it. Python lets only the main thread set
-    handlers; in any other this changes nothing."""
+    handlers; in any other this changes nothing. A handler that was not set from Python stays: it could not be set again."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -287,7 +287,8 @@ class _SignalHandler:
 
     def __enter__(self) -> "_SignalHandler":
         if threading.current_thread() is threading.main_thread():
-            self.before = {number: signal.signal(number, self.note) for number in (signal.SIGINT, signal.SIGTERM)}
+            numbers = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is not None]
+            self.before = {number: signal.signal(number, self.note) for number in numbers}
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -364,10 +365,11 @@ def _sized(run: Run, config: RunConfig, display: Display) -> RunConfig:
         old = run.load_config()[0]
         decided = {name: getattr(old, name, None) for name in config.open if getattr(config, name) is None}
         config = replace(config, **{name: value for name, value in decided.items() if value is not None})
-    asked, config = config, planned(config)
-    if asked is not config:
-        scene = read_scene(config)
-        width, height = scene.cameras.size[scene.train[0] if len(scene.train) else 0].tolist()
+    if any(getattr(config, name) is None for name in config.open):
+        scene = read_scene(replace(config, downscale=1))
+        config = planned(config, scene)
+        sizes = scene.cameras.scaled(config.downscale or 1).size
+        width, height = sizes[scene.train[0] if len(scene.train) else 0].tolist()
         ends = f"{config.minutes:g} minutes" if config.minutes is not None else f"{config.limited(len(scene.train)):,} steps"
         reduced = f" (1/{config.downscale:.3g}; --downscale 1 keeps them whole)" if config.downscale != 1 else ""
         display.say(f"plan: {len(scene.train)} views at {width}x{height}{reduced}{config.described()}, {ends}")
