@@ -102,7 +102,7 @@ def apply_dictionary(scene: Scene, file: StyleFile, encoders: Encoders, dictiona
         check_stylizer(config, stylizer, dictionary, scene_style, affine=scene.decoder is None and config.colours <= 0)
         stylizer = stylizer.to(device)
         if scene.decoder is None:
-            colours = region_maps(stylizer, dictionary, scene_style, config)
+            colours = region_maps(stylizer, dictionary, scene_style, config, allowed)
         else:
             colours = colour_maps(
                 stylizer,
