@@ -17,6 +17,7 @@ from fprf.ops.harmonics import as_drawn
 from fprf.ops.harmonics import spherical_harmonics as functions
 from fprf.plugins.encoders.config import BundledSemanticConfig, RandomConfig
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
+from fprf.rendering.cameras import pixel_grid
 from fprf.splats.captures import light_alone, look_at_capture, open_capture
 from fprf.splats.config import LookConfig
 from fprf.splats.files import read_capture, write_gaussians
@@ -153,6 +154,21 @@ def test_maps_of_matches_heed_places(scene: SplatScene, photographs: list[Path])
     assert float(taken[..., dusk].abs().max()) == 0 and float(taken.sum(-1).max()) > 0.99
     view = scene.cached(scene.cameras, 0)
     assert torch.allclose(view.paint(found.restyle.match), taken.flatten(0, 1), atol=1e-6)
+
+
+def test_painting_takes_bounded_memory_and_changes_nothing(scene: SplatScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def values(semantic: torch.Tensor, points: torch.Tensor | None) -> torch.Tensor:
+        asked.append(len(semantic))
+        return semantic[:, :3].repeat(1, 7)
+
+    whole, opacity = scene.paint(scene.cameras, 0, pixel_grid(scene.cameras, 0), values)
+    monkeypatch.setattr("fprf.splats.scene._ROWS", 64)
+    monkeypatch.setattr("fprf.splats.scene._CHANNELS", 8)
+    asked.clear()
+    parts, same = scene.paint(scene.cameras, 0, pixel_grid(scene.cameras, 0), values)
+    assert max(asked) == 64 and torch.equal(parts, whole) and torch.equal(opacity, same)
 
 
 @pytest.mark.parametrize("place", ["box:1,2:3", "box:1,2,3:4,5,nan", "path:0,0,0:1,1,1", "path:0,0,0:1,1,1:-1"])
