@@ -168,7 +168,7 @@ class SplatScene(Scene):
         for start in range(0, len(means), _ROWS):
             rows = slice(start, start + _ROWS)
             shown[rows] = values(features[rows].float(), means[rows])
-        for some, into in zip(shown.split(_CHANNELS, 1), out.split(_CHANNELS, 1), strict=True):
+        for some, into in zip(torch.split(shown, _CHANNELS, 1), torch.split(out, _CHANNELS, 1), strict=True):
             drawn = draw(self.gaussians, camera, antialiased=self.antialiased, features=some)
             # What is drawn is weighted by opacity.
             opacity = drawn.opacity.flatten()[at]
