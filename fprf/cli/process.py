@@ -88,7 +88,7 @@ def _check(root: Path) -> None:
     delivered = parse_scene(root, 1, None)
     for note in delivered.notes:
         print(f"note: {note}")
-    size = planned(config).downscale or 1
+    size = planned(config, delivered).downscale or 1
     width, height = delivered.cameras.scaled(size).size[0].tolist()
     run = default_output(config, DEFAULT_METHOD)
     print(f"{len(delivered.train)} + {len(delivered.test)} views, trained at {width}x{height}")

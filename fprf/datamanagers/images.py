@@ -166,6 +166,15 @@ def load_image(
     return np.asarray(resized, dtype=np.uint8)
 
 
+def has_transparency(path: Path) -> bool:
+    """Whether any pixel of an image that has alpha is not opaque; true for one that cannot be decoded."""
+    try:
+        alpha = _decode(path, upright=False)[1]
+    except DataError:
+        return True
+    return alpha is not None and np.asarray(alpha).min() < 255
+
+
 def load_mask(path: Path, size: tuple[int, int] | None = None, *, upright: bool = False) -> NDArray[np.bool_]:
     """A mask [H W] at `size` (width, height), or as delivered without one: true where it is white or opaque.
 

@@ -74,6 +74,8 @@ LAYER = 1.15
 """Points up to so many times the nearest distance in their tile are seen."""
 PROJECTIONS = 1 << 26
 """Points are thinned so that no more projections than these are made."""
+PIECE = 1 << 20
+"""Pairs that are projected at once: each takes about 250 bytes on the way."""
 
 
 class Sightings(NamedTuple):
@@ -97,11 +99,11 @@ def find_sightings(scene: Scene) -> Sightings | None:
     if scene.seen is not None:
         kept = scene.seen[torch.isin(scene.seen[:, 0], scene.train)]
         kept = kept[kept[:, 0].argsort(stable=True)]
-        sightings = _sighted(scene.cameras, kept[:, 0], scene.points[kept[:, 1]])
+        parts = [_sighted(scene.cameras, view, scene.points[point]) for view, point in torch.split(kept.T, PIECE, 1)]
     else:
         points = scene.points[:: max(1, len(scene.points) * len(scene.train) // PROJECTIONS)]
         parts = [_nearest(scene.cameras, view, points) for view in scene.train.tolist()]
-        sightings = Sightings(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
+    sightings = Sightings(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
     return sightings if len(sightings.view) else None
 
 

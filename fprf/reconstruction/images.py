@@ -7,7 +7,6 @@ depends on what is shown, so frames are compared with their neighbours only.
 import hashlib
 import math
 import re
-import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from io import BytesIO
 from itertools import pairwise
@@ -22,7 +21,7 @@ from PIL.ExifTags import Base as Tag
 
 from ..datamanagers.images import IMAGE_SUFFIXES, Image, load_image, open_image, read_header, silent
 from ..errors import DataError, UsageError
-from ..io.atomic import atomic_path, write_bytes
+from ..io.atomic import write_bytes
 from .config import SfmConfig
 from .scene_folder import Progress, SceneFolder, State, step_key
 
@@ -83,17 +82,14 @@ def choose_frames(scores: Sequence[float], count: int, least: float) -> tuple[li
     return chosen, dict(sorted(dropped.items()))
 
 
-def save_frames(video: Path, frames: Sequence[int], folder: Path, progress: Progress) -> None:
-    """Write some of the frames, as JPEG (95), each whole or not at all; those that are there stay."""
-    wanted = {frame for frame in frames if not (folder / _FRAME.format(frame)).is_file()}
-    if not wanted:
-        return
-    last, done = max(wanted), 0
+def save_frames(video: Path, frames: Sequence[int], place: SceneFolder, state: State, progress: Progress) -> None:
+    """Write some of the frames, at least one, as JPEG (95)."""
+    wanted, last, done = set(frames), max(frames), 0
     for index, (_, image) in enumerate(_frames(video, wanted)):
         if index in wanted:
             coded, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
             assert coded
-            write_bytes(folder / _FRAME.format(index), data.tobytes())
+            _write_image(place, state, _FRAME.format(index), data.tobytes())
             done += 1
             progress(done, len(wanted), "writing frames")
         if index == last:
@@ -168,6 +164,8 @@ def gather_images(source: Path, place: SceneFolder, state: State, config: SfmCon
     here = str(source.resolve())
     if state.source not in ("", here):
         raise UsageError(f"--output {place.root}: was begun with {state.source}; go on with that, or name another folder")
+    if source.resolve() == place.root.resolve():
+        raise UsageError(f"{source}: is the scene folder itself; give {place.images}, or name another --output")
     if source.is_dir():
         gathered = _from_folder(source, place, state, progress)
     elif source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES:
@@ -226,9 +224,12 @@ def _from_folder(source: Path, place: SceneFolder, state: State, progress: Progr
     Formats that COLMAP does not read become JPEGs, whatever the name says: IMG_1.heic is IMG_1.heic.jpg in the scene. All
     others are copied: COLMAP and `load_image` see the same pixels in them.
     """
-    # Images may lie in the scene already; hidden folders are those of other programs.
-    inplace = place.images.resolve() == source.resolve()
+    # Images may lie in the scene already. A scene inside of the source is left out; hidden folders are those of other programs.
+    inplace, scene = place.images.resolve() == source.resolve(), place.root.resolve()
     files = sorted(path for path in source.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
+    if source.resolve() in scene.parents:
+        inner = source / scene.relative_to(source.resolve())
+        files = [path for path in files if not path.is_relative_to(inner)]
     files = [path for path in files if not any(part.startswith(".") for part in path.relative_to(source).parts)]
     entries: dict[str, dict[str, Any]] = {}
     state.dropped = {}
@@ -239,8 +240,12 @@ def _from_folder(source: Path, place: SceneFolder, state: State, progress: Progr
         if name in entries or (inplace and name != given):
             raise UsageError(f"{path}: COLMAP takes no blanks in names; rename the image, so that no other is called {name}")
         # What was gathered before, and has not changed, is not read again.
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        data = path.read_bytes()
+        digest = hashlib.sha256(data).hexdigest()
+        shown = given.encode(errors="backslashreplace").decode()
         try:
+            if shown != given:
+                raise DataError("its name is not UTF-8: rename it")
             kind = read_header(path).kind
             foreign = kind in _FOREIGN
             name = f"{name}.jpg" if foreign else name
@@ -249,14 +254,13 @@ def _from_folder(source: Path, place: SceneFolder, state: State, progress: Progr
             if foreign and inplace:
                 raise DataError(f"{path}: COLMAP reads no {kind}: name another --output, where JPEGs are made")
             if fresh and foreign:
-                _write_jpeg(path, place.images / name)
+                _write_image(place, state, name, _jpeg(path))
             if fresh:
                 known = _described(place.images / name if foreign else path, digest)
             if fresh and not (inplace or foreign):
-                with atomic_path(place.images / name) as temporary:
-                    shutil.copyfile(path, temporary)
+                _write_image(place, state, name, data)
         except DataError as fault:
-            state.dropped[given] = str(fault).removeprefix(f"{path}: ").partition(";")[0]
+            state.dropped[shown] = str(fault).removeprefix(f"{path}: ").partition(";")[0]
             continue
         entries[name] = known
     progress(len(files), len(files), "reading images")
@@ -281,7 +285,7 @@ def _from_video(
         raise DataError(f"{source}: no frame can be decoded; convert it to H.264 in an .mp4, or give a folder of images")
     progress(len(scores), len(scores), "looking for sharp frames")
     chosen, dropped = choose_frames(scores, config.frames, config.blurred)
-    save_frames(source, chosen, place.images, progress)
+    save_frames(source, chosen, place, state, progress)
     state.dropped = {f"frame {frame}": reason for frame, reason in dropped.items()}
     state.done["frames"] = key
     frames = {}
@@ -291,7 +295,17 @@ def _from_video(
     return frames
 
 
-def _write_jpeg(path: Path, target: Path) -> None:
+def _write_image(place: SceneFolder, state: State, name: str, data: bytes) -> None:
+    """Write an image, whole or not at all. Raises UsageError where another picture lies that no earlier run has brought."""
+    path = place.images / name
+    there = path.read_bytes() if path.is_file() else None  # a run that was cut off left the same bytes
+    if there is not None and there != data and name not in state.images:
+        raise UsageError(f"--output {place.root}: images/{name} is another picture; name a folder that is new or empty")
+    if there != data:
+        write_bytes(path, data)
+
+
+def _jpeg(path: Path) -> bytes:
     """The image as JPEG, upright, with what the file says of its camera. Raises DataError where it cannot be decoded."""
     # The pixels are turned here, so that nothing may turn them again.
     pixels, exif, data = load_image(path, upright=True), _exif(path), BytesIO()
@@ -302,7 +316,7 @@ def _write_jpeg(path: Path, target: Path) -> None:
         block = b""
     block = block if len(block) < _EXIF_BYTES else b""
     PIL.Image.fromarray(pixels).save(data, "JPEG", quality=97, subsampling=0, exif=block)
-    write_bytes(target, data.getvalue())
+    return data.getvalue()
 
 
 def _described(path: Path, digest: str) -> dict[str, Any]:

@@ -20,6 +20,8 @@ from ..errors import DataError, UsageError
 from ..io.atomic import write_json
 
 _FORMAT = 1
+_IGNORED = {"images", "sfm", ".DS_Store", "Thumbs.db", "desktop.ini"}
+"""What a folder may hold in which a scene is begun: images, and what file managers leave behind."""
 
 Progress = Callable[[int, int, str], None]
 """Told (done, total, what)."""
@@ -65,7 +67,7 @@ class State:
         # Only a folder that is new, or holds no more than images, is begun in.
         if not path.is_file():
             here = [entry.name for entry in place.root.iterdir()] if place.root.is_dir() else []
-            if (place.root.exists() and not place.root.is_dir()) or set(here) - {"images", "sfm"}:
+            if (place.root.exists() and not place.root.is_dir()) or set(here) - _IGNORED:
                 raise UsageError(f"--output {place.root}: holds something else; name a folder that is new or empty")
             return cls()
         try:

@@ -364,10 +364,11 @@ def _sized(run: Run, config: RunConfig, display: Display) -> RunConfig:
         old = run.load_config()[0]
         decided = {name: getattr(old, name, None) for name in config.open if getattr(config, name) is None}
         config = replace(config, **{name: value for name, value in decided.items() if value is not None})
-    asked, config = config, planned(config)
-    if asked is not config:
-        scene = read_scene(config)
-        width, height = scene.cameras.size[scene.train[0] if len(scene.train) else 0].tolist()
+    if any(getattr(config, name) is None for name in config.open):
+        scene = read_scene(replace(config, downscale=1))
+        config = planned(config, scene)
+        sizes = scene.cameras.scaled(config.downscale or 1).size
+        width, height = sizes[scene.train[0] if len(scene.train) else 0].tolist()
         ends = f"{config.minutes:g} minutes" if config.minutes is not None else f"{config.limited(len(scene.train)):,} steps"
         reduced = f" (1/{config.downscale:.3g}; --downscale 1 keeps them whole)" if config.downscale != 1 else ""
         display.say(f"plan: {len(scene.train)} views at {width}x{height}{reduced}{config.described()}, {ends}")

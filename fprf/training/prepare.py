@@ -50,11 +50,14 @@ def device_of(name: str) -> torch.device:
         raise PluginError(f"device: {name!r} is not available here; there is {known}{ray}") from e
 
 
-def planned(config: RunConfig) -> RunConfig:
-    """The config with what it leaves open decided, the size of its images first. Raises as `read_scene`."""
+def planned(config: RunConfig, whole: Scene | None = None) -> RunConfig:
+    """The config with what it leaves open decided, the size of its images first, by its scene at its own size.
+
+    That is read where it is not given. Raises as `read_scene`.
+    """
     if all(getattr(config, name) is not None for name in config.open):
         return config
-    return config.planned(read_scene(replace(config, downscale=1)), device_of(config.trained_on).type)
+    return config.planned(whole or read_scene(replace(config, downscale=1)), device_of(config.trained_on).type)
 
 
 def read_scene(config: RunConfig, saved: Facts | None = None) -> Scene:
@@ -64,7 +67,9 @@ def read_scene(config: RunConfig, saved: Facts | None = None) -> Scene:
     """
     if config.data is None:
         raise UsageError("no scene is named: give --data FOLDER, or --data garden for the embedded one")
-    scene = parse_scene(config.data, config.downscale or planned(config).downscale or 1, config.scene_parser)
+    scene = parse_scene(config.data, config.downscale or 1, config.scene_parser)
+    if config.downscale is None and (size := planned(config, scene).downscale or 1) != 1:
+        scene = replace(scene, cameras=scene.cameras.scaled(size))
     return scene if saved is None else at_origin(scene, saved.origin)
 
 

@@ -169,7 +169,9 @@ def test_a_bent_camera_is_found_again(x: float, y: float, z: float, k1: float, p
 @pytest.fixture(scope="module")
 def bay(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Cameras]:
     folder = tmp_path_factory.mktemp("bay")
-    return folder / "data", bay_records(folder / "data")
+    cameras = bay_records(folder / "data")
+    (folder / "data/._a.tfrecord").write_bytes(b"\0\5\x16\7Mac OS X")
+    return folder / "data", cameras
 
 
 @pytest.fixture(autouse=True)

@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -79,6 +80,9 @@ def test_one_capture_in_every_format_is_one_scene(tmp_path: Path, name: str) -> 
         for field in ("pose", "focal", "centre", "distortion"):
             torch.testing.assert_close(getattr(scene.cameras, field), getattr(wanted, field), atol=1e-9, rtol=0)
         assert scene.cameras.size.tolist() == wanted.size.tolist() and scene.cameras.lens.tolist() == wanted.lens.tolist()
+    for file in [*tmp_path.rglob("*")]:  # macOS leaves these beside each file
+        if file.is_file():
+            file.with_name(f"._{file.name}").write_bytes(b"\0\5\x16\7Mac OS X")
     scene = parse(tmp_path)
     names = [f"{k}.png" for k in range(9)] if "record3d" in name else list(capture.names)
     assert [path.name for path in scene.paths] == names
@@ -108,6 +112,7 @@ LENSES: list[tuple[Writer, int, list[float]]] = [
     (partial(write_transforms, camera_model="PINHOLE"), PINHOLE, STRAIGHT),
     (partial(write_transforms, camera_model="OPENCV"), PINHOLE, STRAIGHT),
     (partial(write_transforms, camera_model="OPENCV", k3=0.1, k4=0.2), OPENCV, [0, 0, 0.1, 0.2, 0, 0]),
+    (partial(write_transforms, distortion_params=[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]), OPENCV, [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]),
     (partial(write_transforms, camera_model="OPENCV_FISHEYE", k1=0.1), FISHEYE, [0.1, 0, 0, 0, 0, 0]),
     (partial(write_transforms, is_fisheye=True), FISHEYE, STRAIGHT),
     (partial(write_transforms, k1=None), PINHOLE, STRAIGHT),
@@ -152,21 +157,30 @@ def test_reduced_images_must_be_named(tmp_path: Path) -> None:
         parse(tmp_path)
 
 
-def test_transforms_take_points_from_the_model_that_they_were_made_of(tmp_path: Path) -> None:
-    capture = Capture.make(5)
+@pytest.mark.parametrize("shift", [0.0, 0.5])
+def test_poses_take_points_from_the_model_that_they_were_made_of(tmp_path: Path, shift: float) -> None:
+    capture = replace(Capture.make(5), names=("a/1.png", "b/1.png", "b/2.png", "b/3.png", "b/4.png"))  # a rig of two cameras
     write_colmap(tmp_path, capture)
     write_transforms(tmp_path, capture)
     scene, model = parse(tmp_path), parse(tmp_path, ColmapConfig())
     assert scene.points is not None and model.points is not None and scene.seen is not None and model.seen is not None
     assert torch.equal(scene.points, model.points) and torch.equal(scene.seen, model.seen)
-    # ns-process-data turns the poses and leaves the model as it is, in colmap/sparse/0.
-    applied = np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1.0, 0.5]])
+    for write in (write_colmap, write_llff):
+        write(tmp_path / "llff", Capture.make(5))  # type: ignore[operator]
+    scene = parse(tmp_path / "llff")
+    assert scene.points is not None and torch.equal(scene.points, model.points)
+    assert scene.seen is not None and torch.equal(scene.seen, model.seen) and scene.notes == ()
+    (tmp_path / "llff/sparse/0/images.bin").write_bytes(b"1")  # a model that is broken, or of another program
+    scene = parse(tmp_path / "llff")
+    assert scene.points is None and len(scene.notes) == 1 and "points are not read: " in scene.notes[0]
+    # ns-process-data turns the poses and leaves the model as it is, in colmap/sparse/0; it once did not say how.
+    applied = np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1.0, shift]])
     turned = np.concatenate([applied[:, :3] @ capture.poses[:, :, :3], capture.poses[:, :, 3:]], 2)
     turned[:, :, 3] = capture.poses[:, :, 3] @ applied[:, :3].T + applied[:, 3]
     moved = Capture(capture.names, turned, capture.points)
     (tmp_path / "ns/colmap").mkdir(parents=True)
     shutil.copytree(tmp_path / "sparse", tmp_path / "ns/colmap/sparse")
-    write_transforms(tmp_path / "ns", moved, applied_transform=applied.tolist())
+    write_transforms(tmp_path / "ns", moved, applied_transform=applied.tolist() if shift else None)
     (tmp_path / "ns/points.npz").unlink()
     scene = parse(tmp_path / "ns")
     assert scene.points is not None and torch.equal(scene.seen, model.seen)
@@ -277,6 +291,9 @@ def test_blender_s_two_files(tmp_path: Path) -> None:
     assert {scene.paths[k].parent.name for k in scene.train} == {"train"}
     assert {scene.paths[k].parent.name for k in scene.test} == {"test"}
     assert scene.cameras.focal[0, 0].item() == pytest.approx(5 / math.tan(0.6911 / 2))
+    for path in scene.paths:  # what game engines write
+        assert cv2.imwrite(str(path), np.full((10, 10, 4), 255, np.uint8))
+    assert not parse(tmp_path).alpha
 
 
 @pytest.mark.parametrize(
@@ -285,6 +302,7 @@ def test_blender_s_two_files(tmp_path: Path) -> None:
         ({"train_filenames": ["images/0001.png"], "test_filenames": ["images/0003.png"]}, [1], [3]),
         ({"train_filenames": ["./images/0001.png"]}, [1], [0, 2, 3]),
         ({"train_filenames": ["images/0001.png"], "val_filenames": ["images/0000.png"]}, [1], [2, 3]),
+        ({"train_filenames": [f"images/000{k}.png" for k in range(3)], "val_filenames": ["./images/0003.png"]}, [0, 1, 2], [3]),
         ({"test_filenames": ["images/0000.png", "images/0002.png"]}, [1, 3], [0, 2]),
     ],
 )
@@ -310,6 +328,17 @@ def test_masks_are_named_or_lie_beside_the_images(tmp_path: Path) -> None:
     scene = parse(tmp_path)
     assert scene.masks == (None, tmp_path / "people/a.png", None, None)
     assert scene.sky_masks == (None, None, None, tmp_path / "sky/b.png")
+    write_transforms(tmp_path / "round", Capture.make(2), fisheye_crop_radius=9.0)
+    assert "fisheye_crop_radius is not applied" in parse(tmp_path / "round").notes[0]
+    # Images may lie in the scene's folder itself; what lies outside of it is another's.
+    flat = write_transforms(tmp_path / "flat", Capture.make(4))
+    for frame in flat["frames"]:  # type: ignore[attr-defined]
+        name = frame["file_path"] = Path(frame["file_path"]).name
+        (tmp_path / "flat/images" / name).rename(tmp_path / "flat" / name)
+    (tmp_path / "flat/transforms.json").write_text(json.dumps(flat))
+    assert parse(tmp_path / "flat").masks == ()
+    write_image(tmp_path / "flat/masks/0001.png")
+    assert parse(tmp_path / "flat").masks == (None, tmp_path / "flat/masks/0001.png", None, None)
     frames[1]["mask_path"] = "../a.png"
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     with pytest.raises(DataError, match="leaves"):

@@ -1,4 +1,6 @@
+import contextlib
 import json
+import os
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -105,10 +107,16 @@ def test_what_cannot_be_used_is_dropped_with_its_reason(photos: Path, tmp_path: 
     (photos / "half.jpg").write_bytes(whole[: len(whole) // 2])
     (photos / "notes.txt").write_text("not an image at all")
     photo(photos / ".hidden" / "x.jpg")
+    lost = {"empty.jpg", "text.png", "half.jpg"}
+    with contextlib.suppress(OSError):  # file systems that take UTF-8 alone
+        (photos / "IMG_1.jpg").with_name(os.fsdecode(b"\xe9.jpg")).write_bytes(whole)
+        lost.add("\\udce9.jpg")
     state = gathered(photos, SceneFolder(tmp_path / "scene"))
-    assert len(state.images) == 3 and state.dropped.keys() == {"empty.jpg", "text.png", "half.jpg"}
+    assert len(state.images) == 3 and state.dropped.keys() == lost
+    assert asdict(State.load(SceneFolder(tmp_path / "scene"))) == asdict(state)
     assert "truncated" in state.dropped["half.jpg"]
-    assert lost_files(state).startswith("3 of 6 files could not be decoded: empty.jpg (the file is empty), half.jpg (")
+    told = f"{len(lost)} of {3 + len(lost)} files could not be decoded: empty.jpg (the file is empty), half.jpg ("
+    assert lost_files(state).startswith(told)
 
 
 def test_heic_becomes_jpeg_with_its_lens_or_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -194,7 +202,37 @@ def test_a_video_gives_its_sharp_frames(tmp_path: Path) -> None:
     assert (place.images / "frame_000004.jpg").stat().st_mtime_ns == stamp
     assert len(gathered(tmp_path / "clip.mp4", place, frames=6, blurred=0.0).images) == len(names(place)) == 6
     with pytest.raises(DataError, match="frame 99 was there before"):
-        save_frames(tmp_path / "clip.mp4", [2, 99], tmp_path / "out", lambda *_: None)
+        save_frames(tmp_path / "clip.mp4", [2, 99], SceneFolder(tmp_path / "out"), State(), lambda *_: None)
+    # Another video in its place leaves nothing of the first.
+    write_video(tmp_path / "clip.mp4", [np.full_like(base, 255)] * 9, 12, h264=False)
+    for name in gathered(tmp_path / "clip.mp4", place, frames=4, blurred=0.0).images:
+        assert load_image(place.images / name).min() > 240
+
+
+@pytest.mark.parametrize("kind", ["copy", "webp", "video"])
+def test_pictures_of_others_stay(photos: Path, tmp_path: Path, kind: str) -> None:
+    place, source = SceneFolder(tmp_path / "scene"), tmp_path / "clip.mp4" if kind == "video" else photos
+    name = {"copy": "IMG_10.jpg", "webp": "a.webp.jpg", "video": "frame_000000.jpg"}[kind]
+    write_video(tmp_path / "clip.mp4", [cv2.imread(str(photos / "IMG_1.jpg"))] * 3, 12, h264=False)
+    Image.fromarray(NOISE).save(photos / "a.webp")
+    (place.root / ".DS_Store").parent.mkdir()
+    (place.root / ".DS_Store").touch()
+    mine = photo(place.images / name, 99).read_bytes()
+    with pytest.raises(UsageError, match=f"images/{name} is another picture; name a folder"):
+        gathered(source, place)
+    assert (place.images / name).read_bytes() == mine
+    (place.images / name).unlink()
+    gathered(source, place)
+    (place.work / "state.json").unlink()  # as if it had been cut off
+    assert name in gathered(source, place).images
+
+
+def test_a_scene_inside_of_the_source_is_none_of_its_photographs(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(photos)
+    for _ in range(2):
+        assert len(gathered(Path(), SceneFolder(Path("scenes/in"))).images) == 3
+    with pytest.raises(UsageError, match="is the scene folder itself; give new/images"):
+        gathered(Path("new"), SceneFolder(Path("new")))
 
 
 def test_mistakes_are_named(photos: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -79,13 +80,16 @@ def test_more_time_and_fewer_images_never_reduce_further(side: int, views: int, 
     assert found == 1 or side * side / found**2 > least / 2.25
 
 
-def test_a_config_gets_the_size_of_its_scene(world: World) -> None:
+def test_a_config_gets_the_size_of_its_scene(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     config = planned(replace(world.config, downscale=None))
     assert config == world.config and planned(config) is config
     half = read_scene(replace(config, downscale=2))
     assert half.cameras.size[0].tolist() == [16, 12]
     with pytest.raises(UsageError, match="--data FOLDER, or --data garden"):
         read_scene(replace(config, data=None))
+    # A large capture takes long to parse: once is enough to find its size too.
+    monkeypatch.setattr("fprf.training.prepare.parse_scene", once := Mock(return_value=world.prepared.scene))
+    assert read_scene(replace(config, downscale=None)) is world.prepared.scene and once.call_count == 1
 
 
 def test_what_training_came_to(world: World, tmp_path: Path) -> None:

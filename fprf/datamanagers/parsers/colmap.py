@@ -8,6 +8,7 @@ is kept. Each view's depths are the 0.1 and 99.9 percentile of the points that i
 """
 
 import contextlib
+import itertools
 import shlex
 import struct
 import zipfile
@@ -268,12 +269,13 @@ def observed_points(model: ColmapModel, images: Sequence[ColmapImage]) -> list[N
     """Rows of the model's points that each image observes; ids that are not in the model are left out."""
     # By binary search among the sorted ids.
     order = np.argsort(model.point_ids, kind="stable")
+    ids = model.point_ids[order]
     observed = []
     for image in images:
-        at = np.searchsorted(model.point_ids, image.observed, sorter=order)
-        inside = at < len(order)
-        row = order[at[inside]]
-        observed.append(row[model.point_ids[row] == image.observed[inside]])
+        at = np.searchsorted(ids, image.observed)
+        inside = at < len(ids)
+        at = at[inside]
+        observed.append(order[at[ids[at] == image.observed[inside]]])
     return observed
 
 
@@ -293,21 +295,27 @@ def _finite(points: NDArray[np.float64], seen: NDArray[np.int64]) -> tuple[NDArr
 
 
 def cloud_of_model(
-    folder: Path, names: Sequence[str], poses: Sequence[NDArray[np.float64]], applied: NDArray[np.float64]
-) -> Cloud | None:
-    """The points of a model whose images are these views, by file name and place; None where it is another's.
+    data: Path, views: Sequence[View], applied: NDArray[np.float64]
+) -> tuple[NDArray[np.float64] | None, NDArray[np.int64] | None, list[str]]:
+    """The points of a folder's model whose images are these views, by file name and place, and their pairs; and notes.
 
-    The views may stand as in the model, or moved by `applied` [3 4], which then moves the points too.
+    None where it is another's or cannot be read. The views may stand as in the model, or moved by `applied` [3 4], which then
+    moves the points too.
     """
-    # The same images, by the names of their files?
-    model = read_model(folder)
-    images = {PurePosixPath(image.name).name: image for image in model.images}
-    files = [PurePosixPath(name).name for name in names]
-    if not len(model.points) or len(set(files)) < len(files) or not set(files) <= images.keys():
-        return None
-    ordered = [images[file] for file in files]
+    folder = largest_model(data)[0]
+    try:
+        model = None if folder is None else read_model(folder)
+    except DataError as fault:
+        return None, None, [f"points are not read: {fault}"]
+    # The same images, by the names of their files, with as many of their folders (those of a rig's cameras) as tell them apart?
+    names = [PurePosixPath(view.name).parts for view in views]
+    depth = next(n for n in itertools.count(1) if len({name[-n:] for name in names}) == len(names))
+    images = {PurePosixPath(image.name).parts[-depth:]: image for image in model.images} if model else {}
+    if model is None or not len(model.points) or not {name[-depth:] for name in names} <= images.keys():
+        return None, None, []
+    ordered = [images[name[-depth:]] for name in names]
     # Do their cameras stand where the views do, as they are or moved?
-    here = np.stack([pose[:, 3] for pose in poses])
+    here = np.stack([view.pose[:, 3] for view in views])
     turn = rotations(torch.tensor([image.quaternion for image in ordered], dtype=torch.float64)).numpy()
     offset = np.array([image.translation for image in ordered])
     extent = np.ptp(here, axis=0).max() if len(here) > 1 else 1.0
@@ -316,8 +324,8 @@ def cloud_of_model(
             centres = -np.einsum("vji,vj->vi", turn, offset) @ move[:, :3].T + move[:, 3]
             points = model.points @ move[:, :3].T + move[:, 3]
         if np.abs(centres - here).max() <= _APART * extent:
-            return cloud_of_images(replace(model, points=points), observed_points(model, ordered))
-    return None
+            return *cloud_of_images(replace(model, points=points), observed_points(model, ordered)), []
+    return None, None, []
 
 
 def read_cloud(path: Path, views: int) -> Cloud:

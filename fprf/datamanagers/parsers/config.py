@@ -43,14 +43,14 @@ def model_folders(data: Path) -> list[Path]:
 
 def is_record(name: str) -> bool:
     """Return whether a file name is that of a TFRecord file or of one of its shards."""
-    return re.search(r"\.tfrecord(-\d+-of-\d+)?$", name) is not None
+    return re.search(r"^[^.].*\.tfrecord(-\d+-of-\d+)?$", name) is not None
 
 
 def keyframes(data: Path) -> list[tuple[Path, Path]]:
     """Folders of Polycam's images and cameras, corrected ones first; they lie in `keyframes`, which `data` may be."""
     for root in (data / "keyframes", data):
         pairs = [(root / f"{kind}images", root / f"{kind}cameras") for kind in ("corrected_", "")]
-        there = [(images, cameras) for images, cameras in pairs if images.is_dir() and next(cameras.glob("*.json"), None)]
+        there = [(images, cameras) for images, cameras in pairs if images.is_dir() and next(cameras.glob("[!.]*.json"), None)]
         if there:
             return there
     return []
@@ -204,7 +204,7 @@ class PhotoTourismConfig(DataParserConfig):
 
     def recognises(self, data: Path) -> Recognised | None:
         """By the only *.tsv beside a model, or beside `dense` with a model."""
-        tables = [path.name for path in data.glob("*.tsv")]
+        tables = [path.name for path in data.glob("[!.]*.tsv")]
         modelled = model_folders(data) or model_folders(data / "dense")
         return Recognised(0.6, tables[0]) if len(tables) == 1 and modelled else None
 

@@ -1,7 +1,8 @@
 """LLFF captures: `poses_bounds.npy`, one row an image in the order of their names.
 
 A row is a 3x5 matrix [R | t | (height, width, focal)] and the nearest and farthest depth. Columns of R are the camera's
-down, right and back axes in the world; ours are right, up and back. The world frame is kept.
+down, right and back axes in the world; ours are right, up and back. The world frame is kept. Points are those of the COLMAP
+model that the poses came from, where it is there.
 """
 
 import re
@@ -13,6 +14,7 @@ from ...errors import DataError
 from ...interfaces import DataParser
 from ..images import image_names
 from ..scene import Scene
+from .colmap import cloud_of_model
 from .config import LlffConfig
 from .files import path_inside, read_bytes, read_npy
 from .views import View, assemble_scene, pixel_size, read_views, rigid_pose
@@ -68,6 +70,8 @@ class LlffParser(DataParser):
             )
 
         views, _, notes = read_views(data, enumerate(names), view)
+        points, seen, said = cloud_of_model(data, views, np.eye(3, 4))
         if names != sorted(names, key=lambda name: (len(name), name)) and all(Path(name).stem.isdecimal() for name in names):
             notes.append(f"rows of poses_bounds.npy are taken in LLFF's order of names: {', '.join(names[:3])}, ...")
-        return assemble_scene(data, views, downscale=downscale, reduced=True, notes=notes)
+        notes += said
+        return assemble_scene(data, views, downscale=downscale, points=points, seen=seen, reduced=True, notes=notes)

@@ -37,7 +37,7 @@ class MegaNerfParser(DataParser):
         files: list[tuple[Path, str]] = []
         for split in ("train", "val"):
             folder = data / split / "metadata"
-            files += [(file, split) for file in folder.glob("*.pt")]
+            files += [(file, split) for file in folder.glob("[!.]*.pt")]
             if not files:
                 raise DataError(
                     f"{folder}: no *.pt files; name the folder of a scene, with train/metadata and train/rgbs in it"

@@ -25,7 +25,7 @@ class PhotoTourismParser(DataParser):
     def parse(self, data: Path, downscale: float) -> Scene:
         """The listed photographs. Raises DataError where the table names none of the model's."""
         # The table says which photographs are used; their poses are those of the model beside it.
-        tables = [data / self.config.list] if self.config.list else sorted(data.glob("*.tsv"))
+        tables = [data / self.config.list] if self.config.list else sorted(data.glob("[!.]*.tsv"))
         if len(tables) != 1:
             raise DataError(f"{data}: {len(tables)} tables *.tsv; exactly one is needed, or its name in parser.list")
         table = tables[0]

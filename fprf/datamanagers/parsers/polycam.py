@@ -31,8 +31,8 @@ class PolycamParser(DataParser):
         frames: dict[str, tuple[Path, Path]] = {}
         alone: set[str] = set()
         for images, cameras in folders:
-            known = {path.stem for path in cameras.glob("*.json")}
-            paths = {path.stem: path for path in images.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES}
+            known = {path.stem for path in cameras.glob("[!.]*.json")}
+            paths = {path.stem: path for path in images.glob("[!.]*") if path.suffix.lower() in IMAGE_SUFFIXES}
             frames = {stem: (path, cameras / f"{stem}.json") for stem, path in paths.items() if stem in known} | frames
             alone |= paths.keys()
         if not frames:

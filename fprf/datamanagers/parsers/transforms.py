@@ -1,7 +1,8 @@
 """`transforms.json` of Nerfstudio and instant-ngp, and Blender's `transforms_train.json` / `transforms_test.json`.
 
 Poses are camera-to-world in OpenGL axes and are kept as they are (an `applied_transform` is not undone). Intrinsics
-(`fl_x fl_y cx cy w h`, else `camera_angle_x`; `k1 k2 k3 k4 p1 p2`; `camera_model`; `near`, `far`) stand once or by frame.
+(`fl_x fl_y cx cy w h`, else `camera_angle_x`; `distortion_params`, else `k1 k2 k3 k4 p1 p2`; `camera_model`; `near`, `far`)
+stand once or by frame.
 `mask_path` names an image's mask (black pixels are left out), `sky_mask_path` one of its sky (white).
 `points.npz` beside the file or the PLY file that `ply_file_path` names hold sparse points in the same frame; so does the
 COLMAP model, in `sparse/0` or elsewhere, that it was made of, whose points are moved by `applied_transform`.
@@ -20,7 +21,7 @@ from ...errors import DataError
 from ...interfaces import DataParser
 from ..images import IMAGE_SUFFIXES
 from ..scene import Scene
-from .colmap import cloud_of_model, largest_model, read_cloud
+from .colmap import cloud_of_model, read_cloud
 from .config import TransformsConfig
 from .files import NamedFiles, Record, as_record, path_inside, read_json, read_ply_points
 from .views import UNDISTORT, View, assemble_scene, index_tensor, lens_of, read_views, rigid_pose, stated_size
@@ -29,6 +30,8 @@ _LENSES = frozenset(
     {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "EQUIRECTANGULAR"}
     | {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 )
+_APPLIED = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]])
+"""What ns-process-data applied before it wrote `applied_transform`."""
 
 
 class _Entry(NamedTuple):
@@ -66,6 +69,8 @@ class TransformsParser(DataParser):
         views, kept, notes = read_views(data, once, lambda entry: _view(entry, inside))
         if any(same):
             notes.append(f"frames that are written twice are read once: {sum(same)}")
+        if tops[0].get("fisheye_crop_radius") is not None:
+            notes.append("fisheye_crop_radius is not applied: leave out what lies outside of the circle with masks/")
         points, seen, said = _cloud(inside, tops[0], once, views)
         split = _split(inside, tops, once, kept)
         return assemble_scene(data, views, downscale=downscale, split=split, points=points, seen=seen, notes=notes + said)
@@ -112,12 +117,11 @@ def _cloud(
     if points is None and ply:
         points, notes = read_ply_points(inside.find(f"{top.where}: ply_file_path", ply)[1])
     # A model also says which views see its points.
-    model = largest_model(inside.root)[0]
-    if seen is None and model is not None:
-        applied = np.eye(3, 4) if top.get("applied_transform") is None else top.matrix("applied_transform")[:3]
-        sparse = cloud_of_model(model, [view.name for view in views], [view.pose for view in views], applied)
-        return (points, None, notes) if sparse is None else (*sparse, [])
-    return points, seen, notes
+    if seen is not None:
+        return points, seen, notes
+    applied = _APPLIED if top.get("applied_transform") is None else top.matrix("applied_transform")[:3]
+    sparse, seen, said = cloud_of_model(inside.root, views, applied)
+    return (points, None, notes + said) if sparse is None else (sparse, seen, [])
 
 
 def _view(entry: _Entry, inside: NamedFiles) -> View:
@@ -168,8 +172,11 @@ def _focal(record: Record, size: tuple[int, int]) -> tuple[float, float]:
 
 
 def _lens(record: Record) -> tuple[tuple[float, float, float, float, float, float], int]:
+    # Nerfstudio's list in this order counts before single terms.
     # Terms beyond six are those of lenses that cannot be represented: `lens_of` refuses them unless they are 0.
     k = [record.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
+    if record.get("distortion_params") is not None:
+        k = record.numbers("distortion_params", 6).tolist()
     others = [record.number(key) or 0.0 for key in ("k5", "k6")]
     model = record.text("camera_model")
     if model is None:
@@ -200,7 +207,11 @@ def _split(inside: NamedFiles, tops: list[Record], entries: list[_Entry], kept: 
     both = listed[0] & listed[1]
     if both:
         raise DataError(f"{top.where}: {min(both)!r} is in train_filenames and in test_filenames; remove it from one")
-    # A side without a list has the rest.
+    # A side without a list has the rest; where nothing is left for testing, the views for validation serve.
     learned = names - listed[1] if train is None else listed[0]
-    held = names - listed[0] - set(top.texts("val_filenames") or ()) if test is None else listed[1]
+    held = listed[1]
+    if test is None:
+        where, key = top.where, "val_filenames"
+        val = {inside.find(f"{where}: {key}", text, IMAGE_SUFFIXES)[0] for text in top.texts(key) or ()} - listed[0]
+        held = names - listed[0] - val or val
     return index_tensor([e.name in learned for e in kept]), index_tensor([e.name in held for e in kept])

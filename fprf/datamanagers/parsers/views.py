@@ -21,7 +21,7 @@ from ...errors import DataError
 from ...rendering.cameras import Cameras
 from ...rendering.lens import FISHEYE, OPENCV, PINHOLE
 from ...rendering.splines import rotations
-from ..images import read_header
+from ..images import has_transparency, read_header
 from ..scene import Scene
 from .files import name_of
 
@@ -40,6 +40,8 @@ _LOOSE = 1e-3
 """Largest deviation of RᵀR from 1 that counts as rounding and is repaired."""
 _FAR = 1e12
 """Largest coordinate of a camera: beyond it float64 has no millimetres left."""
+_LOOKED_AT = 4
+"""Images with an alpha channel that are decoded, at most, to see whether it says anything."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,7 +235,7 @@ def assemble_scene(
     smaller copies of the same shape, which the cameras are then scaled to.
     """
     # Sizes as the files have them, from headers alone.
-    alpha = False
+    clear: list[Path] = []
     sizes = []
     for view in views:
         header = read_header(view.path)
@@ -245,7 +247,7 @@ def assemble_scene(
                 f"{view.path}: {size[0]}x{size[1]} pixels, but its camera has {view.size[0]}x{view.size[1]}; "
                 "restore the image (was it resized, rotated or cropped?) or calibrate again"
             )
-        alpha |= header.alpha
+        clear += [view.path] * header.alpha
         sizes.append(size)
     # Cameras at the size that the capture states, brought to that of the files.
     delivered = Cameras(
@@ -271,7 +273,8 @@ def assemble_scene(
         depths=torch.tensor(depths, dtype=torch.float64) if len(depths) == len(views) else None,
         masks=_masks(data, views, [view.mask for view in views], "masks"),
         sky_masks=_masks(data, views, [view.sky_mask for view in views], "sky_masks"),
-        alpha=alpha,
+        # Game engines and screenshots write alpha that is opaque everywhere: a few files tell.
+        alpha=any(map(has_transparency, clear[:: -(-len(clear) // _LOOKED_AT) or 1])),
         notes=tuple(notes),
     )
 
@@ -287,10 +290,11 @@ def _masks(data: Path, views: Sequence[View], named: Sequence[Path | None], fold
     found: list[Path | None] = []
     for view in views:
         mask = None
-        # Beside the image's folder, or beside a folder around that, up to the scene's.
-        for above in view.path.parents[1:]:
+        # Beside the image's folder, or beside a folder around that, up to the scene's; images may lie in that itself.
+        start = int(view.path.parent != data)
+        for above in view.path.parents[start:]:
             if mask is None and (above / folder).is_dir():
-                inner = (above / folder).joinpath(*view.path.relative_to(above).parts[1:])
+                inner = (above / folder).joinpath(*view.path.relative_to(above).parts[start:])
                 spellings = (inner.with_name(inner.name + ".png"), inner.with_suffix(".png"), inner)
                 mask = next((path for path in spellings if path.is_file()), None)
             if above == data or not above.is_relative_to(data):
