@@ -362,7 +362,7 @@ def test_a_small_file_of_many_pieces_takes_no_minutes(ending: str, tmp_path: Pat
     start = time.process_time()
     with pytest.raises(DataError):
         read_capture(tmp_path / f"x.{ending}")
-    assert time.process_time() - start < 2
+    assert time.process_time() - start < 3
 
 
 @pytest.mark.parametrize("ending", ["ply", "glb", "sog", "splat"])
