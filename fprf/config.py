@@ -207,8 +207,8 @@ class RunConfig:
     downscale: int | float | None = None
     """Factor, at least 1, by which the delivered images are reduced; none = found from their size and number, the rays of the
     training and the device (docs/formats.md), and saved with the run."""
-    steps: int = 30_000
-    """Optimiser steps."""
+    steps: int | None = 30_000
+    """Optimiser steps; none only where a kind of scene says for itself how many."""
     minutes: float | None = None
     """Wall-clock limit, features included; the schedule ends with whichever comes first, steps or minutes."""
     seed: int = 0
@@ -219,7 +219,8 @@ class RunConfig:
     def __post_init__(self) -> None:
         if self.downscale is not None:
             at_least("downscale", self.downscale, 1)
-        at_least("steps", self.steps, 0)
+        if self.steps is not None:
+            at_least("steps", self.steps, 0)
         between("seed", self.seed, 0, 2**31 - 1)
         if self.minutes is not None:
             positive("minutes", self.minutes)
@@ -257,6 +258,7 @@ class RunConfig:
 
     def limited(self, views: int) -> int:
         """Optimiser steps on so many training views."""
+        assert self.steps is not None
         return self.steps
 
     def find_downscale(self, scene: "ParsedScene", device: str) -> int:
@@ -318,6 +320,8 @@ class TrainConfig(RunConfig):
 
     kind: ClassVar[str] = "fields"
 
+    steps: int = 30_000
+    """Optimiser steps."""
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
     device_memory: float = 0.5

@@ -42,6 +42,8 @@ def run(args: list[str]) -> int:
     for name in names:
         if names.count(name) > 1:
             raise UsageError(f"--styles {name}: two styles of this name; give each its own")
+        if any(ending.startswith(f".{name.lower()}.") for ending in endings()):
+            raise UsageError(f"--styles {name}: splats.{name}.ply is the name of another format; give the style another one")
     if what.single is not None and len(styles) > 1:
         raise UsageError(f"--output {what.single}: one file holds one style, {len(styles)} are asked for; name a folder")
     from ..io.atomic import write_json

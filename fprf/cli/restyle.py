@@ -2,17 +2,18 @@
 
 import functools
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..checks import positive
-from ..errors import UsageError
+from ..errors import DataError, UsageError
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from ..progress import Display
-from ..splats.config import LookConfig, endings, format_name, is_scene
-from ..style.config import NO_MASK, StyleConfig
+from ..splats.config import LookConfig, endings, format_name, is_scene, stem_of
+from ..style.config import NO_MASK, StyleConfig, find_reference, labels, parse_region_value
 from ..style.files import StyleFile, write_style
 from .style_flags import read_flags
 from .stylize import print_explained
@@ -80,19 +81,20 @@ def run(args: list[str]) -> int:
     outputs = _outputs(config)
     from ..memory import peak
     from ..splats.captures import light_alone, neighbouring_light, open_captures
-    from ..splats.files import Written, read_capture, write_capture
+    from ..splats.files import read_capture, write_capture
     from ..style.regions import Regions
     from ..style.restyle import apply_style
 
+    for path in (*file.style.references, *file.style.masks):
+        if path != NO_MASK and not path.exists():
+            raise DataError(f"{path}: no such file; check what --references and --masks name")
     begun = time.perf_counter()
     photographed = file.style.references
     file = _with_views(config, file)
-    config = replace(config, references=file.style.references)
+    config = replace(config, references=file.style.references, weights=(), masks=())
     with Display() as display:
         report = functools.partial(display.count, what="looking")
         seen = open_captures(config.captures, config, cache=config.cache, progress=report, say=display.say)
-        for note in seen.first.notes:
-            display.say(f"{seen.first.path}: {note}")
         scene = seen.scene
         scene.found()  # views are encoded now, or read from the cache: the time is reported apart from that of styles
         looked = time.perf_counter() - begun
@@ -107,30 +109,36 @@ def run(args: list[str]) -> int:
             styled = light_alone(styled, gain) if config.match_light else styled
             made.append(_Restyled(name, styled, scene.restyled(styled.restyle), time.perf_counter() - start))
         # File by file, each in all styles: one of them is in memory at a time.
-        written, faults, count, steps = Written(), dict[str, None](), 0, len(config.captures) * len(named)
+        left, losses, count, steps = Counter[str](), dict[str, None](), 0, len(config.captures) * len(named)
         for k, path in enumerate(config.captures if outputs or len(config.captures) == 1 else ()):
             capture = seen.first if k == 0 else read_capture(path)
             count += len(capture.gaussians)
-            faults |= dict.fromkeys(capture.gaussians.faults())
+            faulty = False
             for i, one in enumerate(made if outputs else ()):
                 display.count(k * len(named) + i, steps, "restyling")
                 start = time.perf_counter()
                 # The style's name goes before the ending; a SOG folder gets a folder of that name, and holds its style.json.
-                output = outputs[k]
+                output, stem = outputs[k], stem_of(outputs[k])
                 folder = output.name.lower() == "meta.json"
-                stem, dot, ending = output.name.partition(".")
                 if one.name and folder:
                     output = output.parent / one.name / output.name
                 elif one.name:
-                    output = output.with_name(f"{stem}-{one.name}{dot}{ending}")
+                    output = output.with_name(f"{stem}-{one.name}{output.name[len(stem) :]}")
                 harmonics = seen.harmonics(k, capture, one.styled.restyle)
                 written = write_capture(output, capture, harmonics, scene.views)
-                beside = "style.json" if folder else f"{output.name.partition('.')[0]}.style.json"
+                faulty = written.faulty
+                where = f"{output.name}: " if len(outputs) > 1 else ""
+                losses |= dict.fromkeys(f"{where}{loss}" for loss in written.losses())
+                beside = "style.json" if folder else f"{stem_of(output)}.style.json"
                 write_style(output.with_name(beside), one.styled.controls.saved)
                 made[i] = one._replace(seconds=one.seconds + time.perf_counter() - start)
+            for number, what in (each.split(" ", 1) for each in capture.gaussians.faults()):
+                left[f"{what} left {'out' if faulty else 'as they are'}"] += int(number)
         display.count(steps, steps, "restyling")
     for note in dict.fromkeys(note for each in made for note in each.styled.controls.notes):
         print(note)
+    if outputs and not made:
+        print(f"--output {config.output}: no capture is written, since no --references are named")
     if config.explain:
         parent = (config.output or config.page or Path("x")).parent
         for one in made:
@@ -140,11 +148,10 @@ def run(args: list[str]) -> int:
     if config.page is not None:
         _write_page(config.page, config, scene, made)
     each_seconds = sum(each.seconds for each in made) / max(1, len(made))
-    left = "".join(f", {each} left {'out' if written.faulty else 'as they are'}" for each in faults)
-    left += "".join(f", {loss}" for loss in written.losses())
+    missing = "".join(f", {each}" for each in (*(f"{number} {what}" for what, number in left.items()), *losses))
     files = f" in {len(config.captures)} files" if len(config.captures) > 1 else ""
     print(
-        f"{count} Gaussians{files}{left}; looked at in {looked:.1f} s, {each_seconds:.2f} s for each of {len(made)} styles, "
+        f"{count} Gaussians{files}{missing}; looked at in {looked:.1f} s, {each_seconds:.2f} s for each of {len(made)} styles, "
         f"at most {(peak() or 0) / 1e9:.1f} GB"
     )
     return 0
@@ -210,33 +217,49 @@ def _with_views(config: RestyleConfig, file: StyleFile) -> StyleFile:
 
     # Photographs stay; in the place of a capture or run stand its views, with masks of what they show.
     rows: list[tuple[Path, Path, float]] = []
+    numbers_of, stems = list[range](), [stem_of(path) for path in style.references]
     beside = config.output or config.page or Path("x")
     weights, masks = style.weights or (1.0,) * len(style.references), style.masks or (NO_MASK,) * len(style.references)
-    for path, mask, weight in zip(style.references, masks, weights, strict=True):
+    for i, (path, mask, weight) in enumerate(zip(style.references, masks, weights, strict=True)):
+        before = len(rows)
         if path not in scenes:
             rows.append((path, mask, weight))
+            numbers_of.append(range(before, len(rows)))
             continue
-        folder = beside.parent / f"{beside.name.partition('.')[0]}.references" / f"{path.resolve().name.partition('.')[0]}"
-        pictures, covers, shares = reference_views(path, config, folder)
+        if mask != NO_MASK:
+            raise UsageError(f"--masks: {mask} is for one photograph, {path} gives several views; write none")
+        name = stems[i] if stems.count(stems[i]) == 1 else f"{stems[i]}-{i}"
+        pictures, covers, shares = reference_views(path, config, beside.parent / f"{stem_of(beside)}.references" / name)
         # All views of a scene weigh as much as one photograph.
         rows += [
             (picture, cover, weight * share / sum(shares))
             for picture, cover, share in zip(pictures, covers, shares, strict=True)
         ]
+        numbers_of.append(range(before, len(rows)))
+
+    def expanded(field: str, texts: Sequence[str]) -> tuple[str, ...]:
+        # What is said of a capture holds for each of its views.
+        pairs = [parse_region_value(field, text) for text in texts]
+        return tuple(f"{region}={k}" for region, of in pairs for k in numbers_of[find_reference(of, style.references)])
+
+    pin, forbid = expanded("pin", style.pin), expanded("forbid", style.forbid)
     pictures, covers, numbers = zip(*rows, strict=True)
     # A capture shows what there is, not a mood: where no photograph is among them, everything takes its match.
     bold = 1.0 if len(scenes) == len(style.references) and style.bold == StyleConfig().bold else style.bold
-    return file._replace(style=replace(style, references=pictures, masks=covers, weights=numbers, bold=bold))
+    return file._replace(
+        style=replace(style, references=pictures, masks=covers, weights=numbers, pin=pin, forbid=forbid, bold=bold)
+    )
 
 
 def _styles(config: RestyleConfig, file: StyleFile) -> list[tuple[str, StyleFile]]:
     """The styles with what is added to the names of their files."""
     if not config.each:
         return [("", file)] if config.references else []
-    alone = []
+    # Without dots: x.compressed would make another format of a .ply.
+    alone, stems = [], [path.stem.replace(".", "_") for path in config.references]
     for i, path in enumerate(config.references):
         style = replace(file.style, references=(path,), weights=(), masks=file.style.masks[i : i + 1])
-        name = path.stem if sum(other.stem == path.stem for other in config.references) == 1 else f"{path.stem}-{i}"
+        name = stems[i] if stems.count(stems[i]) == 1 else f"{stems[i]}-{i}"
         alone.append((name, file._replace(style=style)))
     return alone
 
@@ -246,7 +269,6 @@ def _write_page(path: Path, config: RestyleConfig, scene: "SplatScene", made: Se
     from ..datamanagers.images import load_image
     from ..io.images import to_uint8
     from ..page.writer import Page, PageView, Reference, Style, write_page
-    from ..style.config import labels
 
     # Views lie on rings around the scene or within it, the nearer ones first: from these the things can be told.
     nearer = max(min(_SHOWN, len(scene.names)), len(scene.names) // 2)
@@ -262,7 +284,7 @@ def _write_page(path: Path, config: RestyleConfig, scene: "SplatScene", made: Se
         harmonics = each.scene.shown.harmonics
         styles.append(Style(name, pictures, harmonics, references=of))
     page = Page(
-        title=config.captures[0].resolve().name.partition(".")[0] or "capture",
+        title=stem_of(config.captures[0]) or "capture",
         facts={"Gaussians": len(scene.gaussians), "Regions": len(scene.measured()[0].share), "Styles": len(styles)},
         views=[PageView(scene.names[view], picture) for view, picture in zip(views, before, strict=True)],
         styles=styles,

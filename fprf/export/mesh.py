@@ -179,7 +179,7 @@ def _lattice(maps: Maps, edge: float | None) -> tuple[Annotated[Tensor, "M 3"], 
     while True:
         # A block counts where several views see something in or beside it: what one alone sees is the air before an edge.
         around = _AROUND * edge * torch.cartesian_prod(*(torch.tensor([-1.0, 1.0], dtype=torch.float64),) * 3)
-        each = [((points[:, None] + around).view(-1, 3) / (edge * _BLOCK)).floor().long() for points in seen]
+        each = (((points[:, None] + around).view(-1, 3) / (edge * _BLOCK)).floor().long() for points in seen)
         block, views = torch.unique(torch.cat([torch.unique(b, dim=0) for b in each]), dim=0, return_counts=True)
         block = block[views >= _AGREE]
         if len(block) * _BLOCK**3 <= _MOST:

@@ -10,7 +10,9 @@ holds any. Then each file is read and written once; of the others nothing is in 
 import functools
 import hashlib
 import math
+import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated
@@ -46,6 +48,8 @@ SAMPLE = 2_000_000
 """Gaussians that are looked at, at most: what is in memory of captures of any size, beside the file at hand."""
 _FINEST, _LEVELS = 1024, 12
 """Cells along the longest side of the bulk at the finest level; levels, each of cells twice as wide."""
+_STRAY = 500.0
+"""Extents of the bulk from it, beyond which Gaussians do not say where cells begin: twice that fits into 2^20 finest ones."""
 _BLACK = 0.055
 """Added to sRGB, it is a power of linear light."""
 _VIEW, _SOLID = (480, 360), 0.95
@@ -129,7 +133,8 @@ def open_capture(
         except (CheckpointError, TypeError) as error:
             say(f"looking again: {error}")
         else:
-            path.touch()
+            with suppress(OSError):  # another process may just have removed it
+                os.utime(path)
             return replace(_scene_of(gaussians, antialiased, cameras, lambda: semantics, encoder), origin=capture.origin)
     scene = look_at_capture(gaussians, antialiased, encoder, look, progress, capture.camera)
 
@@ -137,8 +142,10 @@ def open_capture(
         semantics = scene.found()
         views = {f"camera.{field.name}": getattr(scene.views, field.name) for field in fields(Cameras)}
         save(path, {**views, **semantics_tensors(semantics)}, sealed=True)
-        for old in sorted(folder.glob("*.safetensors"), key=lambda each: each.stat().st_mtime)[:-_CACHED]:
-            old.unlink(missing_ok=True)
+        with suppress(OSError):  # another process removes files, too: what is left the next one finds
+            files = [each for each in folder.glob("*.safetensors") if each.is_file()]
+            for old in sorted(files, key=lambda each: each.stat().st_mtime)[:-_CACHED]:
+                old.unlink(missing_ok=True)
         return semantics
 
     return replace(scene, found=functools.cache(found), origin=capture.origin)
@@ -190,13 +197,13 @@ def open_captures(
     Of several captures each gives a like share of the sample. `first` is the first one, where it was read already. Raises
     DataError where nothing can be seen.
     """
-    first = first or read_capture(paths[0])
+    first = first or _read(paths[0], say)
     if len(paths) == 1 and len(first.gaussians) <= sample:
         scene = open_capture(first, look, cache=cache, progress=progress, say=say)
         return Captures(scene, (slice(0, len(scene.gaussians)),), (torch.zeros(3),), first)
     parts, key, compensated = list[Gaussians](), hashlib.sha256(f"{sample} {len(paths)}".encode()), first.antialiased
     for path in paths:
-        capture = first if path == paths[0] else read_capture(path)
+        capture = first if path == paths[0] else _read(path, say)
         key.update(hashlib.sha256(capture.data).digest())
         release(capture.data)
         here = torch.tensor([a - b for a, b in zip(capture.origin, first.origin, strict=True)])
@@ -218,6 +225,14 @@ def open_captures(
     ends = torch.tensor([len(part) for part in parts]).cumsum(0).tolist()
     rows = tuple(slice(end - len(part), end) for end, part in zip(ends, parts, strict=True))
     return Captures(scene, rows, tuple(moved), first)
+
+
+def _read(path: Path, say: Callable[[str], None]) -> Capture:
+    """A capture, with what its file was taken for."""
+    capture = read_capture(path)
+    for note in capture.notes:
+        say(f"{capture.path}: {note}")
+    return capture
 
 
 def sampled(gaussians: Gaussians, most: int) -> Gaussians:
@@ -281,7 +296,7 @@ def neighbouring_light(captures: Captures, references: Sequence[Path]) -> Annota
     colours = (torch.cat([own.colours, *(part.colours for part in parts)]).double().clamp(0, 1) + _BLACK).log()
     # What can be seen counts, by its opacity.
     weight = torch.cat([own.opacities, *(part.opacities for part in parts)]).double()
-    low, edge = means.amin(0), (bulk_of(means.numpy()).side or 1.0) / _FINEST
+    low, edge = _grid(means)
     gain, most = None, _SHARED - 1
     for level in range(_LEVELS - 2):
         cell = torch.unique(cells_of(places, low, edge * 2**level), return_inverse=True)[1]
@@ -355,13 +370,18 @@ def reference_views(path: Path, look: LookConfig, folder: Path) -> tuple[tuple[P
     return tuple(pictures), tuple(masks), tuple(weights)
 
 
+def _grid(points: Annotated[Tensor, "N 3"]) -> tuple[Annotated[Tensor, "3"], float]:
+    """Where the cells around points begin, and the edge of the finest; strays would push all others out of the grid."""
+    bulk = bulk_of(points.numpy())
+    return points[torch.from_numpy(bulk.apart <= _STRAY)].amin(0), (bulk.side or 1.0) / _FINEST
+
+
 class Neighbours:
     """Features at places, as the mean of those of the points in the smallest cell around that holds any."""
 
     def __init__(self, points: Annotated[Tensor, "M 3"], features: Annotated[Tensor, "M D"]) -> None:
-        self.low, self.fallback = points.amin(0), features.float().mean(0)
-        self.edge = (bulk_of(points.numpy()).side or 1.0) / _FINEST
-        self.levels = []
+        self.low, self.edge = _grid(points)
+        self.fallback, self.levels = features.float().mean(0), []
         for level in range(_LEVELS):
             keys, cell = torch.unique(cells_of(points, self.low, self.edge * 2**level), return_inverse=True)
             # A level has the means of its cells, by the sorted numbers of these.

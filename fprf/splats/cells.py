@@ -213,7 +213,7 @@ def open_cell(task: Task) -> Overview | CellPart:
             folder=folder,
             # What is finished stays when a run is gone on with for more steps or minutes.
             asked={"task": digest_of(config, free, scene, scene.train.tolist(), {"format": _FORMAT, "start": ""})},
-            schedule=Schedule(own.steps, task.minutes, config.checkpoint_minutes),
+            schedule=Schedule(own.most_steps, task.minutes, config.checkpoint_minutes),
             config=own,
             facts=facts,
             every=every,
@@ -226,11 +226,11 @@ def open_cell(task: Task) -> Overview | CellPart:
         "windows": sorted(cell.windows.items()),
     }
     task_digest = digest_of(config, free, scene, list(cell.windows), parts)
-    steps = max(1, round((1 - config.overview) * config.steps))
+    steps = max(1, round((1 - config.overview) * config.most_steps))
     return CellPart(
         name=f"cell {number:02d}",
         folder=folder,
-        asked={"task": task_digest, "steps": config.steps, "minutes": config.minutes},
+        asked={"task": task_digest, "steps": config.most_steps, "minutes": config.minutes},
         schedule=Schedule(steps, task.minutes, config.checkpoint_minutes),
         config=config,
         scene=scene,
@@ -257,7 +257,7 @@ def overview_config(config: GaussiansConfig, scene: Scene) -> tuple[GaussiansCon
         coarse=min(1.0, config.coarse / config.overview / 3 ** math.log2(factor)),
         # As many as one piece would have by then.
         cap=round(config.initial * (config.most / config.initial) ** min(1.0, config.overview / config.grow)),
-        steps=max(1, round(config.overview * config.steps), _VISITS * len(scene.train[::every])),
+        steps=max(1, round(config.overview * config.most_steps), _VISITS * len(scene.train[::every])),
     )
     return own, every
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 CAPTURES = "fprf.captures"
 """Entry points of file formats of Gaussians (`splats.files.base.CaptureFormat`), by the ending of their files."""
-_CAP, _PASSES = 60_000, 280
+_CAP, _PASSES, _STEPS, _NO_END = 60_000, 280, 10_000, 100_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,8 +66,8 @@ class GaussiansConfig(RunConfig):
 
     device: str = "auto"
     """cpu, cuda, or auto. On CUDA they are trained where gsplat is installed (`pip install 'fprf[cuda]'`), else on the CPU."""
-    steps: int = 10_000
-    """Optimiser steps: one view each. With minutes and no steps, as many as there is time for."""
+    steps: int | None = None
+    """Optimiser steps: one view each. none = 10 000, or with minutes as many as there is time for."""
     passes: int | None = None
     """Passes over the training views at most, whatever `steps` and `minutes` say: more of them learn few photographs by heart.
     Not in cells. none = 280, and more for photographs of more than 640 x 360 pixels."""
@@ -176,6 +176,11 @@ class GaussiansConfig(RunConfig):
         return self.passes or _PASSES
 
     @property
+    def most_steps(self) -> int:
+        """`steps`; where they are not given, 10 000, or 100 000 where minutes are."""
+        return self.steps if self.steps is not None else _STEPS if self.minutes is None else _NO_END
+
+    @property
     def trained_on(self) -> str:
         return self.device
 
@@ -189,7 +194,7 @@ class GaussiansConfig(RunConfig):
 
     def limited(self, views: int) -> int:
         """At most so many passes over them."""
-        return min(self.steps, self.most_passes * views)
+        return min(self.most_steps, self.most_passes * views)
 
     def described(self) -> str:
         return f", up to {self.most:,} Gaussians"
@@ -208,6 +213,16 @@ def format_name(path: Path) -> str | None:
     installed = registry.installed(CAPTURES)
     fits = [each for each in installed if name.endswith(f".{each}") or (name == each and "." in each)]
     return max(fits, key=len, default=None)
+
+
+def stem_of(path: Path) -> str:
+    """The name of a capture without the ending that says its format; of an index that of its folder, of a page its stem."""
+    if path.is_dir():
+        return path.resolve().name
+    name = format_name(path)
+    if path.name.lower() in ("meta.json", name):
+        return path.resolve().parent.name
+    return path.stem if name is None else path.name[: -len(name) - 1]
 
 
 def is_scene(path: Path) -> bool:

@@ -1,7 +1,7 @@
 """Where Gaussians begin: at the reconstruction's points, else at points matched between posed views, else anywhere in view."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, NamedTuple
 
 import cv2
@@ -47,7 +47,7 @@ def initial_points(scene: Scene, images: Mapping[int, Image], count: int, rng: n
         position = scene.points.double().numpy()
         position = position[np.isfinite(position).all(1)]
         position = position[np.sort(rng.permutation(len(position))[:count])]
-        return Points(position, _mean_colours(scene, images, position)[0]), "points of the reconstruction"
+        return Points(position, _mean_colours(scene, images.__getitem__, position)[0]), "points of the reconstruction"
     points, kind = _matched(scene, images), "points matched between views"
     if len(points.position) < _ENOUGH:
         points, kind = _scattered(scene, images, min(count, 10_000), rng), "random points"
@@ -70,14 +70,15 @@ def surroundings(scene: Scene, images: Mapping[int, Image], points: Points, coun
     turn, level = np.arange(count) * math.pi * (3 - math.sqrt(5)), np.sqrt(1 - height**2)
     direction = np.stack([level * np.cos(turn), level * np.sin(turn), height], 1)
     position = centre + _FAR * float(radius) * direction
+
     # Blurred, since what is far is drawn by few Gaussians, and a sharp pixel would become a blot.
-    small: dict[int, Image] = {}
-    for view in scene.train.tolist():
+    def blurred(view: int) -> Image:
         tall, wide = images[view].shape[:2]
         shrink = _BLUR / min(tall, wide)
         reduced = cv2.resize(images[view], (round(wide * shrink), round(tall * shrink)), interpolation=cv2.INTER_AREA)
-        small[view] = np.asarray(cv2.resize(reduced, (wide, tall), interpolation=cv2.INTER_LINEAR), np.uint8)
-    colour, seen = _mean_colours(scene, small, position)
+        return np.asarray(cv2.resize(reduced, (wide, tall), interpolation=cv2.INTER_LINEAR), np.uint8)
+
+    colour, seen = _mean_colours(scene, blurred, position)
     if seen.any():
         alike = direction[~seen] @ direction[seen].T
         nearest = np.argsort(-alike, axis=1)[:, :_NEIGHBOURING]
@@ -120,13 +121,13 @@ def projected(scene: Scene, points: Annotated[Tensor, "P 3"]) -> Iterator[tuple[
 
 
 def _mean_colours(
-    scene: Scene, images: Mapping[int, Image], position: Doubles
+    scene: Scene, image: Callable[[int], Image], position: Doubles
 ) -> tuple[Annotated[NDArray[np.float32], "P 3"], Annotated[NDArray[np.bool_], "P"]]:
     """Mean colours over the training views that have points in the picture, grey where none has; and where one has."""
     total, count = np.zeros((len(position), 3)), np.zeros(len(position))
     for view, pixel, _, inside in projected(scene, torch.from_numpy(position)):
         x, y = pixel[inside].long().numpy().T
-        total[inside.numpy()] += images[view][y, x]
+        total[inside.numpy()] += image(view)[y, x]
         count[inside.numpy()] += 1
     colour = np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None] / 255, 0.5)
     return colour.astype(np.float32), count > 0

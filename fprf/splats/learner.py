@@ -336,7 +336,7 @@ class GaussianLearner(SceneLearner):
         blur = f"; blurred, and so shown rarely: {len(dull)} of {len(self.levels[0])} ({few})" if dull else ""
         light = ", tones" if self.tones is not None else ""
         where = "" if self.device == CPU else f", on {self.device} by gsplat"
-        limit = passes if most < self.config.steps else ""
+        limit = passes if most < self.config.most_steps else ""
         line = f", {self.model.count} Gaussians at {self.origin}{light}{where}{blur}{limit}"
         return line + left_out(self.asked)
 

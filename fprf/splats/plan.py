@@ -30,8 +30,6 @@ _LEAST = 400 * 225
 """Pixels below which none is reduced for lack of time."""
 _PATIENCE = 600.0
 """Seconds within which steps have to end where no minutes are given: larger photographs are reduced."""
-_NO_END = 100_000
-"""Steps, at most, where minutes are given and no steps."""
 _FEWEST, _MOST, _GROWTH = 60_000, 1_000_000, 0.6
 """Gaussians of a minute, the most of all, and the power of the time that their number grows with."""
 _PROBE, _REPEATS, _REFERENCE = 1 << 16, 200, 55e-6
@@ -50,7 +48,6 @@ def plan(config: "GaussiansConfig", scene: "Scene") -> "GaussiansConfig":
     speed, budget = machine_speed(), None
     if config.minutes is not None:
         budget = max(1.0, 60 * config.minutes - _START) * speed
-        config = replace(config, steps=_NO_END if config.steps == type(config).steps else config.steps)
     # The largest size at which the time is enough for some passes over the photographs.
     size = config.downscale or max(1, longest / config.longest)
     while True:

@@ -232,6 +232,8 @@ class _Search:
         usual = float((extent[some] - away.log()).median())
         # Directions far from each other, of what is not in the far surroundings.
         ahead = torch.nn.functional.normalize(points[some][away < away.quantile(0.8)] - place, dim=1)
+        if not len(ahead):  # all are in one place
+            return None
         mean = torch.nn.functional.normalize(ahead.mean(0), dim=0)
         picked = [int((ahead @ mean).argmax())]
         for _ in range(_TARGETS - 1):

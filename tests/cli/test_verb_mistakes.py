@@ -35,6 +35,7 @@ MISTAKES = """
     export run --mesh-edge 0 | --mesh-edge
     export run --styles A | NAME=
     export run --styles a=absent.png | absent.png
+    export run --styles compressed=A.png | another format
     export run --styles a=x.png b=x.png --output out/one.ply | one file holds one style
     export run cameras --output out/one.splat | holds splat
     export run glb --reach 1e-6 --output out | no view sees a surface

@@ -62,8 +62,11 @@ def look() -> LookConfig:
     return LookConfig(views=6, size=(64, 48), regions=4, semantic=semantic)
 
 
-def test_a_sample_tells_the_colours_of_all(photograph: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("far", [0.0, 1e5])
+def test_a_sample_tells_the_colours_of_all(far: float, photograph: Path, tmp_path: Path) -> None:
+    """Strays in the sample, too, are no neighbours of all others."""
     made, path = ball(4000), tmp_path / "in.ply"
+    made.means[8::800] -= far
     made.means[5] = torch.nan
     write_gaussians(path, made)
     style = StyleFile(StyleConfig(references=(photograph,), stylizer=RegionToneConfig(centred=False)))
@@ -102,6 +105,37 @@ def test_a_capture_gives_its_light_to_another(flags: list[str], tmp_path: Path) 
     views = sorted((tmp_path / "out.references" / "day").iterdir())
     style = json.loads((tmp_path / "out.style.json").read_text())["style"]
     assert len(views) == 12 and len(style["references"]) == 6 and sum(style["weights"]) == pytest.approx(1)
+
+
+def test_what_is_said_of_a_capture_holds_for_each_of_its_views(photograph: Path, tmp_path: Path) -> None:
+    """Captures of one name keep their views apart; number 1 is the second reference, not a view of the first."""
+    paths = [tmp_path / name for name in ("in.ply", "a/light.ply", "b/light.ply")]
+    for path in paths:
+        write_gaussians(path, ball(200))
+    words = ["restyle", str(paths[0]), *SMALL, "--cache", str(tmp_path / "cache"), "--weights", "1", "2", "1"]
+    words += ["--pin", "everywhere=1", "--masks", "none", "none", str(photograph)]
+    assert cli.main([*words, "--references", *map(str, paths[1:]), str(photograph), "--output", str(tmp_path / "out.ply")]) == 0
+    style = json.loads((tmp_path / "out.style.json").read_text())["style"]
+    assert len(set(style["references"])) == 13 and style["pin"] == [f"everywhere={k}" for k in range(6, 12)]
+    assert [sum(style["weights"][k : k + 6]) for k in (0, 6, 12)] == pytest.approx([1, 2, 1])
+
+
+def test_each_style_of_several_files_has_its_own_names(
+    photograph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photos, paths = [tmp_path / f"{name}.png" for name in ("x.1", "x.compressed")], [tmp_path / f"in.{k}.ply" for k in (0, 1)]
+    for photo, path in zip(photos, paths, strict=True):
+        photo.write_bytes(photograph.read_bytes())
+        made = ball(200)
+        made.means[:3] = torch.nan
+        write_gaussians(path, made)
+    words = [*SMALL, "--cache", str(tmp_path / "cache"), "--explain", "--output", str(tmp_path / "out")]
+    assert cli.main(["restyle", *map(str, paths), *words]) == 0
+    assert "no capture is written" in capsys.readouterr().out
+    assert cli.main(["restyle", *map(str, paths), *words, "--each", "--references", *map(str, photos)]) == 0
+    assert "6 that are not finite left as they are" in capsys.readouterr().out
+    names = {f"in.{k}-{style}{end}" for k in (0, 1) for style in ("x_1", "x_compressed") for end in (".ply", ".style.json")}
+    assert names == {path.name for path in (tmp_path / "out").glob("in.*")}
 
 
 def test_a_killed_restyle_leaves_no_half_file(photograph: Path, tmp_path: Path) -> None:

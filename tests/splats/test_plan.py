@@ -48,6 +48,8 @@ def test_a_dozen_large_photographs(minutes: float, size: float) -> None:
 def test_what_is_given_stays() -> None:
     given = replace(CONFIG, minutes=1, downscale=7, cap=12_345, passes=9, steps=77)
     assert planned(given) == given
+    long = replace(CONFIG, minutes=60)
+    assert planned(replace(long, steps=10_000)).most_steps == 10_000 < planned(long).most_steps
     assert planned(replace(CONFIG, minutes=60, longest=800)).downscale == 3.54
     without = planned(replace(CONFIG, steps=100))
     assert without.downscale == 1.77 and without.most == 60_000 and without.limited(30) == 100

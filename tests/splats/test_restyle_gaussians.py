@@ -197,8 +197,10 @@ def test_light_alone_counts_photographs_by_their_weights(scene: SplatScene, phot
 def test_what_the_cache_knows_of_a_capture_gives_the_same_colours(photographs: list[Path], tmp_path: Path) -> None:
     write_gaussians(tmp_path / "a.ply", ball(400))
     capture, look, said = read_capture(tmp_path / "a.ply"), LookConfig(views=6, size=(96, 72), regions=4), list[str]()
+    (tmp_path / "cache").mkdir()
+    (tmp_path / "cache" / "gone.safetensors").symlink_to("removed")  # as another process has it
     first = styled(open_capture(capture, look, cache=tmp_path / "cache"), photographs[0])
-    (kept,) = (tmp_path / "cache").iterdir()
+    (kept,) = (path for path in (tmp_path / "cache").iterdir() if path.is_file())
     for damaged in (False, True):
         if damaged:
             kept.write_bytes(kept.read_bytes()[:-1])
@@ -227,6 +229,8 @@ def test_objects_are_seen_from_around_and_rooms_from_within() -> None:
     for given, inside in ((room.select(slice(-5000)), None), (room, False)):
         outside = find_views(given, count=8, size=(64, 48), up=UP, inside=inside)
         assert not (outside.pose[:, :, 3].abs() < half).all(1).any()
+    one = replace(ball(200), means=torch.zeros(200, 3), log_scales=torch.zeros(200, 3))
+    assert len(find_views(one, count=2, size=(64, 48), up=UP)) == 2, "all in one place, of one size"
     few = room.select(slice(4))
     with pytest.raises(DataError):
         find_views(replace(few, log_scales=few.log_scales - 30, logits=few.logits - 30), count=2, size=(64, 48), up=UP)
