@@ -95,10 +95,14 @@ def write_video(path: Path, frames: Iterable[Picture], fps: float, *, h264: bool
         if not writer.isOpened():
             raise DataError(f"{path}: no video encoder here; install one with pip install 'fprf[video]', or write a folder")
         try:
-            for frame in chain([first], even):
+            for count, frame in enumerate(chain([first], even), 1):
                 writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
         finally:
             writer.release()
+        # The writer says nothing of a full disk, which leaves a film without its index.
+        found = max(0, int(cv2.VideoCapture(str(temporary)).get(cv2.CAP_PROP_FRAME_COUNT)))
+        if found < count:
+            raise unwritable(path, OSError(f"{found} of {count} frames are in it"))
         return "mp4v"
 
 
