@@ -94,9 +94,11 @@ def write_video(path: Path, frames: Iterable[Picture], fps: float, *, h264: bool
         writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), float(rate), size)
         if not writer.isOpened():
             raise DataError(f"{path}: no video encoder here; install one with pip install 'fprf[video]', or write a folder")
+        count = 0
         try:
-            for count, frame in enumerate(chain([first], even), 1):
+            for frame in chain([first], even):
                 writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+                count += 1
         finally:
             writer.release()
         # The writer says nothing of a full disk, which leaves a film without its index.

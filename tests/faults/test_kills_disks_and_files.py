@@ -138,11 +138,12 @@ def test_a_file_that_the_system_cuts_off_is_one_line_and_costs_nothing(root: Pat
 
 
 def test_a_film_that_the_system_cuts_off_is_no_film(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (60, 64, 64, 3), np.uint8)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
     try:
         with pytest.raises(DataError, match="0 of 60 frames"):
-            write_video(tmp_path / "x.mp4", np.random.default_rng(0).integers(0, 255, (60, 64, 64, 3), np.uint8), 24, h264=False)
+            write_video(tmp_path / "x.mp4", noise, 24, h264=False)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert not list(tmp_path.iterdir())
