@@ -276,7 +276,7 @@ def is_watched(root: Path) -> bool:
 
 class _SignalHandler:
     """SIGINT and SIGTERM held back inside the block, and as before after it. Python lets only the main thread set
-    handlers; in any other this changes nothing."""
+    handlers; in any other this changes nothing. A handler that was not set from Python stays: it could not be set again."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -287,7 +287,8 @@ class _SignalHandler:
 
     def __enter__(self) -> "_SignalHandler":
         if threading.current_thread() is threading.main_thread():
-            self.before = {number: signal.signal(number, self.note) for number in (signal.SIGINT, signal.SIGTERM)}
+            numbers = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is not None]
+            self.before = {number: signal.signal(number, self.note) for number in numbers}
         return self
 
     def __exit__(self, *error: object) -> None:
