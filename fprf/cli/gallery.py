@@ -96,6 +96,8 @@ def run(args: list[str]) -> int:
 
 def _chosen(config: GalleryConfig, together: StyleFile) -> list[tuple[str, StyleFile]]:
     """The styles with their names. Raises UsageError where there are none."""
+    from ..page.writer import CAPTURED
+
     names = _called(config.references)
     # What names photographs one by one does not hold where each is alone.
     alone = replace(together.style, weights=(), masks=(), pin=(), forbid=())
@@ -105,7 +107,7 @@ def _chosen(config: GalleryConfig, together: StyleFile) -> list[tuple[str, Style
         check_photographs(path, file)
         file = file._replace(style=with_folders(file.style, say))
         own = style_name(path, ())
-        chosen.append((f"{own} ({len(chosen) + 1})" if own in dict(chosen) else own, file))
+        chosen.append((f"{own} ({len(chosen) + 1})" if own in (CAPTURED, *dict(chosen)) else own, file))
     if len(names) > 1:
         chosen.append((" + ".join(names.values()) if len(names) <= 3 else f"all {len(names)}", together))
     if not chosen:
@@ -114,13 +116,18 @@ def _chosen(config: GalleryConfig, together: StyleFile) -> list[tuple[str, Style
 
 
 def _called(paths: Sequence[Path]) -> dict[Path, str]:
-    """Names of photographs: their stems; where two agree, their whole names, with a number where these agree as well."""
+    """Names of photographs: their stems; where two agree, their whole names, with a number where these agree as well.
+
+    None is called as the scene without a style is.
+    """
+    from ..page.writer import CAPTURED
+
     names: dict[Path, str] = {}
     paths = list(dict.fromkeys(paths))
     for path in paths:
         alike = sum(other.stem == path.stem for other in paths) > 1
         name = path.name if alike else path.stem
-        names[path] = f"{name} ({len(names) + 1})" if name in names.values() else name
+        names[path] = f"{name} ({len(names) + 1})" if name in (CAPTURED, *names.values()) else name
     return names
 
 

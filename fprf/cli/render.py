@@ -51,8 +51,8 @@ class RenderVerbConfig(StyledRunConfig):
     """Views that `interpolate` and `dataset` go through."""
     frames: int = 120
     """Frames of a spiral or orbit; about as many of an interpolation."""
-    fps: float = 24.0
-    """Frames per second of a film, in [1, 1000]."""
+    fps: float | None = None
+    """Frames per second of a film, in [1, 1000]; by default 24, or those of a camera-path file."""
     style: Path | None = None
     """A style file, as `fprf stylize` writes it; flags come over it."""
     keyframes: Path | None = None
@@ -67,7 +67,7 @@ class RenderVerbConfig(StyledRunConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least("frames", self.frames, 1)
-        at_least("fps", self.fps, 1)
+        at_least("fps", 24 if self.fps is None else self.fps, 1)
         if not self.show:
             raise ConfigError("show: name at least one of colour, depth, normals, match")
         if self.keyframes is not None and (self.references or self.style):
@@ -82,24 +82,27 @@ def run(args: list[str]) -> int:
     from ..io.images import write_image
     from ..io.maps import depth_limits, side_by_side
     from ..io.video import FILMS, MAX_FPS, missing_frames, write_video
-    from ..rendering.paths import make_path
+    from ..rendering.paths import MOTIONS, make_path, read_camera_path
     from ..training.loading import open_run
 
     if config.output.suffix.lower() in _NO_FOLDERS:
         raise UsageError(f"--output {config.output}: films end in {' '.join(FILMS)}; give such a name, or a folder for frames")
-    if config.fps > MAX_FPS:
+    if config.fps is not None and config.fps > MAX_FPS:
         raise UsageError(f"--fps {config.fps:g}: a film has at most {MAX_FPS} frames a second")
     opened = open_run(config.run, config.device, config)
     known = opened.known
     # Spirals, orbits and camera paths bring frames of their own.
     views = known.views(config.split) if config.path in ("interpolate", "dataset") else []
     cameras = make_path(known.cameras, views, config.path, config.frames, opened.scene.origin)
+    fps = config.fps
+    if fps is None:
+        fps = 24.0 if config.path in MOTIONS else read_camera_path(Path(config.path))[1]
     # Captured views keep the stem of their image.
     names = [known.names[view] for view in views] if config.path == "dataset" else [f"{i:05d}" for i in range(len(cameras))]
     takes = _takes(opened.scene, config, file)
-    # Frames of a film wait in a folder beside it, which goes when the film is whole.
+    # Frames of a film wait in a folder beside it, hidden as nobody's own is, which goes when the film is whole.
     whole = config.output.suffix.lower() in FILMS
-    folder = config.output.with_suffix(".frames") if whole else config.output
+    folder = config.output.with_name(f".{config.output.stem}.frames") if whole else config.output
     paths = [folder / f"{name}.{'png' if whole else config.format}" for name in names]
     key = _key(opened, config, cameras)
     todo = missing_frames(folder, key, paths)
@@ -121,7 +124,7 @@ def run(args: list[str]) -> int:
         display.count(len(todo), len(todo), "rendering")
         made = str(config.output)
         if whole:
-            codec = write_video(config.output, (load_image(path) for path in paths), config.fps)
+            codec = write_video(config.output, (load_image(path) for path in paths), fps)
             made = f"{config.output} ({codec})"
             shutil.rmtree(folder)
     seconds = time.perf_counter() - start

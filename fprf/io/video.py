@@ -94,11 +94,17 @@ def write_video(path: Path, frames: Iterable[Picture], fps: float, *, h264: bool
         writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), float(rate), size)
         if not writer.isOpened():
             raise DataError(f"{path}: no video encoder here; install one with pip install 'fprf[video]', or write a folder")
+        count = 0
         try:
             for frame in chain([first], even):
                 writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+                count += 1
         finally:
             writer.release()
+        # The writer says nothing of a full disk, which leaves a film without its index.
+        found = max(0, int(cv2.VideoCapture(str(temporary)).get(cv2.CAP_PROP_FRAME_COUNT)))
+        if found < count:
+            raise unwritable(path, OSError(f"{found} of {count} frames are in it"))
         return "mp4v"
 
 
@@ -124,21 +130,23 @@ _RECORD = ".render.json"
 def missing_frames(folder: Path, key: str, paths: Sequence[Path]) -> list[Path]:
     """Frames that are not there yet; all, where the folder was rendered from something else than `key` says.
 
-    The key is written down at once, so that what is rendered from now on counts. Frames are whole or absent.
+    The key is written down at once, with the names of the frames, so that what is rendered from now on counts, and can be told
+    from a stranger's files. Frames are whole or absent.
     Raises DataError where the system refuses to write there.
     """
-    # What the folder was rendered from, if that can be read.
+    # What the folder was rendered from, if that can be read, and the frames of it.
     record = folder / _RECORD
     try:
-        known = parse_json(record.read_text("utf-8")).get("key")
-    except (OSError, ValueError, AttributeError):
-        known = None
+        content = parse_json(record.read_text("utf-8"))
+        known, old = content.get("key"), [Path(name).name for name in content.get("frames", [])]
+    except (OSError, ValueError, AttributeError, TypeError):
+        known, old = None, []
     if known == key:
         return [path for path in paths if not path.is_file()]
     try:
-        for path in paths:
-            path.unlink(missing_ok=True)
+        for name in {*old, *(path.name for path in paths)}:
+            (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise unwritable(folder, error) from error
-    write_json(record, {"key": key})
+    write_json(record, {"key": key, "frames": [path.name for path in paths]})
     return list(paths)

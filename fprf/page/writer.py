@@ -16,7 +16,7 @@ from typing import Annotated, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..errors import DataError
+from ..errors import DataError, UsageError
 from ..interfaces import Scene
 from ..io.atomic import write_text
 from ..io.images import Picture, data_uri, shrink, to_uint8
@@ -93,7 +93,7 @@ def write_page(path: Path, page: Page, *, megabytes: float | None = None) -> int
     """Write the page to `path` (.html), whole or not at all; return how many Gaussians it shows.
 
     With `megabytes` (2^20 bytes), Gaussians that show least are left out until the file is no larger. Raises DataError where
-    the page without any Gaussian is larger.
+    a page of hardly any Gaussian is larger, UsageError where two looks have one name.
     """
     text, count = page_html(page, megabytes=megabytes, path=path)
     write_text(path, text)
@@ -102,6 +102,9 @@ def write_page(path: Path, page: Page, *, megabytes: float | None = None) -> int
 
 def page_html(page: Page, *, megabytes: float | None = None, path: Path = Path("page.html")) -> tuple[str, int]:
     """The text of a page that lies at `path`, and how many Gaussians it shows. Raises as `write_page`."""
+    names = [CAPTURED, *(style.name for style in page.styles)]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise UsageError(f"{path}: two looks are called {twice[0]!r}; rename the style's photograph or file")
     room = None if megabytes is None else int(megabytes * 2**20)
     fixed = _text(page, None, {})
     if (scene := page.scene) is None:
@@ -109,18 +112,19 @@ def page_html(page: Page, *, megabytes: float | None = None, path: Path = Path("
     harmonics = [scene.shown.harmonics, *(style.harmonics for style in page.styles if style.harmonics is not None)]
     # Pack all, and while it is too large keep the share that would fit, of the Gaussians that weigh most in the views.
     empty, kept = len(fixed.encode()), None
-    for _ in range(4):
+    for _ in range(16):
         _, head, parts = packed_scene(scene, harmonics, page.start, kept)
         text = _text(page, head, parts)
         size, count = len(text.encode()), int(head["count"])
         if room is None or size <= room:
             return text, count
-        share = (room - empty) / max(1, size - empty)
-        if share <= 0.02:
+        if room <= empty:
             break
+        share = (room - empty) / max(1, size - empty)
         # A little less than would fit by the mean: what shows most compresses least.
         kept = scene.seen.weights.topk(max(1, int(0.98 * share * count))).indices.sort().values
-    raise DataError(f"{path}: {empty / 2**20:.1f} MiB without any Gaussian; allow more than {megabytes:g} MiB")
+    sizes = f"{empty / 2**20:.1f} MiB without any Gaussian, {size / 2**20:.1f} MiB with {count}"
+    raise DataError(f"{path}: {sizes}; allow more than {megabytes:g} MiB")
 
 
 def notebook_html(scene: Scene, name: str, view: int, styled: tuple[str, Restyle] | None) -> str:
@@ -196,8 +200,9 @@ def _camera(cameras: Cameras, view: int, depth: float) -> dict[str, Any]:
 def _depth(scene: SplatScene, view: int) -> float:
     """Distance along a camera's axis of the middle of what its picture shows: median of the Gaussians in it."""
     camera = camera_of(scene.views, view)
-    # Of the Gaussians whose centres lie in the middle two thirds of the picture.
-    at = scene.gaussians.means.double() @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    # 100 000 are enough for a median, evenly taken. Of the Gaussians whose centres lie in the middle two thirds of the picture.
+    means = scene.gaussians.means
+    at = means[:: max(1, len(means) // 100_000)].double() @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     depth = at[:, 2].clamp_min(1e-9)
     middle = camera.intrinsics[:2, 2] + at[:, :2] / depth[:, None] * camera.intrinsics.diagonal()[:2]
     size = torch.tensor([camera.width, camera.height]).double()

@@ -221,7 +221,8 @@ def make_path(cameras: Cameras, views: Sequence[int], motion: str, frames: int, 
     """Cameras of a motion, or of a camera-path JSON file, about the `origin` that the captured `cameras` have.
 
     `interpolate` and `dataset` go through `views` of the captured `cameras`, the latter with their own lenses. `frames` are
-    those of a spiral or orbit, and about those of an interpolation; a file and the captured views bring their own number.
+    those of a spiral or orbit, and about those of an interpolation, which leaves out views where they are more; a file and the
+    captured views bring their own number.
     Raises UsageError for what is neither, DataError for a file that is no camera path.
     """
     chosen = torch.tensor(list(views), dtype=torch.int64)
@@ -233,6 +234,9 @@ def make_path(cameras: Cameras, views: Sequence[int], motion: str, frames: int, 
         return orbit(cameras, frames)
     if motion == "interpolate":
         order = tour(cameras, chosen)
+        at_least("frames", frames, 1)
+        if len(order) > frames:
+            order = order[torch.linspace(0, len(order) - 1, frames).round().long()]
         between = max(0, round((frames - 1) / max(1, len(order) - 1)) - 1)
         return interpolate(cameras, order, between)
     file = Path(motion)

@@ -24,6 +24,7 @@ from fprf.evaluation.metrics import psnr
 from fprf.export.fit import seen_points
 from fprf.export.mesh import render_maps
 from fprf.io import images
+from fprf.rendering.paths import make_path, write_camera_path
 from fprf.splats.files import read_capture
 from fprf.splats.photographs import camera_of
 from fprf.splats.views import draw
@@ -83,16 +84,21 @@ def test_frames_that_are_there_are_not_made_again(run: Path, tmp_path: Path, cap
     assert not any(np.array_equal(whole[name], picture) for name, picture in others.items())
 
 
-def test_an_interrupted_film_goes_on(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_film_goes_on(run: Path, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     film = tmp_path / "x.mp4"
     args = ["render", str(run), *ORBIT, "4", "--output", str(film)]
     write = Mock(wraps=images.write_image, side_effect=[DEFAULT, DEFAULT, KeyboardInterrupt])
     monkeypatch.setattr(images, "write_image", write)
     assert cli.main(args) == 130 and not film.exists()
     write.side_effect = None
+    (mine := tmp_path / "x.frames" / "00000.png").parent.mkdir()
+    mine.write_text("stays")
     assert cli.main(args) == 0 and film.is_file()
     assert [call.args[0].name for call in write.call_args_list] == [f"0000{k}.png" for k in (0, 1, 2, 2, 3)]
-    assert not (tmp_path / "x.frames").exists()
+    assert mine.read_text() == "stays" and not (tmp_path / ".x.frames").exists()
+    write_camera_path(tmp_path / "path.json", make_path(world.load().cameras, [0], "dataset", 1), 5)
+    assert cli.main(["render", str(run), "--path", str(tmp_path / "path.json"), "--output", str(film)]) == 0
+    assert cv2.VideoCapture(str(film)).get(cv2.CAP_PROP_FPS) == 5
 
 
 def gallery(run: Path, *words: str) -> str:
@@ -146,6 +152,9 @@ def test_style_files_are_styles_of_the_page(run: Path, world: World) -> None:
     style.write_text(json.dumps({"format": 1, "style": {"references": references, "strength": 0.5}}))
     page = gallery(run, "--styles", str(style), "--views", "0000")
     assert [style["name"] for style in data_of(page)["styles"]] == ["Captured", "mine"]
+    captured = shutil.copy(references[0], run.parent / "Captured.jpg")
+    page = gallery(run, "--references", str(captured), "--views", "0000")
+    assert [style["name"] for style in data_of(page)["styles"]] == ["Captured", "Captured (1)"]
     page = gallery(run, "--references", references[0], "--between", str(style), "--views", "0000")
     assert [style["name"] for style in data_of(page)["styles"]] == ["Captured", "dusk"], "on the way to another style"
 

@@ -15,6 +15,7 @@ from itertools import count
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 import safetensors.torch
 import torch
@@ -22,6 +23,7 @@ from tiny_world import World, after_one_step, flags, parameters, save_checkpoint
 
 from fprf.cli import main as cli
 from fprf.errors import CheckpointError, DataError
+from fprf.io.video import write_video
 from fprf.training import checkpoint
 from fprf.training.model import Model
 from fprf.training.run import Run, lock_folder
@@ -133,6 +135,18 @@ def test_a_file_that_the_system_cuts_off_is_one_line_and_costs_nothing(root: Pat
     assert "model.safetensors: cannot be written (" in line and "KiB are needed, " in line and "\n" not in line
     assert checkpoint.steps(root) == [5, 9] and marked(root, model) == (9, 9.0)
     assert sorted(p.name for p in root.iterdir()) == ["step-0000005", "step-0000009"]
+
+
+def test_a_film_that_the_system_cuts_off_is_no_film(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (60, 64, 64, 3), np.uint8)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    try:
+        with pytest.raises(DataError, match="0 of 60 frames"):
+            write_video(tmp_path / "x.mp4", noise, 24, h264=False)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_that_cannot_be_written_to_is_told_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:

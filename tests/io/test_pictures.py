@@ -143,6 +143,9 @@ def test_missing_frames_are_those_not_there(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("stays")
     assert missing_frames(tmp_path, "a", paths) == [paths[0], paths[2]]
     assert missing_frames(tmp_path, "b", paths) == paths and not paths[1].exists() and (tmp_path / "mine.txt").is_file()
+    for path in paths:
+        path.write_bytes(b"x")
+    assert missing_frames(tmp_path, "c", paths[:1]) == paths[:1] and not paths[2].exists(), "frames of a longer film"
     (tmp_path / ".render.json").write_text("damaged")
     assert missing_frames(tmp_path, "b", paths) == paths
 

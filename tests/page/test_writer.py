@@ -17,9 +17,9 @@ import torch
 from pages import page_of, recoloured, seen, street, written
 from splat_ball import ball
 
-from fprf.errors import DataError
+from fprf.errors import DataError, UsageError
 from fprf.page.pack import CHUNK, fit_maps, pack
-from fprf.page.writer import PageView, Style, write_page
+from fprf.page.writer import PageView, Style, page_html, write_page
 from fprf.splats.files.base import three_to_four
 from fprf.splats.gaussians import HARMONIC, Gaussians
 
@@ -122,6 +122,11 @@ def test_a_budget_drops_what_shows_least(tmp_path: Path) -> None:
     kept = write_page(tmp_path / "some.html", small, megabytes=0.6 * whole / 2**20)
     size = (tmp_path / "some.html").stat().st_size
     assert count == 20_000 > kept > 1000 and 0.45 * whole < size <= 0.6 * whole
+    one = replace(small, views=small.views[:1])
+    fixed = len(page_html(replace(one, scene=None))[0].encode())
+    assert 20 < page_html(one, megabytes=(fixed + 0.01 * (whole - fixed)) / 2**20)[1] < 200, "few of many"
+    with pytest.raises(UsageError, match="two looks are called 'Captured'"):
+        write_page(tmp_path / "none.html", replace(small, styles=[small.styles[0]._replace(name="Captured")]))
     with pytest.raises(DataError, match="without any Gaussian"):
         write_page(tmp_path / "none.html", small, megabytes=0.01)
     assert not (tmp_path / "none.html").exists()

@@ -151,6 +151,12 @@ def test_interpolation_passes_through_its_views(views: int, between: int, seed: 
     assert bool((path.lens == 0).all()) and path.size.tolist() == [[100, 80]] * len(path)
 
 
+@pytest.mark.parametrize("frames", [1, 2, 7, 12, 99])
+def test_an_interpolation_has_about_the_frames_asked_for(frames: int) -> None:
+    made = len(make_path(around(12), range(12), "interpolate", frames))
+    assert made == (frames if frames <= 12 else 100)
+
+
 @given(st.integers(0, 1000))
 def test_look_at_is_level_and_survives_looking_along_up(seed: int) -> None:
     position, target = random(6, seed), random(6, seed + 7)
