@@ -192,8 +192,16 @@ class Start:
         if bool(self._stopped):  # not narrowed by mypy: another thread sets it
             raise _Left
         command = [sys.executable, "-m", "fprf", *args]
+        # A group of its own: an interrupt at the terminal is ours alone, and a second one would end it before it has saved.
         with subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace"
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            process_group=0,
+            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
         ) as process:
             self._process = process
             assert process.stdout is not None
@@ -236,7 +244,7 @@ class Start:
         process = self._process
         if process is not None:
             with contextlib.suppress(OSError):
-                process.send_signal(signal.SIGINT)
+                process.send_signal(getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT))
             last = threading.Timer(_EXIT_TIMEOUT, process.kill)
             last.daemon = True
             last.start()

@@ -1,5 +1,6 @@
 """The start page without a browser, and following a run: programs that find poses and train are stood in for by a script."""
 
+import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator
@@ -115,6 +116,8 @@ def test_a_scene_in_training_is_shown_until_it_is_left(page: Shown, photographs:
     state = page.reached(stage="training", share=0.5)
     assert state["detail"] == "step 7 · 20.0 dB · 1:01 left"
     until(lambda: len(page.shown) == 1)
+    # An interrupt at the terminal does not reach it past the viewer, whose own would be the second.
+    assert page._process is not None and os.getpgid(page._process.pid) == page._process.pid
     with pytest.raises(UsageError, match="yard is being made"):
         page.handle(Open(path=str(photographs)))
     page.handle(asked)
