@@ -40,7 +40,6 @@ from .start import Start
 if TYPE_CHECKING:
     from .session import Session, Viewed
 
-COOKIE = "fprf-token"
 _MIN_TOKEN = 16
 """Characters of a token that a user chooses."""
 _ANY_ADDRESS = ("0.0.0.0", "::")  # nosec B104  # recognised, never the default
@@ -98,12 +97,18 @@ class Access:
             return "another site may not talk to this viewer"
         if self.token is None:
             return None
-        kept = cookie_parser(headers.get("cookie", "")).get(COOKIE)
+        kept = cookie_parser(headers.get("cookie", "")).get(cookie_name(name))
         # Compared in constant time: how long it takes tells nothing of how much is right.
         shown = given or kept or headers.get("authorization", "").removeprefix("Bearer ")
         if hmac.compare_digest(shown.encode(), self.token.encode()):
             return None
         return "a token is needed; open the whole address that `fprf view` printed"
+
+
+def cookie_name(host: str) -> str:
+    """Name of the token's cookie under a Host header: with its port, since browsers send cookies to all ports of a host."""
+    port = host.rpartition(":")[2]
+    return f"fprf-token-{port if port.isdecimal() else 80}"
 
 
 def make_access(host: str, token: str | None) -> Access:
@@ -171,9 +176,11 @@ class Guard:
             if refused is not None:
                 await PlainTextResponse(f"{refused[1]}\n", refused[0])(scope, receive, patient)
             elif given is not None and scope["type"] == "http" and scope["method"] == "GET":
-                # Out of the address bar and its history; the cookie is sent to this server alone.
+                # Out of the address bar and its history. Lax: a link on another site opens the page too; what changes
+                # anything has an Origin, which is checked.
                 response = RedirectResponse(scope["path"], 303)
-                response.headers["set-cookie"] = f"{COOKIE}={given}; Path=/; HttpOnly; SameSite=Strict"
+                name = cookie_name(connection.headers.get("host", ""))
+                response.headers["set-cookie"] = f"{name}={given}; Path=/; HttpOnly; SameSite=Lax"
                 await response(scope, receive, patient)
             else:
                 await self._app(scope, receive, patient)

@@ -16,11 +16,12 @@ from websockets.sync.client import ClientConnection, connect
 
 from fprf.errors import UsageError
 from fprf.page import server
-from fprf.page.server import COOKIE, Access, Client, ViewerServer, make_access
+from fprf.page.server import Access, Client, ViewerServer, cookie_name, make_access
 
 HERE = Access("127.0.0.1", None)
 TOKEN = "a-token-of-sixteen-characters"
 THERE = Access("0.0.0.0", TOKEN)
+COOKIE = "fprf-token-8080"
 
 
 def test_this_machine_alone_is_let_in_by_its_names_and_from_its_own_pages() -> None:
@@ -41,6 +42,9 @@ def test_from_elsewhere_a_token_is_needed_in_one_of_three_places() -> None:
     assert THERE.refusal(host, "wrong-token-of-16-chars") is not None
     assert THERE.refusal(host, "töken-that-is-no-ascii") is not None
     assert THERE.refusal({**host, "cookie": f"{COOKIE}=x{TOKEN}"}) is not None
+    both = {"cookie": f"{COOKIE}={TOKEN}; fprf-token-8081=another; fprf-token-80={TOKEN}"}  # viewers on other ports
+    assert THERE.refusal({**host, **both}) is None and THERE.refusal({"host": "[::1]:8081", **both}) is not None
+    assert THERE.refusal({"host": "[::1]", **both}) is None
     assert THERE.refusal({**host, "origin": "http://evil.example", "cookie": f"{COOKIE}={TOKEN}"}) is not None
 
 
@@ -165,11 +169,11 @@ def test_a_token_in_the_address_becomes_a_cookie() -> None:
     with Probe(Access("127.0.0.1", TOKEN), 0) as http:
         assert http.address.endswith(f"/?token={TOKEN}")
         assert status(http, "GET /scene") == status(http, "GET /") == status(http, "GET /?token=wrong") == 403
-        answer = request(http, f"GET /?token={TOKEN}")
+        answer, name = request(http, f"GET /?token={TOKEN}"), cookie_name(f"127.0.0.1:{http.port}")
         assert answer.startswith(b"HTTP/1.1 303 ") and b"location: /\r\n" in answer
-        assert f"set-cookie: {COOKIE}={TOKEN}; Path=/; HttpOnly; SameSite=Strict".encode() in answer
-        assert status(http, "GET /", f"Cookie: {COOKIE}={TOKEN}") == 200
-        assert status(http, "POST /echo", f"Cookie: {COOKIE}={TOKEN}", "Content-Length: 0") == 200
+        assert f"set-cookie: {name}={TOKEN}; Path=/; HttpOnly; SameSite=Lax".encode() in answer
+        assert status(http, "GET /", f"Cookie: {name}={TOKEN}") == 200
+        assert status(http, "POST /echo", f"Cookie: {name}={TOKEN}", "Content-Length: 0") == 200
         assert status(http, "POST /echo", "Content-Length: 0") == 403
         with pytest.raises(InvalidStatus) as told, opened(http):
             pass
