@@ -7,6 +7,7 @@ more often.
 """
 
 import json
+import secrets
 import threading
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -84,6 +85,8 @@ class Session:
 
     def __init__(self, viewed: Viewed, post: Post) -> None:
         self.viewed, self._post = viewed, post
+        self._key = secrets.token_hex(8)
+        """Tells pages that a server's scene is another one, also after the server was started anew."""
         self.restyler = Restyler(viewed.scene)
         self.state = State(look=Look(style=viewed.style), together=len(viewed.references) > 1)
         self.uploads = Uploads()
@@ -122,7 +125,7 @@ class Session:
     def hello(self) -> list[tuple[str, dict[str, Any]]]:
         """What a new client has to know."""
         drawn_there, viewed = isinstance(self.viewed.scene, SplatScene), self.viewed
-        scene = {"type": "scene", "name": viewed.name, "gaussians": drawn_there, "step": viewed.step}
+        scene = {"type": "scene", "key": self._key, "name": viewed.name, "gaussians": drawn_there, "step": viewed.step}
         ready = [("colours " + name, self._colours_message(name)) for name in self._colours]
         training = [] if self._progress is None else [("training", self._progress)]
         return [("scene", scene), ("state", self.state.described()), *ready, *training]

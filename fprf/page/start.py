@@ -110,12 +110,9 @@ class Start:
                     ours = whole.name == _FILES and whole.parent.parent == self._output
                     name = whole.parent.name if ours else self._unused(path.stem)
                 self._begin(source, name, asked.minutes)
-            case Stop():
-                busy = self._busy  # asked before it ends by this very request
+            case Stop() if self._progress.error is None:
                 self._interrupt("stop")
-                if not busy:  # a failure is put away
-                    self._tell(Progress())
-            case Leave():
+            case Stop() | Leave():  # a failure is put away, with what is shown of it
                 if self._busy:
                     self._interrupt("leave")
                 self._progress = Progress()

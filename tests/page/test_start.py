@@ -40,6 +40,9 @@ checkpoint.mkdir(parents=True)
 (checkpoint / "manifest.json").touch()
 line = {{"event": "training", "step": 7, "share": 0.5, "psnr": 20.0, "seconds_left": 61}}
 print(json.dumps(line), file=sys.stderr, flush=True)
+if args[args.index("--minutes") + 1] == "3":
+    time.sleep(1)
+    sys.exit("error: out of memory")
 if args[args.index("--minutes") + 1] != "1":
     time.sleep(100)
 """
@@ -138,6 +141,15 @@ def test_a_failure_is_told_and_nothing_is_lost(page: Shown, photographs: Path, t
     page.reached(error="of two dimensions")
     assert (tmp_path / "made" / scene / "files" / "x.ply").read_bytes() == b"ply\n"
     assert page.handle(New(name="My capture.ply"))["scene"] == "My-capture-ply-2"
+
+
+def test_a_training_that_failed_past_its_first_checkpoint_is_put_away(page: Shown, photographs: Path) -> None:
+    page.handle(Open(path=str(photographs), minutes=3))
+    page.reached(error="out of memory")
+    assert len(page.shown) == 1
+    page.handle(Stop())
+    page.reached(stage="idle")
+    assert page.shown == []
 
 
 def test_requests_that_make_no_sense_are_refused(page: Shown) -> None:
