@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import os
+import signal
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -70,6 +71,10 @@ def run(args: list[str]) -> int:
     """Serve until interrupted."""
     description = "Look at a run in the browser; without one, make a scene there of photographs, a video or a capture."
     config = parse(ViewConfig(), args, prog="fprf view", description=description, positional=("run",))
+    # Other ends than an interrupt clean up too; one that is ignored, as under nohup, stays so.
+    for name in ("SIGTERM", "SIGHUP"):
+        if (number := getattr(signal, name, None)) is not None and signal.getsignal(number) == signal.SIG_DFL:
+            signal.signal(number, signal.default_int_handler)
     from ..page.server import ViewerServer, make_access
 
     access = make_access(config.host, config.token)

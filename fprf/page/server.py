@@ -142,6 +142,10 @@ class _Protocol(H11Protocol):  # type: ignore[misc]  # uvicorn's types are not f
             transport.close()
 
 
+class _GoneError(Exception):
+    """The client has gone or is too slow; no OSError, which is a fault of this machine that the client is told."""
+
+
 class Guard:
     """Middleware that answers nobody who may not ask, adds headers, and drops clients that do not read."""
 
@@ -166,13 +170,16 @@ class Guard:
                 message = {**message, "headers": [*kept, *added]}
             # A body goes in pieces, each of which the client must take in time.
             body, start = message.get("body", b""), 0
-            while len(body) - start > _PIECE:
-                piece = {"type": message["type"], "body": body[start : start + _PIECE], "more_body": True}
-                await asyncio.wait_for(send(piece), _TIMEOUT)
-                start += _PIECE
-            await asyncio.wait_for(send({**message, "body": body[start:]} if start else message), _TIMEOUT)
+            try:
+                while len(body) - start > _PIECE:
+                    piece = {"type": message["type"], "body": body[start : start + _PIECE], "more_body": True}
+                    await asyncio.wait_for(send(piece), _TIMEOUT)
+                    start += _PIECE
+                await asyncio.wait_for(send({**message, "body": body[start:]} if start else message), _TIMEOUT)
+            except OSError as error:
+                raise _GoneError from error
 
-        with contextlib.suppress(OSError, TimeoutError):  # the client has gone or is too slow
+        with contextlib.suppress(_GoneError):
             if refused is not None:
                 await PlainTextResponse(f"{refused[1]}\n", refused[0])(scope, receive, patient)
             elif given is not None and scope["type"] == "http" and scope["method"] == "GET":
@@ -232,8 +239,8 @@ class ViewerServer:
             fault = f"--host {access.host} --port {port}: cannot listen there ({error.strerror}); choose another port"
             raise UsageError(fault) from error
         self.port: int = listener.getsockname()[1]
-        # A mistake of the page's user is a line in the answer.
-        wrong = {FprfError: lambda request, error: PlainTextResponse(str(error), 400)}
+        # A mistake of the page's user, or what this machine cannot do, is a line in the answer.
+        wrong = dict.fromkeys((FprfError, OSError), lambda request, error: PlainTextResponse(_line(error), 400))
         app = Starlette(routes=self._routes(), middleware=[Middleware(Guard, access=access)], exception_handlers=wrong)
         # Bounded connections, heads and messages; no proxy is believed, and nothing of a request is logged.
         config = uvicorn.Config(
@@ -372,8 +379,8 @@ class ViewerServer:
                 if session is not None:
                     try:
                         session.handle(number, message)
-                    except FprfError as error:
-                        client.put("said", json.dumps({"type": "said", "text": str(error), "bad": True}))
+                    except (FprfError, OSError) as error:
+                        client.put("said", json.dumps({"type": "said", "text": _line(error), "bad": True}))
 
         # Whichever ends first, a client that leaves or one that does not read, ends the other.
         ways = [asyncio.create_task(receive()), asyncio.create_task(client.send(socket))]
@@ -463,6 +470,11 @@ class ViewerServer:
             except TimeoutError:
                 raise HTTPException(408, "the request came too slowly") from None
         raise HTTPException(413, f"more than {_MAX_BODY} bytes: make the photograph smaller")
+
+
+def _line(error: Exception) -> str:
+    """What an error says; of the system's, where and what."""
+    return f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
 
 
 def _integer(request: Request, name: str) -> int:

@@ -315,7 +315,6 @@ class Session:
                 raise UsageError("this scene has no folder to put a film in")
             films, scene = self.viewed.root / "films", self.viewed.scene
             folder = next(each for number in count(1) if not (each := films / f"{number:04d}").exists())
-            folder.mkdir(parents=True)
             write_film_files(folder, self.state.keys, seconds, scene)
             self.apply(lambda state: replace(state, film=(0, 1, None)))
 

@@ -7,6 +7,7 @@ their poses, and the run folder `run`.
 
 import contextlib
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -102,7 +103,7 @@ class Start:
                 # A file or folder of this machine, by its path as it is copied from elsewhere.
                 if not (text := asked.path.strip().strip("\"'")):
                     raise UsageError("name a run folder, a capture, a video or a folder of photographs")
-                path = Path(text).expanduser()
+                path = Path(os.path.expanduser(text))  # as it is where there is no such user
                 source, whole = find_source(path), path.resolve()
                 if source.kind == "run":
                     name = whole.parent.name if whole.name == _RUN else whole.name

@@ -6,6 +6,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import pytest
 from starlette.requests import Request
@@ -67,7 +68,10 @@ class Probe(ViewerServer):
         async def film(request: Request) -> Response:
             return Response(b"x" * (64 << 20), media_type="video/mp4")
 
-        return [Route("/echo", echo, methods=["POST"]), Route("/film64", film), *super()._routes()]
+        async def full(request: Request) -> Response:
+            raise PermissionError(13, "Permission denied", "/made/yard")
+
+        return [Route("/full", full), Route("/echo", echo, methods=["POST"]), Route("/film64", film), *super()._routes()]
 
 
 @pytest.fixture
@@ -136,6 +140,19 @@ def test_bodies_and_queries_arrive(http: ViewerServer) -> None:
 def test_what_is_wrong_is_refused(http: ViewerServer, line: str, headers: tuple[str, ...], body: bytes, expected: int) -> None:
     assert status(http, line, *headers, body=body) == expected
     assert status(http, "GET /") == 200
+
+
+def test_what_the_system_refuses_is_told(http: ViewerServer) -> None:
+    answer = request(http, "GET /full")
+    assert answer.startswith(b"HTTP/1.1 400 ") and answer.endswith(b"/made/yard: Permission denied")
+
+    def handle(client: int, message: object) -> None:
+        raise OSError(28, "No space left on device", "/films")
+
+    http._session = SimpleNamespace(hello=list, handle=handle, disconnect=str)  # type: ignore[assignment]
+    with opened(http) as client:
+        client.send(GOOD)
+        assert json.loads(client.recv())["text"] == "/films: No space left on device"
 
 
 def test_nonsense_and_half_heads_end_their_own_connection_alone(http: ViewerServer) -> None:

@@ -154,7 +154,8 @@ def test_a_training_that_failed_past_its_first_checkpoint_is_put_away(page: Show
 
 def test_requests_that_make_no_sense_are_refused(page: Shown) -> None:
     empty = page.handle(New(name=""))["scene"]
-    for asked in (Make(scene=empty), Make(scene="../yard"), Open(path=" "), Open(path="/no/such")):
+    wrong = (Open(path=" "), Open(path="/no/such"), Open(path="~nobody-here/x"))
+    for asked in (Make(scene=empty), Make(scene="../yard"), *wrong):
         with pytest.raises(FprfError):
             page.handle(asked)
     with pytest.raises(UsageError):
