@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..checks import at_least, between
-from ..errors import CheckpointError
+from ..errors import CheckpointError, UsageError
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from ..splats.config import GaussianSemanticsConfig
 from ..style.config import StyleConfig
@@ -75,6 +75,7 @@ def run(args: list[str]) -> int:
     for name in ("SIGTERM", "SIGHUP"):
         if (number := getattr(signal, name, None)) is not None and signal.getsignal(number) == signal.SIG_DFL:
             signal.signal(number, signal.default_int_handler)
+    from ..page.messages import SHELF
     from ..page.server import ViewerServer, make_access
 
     access = make_access(config.host, config.token)
@@ -85,12 +86,16 @@ def run(args: list[str]) -> int:
 
         # `--follow` waits for a run folder that training has not made yet.
         path = config.run
+        if config.follow and path is not None and is_capture(path):
+            raise UsageError(f"--follow: {path} is a capture, which no training goes on with; leave it out")
         if path is not None and not (config.follow or is_capture(path) or (path / "config.json").is_file()):
             raise CheckpointError(f"{path}: no config.json here, so it is no run folder; `fprf train` makes one")
         if any(each.is_dir() for each in config.references):  # decoding needs a library that the page does not wait for
             from ..datamanagers.images import photographs
 
             config = replace(config, references=tuple(photographs(config.references, say)))
+        if len(config.references) > SHELF:
+            raise UsageError(f"--references: {len(config.references)} photographs; at most {SHELF} fit on the shelf; name fewer")
         print(server.address, flush=True)
         load = functools.partial(_load, config, server.notify)
         try:

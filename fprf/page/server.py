@@ -307,7 +307,11 @@ class ViewerServer:
         self._close_session()
         session = self._opened.enter_context(Session(viewed, self.post))
         for path in viewed.references:
-            session.upload(path.read_bytes(), path.name)
+            try:
+                session.upload(path.read_bytes(), path.name)
+            except (DataError, OSError) as error:
+                why = error.strerror if isinstance(error, OSError) else str(error).removeprefix("photograph: ")
+                raise DataError(f"{path}: {why}") from error
         if warm:
             session.warm_up()
         self._session = session

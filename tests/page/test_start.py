@@ -14,8 +14,9 @@ from fprf.errors import CheckpointError, DataError, FprfError, UsageError
 from fprf.page import start as start_module
 from fprf.page.messages import Leave, Make, New, Open, Stop
 from fprf.page.server import Access, ViewerServer
-from fprf.page.session import TrainingFollower, Viewed, training_progress, view_of_run
+from fprf.page.session import TrainingFollower, Viewed, view_of_run
 from fprf.page.start import Start
+from fprf.page.uploads import training_progress
 from fprf.training.driver import is_watched
 from fprf.training.loading import open_run
 
@@ -35,16 +36,20 @@ if verb == "process":
     sys.exit(0)
 assert pathlib.Path(args[args.index("--data") + 1], "transforms.json").is_file()
 checkpoint = output / "checkpoints" / "step-0000007"
-checkpoint.mkdir(parents=True)
+checkpoint.mkdir(parents=True, exist_ok=True)
 (output / "config.json").touch()
 (checkpoint / "manifest.json").touch()
 line = {{"event": "training", "step": 7, "share": 0.5, "psnr": 20.0, "seconds_left": 61}}
 print(json.dumps(line), file=sys.stderr, flush=True)
 if args[args.index("--minutes") + 1] == "3":
+    (output / "events.jsonl").write_text("\\n" + json.dumps({{**line, "seconds": 9}}))
     time.sleep(1)
     sys.exit("error: out of memory")
 if args[args.index("--minutes") + 1] != "1":
-    time.sleep(100)
+    try:
+        time.sleep(100)
+    except KeyboardInterrupt:
+        time.sleep(0.5)  # it saves
 """
 
 
@@ -148,8 +153,13 @@ def test_a_training_that_failed_past_its_first_checkpoint_is_put_away(page: Show
     page.reached(error="out of memory")
     assert len(page.shown) == 1
     page.handle(Stop())
-    page.reached(stage="idle")
-    assert page.shown == []
+    recent = page.reached(stage="idle")["recent"]
+    assert page.shown == [] and [(row["name"], row["kind"]) for row in recent] == [("yard", "trained"), ("yard", "train on")]
+    page.handle(Open(path=recent[1]["path"]))
+    page.reached(name="yard", stage="training", share=0.5)
+    page.handle(Leave())
+    with pytest.raises(UsageError, match="the scene before is being saved"):
+        page.handle(Open(path=str(photographs)))
 
 
 def test_requests_that_make_no_sense_are_refused(page: Shown) -> None:
