@@ -95,7 +95,7 @@ def run(args: list[str]) -> int:
 
             config = replace(config, references=tuple(photographs(config.references, say)))
         if len(config.references) > SHELF:
-            raise UsageError(f"--references: {len(config.references)} photographs; at most {SHELF} fit on the shelf; name fewer")
+            raise UsageError(f"--references: {len(config.references)} photographs; the shelf takes {SHELF}: name fewer")
         print(server.address, flush=True)
         load = functools.partial(_load, config, server.notify)
         try:

@@ -132,7 +132,7 @@ class Start:
         with self._lock:
             if self._busy:
                 name = self._progress.name  # none after `leave`, while what there is of it is saved
-                raise UsageError(f"{name} is being made; stop it first" if name else "the scene before is being saved; try again")
+                raise UsageError(f"{name} is being made; stop it first" if name else "a scene is being saved; try again")
             # One scene is made at a time: training takes all cores.
             self._stopped = ""
             folder = self._output / name if source.kind != "run" else source.path

@@ -83,7 +83,7 @@ MISTAKES = """
     view run --host no.such.host.invalid --port 0 --token a-long-enough-token | no.such.host.invalid
     view photos --port 0 | no config.json
     view photos.ply --port 0 --follow | --follow
-    view run --port 0 --references 1 2 3 4 5 6 7 8 9 10 11 12 13 | at most 12
+    view run --port 0 --references 1 2 3 4 5 6 7 8 9 10 11 12 13 | takes 12
 """
 
 

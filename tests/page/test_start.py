@@ -158,7 +158,7 @@ def test_a_training_that_failed_past_its_first_checkpoint_is_put_away(page: Show
     page.handle(Open(path=recent[1]["path"]))
     page.reached(name="yard", stage="training", share=0.5)
     page.handle(Leave())
-    with pytest.raises(UsageError, match="the scene before is being saved"):
+    with pytest.raises(UsageError, match="a scene is being saved"):
         page.handle(Open(path=str(photographs)))
 
 
