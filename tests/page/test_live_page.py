@@ -163,7 +163,8 @@ def test_a_page_keeps_up_with_its_server(world: World) -> None:
             page.locator("[data-look=strength]").fill("0.5")
             page.wait_for_function("() => fprf.stage.to === 'Now'")
             # A page that was away for a moment asks for its view again.
-            page.evaluate("() => { fprf.place.touch = (moved = true) => { window.before ||= moved; }; fprf.live.socket.close(); }")
+            page.evaluate("() => { fprf.place.touch = (moved = true) => { window.before ||= moved; }; }")
+            page.evaluate("() => fprf.live.socket.close()")
             page.wait_for_function("() => window.before")
             # Another scene of the same name and step begins anew.
             server.open(lambda: replace(viewed, step=1), warm=False)

@@ -71,6 +71,9 @@ class Shown(Start):
     def open(self, load: Callable[[], Any], *, warm: bool = True) -> Any:
         return load()
 
+    def trained(self, progress: Any) -> None:
+        """A session's."""
+
     def show_start(self, start: Start) -> None:
         self.shown.clear()
 
