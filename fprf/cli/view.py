@@ -44,7 +44,7 @@ class ViewConfig(QualityConfig):
     stylizer: StylizerConfig | None = None
     """Stylizer that puts styles onto regions; none = region-tone, as `fprf stylize` and `fprf restyle` have it."""
     references: tuple[Path, ...] = ()
-    """Photographs, or folders of them, to begin with: on the shelf, and all in the mix."""
+    """At most 12 photographs, or folders of them, to begin with: on the shelf, and all in the mix."""
     host: str = "127.0.0.1"
     """Address to listen on; any but this machine's own needs a token."""
     port: int = 8080
