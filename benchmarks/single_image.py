@@ -85,7 +85,9 @@ def flat_look(flat: Flat, dictionary: StyleDictionary, config: StylizerConfig, d
         light = light_of(flat.style, dictionary, config, own, bold=StyleConfig.bold)
         light = None if light is None else light.to(device)
     if decoder is None:
-        maps = region_maps(stylizer, dictionary, flat.style, config)
+        maps = region_maps(
+            stylizer, dictionary, flat.style, config, torch.ones(len(flat.style.share), len(dictionary.names)).bool()
+        )
         return Restyle(stylizer, features=config.features if maps is None else 0.0, colours=maps, light=light)
     smoothing = config.smoothing(flat.style)
     colours = colour_maps(

@@ -32,7 +32,7 @@ from .splats.files import Capture, write_capture
 from .splats.gaussians import Gaussians
 from .style.config import StyleConfig, with_preset
 from .style.dictionary import Encoders
-from .style.files import StyleFile, check_photographs, read_style, with_folders, write_style
+from .style.files import StyleFile, check_photographs, read_style, write_style
 from .style.look import Restyle
 from .style.match_maps import MatchMap, match_map
 from .style.restyle import Styled, apply_style, mixed
@@ -154,7 +154,7 @@ class TrainedScene:
             forbid=tuple(forbid),
             keep=tuple(keep),
         )
-        return self.apply(with_folders(style if preset is None else with_preset(style, preset)))
+        return self.apply(style if preset is None else with_preset(style, preset))
 
     def apply(self, style: StyleConfig | PathLike) -> "TrainedScene":
         """The scene in a style that is written down: a config, or a style.json of `fprf stylize`. Raises as `stylize`."""
@@ -169,7 +169,11 @@ class TrainedScene:
         """On the way from this style (0) to that of `other` (1), point by point. Raises UsageError without two styles."""
         if self.styled is None or other.styled is None or self.encoders is not other.encoders:
             raise UsageError("towards: both must be styles of one loaded scene; call `stylize` on the same scene for each")
-        return replace(self, styled=mixed(self.styled, other.styled, at))
+        mix = mixed(self.styled, other.styled, at)
+        # What is between two styles already is no longer what its file says: `save_style` tells a mix by this.
+        saved = mix.controls.saved
+        saved = saved._replace(style=replace(saved.style, between=None))
+        return replace(self, styled=mix._replace(controls=mix.controls._replace(saved=saved)))
 
     def plain(self) -> "TrainedScene":
         """The scene as it was captured."""
@@ -273,7 +277,7 @@ class FinishedCapture:
             luminance=luminance,
             stylizer=RegionToneConfig(centred=False) if stylizer is None else stylizer,
         )
-        styled = apply_style(seen().scene, StyleFile(with_folders(style)))
+        styled = apply_style(seen().scene, StyleFile(style))
         styled = light_alone(styled) if match_light else styled
         return replace(self, harmonics=seen().harmonics(0, self.capture, styled.restyle), seen=seen)
 

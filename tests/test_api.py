@@ -2,6 +2,7 @@ import html
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -56,6 +57,16 @@ def test_a_style_file_goes_out_and_comes_back(scene: TrainedScene, world: World,
     assert torch.allclose(styled.render(2).rgb, again.render(2).rgb, atol=1e-6)
     config = StyleConfig(references=world.references, weights=(1, 3), keep=("1",), luminance=0.5)
     assert torch.equal(styled.render(2).rgb, scene.apply(config).render(2).rgb)
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for path in world.references:
+        shutil.copy(path, folder)
+    (tmp_path / "by_hand.json").write_text('{"format": 1, "style": {"references": ["folder"]}}')
+    assert set(scene.apply(tmp_path / "by_hand.json").references) == {"dusk.png", "snow.png"}
+    between = scene.apply(replace(config, between=tmp_path / "by_hand.json"))
+    between.save_style(tmp_path / "between.json")
+    with pytest.raises(UsageError, match="a mix has no file"):
+        between.towards(styled, 0.5).save_style(tmp_path / "mix.json")
 
 
 def test_matches_of_any_camera(scene: TrainedScene, world: World) -> None:

@@ -70,6 +70,8 @@ BEYOND = 1.25
 """Rays end at most so many times farther than what is seen around them."""
 VIEWS = 256
 """Views whose tiles are looked at together: bounds memory, changes nothing."""
+_ROWS = 1 << 24
+"""Rows that `Tensor.quantile` takes, at most."""
 
 State = TypeVar("State")
 Box = tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]
@@ -97,6 +99,7 @@ def bounds(site: Site) -> Box:
     inside = site.points[((site.points >= low) & (site.points <= high)).all(1)]
     if len(inside) < FEW:
         return low, high
+    inside = inside[:: -(-len(inside) // _ROWS)]
     ends = inside.quantile(torch.tensor([OUTLIERS, 1 - OUTLIERS], dtype=inside.dtype), 0)
     room = PADDING * (ends[1] - ends[0]) + 1e-6
     least, most = site.position.amin(0), site.position.amax(0)

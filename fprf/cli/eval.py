@@ -1,7 +1,6 @@
 """`fprf eval RUN`: measure a run on views it has not seen."""
 
 import math
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,12 +9,14 @@ from typing import TYPE_CHECKING, Any, Literal
 from rich.console import Console
 from rich.table import Table
 
+from ..checks import at_least
 from ..errors import UsageError
 from ..progress import Display
 from ..training.quality import QualityConfig
 from .parsing import parse
 
 if TYPE_CHECKING:
+    from ..datamanagers.images import Image
     from ..training.run import History
 
 
@@ -45,17 +46,22 @@ class EvalConfig(QualityConfig):
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.size is not None:
+            at_least("size", self.size, 1)
+
 
 def run(args: list[str]) -> int:
     """Render the split, write metrics.json, print a table."""
     description = "Measure a run: PSNR, SSIM, speed, memory, consistency over views."
     config = parse(EvalConfig(), args, prog="fprf eval", description=description, positional=("run",))
-    metrics = evaluate(config)
+    # First, since views take long to judge: where this is refused nothing is lost.
     if config.tensorboard is not None:
         from ..training.run import read_history
 
         write_scalars(config.tensorboard, read_history(config.run))
-    _print(metrics)
+    _print(evaluate(config))
     return 0
 
 
@@ -82,11 +88,16 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
     if tuple(view_names(captured.paths)) != known.names:
         raise UsageError(f"{trained.data}: its images are not those of the run; name the folder with --data")
     # What a person looks at are the photographs, whatever size they were trained at.
-    longest, before = int(captured.cameras.size.max()), known.cameras.size
-    wanted = min(longest, config.size or max(_LONGEST, int(before.max())))
-    captured = replace(captured, cameras=captured.cameras.scaled(longest / wanted) if wanted < longest else captured.cameras)
+    longest, before = captured.cameras.size.amax(1, keepdim=True), known.cameras.size
+    wanted = config.size or max(_LONGEST, int(before.max()))
+    captured = replace(captured, cameras=captured.cameras.scaled((longest.double() / wanted).clamp_min(1)))
     known = replace(known, cameras=known.cameras.resized(captured.cameras.size))
     views, fitted = known.views(config.split), {}
+
+    def save(view: int, image: "Image") -> None:
+        if config.images:
+            write_image(config.run / "renders" / config.split / f"{known.names[view]}.png", image)
+
     # Poses of held-out views were never refined with the scene: they may be fitted to it, which changes no colour of it.
     with Display() as display:
         if config.fit_poses:
@@ -97,7 +108,7 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
                 turn, shift = float(moves[view, :3].norm()), float(moves[view, 3:].norm())
                 poses[known.names[view]] = {"turn_degrees": math.degrees(turn), "shift": shift}
             fitted = {"fitted_poses": poses}
-        found, images = judge(scene, known, captured, views, display.count, masks=trained.masked)
+        found = judge(scene, known, captured, views, display.count, save, masks=trained.masked)
     metrics = {
         "method": opened.method,
         "scene": known.name,
@@ -112,14 +123,12 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
         **fitted,
     }
     write_json(config.run / "metrics.json", metrics)
-    if config.images:
-        for view, image in zip(views, images, strict=True):
-            write_image(config.run / "renders" / config.split / f"{known.names[view]}.png", image)
     return metrics
 
 
 def write_scalars(folder: Path, histories: "Sequence[History]") -> int:
-    """One run of TensorBoard for the training and each block, replaced if it is there; how many values were written.
+    """One run of TensorBoard for the training and each of its parts; how many values were written. Event files that lie
+    there are replaced, nothing else.
 
     Times are those of training, so that a resumed run has no gap. Raises UsageError without the package `tensorboard`.
     """
@@ -130,7 +139,8 @@ def write_scalars(folder: Path, histories: "Sequence[History]") -> int:
     written = 0
     for history in histories:
         place = folder / (history.name or "training")
-        shutil.rmtree(place, ignore_errors=True)
+        for old in place.glob("events.out.tfevents.*"):
+            old.unlink()
         writer = SummaryWriter(str(place))
         # A figure that a step did not measure leaves a gap in its curve.
         try:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Literal
 from ..checks import at_least, positive
 from ..errors import FprfError, UsageError
 from ..progress import Display
-from ..style.files import StyleFile, check_photographs, read_style
-from .style_flags import StyledRunConfig, read_flags, style_name
+from ..style.files import StyleFile, check_photographs, read_style, with_folders
+from .style_flags import StyledRunConfig, read_flags, say, style_name
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
@@ -103,6 +103,7 @@ def _chosen(config: GalleryConfig, together: StyleFile) -> list[tuple[str, Style
     for path in config.styles:
         file = read_style(path)
         check_photographs(path, file)
+        file = file._replace(style=with_folders(file.style, say))
         own = style_name(path, ())
         chosen.append((f"{own} ({len(chosen) + 1})" if own in dict(chosen) else own, file))
     if len(names) > 1:

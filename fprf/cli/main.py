@@ -9,6 +9,7 @@ Exit codes: 0 done, 1 our fault, 2 what the user can mend (a mistake, too little
 
 import importlib
 import inspect
+import io
 import os
 import sys
 import traceback
@@ -57,6 +58,10 @@ def main(args: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if args is None else args)
     debug = "--debug" in given or os.environ.get("FPRF_DEBUG", "") not in ("", "0")
     given = [arg for arg in given if arg != "--debug"]
+    # The encoding of a pipe may lack letters that names of files have: printing them must not end a verb.
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
     try:
         code = _run(given)
         sys.stdout.flush()
@@ -81,7 +86,7 @@ def main(args: Sequence[str] | None = None) -> int:
             return 2
         if not debug:
             frames = traceback.extract_tb(error.__traceback__)
-            place = f" ({os.path.relpath(frames[-1].filename)}:{frames[-1].lineno} in {frames[-1].name})" if frames else ""
+            place = f" ({frames[-1].filename}:{frames[-1].lineno} in {frames[-1].name})" if frames else ""
             print(f"internal error: {type(error).__name__}: {error}{place}", file=sys.stderr)
             print(
                 "This is a fault of fprf or of a plug-in. Run it again with --debug and report the traceback.", file=sys.stderr

@@ -1,6 +1,7 @@
 """`fprf pretrain decoder`: train the decoder D_VGG of an encoder. Prints a report as JSON."""
 
 import json
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -41,11 +42,19 @@ def pretrain(
         raise UsageError(f"{prog}: no photographs; name their folders with --images DIR ...")
     if config.output is None:
         raise UsageError(f"{prog}: nowhere to write; name the weights file with --output FILE")
-    begun = time.monotonic()
-    measured = train(config, config.output, say)
-    report = {"weights": str(config.output), **measured, "seed": config.seed, "seconds": round(time.monotonic() - begun, 1)}
-    # The weights by their bare name, since both may be moved.
-    told = {"kind": prog.split()[-1], **report, "weights": config.output.name}
-    write_json(config.output.with_name(config.output.stem + ".report.json"), told)
+    if config.output.is_dir():
+        raise UsageError(f"{prog}: --output {config.output} is a folder; name the weights file to write")
+    from ..pretraining.loop import training_folder
+    from ..training.run import lock_folder
+
+    begun, folder = time.monotonic(), training_folder(config.output)
+    # Checkpoints stay until everything is written: a full disk costs no training.
+    with lock_folder(folder):
+        measured = train(config, config.output, say)
+        report = {"weights": str(config.output), **measured, "seed": config.seed, "seconds": round(time.monotonic() - begun, 1)}
+        # The weights by their bare name, since both may be moved.
+        told = {"kind": prog.split()[-1], **report, "weights": config.output.name}
+        write_json(config.output.with_name(config.output.stem + ".report.json"), told)
+        shutil.rmtree(folder, ignore_errors=True)
     print(json.dumps(report, indent=2))
     return 0

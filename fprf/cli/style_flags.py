@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..errors import UsageError
+from ..plugins import slots
 from ..style.config import PRESETS, StyleConfig, preset_flags, with_preset
 from ..style.files import StyleFile, check_photographs, read_style, with_folders
 from ..training.quality import QualityConfig
@@ -43,11 +44,16 @@ def read_flags(
     the references stand for the images in them. Raises what `parse`, `with_folders` and `read_style` raise, and DataError
     where a photograph of the file is no longer the one it was.
     """
-    # Defaults from the style file, then from the preset, then every flag over both.
-    path = _style_flag(args)
-    file = read_style(path) if path is not None else StyleFile(StyleConfig())
+    # Defaults from the style file, then the stylizer, which decides what a preset sets, then the preset, then all other flags.
+    # Whether cosines are centred is up to the verb: where neither file nor flag says it, its own default holds.
+    path, centred = _style_flag(args), getattr(default.stylizer, "centred", True)
+    file = read_style(path, centred=centred) if path is not None else StyleFile(StyleConfig())
     if path is not None:
         default = replace(default, **_styles(file.style))
+    kind = type(default.stylizer)
+    default, args = slots.resolve(default, args)
+    if type(default.stylizer) is not kind and hasattr(default.stylizer, "centred"):
+        default = slots.replace(default, "stylizer.centred", centred)
     flags = {f"--{name}": name for name in PRESETS}
     for flag in (arg for arg in args if arg in flags):
         print(f"{flag}: {preset_flags(flags[flag])}")
@@ -58,10 +64,12 @@ def read_flags(
     config = parse(default, _joined(args, default), prog=prog, description=about, positional=positional)
     config = with_folders(config, say)
     file = file._replace(style=StyleConfig(**_styles(config)))
-    # Who names photographs takes them as they are now.
-    given = {arg.partition("=")[0] for arg in args}
-    if path is not None and not given & {"--references", "--masks"}:
-        check_photographs(path, file)
+    # Who names photographs takes them as they are now, and masks likewise.
+    if path is not None:
+        given = {arg.partition("=")[0] for arg in args}
+        photographs = () if "--references" in given else config.references
+        masks = () if "--masks" in given else config.masks
+        check_photographs(path, file._replace(style=replace(file.style, references=photographs, masks=masks)))
     return config, file
 
 
@@ -124,8 +132,8 @@ def named_styles(texts: Sequence[str], base: StyleFile) -> list[tuple[str, Style
             # What names photographs one by one does not carry over to others.
             photographs = tuple(Path(part) for part in what.split(","))
             style = replace(base.style, references=photographs, weights=(), masks=(), pin=(), forbid=())
-            file = StyleFile(with_folders(style, say))
-        styles.append((name, file))
+            file = StyleFile(style)
+        styles.append((name, file._replace(style=with_folders(file.style, say))))
     return styles
 
 

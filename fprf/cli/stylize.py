@@ -83,10 +83,9 @@ def run(args: list[str]) -> int:
 def _make(scene: "Scene", output: Path, styled: "Styled", views: list[int], config: StylizeConfig) -> dict[str, Any]:
     """Pictures and match maps of the views; what was matched and how long it took."""
     from ..io.images import to_uint8, write_image
-    from ..style.match_maps import match_map, match_pictures, summarize
+    from ..style.match_maps import match_map, match_picture, match_pictures, summarize
 
     shown = not config.match_only
-    maps = ("match", "score", "confidence", "entropy") if config.match_only else ("match",) if config.matches else ()
     rendering, matching, summaries = 0.0, 0.0, {}
     restyled = scene.restyled(styled.restyle) if shown else scene
     with Display() as display:
@@ -98,14 +97,15 @@ def _make(scene: "Scene", output: Path, styled: "Styled", views: list[int], conf
                 rendering += time.perf_counter() - start
                 write_image(output / f"{name}.png", to_uint8(picture.rgb))
             # Matches are those of the points that the view sees, found apart from its colours.
-            if maps:
+            if config.match_only or config.matches:
                 start = time.perf_counter()
                 matched = match_map(scene, styled, view)
                 matching += time.perf_counter() - start
                 summaries[name] = summarize(matched, styled.codes)
-                pictures = match_pictures(matched, styled.codes)
-                for which in maps:
-                    write_image(output / f"{name}-{which}.png", pictures[which])
+                codes = styled.codes
+                pictures = {"match": match_picture(matched, codes)} if shown else match_pictures(matched, codes)
+                for which, map_picture in pictures.items():
+                    write_image(output / f"{name}-{which}.png", map_picture)
         display.count(len(views), len(views), "restyling" if shown else "matching")
     count = max(1, len(views))
     made: dict[str, Any] = {"seconds_per_view": rendering / count} if shown else {}

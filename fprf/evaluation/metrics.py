@@ -282,16 +282,16 @@ def judge(
     captured: ParsedScene,
     views: Sequence[int],
     progress: Callable[[int, int, str], None],
+    save: Callable[[int, Image], None],
     *,
     masks: bool = True,
-) -> tuple[dict[str, Any], list[Image]]:
-    """Metrics of views of a scene (means and each by name), and their images, each in the light that it was taken in.
+) -> dict[str, Any]:
+    """Metrics of views of a scene: means, and each by name. Their images, in the light that they were taken in, go to `save`.
 
     `captured` has the photographs; pixels that its `masks` leave out do not count. Seconds are those of rendering alone.
     Consistency warps each view into the next one of the list by the rendered depth.
     """
     cameras = known.cameras
-    images: list[Image] = []
     before: View | None = None
     rows, seconds, kept, pixels = {}, 0.0, 0.0, 0
     warped = WarpError(cameras.select(torch.tensor(list(views), dtype=torch.int64)))
@@ -301,7 +301,7 @@ def judge(
         taken, start = scene.as_taken(view), time.perf_counter()
         render = taken.render(cameras, view)
         seconds += time.perf_counter() - start
-        images.append(to_uint8(render.rgb))
+        save(view, to_uint8(render.rgb))
         kept += render.kept
         # Two renders are held at a time, whatever the number of views.
         if before is not None:
@@ -322,4 +322,4 @@ def judge(
         "peak_rss_mib": (peak() or 0) / 2**20,
         "consistency": warped.summary(),
         "per_view": rows,
-    }, images
+    }

@@ -1,11 +1,11 @@
 """Training of a network by any loss: Adam, one cosine to zero by time or steps, checkpoints.
 
-A batch is a function of (seed, step). The checkpoints lie in a folder beside the output until the training is finished.
+A batch is a function of (seed, step). The checkpoints lie in a folder beside the output until its weights are written.
 """
 
 import math
-import shutil
 import time
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,9 +16,10 @@ from torch import Tensor, nn
 from ..interfaces import Figures, Learner, State
 from ..training import checkpoint
 from ..training.driver import Report, Schedule, learn
-from ..training.run import Run, lock_folder
+from ..training.run import Run
 from ..training.tasks import begin
 from .config import PretrainConfig
+from .photos import find_photos
 
 WARM_UP = 0.02
 """Share of the run in which the rate rises."""
@@ -82,7 +83,8 @@ def train(
     output: Path,
     say: Callable[[str], None],
 ) -> int:
-    """Train in place until the budget is spent; the number of steps. A training of the same config goes on, another is dropped.
+    """Train in place until the budget is spent; the number of steps. A training of the same config and photographs goes on,
+    another is dropped. The caller holds `training_folder(output)`, and removes it when the weights are written.
 
     Raises as `training.driver.learn`.
     """
@@ -95,15 +97,14 @@ def train(
             say(f"step {event.step}  {100 * event.share:.0f} %  loss {event.losses['loss']:.5f}")
             spoken = now
 
-    # The folder is a run's, as far as the driver needs one; it goes when the weights are there.
+    # The folder is a run's, as far as the driver needs one.
     run = Run(training_folder(output))
     schedule = Schedule(config.steps, None if config.steps is not None else config.minutes, _SAVED / 60)
-    with lock_folder(run.root):
-        begin(run.root, repr(replace(config, device="auto")))
-        if steps := checkpoint.steps(run.checkpoints):
-            say(f"resumed at step {steps[-1]}")
-        network.train()
-        step, _ = learn(NetworkLearner(network, loss, config), run, schedule, report)
-        network.eval()
-        shutil.rmtree(run.root)
+    photos = [zlib.crc32(path.read_bytes()) for path in find_photos(config.images)[: config.photos]]
+    begin(run.root, repr((replace(config, device="auto"), photos)))
+    if steps := checkpoint.steps(run.checkpoints):
+        say(f"resumed at step {steps[-1]}")
+    network.train()
+    step, _ = learn(NetworkLearner(network, loss, config), run, schedule, report)
+    network.eval()
     return step

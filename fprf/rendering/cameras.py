@@ -62,7 +62,7 @@ class Cameras:
         ratio = size.to(self.focal) / self.size.to(self.focal)
         return replace(self, focal=self.focal * ratio, centre=self.centre * ratio, size=size.to(self.size))
 
-    def scaled(self, downscale: float) -> "Cameras":
+    def scaled(self, downscale: Annotated[Tensor, "V 1"] | float) -> "Cameras":
         """The same views at 1/downscale of their size, rounded to whole pixels and at least one."""
         return self.resized((self.size.double() / downscale).round().clamp_min(1))
 

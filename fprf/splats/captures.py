@@ -24,6 +24,7 @@ from ..io.images import to_uint8, write_image
 from ..io.tensorfiles import load_sealed, save
 from ..ops.rasterise import MIN_ALPHA
 from ..rendering.cameras import Cameras
+from ..style.dictionary import code_odds
 from ..style.look import ColourMaps, Restyle
 from ..style.restyle import Styled
 from ..training.loading import open_run
@@ -315,7 +316,7 @@ def light_alone(styled: Styled, gain: Annotated[Tensor, "3"] | None = None) -> S
     if dictionary.colour_mean is None:
         raise UsageError("--match-light: the style has no colours of photographs; name references")
     # sRGB is a power of linear light but for the black end: a gain is a factor of colours plus 0.055.
-    sides = ((style.region_mean, style.share), (dictionary.colour_mean, dictionary.share))
+    sides = ((style.region_mean, style.share), (dictionary.colour_mean, code_odds(dictionary)))
     before, after = (
         (share.double() / share.double().sum()) @ (colour.double().clamp(0, 1) + _BLACK).log() for colour, share in sides
     )

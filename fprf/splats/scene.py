@@ -29,6 +29,9 @@ from .restyle import Colours, restyled_harmonics
 from .semantics import Semantics
 from .views import SeenMeans, draw, seen_means
 
+_ROWS, _CHANNELS = 1 << 14, 128
+"""Gaussians whose values are found, and channels that are drawn, at a time: bounds the memory."""
+
 
 @dataclass(frozen=True, eq=False)
 class SplatScene(Scene):
@@ -153,20 +156,24 @@ class SplatScene(Scene):
     ) -> tuple[Annotated[Tensor, "R X"], Annotated[Tensor, "R"]]:
         """Values of the Gaussians, drawn."""
         camera, place = cover(cameras, view, self.near)
-        features = self.found().features
-        drawn = draw(
-            self.gaussians,
-            camera,
-            antialiased=self.antialiased,
-            features=values(features[:, : None if semantic else 0].float(), self.gaussians.means),
-        )
-        # What is drawn is weighted by opacity; a pixel of a lens takes the nearest one of the pinhole.
+        features, means = self.found().features[:, : None if semantic else 0], self.gaussians.means
+        # A pixel of a lens takes the nearest one of the pinhole.
         x, y = pixel.long().unbind(1)
         if place is not None:
             x, y = place[y, x].long().unbind(1)
         at = y.clamp(0, camera.height - 1) * camera.width + x.clamp(0, camera.width - 1)
-        opacity = drawn.opacity.flatten()[at]
-        return drawn.features.flatten(0, 1)[at] / opacity.clamp_min(1e-10)[:, None], opacity
+        # Match maps have a channel for each style code: values are found for some Gaussians at a time, and some channels drawn.
+        channels = values(features[:1].float(), means[:1]).shape[1]
+        shown, out = torch.empty(len(means), channels), torch.empty(len(at), channels)
+        for start in range(0, len(means), _ROWS):
+            rows = slice(start, start + _ROWS)
+            shown[rows] = values(features[rows].float(), means[rows])
+        for some, into in zip(torch.split(shown, _CHANNELS, 1), torch.split(out, _CHANNELS, 1), strict=True):
+            drawn = draw(self.gaussians, camera, antialiased=self.antialiased, features=some)
+            # What is drawn is weighted by opacity.
+            opacity = drawn.opacity.flatten()[at]
+            into[:] = drawn.features.flatten(0, 1)[at] / opacity.clamp_min(1e-10)[:, None]
+        return out, opacity
 
     def as_taken(self, view: int) -> "SplatScene":
         if self.tones is None:

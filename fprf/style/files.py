@@ -29,6 +29,7 @@ from typing import Any, NamedTuple, TypeVar
 from ..checks import at_least
 from ..errors import ConfigError, DataError
 from ..io.atomic import write_json
+from ..plugins import slots
 from ..plugins.codec import from_json, packages_of, read_json, to_json
 from ..plugins.registry import nearest
 from ..splats.config import is_scene
@@ -53,8 +54,11 @@ class StyleFile(NamedTuple):
     """Hash of each photograph and mask when the style was saved."""
 
 
-def read_style(path: Path) -> StyleFile:
-    """Read a style file. Raises ConfigError naming the file and the field."""
+def read_style(path: Path, *, centred: bool = True) -> StyleFile:
+    """Read a style file; `centred` is that of a stylizer that has it, where the file does not say.
+
+    Raises ConfigError naming the file and the field.
+    """
     whole = read_json(path, "a style.json, as `fprf stylize` writes it")
     try:
         if not isinstance(whole, dict) or whole.get("format") != _FORMAT or not isinstance(whole.get("style"), dict):
@@ -65,10 +69,12 @@ def read_style(path: Path) -> StyleFile:
         fields = whole["style"]
         if "fprf" in whole and "bold" not in fields:  # saved before there was light: all was painted
             fields = {**fields, "bold": 1.0}
-        stylizer = fields.get("stylizer")
+        stylizer = fields.get("stylizer", {})
         if isinstance(stylizer, dict) and stylizer.get("similarity") == "cosine":  # once a choice, now how it is always done
             fields = {**fields, "stylizer": {name: value for name, value in stylizer.items() if name != "similarity"}}
         style = from_json(fields, StyleConfig, packages=from_json(whole.get("plugins", {}), dict[str, str]))
+        if "centred" not in stylizer and hasattr(style.stylizer, "centred"):
+            style = slots.replace(style, "stylizer.centred", centred)
         hashes = from_json(whole.get("sha256", {}), dict[str, str])
         regions = from_json(whole.get("regions", {}), dict[str, tuple[float, ...]])
         encoder = from_json(whole.get("semantic_encoder", ""), str)
@@ -107,9 +113,10 @@ def check_photographs(path: Path, file: StyleFile) -> None:
     for photo in (*file.style.references, *file.style.masks):
         then = file.sha256.get(photo)
         if then is not None and photo.is_file() and (now := _hash(photo)) != then:
+            flag = "--masks" if photo in file.style.masks else "--references"
             raise DataError(
                 f"{path}: {photo} has changed since the style was saved (sha256 {then[:12]}…, now {now[:12]}…); "
-                "restore it, or name all photographs with --references to take them as they are"
+                f"restore it, or name all with {flag} to take them as they are"
             )
 
 
@@ -124,18 +131,19 @@ def with_folders(style: S, report: Callable[[str], None] = warnings.warn) -> S:
         return style
     from ..datamanagers.images import photographs
 
-    # Each image once, under the weight and mask of what it came with.
-    count = len(style.references)
-    rows: dict[Path, tuple[float, Path]] = {}
+    # Of folders each image once, and none that is also named itself: that has a weight, and may have masks, of its own.
+    count, known = len(style.references), set(style.references)
+    rows: list[tuple[Path, float, Path]] = []
     for path, weight, mask in zip(
         style.references, style.weights or (1.0,) * count, style.masks or (NO_MASK,) * count, strict=True
     ):
         if path in folders and mask != NO_MASK:
             raise ConfigError(f"masks: {mask} is for one photograph, {path} is a folder; write none, or name the photographs")
-        files = photographs([path], report) if path in folders else [path]
-        rows |= {file: (weight, mask) for file in files if file not in rows}
-    weights, masks = zip(*rows.values(), strict=True)
-    return replace(style, references=tuple(rows), weights=weights if style.weights else (), masks=masks if style.masks else ())
+        files = [file for file in photographs([path], report) if file not in known] if path in folders else [path]
+        known |= {*files}
+        rows += [(file, weight, mask) for file in files]
+    references, weights, masks = zip(*rows, strict=True)
+    return replace(style, references=references, weights=weights if style.weights else (), masks=masks if style.masks else ())
 
 
 def _with_paths(style: StyleConfig, change: Callable[[Path], Path]) -> StyleConfig:

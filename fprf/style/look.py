@@ -28,7 +28,7 @@ from ..interfaces import Decoder, Stylizer
 from ..ops.precision import double
 from ..types import Want
 from .config import Place
-from .dictionary import StyleDictionary, blend_codes, choose
+from .dictionary import StyleDictionary, blend_codes, choose, concatenate
 from .light import Light, luma
 from .scene_style import Membership, RegionWeight, SceneStyle, mixed_maps, own_style
 from .statistics import mix, monge, symmetric_root
@@ -151,17 +151,24 @@ def colour_maps(
 
 
 def region_maps(
-    stylizer: Stylizer, dictionary: StyleDictionary, scene: SceneStyle, config: "StylizerConfig"
+    stylizer: Stylizer,
+    dictionary: StyleDictionary,
+    scene: SceneStyle,
+    config: "StylizerConfig",
+    allowed: Annotated[Tensor, "K references"],
 ) -> ColourMaps | None:
     """The maps of scenes whose content is colour (there is no decoder); None where the config asks for none.
 
-    The colours of each region are carried over to those of the codes that it takes.
+    The colours of each region are carried over to those of the codes that it takes; `allowed` as of `regional`.
     """
     if config.colours <= 0:
         return None
-    # Matched with itself as with the photographs, the scene keeps its colours.
-    mine = own_style(scene, dictionary.blend)._replace(origin=dictionary.origin)
-    table = double(config.build(dictionary=mine, scene=scene).region_match(scene.keys))
+    # Matched with itself as with the photographs, the scene keeps its colours. Where a region may not take from all, the scene
+    # stands in the place of each, so that both sides are smoothed over the same regions.
+    names = ("scene",) if bool(allowed.all()) else dictionary.names
+    mine = concatenate([own_style(scene, dictionary.blend)] * len(names), names, [1.0] * len(names))
+    mine = mine._replace(origin=dictionary.origin)
+    table = double(regional(mine, scene, allowed, config).region_match(scene.keys))
     mean, covariances = table @ double(mine.mean), torch.einsum("kt,tij->kij", table, double(mine.covariance))
     taken = double(stylizer.region_match(scene.keys))
     return ColourMaps(scene, *carried_colours(mean, covariances, taken, dictionary), config.colours)
@@ -225,7 +232,7 @@ def regional(
     """
     if bool(allowed.all()):
         return config.build(dictionary=dictionary, scene=scene)
-    if config.handles_allowed_references:
+    if getattr(config, "handles_allowed_references", True):  # what is not installed says so when it is built
         return config.build(dictionary=dictionary._replace(allowed=allowed), scene=scene)
     # One stylizer for each different choice of references.
     rows = [tuple(row) for row in allowed.tolist()]

@@ -50,6 +50,12 @@ class Regions(NamedTuple):
     encoder: str = ""
     """Identity of the encoder that the keys are of, if the file tells."""
 
+    @property
+    def keys_fit(self) -> bool:
+        """The keys are of the scene's own semantic encoder."""
+        lengths_fit = self.basis is not None and {*map(len, self.keys.values())} == {len(self.basis.mean)}
+        return lengths_fit and self.encoder in ("", self.scene.semantic_encoder)
+
 
 class RegionMatch(NamedTuple):
     """One region that somebody meant."""
@@ -118,12 +124,12 @@ def find_regions(regions: Regions, text: str) -> list[RegionMatch]:
 
 def _alike(regions: Regions, name: str) -> list[RegionMatch]:
     """Find the regions that, of all that the style file knows, are most like the one of that name, and really like it."""
-    encoder, style, lengths = regions.scene.semantic_encoder, regions.scene_style, {*map(len, regions.keys.values())}
-    if regions.basis is None or lengths != {len(regions.basis.mean)} or regions.encoder not in ("", encoder):
+    style = regions.scene_style
+    if regions.basis is None or not regions.keys_fit:
         raise UsageError(
             f"region {name!r}: the style file knows it by the semantic encoder {regions.encoder or '(unnamed)'}, the scene has "
-            f"{encoder or 'none'}; name the region by its number or a pixel of a view instead, or choose "
-            "that encoder with --semantic.encoder"
+            f"{regions.scene.semantic_encoder or 'none'}; name the region by its number or a pixel of a view instead, or "
+            "choose that encoder with --semantic.encoder"
         )
     if len(style.share) == 1:
         return [RegionMatch(0, name)]
@@ -211,6 +217,9 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
         best = score.masked_fill(~allowed[:, dictionary.reference], -torch.inf).amax(1)
         poor = (best < style.keep_below).nonzero().flatten().tolist()
         strength[[k for k in poor if k not in pinned]] = 0.0
+        if poor and not bool(strength.any()):
+            scored = "a scene of one region has no scores" if len(score) == 1 else f"the best score is {float(best.max()):.2f}"
+            names.notes.append(f"keep_below {style.keep_below:g}: every region stays as it is; {scored}")
     # Places: what regions may take of these references; all of them where that is none.
     references_of: dict[str, set[int]] = {}
     for pin in pin_texts:
@@ -246,7 +255,7 @@ class _StyleNames:
         self.order = [dictionary.names.index(label) for label in self.labels]
         # All regions, not only those that are named: on another scene each must find its like among all of them.
         every = {f"region{k}": key_of(regions, k) for k in range(len(regions.scene_style.share)) if regions.basis is not None}
-        self.keys = dict(regions.keys) if regions.keys else every
+        self.keys = dict(regions.keys) if regions.keys_fit else every
         self.notes: list[str] = []
 
     def find(self, text: str) -> list[RegionMatch]:
@@ -266,7 +275,7 @@ class _StyleNames:
     def reference(self, number: int) -> str:
         """A reference as a style file names it, wherever its photographs are moved to."""
         name = self.references[number].name
-        return name if self.labels[number] == name else str(number)
+        return name if self.labels[number] == name and "=" not in name else str(number)
 
     def region(self, region: RegionMatch) -> str:
         """Name of a region in a style file, which holds its key under that name."""

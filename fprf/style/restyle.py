@@ -13,7 +13,7 @@ from ..interfaces import Scene
 from ..testing.outputs import check_stylizer
 from .config import NO_MASK, labels
 from .dictionary import Encoders, Reference, StyleDictionary, build_dictionary, encode_photograph
-from .files import Keyframe, StyleFile, check_photographs, fade, read_style
+from .files import Keyframe, StyleFile, check_photographs, fade, read_style, with_folders
 from .light import light_of
 from .look import Restyle, colour_maps, decoded_colours, region_maps, regional
 from .matching import unit
@@ -54,7 +54,7 @@ def apply_style(
     UsageError for no references and for regions that the scene does not have, DataError for unreadable photographs,
     WeightsError where the encoders are not the scene's.
     """
-    style = file.style
+    style = with_folders(file.style)
     if not style.references:
         raise UsageError("--references: at least one photograph is needed, for example --references autumn.jpg night.jpg")
     # Photographs are encoded once, whatever name, weight or style they are used under.
@@ -67,7 +67,7 @@ def apply_style(
             encoded[path, mask] = encode_photograph(path, encoders, name=name, mask=None if mask == NO_MASK else mask)
         references.append(encoded[path, mask]._replace(name=name, weight=weight))
     dictionary = build_dictionary(references, clusters=style.clusters, blend=style.blend, seed=encoders.seed)
-    styled = apply_dictionary(scene, file, encoders, dictionary)
+    styled = apply_dictionary(scene, file._replace(style=style), encoders, dictionary)
     if style.between is None or style.at == 0:
         return styled
     # The other style is built alike, and so is the one that it goes towards itself.
@@ -102,7 +102,7 @@ def apply_dictionary(scene: Scene, file: StyleFile, encoders: Encoders, dictiona
         check_stylizer(config, stylizer, dictionary, scene_style, affine=scene.decoder is None and config.colours <= 0)
         stylizer = stylizer.to(device)
         if scene.decoder is None:
-            colours = region_maps(stylizer, dictionary, scene_style, config)
+            colours = region_maps(stylizer, dictionary, scene_style, config, allowed)
         else:
             colours = colour_maps(
                 stylizer,

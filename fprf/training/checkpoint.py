@@ -75,7 +75,7 @@ def write(root: Path, model: Mapping[str, Tensor], optimizer: Mapping[str, Tenso
     written = steps(root)
     for old in [s for s in written if s <= step][:-KEEP] + [s for s in written if s > step]:
         (_folder(root, old) / "manifest.json").unlink()
-        shutil.rmtree(_folder(root, old))
+        shutil.rmtree(_folder(root, old), ignore_errors=True)  # files that somebody has open stay; `tidy` removes them later
     return folder
 
 

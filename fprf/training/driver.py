@@ -276,7 +276,7 @@ def is_watched(root: Path) -> bool:
 
 class _SignalHandler:
     """SIGINT and SIGTERM held back inside the block, and as before after it. Python lets only the main thread set
-    handlers; in any other this changes nothing."""
+    handlers; in any other this changes nothing. A handler that was not set from Python stays: it could not be set again."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -289,7 +289,7 @@ class _SignalHandler:
         if threading.current_thread() is threading.main_thread():
             # Windows has SIGBREAK for a process group of its own.
             held = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGBREAK", signal.SIGTERM)}
-            self.before = {number: signal.signal(number, self.note) for number in held}
+            self.before = {number: signal.signal(number, self.note) for number in held if signal.getsignal(number) is not None}
         return self
 
     def __exit__(self, *error: object) -> None:

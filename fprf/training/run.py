@@ -230,7 +230,7 @@ def _locked(folder: Path) -> int | None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with ExitStack() as opened:
-            handle = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            handle = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
             opened.callback(os.close, handle)
             # The kernel releases the lock of a process that dies; file systems without locks hold nothing.
             if fcntl is not None:
@@ -319,7 +319,7 @@ def check_images(root: Path, scene: Scene, hashes: Mapping[str, str]) -> None:
 
 
 class History(NamedTuple):
-    """One training: of the run, or of one of its blocks."""
+    """One training: of the run, or of one of its parts."""
 
     name: str
     """Empty for the run itself."""
@@ -333,12 +333,13 @@ class History(NamedTuple):
 
 
 def read_history(run: Path) -> list[History]:
-    """The histories of a run and of its blocks, in the order of their names; those without any line are left out.
+    """The histories of a run and of its parts: blocks, or the overview and cells; those without any line are left out.
 
     Where a run was resumed from an earlier step, the later steps of the first try are dropped. Raises CheckpointError
     where there is no line at all.
     """
-    files = [run / "events.jsonl", *sorted((run / "blocks").glob("*/events.jsonl"))]
+    parts = ("overview", "blocks/*", "cells/*")
+    files = [run / "events.jsonl", *(file for part in parts for file in sorted(run.glob(f"{part}/events.jsonl")))]
     histories = [_history("" if file.parent == run else file.parent.name, file) for file in files if file.is_file()]
     histories = [history for history in histories if history.step]
     if not histories:

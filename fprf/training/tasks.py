@@ -18,7 +18,7 @@ import time
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -158,12 +158,12 @@ def digest_of(
     content: bytes = b"",
 ) -> str:
     """Digest of what a part is trained as: the config but for fields that are `free`, its views, and whatever else decides."""
-    # Poses and intrinsics, as floats in full; images as checksums of their files.
+    # Cameras as floats in full; images as checksums of their files.
     tree = to_json(config)
     assert isinstance(tree, dict)
     document = {
         "config": {name: value for name, value in tree.items() if name not in free},
-        "cameras": [scene.cameras.pose[views].tolist(), scene.cameras.focal[views].tolist()],
+        "cameras": [getattr(scene.cameras, of.name)[views].tolist() for of in fields(scene.cameras)],
     }
     digest = hashlib.sha256(json.dumps(document | dict(parts), sort_keys=True, default=str).encode() + content)
     for view in views:

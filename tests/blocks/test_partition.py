@@ -52,6 +52,12 @@ def test_cameras_stand_in_blocks_and_next_to_nothing_is_left_to_the_surroundings
     assert float((around < 0.5).double().mean()) > 0.95
 
 
+def test_bounds_of_more_points_than_quantiles_are_taken_of() -> None:
+    many = torch.zeros(1, 3, dtype=torch.float64).expand((1 << 24) + 1, 3)
+    low, high = bounds(DRONE._replace(points=many))
+    assert bool(((low <= 0) & (high >= 0)).all())
+
+
 def test_a_grid_has_equal_cells_that_share_faces() -> None:
     cells = GridConfig(cells=(3, 2)).build().cut(DRONE)
     assert len(cells) == 6

@@ -1,5 +1,6 @@
 """How arguments are parsed and how a verb ends; `fprf plugins`, and verbs that packages add."""
 
+import io
 import json
 import os
 import subprocess
@@ -210,6 +211,7 @@ def test_our_fault_is_1_and_short_or_with_debug_whole(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _verb(monkeypatch, lambda args: 1 // 0)
+    monkeypatch.setattr(os.path, "relpath", Mock(side_effect=ValueError("path is on another drive")))
     assert cli.main(["doctor"]) == 1
     text = capsys.readouterr().err
     assert text.startswith("internal error: ZeroDivisionError: ") and "test_command_line.py:" in text
@@ -219,6 +221,14 @@ def test_our_fault_is_1_and_short_or_with_debug_whole(
     monkeypatch.setenv("FPRF_DEBUG", "1")
     assert cli.main(["doctor"]) == 1
     assert "Traceback (most recent call last)" in capsys.readouterr().err
+
+
+def test_a_pipe_without_the_letters_of_a_name_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    _verb(monkeypatch, lambda args: print("写真") or 0)
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", pipe := io.TextIOWrapper(io.BytesIO(), "cp1252"))
+        assert cli.main(["doctor"]) == 0
+    assert pipe.buffer.getvalue().strip() == rb"\u5199\u771f"
 
 
 def test_a_reader_that_leaves_is_met_with_silence() -> None:

@@ -172,6 +172,20 @@ def test_data_that_has_moved(run: Path, world: World, tmp_path: Path) -> None:
     config.write_text(config.read_text().replace(str(world.town), str(tmp_path / "gone")))
     shutil.copytree(world.town, tmp_path / "there")
     assert cli.main(["eval", str(run), "--data", str(tmp_path / "there"), "--no-images"]) == 0
+    assert not (run / "renders").exists()
+
+
+def test_each_photograph_is_judged_at_its_own_size_up_to_a_limit(run: Path, world: World, tmp_path: Path) -> None:
+    town = shutil.copytree(world.town, tmp_path / "town")
+    manifest = town / "transforms.json"
+    document = json.loads(manifest.read_text())
+    document["frames"][0] |= {key: 2 * document[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
+    manifest.write_text(json.dumps(document))
+    photo = cv2.imread(str(town / "images/0000.png"))
+    cv2.imwrite(str(town / "images/0000.png"), cv2.resize(photo, (64, 48)))
+    assert cli.main(["eval", str(run), "--data", str(town), "--size", "40"]) == 0
+    shapes = [picture.shape for picture in pictures(run / "renders" / "test").values()]
+    assert shapes == [(30, 40, 3), (24, 32, 3)]
 
 
 HISTORY = History("", [10, 20], [1.5, 3.0], {"psnr": [12.0, None], "colour": [0.5, 0.25]}, [])
@@ -187,9 +201,12 @@ def read(folder: Path) -> dict[str, list[tuple[int, float, float]]]:
 def test_what_is_written_is_read(tmp_path: Path) -> None:
     pytest.importorskip("tensorboard", reason="the extra `tensorboard` is not installed")
     block = HISTORY._replace(name="02")
+    (tmp_path / "training").mkdir()
+    (tmp_path / "training" / "mine.jpg").touch()
     for _ in range(2):  # again, in place of the first
         assert write_scalars(tmp_path, [HISTORY, block]) == 6
     assert {path.name for path in tmp_path.iterdir()} == {"training", "02"}
+    assert len(list(tmp_path.glob("*/events.out*"))) == 2 and (tmp_path / "training" / "mine.jpg").exists()
     found = read(tmp_path / "training")
     assert found == {"psnr": [(10, 1.5, 12.0)], "colour": [(10, 1.5, 0.5), (20, 3.0, 0.25)]} == read(tmp_path / "02")
 

@@ -14,10 +14,11 @@ from safetensors.torch import load_file
 from tiny_world import World
 
 from fprf.cli import main as cli
+from fprf.cli.restyle import RestyleConfig
 from fprf.cli.style_flags import read_flags
 from fprf.errors import ConfigError, DataError, UsageError
 from fprf.io import tensorfiles
-from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig
+from fprf.plugins.stylizers.config import LocalAdainConfig, RegionConfig, RegionOtConfig
 from fprf.style.config import PRESETS, StyleConfig, preset_flags, with_preset
 from fprf.style.files import StyleFile, write_style
 
@@ -169,6 +170,8 @@ def test_photographs_of_the_file_are_checked_unless_named(file: Path) -> None:
     photo.write_text("other pixels")
     with pytest.raises(DataError, match="has changed"):
         read("RUN", "--style", str(file))
+    with pytest.raises(DataError, match="has changed"):
+        read("RUN", "--style", str(file), "--masks", "none")
     assert read("RUN", "--style", str(file), "--references", str(photo))[1].style.references == (photo,)
 
 
@@ -188,6 +191,8 @@ def test_a_preset_lies_over_the_file_and_below_the_flags(file: Path, capsys: pyt
     gentle = with_preset(StyleConfig(references=(Path("a.jpg"),)), "gentle")
     assert found.style == replace(gentle, luminance=0.9)
     assert capsys.readouterr().out == f"--gentle: {preset_flags('gentle')}\n"
+    for words in (["--gentle", "--stylizer", "region-ot"], ["--stylizer=region-ot", "--gentle"]):
+        assert read("RUN", *words)[1].style.stylizer == RegionOtConfig(smoothness=PRESETS["gentle"]["stylizer.smoothness"])
     config, _ = read("RUN", "--style", str(file), "--gentle")
     assert config.strength == PRESETS["gentle"]["strength"] and config.weights == (2.0,)
 
@@ -196,3 +201,19 @@ def test_a_preset_lies_over_the_file_and_below_the_flags(file: Path, capsys: pyt
 def test_every_preset_is_what_its_flags_say(name: str) -> None:
     assert read("RUN", f"--{name}")[1] == read("RUN", *preset_flags(name).split())[1]
     assert with_preset(StyleConfig(), name) != StyleConfig()
+
+
+def test_captures_are_matched_uncentred_unless_somebody_says_otherwise(tmp_path: Path) -> None:
+    path, words = tmp_path / "s.json", ["scan.ply", "--references", "a.jpg"]
+    for flags, stylizer, wanted in (
+        ("--stylizer region-ot", None, False),
+        ("--stylizer region-ot --stylizer.centred true", None, True),
+        (f"--style {path}", None, False),
+        (f"--style {path}", {"type": "region-tone", "temperature": 0.2}, False),
+        (f"--style {path}", {"type": "region-tone", "centred": True}, True),
+        (f"--style {path} --stylizer region-ot", {"type": "adain"}, False),
+    ):
+        path.write_text(json.dumps({"format": 1, "style": {} if stylizer is None else {"stylizer": stylizer}}))
+        args = [*words, *flags.split()]
+        config, _ = read_flags(RestyleConfig(), args, prog="fprf restyle", description="", positional=("captures",))
+        assert isinstance(config.stylizer, RegionConfig) and config.stylizer.centred == wanted

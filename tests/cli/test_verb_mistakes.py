@@ -22,6 +22,8 @@ MISTAKES = """
     eval | RUN is missing
     eval absent | no run folder
     eval run --split half | --split half
+    eval run --size 0 | --size
+    eval untold --tensorboard out --split all | no events.jsonl
     eval run --quality great | --quality great: it takes draft or standard or best
     eval moved | gone: no such folder
     eval other | its images are not those of the run
@@ -91,8 +93,9 @@ MISTAKES = """
 def _place(_world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folders and files of the names above."""
     folder = tmp_path_factory.mktemp("mistakes")
-    for name in ("run", "moved", "other", "untested"):
+    for name in ("run", "moved", "other", "untested", "untold"):
         shutil.copytree(_world.run, folder / name)
+    (folder / "untold" / "events.jsonl").unlink()
     for name in ("photos", "empty"):
         (folder / name).mkdir()
     for name, path in zip("AB", _world.references, strict=True):

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from ssim_oracle import noise, ssim_oracle
 from tiny_world import World
 from torch import Tensor
 
-from fprf.datamanagers.images import load_image
+from fprf.datamanagers.images import Image, load_image
 from fprf.errors import DataError, NumericsError
 from fprf.evaluation.metrics import PSNR_CAP, WarpError, image_metrics, judge, lpips, psnr, ssim, warp
 from fprf.io.images import to_uint8, write_image
@@ -123,11 +124,18 @@ def test_images_that_cannot_be_compared_are_refused() -> None:
 
 def test_metrics_are_those_of_the_renders(world: World) -> None:
     trained, scene = world.load(), world.prepared.scene
-    told: list[tuple[int, int, str]] = []
-    metrics, images = judge(trained, trained.known, scene, trained.known.test, lambda *of: told.append(of))
-    assert [of[:2] for of in told] == [(0, 2), (1, 2), (2, 2)]
-    assert len(images) == metrics["views"] == 2 and metrics["per_view"].keys() == {"0000", "0008"}
-    for view, image in zip(trained.known.test, images, strict=True):
+    told: list[Any] = []
+    images: dict[int, Image] = {}
+
+    def save(view: int, image: Image) -> None:
+        images[view] = image
+        told.append("saved")
+
+    metrics = judge(trained, trained.known, scene, trained.known.test, lambda *of: told.append(of[:2]), save)
+    assert told == [(0, 2), "saved", (1, 2), "saved", (2, 2)], "each as it is made"
+    assert metrics["views"] == 2 and metrics["per_view"].keys() == {"0000", "0008"}
+    assert tuple(images) == trained.known.test
+    for view, image in images.items():
         again = render_view(trained.model, trained.known.facts, trained.known.cameras, view, trained.config.render)
         assert (to_uint8(again.rgb) == image).all()
         truth = torch.from_numpy(load_image(scene.paths[view], (32, 24))).float() / 255

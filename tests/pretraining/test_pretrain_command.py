@@ -2,9 +2,11 @@
 
 import json
 import shlex
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import DEFAULT, Mock
 
 import pytest
 import torch
@@ -13,12 +15,13 @@ from pretend_cuda import pretend_cuda
 from torch import Tensor, nn
 
 from fprf.cli.pretrain import run
-from fprf.errors import UsageError, WeightsError
+from fprf.errors import DataError, UsageError, WeightsError
 from fprf.methods import fprf_lite
 from fprf.ops import backend
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, RandomConfig
 from fprf.plugins.weights import read_weights
+from fprf.pretraining import decoder as pretraining
 from fprf.pretraining.config import PretrainConfig
 from fprf.pretraining.loop import train, training_folder
 from fprf.training.model import build_decoder
@@ -76,7 +79,15 @@ def test_a_decoder_learns_and_its_report_is_honest(photos: Path, tmp_path: Path,
 
 @pytest.mark.parametrize(
     "args",
-    [[], ["field"], ["content"], ["decoder"], ["decoder", "--images", "."], ["decoder", "--images", ".", "--teachers", "x"]],
+    [
+        [],
+        ["field"],
+        ["content"],
+        ["decoder"],
+        ["decoder", "--images", "."],
+        ["decoder", "--images", ".", "--teachers", "x"],
+        ["decoder", "--images", ".", "--output", "."],
+    ],
 )
 def test_mistakes(args: list[str]) -> None:
     with pytest.raises(UsageError):
@@ -101,8 +112,8 @@ def network() -> nn.Linear:
     return nn.Linear(3, 2)
 
 
-def test_a_resumed_run_ends_where_an_unbroken_one_does(tmp_path: Path) -> None:
-    config, output = PretrainConfig(steps=9), tmp_path / "w.safetensors"
+def test_a_resumed_run_ends_where_an_unbroken_one_does(photos: Path, tmp_path: Path) -> None:
+    config, output = PretrainConfig(images=(photos,), steps=9), tmp_path / "w.safetensors"
     whole, broken, resumed = network(), network(), network()
     train(whole, quadratic(whole), config, tmp_path / "other.safetensors", lambda _: None)
     with pytest.raises(KeyboardInterrupt):
@@ -111,7 +122,21 @@ def test_a_resumed_run_ends_where_an_unbroken_one_does(tmp_path: Path) -> None:
     assert train(resumed, quadratic(resumed), config, output, said.append) == 9
     assert said[0] == "resumed at step 5"
     assert torch.equal(resumed.weight, whole.weight)
-    assert not training_folder(output).exists()
+
+
+def test_checkpoints_stay_until_the_weights_are_written_and_serve_the_same_photographs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photos, output = photo_folder(tmp_path / "photos", 3), tmp_path / "w.safetensors"
+    full = Mock(wraps=pretraining.write_weights, side_effect=[DataError("full"), DataError("full"), DEFAULT])
+    monkeypatch.setattr(pretraining, "write_weights", full)
+    for _ in range(2):
+        with pytest.raises(DataError, match="full"):
+            made(photos, output, "--steps", "2")
+    assert "resumed at step 2" in capsys.readouterr().err
+    shutil.copy(next(photos.iterdir()), photos / "more.png")
+    made(photos, output, "--steps", "2")
+    assert "resumed" not in capsys.readouterr().err and not training_folder(output).exists()
 
 
 def test_the_same_weights_and_report_on_a_device(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -297,6 +297,10 @@ def test_what_is_written_again_keeps_its_place(tmp_path: Path) -> None:
         write_capture(tmp_path / f"same.{ending}", capture, capture.gaussians.harmonics)
         assert (tmp_path / f"same.{ending}").read_bytes() == (tmp_path / name).read_bytes()
         assert offset_file(tmp_path / f"same.{ending}").exists() == (name == "in.splat")
+    (tmp_path / "folder.splat").mkdir()
+    with pytest.raises(DataError):
+        write_gaussians(tmp_path / "folder.splat", made, origin=UTM)
+    assert not offset_file(tmp_path / "folder.splat").exists(), "nothing is said of a file that was not written"
 
 
 def scaled(gaussians: Gaussians, factor: float) -> Gaussians:

@@ -45,6 +45,12 @@ def seen_along(gaussians: Gaussians, direction: torch.Tensor) -> torch.Tensor:
     return torch.einsum("dk,nkc->dnc", values, gaussians.harmonics.double())
 
 
+def test_a_glb_of_more_than_its_lengths_can_say_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fprf.splats.files.gltf._MOST", 1000)
+    with pytest.raises(DataError, match=r"\.ply or \.spz"):
+        write_gaussians(tmp_path / "x.glb", ball(40))
+
+
 def test_a_glb_has_what_the_extension_demands(tmp_path: Path) -> None:
     made = cloud(3, 50)
     write_gaussians(tmp_path / "x.glb", made)
@@ -163,12 +169,18 @@ def test_several_primitives_quantised_attributes_and_files_beside(tmp_path: Path
     )
     document["accessors"][-1]["normalized"] = True
     rotation = {"KHR_gaussian_splatting:ROTATION": len(document["accessors"]) - 1}
-    document["meshes"].append({"primitives": [primitive | {"attributes": primitive["attributes"] | rotation}]})
+    # The second primitive has all but its rotations in a copy of the first one's bytes.
+    first = len(document["accessors"])
+    for view, accessor in zip(document["bufferViews"][:-1], document["accessors"][:-1], strict=True):
+        document["accessors"].append(accessor | {"bufferView": len(document["bufferViews"])})
+        document["bufferViews"].append(view | {"byteOffset": view["byteOffset"] + len(body)})
+    copied = {name: first + k for name, k in primitive["attributes"].items()}
+    document["meshes"].append({"primitives": [primitive | {"attributes": copied | rotation}]})
     document["nodes"].append({"mesh": 1, "rotation": [1, 0, 0, 0], "translation": [5, 0, 0]})
     document["scenes"][0]["nodes"] = [0, 1]
-    document["buffers"][0]["uri"] = "x.bin"
+    document["buffers"][0]["uri"] = "my%20scan.bin"
     document["buffers"].append({"byteLength": len(extra), "uri": "data:;base64," + base64.b64encode(extra).decode()})
-    (tmp_path / "x.bin").write_bytes(body)
+    (tmp_path / "my scan.bin").write_bytes(2 * body)
     path.write_text(json.dumps(document))
     capture = read_capture(path)
     first, second = (capture.gaussians.select(slice(start, start + 40)) for start in (0, 40))
@@ -176,12 +188,11 @@ def test_several_primitives_quantised_attributes_and_files_beside(tmp_path: Path
         second.means - torch.tensor([5.0, 0, 0]), made.means, atol=1e-6
     )
     assert torch.allclose(covariances(second), covariances(first), rtol=1e-2, atol=1e-6)
-    write_capture(tmp_path / "there" / "y.gltf", capture, capture.gaussians.harmonics * 0.5)
+    new = capture.gaussians.harmonics * torch.tensor([0.5, 0.25]).repeat_interleave(40)[:, None, None]
+    write_capture(tmp_path / "there" / "y.gltf", capture, new)
     again = read_capture(tmp_path / "there" / "y.gltf").gaussians
-    assert torch.allclose(again.harmonics, capture.gaussians.harmonics * 0.5, atol=1e-6) and torch.equal(
-        again.means, capture.gaussians.means
-    )
-    document["buffers"][0]["uri"] = "../x.bin"
+    assert torch.allclose(again.harmonics, new, atol=1e-6) and torch.equal(again.means, capture.gaussians.means)
+    document["buffers"][0]["uri"] = "%2e%2e/my%20scan.bin"
     path.write_text(json.dumps(document))
     with pytest.raises(DataError, match="beside"):
         read_capture(path)
@@ -210,6 +221,7 @@ def test_linear_colours_come_out_as_srgb_and_go_back(tmp_path: Path) -> None:
         lambda d: d["accessors"][0].update(count=10**9),
         lambda d: d["bufferViews"][1].update(byteOffset=-4),
         lambda d: d["nodes"][0].update(children=[0]),
+        lambda d: d.update(nodes=2 * d["nodes"], scenes=[{"nodes": [0, 1]}]),
         lambda d: d.update(scene=7),
         lambda d: d["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"].update(extensions={"packed": {}}),
     ],
@@ -309,6 +321,8 @@ def test_a_streamed_sog_is_read_at_its_finest_level(tmp_path: Path) -> None:
         {"filenames": ["../x/meta.json"] * 3},
         {"filenames": []},
         {"filenames": ["1_0/meta.json"] * 3},
+        {"filenames": ["0_0/meta.json", "./0_0/meta.json", "1_0/meta.json"]},
+        {"tree": {"children": leaves + leaves}},
     ):
         path.write_text(json.dumps(index | wrong))
         with pytest.raises(DataError):

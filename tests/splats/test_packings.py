@@ -3,6 +3,7 @@
 import gzip
 import json
 import struct
+import time
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -105,7 +106,8 @@ def ascii_ply(data: bytes, newline: str) -> bytes:
     rows = np.frombuffer(body, "<f4").reshape(count, -1)
     lines = head.decode().replace("binary_little_endian", "ascii").splitlines()
     extra = ["comment Vertical axis: z", "element face 2", "property list uchar int v", "element time 1", "property double t"]
-    lines = [*lines[:2], *extra, *lines[2:], "end_header", "3 0 1 2", "0", "2.5"]
+    extra += ["property char c", "property ushort u"]
+    lines = [*lines[:2], *extra, *lines[2:], "end_header", "3 0 1 2", "0", "2.5 -1 9"]
     return newline.join([*lines, *(" ".join(repr(float(v)) for v in row) for row in rows), ""]).encode()
 
 
@@ -120,7 +122,8 @@ def test_ascii_files_are_read_and_become_binary(newline: str, tmp_path: Path) ->
     assert equal(again.gaussians, made.recoloured(made.harmonics * 0.5)) and again.up == (0, 0, -1)
     assert b"element time 1" in (tmp_path / "y.ply").read_bytes()
     text = path.read_bytes()
-    for wrong in (text[: len(text) // 2], text.replace(b"2.5", b"two"), text.replace(b"vertex 30", b"vertex 999999999")):
+    one = b"".join(text.splitlines(keepends=True)[:-29]).replace(b"vertex 30", b"vertex 5")
+    for wrong in (text[: len(text) // 2], one, text.replace(b"2.5", b"two"), text.replace(b"vertex 30", b"vertex 999999999")):
         path.write_bytes(wrong)
         with pytest.raises(DataError):
             read_capture(path)
@@ -309,6 +312,11 @@ def test_a_sog_however_it_is_archived(tmp_path: Path) -> None:
         write_capture(tmp_path / "folder" / "meta.json", capture, capture.gaussians.harmonics * 0.5)
         found = read_capture(tmp_path / "folder").gaussians
         assert torch.equal(found.means, plain.gaussians.means)
+        assert {each.name for each in (tmp_path / "folder").iterdir()} == {*parts}, "no other file is replaced"
+    meta = json.loads(parts["meta.json"]) | {"more": {"files": [".bashrc"]}}
+    path.write_bytes(bundle(parts | {"meta.json": json.dumps(meta).encode(), ".bashrc": b"echo"}))
+    with pytest.raises(DataError, match="bashrc"):
+        write_capture(tmp_path / "folder" / "meta.json", read_capture(path), plain.gaussians.harmonics)
 
 
 def test_short_codebooks_and_models_of_sog(tmp_path: Path) -> None:
@@ -343,6 +351,18 @@ def test_a_small_gzip_that_unpacks_to_much_is_refused(tmp_path: Path) -> None:
     (tmp_path / "x.spz").write_bytes(packer.compress(content + bytes(64 << 20)) + packer.flush())
     with pytest.raises(DataError):
         read_capture(tmp_path / "x.spz")
+
+
+@pytest.mark.parametrize("ending", ["spz", "ply"])
+def test_a_small_file_of_many_pieces_takes_no_minutes(ending: str, tmp_path: Path) -> None:
+    """Empty members of gzip, and faces of a mesh."""
+    head = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nelement face 3000000\n"
+    mesh = head + b"property list uchar int v\nend_header\n" + bytes(3_000_004)
+    (tmp_path / f"x.{ending}").write_bytes(mesh if ending == "ply" else gzip.compress(b"") * 150_000)
+    start = time.process_time()
+    with pytest.raises(DataError):
+        read_capture(tmp_path / f"x.{ending}")
+    assert time.process_time() - start < 3
 
 
 @pytest.mark.parametrize("ending", ["ply", "glb", "sog", "splat"])

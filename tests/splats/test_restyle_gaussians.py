@@ -17,7 +17,8 @@ from fprf.ops.harmonics import as_drawn
 from fprf.ops.harmonics import spherical_harmonics as functions
 from fprf.plugins.encoders.config import BundledSemanticConfig, RandomConfig
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
-from fprf.splats.captures import look_at_capture, open_capture
+from fprf.rendering.cameras import pixel_grid
+from fprf.splats.captures import light_alone, look_at_capture, open_capture
 from fprf.splats.config import LookConfig
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.gaussians import HARMONIC, Gaussians
@@ -155,6 +156,21 @@ def test_maps_of_matches_heed_places(scene: SplatScene, photographs: list[Path])
     assert torch.allclose(view.paint(found.restyle.match), taken.flatten(0, 1), atol=1e-6)
 
 
+def test_painting_takes_bounded_memory_and_changes_nothing(scene: SplatScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def values(semantic: torch.Tensor, points: torch.Tensor | None) -> torch.Tensor:
+        asked.append(len(semantic))
+        return semantic[:, :3].repeat(1, 7)
+
+    whole, opacity = scene.paint(scene.cameras, 0, pixel_grid(scene.cameras, 0), values)
+    monkeypatch.setattr("fprf.splats.scene._ROWS", 64)
+    monkeypatch.setattr("fprf.splats.scene._CHANNELS", 8)
+    asked.clear()
+    parts, same = scene.paint(scene.cameras, 0, pixel_grid(scene.cameras, 0), values)
+    assert max(asked) == 64 and torch.equal(parts, whole) and torch.equal(opacity, same)
+
+
 @pytest.mark.parametrize("place", ["box:1,2:3", "box:1,2,3:4,5,nan", "path:0,0,0:1,1,1", "path:0,0,0:1,1,1:-1"])
 def test_a_malformed_place_is_refused(place: str) -> None:
     with pytest.raises(ConfigError):
@@ -170,6 +186,12 @@ def test_luminance_is_kept_and_styles_mix(scene: SplatScene, photographs: list[P
     mixed = styled(scene, photographs[0], between=tmp_path / "style.json", at=0.25)
     free = uncut(mixed) & uncut(a) & uncut(b)
     assert int(free.sum()) > 50 and torch.allclose(mixed[free], (0.75 * a + 0.25 * b)[free], atol=1e-4)
+
+
+def test_light_alone_counts_photographs_by_their_weights(scene: SplatScene, photographs: list[Path]) -> None:
+    both, snow = applied(scene, *photographs, weights=(1e-6, 1.0)), applied(scene, photographs[1])
+    maps, alone = (light_alone(each).restyle.colours for each in (both, snow))
+    assert maps is not None and alone is not None and torch.allclose(maps.matrix, alone.matrix, atol=1e-4)
 
 
 def test_what_the_cache_knows_of_a_capture_gives_the_same_colours(photographs: list[Path], tmp_path: Path) -> None:

@@ -11,10 +11,10 @@ from fprf.ops.harmonics import as_drawn
 from fprf.plugins.stylizers.config import RegionToneConfig
 from fprf.splats.gaussians import HARMONIC
 from fprf.splats.restyle import all_around, restyled_harmonics
-from fprf.style.dictionary import Reference, build_dictionary
+from fprf.style.dictionary import Reference, build_dictionary, concatenate
 from fprf.style.light import APPLIED, Light, light_maps, light_of, unrivalled
-from fprf.style.look import Restyle, region_maps
-from fprf.style.scene_style import SceneStyle, scene_style
+from fprf.style.look import Restyle, region_maps, regional
+from fprf.style.scene_style import SceneStyle, own_style, scene_style
 
 KINDS, EACH = 4, 150
 CONFIG = RegionToneConfig(smoothness=0.0)
@@ -55,7 +55,8 @@ def look_of(scene: SceneStyle, *references: Reference, bold: float = 0.5, streng
     d = build_dictionary(references, clusters=KINDS, blend=0.0)
     stylizer = CONFIG.build(dictionary=d, scene=scene)
     light = light_of(scene, d, CONFIG, (scene.region_mean, scene.region_covariance), bold=bold)
-    return Restyle(stylizer, strength, features=0.0, colours=region_maps(stylizer, d, scene, CONFIG), light=light)
+    colours = region_maps(stylizer, d, scene, CONFIG, torch.ones(KINDS, len(references)).bool())
+    return Restyle(stylizer, strength, features=0.0, colours=colours, light=light)
 
 
 def lights(look: Restyle) -> Light:
@@ -185,3 +186,14 @@ def test_a_code_that_another_kind_claims_is_no_match_and_one_that_its_like_claim
     assert float(unrivalled(twin, d, right).min()) > 0.9
     wrong = right.roll(1, 1)
     assert float(unrivalled(twin, d, wrong).max()) < 0.5
+
+
+def test_a_pin_to_the_scene_itself_changes_no_colour() -> None:
+    """Regions that lend each other their styles across soft borders stop so on both sides where one of them is pinned."""
+    scene = made_scene()[2]._replace(contacts=torch.full((KINDS, KINDS), 0.05).fill_diagonal_(0))
+    own, config = own_style(scene), RegionToneConfig()
+    own = own._replace(colour_mean=own.mean, colour_covariance=own.covariance)
+    both, allowed = concatenate([own, own], ["a", "b"], [1.0, 1.0]), torch.ones(KINDS, 2).bool()
+    allowed[0, 1] = False
+    maps = region_maps(regional(both, scene, allowed, config), both, scene, config, allowed)
+    assert maps is not None and float((scene.region_mean[:, None] @ maps.matrix + maps.bias[:, None]).abs().max()) < 1e-6

@@ -108,6 +108,7 @@ def test_poor_matches_are_kept_unless_pinned(world: World, styled: Styled) -> No
     own = styled.dictionary.names.index("dusk.png")
     k = int(score[:, styled.dictionary.reference == own].amax(1).argmax())
     left = float(score[k, styled.dictionary.reference != own].max())
+    assert controls_of(world, styled, keep_below=1.0).notes[-1].startswith("keep_below 1: every region stays as it is")
     forbidden = controls_of(world, styled, keep_below=left + 1e-3 if left < 0.999 else 1.0, forbid=(f"{k}=dusk.png",))
     assert forbidden.strength[k] == 0
 
@@ -142,8 +143,19 @@ def test_what_is_saved_means_the_same_on_the_same_scene(world: World, styled: St
     again = region_controls(Regions(old.scene, old.scene_style, old.basis, saved.regions), styled.dictionary, saved.style)
     assert torch.equal(again.allowed, controls.allowed) and torch.equal(again.strength, controls.strength)
     assert again.saved == saved, "names and keys stay as they are, however often it is saved"
+    other = Regions(old.scene, old.scene_style, old.basis, {"sky": old.scene_style.keys[0].tolist() * 99}, "another encoder")
+    here = region_controls(other, styled.dictionary, replace(style_of(world.references), keep=("0",))).saved
+    assert here.regions == saved.regions and here.style.keep == ("region0",), "keys of another encoder are not kept"
     named = {text.partition("=")[0] for text in (*saved.style.pin, *saved.style.forbid, *saved.style.keep)}
     assert len(again.notes) == len(named) and "region 'region0' of the style is region 0 here (cosine 1.00)" in again.notes
+
+
+def test_a_photograph_with_an_equals_sign_in_its_name_is_saved_by_number(world: World, styled: Styled) -> None:
+    style = style_of((Path("a=b.png"), *world.references[1:]))
+    dictionary = styled.dictionary._replace(names=tuple({"dusk.png": "a=b.png"}.get(n, n) for n in styled.dictionary.names))
+    first = region_controls(styled.controls.regions, dictionary, replace(style, pin=("0=0",)))
+    again = region_controls(styled.controls.regions._replace(keys=first.saved.regions), dictionary, first.saved.style)
+    assert first.saved.style.pin == ("region0=0",) and torch.equal(again.allowed, first.allowed)
 
 
 def test_the_place_of_a_region_is_in_the_view_that_shows_most_of_it(world: World) -> None:

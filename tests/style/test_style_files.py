@@ -14,7 +14,16 @@ from tiny_world import World
 from fprf.errors import ConfigError, DataError, UsageError
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionToneConfig
 from fprf.style.config import NO_MASK, StyleConfig, find_reference, labels, parse_strength
-from fprf.style.files import Keyframe, StyleFile, check_photographs, fade, read_keyframes, read_style, write_style
+from fprf.style.files import (
+    Keyframe,
+    StyleFile,
+    check_photographs,
+    fade,
+    read_keyframes,
+    read_style,
+    with_folders,
+    write_style,
+)
 from fprf.style.restyle import keyed_looks
 
 
@@ -217,3 +226,12 @@ def test_a_style_of_before_names_how_regions_are_matched(tmp_path: Path) -> None
     path.write_text(json.dumps({"format": 1, "style": {"stylizer": stylizer | {"similarity": "dot"}}}))
     with pytest.raises(ConfigError, match="similarity"):
         read_style(path)
+
+
+def test_a_photograph_may_be_named_twice_beside_a_folder_that_holds_it(world: World, tmp_path: Path) -> None:
+    for photograph in world.references:
+        shutil.copy(photograph, tmp_path)
+    dusk, sky = tmp_path / "dusk.png", tmp_path / "masks" / "sky.png"
+    style = with_folders(StyleConfig(references=(tmp_path, dusk, dusk), weights=(1, 2, 3), masks=(NO_MASK, sky, NO_MASK)))
+    assert style.references == (tmp_path / "snow.png", dusk, dusk)
+    assert style.weights == (1, 2, 3) and style.masks == (NO_MASK, sky, NO_MASK)

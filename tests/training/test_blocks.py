@@ -53,10 +53,12 @@ def test_finished_blocks_come_back_and_what_does_not_fit_is_refused(block_world:
             restore(member, "member", wrong)
 
 
-def asked(world: BlockWorld, block: int, **change: Any) -> str:
-    """Digest of a block's task in a config with other fields."""
+def asked(world: BlockWorld, block: int, moved: str = "", **change: Any) -> str:
+    """Digest of a block's task in a config with other fields, or with a field of the cameras moved."""
     config = replace(world.config, **change)
     scene, rays = read_scene(config), tensorfiles.read(folder_of(world.root, block) / RAYS)
+    cameras = {moved: getattr(scene.cameras, moved) + 1} if moved else {}
+    scene = replace(scene, cameras=replace(scene.cameras, **cameras))
     cells, facts = make_plan(scene, config.blocks).cells, Run(world.root).load_known().facts
     digest: str = block_task(config, facts, scene, cells, block, rays)["task"]
     return digest
@@ -72,7 +74,8 @@ def test_what_makes_it_another_task_and_what_does_not(block_world: BlockWorld) -
         {"content": replace(base.content, moves_density=True)},
         {"loss": replace(base.loss, rgb=2.0)},
     ]
-    assert len({was, *(asked(block_world, 1, **other) for other in others)}) == 5
+    others += [{"moved": name} for name in ("pose", "focal", "centre", "size", "distortion", "lens")]
+    assert len({was, *(asked(block_world, 1, **other) for other in others)}) == 11
 
 
 def test_each_block_knows_its_views_and_tiles(block_world: BlockWorld) -> None:

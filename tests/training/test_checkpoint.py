@@ -1,7 +1,10 @@
 """Checkpoints and their tensor files: everything comes back, and what was cut short or damaged does not count."""
 
+import errno
+import os
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -44,6 +47,17 @@ def test_a_past_that_was_gone_back_from_is_dropped(world: World, root: Path) -> 
     model, optimizer = after_one_step(world)
     save_checkpoint(root, model, optimizer, step=7, seconds=0.0)
     assert checkpoint.steps(root) == [5, 7]
+
+
+def test_an_old_checkpoint_that_cannot_be_removed_ends_nothing(
+    world: World, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "rmdir", Mock(side_effect=OSError(errno.ENOTEMPTY, "a file in it is open")))
+        save_checkpoint(root, *after_one_step(world), step=11, seconds=0.0)
+    assert checkpoint.steps(root) == [9, 11] and (root / "step-0000005").exists()
+    checkpoint.tidy(root)
+    assert not (root / "step-0000005").exists()
 
 
 def test_what_was_cut_short_does_not_count_and_tidying_removes_nothing_else(root: Path) -> None:

@@ -5,6 +5,7 @@ import os
 import signal
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -124,7 +125,7 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_named(world: World, tm
         run = bad_gradients(world, tmp_path / "four", config, 3e38, 3)
     assert same(parameters(Run(three), 3), parameters(run, 4))
     (event,) = events(run, "skipped")
-    assert event["step"] == 3 and event["skipped"].startswith("rgb" if kind == "loss" else "a gradient")
+    assert event["step"] == 3 and event["skipped"].startswith("rgb" if kind == "loss" else "the loss or a gradient")
 
 
 def test_a_run_with_skipped_steps_is_the_same_when_it_is_resumed(world: World, tmp_path: Path) -> None:
@@ -206,3 +207,11 @@ def test_the_first_signal_lets_the_step_end_and_the_second_saves_nothing_doubtfu
     assert checkpoint.steps(run.checkpoints) == [4] and same(before, parameters(run, 4))
     ends = [parameters(trained_for(world, tmp_path / name, config), 9) for name in ("run", "straight")]
     assert same(*ends)
+
+
+def test_handlers_that_were_not_set_from_python_stay(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    change = Mock(return_value=None)
+    monkeypatch.setattr(signal, "getsignal", lambda number: None)
+    monkeypatch.setattr(signal, "signal", change)
+    trained_for(world, tmp_path / "run", replace(world.config, steps=1))
+    change.assert_not_called()

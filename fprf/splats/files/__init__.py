@@ -103,8 +103,8 @@ def write_gaussians(
     added, beside = added_and_beside(origin, local or not form.exact)
     if isinstance(gaussians, GaussianRows):
         if form.exact and form.view_dependent and not plain:
-            write_offset(path, beside)
             form.write(path, form.pack_rows(gaussians, added))
+            write_offset(path, beside)
             return Written()
         antialiased, gaussians = gaussians.antialiased, gaussians.part(slice(0, gaussians.count))
     # What the format cannot hold is left out first, so that it decides nothing about the rest.
@@ -123,9 +123,9 @@ def write_gaussians(
         seen = seen_means(gaussians, views, antialiased=antialiased)
         gaussians = seen.gaussians(gaussians) if bare else seen.plain(gaussians)
         antialiased = False
-    data = form.pack(gaussians, antialiased, added)
+    # The offset comes last, so that a file that cannot be written leaves the one before it in its place.
+    form.write(path, form.pack(gaussians, antialiased, added))
     write_offset(path, beside)
-    form.write(path, data)
     return Written(faulty, far, tuple(form.notes(gaussians)))
 
 
@@ -146,9 +146,9 @@ def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N 
         (harmonics[rows] != before[rows]).flatten(1).any(1) & harmonics[rows].isfinite().flatten(1).all(1)
         for rows in pieces(len(before))
     ])  # fmt: skip
-    write_offset(path, capture.offset)
     if bool(changed.any()):
         form.write(path, capture.recolour(harmonics.numpy(), np.asarray(changed)))
     else:
         form.write(path, (capture.data[start : start + _MAPPED] for start in range(0, len(capture.data), _MAPPED)))
+    write_offset(path, capture.offset)
     return Written()

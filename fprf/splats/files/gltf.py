@@ -7,6 +7,7 @@ has those of PLY files, right down front, under a node that turns them by 180 de
 """
 
 import base64
+import itertools
 import json
 import math
 import re
@@ -15,6 +16,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import unquote
 
 import numpy as np
 import torch
@@ -33,6 +35,8 @@ _HARMONICS = [f"{_NAME}:SH_DEGREE_{degree}_COEF_{k}" for degree in range(4) for 
 _SHAPE = ("POSITION", f"{_NAME}:ROTATION", f"{_NAME}:SCALE", f"{_NAME}:OPACITY")
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_MOST = (1 << 32) - (1 << 20)
+"""Bytes of a .glb's buffer, whose lengths are 32-bit; the rest is for its document."""
 _LEAST = 1e-30
 """Sizes are at least this, so that their logarithm is finite."""
 _DRAFTS = ("BT.", "Display-P3", "linear")
@@ -187,6 +191,8 @@ class Gltf(CaptureFormat):
 
 def _glb(document: dict[str, Any], body: Iterable[bytes]) -> list[bytes]:
     """The pieces of a .glb: its header, its document and its one buffer."""
+    if (needed := document["buffers"][0]["byteLength"]) > _MOST:
+        raise DataError(f"Gaussians of {needed} bytes, where a .glb holds {_MOST} at most; export them as .ply or .spz")
     text, chunks = json.dumps(document, separators=(",", ":"), ensure_ascii=False).encode(), [*body]
     text += b" " * (-len(text) % 4)
     chunks.append(bytes(-sum(map(len, chunks)) % 4))
@@ -208,11 +214,11 @@ def _document(data: Data) -> tuple[dict[str, Any], int]:
 
 def _binary(path: Path, document: dict[str, Any]) -> bytes:
     """The .glb of a .gltf: with its buffers, from base64 or from files in its folder, as one."""
-    body, starts = b"", []
+    body, starts = bytearray(), []
     for about in document["buffers"]:
         uri = about["uri"]
         inside = uri.startswith("data:")
-        content = base64.b64decode(uri.partition(",")[2], validate=True) if inside else base.beside(path, uri)
+        content = base64.b64decode(uri.partition(",")[2], validate=True) if inside else base.beside(path, unquote(uri))
         starts.append(len(body))
         body += content + bytes(-len(content) % 4)
     # Views keep their order; where each begins counts from the start of the joined buffer.
@@ -220,7 +226,7 @@ def _binary(path: Path, document: dict[str, Any]) -> bytes:
         view["byteOffset"] = view.get("byteOffset", 0) + starts[view["buffer"]]
         view["buffer"] = 0
     document["buffers"] = [{"byteLength": len(body)}]
-    return b"".join(_glb(document, [body]))
+    return b"".join(_glb(document, [bytes(body)]))
 
 
 def _parts(path: Path, document: dict[str, Any], data: Data | bytearray, start: int) -> list[_Part]:
@@ -263,6 +269,10 @@ def _parts(path: Path, document: dict[str, Any], data: Data | bytearray, start: 
             about = document["accessors"][primitive["attributes"][_SHAPE[2]]]
             whole = about["componentType"] != 5126 and not about.get("normalized")
             found.append(_Part(columns, linear / scale, scale, matrix[:3, 3], extension, whole))
+    # Gaussians shown several times would multiply a small file, and have but one place for several new colours.
+    colours = sorted((part.columns[_HARMONICS[0]] for part in found), key=lambda column: column.ctypes.data)
+    if any(itertools.starmap(np.may_share_memory, itertools.pairwise(colours))):
+        raise DataError(f"{path}: several nodes or primitives show the same Gaussians; export each with its own")
     return found
 
 

@@ -5,6 +5,7 @@ of coarser levels alone are not opened. `environment` is one more SOG, which is 
 """
 
 import json
+import posixpath
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -43,18 +44,21 @@ class StreamedSog(CaptureFormat):
                 first, count = level["offset"], level["count"]
                 if not all(isinstance(number, int) and number >= 0 for number in (first, count, level["file"])):
                     raise ValueError(f"a leaf of {count} Gaussians from {first} on")
-                wanted.setdefault(str(index["filenames"][level["file"]]), []).append(slice(first, first + count))
+                name = posixpath.normpath(index["filenames"][level["file"]])
+                wanted.setdefault(name, []).append(slice(first, first + count))
             if index.get("environment"):
-                wanted[str(index["environment"])] = [slice(0, None)]
+                wanted[posixpath.normpath(index["environment"])] = [slice(0, None)]
         except base.UNSOUND as error:
             raise DataError(f"{path}: no sound lod-meta.json ({error!r}); not a streamed SOG, or it is damaged") from error
         # Files are read one by one; the cache knows the capture by the content of all.
         parts, archives, antialiased = [], {path.name: bytes(data)}, True
         for name, rows in wanted.items():
             chunk = Sog().read(path.parent / name, base.beside(path, name))
-            most = max(each.stop or 0 for each in rows)
+            # Leaves that share rows would multiply a small file: together they have no more than it.
+            leaves = [each for each in rows if each.stop is not None]
+            most = max(sum(each.stop - each.start for each in leaves), *(each.stop for each in leaves), 0)
             if most > len(chunk.gaussians):
-                raise DataError(f"{path}: {name} has {len(chunk.gaussians)} Gaussians, not {most}; copy the folder again")
+                raise DataError(f"{path}: {name} has {len(chunk.gaussians)} Gaussians, its leaves {most}; export it again")
             for each in rows:
                 means, *others = base.arrays(chunk.gaussians.select(each))
                 parts.append((means + np.array(chunk.shift), *others))

@@ -31,7 +31,7 @@ _TYPES = {
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
     "double": "<f8", "float64": "<f8",
 }  # fmt: skip
-_NAMES = {"u1": "uchar", "u4": "uint", "i4": "int", "f4": "float", "f8": "double"}
+_NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
 _COMMENT = re.compile(r"(splatrendermode|antialiased|vertical axis)\b[\s:=]*(.*)", re.IGNORECASE)
 _UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, -1.0)}
 """What points up where a vertical axis is named by its letter, as Brush reads it: up is -y and -z."""
@@ -367,10 +367,10 @@ def _elements(path: Path, data: Data, header: _Header) -> dict[str, _Element]:
             if ascii_rows:
                 elements[words[1]] = _Element(np.dtype([]), count, offset)
                 continue
-            if (after := _after_lists(data, offset, count, kinds)) is None and "vertex" not in elements:
+            if "vertex" in elements:
+                break  # lists that follow the Gaussians may be cut, and the million faces of a mesh take seconds
+            if (after := _after_lists(data, offset, count, kinds)) is None:
                 raise DataError(f"{path}: {what} runs beyond the end of the file; copy it again, it is cut off or damaged")
-            if after is None:
-                break  # what follows the Gaussians may be cut
             offset = after
             continue
         table = np.dtype([(each[-1], of[0]) for each, of in zip(properties, kinds, strict=True)])
@@ -392,6 +392,8 @@ def _from_ascii(path: Path, data: Data, header: _Header, elements: Mapping[str, 
             if element.names() and element.rows:
                 # A row is a line; numbers are read as float64 and then rounded to their own type.
                 numbers = np.loadtxt(lines, np.float64, comments=None, max_rows=element.rows, ndmin=2)
+                if len(numbers) != element.rows:
+                    raise ValueError(f"{len(numbers)} of {element.rows} rows")
                 table = np.empty(element.rows, element.kind)
                 for field, column in zip(element.names(), numbers.T, strict=True):
                     table[field] = column

@@ -12,6 +12,7 @@ Recoloured, a file keeps its labels: each entry of the palette becomes the mean 
 
 import io
 import json
+import re
 import zipfile
 import zlib
 from collections.abc import Iterable, Mapping
@@ -43,6 +44,8 @@ _SLACK = 1 << 16
 _PRECISION = 2.0**-12
 """Steps of positions in extents of the capture, to which outliers do not matter."""
 _MEMBERS = 64
+_NAME = re.compile(r"\w[\w .-]*\.(webp|png)", re.IGNORECASE)
+"""Names of images in a folder: no other file can be read or replaced by what a meta.json says."""
 _LLOYD = 12
 _FIRST = (1980, 1, 1, 0, 0, 0)
 """Time of archived files: the same capture gives the same bytes."""
@@ -174,10 +177,9 @@ class Sog(CaptureFormat):
             return
         files = unbundle(path, b"".join(pieces))
         folder = folder_of(path, files)
-        for name, content in files.items():
-            own = name.removeprefix(folder)
-            if name.startswith(folder) and own and "/" not in own:
-                write_bytes(path.with_name(own), content)
+        for name in (*_images(path, _json(path, files[f"{folder}meta.json"])), "meta.json"):
+            if f"{folder}{name}" in files:
+                write_bytes(path.with_name(name), files[f"{folder}{name}"])
 
 
 def _bent(means: Floats) -> Floats:
@@ -325,18 +327,23 @@ class _Pictures:
 
 def _folder(path: Path, data: bytes) -> dict[str, bytes]:
     """The images that a meta.json names, from its own folder alone, and itself."""
-    meta = _json(path, data)
-    groups = [value for value in meta.values() if isinstance(value, dict)]
-    names = [name for group in groups for name in group.get("files", []) if isinstance(group.get("files"), list)]
     parts: dict[str, bytes] = {}
-    for name in names:
-        if not isinstance(name, str) or Path(name).name != name or len(parts) > _MEMBERS:
-            raise DataError(f"{path}: {name!r} is no file beside it; not a SOG folder")
+    for name in _images(path, _json(path, data)):
         try:
             parts[name] = (path.parent / name).read_bytes()
         except (OSError, ValueError) as error:
             raise DataError(f"{path}: {name} beside it cannot be read; copy the whole folder") from error
     return {**parts, path.name: data} if path.name == "meta.json" else {**parts, "meta.json": data}
+
+
+def _images(path: Path, meta: Mapping[str, Any]) -> list[str]:
+    """Names of the images of a meta.json. Raises DataError for one that may be any other file's."""
+    lists = [group.get("files") for group in meta.values() if isinstance(group, dict)]
+    names = [name for files in lists if isinstance(files, list) for name in files]
+    for name in names:
+        if not isinstance(name, str) or not _NAME.fullmatch(name) or len(names) > _MEMBERS:
+            raise DataError(f"{path}: {name!r} is no .webp or .png beside it; not a SOG folder")
+    return names
 
 
 def _json(path: Path, data: bytes) -> dict[str, Any]:

@@ -39,6 +39,8 @@ _RATIO = 1032
 """Times its size that deflated data may unpack to at most."""
 _TRAILER = 1 << 20
 """Bytes behind the streams (extensions) that are kept."""
+_PIECE = 1 << 12
+"""Packed bytes at a time."""
 _TINT = 0.15
 _COORDINATES = 0xADBE0003
 """Type of the extension that says which axes a file has; its payload is their number."""
@@ -265,29 +267,31 @@ def _header(path: Path, data: Data) -> _Header:
 
 def _unzip(path: Path, data: Data) -> tuple[bytes, bytes]:
     """Return the content of all members of a gzip file, no more than its header announces, and what lies behind them."""
-    content, left, most = b"", bytes(data), _HEADER.size
+    content, at, most = bytearray(), 0, _HEADER.size
     try:
-        while left[:2] == b"\x1f\x8b":
-            packer, piece = zlib.decompressobj(31), left
+        while data[at : at + 2] == b"\x1f\x8b":
+            packer = zlib.decompressobj(31)
             while not packer.eof and len(content) < most:
-                got, piece = packer.decompress(piece, most - len(content)), packer.unconsumed_tail
+                # zlib copies what it leaves of a piece: of the whole file that would take minutes where members are many.
+                piece = data[at : at + _PIECE]
+                got = packer.decompress(piece, most - len(content))
+                at += len(piece) - len(packer.unused_data if packer.eof else packer.unconsumed_tail)
                 content += got
                 if len(content) == most == _HEADER.size:  # the header bounds the rest
-                    header = _header(path, content)
+                    header = _header(path, bytes(content))
                     if header.version > 3:
                         raise DataError(f"{path}: .spz of version 4 within gzip; unpack it first (gunzip)")
                     most += sum(header.sizes) + _TRAILER
                     if sum(header.sizes) > _RATIO * len(data):
                         raise base.short(path, len(data), sum(header.sizes) // _RATIO, f"{header.number} Gaussians")
                 if not got and not piece and not packer.eof:
-                    return content, b""
+                    return bytes(content), b""
             if not packer.eof:
                 raise DataError(f"{path}: more than {_TRAILER} bytes behind the Gaussians; it is damaged or of another kind")
-            left = packer.unused_data
     except zlib.error as error:
         reason = "its checksum is another" if "data check" in str(error) else str(error)
         raise DataError(f"{path}: damaged gzip ({reason}); copy the file again") from error
-    return content, left
+    return bytes(content), data[at:]
 
 
 def _frames(path: Path, data: Data, header: _Header) -> tuple[list[bytes], list[bytes], int]:
