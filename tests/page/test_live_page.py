@@ -46,7 +46,7 @@ def served(run: Path | None, *args: str) -> Iterator[str]:
         try:
             yield process.stdout.readline().strip()
         finally:
-            process.send_signal(signal.SIGINT)
+            process.send_signal(signal.SIGTERM if run is None else signal.SIGINT)  # either cleans up
             try:
                 _, error = process.communicate(timeout=60)
             except subprocess.TimeoutExpired:
