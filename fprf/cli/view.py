@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import os
+import signal
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..checks import at_least, between
-from ..errors import CheckpointError
+from ..errors import CheckpointError, UsageError
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from ..splats.config import GaussianSemanticsConfig
 from ..style.config import StyleConfig
@@ -43,7 +44,7 @@ class ViewConfig(QualityConfig):
     stylizer: StylizerConfig | None = None
     """Stylizer that puts styles onto regions; none = region-tone, as `fprf stylize` and `fprf restyle` have it."""
     references: tuple[Path, ...] = ()
-    """Photographs, or folders of them, to begin with: on the shelf, and all in the mix."""
+    """At most 12 photographs, or folders of them, to begin with: on the shelf, and all in the mix."""
     host: str = "127.0.0.1"
     """Address to listen on; any but this machine's own needs a token."""
     port: int = 8080
@@ -70,6 +71,11 @@ def run(args: list[str]) -> int:
     """Serve until interrupted."""
     description = "Look at a run in the browser; without one, make a scene there of photographs, a video or a capture."
     config = parse(ViewConfig(), args, prog="fprf view", description=description, positional=("run",))
+    # Other ends than an interrupt clean up too; one that is ignored, as under nohup, stays so.
+    for name in ("SIGTERM", "SIGHUP"):
+        if (number := getattr(signal, name, None)) is not None and signal.getsignal(number) == signal.SIG_DFL:
+            signal.signal(number, signal.default_int_handler)
+    from ..page.messages import SHELF
     from ..page.server import ViewerServer, make_access
 
     access = make_access(config.host, config.token)
@@ -80,12 +86,16 @@ def run(args: list[str]) -> int:
 
         # `--follow` waits for a run folder that training has not made yet.
         path = config.run
+        if config.follow and path is not None and is_capture(path):
+            raise UsageError(f"--follow: {path} is a capture, which no training goes on with; leave it out")
         if path is not None and not (config.follow or is_capture(path) or (path / "config.json").is_file()):
             raise CheckpointError(f"{path}: no config.json here, so it is no run folder; `fprf train` makes one")
         if any(each.is_dir() for each in config.references):  # decoding needs a library that the page does not wait for
             from ..datamanagers.images import photographs
 
             config = replace(config, references=tuple(photographs(config.references, say)))
+        if len(config.references) > SHELF:
+            raise UsageError(f"--references: {len(config.references)} photographs; the shelf takes {SHELF}: name fewer")
         print(server.address, flush=True)
         load = functools.partial(_load, config, server.notify)
         try:

@@ -344,11 +344,13 @@ def film_cameras(keys: Sequence[Key], seconds: float, side: int = FILM_SIDE) -> 
 
 
 def write_film_files(folder: Path, keys: Sequence[Key], seconds: float, scene: Scene, side: int = FILM_SIDE) -> None:
-    """Write path.json, keys.json, and a folder a look with style.json and its photographs.
+    """Write path.json, keys.json, and a folder a look with style.json and its photographs; the folder is made.
 
     The path is in the capture's coordinates.
     """
-    write_camera_path(folder / "path.json", film_cameras(keys, seconds, side), FPS, scene.origin)
+    cameras = film_cameras(keys, seconds, side)  # refused before there is a folder
+    folder.mkdir(parents=True, exist_ok=True)
+    write_camera_path(folder / "path.json", cameras, FPS, scene.origin)
     # Keys with equal looks share a style, so that nothing is restyled between them.
     looks: dict[Look, Path] = {}
     rows: list[dict[str, object]] = []

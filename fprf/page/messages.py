@@ -10,6 +10,9 @@ from msgspec import Meta, Struct
 
 from ..errors import DataError
 
+SHELF = 12
+"""Photographs on the shelf; the oldest that no look needs makes room."""
+
 Text: TypeAlias = Annotated[str, Meta(max_length=80)]
 Number: TypeAlias = Annotated[float, Meta(ge=-1e9, le=1e9)]  # NaN fails either bound
 Share: TypeAlias = Annotated[float, Meta(ge=0, le=1)]

@@ -40,7 +40,6 @@ from .start import Start
 if TYPE_CHECKING:
     from .session import Session, Viewed
 
-COOKIE = "fprf-token"
 _MIN_TOKEN = 16
 """Characters of a token that a user chooses."""
 _ANY_ADDRESS = ("0.0.0.0", "::")  # nosec B104  # recognised, never the default
@@ -98,12 +97,18 @@ class Access:
             return "another site may not talk to this viewer"
         if self.token is None:
             return None
-        kept = cookie_parser(headers.get("cookie", "")).get(COOKIE)
+        kept = cookie_parser(headers.get("cookie", "")).get(cookie_name(name))
         # Compared in constant time: how long it takes tells nothing of how much is right.
         shown = given or kept or headers.get("authorization", "").removeprefix("Bearer ")
         if hmac.compare_digest(shown.encode(), self.token.encode()):
             return None
         return "a token is needed; open the whole address that `fprf view` printed"
+
+
+def cookie_name(host: str) -> str:
+    """Name of the token's cookie under a Host header: with its port, since browsers send cookies to all ports of a host."""
+    port = host.rpartition(":")[2]
+    return f"fprf-token-{port if port.isdecimal() else 80}"
 
 
 def make_access(host: str, token: str | None) -> Access:
@@ -137,6 +142,10 @@ class _Protocol(H11Protocol):  # type: ignore[misc]  # uvicorn's types are not f
             transport.close()
 
 
+class _GoneError(Exception):
+    """The client has gone or is too slow; no OSError, which is a fault of this machine that the client is told."""
+
+
 class Guard:
     """Middleware that answers nobody who may not ask, adds headers, and drops clients that do not read."""
 
@@ -161,19 +170,24 @@ class Guard:
                 message = {**message, "headers": [*kept, *added]}
             # A body goes in pieces, each of which the client must take in time.
             body, start = message.get("body", b""), 0
-            while len(body) - start > _PIECE:
-                piece = {"type": message["type"], "body": body[start : start + _PIECE], "more_body": True}
-                await asyncio.wait_for(send(piece), _TIMEOUT)
-                start += _PIECE
-            await asyncio.wait_for(send({**message, "body": body[start:]} if start else message), _TIMEOUT)
+            try:
+                while len(body) - start > _PIECE:
+                    piece = {"type": message["type"], "body": body[start : start + _PIECE], "more_body": True}
+                    await asyncio.wait_for(send(piece), _TIMEOUT)
+                    start += _PIECE
+                await asyncio.wait_for(send({**message, "body": body[start:]} if start else message), _TIMEOUT)
+            except OSError as error:
+                raise _GoneError from error
 
-        with contextlib.suppress(OSError, TimeoutError):  # the client has gone or is too slow
+        with contextlib.suppress(_GoneError):
             if refused is not None:
                 await PlainTextResponse(f"{refused[1]}\n", refused[0])(scope, receive, patient)
             elif given is not None and scope["type"] == "http" and scope["method"] == "GET":
-                # Out of the address bar and its history; the cookie is sent to this server alone.
+                # Out of the address bar and its history. Lax: a link on another site opens the page too; what changes
+                # anything has an Origin, which is checked.
                 response = RedirectResponse(scope["path"], 303)
-                response.headers["set-cookie"] = f"{COOKIE}={given}; Path=/; HttpOnly; SameSite=Strict"
+                name = cookie_name(connection.headers.get("host", ""))
+                response.headers["set-cookie"] = f"{name}={given}; Path=/; HttpOnly; SameSite=Lax"
                 await response(scope, receive, patient)
             else:
                 await self._app(scope, receive, patient)
@@ -225,8 +239,8 @@ class ViewerServer:
             fault = f"--host {access.host} --port {port}: cannot listen there ({error.strerror}); choose another port"
             raise UsageError(fault) from error
         self.port: int = listener.getsockname()[1]
-        # A mistake of the page's user is a line in the answer.
-        wrong = {FprfError: lambda request, error: PlainTextResponse(str(error), 400)}
+        # A mistake of the page's user, or what this machine cannot do, is a line in the answer.
+        wrong = dict.fromkeys((FprfError, OSError), lambda request, error: PlainTextResponse(_line(error), 400))
         app = Starlette(routes=self._routes(), middleware=[Middleware(Guard, access=access)], exception_handlers=wrong)
         # Bounded connections, heads and messages; no proxy is believed, and nothing of a request is logged.
         config = uvicorn.Config(
@@ -293,7 +307,11 @@ class ViewerServer:
         self._close_session()
         session = self._opened.enter_context(Session(viewed, self.post))
         for path in viewed.references:
-            session.upload(path.read_bytes(), path.name)
+            try:
+                session.upload(path.read_bytes(), path.name)
+            except (DataError, OSError) as error:
+                why = error.strerror if isinstance(error, OSError) else str(error).removeprefix("photograph: ")
+                raise DataError(f"{path}: {why}") from error
         if warm:
             session.warm_up()
         self._session = session
@@ -365,8 +383,8 @@ class ViewerServer:
                 if session is not None:
                     try:
                         session.handle(number, message)
-                    except FprfError as error:
-                        client.put("said", json.dumps({"type": "said", "text": str(error), "bad": True}))
+                    except (FprfError, OSError) as error:
+                        client.put("said", json.dumps({"type": "said", "text": _line(error), "bad": True}))
 
         # Whichever ends first, a client that leaves or one that does not read, ends the other.
         ways = [asyncio.create_task(receive()), asyncio.create_task(client.send(socket))]
@@ -456,6 +474,11 @@ class ViewerServer:
             except TimeoutError:
                 raise HTTPException(408, "the request came too slowly") from None
         raise HTTPException(413, f"more than {_MAX_BODY} bytes: make the photograph smaller")
+
+
+def _line(error: Exception) -> str:
+    """What an error says; of the system's, where and what."""
+    return f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
 
 
 def _integer(request: Request, name: str) -> int:

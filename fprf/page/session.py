@@ -6,10 +6,11 @@ newest checkpoint is shown, and as long as somebody looks the folder says so (`t
 more often.
 """
 
-import json
+import secrets
 import threading
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -39,7 +40,7 @@ from .drawing import (
 from .pack import colour_header, colour_section, container
 from .render_worker import RenderWorker, Steps
 from .state import NOW, Look, Photograph, Shown, State
-from .uploads import Uploads, newest_step, shown_name
+from .uploads import Uploads, newest_step, shown_name, training_progress
 from .writer import about, packed_scene
 
 if TYPE_CHECKING:
@@ -84,6 +85,8 @@ class Session:
 
     def __init__(self, viewed: Viewed, post: Post) -> None:
         self.viewed, self._post = viewed, post
+        self._key = secrets.token_hex(8)
+        """Tells pages that a server's scene is another one, also after the server was started anew."""
         self.restyler = Restyler(viewed.scene)
         self.state = State(look=Look(style=viewed.style), together=len(viewed.references) > 1)
         self.uploads = Uploads()
@@ -122,7 +125,7 @@ class Session:
     def hello(self) -> list[tuple[str, dict[str, Any]]]:
         """What a new client has to know."""
         drawn_there, viewed = isinstance(self.viewed.scene, SplatScene), self.viewed
-        scene = {"type": "scene", "name": viewed.name, "gaussians": drawn_there, "step": viewed.step}
+        scene = {"type": "scene", "key": self._key, "name": viewed.name, "gaussians": drawn_there, "step": viewed.step}
         ready = [("colours " + name, self._colours_message(name)) for name in self._colours]
         training = [] if self._progress is None else [("training", self._progress)]
         return [("scene", scene), ("state", self.state.described()), *ready, *training]
@@ -226,15 +229,22 @@ class Session:
             self.viewed = viewed
             before = self.restyler.reload(viewed.scene)
             self._load()
-            # Clients fetch shapes and colours anew: Gaussians of this state are others.
+            # Clients fetch shapes and colours anew: Gaussians of this state are others. What had colours is coloured again.
+            coloured = [*self._colours]
             self._colours.clear()
             for kind, message in self.hello():
                 self._post(None, kind, message)
             # Regions are measured anew, in any order: what is pinned is found again among them.
-            if before is not None and (self.state.look.rules or self.state.picked is not None):
+            picked = self.state.picked
+            if before is not None and (picked is not None or any(look.rules for look in self.state.looks)):
                 regions = matching_regions(before, self.restyler.encoders.scene_style).tolist()
-                self.apply(lambda state: replace(state, look=state.look.renumbered(regions), picked=None))
-            if not self.state.look.plain:
+                self.apply(lambda state: state.renumbered(regions))
+                if picked is not None:
+                    self._select(regions[picked.region])
+            for name, look in self.state.kept:
+                if name in coloured:
+                    self._worker.run(("kept", name), partial(self._colour, name, Shown(look)))
+            if NOW in coloured or not self.state.look.plain:
                 self._refresh()
 
         self._worker.run("reload", job)
@@ -312,7 +322,6 @@ class Session:
                 raise UsageError("this scene has no folder to put a film in")
             films, scene = self.viewed.root / "films", self.viewed.scene
             folder = next(each for number in count(1) if not (each := films / f"{number:04d}").exists())
-            folder.mkdir(parents=True)
             write_film_files(folder, self.state.keys, seconds, scene)
             self.apply(lambda state: replace(state, film=(0, 1, None)))
 
@@ -343,8 +352,6 @@ class Session:
 
 _POLL = 0.5
 """Seconds between looks at a run folder."""
-_TAIL = 4096
-"""Bytes of the end of events.jsonl that hold its last line."""
 
 
 class TrainingFollower:
@@ -379,18 +386,3 @@ class TrainingFollower:
             self.session.reload(self._load())
         if (progress := training_progress(self._root)) is not None:
             self.session.trained(progress)
-
-
-def training_progress(root: Path) -> dict[str, Any] | None:
-    """Progress of a run, by the last line of its events.jsonl: step, share, psnr, seconds left; None where it does not say."""
-    try:
-        with (root / "events.jsonl").open("rb") as file:
-            file.seek(max(0, file.seek(0, 2) - _TAIL))
-            # The first line of the tail may be cut off; events without a share tell nothing of progress.
-            lines = [json.loads(line) for line in file.read().decode(errors="replace").splitlines()[1:]]
-        last = next(line for line in reversed(lines) if "share" in line)
-        # As long again for each share that is left, at the speed so far.
-        left = last["seconds"] * (1 - last["share"]) / max(last["share"], 1e-3)
-        return {"step": int(last["step"]), "share": last["share"], "psnr": float(last["psnr"]), "seconds_left": round(left)}
-    except (OSError, ValueError, KeyError, StopIteration):
-        return None

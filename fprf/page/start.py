@@ -7,6 +7,7 @@ their poses, and the run folder `run`.
 
 import contextlib
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -21,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from ..errors import DataError, FprfError, UsageError
 from .messages import Leave, Make, New, Open, StartRequest, Stop
-from .uploads import SceneFiles, Source, find_source, is_capture, newest_step
+from .uploads import SceneFiles, Source, find_source, is_capture, newest_step, training_progress
 
 if TYPE_CHECKING:
     from .server import ViewerServer
@@ -102,20 +103,17 @@ class Start:
                 # A file or folder of this machine, by its path as it is copied from elsewhere.
                 if not (text := asked.path.strip().strip("\"'")):
                     raise UsageError("name a run folder, a capture, a video or a folder of photographs")
-                path = Path(text).expanduser()
+                path = Path(os.path.expanduser(text))  # as it is where there is no such user
                 source, whole = find_source(path), path.resolve()
                 if source.kind == "run":
                     name = whole.parent.name if whole.name == _RUN else whole.name
                 else:
-                    ours = whole.name == _FILES and whole.parent.parent == self._output
+                    ours = whole.name in (_FILES, _SCENE) and whole.parent.parent == self._output
                     name = whole.parent.name if ours else self._unused(path.stem)
                 self._begin(source, name, asked.minutes)
-            case Stop():
-                busy = self._busy  # asked before it ends by this very request
+            case Stop() if self._progress.error is None:
                 self._interrupt("stop")
-                if not busy:  # a failure is put away
-                    self._tell(Progress())
-            case Leave():
+            case Stop() | Leave():  # a failure is put away, with what is shown of it
                 if self._busy:
                     self._interrupt("leave")
                 self._progress = Progress()
@@ -133,7 +131,8 @@ class Start:
     def _begin(self, source: Source, name: str, minutes: float) -> None:
         with self._lock:
             if self._busy:
-                raise UsageError(f"{self._progress.name} is being made; stop it first")
+                name = self._progress.name  # none after `leave`, while what there is of it is saved
+                raise UsageError(f"{name} is being made; stop it first" if name else "a scene is being saved; try again")
             # One scene is made at a time: training takes all cores.
             self._stopped = ""
             folder = self._output / name if source.kind != "run" else source.path
@@ -192,8 +191,16 @@ class Start:
         if bool(self._stopped):  # not narrowed by mypy: another thread sets it
             raise _Left
         command = [sys.executable, "-m", "fprf", *args]
+        # A group of its own: an interrupt at the terminal is ours alone, and a second one would end it before it has saved.
         with subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace"
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            process_group=0,
+            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
         ) as process:
             self._process = process
             assert process.stdout is not None
@@ -236,7 +243,7 @@ class Start:
         process = self._process
         if process is not None:
             with contextlib.suppress(OSError):
-                process.send_signal(signal.SIGINT)
+                process.send_signal(getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT))
             last = threading.Timer(_EXIT_TIMEOUT, process.kill)
             last.daemon = True
             last.start()
@@ -266,14 +273,22 @@ class Start:
         # Runs of the terminal lie in `runs`, that of the demo in its folder.
         runs = [(path.parent, path.parent.name) for path in Path("runs").glob("*/config.json") if newest_step(path.parent) >= 0]
         found = [*runs, (Path("demo/run"), "demo")]
-        for folder in self._output.glob("*/"):  # a scene's run, or its files where there is none yet
-            found.append((folder / (_RUN if newest_step(folder / _RUN) >= 0 else _FILES), folder.name))
+        for folder in self._output.glob("*/"):  # a scene's run, and its files where training has not come to its end
+            run, files, scene = (folder / part for part in (_RUN, _FILES, _SCENE))
+            trained = newest_step(run) >= 0
+            progress = training_progress(run) if trained else {"share": 0}
+            if trained:
+                found.append((run, folder.name))
+            if progress is not None and progress["share"] < 1:
+                found.append((scene if trained and not files.is_dir() else files, folder.name))
         dated = [(path.stat().st_mtime, path, name) for path, name in found if path.is_dir()]
         rows = []
         for date, path, name in sorted(dated, reverse=True)[:_RECENT]:
             kind = "trained"
-            if path.name == _FILES:
-                kind = "capture" if any(is_capture(each) for each in (path, *path.iterdir())) else "not trained yet"
+            if path.name in (_FILES, _SCENE):
+                some = newest_step(path.with_name(_RUN)) >= 0
+                capture = any(is_capture(each) for each in (path, *path.iterdir()))
+                kind = "train on" if some else "capture" if capture else "not trained yet"
             when = time.strftime("%d %b %H:%M", time.localtime(date))
             rows.append({"path": str(path.resolve()), "name": name, "kind": kind, "when": when})
         return rows

@@ -20,12 +20,10 @@ from ..plugins.slots import hints_of
 from ..style.config import StyleConfig, with_preset
 from ..style.dictionary import Reference
 from . import messages
-from .messages import Camera
+from .messages import SHELF, Camera
 
 Map: TypeAlias = Literal["none", "matches", "regions"]
 RegionAction: TypeAlias = Literal["pin", "forbid", "keep"]
-SHELF = 12
-"""Photographs on the shelf; the oldest that no look needs makes room."""
 NOW = "Now"
 """Name of the colours of the present look, beside those of looks that are kept."""
 _MAX_KEYS = 64
@@ -178,10 +176,20 @@ class State:
         return Shown(self.look, self.map, None if self.picked is None else self.picked.region)
 
     @property
+    def looks(self) -> tuple[Look, ...]:
+        """The look of now, those that were kept, and those of the film."""
+        return (self.look, *(look for _, look in self.kept), *(key.look for key in self.keys))
+
+    @property
     def in_use(self) -> frozenset[Photograph]:
         """Photographs that some look needs."""
-        looks = [self.look, *(look for _, look in self.kept), *(key.look for key in self.keys)]
-        return frozenset(photograph for look in looks for photograph, _ in look.mix)
+        return frozenset(photograph for look in self.looks for photograph, _ in look.mix)
+
+    def renumbered(self, regions: Sequence[int]) -> "State":
+        """With region r as regions[r] in the rules of all looks; none is picked: regions were measured again."""
+        kept = tuple((name, look.renumbered(regions)) for name, look in self.kept)
+        keys = tuple(key._replace(look=key.look.renumbered(regions)) for key in self.keys)
+        return replace(self, look=self.look.renumbered(regions), kept=kept, keys=keys, picked=None)
 
     def photograph(self, number: int | None) -> Photograph:
         """A photograph of the shelf. Raises UsageError where it is not there."""

@@ -18,7 +18,7 @@ import threading
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path, PurePosixPath
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 from ..datamanagers.images import IMAGE_SUFFIXES, kind_of
 from ..datamanagers.parsers.config import recognise
@@ -174,6 +174,8 @@ _MAX_SCENE_BYTES = 16 << 30
 _ROOM = 1 << 30
 """Bytes of the disk that are left free."""
 _MAX_DEPTH, _MAX_PART = 6, 120
+_TAIL = 4096
+"""Bytes of the end of events.jsonl that hold its last line."""
 
 
 class Source(NamedTuple):
@@ -200,6 +202,21 @@ def newest_step(run: Path) -> int:
     """Step of the newest whole checkpoint; -1 where there is none."""
     steps = (path.parent.name.removeprefix("step-") for path in run.glob("checkpoints/step-*/manifest.json"))
     return max((int(step) for step in steps if step.isdigit()), default=-1)
+
+
+def training_progress(root: Path) -> dict[str, Any] | None:
+    """Progress of a run, by the last line of its events.jsonl: step, share, psnr, seconds left; None where it does not say."""
+    try:
+        with (root / "events.jsonl").open("rb") as file:
+            file.seek(max(0, file.seek(0, 2) - _TAIL))
+            # The first line of the tail may be cut off; events without a share tell nothing of progress.
+            lines = [json.loads(line) for line in file.read().decode(errors="replace").splitlines()[1:]]
+        last = next(line for line in reversed(lines) if "share" in line)
+        # As long again for each share that is left, at the speed so far.
+        left = last["seconds"] * (1 - last["share"]) / max(last["share"], 1e-3)
+        return {"step": int(last["step"]), "share": last["share"], "psnr": float(last["psnr"]), "seconds_left": round(left)}
+    except (OSError, ValueError, KeyError, StopIteration):
+        return None
 
 
 def find_source(path: Path) -> Source:

@@ -287,8 +287,9 @@ class _SignalHandler:
 
     def __enter__(self) -> "_SignalHandler":
         if threading.current_thread() is threading.main_thread():
-            numbers = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is not None]
-            self.before = {number: signal.signal(number, self.note) for number in numbers}
+            # Windows has SIGBREAK for a process group of its own.
+            held = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGBREAK", signal.SIGTERM)}
+            self.before = {number: signal.signal(number, self.note) for number in held if signal.getsignal(number) is not None}
         return self
 
     def __exit__(self, *error: object) -> None:

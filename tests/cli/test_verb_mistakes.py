@@ -85,6 +85,8 @@ MISTAKES = """
     view run --token short | --token
     view run --host no.such.host.invalid --port 0 --token a-long-enough-token | no.such.host.invalid
     view photos --port 0 | no config.json
+    view photos.ply --port 0 --follow | --follow
+    view run --port 0 --references 1 2 3 4 5 6 7 8 9 10 11 12 13 | takes 12
 """
 
 

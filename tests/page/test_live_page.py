@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,12 @@ import cv2
 import pytest
 import torch
 from chromium import chromium
+from pages import seen
 from splat_ball import ball
 from tiny_world import World, flags
 
+from fprf.page.server import Access, ViewerServer
+from fprf.page.session import Viewed
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.gaussians import from_tensors
 from fprf.training import checkpoint
@@ -42,7 +46,7 @@ def served(run: Path | None, *args: str) -> Iterator[str]:
         try:
             yield process.stdout.readline().strip()
         finally:
-            process.send_signal(signal.SIGINT)
+            process.send_signal(signal.SIGTERM if run is None else signal.SIGINT)  # either cleans up
             try:
                 _, error = process.communicate(timeout=60)
             except subprocess.TimeoutExpired:
@@ -140,6 +144,31 @@ def test_gaussians_take_photographs_looks_are_kept_and_two_pages_agree(world: Wo
             page.locator("#save-ply").click()
         downloaded.value.save_as(tmp_path / "restyled.ply")
         assert len(read_capture(tmp_path / "restyled.ply").gaussians) == 500
+
+
+def test_a_page_keeps_up_with_its_server(world: World) -> None:
+    viewed = Viewed(seen(ball(400, 2)), "ball", 1)
+    with ViewerServer(Access("127.0.0.1", None), 0) as server:
+        session = server.open(lambda: viewed, warm=False)
+        with front(server.address) as page:
+            # A newer state comes while a sort is under way.
+            page.evaluate("() => { fprf.place.splats.worker.postMessage = () => {}; fprf.place.touch(); }")
+            page.wait_for_function("() => fprf.place.sorting")
+            session.reload(replace(viewed, step=1))
+            page.wait_for_function("() => fprf.live.scene.step === 1 && fprf.place.splats.kept && !fprf.place.sorting")
+            # What is changed here is seen here.
+            page.set_input_files("#photographs", str(world.references[0]))
+            page.wait_for_function("() => fprf.stage.to === 'Now'", timeout=120_000)
+            page.evaluate("() => fprf.stage.choose('Captured')")
+            page.locator("[data-look=strength]").fill("0.5")
+            page.wait_for_function("() => fprf.stage.to === 'Now'")
+            # A page that was away for a moment asks for its view again.
+            page.evaluate("() => { fprf.place.touch = (moved = true) => { window.before ||= moved; }; }")
+            page.evaluate("() => fprf.live.socket.close()")
+            page.wait_for_function("() => window.before")
+            # Another scene of the same name and step begins anew.
+            server.open(lambda: replace(viewed, step=1), warm=False)
+            page.wait_for_function("() => !window.before && window.fprf")
 
 
 def test_photographs_become_a_restyled_ply_without_a_terminal(tmp_path: Path) -> None:

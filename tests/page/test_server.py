@@ -6,6 +6,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import pytest
 from starlette.requests import Request
@@ -16,11 +17,12 @@ from websockets.sync.client import ClientConnection, connect
 
 from fprf.errors import UsageError
 from fprf.page import server
-from fprf.page.server import COOKIE, Access, Client, ViewerServer, make_access
+from fprf.page.server import Access, Client, ViewerServer, cookie_name, make_access
 
 HERE = Access("127.0.0.1", None)
 TOKEN = "a-token-of-sixteen-characters"
 THERE = Access("0.0.0.0", TOKEN)
+COOKIE = "fprf-token-8080"
 
 
 def test_this_machine_alone_is_let_in_by_its_names_and_from_its_own_pages() -> None:
@@ -41,6 +43,9 @@ def test_from_elsewhere_a_token_is_needed_in_one_of_three_places() -> None:
     assert THERE.refusal(host, "wrong-token-of-16-chars") is not None
     assert THERE.refusal(host, "töken-that-is-no-ascii") is not None
     assert THERE.refusal({**host, "cookie": f"{COOKIE}=x{TOKEN}"}) is not None
+    both = {"cookie": f"{COOKIE}={TOKEN}; fprf-token-8081=another; fprf-token-80={TOKEN}"}  # viewers on other ports
+    assert THERE.refusal({**host, **both}) is None and THERE.refusal({"host": "[::1]:8081", **both}) is not None
+    assert THERE.refusal({"host": "[::1]", **both}) is None
     assert THERE.refusal({**host, "origin": "http://evil.example", "cookie": f"{COOKIE}={TOKEN}"}) is not None
 
 
@@ -63,7 +68,10 @@ class Probe(ViewerServer):
         async def film(request: Request) -> Response:
             return Response(b"x" * (64 << 20), media_type="video/mp4")
 
-        return [Route("/echo", echo, methods=["POST"]), Route("/film64", film), *super()._routes()]
+        async def full(request: Request) -> Response:
+            raise PermissionError(13, "Permission denied", "/made/yard")
+
+        return [Route("/full", full), Route("/echo", echo, methods=["POST"]), Route("/film64", film), *super()._routes()]
 
 
 @pytest.fixture
@@ -134,6 +142,19 @@ def test_what_is_wrong_is_refused(http: ViewerServer, line: str, headers: tuple[
     assert status(http, "GET /") == 200
 
 
+def test_what_the_system_refuses_is_told(http: ViewerServer) -> None:
+    answer = request(http, "GET /full")
+    assert answer.startswith(b"HTTP/1.1 400 ") and answer.endswith(b"/made/yard: Permission denied")
+
+    def handle(client: int, message: object) -> None:
+        raise OSError(28, "No space left on device", "/films")
+
+    http._session = SimpleNamespace(hello=list, handle=handle, disconnect=str)  # type: ignore[assignment]
+    with opened(http) as client:
+        client.send(GOOD)
+        assert json.loads(client.recv())["text"] == "/films: No space left on device"
+
+
 def test_nonsense_and_half_heads_end_their_own_connection_alone(http: ViewerServer) -> None:
     for data in (b"", b"\x16\x03\x01\x02\x00", b"\0" * 100 + b"\r\n\r\n", b"GET / HTTP/1.1\r\nX: " + b"y" * 20_000):
         talk(http, data)
@@ -165,11 +186,11 @@ def test_a_token_in_the_address_becomes_a_cookie() -> None:
     with Probe(Access("127.0.0.1", TOKEN), 0) as http:
         assert http.address.endswith(f"/?token={TOKEN}")
         assert status(http, "GET /scene") == status(http, "GET /") == status(http, "GET /?token=wrong") == 403
-        answer = request(http, f"GET /?token={TOKEN}")
+        answer, name = request(http, f"GET /?token={TOKEN}"), cookie_name(f"127.0.0.1:{http.port}")
         assert answer.startswith(b"HTTP/1.1 303 ") and b"location: /\r\n" in answer
-        assert f"set-cookie: {COOKIE}={TOKEN}; Path=/; HttpOnly; SameSite=Strict".encode() in answer
-        assert status(http, "GET /", f"Cookie: {COOKIE}={TOKEN}") == 200
-        assert status(http, "POST /echo", f"Cookie: {COOKIE}={TOKEN}", "Content-Length: 0") == 200
+        assert f"set-cookie: {name}={TOKEN}; Path=/; HttpOnly; SameSite=Lax".encode() in answer
+        assert status(http, "GET /", f"Cookie: {name}={TOKEN}") == 200
+        assert status(http, "POST /echo", f"Cookie: {name}={TOKEN}", "Content-Length: 0") == 200
         assert status(http, "POST /echo", "Content-Length: 0") == 403
         with pytest.raises(InvalidStatus) as told, opened(http):
             pass

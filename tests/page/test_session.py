@@ -2,17 +2,21 @@ import json
 import threading
 import zlib
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from session_helpers import Listener, camera_of
 from tiny_world import World
 
-from fprf.errors import FprfError, UsageError
+from fprf.errors import DataError, FprfError, UsageError
 from fprf.page import messages
+from fprf.page.messages import SHELF
 from fprf.page.render_worker import Steps
+from fprf.page.server import Access, ViewerServer
 from fprf.page.session import Session
-from fprf.page.state import SHELF, State
+from fprf.page.state import State
 from fprf.splats.files import read_capture
 
 
@@ -95,7 +99,15 @@ def test_what_is_wrong_is_said_and_changes_nothing(session: Session, world: Worl
     ):
         with pytest.raises(FprfError):
             session.handle(1, wrong)
-    assert session.state == before
+    assert session.state == before and not (session.viewed.root / "films").exists()  # type: ignore[operator]
+
+
+@pytest.mark.parametrize(("name", "told"), [("none.jpg", "No such file"), ("text.jpg", "no PNG")])
+def test_references_that_cannot_be_taken_are_named(splats: Session, tmp_path: Path, name: str, told: str) -> None:
+    (tmp_path / "text.jpg").write_text("text")
+    viewed = replace(splats.viewed, references=(tmp_path / name,))
+    with ViewerServer(Access("127.0.0.1", None), 0) as server, pytest.raises(DataError, match=f"{name}: {told}"):
+        server.open(lambda: viewed)
 
 
 def test_an_upload_ends_with_the_viewer(session: Session, world: World) -> None:
@@ -135,14 +147,27 @@ def test_the_warm_up_leaves_nothing_behind(session: Session, listener: Listener)
 
 
 def test_newer_states_of_a_training_are_shown_as_they_come(splats: Session, listener: Listener, world: World) -> None:
+    def reloaded(*names: str, **changes: Any) -> None:
+        """Show a newer state, whose colours come anew."""
+        count = len(listener.sent)
+        splats.reload(replace(splats.viewed, **changes))
+        listener.until(lambda: {f"colours {name}" for name in names} <= {kind for _, kind, _ in listener.sent[count:]})
+
     splats.upload(world.references[0].read_bytes(), "dusk.png")
-    listener.until(lambda: any(kind == "colours Now" for _, kind, _ in listener.sent))
+    splats.handle(1, messages.Keep(name="dark", action="keep"))
+    listener.until(lambda: {"colours Now", "colours dark"} <= {kind for _, kind, _ in listener.sent})
     before, scene = splats.geometry, splats.viewed.scene
     moved = replace(scene, gaussians=replace(scene.gaussians, means=scene.gaussians.means + 0.1))  # type: ignore[type-var]
     count = len(listener.sent)
-    splats.reload(replace(splats.viewed, scene=moved, step=9))
-    listener.until(lambda: any(kind == "colours Now" for _, kind, _ in listener.sent[count:]))
+    reloaded("Now", "dark", scene=moved, step=9)
     scenes = [message for _, kind, message in listener.sent[count:] if kind == "scene"]
     assert scenes[-1]["step"] == 9 and splats.geometry != before
     splats.trained({"step": 9, "share": 0.5})
     assert ("training", {"type": "training", "step": 9, "share": 0.5}) in splats.hello()
+    # A map and a region of the captured colours go on as well.
+    splats.handle(1, messages.Set(name="strength", value=0.0))
+    splats.handle(1, messages.Map(map="regions"))
+    splats.handle(1, messages.Pick(camera=camera_of(moved, 2), x=0.5, y=0.5))
+    listener.until(lambda: splats.state.picked is not None)
+    reloaded("Now", scene=scene, step=10)
+    assert splats.state.picked is not None and splats.state.map == "regions"

@@ -1,5 +1,6 @@
 """The start page without a browser, and following a run: programs that find poses and train are stood in for by a script."""
 
+import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator
@@ -13,8 +14,9 @@ from fprf.errors import CheckpointError, DataError, FprfError, UsageError
 from fprf.page import start as start_module
 from fprf.page.messages import Leave, Make, New, Open, Stop
 from fprf.page.server import Access, ViewerServer
-from fprf.page.session import TrainingFollower, Viewed, training_progress, view_of_run
+from fprf.page.session import TrainingFollower, Viewed, view_of_run
 from fprf.page.start import Start
+from fprf.page.uploads import training_progress
 from fprf.training.driver import is_watched
 from fprf.training.loading import open_run
 
@@ -34,13 +36,20 @@ if verb == "process":
     sys.exit(0)
 assert pathlib.Path(args[args.index("--data") + 1], "transforms.json").is_file()
 checkpoint = output / "checkpoints" / "step-0000007"
-checkpoint.mkdir(parents=True)
+checkpoint.mkdir(parents=True, exist_ok=True)
 (output / "config.json").touch()
 (checkpoint / "manifest.json").touch()
 line = {{"event": "training", "step": 7, "share": 0.5, "psnr": 20.0, "seconds_left": 61}}
 print(json.dumps(line), file=sys.stderr, flush=True)
+if args[args.index("--minutes") + 1] == "3":
+    (output / "events.jsonl").write_text("\\n" + json.dumps({{**line, "seconds": 9}}))
+    time.sleep(1)
+    sys.exit("error: out of memory")
 if args[args.index("--minutes") + 1] != "1":
-    time.sleep(100)
+    try:
+        time.sleep(100)
+    except KeyboardInterrupt:
+        time.sleep(0.5)  # it saves
 """
 
 
@@ -61,6 +70,9 @@ class Shown(Start):
 
     def open(self, load: Callable[[], Any], *, warm: bool = True) -> Any:
         return load()
+
+    def trained(self, progress: Any) -> None:
+        """A session's."""
 
     def show_start(self, start: Start) -> None:
         self.shown.clear()
@@ -115,6 +127,8 @@ def test_a_scene_in_training_is_shown_until_it_is_left(page: Shown, photographs:
     state = page.reached(stage="training", share=0.5)
     assert state["detail"] == "step 7 · 20.0 dB · 1:01 left"
     until(lambda: len(page.shown) == 1)
+    # An interrupt at the terminal does not reach it past the viewer, whose own would be the second.
+    assert page._process is not None and os.getpgid(page._process.pid) == page._process.pid
     with pytest.raises(UsageError, match="yard is being made"):
         page.handle(Open(path=str(photographs)))
     page.handle(asked)
@@ -137,9 +151,24 @@ def test_a_failure_is_told_and_nothing_is_lost(page: Shown, photographs: Path, t
     assert page.handle(New(name="My capture.ply"))["scene"] == "My-capture-ply-2"
 
 
+def test_a_training_that_failed_past_its_first_checkpoint_is_put_away(page: Shown, photographs: Path) -> None:
+    page.handle(Open(path=str(photographs), minutes=3))
+    page.reached(error="out of memory")
+    assert len(page.shown) == 1
+    page.handle(Stop())
+    recent = page.reached(stage="idle")["recent"]
+    assert page.shown == [] and [(row["name"], row["kind"]) for row in recent] == [("yard", "trained"), ("yard", "train on")]
+    page.handle(Open(path=recent[1]["path"]))
+    page.reached(name="yard", stage="training", share=0.5)
+    page.handle(Leave())
+    with pytest.raises(UsageError, match="a scene is being saved"):
+        page.handle(Open(path=str(photographs)))
+
+
 def test_requests_that_make_no_sense_are_refused(page: Shown) -> None:
     empty = page.handle(New(name=""))["scene"]
-    for asked in (Make(scene=empty), Make(scene="../yard"), Open(path=" "), Open(path="/no/such")):
+    wrong = (Open(path=" "), Open(path="/no/such"), Open(path="~nobody-here/x"))
+    for asked in (Make(scene=empty), Make(scene="../yard"), *wrong):
         with pytest.raises(FprfError):
             page.handle(asked)
     with pytest.raises(UsageError):

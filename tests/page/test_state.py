@@ -16,9 +16,9 @@ from tiny_world import World
 from fprf.errors import ConfigError, DataError, UsageError
 from fprf.page import messages
 from fprf.page.drawing import cameras_of
-from fprf.page.messages import Camera, Card, Keep, Key, Preset, Set, StartRequest, read_message
-from fprf.page.state import SHELF, Look, Photograph, State
+from fprf.page.messages import SHELF, Camera, Card, Keep, Key, Preset, Set, StartRequest, read_message
 from fprf.page.state import Key as Keyframe
+from fprf.page.state import Look, Photograph, State
 from fprf.plugins.stylizers.config import AdainConfig
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import Reference

@@ -24,7 +24,7 @@ const unpacked = async (answer) => {
 
 class Live {
   constructor() {
-    Object.assign(this, { place: null, stage: null, scene: null, state: null, asked: false, last: {}, cards: new Map(), pending: new Map() });
+    Object.assign(this, { place: null, stage: null, scene: null, state: null, asked: false, changed: false, last: {}, cards: new Map(), pending: new Map() });
     this.start = new Start();
     this.controls();
     this.connect();
@@ -38,6 +38,7 @@ class Live {
   }
 
   tell(type, more = {}) {
+    if (["set", "preset", "card", "map", "region"].includes(type)) this.changed = true;
     if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify({ type, ...more }));
   }
 
@@ -58,7 +59,7 @@ class Live {
     if (!this.scene) { this.mode("start"); this.start.fill(message); return; }
     if (message.stage === "idle") { location.reload(); return; }
     at("scenes").hidden = false;
-    at("finish").hidden = message.stage !== "training";
+    at("finish").hidden = message.stage !== "training" || Boolean(message.error);
     if (message.error) say(message.error, true);
   }
 
@@ -68,8 +69,8 @@ class Live {
 
   async open(scene) {
     const before = this.scene;
-    if (before && (before.name !== scene.name || before.gaussians !== scene.gaussians)) { location.reload(); return; }
-    if (before && before.step === scene.step) return; // it was only away for a moment
+    if (before && before.key !== scene.key) { location.reload(); return; }
+    if (before && before.step === scene.step) { this.place.touch(); return; } // it was only away for a moment
     const { head, parts } = await unpacked(await fetch("/scene"));
     this.mode("scene");
     this.scene = scene;
@@ -110,9 +111,12 @@ class Live {
     const { head, parts } = await unpacked(await fetch(`/colours?name=${encodeURIComponent(name)}&version=${version}`));
     await this.place.splats.add(name, head, parts.rows);
     this.place.touch(false);
-    const fresh = !this.stage.styles.some((style) => style.name === name);
+    const { styles, from, to, wiping, amount } = this.stage, fresh = !styles.some((style) => style.name === name);
     this.stage.add({ name });
-    if (fresh && name === "Now") this.stage.choose(name);
+    if (name !== "Now") return;
+    // What was changed here is seen here; what others change is not thrust upon this page.
+    if (fresh || (this.changed && to !== name && (from !== name || !(wiping || amount < 1)))) this.stage.choose(name);
+    this.changed = false;
   }
 
   // Where the server draws: the newest pictures, and the line between them.
@@ -244,6 +248,7 @@ class Live {
       const line = say(`${file.name} …`, true);
       line.className = "";
       try {
+        this.changed = true;
         await post(`/photograph?name=${encodeURIComponent(file.name)}`, file);
       } catch (error) {
         say(`${file.name}: ${error.message}`, true);

@@ -183,6 +183,7 @@ class Splats {
     [...Object.values(this.textures), ...coloured].forEach((texture) => this.gl.deleteTexture(texture));
     this.colours.clear();
     this.worker?.terminate();
+    this.sorted?.(); // a sort that was under way is never answered
     Object.assign(this, { head, count: head.count, order: null, kept: 0, sortMilliseconds: 0 });
     this.source = { shape, chunks, palette }; // to come back from a lost context
     this.worker = new Worker(URL.createObjectURL(new Blob([`"use strict";(${sorter})()`], { type: "text/javascript" })));
@@ -298,6 +299,7 @@ class Splats {
   // Order the Gaussians for a camera; `view` is world to camera by columns. One at a time.
   sort(view, near) {
     return new Promise((done) => {
+      this.sorted = done;
       this.worker.onmessage = ({ data }) => {
         this.order = data.order;
         this.kept = data.kept;
