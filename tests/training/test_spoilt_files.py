@@ -177,6 +177,6 @@ def test_a_line_of_events_with_a_number_too_large_is_passed_over(example: Exampl
     events = example.parts[0] / "events.jsonl"
     events.write_text(events.read_text() + f'{{"step": 4, "seconds": {LARGE}}}\n{{"step": {LARGE}, "seconds": 2}}\n')
     events.write_text(events.read_text() + '{"step": 5, "seconds": 3, "psnr": 1e308}\n')
-    (history,) = read_history(example.root)
+    (history,) = (each for each in read_history(example.root) if each.name in ("", example.parts[0].name))
     assert history.step == [3, 5] and history.values["psnr"] == [20.0, None]
     example.restore()
