@@ -206,7 +206,8 @@ def test_photographs_become_a_restyled_ply_without_a_terminal(tmp_path: Path) ->
         downloaded.value.save_as(tmp_path / "picture.png")
         assert cv2.imread(str(tmp_path / "picture.png")).std() > 20
         page.locator("#scenes").click()
-        page.locator("#recent b", has_text="garden").wait_for()
+        page.get_by_role("button", name="garden trained").wait_for()
+        page.get_by_role("button", name="garden train on").wait_for()  # it was stopped before its end
 
 
 @pytest.mark.parametrize("method", ["fprf-lite", "fprf-splats"])
