@@ -11,7 +11,7 @@ SCENES = {
     "llff_fern, poses by fprf process": "#a142f4",
     "garden_seattle": "#d93025",
 }
-"""Scenes that are drawn, and their colours; both are legible on white and on black."""
+"""Scenes that are drawn, and the colours of their lines."""
 PANELS = (
     ("psnr", "PSNR in dB, higher is better", 20.0, 34.0, 2.0),
     ("ssim", "SSIM, higher is better", 0.65, 0.95, 0.05),

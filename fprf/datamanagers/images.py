@@ -167,7 +167,7 @@ def load_image(
 
 
 def has_transparency(path: Path) -> bool:
-    """Whether any pixel of an image that has alpha is not opaque; true for one that cannot be decoded."""
+    """Return true if an image has a pixel that is not opaque, and for one that cannot be decoded."""
     try:
         alpha = _decode(path, upright=False)[1]
     except DataError:

@@ -477,7 +477,7 @@ class ViewerServer:
 
 
 def _line(error: Exception) -> str:
-    """What an error says; of the system's, where and what."""
+    """The text of an error for the client; of an OSError its file and reason."""
     return f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
 
 

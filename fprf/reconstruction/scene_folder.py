@@ -21,7 +21,7 @@ from ..io.atomic import write_json
 
 _FORMAT = 1
 _IGNORED = {"images", "sfm", ".DS_Store", "Thumbs.db", "desktop.ini"}
-"""What a folder may hold in which a scene is begun: images, and what file managers leave behind."""
+"""Names that a folder may hold when a scene is begun in it: images, and what file managers leave behind."""
 
 Progress = Callable[[int, int, str], None]
 """Told (done, total, what)."""

@@ -371,7 +371,7 @@ def reference_views(path: Path, look: LookConfig, folder: Path) -> tuple[tuple[P
 
 
 def _grid(points: Annotated[Tensor, "N 3"]) -> tuple[Annotated[Tensor, "3"], float]:
-    """Where the cells around points begin, and the edge of the finest; strays would push all others out of the grid."""
+    """Lowest corner of the cells around points, and the edge of the finest. Strays are left out: the grid cannot reach both."""
     bulk = bulk_of(points.numpy())
     return points[torch.from_numpy(bulk.apart <= _STRAY)].amin(0), (bulk.side or 1.0) / _FINEST
 

@@ -31,7 +31,7 @@ _LENSES = frozenset(
     | {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 )
 _APPLIED = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]])
-"""What ns-process-data applied before it wrote `applied_transform`."""
+"""The transform that ns-process-data applied before it wrote `applied_transform`."""
 
 
 class _Entry(NamedTuple):
