@@ -171,7 +171,7 @@ class CellPart(Part):
         # Only what lies inside and in the border becomes more: its share of all that may be added.
         around = int(cell.around(gaussians.means).sum())
         cap = len(gaussians) + round(max(config.most - len(whole), 0) * around / len(whole))
-        tones = overview_tones(self.facts, start)
+        tones, device = overview_tones(self.facts, start), device_of(config.device)
         learner = GaussianLearner(
             replace(config, cap=cap, rate=_RATE * config.rate),
             make_levels(own, images, masks, near, skies),
@@ -185,7 +185,7 @@ class CellPart(Part):
             stage=Stage(start.step, config.overview, 1.0),
             known=known_of(own, config.data, self.facts),
             origin="the whole scene",
-            device=device_of(config.device),
+            device=device,
         )
         # Their moments go on, and their number grows as if it had from the beginning of the schedule.
         passed = min(config.overview / config.grow, 0.99)

@@ -5,9 +5,9 @@ pixel centres lie at +0.5. Camera axes of the rasteriser are OpenCV's (x right, 
 """
 
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -20,6 +20,7 @@ from torch import Tensor
 from ..datamanagers.images import Image, load_images, load_mask
 from ..datamanagers.scene import Scene
 from ..ops.photometric import WINDOW
+from ..ops.rasterise.gsplat import target_on, usable
 from ..ops.rasterise.rendering import Pinhole
 from ..ops.rasterise.training import Floats, Target, target_of
 from ..rendering.cameras import Cameras, Intrinsics, directions_of, intrinsics_of, pixel_grid, project, rays_through
@@ -77,8 +78,10 @@ class _Kept(OrderedDict[tuple[int, int], Target]):
 class _Scaled(Level):
     """Views at 1/2^k of their size, brought into the rasteriser's layout when a step asks for them."""
 
-    def __init__(self, views: Mapping[int, _View], k: int, kept: _Kept, blurred: frozenset[int]) -> None:
-        self.views, self.k, self.kept, self.blurred = views, k, kept, blurred
+    def __init__(
+        self, views: Mapping[int, _View], k: int, kept: _Kept, blurred: frozenset[int], make: Callable[..., Target]
+    ) -> None:
+        self.views, self.k, self.kept, self.blurred, self.make = views, k, kept, blurred, make
 
     def __iter__(self) -> Iterator[int]:
         return iter(self.views)
@@ -99,13 +102,13 @@ class _Scaled(Level):
         # Each size is reduced from the full one, so that errors do not add up; the camera shrinks with the image.
         colours: Floats = np.divide(image, 255, dtype=np.float32)
         reduced: Floats = np.asarray(cv2.resize(colours, size, interpolation=cv2.INTER_AREA), np.float32) if self.k else colours
-        target = target_of(small, reduced, _resized(valid, size), _resized(sky, size))
+        target = self.make(small, reduced, _resized(valid, size), _resized(sky, size))
         self.kept.add(key, target)
         return target
 
 
 def _bytes(target: Target) -> int:
-    return sum(part.nbytes for part in target if isinstance(part, np.ndarray))
+    return sum(part.nbytes for part in (*target, *(target.there or ())) if isinstance(part, np.ndarray | Tensor))
 
 
 def camera_of(cameras: Cameras, view: int, near: float = 0.01) -> Pinhole:
@@ -212,11 +215,18 @@ def load_photographs(config: GaussiansConfig, scene: Scene, views: list[int]) ->
 
 
 def make_levels(
-    scene: Scene, images: Mapping[int, Image], masks: Masks, near: float, skies: Masks | None = None
+    scene: Scene,
+    images: Mapping[int, Image],
+    masks: Masks,
+    near: float,
+    skies: Masks | None = None,
+    *,
+    device: torch.device | None = None,
 ) -> list[Level]:
     """The training views at their own size, at half of it and so on, until the longer side has less than 240 pixels.
 
-    A view counts where its mask, if it has one, is true; where that in `skies` is true it shows sky.
+    A view counts where its mask, if it has one, is true; where that in `skies` is true it shows sky. They are made for the CPU,
+    or for a CUDA `device` on which gsplat trains.
     """
     cameras = {view: covering(scene.cameras, view, near) for view in scene.train.tolist()}
     longest = max(max(each.width, each.height) for each in cameras.values())
@@ -235,8 +245,9 @@ def make_levels(
         image, valid = undistorted(scene.cameras, view, images[view], camera)
         mask, sky = straightened(masks, view), straightened(skies or {}, view)
         pixels[view] = _View(camera, image, mask if valid is None else valid if mask is None else valid & mask, sky)
-    kept, blurred = _Kept(), blurred_views(scene.cameras, {view: images[view] for view in cameras}, count)
-    return [_Scaled(pixels, k, kept, blurred[k]) for k in range(count)]
+    blurred = blurred_views(scene.cameras, {view: images[view] for view in cameras}, count)
+    kept, make = _Kept(), partial(target_on, device) if device is not None and usable(device) else target_of
+    return [_Scaled(pixels, k, kept, blurred[k], make) for k in range(count)]
 
 
 def detail(image: Image, scales: int) -> Annotated[NDArray[np.float64], "K"]:

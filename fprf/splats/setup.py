@@ -76,7 +76,7 @@ def build(
     near = find_near(scene, points)
     learner = GaussianLearner(
         config,
-        make_levels(scene, images, masks, near, skies),
+        make_levels(scene, images, masks, near, skies, device=device),
         scene_scale(scene),
         max(config.most, len(points.position) + config.surroundings),
         None if sphere is None else sphere.encloses,

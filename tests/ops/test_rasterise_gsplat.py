@@ -22,8 +22,8 @@ from torch import Tensor
 from fprf.ops import backend, photometric
 from fprf.ops.rasterise import gsplat as rasterise_gsplat
 from fprf.ops.rasterise import rendering as rasterise
-from fprf.ops.rasterise.gsplat import GsplatGaussians, photometric_loss
-from fprf.ops.rasterise.training import TrainableGaussians, target_of
+from fprf.ops.rasterise.gsplat import GsplatGaussians, photometric_loss, target_on
+from fprf.ops.rasterise.training import Target, TrainableGaussians, target_of
 
 CPU = torch.device("cpu")
 
@@ -161,19 +161,22 @@ def test_the_loss_is_that_of_the_kernels(size: tuple[int, int]) -> None:
     assert (found[2] - wanted).norm() < 1e-3 * wanted.norm()
 
 
-def both(bands: int, antialiased: bool = True, device: torch.device = CPU) -> tuple[Any, TrainableGaussians, GsplatGaussians]:
-    """A photograph with a mask and sky, and the same Gaussians twice."""
+def both(
+    bands: int, antialiased: bool = True, device: torch.device = CPU
+) -> tuple[Target, Target, TrainableGaussians, GsplatGaussians]:
+    """A photograph with a mask and sky for the CPU's kernels and on a device, and the same Gaussians for either."""
     view, draw = camera(), np.random.default_rng(0)
     means, quaternions, log_scales, logits, harmonics, _, _ = cloud(bands=bands, size=-1.0)
     rows = torch.cat([means, log_scales, quaternions, logits[:, None], harmonics.flatten(1)], 1).numpy()
     colours = draw.random((30, 40, 3), np.float32)
     x, y = np.meshgrid(np.arange(40), np.arange(30))
-    target = target_of(view, colours, valid=x > 5, sky=y < 9, antialiased=antialiased)
+    given = view, colours, x > 5, y < 9
+    targets = target_of(*given, antialiased=antialiased), target_on(device, *given, antialiased=antialiased)
     weight = draw.random(len(rows), np.float32)
     pair = TrainableGaussians(64, bands), GsplatGaussians(64, bands, device)
     for each in pair:
         each.start(rows, weight=weight)
-    return target, *pair
+    return *targets, *pair
 
 
 @pytest.mark.parametrize(("bands", "antialiased", "factors"), [(9, True, (1.2, 0.9, 0.7)), (1, False, None), (16, True, None)])
@@ -182,12 +185,12 @@ def test_a_step_is_that_of_the_cpu(
 ) -> None:
     """Moments hold the gradients: 4 ROUGH, and 8 ROUGH of their squares (tests/ops/test_rasterise.py). A step of Adam is the
     gradient by its own size, so that what is nearly 0 may go either way."""
-    target, ours, theirs = both(bands, antialiased, device)
+    target, there, ours, theirs = both(bands, antialiased, device)
     rates = np.full(ours.rows, 1e-3, np.float32)
     exposure = None if factors is None else np.array(factors, np.float32)
     kept = {"background": (0.2, 0.5, 0.1), "ssim": 0.2, "rates": rates, "factors": exposure}
     before = ours.read()
-    wanted, found = ours.learn(target, **kept), theirs.learn(target, **kept)
+    wanted, found = ours.learn(target, **kept), theirs.learn(there, **kept)
     assert found[:3] == pytest.approx(wanted[:3], rel=STOP)
     for a, b in ((found.pull, wanted.pull), (found.of_camera, wanted.of_camera)):
         assert np.linalg.norm(a - b) <= 4 * ROUGH * np.linalg.norm(b)
@@ -200,7 +203,7 @@ def test_a_step_is_that_of_the_cpu(
 
 
 def test_all_else_is_bit_for_bit_that_of_the_cpu() -> None:
-    _, ours, theirs = both(4)
+    *_, ours, theirs = both(4)
     draw, some = np.random.default_rng(1), np.array([5, 17, 3])
     moments = draw.normal(size=(2, *ours.read().shape)).astype(np.float32)
     for each in (ours, theirs):
@@ -219,7 +222,7 @@ def test_all_else_is_bit_for_bit_that_of_the_cpu() -> None:
 
 
 def test_a_photograph_without_numbers_moves_nothing(device: torch.device) -> None:
-    target, _, gaussians = both(4, device=device)
+    target, _, _, gaussians = both(4, device=device)
     target.planes[:] = np.nan
     before = gaussians.read(), *gaussians.moments()
     found = gaussians.learn(target, background=(0, 0, 0), ssim=0.2, rates=np.ones(gaussians.rows, np.float32))

@@ -26,6 +26,7 @@ from .forward_kernels import SIDE, SLOTS
 from .layout import FIXED
 
 if TYPE_CHECKING:  # it imports torch, which compilation need not wait for
+    from .gsplat import Photograph
     from .reference import Pinhole
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
@@ -49,6 +50,8 @@ class Target(NamedTuple):
     """1 where the photograph counts, 0 elsewhere, in the shape of the gradient; None = everywhere."""
     sky: Floats | None = None
     """1 where the photograph shows sky, 0 elsewhere, [H16, W16] flat; None = not known."""
+    there: "Photograph | None" = None
+    """The same on a CUDA device, in the place of planes, blurred, valid and sky; None = these."""
 
     @property
     def axes(self) -> Annotated[NDArray[np.float64], "3 3"]:
@@ -218,7 +221,7 @@ class TrainableGaussians:
         `ssim` is the share of 1 - SSIM in the loss, `rates` a learning rate a column; renders are multiplied by `factors`, one
         a channel, before they are compared.
         """
-        width, height, camera, planes, blurred, valid, _ = target
+        width, height, camera, planes, blurred, valid, *_ = target
         # Render, expose, compare: the loss and its slope by every pixel.
         area, pull = target.area, np.zeros(3, np.float32)
         tiles, out, left = self._render(target, background)
