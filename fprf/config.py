@@ -268,9 +268,9 @@ class RunConfig:
         """
         return max(1, math.ceil(math.sqrt(int(scene.cameras.size.prod(1).max()) / _WHOLE_PIXELS)))
 
-    def planned(self, scene: "ParsedScene", device: str) -> "RunConfig":
-        """The config with what it leaves open decided, from a scene at its own size; arguments as of `find_downscale`."""
-        return self if self.downscale is not None else replace(self, downscale=self.find_downscale(scene, device))
+    def planned(self, scene: "ParsedScene", device: "torch.device") -> "RunConfig":
+        """The config with what it leaves open decided, from a scene at its own size and the device that will train."""
+        return self if self.downscale is not None else replace(self, downscale=self.find_downscale(scene, device.type))
 
     def described(self) -> str:
         """Describe the plan beyond the views and their size, for the line that is shown before training."""

@@ -159,11 +159,11 @@ class GaussiansConfig(RunConfig):
 
         return build(self, scene, saved, progress, device=device)
 
-    def planned(self, scene: "Scene", device: str) -> "GaussiansConfig":
+    def planned(self, scene: "Scene", device: "torch.device") -> "GaussiansConfig":
         """Size and number of Gaussians, as `splats.plan` finds them."""
         from .plan import plan
 
-        return plan(self, scene)
+        return plan(self, scene, device)
 
     @property
     def most(self) -> int:

@@ -1,7 +1,8 @@
 """Size of the photographs and number of Gaussians that a time on this machine is best used for.
 
-P pixels of a photograph, V training views, N Gaussians, T seconds on the machine that the constants were measured on. A step
-takes A s P + B N, where s is the share of the full size's pixels that a step sees on average: the first steps see reduced ones.
+P pixels of a photograph, V training views, N Gaussians. On the machine that the constants were measured on a step takes
+A s P + B N, where s is the share of the full size's pixels that a step sees on average: the first steps see reduced ones. On a
+CUDA device with gsplat some steps are made to see what one takes there.
 
 Size counts first, the number of Gaussians second. Five minutes of llff_flower at 1008 x 756 come to 28.0 dB with 160 000
 Gaussians, 27.9 with 120 000 (benchmarks/results/splat_training.json).
@@ -9,10 +10,15 @@ Gaussians, 27.9 with 120 000 (benchmarks/results/splat_training.json).
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
+
+from ..ops.rasterise.gsplat import target_on, trainable, usable
+from ..ops.rasterise.reference import Pinhole
 
 if TYPE_CHECKING:
     from ..datamanagers.scene import Scene
@@ -34,9 +40,12 @@ _FEWEST, _MOST, _GROWTH = 60_000, 1_000_000, 0.6
 """Gaussians of a minute, the most of all, and the power of the time that their number grows with."""
 _PROBE, _REPEATS, _REFERENCE = 1 << 16, 200, 55e-6
 """Numbers whose exponential is taken, how often, and the seconds of the fastest on one of the two cores named above."""
+_SIZES, _FIRST, _TIMED, _BESIDES = ((480, 270), (1920, 1080)), 3, 5, 1.4
+"""Images of the steps that are made on a CUDA device, steps before any is timed, those of which the fastest counts, and what a
+step of training takes in units of these, with all that is done between steps."""
 
 
-def plan(config: "GaussiansConfig", scene: "Scene") -> "GaussiansConfig":
+def plan(config: "GaussiansConfig", scene: "Scene", device: torch.device) -> "GaussiansConfig":
     """Return the config with all decided that it leaves open, for a scene at its own size; what is given stays.
 
     More minutes never give smaller photographs, fewer Gaussians or fewer steps.
@@ -45,20 +54,22 @@ def plan(config: "GaussiansConfig", scene: "Scene") -> "GaussiansConfig":
     if not len(sizes):
         return replace(config, downscale=config.downscale or 1, cap=config.most, passes=config.most_passes)
     views, pixels, longest = len(sizes), float(sizes.double().prod(1).mean()), int(sizes.max())
-    speed, budget = machine_speed(), None
-    if config.minutes is not None:
-        budget = max(1.0, 60 * config.minutes - _START) * speed
+    speed = device_speed(device)
+    budget = None if config.minutes is None else max(1.0, 60 * config.minutes - _START)
     # The largest size at which the time is enough for some passes over the photographs.
     size = config.downscale or max(1, longest / config.longest)
     while True:
-        found = _of_size(config, pixels / size**2)
-        each, steps = _seconds(found, pixels / size**2, _FEWEST), found.limited(views)
-        enough = steps * each <= _PATIENCE * speed if budget is None else budget / each >= max(_STEPS, _PASSES * views)
+        small = pixels / size**2
+        found = _of_size(config, small)
+        each = _seconds(found, small, _FEWEST)
+        steps, times = found.limited(views), speed(_share(found) * small)
+        enough = steps * each <= _PATIENCE * times if budget is None else budget * times / each >= max(_STEPS, _PASSES * views)
         smaller = math.floor(size) + 1
         if enough or config.downscale is not None or pixels / smaller**2 < _LEAST:
             break
         size = smaller
-    seconds = steps * each if budget is None else min(budget, steps * each)
+    # On the machine of the constants, so that a faster one has more Gaussians.
+    seconds = steps * each if budget is None else min(budget * times, steps * each)
     cap = config.cap
     if cap is None:
         cap = min(_MOST, max(_FEWEST, 10_000 * round(_FEWEST / 10_000 * (seconds / 60) ** _GROWTH)))
@@ -90,8 +101,41 @@ def machine_speed() -> float:
     return _REFERENCE / best * math.pow(threads / 2, 0.8)
 
 
+def device_speed(device: torch.device) -> Callable[[float], float]:
+    """Speed of what trains, for images of so many pixels, relative to the machine of the constants."""
+    if not usable(device):
+        known = machine_speed()
+        return lambda many: known
+    draw = np.random.default_rng(0)
+    # Gaussians before a camera, about as wide as they lie apart.
+    rows = 0.1 * draw.standard_normal((_FEWEST, 59), np.float32)
+    depth = draw.uniform(2, 8, _FEWEST)
+    rows[:, :2], rows[:, 2] = draw.uniform(-0.6, 0.6, (_FEWEST, 2)) * depth[:, None], depth
+    rows[:, 3:6] += np.log(3e-3 * depth)[:, None]
+    model = trainable(_FEWEST, 16, device)
+    model.start(rows)
+    pixels, seconds = [], []
+    for width, height in _SIZES:
+        focal = 0.8 * width
+        intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        camera = Pinhole(intrinsics, torch.eye(4), width, height)
+        target, best = target_on(device, camera, draw.random((height, width, 3), np.float32)), math.inf
+        for step in range(_FIRST + _TIMED):
+            start = time.perf_counter()
+            model.learn(target, background=(0.0, 0.0, 0.0), ssim=0.2, rates=np.full(59, 1e-5, np.float32))
+            best = min(best, time.perf_counter() - start) if step >= _FIRST else best
+        pixels.append(width * height)
+        seconds.append(_BESIDES * best)
+    slope = max(0.0, (seconds[1] - seconds[0]) / (pixels[1] - pixels[0]))
+    return lambda many: (_PIXEL * many + _GAUSSIAN * _FEWEST) / max(seconds[0] + slope * (many - pixels[0]), 1e-4)
+
+
 def _seconds(config: "GaussiansConfig", pixels: float, gaussians: int) -> float:
     """Seconds of a step, on average, on the machine of the constants."""
+    return _PIXEL * _share(config) * pixels + _GAUSSIAN * gaussians
+
+
+def _share(config: "GaussiansConfig") -> float:
+    """Share of the full size's pixels that a step sees on average."""
     coarse = config.coarse
-    share = (1 - coarse) + coarse * 2 / 3 / 4 + coarse / 3 / 16
-    return _PIXEL * share * pixels + _GAUSSIAN * gaussians
+    return (1 - coarse) + coarse * 2 / 3 / 4 + coarse / 3 / 16

@@ -57,7 +57,7 @@ def planned(config: RunConfig, whole: Scene | None = None) -> RunConfig:
     """
     if all(getattr(config, name) is not None for name in config.open):
         return config
-    return config.planned(whole or read_scene(replace(config, downscale=1)), device_of(config.trained_on).type)
+    return config.planned(whole or read_scene(replace(config, downscale=1)), device_of(config.trained_on))
 
 
 def read_scene(config: RunConfig, saved: Facts | None = None) -> Scene:

@@ -26,7 +26,7 @@ def steady(monkeypatch: pytest.MonkeyPatch) -> None:
 def planned(config: GaussiansConfig, width: int = 2832, height: int = 2128, views: int = 30) -> GaussiansConfig:
     size = torch.tensor([[width, height]] * views)
     scene = SimpleNamespace(cameras=SimpleNamespace(size=size), train=torch.arange(views))
-    return module.plan(config, scene)  # type: ignore[arg-type]
+    return module.plan(config, scene, torch.device("cpu"))  # type: ignore[arg-type]
 
 
 @given(st.floats(0.2, 60), st.floats(1.1, 8), st.integers(300, 6000), st.integers(300, 6000), st.integers(1, 600))
