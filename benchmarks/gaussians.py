@@ -1,13 +1,13 @@
 """The rasteriser of 3D Gaussians: kernels against the plain torch form, time and error; and what a step of training costs.
 
     python -m benchmarks gaussians [--count 50000] [--threads 1] [--output FILE.json]
-    python -m benchmarks gaussians --training [--threads 2] [--output FILE.json]
+    python -m benchmarks gaussians --training [--threads 2] [--device cuda] [--output FILE.json]
 
 A cloud in front of a camera of 500 x 375 pixels; most Gaussians are a pixel or two wide, as in a trained scene. Seconds are the
 least of several calls: of wall time, and of processor time, which counts all threads. The plain form runs once.
 
 `--training` takes photographs and clouds of several sizes, each in a process of its own: seconds of a step, and MiB that the
-Gaussians and one photograph add to the process.
+Gaussians and one photograph add to the process, or on a CUDA device to what torch has taken there.
 """
 
 import json
@@ -25,8 +25,9 @@ import torch
 from torch import Tensor
 
 from fprf.ops import backend
+from fprf.ops.rasterise.gsplat import obstacle, trainable
 from fprf.ops.rasterise.rendering import Pinhole, Rasterised, lift, rasterise
-from fprf.ops.rasterise.training import TrainableGaussians, target_of
+from fprf.ops.rasterise.training import target_of
 
 from .common import arguments, report
 
@@ -114,7 +115,7 @@ def measure(count: int, times: int) -> dict[str, Any]:
     }
 
 
-def step(size: tuple[int, int], count: int, times: int, threads: int) -> dict[str, Any]:
+def step(size: tuple[int, int], count: int, times: int, threads: int, device: str) -> dict[str, Any]:
     """Seconds of a training step, and MiB of the Gaussians with their moments, and of a photograph."""
     torch.set_num_threads(threads)
     numba.set_num_threads(threads)
@@ -126,26 +127,38 @@ def step(size: tuple[int, int], count: int, times: int, threads: int) -> dict[st
     view = view._replace(intrinsics=view.intrinsics * grown, width=width, height=height)
     photograph = np.random.default_rng(0).random((height, width, 3), np.float32)
 
+    place = torch.device(device)
+
     def peak() -> float:
+        if place.type == "cuda":
+            return torch.cuda.max_memory_allocated(place) / 2**20
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
     before = peak()
-    model = TrainableGaussians(count, BANDS)
+    model = trainable(count, BANDS, place)
     model.start(rows)
     target = target_of(view, photograph)
     rates = np.full(rows.shape[1], RATES, np.float32)
-    taken = least(lambda: model.learn(target, background=(0.0, 0.0, 0.0), ssim=0.2, rates=rates), times)
+
+    def learn_once() -> None:
+        model.learn(target, background=(0.0, 0.0, 0.0), ssim=0.2, rates=rates)  # waits for the device
+
+    learn_once()
+    taken = least(learn_once, times)
     kept = sum(part.nbytes for part in target if isinstance(part, np.ndarray)) / 2**20
     return {"size": size, "gaussians": count, **taken, "mib": peak() - before, "mib_of_a_photograph": kept}
 
 
-def training(times: int, threads: int) -> list[dict[str, Any]]:
+def training(times: int, threads: int, device: str) -> list[dict[str, Any]]:
     """`step` for all sizes and counts."""
+    place = torch.device(device)
+    if place.type == "cuda" and (why := obstacle(place)) is not None:
+        raise SystemExit(f"error: {why}")
     found = []
     for size in SIZES:
         for count in COUNTS:
             with multiprocessing.get_context("spawn").Pool(1) as pool:
-                found.append(pool.apply(step, (size, count, times, threads)))
+                found.append(pool.apply(step, (size, count, times, threads, device)))
             print(json.dumps(found[-1]), flush=True)
     return found
 
@@ -156,13 +169,15 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--times", type=int, default=30)
     parser.add_argument("--training", action="store_true", help="what a step of training costs")
+    parser.add_argument("--device", default="cpu", help="where steps of training run: cpu or cuda")
     parser.add_argument("--output", type=Path)
     args = parser.parse_args(argv)
     if args.training:
-        report(args.output, {"threads": args.threads, "steps": training(args.times, args.threads)})
+        found = {"threads": args.threads, "device": args.device, "steps": training(args.times, args.threads, args.device)}
+        report(args.output, found)
         return
     torch.set_num_threads(args.threads)
     numba.set_num_threads(args.threads)
-    found: dict[str, Any] = {"threads": args.threads, **measure(args.count, args.times)}
+    found = {"threads": args.threads, **measure(args.count, args.times)}
     print(json.dumps(found, indent=1))
     report(args.output, found)
