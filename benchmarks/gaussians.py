@@ -6,8 +6,8 @@
 A cloud in front of a camera of 500 x 375 pixels; most Gaussians are a pixel or two wide, as in a trained scene. Seconds are the
 least of several calls: of wall time, and of processor time, which counts all threads. The plain form runs once.
 
-`--training` takes photographs and clouds of several sizes, each in a process of its own: seconds of a step, and MiB that the
-Gaussians and one photograph add to the process, or on a CUDA device to what torch has taken there.
+`--training` takes photographs and clouds of several sizes: seconds of a step, and MiB that the Gaussians and one photograph
+take, of a process of its own or, on a CUDA device, of torch's memory there.
 """
 
 import json
@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from fprf.ops import backend
-from fprf.ops.rasterise.gsplat import obstacle, trainable
+from fprf.ops.rasterise.gsplat import obstacle, target_on, trainable
 from fprf.ops.rasterise.rendering import Pinhole, Rasterised, lift, rasterise
 from fprf.ops.rasterise.training import target_of
 
@@ -134,10 +134,12 @@ def step(size: tuple[int, int], count: int, times: int, threads: int, device: st
             return torch.cuda.max_memory_allocated(place) / 2**20
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
+    if place.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(place)
     before = peak()
     model = trainable(count, BANDS, place)
     model.start(rows)
-    target = target_of(view, photograph)
+    target = target_of(view, photograph) if place.type == "cpu" else target_on(place, view, photograph)
     rates = np.full(rows.shape[1], RATES, np.float32)
 
     def learn_once() -> None:
@@ -145,7 +147,8 @@ def step(size: tuple[int, int], count: int, times: int, threads: int, device: st
 
     learn_once()
     taken = least(learn_once, times)
-    kept = sum(part.nbytes for part in target if isinstance(part, np.ndarray)) / 2**20
+    parts = (*target, *(target.there or ()))
+    kept = sum(part.nbytes for part in parts if isinstance(part, np.ndarray | Tensor)) / 2**20
     return {"size": size, "gaussians": count, **taken, "mib": peak() - before, "mib_of_a_photograph": kept}
 
 
@@ -157,8 +160,12 @@ def training(times: int, threads: int, device: str) -> list[dict[str, Any]]:
     found = []
     for size in SIZES:
         for count in COUNTS:
-            with multiprocessing.get_context("spawn").Pool(1) as pool:
-                found.append(pool.apply(step, (size, count, times, threads, device)))
+            given = size, count, times, threads, device
+            if place.type == "cuda":
+                found.append(step(*given))
+            else:
+                with multiprocessing.get_context("spawn").Pool(1) as pool:
+                    found.append(pool.apply(step, given))
             print(json.dumps(found[-1]), flush=True)
     return found
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Measure a machine with a GPU in about ten minutes: the tests of devices, a scene trained for a given time, restyled frames
 # a second, a new style to its first frame, and 3D Gaussians of the same scene trained in as much time (by gsplat where it is
-# installed, which compiles its kernels at the first use). Writes one JSON with rows and goals.
+# installed, which compiles its kernels at the first use), with what their steps cost. Writes one JSON with rows and goals.
 #
 #   benchmarks/gpu.sh --scene DIR [--images images_4] [--minutes 3] [--method fprf] [--long STEPS] [--output FILE]
 #                     [-- FLAGS OF fprf train]
@@ -62,7 +62,7 @@ else
     time=(--minutes "$minutes") again=(--steps "$long")
     size=(--rays 762048 --repeats 5) points=(--points 262144)
     photographs=(--data "$scene" --parser llff --parser.images "$images")
-    tests+=("$root/tests/test_gpu.py" "$root/tests/ops/test_rasterise_gsplat.py")
+    tests+=(-m gpu "$root/tests/test_gpu.py" "$root/tests/ops/test_rasterise_gsplat.py" "$root/tests/ops/test_triplane.py")
 fi
 
 # step NAME SECONDS COMMAND...: run it, note its exit status, print the end of its log where it failed.
@@ -85,6 +85,7 @@ step speed 130 "$python" -m benchmarks speed "$work/run" "${size[@]}" "${points[
 step gaussians "$((whole + 600))" "${fprf[@]}" train fprf-splats "${photographs[@]}" "${time[@]}" --device "$device" \
     --output "$work/gaussians"
 step eval-gaussians 60 "${fprf[@]}" eval "$work/gaussians" --no-images --device "$device"
+step steps 60 "$python" -m benchmarks gaussians --training --times 20 --device "$device" --output "$work/training.json"
 if [ "$long" != 0 ]; then
     step train-long 7200 "${fprf[@]}" train "$method" "${data[@]}" "${again[@]}" --device "$device" --output "$work/long" "$@"
     step eval-long 60 "${fprf[@]}" eval "$work/long" --no-images --device "$device"

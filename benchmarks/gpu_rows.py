@@ -84,7 +84,7 @@ def rows(work: Path, form: str) -> Iterator[Row]:
 def kernels(device: torch.device) -> str:
     """Which form of the tri-planes runs."""
     points, table = torch.zeros(1, 3, device=device), torch.zeros(12, 8, device=device)
-    return "numba" if triplane.usable(points, table) else "plain"
+    return "numba" if triplane.usable(points, table) else "triton" if triplane.triton_usable(points, table) else "plain"
 
 
 def read(path: Path) -> Any:
@@ -101,7 +101,8 @@ def main() -> int:
     device = torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
     form = kernels(device)
     found = list(rows(work, form))
-    extra = {"steps": gone, "speed": speed.get("rows"), "counters": speed.get("counters")}
+    training = (read(work / "training.json") or {}).get("steps")
+    extra = {"steps": gone, "speed": speed.get("rows"), "counters": speed.get("counters"), "training_steps": training}
     settings = speed.get("settings", {}) | {"tri_planes": form}
     write_json(options.output, document("gpu", found, device=device, settings=settings, extra=extra))
     console = Console(highlight=False, width=120)

@@ -5,15 +5,19 @@ agree on it. A point outside takes the value at the border. Plane p spans the ax
 in one table [rows, channels] of channel vectors: scale after scale, plane after plane, row v after row, node u after node.
 One table means one parameter, one optimiser state and one pass.
 
-The torch form is the reference for every device and dtype; in float32 on the CPU fused kernels take over (`triplane_kernels`,
-compiled by numba on first use and cached). Both keep coordinates and arithmetic in the dtype of the points, never half (half
-coordinates cost 3.5e-2 of the feature at 512 nodes). Gradients go to the table, and to points that ask for them (poses that are
-refined). A sample has a kink at each node: there its slope is that of the cell above.
+The torch form is the reference for every device and dtype; in float32 fused kernels take over: on the CPU `triplane_kernels`,
+compiled by numba on first use and cached, on CUDA `triplane_triton`, compiled by Triton. All keep coordinates and arithmetic
+in the dtype of the points, never half (half coordinates cost 3.5e-2 of the feature at 512 nodes). Gradients go to the table,
+and to points that ask for them (poses that are refined). A sample has a kink at each node: there its slope is that of the cell
+above.
 """
 
 # The checker takes compiled functions to have one argument.
 # mypy: disable-error-code="call-arg"
 
+import functools
+import importlib.util
+import warnings
 from collections.abc import Sequence
 from typing import Annotated, Any
 
@@ -21,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .backend import compiled_for
+from .backend import compiled, compiled_for
 from .dense import array
 
 AXES = ((0, 1), (0, 2), (1, 2))
@@ -80,11 +84,41 @@ def usable(points: Tensor, table: Tensor) -> bool:
     return compiled_for(points, table) and table.shape[1] % _LANES == 0
 
 
+def triton_usable(points: Tensor, table: Tensor) -> bool:
+    """Return whether Triton's kernels apply: float32 on one CUDA device for which it can compile."""
+    device = points.device
+    if device.type != "cuda" or table.device != device or points.dtype != torch.float32 or table.dtype != torch.float32:
+        return False
+    return compiled() and _compiles(device)
+
+
+@functools.cache
+def _compiles(device: torch.device) -> bool:
+    """True where a kernel can be compiled and launched: tried once, and told where it cannot."""
+    if importlib.util.find_spec("triton") is None or not torch.cuda.is_available():
+        return False
+    from . import triplane_triton as kernels
+
+    try:
+        kernels.forward(torch.zeros(1, 3, device=device), torch.zeros(12, 1, device=device), (2,))
+    except torch.OutOfMemoryError:
+        raise
+    except Exception as error:  # whatever a compiler, a linker or a driver raises
+        reason = (str(error).splitlines() or [""])[0]
+        warnings.warn(
+            f"Triton cannot compile for {device} ({type(error).__name__}: {reason}): tri-planes run in plain torch, slower; "
+            "install a C compiler and Python's headers (apt install gcc python3-dev)",
+            stacklevel=2,
+        )
+        return False
+    return True
+
+
 def lookup(
     points: Annotated[Tensor, "N 3"], table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]
 ) -> Annotated[Tensor, "N scales*F"]:
     """The fastest form that this device and dtype have; equal to the reference within 4u (r |slope| + 3 |value|)."""
-    if not usable(points, table):
+    if not (usable(points, table) or triton_usable(points, table)):
         return lookup_reference(points, table, resolutions)
     result: Tensor = _Lookup.apply(points.contiguous(), table, tuple(resolutions))  # type: ignore[no-untyped-call]
     return result
@@ -99,26 +133,41 @@ def variation(table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]) ->
 
 
 class _Lookup(torch.autograd.Function):
-    """Forward runs over points. Backward runs over (scale, group of channels): no two tasks write the same number, so no locks,
-    and the sum over points has one order: bitwise the same for any number of threads."""
+    """On the CPU forward runs over points, and backward over (scale, group of channels): no two tasks write the same number, so
+    no locks, and the sum over points has one order: bitwise the same for any number of threads."""
 
     @staticmethod
     def forward(ctx: Any, points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> Tensor:
-        from . import triplane_kernels as kernels
-
         ctx.save_for_backward(points, table)
         ctx.resolutions = resolutions
+        if points.is_cuda:
+            from . import triplane_triton
+
+            return triplane_triton.forward(points, table.detach().contiguous(), resolutions)
+        from . import triplane_kernels as kernels
+
         out = torch.empty(len(points), len(resolutions) * table.shape[1])
         kernels.forward(array(points), *_laid_out(table, resolutions), out.view(-1).numpy())
         return out
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+        points, table = ctx.saved_tensors
+        to_points = to_table = None
+        if points.is_cuda:
+            from . import triplane_triton
+
+            if ctx.needs_input_grad[0]:
+                with torch.enable_grad():
+                    given = points.detach().requires_grad_()
+                    value = lookup_reference(given, table.detach(), ctx.resolutions)
+                (to_points,) = torch.autograd.grad(value, given, grads[0])
+            if ctx.needs_input_grad[1]:
+                to_table = triplane_triton.backward(points, table.detach().contiguous(), ctx.resolutions, grads[0])
+            return to_points, to_table, None
         from . import triplane_kernels as kernels
 
-        points, table = ctx.saved_tensors
         given = array(points), *_laid_out(table, ctx.resolutions), array(grads[0])
-        to_points = to_table = None
         if ctx.needs_input_grad[0]:
             to_points = torch.empty(len(points), 3)
             kernels.point_slopes(*given, to_points.view(-1).numpy())

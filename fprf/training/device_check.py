@@ -13,7 +13,7 @@ from torch import Tensor
 from ..config import ContentConfig, RenderConfig, SemanticConfig, TrainConfig
 from ..fields.config import PlanesConfig, SemanticPlanesConfig
 from ..memory import free_memory
-from ..ops import backend, dense
+from ..ops import backend, dense, triplane
 from ..ops.precision import double
 from ..plugins.encoders.config import BundledContentConfig
 from ..plugins.samplers.config import ProposalConfig
@@ -73,6 +73,8 @@ def fast_paths(device: torch.device) -> Iterator[tuple[str, str]]:
         compiled = dense.usable(probe)
     if compiled:
         yield "kernels", "numba's: tri-planes, networks, guided filter"
+    elif triplane.triton_usable(probe, probe):
+        yield "kernels", "Triton's: tri-planes; all else by torch"
     else:
         yield "kernels", "none: everything by torch"
     if device.type == "cuda":

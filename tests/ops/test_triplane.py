@@ -1,14 +1,20 @@
 """Tri-plane lookup and its slopes in points: fused and plain forms against fp64; gradients: `test_operator_table.py`."""
 
+import importlib.util
 import itertools
+import sys
 from collections.abc import Callable, Sequence
+from importlib.machinery import ModuleSpec
+from types import ModuleType
 
 import numba
 import pytest
 import torch
+from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor
 
-from fprf.ops.triplane import lookup, lookup_reference, rows, usable, variation
+from fprf.ops import triplane
+from fprf.ops.triplane import lookup, lookup_reference, rows, triton_usable, usable, variation
 
 Form = Callable[[Tensor, Tensor, Sequence[int]], Tensor]
 U = 2.0**-24
@@ -25,13 +31,23 @@ def points_of(count: int, seed: int = 0) -> Tensor:
     return torch.empty(count, 3).uniform_(-1, 1, generator=torch.Generator().manual_seed(seed))
 
 
+@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
+def device(request: pytest.FixtureRequest) -> torch.device:
+    """Where tables are: numba's kernels take them, or Triton's."""
+    if request.param != "cpu" and not torch.cuda.is_available():
+        pytest.skip("torch sees no CUDA device")
+    return torch.device(request.param)
+
+
 @pytest.mark.parametrize(
     ("resolutions", "channels"), [((64, 181), 8), ((182,), 16), ((5, 33, 2), 24), ((1024,), 8), ((7, 182), 5)]
 )
 @pytest.mark.parametrize("smooth", [False, True])
-def test_both_forms_stay_within_the_bound(resolutions: tuple[int, ...], channels: int, smooth: bool) -> None:
-    table, points = table_of(resolutions, channels, smooth=smooth), (points_of(30) * 256).round() / 256
-    assert usable(points, table) == (channels % 8 == 0)
+def test_both_forms_stay_within_the_bound(
+    resolutions: tuple[int, ...], channels: int, smooth: bool, device: torch.device
+) -> None:
+    table, points = table_of(resolutions, channels, smooth=smooth).to(device), (points_of(30) * 256).round().to(device) / 256
+    assert triton_usable(points, table) if device.type == "cuda" else usable(points, table) == (channels % 8 == 0)
     value = lookup_reference(points.double(), table.double(), resolutions)
     for form in (lookup, lookup_reference):
         found = form(points, table, resolutions)
@@ -44,11 +60,11 @@ WILD = (float("nan"), float("inf"), -float("inf"), 1e30, -1e30, 1.0 + 2e-7, -1.0
 
 @pytest.mark.parametrize("channels", [5, 8, 16])
 @pytest.mark.parametrize("size", [2, 3, 182])
-def test_no_coordinate_leaves_the_table(channels: int, size: int) -> None:
+def test_no_coordinate_leaves_the_table(channels: int, size: int, device: torch.device) -> None:
     """The table lies between sentinels: forward never reads them, backward never writes them. NaN is the lower border."""
-    points = torch.tensor(list(itertools.product(WILD, repeat=3)))
+    points = torch.tensor(list(itertools.product(WILD, repeat=3)), device=device)
     total = rows((size,))
-    padded = torch.full((total + 2 * size * size, channels), float("nan"))
+    padded = torch.full((total + 2 * size * size, channels), float("nan"), device=device)
     table = padded[size * size : size * size + total]
     table.copy_(table_of((size,), channels))
     table.requires_grad_(True)
@@ -101,12 +117,15 @@ def slopes(form: Form, points: Tensor, table: Tensor, resolutions: tuple[int, ..
 @pytest.mark.parametrize(
     ("resolutions", "channels", "count"), [((9,), 8, 1), ((65,), 16, 500), ((17, 9), 24, 97), ((5, 3), 40, 0)]
 )
-def test_slopes_of_points_are_those_of_the_plain_form(resolutions: tuple[int, ...], channels: int, count: int) -> None:
-    points, table = points_in_cells(count, resolutions[0]), table_of(resolutions, channels)
-    grad = torch.randn(count, len(resolutions) * channels, generator=torch.Generator().manual_seed(3))
+def test_slopes_of_points_are_those_of_the_plain_form(
+    resolutions: tuple[int, ...], channels: int, count: int, device: torch.device
+) -> None:
+    points, table = points_in_cells(count, resolutions[0]).to(device), table_of(resolutions, channels).to(device)
+    grad = torch.randn(count, len(resolutions) * channels, generator=torch.Generator().manual_seed(3)).to(device)
     exact = slopes(lookup_reference, points.double(), table.double(), resolutions, grad.double())
     found = slopes(lookup, points, table, resolutions, grad)
-    assert usable(points, table) and found.dtype == torch.float32 and found.shape == (count, 3)
+    assert usable(points, table) or triton_usable(points, table)
+    assert found.dtype == torch.float32 and found.shape == (count, 3)
     # At quarters of a cell; what is left are the roundings of sums over channels and scales.
     assert (found.double() - exact).norm() <= 1e-5 * exact.norm()
 
@@ -124,3 +143,27 @@ def test_outside_the_border_holds(place: float, axis: int) -> None:
     wanted[0, axis] = 0
     for form in (lookup, lookup_reference):
         assert torch.allclose(slopes(form, point, table, (5,), grad), wanted, atol=1e-5)
+
+
+def test_where_triton_cannot_compile_the_plain_form_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is tried once, and said once."""
+    tried = []
+
+    def forward(points: Tensor, table: Tensor, resolutions: Sequence[int]) -> Tensor:
+        tried.append(points.device)
+        raise RuntimeError("no C compiler\nwas found")
+
+    kernels = ModuleType("triplane_triton")
+    kernels.forward = forward  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "fprf.ops.triplane_triton", kernels)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: ModuleSpec(name, None))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    triplane._compiles.cache_clear()
+    try:
+        with pretend_cuda():
+            points, table = torch.zeros(3, 3).to(CUDA), torch.zeros(12, 8).to(CUDA)
+            with pytest.warns(UserWarning, match=r"cuda:0 \(RuntimeError: no C compiler\): tri-planes run in plain torch"):
+                assert not triton_usable(points, table)
+            assert not triton_usable(points, table) and tried == [CUDA]
+    finally:
+        triplane._compiles.cache_clear()
