@@ -40,7 +40,7 @@ _FEWEST, _MOST, _GROWTH = 60_000, 1_000_000, 0.6
 """Gaussians of a minute, the most of all, and the power of the time that their number grows with."""
 _PROBE, _REPEATS, _REFERENCE = 1 << 16, 200, 55e-6
 """Numbers whose exponential is taken, how often, and the seconds of the fastest on one of the two cores named above."""
-_SIZES, _FIRST, _TIMED, _BESIDES = ((480, 270), (1920, 1080)), 3, 5, 1.4
+_SIZES, _FIRST, _TIMED, _BESIDES = ((480, 270), (1920, 1080)), 20, 10, 1.4
 """Images of the steps that are made on a CUDA device, steps before any is timed, those of which the fastest counts, and what a
 step of training takes in units of these, with all that is done between steps."""
 
