@@ -33,6 +33,7 @@ from ..errors import CheckpointError, DataError, NumericsError, PluginError
 from ..interfaces import Encoder
 from ..io import tensorfiles
 from ..ops import guided
+from ..ops.precision import float32_convolutions
 from .basis import Basis, fit_basis
 from .config import GuidedConfig
 
@@ -227,7 +228,7 @@ def extract(
         basis = _basis(folder, prints, image, encoder, dim, remembered)
     projection = digest(*(t.numpy().tobytes() for t in basis.tensors().values())) if basis else "raw"
     device = _device(encoder)
-    place = () if device.type == "cpu" else (device.type,)  # other devices round otherwise, TF32 by 1e-3
+    place = () if device.type == "cpu" else (device.type,)  # other devices round otherwise
     entries: dict[int, Entry] = {}
     keys = {}
     # View by view, what is not there yet.
@@ -262,7 +263,8 @@ def _device(encoder: Encoder) -> torch.device:
 @torch.no_grad()
 def _encode(encoder: Encoder, pixels: Annotated[Tensor, "H W 3"], view: int) -> Annotated[Tensor, "C h w"]:
     image = (pixels.float() / 255).permute(2, 0, 1)[None]
-    features: Tensor = encoder(image.to(_device(encoder)))
+    with float32_convolutions():
+        features: Tensor = encoder(image.to(_device(encoder)))
     # An encoder may be a stranger's: its mistakes are told here, not met as a strange scene.
     if features.ndim != 4 or features.shape[:2] != (1, encoder.channels) or not features.numel():
         raise PluginError(

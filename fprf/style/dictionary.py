@@ -28,7 +28,7 @@ from ..errors import DataError
 from ..interfaces import Encoder
 from ..io.atomic import write_bytes
 from ..ops.guided import apply, coefficients
-from ..ops.precision import double
+from ..ops.precision import double, float32_convolutions
 from .statistics import covariance, group_moments, kmeans, mix, moments
 
 if TYPE_CHECKING:
@@ -141,7 +141,8 @@ def semantic_samples(
 
 
 def _encode(encoder: Encoder, image: Annotated[Tensor, "H W 3"]) -> Annotated[Tensor, "C h w"]:
-    features: Tensor = encoder(image.permute(2, 0, 1)[None])
+    with float32_convolutions():
+        features: Tensor = encoder(image.permute(2, 0, 1)[None])
     return features[0].float()
 
 

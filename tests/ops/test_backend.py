@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from fprf.ops import backend, dense, triplane
-from fprf.ops.precision import tf32
+from fprf.ops.precision import float32_convolutions, tf32
 
 
 def test_plain_forms_alone_within_the_block() -> None:
@@ -36,3 +36,11 @@ def test_tf32_is_put_back_after_an_error(enabled: bool) -> None:
         assert torch.get_float32_matmul_precision() == ("high" if enabled else "highest")
         raise KeyError
     assert torch.get_float32_matmul_precision() == "highest"
+
+
+def test_convolutions_are_in_float32_within_the_block() -> None:
+    before = torch.backends.cudnn.conv.fp32_precision
+    with pytest.raises(KeyError), float32_convolutions():
+        assert torch.backends.cudnn.conv.fp32_precision == "ieee"
+        raise KeyError
+    assert torch.backends.cudnn.conv.fp32_precision == before
