@@ -32,7 +32,7 @@ def float32_convolutions() -> Iterator[None]:
 
     Features that are off by 1e-4 are clustered otherwise: a style then moved by up to 0.1 of a colour in [0, 1].
     """
-    convolutions = torch.backends.cudnn.conv
+    convolutions = torch.backends.cudnn.conv  # type: ignore[attr-defined]
     before = convolutions.fp32_precision
     convolutions.fp32_precision = "ieee"
     try:
