@@ -1,15 +1,10 @@
-"""Full precision within autocast, TF32 within a block or nowhere in it, and float64 where a device has it."""
+"""TF32 within a block or nowhere in it, and float64 where a device has it."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
 from torch import Tensor
-
-
-def full_precision(x: Tensor) -> torch.autocast:
-    """Switches autocast off where x lies: attention in bfloat16 is off by 0.18 at |f|^2 = 1e4, styled features by 3 %."""
-    return torch.autocast(x.device.type, enabled=False)
 
 
 @contextmanager
