@@ -66,7 +66,7 @@ def test_the_embedded_garden_is_read_by_name_where_no_such_folder_is(tmp_path: P
         Path("garden", made).touch()
         assert len(parse_scene(Path("garden"), 4, None).paths) == 25
     Path("garden/config.json").rename("garden/photograph.jpg")
-    with pytest.raises(DataError, match="but nothing"):
+    with pytest.raises(DataError, match="entries"):
         parse_scene(Path("garden"), 4, None)
 
 
