@@ -327,9 +327,8 @@ class TrainConfig(RunConfig):
     device_memory: float = 0.5
     """Share of a GPU's free memory that images and feature targets may take in training; where they need more they stay in host
     memory, and each batch is copied one step ahead."""
-    precision: Literal["float32", "tf32", "bfloat16"] = "float32"
-    """Of matrix products on a GPU in training: tf32 rounds their factors to 11 bits (CUDA), bfloat16 those of the networks to 8
-    bits; geometry and sums stay in float32. docs/measurements.md has the errors."""
+    precision: Literal["float32", "tf32"] = "float32"
+    """Of matrix products on CUDA in training: tf32 rounds their factors to 11 bits. docs/measurements.md has the error."""
     datamanager: DataManagerConfig = RayBatchesConfig()
     """Feeds training."""
     sampler: SamplerConfig = ProposalConfig()

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor
 
-from fprf.ops.precision import float32_convolutions
+from fprf.ops.backend import float32_convolutions
 
 
 def ones(*shape: int) -> Tensor:

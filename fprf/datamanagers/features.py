@@ -33,7 +33,7 @@ from ..errors import CheckpointError, DataError, NumericsError, PluginError
 from ..interfaces import Encoder
 from ..io import tensorfiles
 from ..ops import guided
-from ..ops.precision import float32_convolutions
+from ..ops.backend import float32_convolutions
 from .basis import Basis, fit_basis
 from .config import GuidedConfig
 

@@ -23,7 +23,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import DataError
-from .precision import float64_device, full_precision
+from .backend import float64_device
 
 # Measured on photographs: 8 to 12 cost a tenth of the error that the stride brings anyway, 6 doubles it.
 FINENESS = 10.0
@@ -84,10 +84,9 @@ def coefficients(
     channels = features.shape[0]
     result = torch.empty(len(y.keep), len(x.keep), channels, 4, device=features.device)
     group = max(1, GROUP // (4 * moments[0].numel()))
-    with full_precision(features):
-        for first in range(0, channels, group):
-            part = features[first : first + group].float()
-            result[:, :, first : first + group] = _solve(part, mean, inverse, moments, colour, operators).permute(2, 3, 1, 0)
+    for first in range(0, channels, group):
+        part = features[first : first + group].float()
+        result[:, :, first : first + group] = _solve(part, mean, inverse, moments, colour, operators).permute(2, 3, 1, 0)
     return result
 
 
@@ -145,7 +144,7 @@ def apply_packed(
 ) -> Annotated[Tensor, "R C"]:
     """`apply` for pixels of several views at once, float32; all tensors on one device, `view` counts in `packed`.
 
-    Makes R x 16 x P numbers on the way. Sums are of float32 numbers whatever autocast or TF32 say.
+    Makes R x 16 x P numbers on the way. Sums are of float32 numbers whatever TF32 says.
     """
     cells = packed.cells[view]
     row, column, share = _corners(pixel, cells, packed.size[view])

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from ..errors import WeightsError
 from ..interfaces import Decoder, Encoder
-from ..ops.precision import double, float32_convolutions
+from ..ops.backend import double, float32_convolutions
 from ..plugins.decoders.decoders import DECODER_KIND, MlpDecoder, load_decoder
 from ..plugins.encoders.vgg import VggEncoder, build_vgg
 from ..plugins.weights import write_weights

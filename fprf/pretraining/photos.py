@@ -16,8 +16,8 @@ from ..datamanagers.config import GuidedConfig
 from ..datamanagers.images import load_image
 from ..errors import DataError
 from ..interfaces import Encoder
+from ..ops.backend import float32_convolutions
 from ..ops.guided import apply, coefficients, upsample
-from ..ops.precision import float32_convolutions
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
 HELD_OUT = 12

@@ -20,7 +20,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..interfaces import ContentField, Decoder, Sampler, SemanticField
-from ..ops.precision import full_precision
 from ..types import Rays, Rendered, Sampled, View, Want
 from .space import Space
 from .stepfun import keep_heaviest, midpoints, scale_gradient, transmittance_weights
@@ -74,55 +73,51 @@ class March(NamedTuple):
 def march(
     rays: Rays, parts: Parts, *, budget: float, step: int | None = None, generator: torch.Generator | None = None
 ) -> March:
-    """Sample rays, weigh the samples, and keep the heaviest. `step` is given in training alone.
-
-    In full precision under autocast too: a density is an exponential.
-    """
-    with full_precision(rays.origin):
-        # Where to look along each ray: edges t [R E] of S = E - 1 steps, placed by the sampler.
-        space = parts.space
-        sampled = parts.sampler(_detached(rays), space=space, step=step, generator=generator)
-        # A camera samples what is near it far more densely than any other camera does, and could explain its own image by a
-        # veil there. Scaling gradients by the square of the distance makes every piece of space count alike (Philip and
-        # Deschaintre 2023); beyond a few times the nearest distance that is no longer needed. In a box, and in normalised
-        # device coordinates, no camera stands amid the samples.
-        scaled = step is not None and space.kind in ("contraction", "open")
-        # Densities at the middle of each step, in the unit cube, where the fields live.
-        middle = midpoints(sampled.t)
-        points = rays.origin[:, None] + rays.direction[:, None] * middle[..., None]
-        located = space.locate(points.view(-1, 3))
-        sample = parts.field.density(located)
-        density = sample.density.view(middle.shape)
-        scale = (middle / (_NEAR_CAMERA * rays.near[:, None])).square().clamp(max=1) if scaled else None
-        if scale is not None:
-            density = scale_gradient(density, scale)
-        # Weights and transmittance of Eq. 2; what is only shown needs no gradient.
-        weights = transmittance_weights(density, sampled.t)
-        optical = (density * (sampled.t[:, 1:] - sampled.t[:, :-1])).sum(-1)
-        transmittance = torch.exp(-optical)  # 1 - sum of weights would cancel where the ray is opaque
-        with torch.no_grad():
-            opacity = -torch.expm1(-optical)
-            depth = (weights * middle).sum(-1) / weights.sum(-1).clamp_min(1e-10)
-            keep = keep_heaviest(weights, budget)
-        if step is not None and rays.origin.device.type != "cpu":
-            # All samples, the light ones with weight 0: shapes that the host knows without waiting.
-            ray = torch.arange(len(weights), device=weights.device)[:, None].expand(weights.shape).reshape(-1)
-            heavy = torch.where(keep, weights, 0.0).view(-1)
-            flat = None if scale is None else scale.view(-1)
-            kept = PackedSamples(ray, heavy, located, sample.latent, rays.view.index_select(0, ray), flat, whole=True)
-            return March(sampled, weights, depth, opacity, transmittance, kept)
-        # Elsewhere the kept ones alone, gathered.
-        index = keep.view(-1).nonzero()[:, 0]
-        ray = index // max(1, middle.shape[1])
-        kept = PackedSamples(
-            ray,
-            weights.view(-1).index_select(0, index),
-            located.index_select(0, index),
-            sample.latent.index_select(0, index),
-            rays.view.index_select(0, ray),
-            None if scale is None else scale.view(-1).index_select(0, index),
-        )
+    """Sample rays, weigh the samples, and keep the heaviest. `step` is given in training alone."""
+    # Where to look along each ray: edges t [R E] of S = E - 1 steps, placed by the sampler.
+    space = parts.space
+    sampled = parts.sampler(_detached(rays), space=space, step=step, generator=generator)
+    # A camera samples what is near it far more densely than any other camera does, and could explain its own image by a
+    # veil there. Scaling gradients by the square of the distance makes every piece of space count alike (Philip and
+    # Deschaintre 2023); beyond a few times the nearest distance that is no longer needed. In a box, and in normalised
+    # device coordinates, no camera stands amid the samples.
+    scaled = step is not None and space.kind in ("contraction", "open")
+    # Densities at the middle of each step, in the unit cube, where the fields live.
+    middle = midpoints(sampled.t)
+    points = rays.origin[:, None] + rays.direction[:, None] * middle[..., None]
+    located = space.locate(points.view(-1, 3))
+    sample = parts.field.density(located)
+    density = sample.density.view(middle.shape)
+    scale = (middle / (_NEAR_CAMERA * rays.near[:, None])).square().clamp(max=1) if scaled else None
+    if scale is not None:
+        density = scale_gradient(density, scale)
+    # Weights and transmittance of Eq. 2; what is only shown needs no gradient.
+    weights = transmittance_weights(density, sampled.t)
+    optical = (density * (sampled.t[:, 1:] - sampled.t[:, :-1])).sum(-1)
+    transmittance = torch.exp(-optical)  # 1 - sum of weights would cancel where the ray is opaque
+    with torch.no_grad():
+        opacity = -torch.expm1(-optical)
+        depth = (weights * middle).sum(-1) / weights.sum(-1).clamp_min(1e-10)
+        keep = keep_heaviest(weights, budget)
+    if step is not None and rays.origin.device.type != "cpu":
+        # All samples, the light ones with weight 0: shapes that the host knows without waiting.
+        ray = torch.arange(len(weights), device=weights.device)[:, None].expand(weights.shape).reshape(-1)
+        heavy = torch.where(keep, weights, 0.0).view(-1)
+        flat = None if scale is None else scale.view(-1)
+        kept = PackedSamples(ray, heavy, located, sample.latent, rays.view.index_select(0, ray), flat, whole=True)
         return March(sampled, weights, depth, opacity, transmittance, kept)
+    # Elsewhere the kept ones alone, gathered.
+    index = keep.view(-1).nonzero()[:, 0]
+    ray = index // max(1, middle.shape[1])
+    kept = PackedSamples(
+        ray,
+        weights.view(-1).index_select(0, index),
+        located.index_select(0, index),
+        sample.latent.index_select(0, index),
+        rays.view.index_select(0, ray),
+        None if scale is None else scale.view(-1).index_select(0, index),
+    )
+    return March(sampled, weights, depth, opacity, transmittance, kept)
 
 
 def _detached(rays: Rays) -> Rays:
@@ -152,7 +147,6 @@ def shade(
 
 def composite(kept: PackedSamples, values: Annotated[Tensor, "M C"], rays: int) -> Annotated[Tensor, "rays C"]:
     """Weighted sum over the kept samples of each ray (paper, Eq. 2)."""
-    values = values.to(kept.weight.dtype)  # under autocast networks answer in half precision
     if kept.whole and rays > 0:
         return (values * kept.weight[:, None]).view(rays, -1, values.shape[1]).sum(1)
     return values.new_zeros(rays, values.shape[1]).index_add(0, kept.ray, values * kept.weight[:, None])

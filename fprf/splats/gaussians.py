@@ -108,6 +108,10 @@ class Gaussians:
         """The same Gaussians with other harmonics."""
         return replace(self, harmonics=harmonics)
 
+    def to(self, device: torch.device) -> "Gaussians":
+        """The same Gaussians on a device."""
+        return Gaussians(*(part.to(device) for part in vars(self).values()))
+
     def select(self, index: Annotated[Tensor, "M"] | slice) -> "Gaussians":
         """Some of the Gaussians, in the order of `index` (int64, or a mask of all); without a copy those of a slice."""
         return Gaussians(*(part[index] for part in vars(self).values()))

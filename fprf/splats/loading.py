@@ -11,13 +11,14 @@ from torch import Tensor
 from ..config import RunConfig
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError, UsageError
+from ..ops.rasterise.gsplat import usable
 from ..rendering.cameras import Cameras
 from ..training import checkpoint
 from ..training.camera_optimizers import Poses, Tones, moved_cameras
 from ..training.driver import Schedule, learn
 from ..training.loading import LoadedRun
 from ..training.model import Facts, tones_of
-from ..training.prepare import reach_of
+from ..training.prepare import device_of, reach_of
 from ..training.quality import PRESETS, QualityConfig, tone_of
 from ..training.run import Run, in_training
 from .config import GaussiansConfig
@@ -37,14 +38,14 @@ _LEVELS, _MANY = "levels", 400_000
 
 
 def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityConfig) -> LoadedRun[SplatScene]:
-    """A run of Gaussians; they are drawn on the CPU, whatever the device.
+    """A run of Gaussians; on a CUDA device views are drawn where gsplat can, all else is on the CPU.
 
     Raises CheckpointError with what is missing, UsageError for qualities other than a resolution.
     """
     assert isinstance(config, GaussiansConfig)  # by its kind
     if quality.max_memory:
         raise UsageError("--max-memory: is for runs of fields; leave it out")
-    root, preset = run.root, None if quality.quality is None else PRESETS[quality.quality]
+    root, preset, drawn_on = run.root, None if quality.quality is None else PRESETS[quality.quality], device_of(device)
     merged = None if preset is None else preset.merged
     # Levels of detail were written from what was verified.
     key = "" if merged is None else checkpoint.digest(run.checkpoints)
@@ -114,6 +115,7 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
         poses=fit,
         merged=merged,
         levels=functools.cache(levels),
+        drawn_on=drawn_on if usable(drawn_on) else torch.device("cpu"),
     )
     return LoadedRun(run, run.load_config()[1], known, saved.step, saved.seconds, shown)
 

@@ -35,7 +35,7 @@ _ROWS, _CHANNELS = 1 << 14, 128
 
 @dataclass(frozen=True, eq=False)
 class SplatScene(Scene):
-    """Gaussians with views of them, all on the CPU."""
+    """Gaussians with views of them, all on the CPU but for what is drawn elsewhere."""
 
     gaussians: Gaussians
     """Gaussians as they were captured; all finite."""
@@ -67,6 +67,8 @@ class SplatScene(Scene):
     """Exposures of the views, where a run has learnt them."""
     poses: Callable[[ParsedScene, Sequence[int]], Annotated[Tensor, "V 6"]] | None = None
     """Fits poses of views to their photographs (`fit_poses`); None = there are no photographs."""
+    drawn_on: torch.device = torch.device("cpu")
+    """Where views are drawn: the CPU, or a CUDA device on which gsplat draws."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -90,6 +92,11 @@ class SplatScene(Scene):
     def shown(self) -> Gaussians:
         """The Gaussians in the scene's look, all in memory."""
         return self.part(slice(0, len(self.gaussians)))
+
+    @cached_property
+    def _there(self) -> Gaussians:
+        """`shown`, where it is drawn."""
+        return self.shown.to(self.drawn_on)
 
     def part(self, rows: slice) -> Gaussians:
         """Some of the Gaussians in the scene's look."""
@@ -132,14 +139,15 @@ class SplatScene(Scene):
             return enlarged(self.render(small, 0, resolution=1.0), cameras.size[view].tolist())
         # A lens is drawn through a pinhole that covers it, and brought to its pixels in the end.
         camera, place = cover(cameras, view, self.near)
-        shown = self.shown if self.merged is None else self._detail.select(camera, self.merged)
+        shown = self._there if self.merged is None else self._detail.select(camera, self.merged).to(self.drawn_on)
         drawn = draw(shown, camera, antialiased=self.antialiased, background=self.background)
+        colour, along, opacity = drawn.image.cpu(), drawn.depth.cpu(), drawn.opacity.cpu()
         # Depths are along z; those of a view along its rays, whose lengths are these where z is 1.
         inverse = camera.intrinsics.inverse().float()
         x = (torch.arange(camera.width) + 0.5) * inverse[0, 0] + inverse[0, 2]
         y = (torch.arange(camera.height) + 0.5) * inverse[1, 1] + inverse[1, 2]
-        depth = drawn.depth * (x.square() + y.square()[:, None] + 1).sqrt()
-        colour, shape = drawn.image, torch.stack([depth, drawn.opacity], -1)
+        depth = along * (x.square() + y.square()[:, None] + 1).sqrt()
+        shape = torch.stack([depth, opacity], -1)
         if place is not None:
             colour, shape = distorted(colour, place), distorted(shape, place, linear=True)
         return View((colour * torch.tensor(self.tone)).clamp(0, 1), shape[..., 0], shape[..., 1], 1.0)

@@ -37,8 +37,8 @@ _WIDTH, _WIDTH_IN_CELLS = 0.5, 0.25
 """Greatest width of all others in distances to the nearest camera; in scenes of cells."""
 _EVERY, _EVERY_IN_CELLS, _SPHERE_EVERY = 20, 100, 10
 """Steps between cuts of widths; in scenes of cells; of the surroundings."""
-_TOGETHER = 256
-"""Gaussians whose distances to cameras are taken together."""
+_TOGETHER, _PAIRS = 256, 1 << 16
+"""Gaussians whose distances to cameras are taken together, at least, and pairs of both, where cameras are few."""
 _NEAR_POINTS, _NEAR_DEPTHS = 4000, 10_000_000
 """Points, and depths of them in all views, that say how near to a camera things are, at most."""
 _NEAR, _NEAR_UNSEEN = 0.25, 1e-3
@@ -141,7 +141,8 @@ def limit_widths(scene: Scene, near: float, *, cells: bool, sphere: _Sphere | No
             wide = np.flatnonzero(gaussians.read(LOG_SCALES).max(1) > math.log(share * near))
             if len(wide):
                 points = torch.from_numpy(gaussians.read(MEANS, wide))
-                distance = torch.cat([nearest_camera(part) for part in torch.split(points, _TOGETHER)])
+                together = max(_TOGETHER, _PAIRS // len(centres))
+                distance = torch.cat([nearest_camera(part) for part in torch.split(points, together)])
                 gaussians.limit_scales((share * distance).clamp_min(1e-12).log().numpy(), wide)
 
     return limit

@@ -81,7 +81,7 @@ def draw(
 ) -> Rasterised:
     """A view of Gaussians; harmonics above degree 3, which files may hold, are not drawn."""
     parts = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits, gaussians.harmonics[:, :16])
-    behind = torch.tensor(background)
+    behind = torch.tensor(background, device=gaussians.means.device)
     return rasterise(*parts, camera, features=features, background=behind, antialiased=antialiased)
 
 

@@ -2,7 +2,7 @@
 
 Letters: N points or queries, D semantic channels, T style codes with a key each, K regions of a scene with a key each.
 Semantics are vectors [D] in the scene's semantic basis, without a unit; scores are cosines in [-1, 1], or dot products; shares
-are in [0, 1]. At least float32, autocast or not; tables of regions are float64.
+are in [0, 1]. At least float32; tables of regions are float64.
 
     R = queries x keys^T                        cross-correlation             paper, Eq. 5
     R^S = softmax(R / temperature)              attention, rows sum to 1      paper, Eq. 6
@@ -28,7 +28,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from ..ops.precision import double, full_precision
+from ..ops.backend import double
 
 _FLAT = 1e-6
 """Below this share of what they were computed from, lengths and spreads are float32 rounding."""
@@ -46,14 +46,12 @@ def unit(x: Annotated[Tensor, "N D"], centre: Annotated[Tensor, "D"]) -> Annotat
 
 def share_mean(keys: Annotated[Tensor, "T D"], share: Annotated[Tensor, "T"]) -> Annotated[Tensor, "D"]:
     """Mean of the keys by their shares: the centre of a set of codes."""
-    with full_precision(keys):
-        return (share / share.sum()) @ keys
+    return (share / share.sum()) @ keys
 
 
 def scores(queries: Annotated[Tensor, "N D"], keys: Annotated[Tensor, "T D"]) -> Annotated[Tensor, "N T"]:
     """The cross-correlation matrix R (paper, Eq. 5), in float32 or wider."""
-    with full_precision(queries):
-        return queries @ keys.T
+    return queries @ keys.T
 
 
 def score_spread(queries: Annotated[Tensor, "N D"], keys: Annotated[Tensor, "T D"]) -> float:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import CheckpointError, DataError
-from ..ops.precision import double, full_precision
+from ..ops.backend import double
 from .dictionary import BLEND, StyleDictionary, blend_codes
 from .matching import point_shares, score_spread, unit
 from .statistics import Moments, covariance, group_moments, kmeans
@@ -130,15 +130,14 @@ def mixed_maps(
 
     Within (C + K + 3) u sum_k share_k (|x| |matrix_k| + |bias_k|), u = 2^-24.
     """
-    with full_precision(x):
-        if len(matrix) == 1:
-            return x @ matrix[0] + bias[0]
-        mixed = share @ bias
-        # A point belongs to two or three regions: the maps of the others are not computed.
-        for k in range(len(matrix)):
-            inside = share[:, k].nonzero().squeeze(1)
-            mixed.index_add_(0, inside, (x[inside] * share[inside, k, None]) @ matrix[k])
-        return mixed
+    if len(matrix) == 1:
+        return x @ matrix[0] + bias[0]
+    mixed = share @ bias
+    # A point belongs to two or three regions: the maps of the others are not computed.
+    for k in range(len(matrix)):
+        inside = share[:, k].nonzero().squeeze(1)
+        mixed.index_add_(0, inside, (x[inside] * share[inside, k, None]) @ matrix[k])
+    return mixed
 
 
 class RegionWeight(nn.Module):

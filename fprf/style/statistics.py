@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from ..errors import NumericsError
-from ..ops.precision import double, float64_device, full_precision
+from ..ops.backend import double, float64_device
 
 _CHUNK = 16384
 """Rows centred at a time: bounds the float64 copies of large inputs."""
@@ -141,10 +141,9 @@ _RIDGE = 1e-4
 
 def symmetric_root(c: Annotated[Tensor, "... C C"]) -> Annotated[Tensor, "... C C"]:
     """The symmetric positive root of symmetric matrices; negative eigenvalues (rounding) count as 0."""
-    with full_precision(c):
-        value, vector = torch.linalg.eigh(c)
-        root: Tensor = (vector * value.clamp_min(0.0).sqrt()[..., None, :]) @ vector.mT
-        return root
+    value, vector = torch.linalg.eigh(c)
+    root: Tensor = (vector * value.clamp_min(0.0).sqrt()[..., None, :]) @ vector.mT
+    return root
 
 
 def monge(
@@ -162,9 +161,8 @@ def monge(
     product = half @ half.mT
     t = (product + product.mT) / 2
     # Cap the eigenvalues; where none is too large the map stays untouched, bit for bit.
-    with full_precision(t):
-        value, vector = torch.linalg.eigh(t)
-        capped = (vector * value.clamp(0.0, gain)[..., None, :]) @ vector.mT
+    value, vector = torch.linalg.eigh(t)
+    capped = (vector * value.clamp(0.0, gain)[..., None, :]) @ vector.mT
     return torch.where((value[..., -1] > gain)[..., None, None], (capped + capped.mT) / 2, t)
 
 

@@ -22,7 +22,7 @@ from ..datamanagers.scene import Scene as ParsedScene
 from ..errors import CheckpointError
 from ..interfaces import DataManager, Figures, SceneLearner, State
 from ..memory import free_memory
-from ..ops.precision import tf32
+from ..ops.backend import tf32
 from ..progress import Display
 from ..rendering.cameras import PixelRays
 from ..rendering.renderer import render_rays
@@ -74,7 +74,6 @@ class FieldLearner(SceneLearner):
         betas = 0.9, adam.beta2
         self.optimizer = torch.optim.Adam(self.model.learned(), lr=adam.rate, betas=betas, eps=adam.eps, fused=True)
         self.tf32 = config.precision == "tf32" and device.type == "cuda"
-        self.half = config.precision == "bfloat16" and device.type != "cpu"
         # A mistake in the config is told before features are moved and steps are taken.
         check_penalties(config.loss, self.model)
         self.extra = extra_term(config.loss)
@@ -115,19 +114,18 @@ class FieldLearner(SceneLearner):
             group["lr"] = rate(self.config.optimizer, step, share)
         draws = generator_of(self.config.seed, step, self.device, purpose="draws")
         # Colour, content and semantics along each ray; outputs that no loss needs are not computed.
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.half):
-            rendered = render_rays(
-                rays,
-                self.model.parts,
-                want=wanted(self.config.loss, batch, self.extra),
-                budget=self.config.render.train_budget,
-                background=self.background,
-                step=step + self.lead,
-                generator=draws,
-                semantic_rays=len(batch.semantic) if batch.semantic is not None else None,
-                semantic_samples=self.config.semantic.samples,
-                content_moves_density=self.config.content.moves_density,
-            )
+        rendered = render_rays(
+            rays,
+            self.model.parts,
+            want=wanted(self.config.loss, batch, self.extra),
+            budget=self.config.render.train_budget,
+            background=self.background,
+            step=step + self.lead,
+            generator=draws,
+            semantic_rays=len(batch.semantic) if batch.semantic is not None else None,
+            semantic_samples=self.config.semantic.samples,
+            content_moves_density=self.config.content.moves_density,
+        )
         # Photographs differ in exposure: what is compared is the render as the view would have taken it.
         if self.model.tones is not None and rendered.rgb is not None:
             rendered = rendered._replace(rgb=rendered.rgb * self.model.tones(batch.view))

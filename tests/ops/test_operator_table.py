@@ -268,22 +268,6 @@ def test_gradients_are_those_of_float64(case: Case, n: int) -> None:
         assert abs(float(apart.mean())) <= 1e-4 * float(b.abs().mean())
 
 
-NETWORKS = ("dense.network", "dense.network, plain")
-"""What somebody who asks for autocast wants to be lowered."""
-
-
-@pytest.mark.parametrize("case", [pytest.param(case, id=case.name) for case in CASES if case.name not in NETWORKS])
-def test_autocast_does_not_lower_the_precision(case: Case) -> None:
-    given = cast(list(case.make(37)), torch.float32)
-    usual = outputs(case.call(*given))
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        found = outputs(case.call(*given))
-    exact = outputs(case.call(*cast(given, torch.float64)))
-    for one, plain, other in zip(found, usual, exact, strict=True):
-        assert one.dtype == plain.dtype
-        check_close(case, one, other)
-
-
 HERE = Path(__file__).parent
 KERNELS = ("dense", "guided", "rasterise", "triplane")
 

@@ -90,4 +90,14 @@ def test_auto_trains_where_gsplat_draws(
     events = [json.loads(line)["event"] for line in (said.out + said.err).splitlines() if '"event"' in line]
     assert sum("on cuda:0 by gsplat" in each for each in events) == installed
     assert sum("Gaussians are trained on the CPU" in each and "fprf[cuda]" in each for each in events) == (not installed)
-    assert len(open_run(tmp_path / "run", "cpu").scene.gaussians) > 100
+    scene = open_run(tmp_path / "run", "cpu").scene
+    assert len(scene.gaussians) > 100
+    with pretend_cuda(), stand_in(), monkeypatch.context() as patched:
+        if not installed:
+            patched.setitem(sys.modules, "gsplat", None)
+        other = open_run(tmp_path / "run", "auto").scene
+        drawn, wanted = (each.render(scene.cameras.scaled(2), 1) for each in (other, scene))
+    assert other.drawn_on == (CUDA if installed else torch.device("cpu"))
+    for name in ("rgb", "depth", "opacity"):
+        assert getattr(drawn, name).device.type == "cpu"
+        torch.testing.assert_close(getattr(drawn, name), getattr(wanted, name), rtol=1e-3, atol=2e-3)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ...interfaces import Stylizer
-from ...ops.precision import double, full_precision
+from ...ops.backend import double
 from ...style.dictionary import StyleDictionary, code_odds, whole_style
 from ...style.matching import point_shares, score_spread, share_mean, unit
 from ...style.scene_style import SceneStyle, check_fit
@@ -81,15 +81,14 @@ class AdainStylizer(Stylizer):
 
     def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
         """AdaIN; the mean is subtracted first, since a x + b loses digits where the mean is large."""
-        with full_precision(content):
-            features = content.to(self.gain)
-            if self.matched:
-                assert semantic is not None, "Want.SEMANTIC was asked for"
-                share = self.match(semantic)
-                styled = (features - self.content_mean) * (share @ self.gain) + share @ self.style_mean
-            else:
-                styled = (features - self.content_mean) * self.gain + self.style_mean
-            return styled.to(content)
+        features = content.to(self.gain)
+        if self.matched:
+            assert semantic is not None, "Want.SEMANTIC was asked for"
+            share = self.match(semantic)
+            styled = (features - self.content_mean) * (share @ self.gain) + share @ self.style_mean
+        else:
+            styled = (features - self.content_mean) * self.gain + self.style_mean
+        return styled.to(content)
 
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
         if not self.matched:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ...interfaces import Stylizer
-from ...ops.precision import double, full_precision
+from ...ops.backend import double
 from ...style.dictionary import StyleDictionary, choose, code_odds, whole_style
 from ...style.matching import match_keys, unit
 from ...style.scene_style import Membership, SceneStyle, check_fit, mixed_maps, own_style
@@ -125,19 +125,17 @@ class TwoSidedStylizer(Stylizer):
         self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
     ) -> tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N K"]]:
         """`forward`, and the regions that points belong to."""
-        with full_precision(content):
-            share = self.membership(content[:, :0] if semantic is None else semantic)
-            away = content.to(self.centre) - self.centre
-            if self.matrix.ndim == 2:  # gains and biases are mixed before they are applied
-                styled = away * (share @ self.matrix) + share @ self.bias
-            else:
-                styled = mixed_maps(away, share, self.matrix, self.bias)
-            return styled.to(content), share
+        share = self.membership(content[:, :0] if semantic is None else semantic)
+        away = content.to(self.centre) - self.centre
+        if self.matrix.ndim == 2:  # gains and biases are mixed before they are applied
+            styled = away * (share @ self.matrix) + share @ self.bias
+        else:
+            styled = mixed_maps(away, share, self.matrix, self.bias)
+        return styled.to(content), share
 
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
-        with full_precision(semantic):
-            share: Tensor = self.membership(semantic)
-            return share @ self.table
+        share: Tensor = self.membership(semantic)
+        return share @ self.table
 
     def region_match(self, keys: Annotated[Tensor, "K D"]) -> Annotated[Tensor, "K T"]:
         """The table itself."""
