@@ -17,8 +17,9 @@ import numba
 import numpy as np
 
 from .simd import BLOCK, WIDE, load, maximum, narrow, repeat, store, traced
+from .threads import cached_jit
 
-_jit = numba.njit(parallel=True, cache=True, nogil=True)
+_jit = cached_jit(parallel=True, nogil=True)
 _LEAST = np.float32(-np.inf)
 # As many sums as registers hold beside the weights: 24 of 32 on machines with 512 bits, 12 of 16 elsewhere.
 ROWS = (0, 16, 12, 8, 6) if WIDE == 16 else (0, 12, 6, 4, 3)
@@ -40,7 +41,7 @@ def multiply(x, x_at, w, w_at, w_step, start, s_at, s_row, out, o_at, depth, flo
         store(out, o_at + w_step * r + c * WIDE, maximum(narrow(floor, WIDE), value))
 
 
-@numba.njit(inline="always", cache=True)
+@numba.njit(inline="always")
 def product(x, x_at, w, w_at, width, start, s_at, s_row, out, depth, floor):
     """out[r] = max(start[r] + x[r] w, floor) for a block of rows of `width`."""
     for c in range(0, width, 4 * WIDE):
@@ -64,7 +65,7 @@ def add_shift(bias, at, side, s_at, out, to):
     store(out, to, load(bias, at, WIDE) + load(side, s_at, WIDE))
 
 
-@numba.njit(inline="always", cache=True)
+@numba.njit(inline="always")
 def _layers(source, at, depth, weights, biases, widths, side, row, first, rows, here, there, out, outputs):
     """A block of rows of `source` through all layers, to rows `first` on of `out`; `source` may be `there`."""
     # Sums start from the biases, or from these and what is shared.

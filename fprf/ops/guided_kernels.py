@@ -11,6 +11,7 @@ import numba
 import numpy as np
 
 from .simd import NARROW, load, load_halves, narrow, store, traced
+from .threads import cached_jit
 
 PIXELS = 64
 """Pixels of a task."""
@@ -22,7 +23,7 @@ def _add_halves(total, at, address, weight):
     store(total, at, load(total, at, NARROW) + load_halves(address, NARROW) * narrow(weight, NARROW))
 
 
-@numba.njit(inline="always", cache=True)
+@numba.njit(inline="always")
 def _corner(position, cells):
     """Lower cell, upper cell, share of the upper one; NaN falls on the lower border: no index may leave the table."""
     at = position - np.float32(0.5)
@@ -31,7 +32,7 @@ def _corner(position, cells):
     return low, min(low + 1, cells - 1), at - np.float32(low)
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, fastmath={"contract"})
+@cached_jit(parallel=True, nogil=True, fastmath={"contract"})
 def gather(slot, address, shape, scale, centre, run, pixel, rgb, out):
     """out[i] [R C] = F = scale (A I + b) + centre at pixel[i] [R 2] with the colour I = rgb[i] [R 3] of the view slot[i].
 

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 from .simd import LANES, absolute, as_float, lanes, load, splat, store, total, traced, where_greater
-from .threads import on_threads, take
+from .threads import cached_jit, on_threads, take
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 WINDOW = 11
@@ -21,7 +21,7 @@ _WEIGHTS = (_weights / _weights.sum()).tolist()
 _C1, _C2 = 0.01**2, 0.03**2
 _STRIP = 48
 """Rows that a thread takes at a time."""
-_jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz"})
+_jit = cached_jit(nogil=True, fastmath={"contract", "arcp", "nsz"})
 
 
 def slack(padded_width: int) -> int:

@@ -1,13 +1,22 @@
-"""Threads of compiled kernels. Numba's own cost half of the compilation, and split work evenly, which pixels and Gaussians
-are not: here threads take what is to be done one by one.
+"""Cache and threads of compiled kernels.
+
+Numba caches what it compiled under the text of a kernel's own file, but constants and traced functions of other files are
+compiled into it: after an update it would go on with the former ones. Here the text of all that kernels are made of counts:
+the files of `fprf/ops` without torch.
+
+Numba's own threads cost half of the compilation, and split work evenly, which pixels and Gaussians are not: here threads take
+what is to be done one by one.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg"
 
+import hashlib
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from pathlib import Path
+from types import CellType, FunctionType
 from typing import Any
 
 import numba
@@ -15,6 +24,28 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
+
+
+@cache
+def _sources() -> str:
+    """Hash of the text that kernels are compiled from."""
+    texts = (file.read_bytes() for file in sorted(Path(__file__).parent.rglob("*.py")))
+    return hashlib.sha256(b"".join(text for text in texts if b"\nimport torch" not in text)).hexdigest()
+
+
+def cached_jit(**options: Any) -> Callable[[Any], Any]:
+    """`numba.njit` with these options and a cache; numba looks for what it compiled by variables that a function encloses."""
+
+    def compiled(function: Any) -> Any:
+        code, enclosed = function.__code__, function.__closure__ or ()
+        code = code.replace(co_freevars=(*code.co_freevars, "sources"))
+        dated = FunctionType(
+            code, function.__globals__, function.__name__, function.__defaults__, (*enclosed, CellType(_sources()))
+        )
+        dated.__module__, dated.__qualname__, dated.__doc__ = function.__module__, function.__qualname__, function.__doc__
+        return numba.njit(cache=True, **options)(dated)
+
+    return compiled
 
 
 @intrinsic

@@ -7,18 +7,19 @@ import numba
 import numpy as np
 
 from .simd import BLOCK, NARROW, WIDE, load, narrow, store, traced
+from .threads import cached_jit
 
 AXES = ((0, 1), (0, 2), (1, 2))
 """Those of `triplane`, which imports this module."""
 GROUP = 16
 """Channels of one backward task: a cache line of float32."""
 
-_jit = numba.njit(parallel=True, cache=True, nogil=True)
+_jit = cached_jit(parallel=True, nogil=True)
 # Differences of neighbours may be summed in any order inside a row: the sum is a regulariser, kept in float64.
-_jit_sum = numba.njit(parallel=True, cache=True, nogil=True, fastmath={"contract", "reassoc"})
+_jit_sum = cached_jit(parallel=True, nogil=True, fastmath={"contract", "reassoc"})
 
 
-@numba.njit(inline="always", cache=True)
+@numba.njit(inline="always")
 def _cells(points, first, count, size, start, channels, corner, part):
     """For `count` <= BLOCK points: first number of the lower corner's vector in each plane, share of the next node per axis.
 
@@ -93,7 +94,7 @@ def product_slopes(table, grad, sums, a, b, c, o, step, stride, u, v, w):
         store(sums, at, load(sums, at, NARROW) + g * (first + second))
 
 
-@numba.njit(inline="always", cache=True)
+@numba.njit(inline="always")
 def _features(points, first, count, table, channels, sizes, starts, corner, part, out, to):
     """For `count` <= BLOCK points [3] the products of their samples, scales side by side, to out[to :]."""
     scales = len(sizes)

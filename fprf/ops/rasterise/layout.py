@@ -8,11 +8,10 @@ of the opacity 10, then harmonics [K 3], K = 1, 4, 9 or 16 `bands`. A flat array
 
 from typing import Any
 
-import numba
 import numpy as np
 
 from ..simd import LANES, load, maximum, splat, square_root
-from ..threads import on_threads, take
+from ..threads import cached_jit, on_threads, take
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 FIXED = 11
@@ -23,7 +22,7 @@ _f = np.float32
 _LARGE, _MOST_LOG, MARK = _f(1e15), _f(30), _f(-70)
 """Coordinates beyond which a Gaussian is invalid; most of a logarithm; the logit of the invalid."""
 
-jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz"})
+jit = cached_jit(nogil=True, fastmath={"contract", "arcp", "nsz"})
 
 
 @jit
