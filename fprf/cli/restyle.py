@@ -175,7 +175,7 @@ def _outputs(config: RestyleConfig) -> list[Path]:
         raise UsageError("--references: at least one photograph is needed, for example --references autumn.jpg night.jpg")
     if config.output is None:
         return []
-    from ..splats.files.base import format_of
+    from ..splats.files.base import check_needs, format_of
 
     # A folder holds a file for each capture under its own name, or a .ply where its format is read alone.
     if config.output.is_dir() or (len(config.captures) > 1 and format_name(config.output) is None):
@@ -198,10 +198,11 @@ def _outputs(config: RestyleConfig) -> list[Path]:
     if format_name(config.output) is None:
         known_endings = ", ".join(endings())
         raise UsageError(f"--output {config.output}: no file of Gaussians by its name; known endings are {known_endings}")
-    if not format_of(config.output).writes:
+    if not (form := format_of(config.output)).writes:
         raise UsageError(
             f"--output {config.output}: files of this format are read, not written; name a .ply, .spz, .sog or .glb"
         )
+    check_needs(form)
     return [config.output]
 
 
