@@ -60,7 +60,7 @@ else
     device=cuda:0 limit=0
     data=(--data "$scene" --datamanager.parser llff --datamanager.parser.images "$images")
     time=(--minutes "$minutes") again=(--steps "$long")
-    size=(--rays 762048 --repeats 5) points=(--points 262144)
+    size=(--rays 100000 --repeats 3) points=(--points 262144)
     photographs=(--data "$scene" --parser llff --parser.images "$images")
     tests+=(-m gpu "$root/tests/test_gpu.py" "$root/tests/ops/test_rasterise_gsplat.py" "$root/tests/ops/test_triplane.py")
 fi
@@ -81,7 +81,7 @@ fprf=("$python" -m fprf)
 step tests 150 "$python" -m pytest "${tests[@]}"
 step train "$whole" "${fprf[@]}" train "$method" "${data[@]}" "${time[@]}" --device "$device" --output "$work/run" "$@"
 step eval 40 "${fprf[@]}" eval "$work/run" --no-images --device "$device"
-step speed 130 "$python" -m benchmarks speed "$work/run" "${size[@]}" "${points[@]}" --device "$device" --output "$work/speed.json"
+step speed 300 "$python" -m benchmarks speed "$work/run" "${size[@]}" "${points[@]}" --device "$device" --output "$work/speed.json"
 step gaussians "$((whole + 600))" "${fprf[@]}" train fprf-splats "${photographs[@]}" "${time[@]}" --device "$device" \
     --output "$work/gaussians"
 step eval-gaussians 60 "${fprf[@]}" eval "$work/gaussians" --no-images --device "$device"

@@ -10,10 +10,11 @@ counted. Real values flow, so whole training runs, renders and restyles can be d
 CPU. Works with a CPU-only torch.
 
 Name the device with its index ("cuda:0"): a CPU-only torch has no guard that could find the index of "cuda" alone; `auto`
-names it. What it cannot show: memory (`mem_get_info` answers `memory`), streams, CUDA's own draws
-(generators are the CPU's), autocast (wrappers have no autocast key), and other threads: operators there are
-neither counted nor pretended. Numbers that reach a kernel as arguments (`x + 1.0`, `torch.full`) are no copies, on a card
-neither.
+names it. Convolutions round their factors to TF32 unless torch is told otherwise, as on a card; their gradients do not.
+
+What it cannot show: memory (`mem_get_info` answers `memory`), streams, CUDA's own draws (generators are the CPU's), autocast
+(wrappers have no autocast key), and other threads: operators there are neither counted nor pretended. Numbers that reach a
+kernel as arguments (`x + 1.0`, `torch.full`) are no copies, on a card neither.
 """
 
 import contextlib
@@ -40,6 +41,7 @@ SYNCS = (
     "aten._linalg_check_errors.default",
 )
 RESHAPED = ("squeeze_", "unsqueeze_", "t_", "transpose_")
+CONVOLUTION = "aten.convolution.default"
 INDEXED = ("aten.index.Tensor", "aten.index_put.default", "aten.index_put_.default", "aten._index_put_impl_.default")
 
 
@@ -127,7 +129,12 @@ def _run(func, args, kwargs, syncs: Counter, uploads: Counter):
         syncs[name] += 1
     if target is not None:
         kwargs = {**kwargs, "device": torch.device("cpu")}
-    result = func(*_each(args, _inner), **_each(kwargs, _inner))
+    arguments = _each(args, _inner)
+    card = there and Pretended.where == CUDA
+    if card and name == CONVOLUTION and torch.backends.cudnn.conv.fp32_precision == "tf32" and args[-1] == 1:
+        # Depthwise kernels multiply in float32.
+        arguments = [*map(_tf32, arguments[:2]), *arguments[2:]]
+    result = func(*arguments, **_each(kwargs, _inner))
     operator = name.split(".")[1]
     in_place = operator.startswith("__i") or (operator.endswith("_") and not operator.endswith("__"))
     if in_place and args and isinstance(args[0], torch.Tensor):
@@ -151,6 +158,14 @@ def _each(x, change):
 
 def _inner(x: torch.Tensor) -> torch.Tensor:
     return x.inner if isinstance(x, Pretended) else x
+
+
+def _tf32(x: torch.Tensor) -> torch.Tensor:
+    """Rounded to 10 bits of mantissa, ties to even."""
+    if x.dtype != torch.float32:
+        return x
+    bits = x.view(torch.int32)
+    return (bits + 0xFFF + (bits >> 13 & 1) & ~0x1FFF).view(torch.float32)
 
 
 def _wrapped(x: torch.Tensor) -> torch.Tensor:

@@ -4,8 +4,11 @@ from collections.abc import Callable
 
 import pytest
 import torch
+import torch.nn.functional as F
 from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor
+
+from fprf.ops.backend import float32_convolutions
 
 
 def ones(*shape: int) -> Tensor:
@@ -58,3 +61,14 @@ def test_waits_and_copies_are_counted(what: dict[str, Callable[[], object]], nam
 def test_what_cuda_refuses_is_refused(wrong: Callable[[], object]) -> None:
     with pretend_cuda(), pytest.raises((RuntimeError, TypeError)):
         wrong()
+
+
+def test_convolutions_are_in_tf32_unless_told_otherwise() -> None:
+    """As on a card: 1 + 2^-12 becomes 1."""
+    x = torch.full((1, 1, 1, 1), 1 + 2**-12)
+    with pretend_cuda():
+        there = x.to(CUDA)
+        assert float(F.conv2d(there, there)) == 1
+        with float32_convolutions():
+            assert float(F.conv2d(there, there)) == float(x * x)
+    assert float(F.conv2d(x, x)) == float(x * x)

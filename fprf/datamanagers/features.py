@@ -33,7 +33,7 @@ from ..errors import CheckpointError, DataError, NumericsError, PluginError
 from ..interfaces import Encoder
 from ..io import tensorfiles
 from ..ops import guided
-from ..ops.precision import float32_convolutions
+from ..ops.backend import float32_convolutions
 from .basis import Basis, fit_basis
 from .config import GuidedConfig
 
@@ -228,7 +228,8 @@ def extract(
         basis = _basis(folder, prints, image, encoder, dim, remembered)
     projection = digest(*(t.numpy().tobytes() for t in basis.tensors().values())) if basis else "raw"
     device = _device(encoder)
-    place = () if device.type == "cpu" else (device.type,)  # other devices round otherwise
+    # Other devices round otherwise; files without "float32" are from when CUDA convolved in TF32.
+    place = () if device.type == "cpu" else (device.type, "float32")
     entries: dict[int, Entry] = {}
     keys = {}
     # View by view, what is not there yet.

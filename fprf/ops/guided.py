@@ -23,7 +23,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import DataError
-from .precision import float64_device
+from .backend import float64_device
 
 # Measured on photographs: 8 to 12 cost a tenth of the error that the stride brings anyway, 6 doubles it.
 FINENESS = 10.0

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from ..errors import WeightsError
 from ..interfaces import Decoder, Encoder
-from ..ops.precision import double
+from ..ops.backend import double, float32_convolutions
 from ..plugins.decoders.decoders import DECODER_KIND, MlpDecoder, load_decoder
 from ..plugins.encoders.vgg import VggEncoder, build_vgg
 from ..plugins.weights import write_weights
@@ -51,7 +51,8 @@ class StyleNetwork(nn.Module):
 
     def forward(self, images: Annotated[Tensor, "B 3 H W"]) -> list[Annotated[Tensor, "B C h w"]]:
         """Activations of sRGB images in [0, 1], at every layer of `layers`."""
-        found = [x for place, x in enumerate(self.encoder.activations(images)) if place in self._places]
+        with float32_convolutions():
+            found = [x for place, x in enumerate(self.encoder.activations(images)) if place in self._places]
         return [x / self.get_buffer(f"unit_{layer}") for x, layer in zip(found, self.layers, strict=True)]
 
     @torch.no_grad()

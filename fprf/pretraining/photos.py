@@ -16,6 +16,7 @@ from ..datamanagers.config import GuidedConfig
 from ..datamanagers.images import load_image
 from ..errors import DataError
 from ..interfaces import Encoder
+from ..ops.backend import float32_convolutions
 from ..ops.guided import apply, coefficients, upsample
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -69,7 +70,8 @@ def filtered_at(
     """Features and colours at pixels (row, column)."""
     height, width = photo.shape[:2]
     pixels = pixels.to(photo.device)
-    features = encoder(photo.permute(2, 0, 1)[None])[0]
+    with float32_convolutions():
+        features: Tensor = encoder(photo.permute(2, 0, 1)[None])[0]
     # Features are filtered along the photograph's edges, as those of a scene are (guided filter).
     coefs = coefficients(features, photo, radius=_radius(photo), eps=GUIDED.eps, stride=GUIDED.stride)
     rgb = photo[pixels[:, 0], pixels[:, 1]]
@@ -90,7 +92,8 @@ def filtered_crop(
 @torch.no_grad()
 def filtered_whole(encoder: Encoder, photo: Annotated[Tensor, "H W 3"]) -> Annotated[Tensor, "N C"]:
     """Features at every pixel, row by row."""
-    features = encoder(photo.permute(2, 0, 1)[None])[0]
+    with float32_convolutions():
+        features: Tensor = encoder(photo.permute(2, 0, 1)[None])[0]
     return upsample(features, photo, radius=_radius(photo), eps=GUIDED.eps, stride=GUIDED.stride).flatten(0, 1)
 
 

@@ -133,9 +133,9 @@ def limit_widths(scene: Scene, near: float, *, cells: bool, sphere: _Sphere | No
     def limit(gaussians: Trainable, step: int) -> None:
         # Seen from beside, a wide one of the surroundings would be drawn before the scene.
         if sphere is not None and step % _SPHERE_EVERY == 0:
-            square = np.square(gaussians.read(MEANS) - sphere.centre.numpy()).sum(1)
-            inside = square < (_INSIDE_SPHERE * sphere.radius) ** 2
-            gaussians.limit_scales(np.where(inside, np.float32(np.inf), np.float32(math.log(_SPHERE_WIDTH * sphere.radius))))
+            apart = gaussians.read(MEANS) - sphere.centre.numpy()
+            far = np.flatnonzero(np.einsum("nk,nk->n", apart, apart) >= (_INSIDE_SPHERE * sphere.radius) ** 2)
+            gaussians.limit_scales(np.full(len(far), math.log(_SPHERE_WIDTH * sphere.radius), np.float32), far)
         # What is narrower than the share of `near` is narrow enough everywhere that it is drawn: distances cost time.
         if step % every == 0:
             wide = np.flatnonzero(gaussians.read(LOG_SCALES).max(1) > math.log(share * near))

@@ -27,8 +27,8 @@ from ..datamanagers.images import Image, load_image, load_mask
 from ..errors import DataError
 from ..interfaces import Encoder
 from ..io.atomic import write_bytes
+from ..ops.backend import double, float32_convolutions
 from ..ops.guided import apply, coefficients
-from ..ops.precision import double, float32_convolutions
 from .statistics import covariance, group_moments, kmeans, mix, moments
 
 if TYPE_CHECKING:

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Annotated
 import torch
 from torch import Tensor, nn
 
-from ..ops.precision import double
+from ..ops.backend import double
 from .dictionary import StyleDictionary, choose, code_odds
 from .matching import score_spread, share_mean, unit
 from .scene_style import Membership, SceneStyle

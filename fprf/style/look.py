@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from ..checks import between
 from ..interfaces import Decoder, Stylizer
-from ..ops.precision import double
+from ..ops.backend import double
 from ..types import Want
 from .config import Place
 from .dictionary import StyleDictionary, blend_codes, choose, concatenate

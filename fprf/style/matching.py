@@ -28,7 +28,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from ..ops.precision import double
+from ..ops.backend import double
 
 _FLAT = 1e-6
 """Below this share of what they were computed from, lengths and spreads are float32 rounding."""

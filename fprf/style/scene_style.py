@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import CheckpointError, DataError
-from ..ops.precision import double
+from ..ops.backend import double
 from .dictionary import BLEND, StyleDictionary, blend_codes
 from .matching import point_shares, score_spread, unit
 from .statistics import Moments, covariance, group_moments, kmeans

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from ..errors import NumericsError
-from ..ops.precision import double, float64_device
+from ..ops.backend import double, float64_device
 
 _CHUNK = 16384
 """Rows centred at a time: bounds the float64 copies of large inputs."""

@@ -14,7 +14,7 @@ from ..config import ContentConfig, RenderConfig, SemanticConfig, TrainConfig
 from ..fields.config import PlanesConfig, SemanticPlanesConfig
 from ..memory import free_memory
 from ..ops import backend, dense, triplane
-from ..ops.precision import double, float32_convolutions
+from ..ops.backend import double, float32_convolutions
 from ..plugins.encoders.config import BundledContentConfig
 from ..plugins.samplers.config import ProposalConfig
 from ..plugins.stylizers.config import RegionToneConfig

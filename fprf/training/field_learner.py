@@ -22,7 +22,7 @@ from ..datamanagers.scene import Scene as ParsedScene
 from ..errors import CheckpointError
 from ..interfaces import DataManager, Figures, SceneLearner, State
 from ..memory import free_memory
-from ..ops.precision import tf32
+from ..ops.backend import tf32
 from ..progress import Display
 from ..rendering.cameras import PixelRays
 from ..rendering.renderer import render_rays

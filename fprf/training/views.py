@@ -11,7 +11,7 @@ from torch import Tensor
 from ..config import RenderConfig
 from ..interfaces import Decoder, SceneView, Values
 from ..memory import chunk_size, in_parts
-from ..ops.precision import float64_device
+from ..ops.backend import float64_device
 from ..rendering.cameras import Cameras, PixelRays, grid_rays, rays_through
 from ..rendering.renderer import PackedSamples, composite, composite_mean, enlarged, march, march_features, render_rays, shade
 from ..style.look import Restyle

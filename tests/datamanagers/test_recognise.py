@@ -62,7 +62,11 @@ def test_the_embedded_garden_is_read_by_name_where_no_such_folder_is(tmp_path: P
     scene = parse_scene(Path("garden"), 4, None)
     assert scene.name == "garden" and len(scene.paths) == 25 and len(scene.test) == 4 and scene.points is not None
     Path("garden").mkdir()
-    with pytest.raises(DataError, match="but nothing"):
+    for made in (".lock", "config.json"):  # --output garden
+        Path("garden", made).touch()
+        assert len(parse_scene(Path("garden"), 4, None).paths) == 25
+    Path("garden/config.json").rename("garden/photograph.jpg")
+    with pytest.raises(DataError, match="entries"):
         parse_scene(Path("garden"), 4, None)
 
 

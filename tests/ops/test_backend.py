@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from fprf.ops import backend, dense, triplane
-from fprf.ops.precision import float32_convolutions, tf32
+from fprf.ops.backend import float32_convolutions, tf32
 
 
 def test_plain_forms_alone_within_the_block() -> None:

@@ -210,7 +210,7 @@ def test_all_else_is_bit_for_bit_that_of_the_cpu() -> None:
         each.start(each.read(), *moments, draw.random(60, np.float32) if each is ours else ours.moments()[2])
     order, one, other = draw.permutation(62), *draw.normal(size=(2, 3, ours.rows)).astype(np.float32)
     for each in (ours, theirs):
-        each.limit_scales(np.full(60, -1.1, np.float32))
+        each.limit_scales(np.full(60, -1.1, np.float32), np.arange(60))
         each.limit_scales(np.array([-1.5, -1.2, -3], np.float32), some)
         each.multiply(slice(14, None), 0.7)
         each.split(some, np.array([8, 60, 61]), one, other)

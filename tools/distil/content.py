@@ -15,7 +15,7 @@ from torch import Tensor
 
 from fprf.errors import UsageError
 from fprf.interfaces import Encoder
-from fprf.ops.precision import double
+from fprf.ops.backend import double
 from fprf.plugins.encoders.bundled import CONTENT_KIND, ContentStudent, load_content_encoder
 from fprf.plugins.encoders.config import Vgg19Config
 from fprf.plugins.weights import write_weights

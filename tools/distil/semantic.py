@@ -22,7 +22,7 @@ from benchmarks.town.render import geometry, render, walk
 from benchmarks.town.surface import CLASSES
 from fprf.errors import UsageError, WeightsError
 from fprf.interfaces import Encoder
-from fprf.ops.precision import double
+from fprf.ops.backend import double
 from fprf.plugins.encoders.bundled import SEMANTIC_KIND, SemanticStudent, load_semantic_encoder
 from fprf.plugins.encoders.frozen import replicate_to_multiple
 from fprf.plugins.weights import read_weights, write_weights

@@ -147,8 +147,9 @@ class GardenConfig(DataParserConfig):
     """The embedded scene: 25 photographs of a garden in Seattle, with their poses. Reads no folder."""
 
     def recognises(self, data: Path) -> Recognised | None:
-        """By the path `garden`, where there is no such folder."""
-        return Recognised(1.0, "the embedded scene") if data == Path("garden") and not data.exists() else None
+        """By the path `garden`, where there is no such folder, or one that a run of it has begun or left."""
+        left = data.is_dir() and ((data / "config.json").is_file() or all(each.name.startswith(".") for each in data.iterdir()))
+        return Recognised(1.0, "the embedded scene") if data == Path("garden") and (left or not data.exists()) else None
 
     def build(self) -> DataParser:
         from .transforms import GardenParser

@@ -217,15 +217,10 @@ class GsplatGaussians:
         """Multiply columns of the parameters of all Gaussians."""
         self._values[: self.count, columns] *= factor
 
-    def limit_scales(self, most: Annotated[Floats, "M"], index: NDArray[np.int64] | None = None) -> None:
-        """Cut logarithms of standard deviations that are above `most`, of all Gaussians or of some."""
-        limit = self._there(most)[:, None]
-        if index is None:
-            scales = self._values[: self.count, LOG_SCALES]
-            torch.minimum(scales, limit, out=scales)
-        else:
-            some = self._there(index)
-            self._values[some, LOG_SCALES] = torch.minimum(self._values[some, LOG_SCALES], limit)
+    def limit_scales(self, most: Annotated[Floats, "M"], index: Annotated[NDArray[np.int64], "M"]) -> None:
+        """Cut logarithms of standard deviations of some Gaussians that are above `most`."""
+        some = self._there(index)
+        self._values[some, LOG_SCALES] = torch.minimum(self._values[some, LOG_SCALES], self._there(most)[:, None])
 
     def split(
         self, index: NDArray[np.int64], to: NDArray[np.int64], one: Annotated[Floats, "M R"], other: Annotated[Floats, "M R"]

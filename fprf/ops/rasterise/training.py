@@ -175,15 +175,10 @@ class TrainableGaussians:
         """Multiply columns of the parameters of all Gaussians."""
         self._by_block(self._blocks)[: -(-self.count // LANES), columns] *= np.float32(factor)
 
-    def limit_scales(self, most: Annotated[Floats, "M"], index: NDArray[np.int64] | None = None) -> None:
-        """Cut logarithms of standard deviations that are above `most`, of all Gaussians or of some."""
+    def limit_scales(self, most: Annotated[Floats, "M"], index: Annotated[NDArray[np.int64], "M"]) -> None:
+        """Cut logarithms of standard deviations of some Gaussians that are above `most`."""
         scales = self._by_block(self._blocks)[:, LOG_SCALES]
-        if index is not None:
-            scales[index // LANES, :, index % LANES] = np.minimum(self.read(LOG_SCALES, index), most[:, None])
-            return
-        used = scales[: -(-self.count // LANES)]
-        every = np.pad(most, (0, used.size // 3 - self.count), constant_values=np.inf)
-        np.minimum(used, every.reshape(-1, 1, LANES), out=used)
+        scales[index // LANES, :, index % LANES] = np.minimum(self.read(LOG_SCALES, index), most[:, None])
 
     def split(
         self, index: NDArray[np.int64], to: NDArray[np.int64], one: Annotated[Floats, "M R"], other: Annotated[Floats, "M R"]

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ...interfaces import Stylizer
-from ...ops.precision import double
+from ...ops.backend import double
 from ...style.dictionary import StyleDictionary, code_odds, whole_style
 from ...style.matching import point_shares, score_spread, share_mean, unit
 from ...style.scene_style import SceneStyle, check_fit

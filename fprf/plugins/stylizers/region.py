@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ...interfaces import Stylizer
-from ...ops.precision import double
+from ...ops.backend import double
 from ...style.dictionary import StyleDictionary, choose, code_odds, whole_style
 from ...style.matching import match_keys, unit
 from ...style.scene_style import Membership, SceneStyle, check_fit, mixed_maps, own_style
