@@ -47,13 +47,14 @@ def run(args: list[str]) -> int:
     if what.single is not None and len(styles) > 1:
         raise UsageError(f"--output {what.single}: one file holds one style, {len(styles)} are asked for; name a folder")
     from ..io.atomic import write_json
-    from ..splats.files.base import format_of
+    from ..splats.files.base import check_needs, format_of
     from ..style.restyle import apply_style
     from ..training.loading import open_run
 
     for kind in what.formats:
-        if not format_of(Path(f"splats.{kind}")).writes:
+        if not (form := format_of(Path(f"splats.{kind}"))).writes:
             raise UsageError(f"fprf export: {kind} is read, not written; name ply, splat, spz, sog or glb")
+        check_needs(form)
     start = time.perf_counter()
     opened = open_run(config.run, config.device)
     # All looks share one geometry; a single file holds the last of them.

@@ -1,5 +1,6 @@
 """`fprf render RUN --path PATH --output X.mp4`: fly through a scene, plain or restyled."""
 
+import functools
 import hashlib
 import shutil
 import time
@@ -192,7 +193,9 @@ def _takes(scene: "Scene", config: RenderVerbConfig, file: "StyleFile") -> "list
     takes = []
     if config.keyframes is not None:
         look = keyed_looks(scene, read_keyframes(config.keyframes))
-        takes.append(Take("keyframes", lambda frame: scene.restyled(look(frame))))
+        # While a look is held it is one scene, which recolours its Gaussians once.
+        restyled = functools.lru_cache(maxsize=1)(scene.restyled)
+        takes.append(Take("keyframes", lambda frame: restyled(look(frame))))
     elif config.references:
         takes.append(_styled_take(scene, "style", file))
     for text in config.styles:

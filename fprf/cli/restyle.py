@@ -109,10 +109,9 @@ def run(args: list[str]) -> int:
             styled = light_alone(styled, gain) if config.match_light else styled
             made.append(_Restyled(name, styled, scene.restyled(styled.restyle), time.perf_counter() - start))
         # File by file, each in all styles: one of them is in memory at a time.
-        left, losses, count, steps = Counter[str](), dict[str, None](), 0, len(config.captures) * len(named)
+        left, losses, steps = Counter[str](), dict[str, None](), len(config.captures) * len(named)
         for k, path in enumerate(config.captures if outputs or len(config.captures) == 1 else ()):
             capture = seen.first if k == 0 else read_capture(path)
-            count += len(capture.gaussians)
             faulty = False
             for i, one in enumerate(made if outputs else ()):
                 display.count(k * len(named) + i, steps, "restyling")
@@ -151,8 +150,8 @@ def run(args: list[str]) -> int:
     missing = "".join(f", {each}" for each in (*(f"{number} {what}" for what, number in left.items()), *losses))
     files = f" in {len(config.captures)} files" if len(config.captures) > 1 else ""
     print(
-        f"{count} Gaussians{files}{missing}; looked at in {looked:.1f} s, {each_seconds:.2f} s for each of {len(made)} styles, "
-        f"at most {(peak() or 0) / 1e9:.1f} GB"
+        f"{seen.count} Gaussians{files}{missing}; looked at in {looked:.1f} s, {each_seconds:.2f} s for each of {len(made)} "
+        f"styles, at most {(peak() or 0) / 1e9:.1f} GB"
     )
     return 0
 
@@ -175,7 +174,7 @@ def _outputs(config: RestyleConfig) -> list[Path]:
         raise UsageError("--references: at least one photograph is needed, for example --references autumn.jpg night.jpg")
     if config.output is None:
         return []
-    from ..splats.files.base import format_of
+    from ..splats.files.base import check_needs, format_of
 
     # A folder holds a file for each capture under its own name, or a .ply where its format is read alone.
     if config.output.is_dir() or (len(config.captures) > 1 and format_name(config.output) is None):
@@ -198,10 +197,11 @@ def _outputs(config: RestyleConfig) -> list[Path]:
     if format_name(config.output) is None:
         known_endings = ", ".join(endings())
         raise UsageError(f"--output {config.output}: no file of Gaussians by its name; known endings are {known_endings}")
-    if not format_of(config.output).writes:
+    if not (form := format_of(config.output)).writes:
         raise UsageError(
             f"--output {config.output}: files of this format are read, not written; name a .ply, .spz, .sog or .glb"
         )
+    check_needs(form)
     return [config.output]
 
 

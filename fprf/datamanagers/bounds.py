@@ -31,6 +31,8 @@ MARGIN = 1.02
 """Bounds are this much wider than what the training rays span, so that no training point lies on a border."""
 DEPTHS = 1 << 22
 """About how many depths of points are looked at; a large capture has billions, and quantile() takes 16 million."""
+_MOST = 1 << 24
+"""Points whose spread is measured, at most: as many as quantile() takes."""
 ROUNDING = 1e-12
 """Cameras closer together than this share of their coordinates stand in one place: the rest is float64's rounding."""
 
@@ -131,7 +133,8 @@ def _contraction(scene: Scene) -> Space:
     local = (position - centre) @ rotation.T
     radius = float(local.abs().amax(-1).quantile(0.9))
     if scene.points is not None and len(scene.points) >= 8:
-        spread = float(((scene.points - centre) @ rotation.T).abs().amax(-1).quantile(0.5))
+        some = scene.points[:: -(-len(scene.points) // _MOST)]
+        spread = float(((some - centre) @ rotation.T).abs().amax(-1).quantile(0.5))
         radius = max(radius, min(spread, 3 * radius if radius > 0 else spread))
     if radius <= ROUNDING * float(position.abs().amax()):
         raise DataError(f"{scene.name}: all cameras stand in one place and there are no points; capture from several places")

@@ -144,7 +144,7 @@ def missing_frames(folder: Path, key: str, paths: Sequence[Path]) -> list[Path]:
     if known == key:
         return [path for path in paths if not path.is_file()]
     try:
-        for name in {*old, *(path.name for path in paths)}:
+        for name in {*old, *(path.name for path in paths)} - {"", ".."}:  # which are folders
             (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise unwritable(folder, error) from error

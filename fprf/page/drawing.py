@@ -11,7 +11,7 @@ these very files, so the same command makes it again, at any size.
 import shutil
 from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -378,12 +378,13 @@ def film_frames(folder: Path, scene: Scene) -> list[Steps[Picture]]:
     """The frames of a film's folder, each to be rendered step by step."""
     cameras, _ = read_camera_path(folder / "path.json", scene.origin)
     looks = keyed_looks(scene, read_keyframes(folder / "keys.json"))
+    restyled = lru_cache(maxsize=1)(scene.restyled)  # while a look is held Gaussians are recoloured once
 
     def rendered(number: int) -> Steps[Picture]:
         look = looks(number)
         yield
         if isinstance(scene, SplatScene):
-            return to_uint8(scene.restyled(look).render(cameras, number).rgb)
+            return to_uint8(restyled(look).render(cameras, number).rgb)
         # A scene that is rendered here may take its time: after each strip a client may come first.
         rows = []
         for strip in _strips(scene, cameras.select(torch.tensor([number]))):

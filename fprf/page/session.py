@@ -126,7 +126,8 @@ class Session:
         """What a new client has to know."""
         drawn_there, viewed = isinstance(self.viewed.scene, SplatScene), self.viewed
         scene = {"type": "scene", "key": self._key, "name": viewed.name, "gaussians": drawn_there, "step": viewed.step}
-        ready = [("colours " + name, self._colours_message(name)) for name in self._colours]
+        coloured = [*self._colours.items()]  # the worker goes on changing them
+        ready = [(f"colours {name}", _colours_message(name, version)) for name, (version, _) in coloured]
         training = [] if self._progress is None else [("training", self._progress)]
         return [("scene", scene), ("state", self.state.described()), *ready, *training]
 
@@ -256,9 +257,9 @@ class Session:
 
     def colours(self, name: str) -> bytes:
         """Colours of the present look or of a kept one, for a browser. Raises UsageError where there are none."""
-        if name not in self._colours:
+        if (found := self._colours.get(name)) is None:
             raise UsageError(f"{name}: no such colours")
-        return self._colours[name][1]
+        return found[1]
 
     def gaussians(self) -> Path:
         """The Gaussians in the look of now, as a .ply file. Raises UsageError for a scene without any."""
@@ -303,11 +304,9 @@ class Session:
         scene = self.viewed.scene
         assert isinstance(scene, SplatScene)
         colours = gaussian_colours(scene, self.packed, self.restyler, shown)
-        self._colours[name] = (next(self._version), container(colour_header(colours), {"rows": colour_section(colours, 1)}))
-        self._post(None, f"colours {name}", self._colours_message(name))
-
-    def _colours_message(self, name: str) -> dict[str, Any]:
-        return {"type": "colours", "name": name, "version": self._colours[name][0]}
+        version = next(self._version)
+        self._colours[name] = (version, container(colour_header(colours), {"rows": colour_section(colours, 1)}))
+        self._post(None, f"colours {name}", _colours_message(name, version))
 
     def _select(self, region: int | None) -> None:
         picked = None if region is None else self.restyler.region_info(self.state.look, region)
@@ -348,6 +347,10 @@ class Session:
         expected = isinstance(error, FprfError)
         text = str(error) if expected else f"this should not have happened: {type(error).__name__}: {error}"
         self.notify(text, bad=True)
+
+
+def _colours_message(name: str, version: int) -> dict[str, Any]:
+    return {"type": "colours", "name": name, "version": version}
 
 
 _POLL = 0.5

@@ -29,8 +29,8 @@ class PluginConfig:
     def needs(self) -> tuple[Need, ...]:
         """Packages and files that `build` wants and that are not here, found without building or downloading anything.
 
-        `fprf train` shows the needs of all plug-ins at once, before any work, and `fprf doctor METHOD` beforehand. By default
-        none. A slot's own plug-in is asked for itself.
+        `fprf train` shows the needs of all plug-ins at once, before any work, and `fprf doctor METHOD` beforehand; of a
+        format of files `fprf restyle` and `fprf export`. By default none. A slot's own plug-in is asked for itself.
         """
         return ()
 

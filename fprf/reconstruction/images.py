@@ -219,7 +219,7 @@ def natural_order(names: Iterable[str]) -> list[str]:
 
 
 def _from_folder(source: Path, place: SceneFolder, state: State, progress: Progress) -> dict[str, dict[str, Any]]:
-    """Every image below the folder that can be decoded, under its relative name without blanks.
+    """Every image below the folder that can be decoded, under its relative name without blanks and a leading #.
 
     Formats that COLMAP does not read become JPEGs, whatever the name says: IMG_1.heic is IMG_1.heic.jpg in the scene. All
     others are copied: COLMAP and `load_image` see the same pixels in them.
@@ -236,9 +236,9 @@ def _from_folder(source: Path, place: SceneFolder, state: State, progress: Progr
     for i, path in enumerate(files):
         progress(i, len(files), "reading images")
         given = path.relative_to(source).as_posix()
-        name = re.sub(r"\s", "_", given)
+        name = re.sub(r"\s|^#", "_", given)  # in COLMAP's lists of pairs a blank ends a name, and # begins a comment
         if name in entries or (inplace and name != given):
-            raise UsageError(f"{path}: COLMAP takes no blanks in names; rename the image, so that no other is called {name}")
+            raise UsageError(f"{path}: COLMAP takes no blanks or leading # in names; rename it so that none else is {name}")
         # What was gathered before, and has not changed, is not read again.
         data = path.read_bytes()
         digest = hashlib.sha256(data).hexdigest()

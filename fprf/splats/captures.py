@@ -163,6 +163,8 @@ class Captures:
     """What was added to the means of each capture, so that none lies in another's place."""
     first: Capture
     """The first capture, as it was read."""
+    count: int
+    """Gaussians of all captures."""
 
     def harmonics(self, index: int, capture: Capture, look: Restyle) -> Annotated[Tensor, "N K 3"]:
         """Harmonics in a look of all Gaussians of capture number `index` that can be drawn."""
@@ -200,15 +202,20 @@ def open_captures(
     first = first or _read(paths[0], say)
     if len(paths) == 1 and len(first.gaussians) <= sample:
         scene = open_capture(first, look, cache=cache, progress=progress, say=say)
-        return Captures(scene, (slice(0, len(scene.gaussians)),), (torch.zeros(3),), first)
+        return Captures(scene, (slice(0, len(scene.gaussians)),), (torch.zeros(3),), first, len(first.gaussians))
     parts, key, compensated = list[Gaussians](), hashlib.sha256(f"{sample} {len(paths)}".encode()), first.antialiased
+    count = 0
     for path in paths:
         capture = first if path == paths[0] else _read(path, say)
         key.update(hashlib.sha256(capture.data).digest())
         release(capture.data)
+        count += len(capture.gaussians)
         here = torch.tensor([a - b for a, b in zip(capture.origin, first.origin, strict=True)])
         part = sampled(capture.gaussians.drawable(), max(1, sample // len(paths)))
-        parts.append(replace(part, means=part.means + here) if bool(here.any()) else part)
+        if bool(here.any()):
+            key.update(f"{here.tolist()}".encode())  # an offset beside a file moves it among the others
+            part = replace(part, means=part.means + here)
+        parts.append(part)
         compensated = compensated or capture.antialiased
     moved = _apart(parts)
     together = _joined([replace(part, means=part.means + by) for part, by in zip(parts, moved, strict=True)])
@@ -224,7 +231,7 @@ def open_captures(
     scene = open_capture(whole, look, cache=cache, progress=progress, say=say)
     ends = torch.tensor([len(part) for part in parts]).cumsum(0).tolist()
     rows = tuple(slice(end - len(part), end) for end, part in zip(ends, parts, strict=True))
-    return Captures(scene, rows, tuple(moved), first)
+    return Captures(scene, rows, tuple(moved), first, count)
 
 
 def _read(path: Path, say: Callable[[str], None]) -> Capture:

@@ -162,7 +162,7 @@ def keyed_looks(scene: Scene, keys: Sequence[Keyframe]) -> Callable[[int], Resty
     def look(at: int) -> Restyle | None:
         before, after, way = fade(frames, at)
         first, second = looks[keys[before].style], looks[keys[after].style]
-        if way == 0:
+        if way == 0 or second is first:
             return first
         if first is None:
             return None if second is None else second.faded.mixed(second, way)

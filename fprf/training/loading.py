@@ -22,7 +22,7 @@ from ..types import Origin, View
 from . import checkpoint
 from .blocks import load_blocked
 from .model import Model, build_model
-from .prepare import device_of, reach_of
+from .prepare import build_encoders, device_of, reach_of
 from .quality import QualityConfig, at_quality
 from .run import Known, Run, in_training
 from .style_pass import measure_style
@@ -147,8 +147,7 @@ class Trained(Scene):
     def encoders(self) -> Encoders:
         """The encoders that the scene was trained with. Raises WeightsError where those at hand are others."""
         (style, basis), config, facts = self.measured(), self.config, self.known.facts
-        content = config.content.encoder.build()
-        semantic = config.semantic.encoder.build() if config.semantic.encoder is not None and basis is not None else None
+        content, semantic = build_encoders(config, semantic=basis is not None)
         # Features of another encoder would mean something else: references and scene must speak of the same.
         trained_with = ("content", content, facts.content_encoder), ("semantic", semantic, facts.semantic_encoder)
         for name, encoder, known in trained_with:

@@ -15,8 +15,8 @@ from ..datamanagers.bounds import find_space
 from ..datamanagers.images import WHITE
 from ..datamanagers.parsers.config import parse_scene
 from ..datamanagers.scene import Scene, at_origin, exposures_differ, find_sightings, with_exposure
-from ..errors import PluginError, UsageError
-from ..interfaces import DataManager
+from ..errors import PluginError, UsageError, WeightsError
+from ..interfaces import DataManager, Encoder
 from ..rendering.space import Space
 from .model import Facts, build_decoder
 
@@ -73,6 +73,21 @@ def read_scene(config: RunConfig, saved: Facts | None = None) -> Scene:
     return scene if saved is None else at_origin(scene, saved.origin)
 
 
+def build_encoders(config: TrainConfig, *, semantic: bool = True) -> tuple[Encoder, Encoder | None]:
+    """The encoders of content and, where wanted and chosen, of semantics. Raises WeightsError with what either lacks."""
+    built, missing = list[Encoder | None](), list[str]()
+    for each in (config.content.encoder, config.semantic.encoder if semantic else None):
+        try:
+            built.append(None if each is None else each.build())
+        except WeightsError as error:
+            missing.append(str(error))
+    if missing:
+        raise WeightsError("; also ".join(missing))
+    content, other = built
+    assert content is not None
+    return content, other
+
+
 def prepare(
     config: TrainConfig,
     scene: Scene,
@@ -88,8 +103,9 @@ def prepare(
     Arguments as of `RunConfig.build` and `DataManagerConfig.build`. Raises WeightsError where an encoder or a decoder lacks
     its weights.
     """
-    device, encoder = device_of(config.device), config.semantic.encoder
-    content, semantic = config.content.encoder.build().to(device), None if encoder is None else encoder.build().to(device)
+    device = device_of(config.device)
+    content, semantic = build_encoders(config)
+    content, semantic = content.to(device), None if semantic is None else semantic.to(device)
     build_decoder(config, encoder=content.identity, channels=content.channels)  # refused now, not after all the features
     background = config.render.background or (WHITE if scene.alpha else None)
     # Decodes all images and extracts their features, or finds both in the cache.

@@ -3,6 +3,7 @@
 import json
 import shlex
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -30,6 +31,7 @@ MISTAKES = """
     eval untested | --split test
     export run plx | 'plx'
     export run ksplat | ksplat is read, not written
+    export absent usdz | pip install usd-core
     export run --fit 0 | --fit
     export run --views 1 | --views
     export run --mesh-edge 0 | --mesh-edge
@@ -61,6 +63,7 @@ MISTAKES = """
     restyle in.ply --references A.png | --output
     restyle in.ply --references A.png --output out.obj | out.obj
     restyle in.ply --references A.png --output out.ksplat | read, not written
+    restyle in.ply --references absent.png --output out.usdz | pip install usd-core
     restyle in.ply --references A.png --output out.ply --up 0 0 0 | up
     restyle in.ply --references A.png --page out.png | --page
     restyle in.ply in.ply --references A.png --output out | several captures
@@ -128,6 +131,7 @@ def test_a_mistake_is_one_line(
     command, _, told = line.partition(" | ")
     if command.startswith("view"):
         monkeypatch.setattr("importlib.util.find_spec", lambda name: object())
+    monkeypatch.setitem(sys.modules, "pxr", None)  # usd-core
     monkeypatch.chdir(_place)
     before = files(_place)
     assert cli.main(shlex.split(command)) == 2

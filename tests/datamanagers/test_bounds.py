@@ -127,6 +127,12 @@ def test_a_ring_looks_at_its_centre() -> None:
     assert space.rotation[2] == pytest.approx((0.0, 0.0, 1.0), abs=0.2)
 
 
+def test_points_may_be_more_than_quantile_takes() -> None:
+    point = torch.tensor([[4.0, 9.0, 0.5]], dtype=F64)
+    few, many = (find_space(replace(ring(), points=point.expand(count, 3))) for count in (8, (1 << 24) + 1))
+    assert few == many
+
+
 def test_ndc_frames_all_rays_and_starts_before_the_nearest_point() -> None:
     scene = forward()
     assert scene.points is not None

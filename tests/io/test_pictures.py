@@ -146,8 +146,9 @@ def test_missing_frames_are_those_not_there(tmp_path: Path) -> None:
     for path in paths:
         path.write_bytes(b"x")
     assert missing_frames(tmp_path, "c", paths[:1]) == paths[:1] and not paths[2].exists(), "frames of a longer film"
-    (tmp_path / ".render.json").write_text("damaged")
-    assert missing_frames(tmp_path, "b", paths) == paths
+    for damaged in ("damaged", '{"key": "a", "frames": ["", "..", "."]}'):
+        (tmp_path / ".render.json").write_text(damaged)
+        assert missing_frames(tmp_path, "b", paths) == paths
 
 
 COLOURS = [(230, 40, 40), (40, 200, 60), (30, 60, 220), (240, 240, 240), (10, 10, 10)]

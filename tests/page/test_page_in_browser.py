@@ -186,9 +186,23 @@ def test_a_lost_context_comes_back(page: Any) -> None:
     assert np.abs(pixels(page) - before).mean() < 0.01
 
 
-def test_without_webgl_there_are_pictures(browser: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("script", "why"),
+    [
+        ("HTMLCanvasElement.prototype.getContext = () => null", "no WebGL 2"),
+        (
+            "const get = WebGL2RenderingContext.prototype.getParameter; WebGL2RenderingContext.prototype.getParameter = "
+            "function (name) { return name === this.MAX_TEXTURE_SIZE ? 1 / 4 : get.call(this, name); }",
+            "draws 256 Gaussians at most, and these are 500",
+        ),
+    ],
+)
+def test_without_webgl_or_room_for_all_gaussians_there_are_pictures(
+    browser: Any, tmp_path: Path, script: str, why: str
+) -> None:
     path = written(tmp_path / "page.html", seen(ball(500)))
-    page = opened(browser, path, script="HTMLCanvasElement.prototype.getContext = () => null")
+    page = opened(browser, path, script=script)
+    assert why in page.evaluate("() => document.querySelector('.place').dataset.why")
     page.locator(".look", has_text="dusk").click()
     assert page.locator(".still.two").is_visible() and not page.locator("#canvas").is_visible()
     page.locator("#wiping").click()

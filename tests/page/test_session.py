@@ -1,4 +1,5 @@
 import json
+import sys
 import threading
 import zlib
 from dataclasses import replace
@@ -64,6 +65,19 @@ def test_a_photograph_recolours_gaussians_and_they_can_be_saved(splats: Session,
         splats.colours("else")
     saved, scene = read_capture(splats.gaussians()).gaussians, splats.viewed.scene
     assert torch.equal(saved.means, scene.gaussians.means) and not torch.equal(saved.harmonics, scene.gaussians.harmonics)
+
+
+def test_a_client_may_come_while_looks_are_coloured(splats: Session, listener: Listener, world: World) -> None:
+    splats.upload(world.references[0].read_bytes(), "dusk.png")
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        for k in range(60):
+            splats.handle(1, messages.Keep(name=f"look {k}", action="keep"))
+        while "colours look 59" not in {kind for kind, _ in splats.hello()}:
+            pass
+    finally:
+        sys.setswitchinterval(interval)
 
 
 def test_a_click_picks_a_region_and_its_rules_change_the_look(session: Session, listener: Listener, world: World) -> None:

@@ -182,9 +182,15 @@ def test_images_may_lie_in_the_scene_already(tmp_path: Path) -> None:
     assert len(gathered(place.images, place).images) == 4
     (place.images / "3.png").unlink()
     assert len(gathered(place.images, place).images) == 3 and len(names(place)) == 3
-    photo(place.images / "a b.png")
-    with pytest.raises(UsageError, match="no blanks"):
-        gathered(place.images, place)
+    for k in range(3):
+        photo(tmp_path / "photos" / f"#{k}.png", k)
+    copied = gathered(tmp_path / "photos", SceneFolder(tmp_path / "copy"))
+    assert list(copied.images) == ["_0.png", "_1.png", "_2.png"], "# begins a comment in lists of pairs"
+    for name in ("a b.png", "#1.png"):
+        photo(place.images / name)
+        with pytest.raises(UsageError, match="no blanks or leading #"):
+            gathered(place.images, place)
+        (place.images / name).unlink()
 
 
 def test_a_video_gives_its_sharp_frames(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from fprf.io.images import srgb_to_linear
 from fprf.ops.harmonics import HARMONIC
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.plugins.stylizers.config import RegionToneConfig
+from fprf.rendering.local_frame import write_offset
 from fprf.splats.captures import neighbouring_light, open_captures
 from fprf.splats.config import GaussianSemanticsConfig, LookConfig
 from fprf.splats.files import read_capture, write_gaussians
@@ -87,6 +88,22 @@ def test_captures_in_one_place_are_seen_beside_each_other(tmp_path: Path) -> Non
     seen = open_captures([tmp_path / "a.ply", tmp_path / "b.ply"], look(), cache=tmp_path / "cache")
     first, second = (seen.scene.gaussians.means[rows] for rows in seen.rows)
     assert first[:, 0].max() < second[:, 0].min() + 0.5 and seen.scene.gaussians.degree == 1
+
+
+def test_an_offset_that_changed_is_looked_at_again(tmp_path: Path) -> None:
+    paths = halves(tmp_path, ball(200))
+    for k, east in enumerate((0.0, 5.0), 1):
+        write_offset(paths[1], (east, 0.0, 0.0))
+        open_captures(paths, look(), cache=tmp_path / "cache").scene.found()
+        assert len(list((tmp_path / "cache").iterdir())) == k
+
+
+def test_a_page_of_several_captures_tells_how_many_gaussians(
+    photograph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [*SMALL, "--cache", str(tmp_path / "cache"), "--references", str(photograph), "--page", str(tmp_path / "x.html")]
+    assert cli.main(["restyle", *map(str, halves(tmp_path, ball(200))), *words]) == 0
+    assert "200 Gaussians in 2 files" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("flags", [[], ["--match-light", "true"]])

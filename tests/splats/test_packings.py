@@ -2,10 +2,12 @@
 
 import gzip
 import json
+import os
 import struct
 import time
 import zlib
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -290,7 +292,7 @@ def sog_of(made: Gaussians, path: Path) -> dict[str, bytes]:
     return unbundle(path, path.read_bytes())
 
 
-def test_a_sog_however_it_is_archived(tmp_path: Path) -> None:
+def test_a_sog_however_it_is_archived(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "x.sog"
     parts = sog_of(ball(300), path)
     plain = read_capture(path)
@@ -313,6 +315,14 @@ def test_a_sog_however_it_is_archived(tmp_path: Path) -> None:
         found = read_capture(tmp_path / "folder").gaussians
         assert torch.equal(found.means, plain.gaussians.means)
         assert {each.name for each in (tmp_path / "folder").iterdir()} == {*parts}, "no other file is replaced"
+    # A folder that is cut off while its files take their names is none.
+    calls, replaced = count(1), os.replace
+    monkeypatch.setattr(os, "replace", lambda *names: replaced(*names) if next(calls) < 3 else os.stat("absent"))
+    with pytest.raises(DataError):
+        write_capture(tmp_path / "folder" / "meta.json", plain, plain.gaussians.harmonics * 0.5)
+    with pytest.raises(DataError, match="cannot be read"):
+        read_capture(tmp_path / "folder")
+    monkeypatch.undo()
     meta = json.loads(parts["meta.json"]) | {"more": {"files": [".bashrc"]}}
     path.write_bytes(bundle(parts | {"meta.json": json.dumps(meta).encode(), ".bashrc": b"echo"}))
     with pytest.raises(DataError, match="bashrc"):

@@ -32,6 +32,7 @@ from fprf.splats.files import read_capture
 from fprf.splats.gaussians import Gaussians, tensors_of
 from fprf.splats.learner import GaussianLearner
 from fprf.splats.photographs import camera_of
+from fprf.splats.scene import SplatScene
 from fprf.splats.setup import build
 from fprf.training import checkpoint, driver
 from fprf.training.camera_optimizers import Tones, moved_cameras
@@ -262,7 +263,9 @@ def test_training_is_watched_and_changes_no_bit(
     assert all(torch.equal(tensor, watched.model[name]) for name, tensor in alone.model.items())
 
 
-def test_styles_on_a_run(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_styles_on_a_run(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     for name, colour in (("dusk", (40, 30, 120)), ("snow", (230, 235, 240))):
         noise = np.random.default_rng(0).integers(-20, 20, (96, 128, 3))
         write_image(tmp_path / f"{name}.png", (np.array(colour) + noise).clip(0, 255).astype(np.uint8))
@@ -296,6 +299,12 @@ def test_styles_on_a_run(run: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     keys = [{"frame": 0, "style": None}, {"frame": 3, "style": str(tmp_path / "both" / "style.json")}]
     (tmp_path / "keys.json").write_text(json.dumps({"format": 1, "keyframes": keys}))
     made("render", "keyed", *dataset, "--keyframes", str(tmp_path / "keys.json"))
+    # A look that is held is one scene, whose Gaussians are recoloured once.
+    (tmp_path / "held.json").write_text(json.dumps({"format": 1, "keyframes": [keys[1] | {"frame": 0}]}))
+    scenes, restyled = [], SplatScene.restyled
+    monkeypatch.setattr(SplatScene, "restyled", lambda scene, look: scenes.append(look) or restyled(scene, look))
+    held = made("render", "held", "--path", "orbit", "--frames", "3", "--keyframes", str(tmp_path / "held.json"))
+    assert len(scenes) == 1 and len([*held.glob("*.png")]) == 3
     files = made("export", "files", "ply", "--references", snow)
     plain, styled = (read_capture(files / f"splats{name}.ply").gaussians for name in ("", ".snow"))
     assert torch.equal(plain.means, styled.means) and styled.colours.mean() > plain.colours.mean() + 0.05

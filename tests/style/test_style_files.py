@@ -206,6 +206,8 @@ def test_each_frame_has_its_look(world: World, tmp_path: Path) -> None:
         world.load(),
         [Keyframe(2, None), Keyframe(6, styles[0]), Keyframe(10, styles[1]), Keyframe(14, None), Keyframe(20, None)],
     )
+    held = keyed_looks(world.load(), [Keyframe(0, styles[0]), Keyframe(9, styles[0])])
+    assert held(4) is held(0), "nothing fades"
     assert looks(0) is looks(2) is looks(14) is looks(17) is looks(30) is None
     first, second = looks(6), looks(10)
     assert first is not None and second is not None and first.others == second.others == ()

@@ -12,11 +12,13 @@ from tiny_world import World
 
 from fprf.cli import main as cli
 from fprf.cli.parsing import load_method
-from fprf.errors import CheckpointError, PluginError, UsageError
+from fprf.errors import CheckpointError, PluginError, UsageError, WeightsError
+from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig
 from fprf.training.camera_optimizers import Tones
 from fprf.training.driver import train
 from fprf.training.loading import Trained, load_run
 from fprf.training.model import Model
+from fprf.training.prepare import prepare, read_scene
 from fprf.training.quality import PRESETS, QualityConfig, at_quality
 
 
@@ -46,6 +48,16 @@ def test_rendering_needs_no_encoder(moved: Path) -> None:
     path.write_text(path.read_text().replace('"bundled-content"', '"gone-content"').replace('"bundled-semantic"', '"gone"'))
     trained = load_run(moved)
     assert bool(trained.render(trained.cameras, 0).rgb.isfinite().all())
+
+
+def test_all_weights_that_are_missing_are_told(world: World) -> None:
+    trained = world.load()
+    content = replace(trained.config.content, encoder=BundledContentConfig(weights=Path("a.pt")))
+    semantic = replace(trained.config.semantic, encoder=BundledSemanticConfig(weights=Path("b.pt")))
+    config = replace(trained.config, content=content, semantic=semantic)
+    for act in (replace(trained, config=config).encoders, lambda: prepare(config, read_scene(config))):
+        with pytest.raises(WeightsError, match=r"a\.pt: no such.*b\.pt: no such"):
+            act()
 
 
 def test_what_is_missing_is_named_with_what_to_do(moved: Path, tmp_path: Path) -> None:

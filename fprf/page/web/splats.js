@@ -177,6 +177,8 @@ class Splats {
 
   // Gaussians, in the place of any from before; styles are added then. `head` is that of pack.py; `parts` are its deflated sections.
   async load(head, parts) {
+    const most = this.gl.getParameter(this.gl.MAX_TEXTURE_SIZE) * WIDTH / 2; // what is projected takes two texels each
+    if (most && head.count > most) throw new Error(`this device draws ${most} Gaussians at most, and these are ${head.count}: open it on another one`);
     const [planes, floats, palette] = await Promise.all([parts.shape, parts.chunks, parts.palette].map(inflate));
     const shape = new Uint32Array(woven(planes, head.count, 16).buffer), chunks = new Float32Array(floats.buffer);
     const coloured = [...this.styles.values()].flatMap(({ rows, maps }) => [rows, maps]);

@@ -139,6 +139,12 @@ def format_of(path: Path) -> CaptureFormat:
     return registry.make(CaptureFormat.group, name, CaptureFormat)
 
 
+def check_needs(form: CaptureFormat) -> None:
+    """Raise DataError where a package that writes files of a format is missing."""
+    for need in form.needs():
+        raise DataError(f"{type(form).__name__.lower()}: files of this format are written by {need.what}; {need.remedy}")
+
+
 def pieces(count: int) -> Iterator[slice]:
     """Rows 0 to `count` in slices of at most `ROWS`."""
     for start in range(0, count, ROWS):

@@ -16,6 +16,7 @@ import re
 import zipfile
 import zlib
 from collections.abc import Iterable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 
 from ...datamanagers.images import header_of
 from ...errors import DataError
-from ...io.atomic import write_bytes
+from ...io.atomic import atomic_path
 from ...types import Origin
 from ..gaussians import COUNTS, Gaussians
 from . import base
@@ -171,15 +172,19 @@ class Sog(CaptureFormat):
         return [bundle(parts | {"meta.json": json.dumps(meta, separators=(",", ":")).encode()})]
 
     def write(self, path: Path, pieces: Iterable[bytes]) -> None:
-        """An archive; of a meta.json its files, into the same folder."""
+        """An archive; of a meta.json its files, into the same folder: while images are replaced it has no meta.json."""
         if path.name.lower() != "meta.json":
             super().write(path, pieces)
             return
         files = unbundle(path, b"".join(pieces))
         folder = folder_of(path, files)
-        for name in (*_images(path, _json(path, files[f"{folder}meta.json"])), "meta.json"):
-            if f"{folder}{name}" in files:
-                write_bytes(path.with_name(name), files[f"{folder}{name}"])
+        names = dict.fromkeys(("meta.json", *_images(path, _json(path, files[f"{folder}meta.json"]))))
+        with ExitStack() as stack:
+            # Files take their names from the last to the first.
+            for name in names:
+                if f"{folder}{name}" in files:
+                    stack.enter_context(atomic_path(path.with_name(name))).write_bytes(files[f"{folder}{name}"])
+            path.with_name("meta.json").unlink(missing_ok=True)
 
 
 def _bent(means: Floats) -> Floats:

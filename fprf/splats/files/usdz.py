@@ -12,6 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from ...errors import DataError
+from ...plugins.config import Need
 from ...types import Origin
 from ..gaussians import COUNTS, Gaussians
 from . import base
@@ -27,6 +28,15 @@ class Usdz(CaptureFormat):
 
     reads: ClassVar[bool] = False
 
+    def needs(self) -> tuple[Need, ...]:
+        try:
+            from pxr import UsdVol
+
+            UsdVol.ParticleField3DGaussianSplat  # noqa: B018
+        except (ImportError, AttributeError):
+            return (Need("usd-core 26.3 or later", "pip install usd-core, or name a .ply or .glb"),)
+        return ()
+
     def recognises(self, head: bytes, size: int) -> bool:
         return head.startswith(b"PK")
 
@@ -35,14 +45,9 @@ class Usdz(CaptureFormat):
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
         """A stage of one prim, Y up, in metres; harmonics of degree 4 are left out."""
-        try:
-            from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils, UsdVol, Vt
+        base.check_needs(self)
+        from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils, UsdVol, Vt
 
-            schema = UsdVol.ParticleField3DGaussianSplat
-        except (ImportError, AttributeError) as error:
-            raise DataError(
-                ".usdz is written by usd-core 26.3 or later; pip install usd-core, or name a .ply or .glb"
-            ) from error
         means, turns, scales, logits, harmonics = base.arrays(gaussians)
         bands = min(harmonics.shape[1], COUNTS[3])
         harmonics = np.matmul(base.turned_harmonics(np.diag(_TURN), bands), harmonics[:, :bands])
@@ -60,7 +65,7 @@ class Usdz(CaptureFormat):
             stage = Usd.Stage.CreateNew(layer)
             UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
             UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-            field = schema.Define(stage, Sdf.Path("/capture"))
+            field = UsdVol.ParticleField3DGaussianSplat.Define(stage, Sdf.Path("/capture"))
             stage.SetDefaultPrim(field.GetPrim())
             for name, kind, values in columns:
                 array = kind.FromNumpy(np.ascontiguousarray(values, np.float32))
