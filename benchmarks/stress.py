@@ -12,7 +12,7 @@ from torch import Tensor
 from fprf.checks import at_least
 from fprf.config import RenderConfig
 from fprf.datamanagers.bounds import find_space
-from fprf.datamanagers.scene import Scene
+from fprf.datamanagers.scene import ParsedScene
 from fprf.errors import FprfError
 from fprf.io import tensorfiles
 from fprf.plugins.stylizers.config import RegionOtConfig
@@ -134,7 +134,7 @@ OFFSET = (1e6, -3e6, 5e5)
 """Metres: of the size of UTM coordinates."""
 
 
-def invariants(trained: Trained, scene: Scene | None, cameras: Cameras, references: tuple[Path, ...]) -> list[Check]:
+def invariants(trained: Trained, scene: ParsedScene | None, cameras: Cameras, references: tuple[Path, ...]) -> list[Check]:
     """Of one view; what needs the scene's images or points is left out without them."""
     model, facts = trained.model, trained.known.facts
     rays = view_rays(model, cameras, 0)
@@ -195,7 +195,7 @@ def _threads(trained: Trained, rays: Rays, plain: Tensor) -> list[Check]:
     return [_row("1 and 2 threads", "the same bits", _largest(*found), 0.0)]
 
 
-def _worlds(trained: Trained, scene: Scene, cameras: Cameras, plain: Tensor) -> list[Check]:
+def _worlds(trained: Trained, scene: ParsedScene, cameras: Cameras, plain: Tensor) -> list[Check]:
     """The capture moved and scaled as a whole: its space is found anew, the model lives in that."""
     worlds = []
     if len(scene.paths) > 2:
@@ -240,7 +240,7 @@ def _styled_error(trained: Trained, rays: Rays, look: Restyle) -> float:
     return decibels(found, exact(trained.model, trained.known.facts, rays, look))
 
 
-def _reordered(scene: Scene, order: Annotated[Tensor, "V"]) -> Scene:
+def _reordered(scene: ParsedScene, order: Annotated[Tensor, "V"]) -> ParsedScene:
     inverse = torch.argsort(order)
     return replace(
         scene,
@@ -254,7 +254,7 @@ def _reordered(scene: Scene, order: Annotated[Tensor, "V"]) -> Scene:
     )
 
 
-def _moved(scene: Scene, scale: float, offset: Annotated[Tensor, "3"]) -> Scene:
+def _moved(scene: ParsedScene, scale: float, offset: Annotated[Tensor, "3"]) -> ParsedScene:
     return replace(
         scene,
         cameras=_placed(scene.cameras, scale, offset),

@@ -50,7 +50,7 @@ from .types import Batch, Cell, FieldSample, Origin, Rays, Rendered, Sampled, Si
 if TYPE_CHECKING:
     from .datamanagers.basis import Basis
     from .datamanagers.features import FeatureStore
-    from .datamanagers.scene import Scene as ParsedScene
+    from .datamanagers.scene import ParsedScene
     from .progress import Display
     from .rendering.cameras import Cameras
     from .rendering.renderer import Parts
@@ -446,7 +446,7 @@ class BlockLayout(ABC):
 
 
 class DataParser(ABC):
-    """A scene folder to a `datamanagers.scene.Scene`. Decodes no image."""
+    """A scene folder to a `datamanagers.scene.ParsedScene`. Decodes no image."""
 
     @abstractmethod
     def parse(self, data: Path, downscale: float) -> "ParsedScene":

@@ -28,7 +28,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..datamanagers.bounds import FAR, NEAR, ROUNDING, axes
-from ..datamanagers.scene import TILES, Scene, Sightings, find_sightings, tile_of
+from ..datamanagers.scene import TILES, ParsedScene, Sightings, find_sightings, tile_of
 from ..errors import ConfigError, DataError
 from ..interfaces import BlockLayout
 from ..io.atomic import write_json
@@ -199,7 +199,7 @@ def level_axes(cameras: Cameras) -> Annotated[Tensor, "3 3"]:
     return torch.stack([along, torch.linalg.cross(up, along), up])
 
 
-def open_space(scene: Scene, sightings: Sightings | None) -> Space:
+def open_space(scene: ParsedScene, sightings: Sightings | None) -> Space:
     """The space of kind `open`. Raises DataError where all cameras stand in one place and nothing says how far they see."""
     # A unit is the distance that views commonly see: of points, else as the capture says, else of the cameras' spacing.
     position = scene.cameras.pose[:, :, 3]
@@ -222,7 +222,7 @@ def open_space(scene: Scene, sightings: Sightings | None) -> Space:
     return Space("open", middle, (first, second, third), 1 / unit, near, FAR)
 
 
-def site_of(scene: Scene, space: Space) -> Site:
+def site_of(scene: ParsedScene, space: Space) -> Site:
     """Training cameras and sparse points in the space."""
     turn = torch.tensor(space.rotation, dtype=torch.float64)
     centre = torch.tensor(space.centre, dtype=torch.float64)
@@ -237,7 +237,7 @@ def site_of(scene: Scene, space: Space) -> Site:
 
 
 def tile_rays(
-    scene: Scene, space: Space, views: Annotated[Tensor, "M"], sightings: Sightings | None
+    scene: ParsedScene, space: Space, views: Annotated[Tensor, "M"], sightings: Sightings | None
 ) -> tuple[
     Annotated[Tensor, "M 1 1 3"],
     Annotated[Tensor, "M TILES TILES 3"],
@@ -311,7 +311,7 @@ class Plan:
         return self.views[(self.seen[:, block] & (self.pixels > 0)).flatten(1).any(1)]
 
 
-def make_plan(scene: Scene, layout: LayoutConfig) -> Plan:
+def make_plan(scene: ParsedScene, layout: LayoutConfig) -> Plan:
     """Cut the scene and find out who sees what. Raises ConfigError where a block would have nothing to learn from."""
     # Geometry alone: no image is decoded to find out who sees what.
     sightings = find_sightings(scene)
@@ -336,7 +336,7 @@ def make_plan(scene: Scene, layout: LayoutConfig) -> Plan:
     return Plan(space=space, cells=[cells[block] for block in used], views=scene.train, seen=seen[:, used], pixels=pixels)
 
 
-def bisect_sightings(scene: Scene, count: int) -> list[Cell]:
+def bisect_sightings(scene: ParsedScene, count: int) -> list[Cell]:
     """`count` cells, each with about as many sightings of points. Raises ConfigError where the points do not allow that."""
     sightings = find_sightings(scene)
     if sightings is None or len(sightings.view) < SEEN * count:

@@ -30,7 +30,7 @@ from .basis import Basis
 from .config import RayBatchesConfig
 from .features import Progress, extract
 from .images import WHITE, load_images, load_mask
-from .scene import Scene, find_sightings
+from .scene import ParsedScene, find_sightings
 
 HELD = 512 * 2**20
 """Bytes of pixels that are simply held in memory."""
@@ -154,7 +154,7 @@ class RayBatches(DataManager):
         self,
         config: RayBatchesConfig,
         *,
-        scene: Scene,
+        scene: ParsedScene,
         content: Encoder | None,
         semantic: Encoder | None,
         dim: int,

@@ -15,7 +15,7 @@ from torch import Tensor
 from ..errors import DataError
 from ..rendering.cameras import Cameras, rays_through
 from ..rendering.space import Kind, Space
-from .scene import Scene
+from .scene import ParsedScene
 
 FORWARD_ANGLE = math.radians(35)
 """Cameras that all look within this angle of their mean direction may be forward-facing."""
@@ -52,7 +52,7 @@ def focus(cameras: Cameras) -> tuple[Annotated[Tensor, "3"], float]:
     return middle + torch.linalg.solve(matrix + ridge, target)[:, 0], float(values[0] / values[-1].clamp_min(1e-12))
 
 
-def find_space(scene: Scene) -> Space:
+def find_space(scene: ParsedScene) -> Space:
     """The space of a scene. Raises DataError where cameras leave it undefined (all of them in one place, no points)."""
     kind = find_kind(scene)
     if kind != "box":
@@ -68,7 +68,7 @@ def find_space(scene: Scene) -> Space:
     return Space("box", _three(centre), _rows(torch.eye(3)), 1 / (BOX_SHARE * distance), 0.0, FAR)
 
 
-def find_kind(scene: Scene) -> Kind:
+def find_kind(scene: ParsedScene) -> Kind:
     """Choose the one of the three that fits."""
     if scene.alpha:
         return "box"
@@ -86,7 +86,7 @@ def find_kind(scene: Scene) -> Kind:
     return "ndc" if offset.norm(dim=-1).amax() < FORWARD_SPREAD * depth.median() else "contraction"
 
 
-def _depths(scene: Scene) -> Tensor | None:
+def _depths(scene: ParsedScene) -> Tensor | None:
     """Depths that the capture knows: of its sparse points in every camera, or the middle of its near and far."""
     if scene.points is not None and len(scene.points) >= 8:
         pose = scene.cameras.pose
@@ -120,7 +120,7 @@ def axes(cameras: Cameras) -> Tensor:
     return torch.stack([along, torch.linalg.cross(up, along), up])
 
 
-def _contraction(scene: Scene) -> Space:
+def _contraction(scene: ParsedScene) -> Space:
     cameras = scene.cameras
     position = cameras.pose[:, :, 3]
     rotation = axes(cameras)
@@ -143,7 +143,7 @@ def _contraction(scene: Scene) -> Space:
     return Space("contraction", _three(centre), _rows(rotation), 1 / radius, max(near, 1e-3), FAR)
 
 
-def _nearest(scene: Scene) -> float | None:
+def _nearest(scene: ParsedScene) -> float | None:
     """Nearest depth that the capture says, else that of its sparse points but for a thousandth, which may be wrong."""
     if scene.depths is not None:
         return float(scene.depths[:, 0].amin())
@@ -151,7 +151,7 @@ def _nearest(scene: Scene) -> float | None:
     return None if depth is None else float(depth.quantile(0.001 if len(depth) >= 1000 else 0.0))
 
 
-def _ndc(scene: Scene) -> Space:
+def _ndc(scene: ParsedScene) -> Space:
     cameras = scene.cameras
     pose = cameras.pose
     # Axes of the mean camera: back, right, and what is across both.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from ..interfaces import DataManager, Encoder
     from .basis import Basis
-    from .scene import Scene
+    from .scene import ParsedScene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ class DataManagerConfig(PluginConfig):
     def build(
         self,
         *,
-        scene: Scene,
+        scene: ParsedScene,
         content: Encoder | None,
         semantic: Encoder | None,
         dim: int,
@@ -96,7 +96,7 @@ class RayBatchesConfig(DataManagerConfig):
     def build(
         self,
         *,
-        scene: Scene,
+        scene: ParsedScene,
         content: Encoder | None,
         semantic: Encoder | None,
         dim: int,

@@ -40,7 +40,7 @@ from PIL.WebPImagePlugin import WebPImageFile
 from ..errors import DataError
 
 if TYPE_CHECKING:
-    from .scene import Scene
+    from .scene import ParsedScene
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif", ".hif", ".avif"})
 """Suffixes of images in a folder's list, in lower case. What a file is, its content says."""
@@ -199,7 +199,7 @@ def load_mask(path: Path, size: tuple[int, int] | None = None, *, upright: bool 
     return np.asarray(bright if size is None else cv2.resize(bright, size, interpolation=cv2.INTER_NEAREST)).astype(np.bool_)
 
 
-def useless_masks(scene: "Scene") -> str:
+def useless_masks(scene: "ParsedScene") -> str:
     """Describe masks that leave no pixel of any view, or every pixel of all; empty for others and without masks."""
     # Masks of one colour, all of the same, mean that white and black were swapped, or that nothing was painted.
     first = None
@@ -216,7 +216,9 @@ def useless_masks(scene: "Scene") -> str:
     return f"{count} are white: every pixel is used; paint black, or transparent, what is to be left out"
 
 
-def load_images(scene: "Scene", background: Sequence[float] | None = None, views: Sequence[int] | None = None) -> list[Image]:
+def load_images(
+    scene: "ParsedScene", background: Sequence[float] | None = None, views: Sequence[int] | None = None
+) -> list[Image]:
     """Views of a scene (all, in the scene's order, where none are named) at their cameras' sizes, which may differ.
 
     Raises DataError as `load_image` does, and where a file's shape has changed since the scene was parsed.

@@ -22,7 +22,7 @@ from ..types import Origin
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
+class ParsedScene:
     """V views of one place. Cameras are at the size that images are used at (after `downscale`)."""
 
     name: str
@@ -53,13 +53,13 @@ class Scene:
     """Subtracted from the capture's coordinates, along its own axes: cameras and points are relative to it."""
 
 
-def in_local_frame(scene: Scene) -> Scene:
+def in_local_frame(scene: ParsedScene) -> ParsedScene:
     """The scene about its `local_origin`: projected metres (UTM) and Earth-centred ones are beyond float32."""
     further = local_origin(scene.cameras.pose[:, :, 3], scene.points)
     return at_origin(scene, (scene.origin[0] + further[0], scene.origin[1] + further[1], scene.origin[2] + further[2]))
 
 
-def at_origin(scene: Scene, origin: Origin) -> Scene:
+def at_origin(scene: ParsedScene, origin: Origin) -> ParsedScene:
     """The same scene relative to another origin, such as that of a run which goes on."""
     if origin == scene.origin:
         return scene
@@ -91,7 +91,7 @@ class Sightings(NamedTuple):
     """World distance from the camera, along the ray."""
 
 
-def find_sightings(scene: Scene) -> Sightings | None:
+def find_sightings(scene: ParsedScene) -> Sightings | None:
     """The sightings of the training views; None without sparse points or where none is in any view."""
     if scene.points is None or not len(scene.points):
         return None
@@ -152,7 +152,7 @@ def exposures_differ(exposure: Annotated[Tensor, "V"] | None) -> bool:
     return exposure is not None and len(exposure) > 1 and GAMMA * float(exposure.log().std()) > DIFFERENT
 
 
-def with_exposure(scene: Scene, image: Callable[[int], Annotated[Tensor, "H W 3"]]) -> Scene:
+def with_exposure(scene: ParsedScene, image: Callable[[int], Annotated[Tensor, "H W 3"]]) -> ParsedScene:
     """The scene with the exposure of its views, measured where the capture does not say it; unchanged without points.
 
     `image(view)` is a training view, in [0, 1]. Held-out views take the mean of their neighbours in the order of names, as far
@@ -176,7 +176,7 @@ def with_exposure(scene: Scene, image: Callable[[int], Annotated[Tensor, "H W 3"
     return replace(scene, exposure=(gain / GAMMA).exp())
 
 
-def sparser(scene: Scene) -> Scene:
+def sparser(scene: ParsedScene) -> ParsedScene:
     """The scene with every n-th point, so that about MOST pairs are left."""
     if scene.points is None:
         return scene
@@ -188,7 +188,7 @@ def sparser(scene: Scene) -> Scene:
 
 
 def _gains(
-    sightings: Sightings, scene: Scene, image: Callable[[int], Annotated[Tensor, "H W 3"]]
+    sightings: Sightings, scene: ParsedScene, image: Callable[[int], Annotated[Tensor, "H W 3"]]
 ) -> Annotated[Tensor, "V"] | None:
     """g of the training views, 0 of those that too few sightings tell of; None where none is left. float64."""
     # Brightness b of each sighting, where its pixel is neither dark nor clipped.

@@ -30,7 +30,7 @@ from kornia.metrics import ssim as _ssim_map
 from torch import Tensor
 
 from ..datamanagers.images import Image
-from ..datamanagers.scene import Scene as ParsedScene
+from ..datamanagers.scene import ParsedScene
 from ..errors import DataError, NumericsError
 from ..interfaces import Scene
 from ..io.images import to_uint8

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..datamanagers.scene import Scene as ParsedScene
+from ..datamanagers.scene import ParsedScene
 from ..interfaces import Scene
 from ..io.images import to_uint8
 from ..rendering.cameras import Cameras, grid_rays

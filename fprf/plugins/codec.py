@@ -131,7 +131,7 @@ def _read(data: Any, hint: Any, path: str, packages: Mapping[str, str]) -> Any:
         fields = dict(_expect(data, dict, path))
         name = fields.pop("type", None)
         if not isinstance(name, str):
-            raise ConfigError(f'{path}: expected the plug-in\'s name as "type", found {name!r}')
+            raise ConfigError(f'{path}: expected the plug-in\'s name as "type", found {_shown(repr(name))}')
         try:
             chosen = registry.load(hint.group, name, hint)
         except PluginError as reason:
@@ -155,7 +155,7 @@ def _read(data: Any, hint: Any, path: str, packages: Mapping[str, str]) -> Any:
         for value, meant in allowed.items():
             if type(value) is type(data) and value == data:  # True == 1
                 return meant
-        raise ConfigError(f"{path}: {data!r} is not one of {', '.join(map(repr, allowed))}")
+        raise ConfigError(f"{path}: {_shown(repr(data))} is not one of {', '.join(map(repr, allowed))}")
     # Plain values.
     if hint is Path:
         return Path(_expect(data, str, path))
@@ -173,6 +173,11 @@ def _read(data: Any, hint: Any, path: str, packages: Mapping[str, str]) -> Any:
     raise ConfigError(f"{path}: a field of type {hint} cannot be read from a file")
 
 
+def _shown(text: str) -> str:
+    """Text of a file in a message."""
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
 def _read_fields(data: dict[str, Any], cls: type, path: str, packages: Mapping[str, str]) -> Any:
     """A dataclass of the fields in an object."""
     hints = hints_of(cls)
@@ -184,7 +189,7 @@ def _read_fields(data: dict[str, Any], cls: type, path: str, packages: Mapping[s
     for key in data:
         if key not in names:
             raise ConfigError(
-                f"{path}: {cls.__name__} has no field {key!r}{registry.nearest(key, names)} "
+                f"{path}: {cls.__name__} has no field {_shown(repr(key))}{registry.nearest(key, names)} "
                 f"(its fields: {', '.join(names) or 'none'})"
             )
     values = {key: _read(value, hints[key], f"{path}.{key}", packages) for key, value in data.items()}
@@ -204,8 +209,7 @@ def _expect(data: Any, kind: type | tuple[type, ...], path: str) -> Any:
     """The datum itself if it is exactly of that type: a bool is no int, 1.0 is no int, "5" is no number."""
     kinds = kind if isinstance(kind, tuple) else (kind,)
     if type(data) not in kinds:
-        text = json.dumps(data)
-        raise ConfigError(f"{path}: expected {_NAMES[kinds[0]]}, found {text if len(text) <= 60 else f'{text[:57]}...'}")
+        raise ConfigError(f"{path}: expected {_NAMES[kinds[0]]}, found {_shown(json.dumps(data))}")
     return data
 
 

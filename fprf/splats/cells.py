@@ -23,7 +23,7 @@ from torch import Tensor
 from ..blocks.partition import bisect_sightings, read_cells, write_cells
 from ..config import RESUMABLE
 from ..datamanagers.images import load_images
-from ..datamanagers.scene import Scene
+from ..datamanagers.scene import ParsedScene
 from ..errors import CheckpointError
 from ..interfaces import Partition, State
 from ..ops.rasterise.gsplat import usable
@@ -78,7 +78,7 @@ def load_cells(root: Path) -> list[Cell]:
 class Cells(Partition):
     """A scene that is ready to be trained cell by cell."""
 
-    def __init__(self, config: GaussiansConfig, scene: Scene, saved: Facts | None, *, device: torch.device = CPU) -> None:
+    def __init__(self, config: GaussiansConfig, scene: ParsedScene, saved: Facts | None, *, device: torch.device = CPU) -> None:
         self.config, self.scene, self.device = config, scene, device
         self.compiling = [] if usable(device) else compile_beside((config.degree + 1) ** 2)
         self._facts = saved or light_and_poses(config, scene, lambda view: load_images(scene, config.background, [view])[0])
@@ -150,7 +150,7 @@ class CellPart(Part):
     """A cell: its windows, and the Gaussians of the whole scene that they show."""
 
     config: GaussiansConfig
-    scene: Scene
+    scene: ParsedScene
     facts: Facts
     cell: Cell
     start: checkpoint.Saved
@@ -240,7 +240,7 @@ def open_cell(task: Task) -> Overview | CellPart:
     )
 
 
-def overview_config(config: GaussiansConfig, scene: Scene) -> tuple[GaussiansConfig, int]:
+def overview_config(config: GaussiansConfig, scene: ParsedScene) -> tuple[GaussiansConfig, int]:
     """How the whole scene is trained before its cells, and which one of so many photographs it learns from.
 
     Of smaller images, then of fewer, where memory would not be bounded.
@@ -262,12 +262,12 @@ def overview_config(config: GaussiansConfig, scene: Scene) -> tuple[GaussiansCon
     return own, every
 
 
-def other_views(scene: Scene, views: Iterable[int]) -> tuple[int, ...]:
+def other_views(scene: ParsedScene, views: Iterable[int]) -> tuple[int, ...]:
     """Numbers of the views that are not among some."""
     return tuple(sorted(set(range(len(scene.paths))) - set(views)))
 
 
-def scene_in_windows(scene: Scene, cell: Cell) -> Scene:
+def scene_in_windows(scene: ParsedScene, cell: Cell) -> ParsedScene:
     """The scene that a cell sees: its windows are the training views."""
     views = torch.tensor(list(cell.windows), dtype=torch.int64)
     window = torch.tensor(list(cell.windows.values()), dtype=torch.int64)

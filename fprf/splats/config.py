@@ -16,7 +16,7 @@ from ..plugins.executors.config import ExecutorConfig, SerialConfig
 if TYPE_CHECKING:
     import torch
 
-    from ..datamanagers.scene import Scene
+    from ..datamanagers.scene import ParsedScene
     from ..interfaces import Partition, SceneLearner
     from ..training.model import Facts
 
@@ -144,7 +144,7 @@ class GaussiansConfig(RunConfig):
 
     def build(
         self,
-        scene: "Scene",
+        scene: "ParsedScene",
         device: "torch.device",
         *,
         saved: "Facts | None" = None,
@@ -159,7 +159,7 @@ class GaussiansConfig(RunConfig):
 
         return build(self, scene, saved, progress, device=device)
 
-    def planned(self, scene: "Scene", device: "torch.device") -> "GaussiansConfig":
+    def planned(self, scene: "ParsedScene", device: "torch.device") -> "GaussiansConfig":
         """Size and number of Gaussians, as `splats.plan` finds them."""
         from .plan import plan
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..datamanagers.images import Image
-from ..datamanagers.scene import Scene
+from ..datamanagers.scene import ParsedScene
 from ..rendering.cameras import project
 from .gaussians import morton_order
 from .photographs import covering, undistorted
@@ -41,7 +41,7 @@ class Points(NamedTuple):
     colour: Annotated[NDArray[np.float32], "P 3"]
 
 
-def initial_points(scene: Scene, images: Mapping[int, Image], count: int, rng: np.random.Generator) -> tuple[Points, str]:
+def initial_points(scene: ParsedScene, images: Mapping[int, Image], count: int, rng: np.random.Generator) -> tuple[Points, str]:
     """At most `count` points, and where they are from; images as they lie, at the size of the cameras."""
     if scene.points is not None and len(scene.points) >= _ENOUGH:
         position = scene.points.double().numpy()
@@ -55,7 +55,7 @@ def initial_points(scene: Scene, images: Mapping[int, Image], count: int, rng: n
     return Points(points.position[chosen], points.colour[chosen]), kind
 
 
-def surroundings(scene: Scene, images: Mapping[int, Image], points: Points, count: int) -> Points:
+def surroundings(scene: ParsedScene, images: Mapping[int, Image], points: Points, count: int) -> Points:
     """`count` points spread evenly over a distant sphere, in the blurred colours of the photographs that show their directions.
 
     Where no view looks, the colours of the nearest seen directions go on.
@@ -113,7 +113,7 @@ def curve_order(position: Annotated[NDArray[np.floating], "P 3"]) -> NDArray[np.
     return morton_order(cell)
 
 
-def projected(scene: Scene, points: Annotated[Tensor, "P 3"]) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
+def projected(scene: ParsedScene, points: Annotated[Tensor, "P 3"]) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
     """For each training view: its number, pixels and depths of points, and which of them it has in the picture."""
     for view in scene.train.tolist():
         pixel, depth = project(scene.cameras, torch.full((len(points),), view), points)
@@ -121,7 +121,7 @@ def projected(scene: Scene, points: Annotated[Tensor, "P 3"]) -> Iterator[tuple[
 
 
 def _mean_colours(
-    scene: Scene, image: Callable[[int], Image], position: Doubles
+    scene: ParsedScene, image: Callable[[int], Image], position: Doubles
 ) -> tuple[Annotated[NDArray[np.float32], "P 3"], Annotated[NDArray[np.bool_], "P"]]:
     """Mean colours over the training views that have points in the picture, grey where none has; and where one has."""
     total, count = np.zeros((len(position), 3)), np.zeros(len(position))
@@ -133,7 +133,7 @@ def _mean_colours(
     return colour.astype(np.float32), count > 0
 
 
-def _matched(scene: Scene, images: Mapping[int, Image]) -> Points:
+def _matched(scene: ParsedScene, images: Mapping[int, Image]) -> Points:
     """Points triangulated from SIFT matches between neighbouring training views."""
     # Pictures without their lenses: triangulation is that of pinholes.
     views = scene.train.tolist()
@@ -205,7 +205,7 @@ def _triangulated(rays: list[Doubles], pixels: tuple[Doubles, Doubles], centres:
     return np.where((good & (cosine < math.cos(_ANGLE)))[:, None], position, np.nan)
 
 
-def _scattered(scene: Scene, images: Mapping[int, Image], count: int, rng: np.random.Generator) -> Points:
+def _scattered(scene: ParsedScene, images: Mapping[int, Image], count: int, rng: np.random.Generator) -> Points:
     """Points on random rays, their distances spread evenly over the logarithm: from a third to 30 times the cameras' spread."""
     # Random pixels of random views, and their colours.
     views = rng.choice(scene.train.numpy(), count)

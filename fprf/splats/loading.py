@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..config import RunConfig
-from ..datamanagers.scene import Scene
+from ..datamanagers.scene import ParsedScene
 from ..errors import CheckpointError, UsageError
 from ..ops.rasterise.gsplat import usable
 from ..rendering.cameras import Cameras
@@ -85,7 +85,7 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
 
     resolution = preset.resolution if preset is not None else 1.0
 
-    def fit(scene: Scene, views: Sequence[int]) -> Annotated[Tensor, "V 6"]:
+    def fit(scene: ParsedScene, views: Sequence[int]) -> Annotated[Tensor, "V 6"]:
         return fit_poses(config, replace(scene, cameras=known.cameras), known.facts, gaussians, near, tones, views)
 
     def levels() -> Levels:
@@ -128,7 +128,7 @@ def refined(cameras: Cameras, saved: checkpoint.Saved) -> Cameras:
 
 def fit_poses(
     config: GaussiansConfig,
-    scene: Scene,
+    scene: ParsedScene,
     facts: Facts,
     gaussians: Gaussians,
     near: float,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..datamanagers.images import Image, load_images, load_mask
-from ..datamanagers.scene import Scene
+from ..datamanagers.scene import ParsedScene
 from ..ops.photometric import WINDOW
 from ..ops.rasterise.gsplat import target_on, usable
 from ..ops.rasterise.rendering import Pinhole
@@ -202,7 +202,7 @@ def distorted(
     return torch.from_numpy(np.atleast_3d(sampled))
 
 
-def load_photographs(config: GaussiansConfig, scene: Scene, views: list[int]) -> tuple[dict[int, Image], Masks, Masks]:
+def load_photographs(config: GaussiansConfig, scene: ParsedScene, views: list[int]) -> tuple[dict[int, Image], Masks, Masks]:
     """Images of views, then the masks that say where they count, and those that say where they show sky, of views with one."""
     images = dict(zip(views, load_images(scene, config.background, views), strict=True))
 
@@ -215,7 +215,7 @@ def load_photographs(config: GaussiansConfig, scene: Scene, views: list[int]) ->
 
 
 def make_levels(
-    scene: Scene,
+    scene: ParsedScene,
     images: Mapping[int, Image],
     masks: Masks,
     near: float,

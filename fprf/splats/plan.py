@@ -21,7 +21,7 @@ from ..ops.rasterise.gsplat import target_on, trainable, usable
 from ..ops.rasterise.reference import Pinhole
 
 if TYPE_CHECKING:
-    from ..datamanagers.scene import Scene
+    from ..datamanagers.scene import ParsedScene
     from .config import GaussiansConfig
 
 _PIXEL, _GAUSSIAN = 91e-9, 103e-9
@@ -45,7 +45,7 @@ _SIZES, _FIRST, _TIMED, _BESIDES = ((480, 270), (1920, 1080)), 20, 10, 1.4
 step of training takes in units of these, with all that is done between steps."""
 
 
-def plan(config: "GaussiansConfig", scene: "Scene", device: torch.device) -> "GaussiansConfig":
+def plan(config: "GaussiansConfig", scene: "ParsedScene", device: torch.device) -> "GaussiansConfig":
     """Return the config with all decided that it leaves open, for a scene at its own size; what is given stays.
 
     More minutes never give smaller photographs, fewer Gaussians or fewer steps.

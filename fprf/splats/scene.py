@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..datamanagers.basis import Basis
-from ..datamanagers.scene import Scene as ParsedScene
+from ..datamanagers.scene import ParsedScene
 from ..interfaces import Encoder, Scene, SceneView, Values
 from ..rendering.cameras import Cameras, pixel_grid
 from ..rendering.renderer import enlarged

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ..datamanagers.images import Image
-from ..datamanagers.scene import Scene, find_sightings, sparser
+from ..datamanagers.scene import ParsedScene, find_sightings, sparser
 from ..ops.rasterise.gsplat import Trainable, usable
 from ..ops.rasterise.training import LOG_SCALES, MEANS, compile_beside
 from ..training.model import Facts, poses_of, tones_of
@@ -48,7 +48,7 @@ any point."""
 
 def build(
     config: GaussiansConfig,
-    scene: Scene,
+    scene: ParsedScene,
     saved: Facts | None = None,
     progress: Callable[[int, int, str], None] | None = None,
     *,
@@ -96,7 +96,7 @@ def build(
     return learner
 
 
-def light_and_poses(config: GaussiansConfig, scene: Scene, image: Callable[[int], Image]) -> Facts:
+def light_and_poses(config: GaussiansConfig, scene: ParsedScene, image: Callable[[int], Image]) -> Facts:
     """Facts of a scene with exposures and places of the views, where these are learnt; `image(view)` is a training view."""
     exposure = exposure_of(config.tones, scene, lambda view: torch.from_numpy(image(view)).float() / 255)
     return facts_of(scene, config.background, exposure=exposure, poses=config.poses > 0)
@@ -114,7 +114,7 @@ class _Sphere(NamedTuple):
         return apart < _INSIDE_SPHERE * self.radius
 
 
-def limit_widths(scene: Scene, near: float, *, cells: bool, sphere: _Sphere | None = None) -> LimitWidths:
+def limit_widths(scene: ParsedScene, near: float, *, cells: bool, sphere: _Sphere | None = None) -> LimitWidths:
     """Keep Gaussians narrower than a share of the distance to the nearest training camera, and the surroundings thin.
 
     What reaches a camera is drawn before the whole scene as haze, and mixes the semantics of everything. Of thousands of
@@ -148,7 +148,7 @@ def limit_widths(scene: Scene, near: float, *, cells: bool, sphere: _Sphere | No
     return limit
 
 
-def scene_scale(scene: Scene) -> float:
+def scene_scale(scene: ParsedScene) -> float:
     """Unit of the means' learning rate: the radius of the training cameras' positions.
 
     At most the distance at which views commonly see points, where the capture knows: steps in proportion to the radius of a
@@ -160,7 +160,7 @@ def scene_scale(scene: Scene) -> float:
     return radius if sightings is None else min(radius, float(sightings.distance.median()))
 
 
-def find_near(scene: Scene, points: Points) -> float:
+def find_near(scene: ParsedScene, points: Points) -> float:
     """Near plane: a quarter of the depth that 99 % of the points exceed, so that haze right before a lens is not drawn.
 
     Of some of the points and depths, evenly spread; where no view has any, a thousandth of the scene scale.

@@ -6,7 +6,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from ..datamanagers.scene import Scene
+from ..datamanagers.scene import ParsedScene
 from ..fields.config import PlanesConfig, SemanticPlanesConfig
 from ..interfaces import Decoder
 from ..io.images import write_image
@@ -56,7 +56,7 @@ def space() -> Space:
     return Space("box", centre=(0.0, 0.0, 0.0), rotation=eye, scale=1.0, near=0.5, far=3.5)
 
 
-def capture(folder: Path) -> Scene:
+def capture(folder: Path) -> ParsedScene:
     """Five pictures of noise of several sizes, written to a folder; the second is held out."""
     sizes = torch.tensor([[24, 16], [30, 20], [18, 26], [24, 16], [12, 10]])
     paths = [folder / f"{view}.png" for view in range(len(sizes))]
@@ -71,7 +71,7 @@ def capture(folder: Path) -> Scene:
         lens=torch.zeros(len(sizes), dtype=torch.int64),
     )
     train, test = torch.tensor([0, 2, 3, 4]), torch.tensor([1])
-    return Scene(name="noise", paths=tuple(paths), cameras=cameras, train=train, test=test, alpha=False)
+    return ParsedScene(name="noise", paths=tuple(paths), cameras=cameras, train=train, test=test, alpha=False)
 
 
 def parts() -> Parts:

@@ -28,7 +28,7 @@ from ..blocks.partition import Plan, pixel_mask, read_cells, write_cells
 from ..blocks.routing import BlendRouter, InsetRouter, Router, chart_of, surroundings_of, to_single
 from ..config import FREE_IN_BLOCKS, TrainConfig, fields_only
 from ..datamanagers.basis import Basis
-from ..datamanagers.scene import Scene
+from ..datamanagers.scene import ParsedScene
 from ..errors import CheckpointError, ConfigError
 from ..interfaces import Decoder, Learner, Partition
 from ..io import tensorfiles
@@ -210,7 +210,7 @@ def load_blocked(
 class Blocks(Partition):
     """A scene that is ready to be trained block by block."""
 
-    def __init__(self, config: TrainConfig, scene: Scene, plan: Plan, facts: Facts, basis: Basis | None) -> None:
+    def __init__(self, config: TrainConfig, scene: ParsedScene, plan: Plan, facts: Facts, basis: Basis | None) -> None:
         self.config, self.scene, self.plan, self.basis = config, scene, plan, basis
         self._facts = facts
 
@@ -252,7 +252,7 @@ class Blocks(Partition):
 
 
 def block_task(
-    config: TrainConfig, facts: Facts, scene: Scene, cells: Sequence[Cell], block: int, rays: dict[str, Tensor]
+    config: TrainConfig, facts: Facts, scene: ParsedScene, cells: Sequence[Cell], block: int, rays: dict[str, Tensor]
 ) -> dict[str, Any]:
     """The task of a block, and how long it is trained (`Part.asked`). `rays` is its rays.safetensors.
 
@@ -280,7 +280,7 @@ class Block(Part):
     run: Run
     block: int
     config: TrainConfig
-    scene: Scene
+    scene: ParsedScene
     facts: Facts
     rays: dict[str, Tensor]
 

@@ -18,7 +18,7 @@ from torch.profiler import record_function
 
 from ..config import PASSES, OptimizerConfig, TrainConfig
 from ..datamanagers.batches import generator_of
-from ..datamanagers.scene import Scene as ParsedScene
+from ..datamanagers.scene import ParsedScene
 from ..errors import CheckpointError
 from ..interfaces import DataManager, Figures, SceneLearner, State
 from ..memory import free_memory

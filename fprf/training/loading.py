@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..config import RunConfig, TrainConfig, fields_only
 from ..datamanagers.basis import Basis
-from ..datamanagers.scene import Scene as ParsedScene
+from ..datamanagers.scene import ParsedScene
 from ..errors import CheckpointError, PluginError, WeightsError
 from ..interfaces import Decoder, Scene, Values
 from ..plugins.registry import entry, load_object

@@ -14,7 +14,7 @@ from ..datamanagers.basis import Basis
 from ..datamanagers.bounds import find_space
 from ..datamanagers.images import WHITE
 from ..datamanagers.parsers.config import parse_scene
-from ..datamanagers.scene import Scene, at_origin, exposures_differ, find_sightings, with_exposure
+from ..datamanagers.scene import ParsedScene, at_origin, exposures_differ, find_sightings, with_exposure
 from ..errors import PluginError, UsageError, WeightsError
 from ..interfaces import DataManager, Encoder
 from ..rendering.space import Space
@@ -24,7 +24,7 @@ from .model import Facts, build_decoder
 class Prepared(NamedTuple):
     """A scene that is ready to be trained."""
 
-    scene: Scene
+    scene: ParsedScene
     manager: DataManager
     facts: Facts
     basis: Basis | None
@@ -50,7 +50,7 @@ def device_of(name: str) -> torch.device:
         raise PluginError(f"device: {name!r} is not available here; there is {known}{ray}") from e
 
 
-def planned(config: RunConfig, whole: Scene | None = None) -> RunConfig:
+def planned(config: RunConfig, whole: ParsedScene | None = None) -> RunConfig:
     """The config with what it leaves open decided, the size of its images first, by its scene at its own size.
 
     That is read where it is not given. Raises as `read_scene`.
@@ -60,7 +60,7 @@ def planned(config: RunConfig, whole: Scene | None = None) -> RunConfig:
     return config.planned(whole or read_scene(replace(config, downscale=1)), device_of(config.trained_on))
 
 
-def read_scene(config: RunConfig, saved: Facts | None = None) -> Scene:
+def read_scene(config: RunConfig, saved: Facts | None = None) -> ParsedScene:
     """The scene of a config, at its size, about the origin of a run that goes on (`saved`).
 
     Raises UsageError where it names none, DataError where that cannot be read.
@@ -90,7 +90,7 @@ def build_encoders(config: TrainConfig, *, semantic: bool = True) -> tuple[Encod
 
 def prepare(
     config: TrainConfig,
-    scene: Scene,
+    scene: ParsedScene,
     saved: Facts | None = None,
     progress: Callable[[int, int, str], None] | None = None,
     *,
@@ -138,7 +138,7 @@ def prepare(
 
 
 def facts_of(
-    scene: Scene,
+    scene: ParsedScene,
     background: tuple[float, float, float] | None = None,
     *,
     space: Space | None = None,
@@ -161,7 +161,7 @@ def facts_of(
 
 
 def exposure_of(
-    tones: bool | None, scene: Scene, image: Callable[[int], Annotated[Tensor, "H W 3"]], saved: Facts | None = None
+    tones: bool | None, scene: ParsedScene, image: Callable[[int], Annotated[Tensor, "H W 3"]], saved: Facts | None = None
 ) -> tuple[float, ...]:
     """Logarithm of each view's exposure over their geometric mean; empty where tones are not learnt.
 
@@ -181,7 +181,7 @@ def exposure_of(
     return tuple((log - log.mean()).tolist())
 
 
-def reach_of(scene: Scene, space: Space) -> float:
+def reach_of(scene: ParsedScene, space: Space) -> float:
     """World distance that training views commonly see: of their sparse points, else a unit of the space."""
     sightings = find_sightings(scene)
     if sightings is not None:

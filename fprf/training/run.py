@@ -30,7 +30,7 @@ from torch import Tensor
 
 from ..config import RunConfig
 from ..datamanagers.images import load_image, load_mask
-from ..datamanagers.scene import Scene
+from ..datamanagers.scene import ParsedScene
 from ..errors import CheckpointError, DataError, UsageError
 from ..io import tensorfiles
 from ..io.atomic import unwritable, write_json
@@ -84,7 +84,7 @@ class Known:
         return views
 
     def photograph(
-        self, captured: Scene, view: int, *, masks: bool
+        self, captured: ParsedScene, view: int, *, masks: bool
     ) -> tuple[Annotated[Tensor, "H W 3"], Annotated[Tensor, "H W"] | None]:
         """The image of a view at the size of its camera, in [0, 1], and where it counts by the masks; None = everywhere."""
         width, height = self.cameras.size[view].tolist()
@@ -119,7 +119,7 @@ class Run:
             raise CheckpointError(f"{self.root}: no config.json here, so it is no run folder; `fprf train` makes one")
         return load_config(self.root / "config.json")
 
-    def save_known(self, scene: Scene, data: Path | None, facts: Facts) -> None:
+    def save_known(self, scene: ParsedScene, data: Path | None, facts: Facts) -> None:
         """Write scene.json."""
         known = known_of(scene, data, facts)
         cameras = {key: getattr(scene.cameras, key).tolist() for key in _CAMERA}
@@ -174,7 +174,7 @@ class Run:
             f.write(b"\n" * torn + json.dumps(event, allow_nan=False).encode() + b"\n")
 
 
-def known_of(scene: Scene, data: Path | None, facts: Facts) -> Known:
+def known_of(scene: ParsedScene, data: Path | None, facts: Facts) -> Known:
     """The content of scene.json of a scene whose images lie in the folder `data`."""
     return Known(
         name=scene.name,
@@ -276,7 +276,7 @@ _IMAGES_FORMAT = 1
 _NAMED = 3
 
 
-def image_hashes(scene: Scene) -> dict[str, str]:
+def image_hashes(scene: ParsedScene) -> dict[str, str]:
     """SHA-256 of each image's file, by the view's name. Raises DataError where one cannot be read."""
 
     def of(path: Path) -> str:
@@ -296,7 +296,7 @@ def save_image_hashes(root: Path, hashes: Mapping[str, str]) -> None:
     write_json(root / IMAGES, {"format": _IMAGES_FORMAT, "images": dict(hashes)})
 
 
-def check_images(root: Path, scene: Scene, hashes: Mapping[str, str]) -> None:
+def check_images(root: Path, scene: ParsedScene, hashes: Mapping[str, str]) -> None:
     """Raise UsageError where images differ from those that the run in a folder was begun with; no run, or one of before
     there was a list, has none.
     """

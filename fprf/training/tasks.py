@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from ..config import RunConfig
-from ..datamanagers.scene import Scene
+from ..datamanagers.scene import ParsedScene
 from ..errors import CheckpointError
 from ..interfaces import Executor, Learner
 from ..io.atomic import write_json
@@ -47,7 +47,7 @@ class Task:
     root: str
     """Run folder."""
     data: str
-    """Scene folder."""
+    """ParsedScene folder."""
     part: int
     """Number of the part, or WHOLE."""
     minutes: float | None
@@ -152,7 +152,7 @@ def train_all(
 def digest_of(
     config: RunConfig,
     free: Collection[str],
-    scene: Scene,
+    scene: ParsedScene,
     views: Sequence[int],
     parts: Mapping[str, Any],
     content: bytes = b"",

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from fprf.blocks.routing import surroundings_of
-from fprf.datamanagers.scene import Scene
+from fprf.datamanagers.scene import ParsedScene
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import pinhole
 from fprf.types import Cell
@@ -22,10 +22,10 @@ def cameras_at(position: Tensor, ahead: Tensor, upright: Tensor, size: tuple[int
     return pinhole(pose, width=size[0], height=size[1], fov=math.degrees(2 * math.atan(size[1] / size[0])))
 
 
-def scene_of(cameras: Cameras, points: Tensor | None, seen: Tensor | None = None) -> Scene:
+def scene_of(cameras: Cameras, points: Tensor | None, seen: Tensor | None = None) -> ParsedScene:
     """Every 8th view held out."""
     index = torch.arange(len(cameras))
-    return Scene(
+    return ParsedScene(
         name="scene",
         paths=tuple(Path(f"{k:04d}.png") for k in index.tolist()),
         cameras=cameras,
@@ -36,7 +36,7 @@ def scene_of(cameras: Cameras, points: Tensor | None, seen: Tensor | None = None
     )
 
 
-def street(length: float = 100.0, views: int = 40, walls: int = 4000) -> Scene:
+def street(length: float = 100.0, views: int = 40, walls: int = 4000) -> ParsedScene:
     """Along x at 2 m above the ground, looking ahead; walls at y = -6 and 6, 8 m high."""
     draw = torch.Generator().manual_seed(0)
     x = torch.linspace(0, length, views, dtype=torch.float64)
@@ -48,7 +48,7 @@ def street(length: float = 100.0, views: int = 40, walls: int = 4000) -> Scene:
     return scene_of(cameras_at(position, ahead, up), points)
 
 
-def drone(side: float = 90.0, rows: int = 7, height: float = 30.0, points: int = 6000) -> Scene:
+def drone(side: float = 90.0, rows: int = 7, height: float = 30.0, points: int = 6000) -> ParsedScene:
     """A square survey, looking straight down, each flight line the other way round; ground at z = 0."""
     draw = torch.Generator().manual_seed(0)
     way = torch.linspace(0, side, rows, dtype=torch.float64)

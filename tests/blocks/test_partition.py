@@ -11,13 +11,13 @@ from torch import Tensor
 from fprf.blocks.config import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig
 from fprf.blocks.partition import bisect_sightings, bounds, make_plan, open_space, pixel_mask, read_cells, site_of, write_cells
 from fprf.blocks.routing import shares
-from fprf.datamanagers.scene import Scene, find_sightings
+from fprf.datamanagers.scene import ParsedScene, find_sightings
 from fprf.errors import CheckpointError, ConfigError
 from fprf.splats.cells import scene_in_windows
 from fprf.types import Cell, Site
 
 
-def site(scene: Scene) -> Site:
+def site(scene: ParsedScene) -> Site:
     return site_of(scene, open_space(scene, find_sightings(scene)))
 
 
@@ -97,17 +97,17 @@ COUNT = 3
 
 
 @pytest.fixture(scope="module", params=[drone, street])
-def scene(request: pytest.FixtureRequest) -> Scene:
-    scene: Scene = request.param()
+def scene(request: pytest.FixtureRequest) -> ParsedScene:
+    scene: ParsedScene = request.param()
     return scene
 
 
 @pytest.fixture(scope="module")
-def cells(scene: Scene) -> list[Cell]:
+def cells(scene: ParsedScene) -> list[Cell]:
     return bisect_sightings(scene, COUNT)
 
 
-def test_cells_cover_space_once_and_have_equally_many_sightings(scene: Scene, cells: list[Cell]) -> None:
+def test_cells_cover_space_once_and_have_equally_many_sightings(scene: ParsedScene, cells: list[Cell]) -> None:
     draw = torch.Generator().manual_seed(0)
     points = 1e3 * torch.randn(1000, 3, generator=draw, dtype=torch.float64) ** 3
     assert torch.stack([cell.holds(points) for cell in cells]).sum(0).eq(1).all()
@@ -117,7 +117,7 @@ def test_cells_cover_space_once_and_have_equally_many_sightings(scene: Scene, ce
     assert (found - 1 / COUNT).abs().max() < 0.02
 
 
-def test_windows_show_their_points_through_their_cameras(scene: Scene, cells: list[Cell]) -> None:
+def test_windows_show_their_points_through_their_cameras(scene: ParsedScene, cells: list[Cell]) -> None:
     sightings = find_sightings(scene)
     assert sightings is not None
     for cell in cells:
@@ -132,7 +132,7 @@ def test_windows_show_their_points_through_their_cameras(scene: Scene, cells: li
         assert inside[mine].double().mean() > 0.9  # outliers and views with few points are left out
 
 
-def test_windows_of_a_photograph_reach_its_edges(scene: Scene, cells: list[Cell]) -> None:
+def test_windows_of_a_photograph_reach_its_edges(scene: ParsedScene, cells: list[Cell]) -> None:
     for view in {view for cell in cells for view in cell.windows}:
         width, height = scene.cameras.size[view].tolist()
         windows = [cell.windows[view] for cell in cells if view in cell.windows]

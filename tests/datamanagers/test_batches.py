@@ -18,7 +18,7 @@ from tiny_world import World
 import fprf.datamanagers.batches as pixel_file
 from fprf.datamanagers.batches import PixelRuns, RayBatches, allocate_pixels
 from fprf.datamanagers.config import RayBatchesConfig
-from fprf.datamanagers.scene import Scene
+from fprf.datamanagers.scene import ParsedScene
 from fprf.errors import DataError
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.rendering.cameras import rays_through
@@ -28,11 +28,11 @@ SIZES = [(24, 16), (30, 20), (18, 26), (24, 16), (12, 10)]
 
 
 @pytest.fixture
-def scene(tmp_path: Path) -> Scene:
+def scene(tmp_path: Path) -> ParsedScene:
     """A scene of PNG files of noise."""
     for view, size in enumerate(SIZES):
         write_image(tmp_path / f"{view}.png", size, seed=view)
-    return Scene(
+    return ParsedScene(
         name="noise",
         paths=tuple(tmp_path / f"{view}.png" for view in range(len(SIZES))),
         cameras=cameras_of(torch.eye(4, dtype=torch.float64)[:3].repeat(len(SIZES), 1, 1), SIZES, (20.0, 20.0)),
@@ -47,7 +47,7 @@ def write_mask(path: Path, pixels: np.ndarray) -> Path:
 
 
 def make(
-    scene: Scene, cache: Path, *, seed: int = 0, content: bool = False, semantic: bool = False, **fields: Any
+    scene: ParsedScene, cache: Path, *, seed: int = 0, content: bool = False, semantic: bool = False, **fields: Any
 ) -> RayBatches:
     config = RayBatchesConfig(**{"rays": 512} | fields)
     encoders = (RandomConfig(channels=3, stride=2).build(), RandomConfig(channels=6, stride=4).build())
@@ -55,7 +55,7 @@ def make(
     return RayBatches(config, scene=scene, content=one, semantic=two, dim=4, cache=cache, seed=seed)
 
 
-def test_colours_are_those_of_the_files_at_the_pixel_centres(scene: Scene, tmp_path: Path) -> None:
+def test_colours_are_those_of_the_files_at_the_pixel_centres(scene: ParsedScene, tmp_path: Path) -> None:
     images = [cv2.imread(str(path))[..., ::-1].copy() for path in scene.paths]
     batch = make(scene, tmp_path).batch(0)
     assert batch.view.dtype == torch.int64 and batch.rgb.dtype == torch.float32
@@ -66,7 +66,7 @@ def test_colours_are_those_of_the_files_at_the_pixel_centres(scene: Scene, tmp_p
         assert torch.equal(rgb, torch.from_numpy(images[view])[int(y), int(x)].float() / 255)
 
 
-def test_a_batch_is_a_function_of_seed_and_step(scene: Scene, tmp_path: Path) -> None:
+def test_a_batch_is_a_function_of_seed_and_step(scene: ParsedScene, tmp_path: Path) -> None:
     one = make(scene, tmp_path, content=True, semantic=True)
     torch.randn(7)
     two = make(scene, tmp_path, content=True, semantic=True)
@@ -80,7 +80,7 @@ def test_a_batch_is_a_function_of_seed_and_step(scene: Scene, tmp_path: Path) ->
     assert not torch.equal(one.batch(7).pixel, make(scene, tmp_path, seed=1).batch(7).pixel)
 
 
-def test_every_training_pixel_is_as_likely(scene: Scene, tmp_path: Path) -> None:
+def test_every_training_pixel_is_as_likely(scene: ParsedScene, tmp_path: Path) -> None:
     batch = make(scene, tmp_path, rays=200_000).batch(3)
     flat = batch.view * 10_000 + batch.pixel[:, 1].long() * 100 + batch.pixel[:, 0].long()
     _, counts = flat.unique(return_counts=True)
@@ -92,7 +92,7 @@ def test_every_training_pixel_is_as_likely(scene: Scene, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(("share", "expected"), [(1.0, 512), (0.25, 128), (0.001, 1), (0.0, None)])
-def test_the_share_of_semantic_rays(scene: Scene, tmp_path: Path, share: float, expected: int | None) -> None:
+def test_the_share_of_semantic_rays(scene: ParsedScene, tmp_path: Path, share: float, expected: int | None) -> None:
     manager = make(scene, tmp_path, semantic_share=share, content=True, semantic=True)
     batch = manager.batch(2)
     assert batch.content is not None and batch.content.shape == (512, 3)
@@ -161,7 +161,7 @@ def test_points_of_a_reconstruction_count_where_two_views_saw_them(world: World,
     torch.testing.assert_close(pairs, wanted, equal_nan=True)
 
 
-def test_pixels_that_are_left_out_are_never_drawn(scene: Scene, tmp_path: Path) -> None:
+def test_pixels_that_are_left_out_are_never_drawn(scene: ParsedScene, tmp_path: Path) -> None:
     allowed = [np.random.default_rng(9 + view).random((height, width)) > 0.7 for view, (width, height) in enumerate(SIZES)]
     paths = [write_mask(tmp_path / f"mask{view}.png", np.uint8(255) * mask) for view, mask in enumerate(allowed)]
     masked = replace(scene, masks=(paths[0], None, paths[2], None, paths[4]))
@@ -180,7 +180,7 @@ def test_pixels_that_are_left_out_are_never_drawn(scene: Scene, tmp_path: Path) 
     assert torch.equal(ours.pixel, theirs.pixel)
 
 
-def test_scenes_that_leave_nothing_to_learn_are_refused(scene: Scene, tmp_path: Path) -> None:
+def test_scenes_that_leave_nothing_to_learn_are_refused(scene: ParsedScene, tmp_path: Path) -> None:
     dark = tuple(write_mask(tmp_path / f"n{k}.png", np.zeros((h, w), np.uint8)) for k, (w, h) in enumerate(SIZES))
     other = write_mask(tmp_path / "m.png", np.ones((40, 10), np.uint8))
     for wrong in ({"train": scene.train[:0]}, {"masks": dark}, {"masks": (other,) * len(SIZES)}):

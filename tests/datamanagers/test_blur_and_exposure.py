@@ -11,7 +11,7 @@ from tiny_world import World
 from torch import Tensor
 
 from fprf.datamanagers.images import Image
-from fprf.datamanagers.scene import GAMMA, Scene, exposures_differ, find_sightings, with_exposure
+from fprf.datamanagers.scene import GAMMA, ParsedScene, exposures_differ, find_sightings, with_exposure
 from fprf.rendering.cameras import Cameras, ideal_cameras
 from fprf.splats.photographs import blurred_views, detail
 
@@ -83,7 +83,7 @@ def test_too_few_or_empty_photographs_are_not_judged() -> None:
 TOWN_VIEWS = 10
 
 
-def capture(world: World, gain: Tensor, wrong: float = 0.0) -> tuple[Scene, Callable[[int], Tensor]]:
+def capture(world: World, gain: Tensor, wrong: float = 0.0) -> tuple[ParsedScene, Callable[[int], Tensor]]:
     """The tiny town at 512 x 384, every point in any view that may see it; points painted as bright as `gain` says.
 
     Of the sightings a share is `wrong`: something else is there.
@@ -110,7 +110,7 @@ def capture(world: World, gain: Tensor, wrong: float = 0.0) -> tuple[Scene, Call
     return scene, image
 
 
-def errors(scene: Scene, image: Callable[[int], Tensor], gain: Tensor) -> Tensor:
+def errors(scene: ParsedScene, image: Callable[[int], Tensor], gain: Tensor) -> Tensor:
     """What is measured less what it should be, both relative to the training views."""
     exposure = with_exposure(scene, image).exposure
     assert exposure is not None

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from fprf.datamanagers.bounds import find_kind, find_space, focus
-from fprf.datamanagers.scene import Scene
+from fprf.datamanagers.scene import ParsedScene
 from fprf.errors import DataError
 from fprf.rendering.cameras import rays_through
 from fprf.rendering.paths import look_at
@@ -22,9 +22,9 @@ F64 = torch.float64
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=F64)
 
 
-def scene_of(pose: Tensor, points: Tensor | None = None, alpha: bool = False) -> Scene:
+def scene_of(pose: Tensor, points: Tensor | None = None, alpha: bool = False) -> ParsedScene:
     everything = torch.arange(len(pose))
-    return Scene(
+    return ParsedScene(
         name="rig",
         paths=tuple(Path(f"{k}.png") for k in everything),
         cameras=cameras_of(pose, (100, 80), (80.0, 80.0)),
@@ -35,7 +35,7 @@ def scene_of(pose: Tensor, points: Tensor | None = None, alpha: bool = False) ->
     )
 
 
-def ring(count: int = 24, radius: float = 4.0) -> Scene:
+def ring(count: int = 24, radius: float = 4.0) -> ParsedScene:
     """Cameras on an ellipse around (1, 2, 0.5), looking at it, and points on a ball there."""
     angle = torch.arange(count, dtype=F64) * (2 * math.pi / count)
     target = torch.tensor([1.0, 2.0, 0.5], dtype=F64)
@@ -44,7 +44,7 @@ def ring(count: int = 24, radius: float = 4.0) -> Scene:
     return scene_of(look_at(target + offset, target.expand_as(offset), UP), target + ball)
 
 
-def forward(points: bool = True) -> Scene:
+def forward(points: bool = True) -> ParsedScene:
     """A grid of cameras on a wall, all looking along +y at points 5 to 20 away."""
     x, z = torch.meshgrid(torch.linspace(-1, 1, 4, dtype=F64), torch.linspace(-0.5, 0.5, 3, dtype=F64), indexing="ij")
     place = torch.stack([x.flatten(), torch.zeros(12, dtype=F64), z.flatten()], -1)
@@ -54,7 +54,7 @@ def forward(points: bool = True) -> Scene:
     return scene_of(look_at(place, place + ahead, UP), cloud if points else None)
 
 
-def street() -> Scene:
+def street() -> ParsedScene:
     """A drive along (1, 1, 0), looking ahead and to the sides; no points."""
     along = torch.tensor([1.0, 1.0, 0.0], dtype=F64) / math.sqrt(2)
     side = torch.tensor([-1.0, 1.0, 0.0], dtype=F64) / math.sqrt(2)
@@ -63,14 +63,14 @@ def street() -> Scene:
     return scene_of(look_at(place, place + turn.cos() * along + turn.sin() * side, UP))
 
 
-def thing() -> Scene:
+def thing() -> ParsedScene:
     return replace(ring(), alpha=True, points=None)
 
 
 RIGS = {"ring": ring, "forward": forward, "street": street, "thing": thing}
 
 
-def moved(scene: Scene, scale: float, shift: Tensor, turn: Tensor) -> Scene:
+def moved(scene: ParsedScene, scale: float, shift: Tensor, turn: Tensor) -> ParsedScene:
     pose = scene.cameras.pose
     place = (scale * pose[:, :, 3]) @ turn.T + shift
     cameras = replace(scene.cameras, pose=torch.cat([turn @ pose[:, :, :3], place[:, :, None]], -1))
@@ -78,7 +78,7 @@ def moved(scene: Scene, scale: float, shift: Tensor, turn: Tensor) -> Scene:
     return replace(scene, cameras=cameras, points=points, depths=None if scene.depths is None else scene.depths * scale)
 
 
-def located(scene: Scene, space: Space) -> Tensor:
+def located(scene: ParsedScene, space: Space) -> Tensor:
     """Unit-cube coordinates along rays through all cameras' corners and middles."""
     view = torch.arange(len(scene.cameras)).repeat_interleave(3)
     pixel = torch.tensor([[0.5, 0.5], [50.0, 40.0], [99.5, 70.5]], dtype=F64).repeat(len(scene.cameras), 1)

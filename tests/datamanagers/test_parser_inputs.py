@@ -32,7 +32,7 @@ from capture_files import (
 from fprf.datamanagers.images import load_images
 from fprf.datamanagers.parsers.colmap import MODELS
 from fprf.datamanagers.parsers.config import TransformsConfig, parse_scene
-from fprf.datamanagers.scene import Scene
+from fprf.datamanagers.scene import ParsedScene
 from fprf.errors import DataError
 from fprf.rendering.cameras import project
 
@@ -45,7 +45,7 @@ WRITERS: dict[str, Writer] = {
 }
 
 
-def parse(folder: Path) -> Scene:
+def parse(folder: Path) -> ParsedScene:
     return parse_scene(folder, 1, None)
 
 
@@ -54,7 +54,7 @@ def named(template: str, count: int = 3) -> Capture:
     return Capture(tuple(template.format(k) for k in range(count)), capture.poses, capture.points)
 
 
-def expect(scene: Scene, capture: Capture, kept: list[int] | None = None, folder: Path | None = None) -> None:
+def expect(scene: ParsedScene, capture: Capture, kept: list[int] | None = None, folder: Path | None = None) -> None:
     """The scene has these views of the capture, with their poses, and the pixels that were written for them."""
     kept = list(range(len(capture.names))) if kept is None else kept
     assert np.allclose(scene.cameras.pose.numpy(), capture.poses[kept], atol=1e-9)

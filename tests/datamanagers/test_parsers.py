@@ -41,7 +41,7 @@ from fprf.datamanagers.parsers.config import (
     parse_scene,
     recognise,
 )
-from fprf.datamanagers.scene import Scene
+from fprf.datamanagers.scene import ParsedScene
 from fprf.errors import ConfigError, DataError
 from fprf.rendering.lens import FISHEYE, OPENCV, PINHOLE
 
@@ -64,7 +64,7 @@ FORMATS: dict[str, tuple[DataParserConfig, Writer]] = {
 }
 
 
-def parse(folder: Path, config: DataParserConfig | None = None) -> Scene:
+def parse(folder: Path, config: DataParserConfig | None = None) -> ParsedScene:
     return parse_scene(folder, 1, config)
 
 

@@ -18,14 +18,14 @@ from fprf.datamanagers.parsers.config import (
     parse_scene,
     recognise,
 )
-from fprf.datamanagers.scene import Scene
+from fprf.datamanagers.scene import ParsedScene
 from fprf.errors import DataError
 from fprf.interfaces import DataParser
 from fprf.rendering.cameras import project, rays_through
 from fprf.testing import check_parser
 
 
-def assert_same(one: Scene, other: Scene) -> None:
+def assert_same(one: ParsedScene, other: ParsedScene) -> None:
     """The same views, and rays through the same shares of their images, whose sizes may differ."""
     assert [path.stem for path in one.paths] == [path.stem for path in other.paths]
     assert torch.equal(one.train, other.train) and torch.equal(one.test, other.test)
@@ -157,7 +157,7 @@ class Parser(DataParser):
     def __init__(self, wrong: str) -> None:
         self.wrong, self.calls = wrong, 0
 
-    def parse(self, data: Path, downscale: int) -> Scene:
+    def parse(self, data: Path, downscale: int) -> ParsedScene:
         self.calls += 1
         if self.wrong == "absent" and not data.exists():
             raise FileNotFoundError(data)

@@ -86,6 +86,7 @@ def test_any_config_survives_json_text(leaf: Leaf) -> None:
         ({"either": "x"}, "config.either: expected a whole number, found"),
         ({"wholes": 3}, "config: Leaf has no field 'wholes'; did you mean 'whole'?"),
         ({"encoder": {}}, 'config.encoder: expected the plug-in\'s name as "type", found None'),
+        ({"encoder": {"type": [[0] * 999]}}, 'name as "type", found [[' + 18 * "0, " + "0..."),
         ({"encoder": {"type": "random", "chanels": 3}}, "config.encoder: RandomConfig has no field 'chanels'; did you mean"),
         ({"encoder": {"type": "random", "channels": 0}}, "config.encoder: channels: 0 must be at least 1"),
         ([], "config: expected an object, found []"),

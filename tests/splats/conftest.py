@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.town.write import write_town
 from fprf.datamanagers.parsers.config import parse_scene
-from fprf.datamanagers.scene import Scene
+from fprf.datamanagers.scene import ParsedScene
 from fprf.splats.config import GaussiansConfig
 
 
@@ -22,7 +22,7 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> GaussiansConfig:
 
 
 @pytest.fixture(scope="session")
-def scene(config: GaussiansConfig) -> Scene:
+def scene(config: GaussiansConfig) -> ParsedScene:
     return parse_scene(config.data, 1, None)
 
 

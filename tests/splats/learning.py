@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from fprf.datamanagers.images import load_images
-from fprf.datamanagers.scene import Scene
+from fprf.datamanagers.scene import ParsedScene
 from fprf.evaluation.metrics import psnr
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.learner import GaussianLearner
@@ -21,7 +21,7 @@ def stepped(learner: GaussianLearner, begin: int = 0, end: int = STEPS) -> Gauss
     return learner
 
 
-def quality(found: Gaussians, scene: Scene) -> float:
+def quality(found: Gaussians, scene: ParsedScene) -> float:
     """Mean PSNR of the held-out views, drawn by the CPU's kernels."""
     images = load_images(scene)
     drawn = {view: draw(found, camera_of(scene.cameras, view), antialiased=True).image for view in scene.test.tolist()}

@@ -18,7 +18,7 @@ import fprf
 from fprf.cli.main import main
 from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers.config import parse_scene
-from fprf.datamanagers.scene import Scene
+from fprf.datamanagers.scene import ParsedScene
 from fprf.interfaces import State
 from fprf.io.images import write_image
 from fprf.ops.rasterise.rendering import lift
@@ -39,7 +39,7 @@ from fprf.training.camera_optimizers import Tones, moved_cameras
 from fprf.training.loading import open_run
 
 
-def test_it_goes_on_bit_for_bit(config: GaussiansConfig, scene: Scene) -> None:
+def test_it_goes_on_bit_for_bit(config: GaussiansConfig, scene: ParsedScene) -> None:
     asked = replace(config, tones=True, poses=1e-3)
     half, whole, again = (build(asked, scene) for _ in range(3))
     again.load(stepped(half, 0, 30).state())
@@ -54,7 +54,7 @@ SECOND: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("name", SECOND)
-def test_every_field_changes_something(config: GaussiansConfig, scene: Scene, tmp_path: Path, name: str) -> None:
+def test_every_field_changes_something(config: GaussiansConfig, scene: ParsedScene, tmp_path: Path, name: str) -> None:
     if name == "masks":
         width, height = scene.cameras.size[0].tolist()
         write_image(tmp_path / "mask.png", np.zeros((height, width, 3), np.uint8))
@@ -64,7 +64,7 @@ def test_every_field_changes_something(config: GaussiansConfig, scene: Scene, tm
     assert not equal(first.gaussians(), second.gaussians())
 
 
-def test_a_view_without_numbers_changes_nothing(config: GaussiansConfig, scene: Scene) -> None:
+def test_a_view_without_numbers_changes_nothing(config: GaussiansConfig, scene: ParsedScene) -> None:
     learner = build(config, scene)
     before = learner.gaussians()
     for photograph in learner.levels[1].values():
@@ -73,7 +73,7 @@ def test_a_view_without_numbers_changes_nothing(config: GaussiansConfig, scene: 
     assert learner.figures()[2:5] == (1, 1, "the loss") and equal(learner.gaussians(), before)
 
 
-def test_colours_that_no_view_shows_fall_back_to_their_mean(config: GaussiansConfig, scene: Scene) -> None:
+def test_colours_that_no_view_shows_fall_back_to_their_mean(config: GaussiansConfig, scene: ParsedScene) -> None:
     """Else a Gaussian could have any colour from where it was not photographed, and a style would bring that into view."""
     learner = build(config, scene)
     start = learner.gaussians()
@@ -85,7 +85,7 @@ def test_colours_that_no_view_shows_fall_back_to_their_mean(config: GaussiansCon
     assert float(after[:, 1:].min()) == float(after[:, 1:].max()) == pytest.approx(math.exp(-0.06 * 3.96), abs=0.01)
 
 
-def test_a_gaussian_learns_alike_however_late_it_is_seen(config: GaussiansConfig, scene: Scene) -> None:
+def test_a_gaussian_learns_alike_however_late_it_is_seen(config: GaussiansConfig, scene: ParsedScene) -> None:
     """Two views in opposite directions: what the second one shows moves as if nothing had been learnt before."""
     pose = scene.cameras.pose[0].clone()
     back = pose * torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=pose.dtype)
@@ -112,7 +112,7 @@ def test_a_gaussian_learns_alike_however_late_it_is_seen(config: GaussiansConfig
     assert torch.equal(learnt([0] * 40 + [1] * 3), alone)
 
 
-def test_an_exposure_learns_alike_however_rarely_its_view_is_seen(config: GaussiansConfig, scene: Scene) -> None:
+def test_an_exposure_learns_alike_however_rarely_its_view_is_seen(config: GaussiansConfig, scene: ParsedScene) -> None:
     """Nothing lies in view, so a render is the background times the factor; all photographs but one are of that colour."""
     many = 40
     same = replace(scene, cameras=scene.cameras.select(torch.zeros(many, dtype=torch.int64)), train=torch.arange(many))
@@ -137,7 +137,7 @@ def test_an_exposure_learns_alike_however_rarely_its_view_is_seen(config: Gaussi
     torch.testing.assert_close(rarely[0], often[0], rtol=0.1, atol=0)  # apart by the mean of all, which stays
 
 
-def test_tones_are_told_from_the_scene(config: GaussiansConfig, scene: Scene) -> None:
+def test_tones_are_told_from_the_scene(config: GaussiansConfig, scene: ParsedScene) -> None:
     """Photographs that were taken darker or warmer: factors are found up to their mean."""
     asked = replace(config, tones=True, ssim=0.0)  # what SSIM keeps of the targets would be that of the others
     learner = build(asked, scene)
@@ -154,7 +154,7 @@ def test_tones_are_told_from_the_scene(config: GaussiansConfig, scene: Scene) ->
     assert float((found - true).square().mean()) < 0.75 * float(true.square().mean())
 
 
-def test_poses_that_are_off_are_found(config: GaussiansConfig, scene: Scene) -> None:
+def test_poses_that_are_off_are_found(config: GaussiansConfig, scene: ParsedScene) -> None:
     """Training views were turned by three degrees: refined, they come back, up to what turns all of them alike."""
     draw = torch.Generator().manual_seed(0)
     turn = math.radians(3) * torch.nn.functional.normalize(torch.randn(len(scene.paths), 3, generator=draw).double(), dim=1)
@@ -174,7 +174,7 @@ def test_poses_that_are_off_are_found(config: GaussiansConfig, scene: Scene) -> 
     assert error(found) < 0.6 * error(off.cameras)
 
 
-def test_nothing_floats_before_a_sky_that_is_masked(config: GaussiansConfig, scene: Scene, tmp_path: Path) -> None:
+def test_nothing_floats_before_a_sky_that_is_masked(config: GaussiansConfig, scene: ParsedScene, tmp_path: Path) -> None:
     above = np.zeros((24, 32, 3), np.uint8)
     above[:8] = 255
     write_image(tmp_path / "sky.png", above)
@@ -330,7 +330,7 @@ def test_what_gaussians_do_not_know_is_refused_in_one_line(
     assert len([text for text in told if text.startswith("error: ")]) == 1
 
 
-def after_a_step_of_wide_ones(config: GaussiansConfig, scene: Scene, restored: bool = False) -> tuple[Tensor, Tensor]:
+def after_a_step_of_wide_ones(config: GaussiansConfig, scene: ParsedScene, restored: bool = False) -> tuple[Tensor, Tensor]:
     """Means of the first Gaussians, and their widths after a step that begins with 3000 times as wide ones."""
     learner = build(config, scene)
     before = learner.gaussians()
@@ -344,7 +344,7 @@ def after_a_step_of_wide_ones(config: GaussiansConfig, scene: Scene, restored: b
 
 
 @pytest.mark.parametrize("restored", [False, True])
-def test_surroundings_do_not_reach_the_cameras(config: GaussiansConfig, scene: Scene, restored: bool) -> None:
+def test_surroundings_do_not_reach_the_cameras(config: GaussiansConfig, scene: ParsedScene, restored: bool) -> None:
     """However wide one becomes, it is cut to a fifth of its distance: from beside, it would be drawn before the scene."""
     before, widths = after_a_step_of_wide_ones(config, scene, restored)
     distance = before.norm(dim=1, keepdim=True)
@@ -353,14 +353,14 @@ def test_surroundings_do_not_reach_the_cameras(config: GaussiansConfig, scene: S
 
 
 @pytest.mark.parametrize(("cells", "share"), [(1, 0.5), (2, 0.25)])
-def test_nothing_covers_a_camera(config: GaussiansConfig, scene: Scene, cells: int, share: float) -> None:
+def test_nothing_covers_a_camera(config: GaussiansConfig, scene: ParsedScene, cells: int, share: float) -> None:
     before, widths = after_a_step_of_wide_ones(replace(config, cells=cells, surroundings=0), scene)
     near = torch.cdist(before, scene.cameras.pose[scene.train][:, :, 3].float()).amin(1)[:, None]
     assert (widths <= 1.04 * share * near).all() and (widths > 0.8 * share * near).any()
 
 
 @pytest.mark.parametrize("spread", [0.1, 3.0, 100.0])
-def test_the_nearest_of_many_cameras_is_found(scene: Scene, spread: float) -> None:
+def test_the_nearest_of_many_cameras_is_found(scene: ParsedScene, spread: float) -> None:
     draws = torch.Generator().manual_seed(0)
     cameras = scene.cameras.select(torch.zeros(400, dtype=torch.int64))
     centre = 10 * torch.randn(400, 3, generator=draws, dtype=torch.float64)
@@ -377,7 +377,7 @@ def test_the_nearest_of_many_cameras_is_found(scene: Scene, spread: float) -> No
     assert ((torch.from_numpy(widest).double().exp() / 0.25 - apart).abs() <= allowed).all()
 
 
-def test_blurred_views_are_shown_in_every_eighth_epoch_alone(config: GaussiansConfig, scene: Scene) -> None:
+def test_blurred_views_are_shown_in_every_eighth_epoch_alone(config: GaussiansConfig, scene: ParsedScene) -> None:
     images = {view: np.zeros((24, 32, 3), np.uint8) for view in scene.train.tolist()}
     level = photographs.make_levels(scene, images, {}, 0.01)[0]
     views = len(level)

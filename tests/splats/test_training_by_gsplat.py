@@ -13,7 +13,7 @@ from pretend_cuda import CUDA, pretend_cuda
 from splat_ball import equal
 
 from fprf.cli.main import main
-from fprf.datamanagers.scene import Scene
+from fprf.datamanagers.scene import ParsedScene
 from fprf.ops.rasterise.gsplat import GsplatGaussians
 from fprf.splats import plan
 from fprf.splats.config import GaussiansConfig
@@ -30,7 +30,7 @@ def by_gsplat(learner: GaussianLearner) -> GaussianLearner:
     return learner
 
 
-def test_it_learns_what_the_kernels_of_the_cpu_learn(config: GaussiansConfig, scene: Scene) -> None:
+def test_it_learns_what_the_kernels_of_the_cpu_learn(config: GaussiansConfig, scene: ParsedScene) -> None:
     """Rounding grows over steps of Adam and splits by chance: over three seeds they came out 0.12 dB apart at most."""
     asked = replace(config, tones=True, poses=1e-4)
     start = build(asked, scene)
@@ -42,7 +42,7 @@ def test_it_learns_what_the_kernels_of_the_cpu_learn(config: GaussiansConfig, sc
     assert quality(learner.gaussians(), scene) == pytest.approx(ours, abs=0.3)
 
 
-def test_the_device_gives_what_the_cpu_gives_with_one_wait_a_step(config: GaussiansConfig, scene: Scene) -> None:
+def test_the_device_gives_what_the_cpu_gives_with_one_wait_a_step(config: GaussiansConfig, scene: ParsedScene) -> None:
     """Bit for bit: both are torch here. Widths are limited every tenth step, and Gaussians moved every twentieth."""
     asked, waits, uploads = replace(config, tones=True, poses=1e-4), {}, {}
     part, end = (205, 225), 230

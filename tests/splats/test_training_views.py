@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from fprf.datamanagers.images import load_images
-from fprf.datamanagers.scene import Scene
+from fprf.datamanagers.scene import ParsedScene
 from fprf.rendering.cameras import Cameras, ideal_cameras, project
 from fprf.rendering.paths import pinhole
 from fprf.splats import initial, photographs
@@ -34,20 +34,20 @@ def test_matches_between_views_give_points_on_the_surface() -> None:
     u, v = ((along * 3 / focal) * 100 + 240 for along in (x, y))
     images = {view: texture[v.astype(int), (u + 100 * float(pose[view, 0, 3])).astype(int)] for view in range(count)}
     train = torch.arange(count)
-    scene = Scene(name="plane", paths=(Path("a"),) * count, cameras=cameras, train=train, test=train[:0])
+    scene = ParsedScene(name="plane", paths=(Path("a"),) * count, cameras=cameras, train=train, test=train[:0])
     found, origin = initial_points(scene, images, 1000, draws)
     assert origin == "points matched between views" and len(found.position) > 100
     assert np.median(np.abs(found.position[:, 2])) < 0.03
 
 
-def test_points_begin_where_there_are_none(scene: Scene) -> None:
+def test_points_begin_where_there_are_none(scene: ParsedScene) -> None:
     bare = replace(scene, points=None, seen=None)
     found, origin = initial_points(bare, dict(enumerate(load_images(bare))), 500, np.random.default_rng(0))
     assert origin == "random points" and len(found.position) == 500 and np.isfinite(found.position).all()
     assert found.colour.min() >= 0 and found.colour.max() <= 1
 
 
-def test_a_lens_moves_pixels_where_projection_says(scene: Scene) -> None:
+def test_a_lens_moves_pixels_where_projection_says(scene: ParsedScene) -> None:
     """A dot drawn through `cover` and `distorted` lies where the lens maps its place; `undistorted` brings it back."""
     distortion = torch.zeros(len(scene.paths), 6, dtype=torch.float64)
     distortion[:, 0] = -0.2
@@ -77,7 +77,7 @@ def test_a_lens_moves_pixels_where_projection_says(scene: Scene) -> None:
     assert (middle(torch.from_numpy(back).float()) - straight[0]).norm() < 0.15
 
 
-def test_surroundings_fill_what_no_photograph_shows(scene: Scene) -> None:
+def test_surroundings_fill_what_no_photograph_shows(scene: ParsedScene) -> None:
     """All directions have a Gaussian far away: grey photographs give grey surroundings, in and out of view."""
     images = {view: np.full((24, 32, 3), 102, np.uint8) for view in scene.train.tolist()}
     points = initial.Points(np.zeros((1, 3)), np.zeros((1, 3), np.float32))
@@ -88,7 +88,7 @@ def test_surroundings_fill_what_no_photograph_shows(scene: Scene) -> None:
     assert (np.linalg.norm(far.position - centre, axis=1) > 5 * np.linalg.norm(centre)).all()
 
 
-def test_means_move_by_what_views_see_not_by_how_far_apart_they_are(scene: Scene) -> None:
+def test_means_move_by_what_views_see_not_by_how_far_apart_they_are(scene: ParsedScene) -> None:
     """Two copies of a scene far from each other are learnt at the rate of one."""
     apart = torch.tensor([1000.0, 0.0, 0.0], dtype=torch.float64)
     pose = scene.cameras.pose

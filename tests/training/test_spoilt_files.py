@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from benchmarks.town.write import write_town
 from fprf.blocks.partition import write_cells
 from fprf.datamanagers.parsers.config import parse_scene
-from fprf.datamanagers.scene import Scene
+from fprf.datamanagers.scene import ParsedScene
 from fprf.errors import CheckpointError, FprfError
 from fprf.io import tensorfiles
 from fprf.io.atomic import write_json
@@ -43,7 +43,7 @@ class Example:
     """A run in blocks and in cells at once, with the least that its files may hold."""
 
     root: Path
-    scene: Scene
+    scene: ParsedScene
     content: dict[Path, bytes]
 
     @property

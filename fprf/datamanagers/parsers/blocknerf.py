@@ -36,7 +36,7 @@ from ...interfaces import DataParser
 from ...io.atomic import atomic_path, write_json
 from ...rendering.lens import OPENCV
 from ..images import opened
-from ..scene import Scene
+from ..scene import ParsedScene
 from .config import BlockNerfConfig, is_record
 from .views import View, assemble_scene, read_views, rigid_pose, split_by
 
@@ -247,7 +247,7 @@ class BlockNerfParser(DataParser):
     def __init__(self, config: BlockNerfConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: float) -> Scene:
+    def parse(self, data: Path, downscale: float) -> ParsedScene:
         """The scene at 1/downscale of the stored size. Raises DataError naming file and record."""
         files = sorted(path for path in data.rglob("*") if is_record(path.name) and path.is_file())
         if not files:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ...errors import DataError
 from ...interfaces import DataParser
 from ...rendering.splines import rotations
-from ..scene import Scene
+from ..scene import ParsedScene
 from .config import ColmapConfig, model_folders
 from .files import NamedFiles, path_inside, read_bytes, read_float, read_npz, read_ply_points
 from .views import View, assemble_scene, index_tensor, lens_of, pixel_size, quaternion_rotation, read_views, rigid_pose
@@ -374,7 +374,7 @@ class ColmapParser(DataParser):
     def __init__(self, config: ColmapConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: float, roles: Mapping[str, str] | None = None) -> Scene:
+    def parse(self, data: Path, downscale: float, roles: Mapping[str, str] | None = None) -> ParsedScene:
         """The scene at 1/downscale of the size of the images in the chosen folder.
 
         Of `roles`, train or test by file name, images without one are left out; else every 8th is for testing.

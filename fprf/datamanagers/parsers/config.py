@@ -19,7 +19,7 @@ from ...plugins.config import PluginConfig
 
 if TYPE_CHECKING:
     from ...interfaces import DataParser
-    from ..scene import Scene
+    from ..scene import ParsedScene
 
 
 ODM_FILES = "opensfm/reconstruction.json", "odm_report/shots.geojson"
@@ -308,10 +308,10 @@ def recognise(data: Path) -> DataParserConfig:
     )
 
 
-def parse_scene(data: Path, downscale: float, parser: DataParserConfig | None) -> Scene:
+def parse_scene(data: Path, downscale: float, parser: DataParserConfig | None) -> ParsedScene:
     """The scene of a folder at 1/downscale of its size, by the parser that is named or, without one, recognised.
 
-    Where the capture lies far from 0 the scene is in a local frame, whatever the parser (`Scene.origin`).
+    Where the capture lies far from 0 the scene is in a local frame, whatever the parser (`ParsedScene.origin`).
     """
     from ..scene import in_local_frame
 

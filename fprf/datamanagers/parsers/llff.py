@@ -13,7 +13,7 @@ import numpy as np
 from ...errors import DataError
 from ...interfaces import DataParser
 from ..images import image_names
-from ..scene import Scene
+from ..scene import ParsedScene
 from .colmap import cloud_of_model
 from .config import LlffConfig
 from .files import path_inside, read_bytes, read_npy
@@ -26,7 +26,7 @@ class LlffParser(DataParser):
     def __init__(self, config: LlffConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: float) -> Scene:
+    def parse(self, data: Path, downscale: float) -> ParsedScene:
         """The scene at 1/downscale of the images in the chosen folder, whatever size the poses were estimated at."""
         file = data / "poses_bounds.npy"
         rows = read_npy(str(file), read_bytes(file))

@@ -12,7 +12,7 @@ import torch
 from ...errors import DataError
 from ...interfaces import DataParser
 from ..images import IMAGE_SUFFIXES
-from ..scene import Scene
+from ..scene import ParsedScene
 from .views import View, assemble_scene, read_views, rigid_pose, split_by, stated_size
 
 _LARGEST = 1 << 24
@@ -22,7 +22,7 @@ _LARGEST = 1 << 24
 class MegaNerfParser(DataParser):
     """`train` and `val` folders."""
 
-    def parse(self, data: Path, downscale: float) -> Scene:
+    def parse(self, data: Path, downscale: float) -> ParsedScene:
         """The scene at 1/downscale of the delivered size; `val` is held out. Lengths are metres where the capture says."""
         # Metres of a unit of the poses; 1 where nothing is said.
         unit, path = 1.0, data / "coordinates.pt"

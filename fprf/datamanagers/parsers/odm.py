@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...interfaces import DataParser
-from ..scene import Scene
+from ..scene import ParsedScene
 from .config import ODM_FILES, OdmConfig, project_file
 from .files import NamedFiles, Record, as_record, path_inside, read_json
 from .views import View, assemble_scene, image_size, lens_of, read_views, rigid_pose
@@ -46,7 +46,7 @@ class OdmParser(DataParser):
     def __init__(self, config: OdmConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: float) -> Scene:
+    def parse(self, data: Path, downscale: float) -> ParsedScene:
         """The scene at 1/downscale of its photographs, with the reconstruction's points where they are there."""
         file = project_file(data)
         if file is None:

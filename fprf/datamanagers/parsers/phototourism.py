@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ...errors import DataError
 from ...interfaces import DataParser
-from ..scene import Scene
+from ..scene import ParsedScene
 from .colmap import ColmapParser
 from .config import ColmapConfig, PhotoTourismConfig, model_folders
 from .files import name_of
@@ -22,7 +22,7 @@ class PhotoTourismParser(DataParser):
     def __init__(self, config: PhotoTourismConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: float) -> Scene:
+    def parse(self, data: Path, downscale: float) -> ParsedScene:
         """The listed photographs. Raises DataError where the table names none of the model's."""
         # The table says which photographs are used; their poses are those of the model beside it.
         tables = [data / self.config.list] if self.config.list else sorted(data.glob("[!.]*.tsv"))

@@ -13,7 +13,7 @@ import numpy as np
 from ...errors import DataError
 from ...interfaces import DataParser
 from ..images import IMAGE_SUFFIXES
-from ..scene import Scene
+from ..scene import ParsedScene
 from .config import keyframes
 from .files import as_record, read_json
 from .views import View, assemble_scene, read_views, rigid_pose, stated_size
@@ -22,7 +22,7 @@ from .views import View, assemble_scene, read_views, rigid_pose, stated_size
 class PolycamParser(DataParser):
     """`keyframes/` of a raw export."""
 
-    def parse(self, data: Path, downscale: float) -> Scene:
+    def parse(self, data: Path, downscale: float) -> ParsedScene:
         """The scene at 1/downscale of its images."""
         folders = keyframes(data)
         if not folders:

@@ -13,7 +13,7 @@ import numpy as np
 from ...errors import DataError
 from ...interfaces import DataParser
 from ..images import image_names
-from ..scene import Scene
+from ..scene import ParsedScene
 from .config import Record3DConfig, recording
 from .files import as_record, read_json
 from .views import View, assemble_scene, quaternion_rotation, read_views, rigid_pose, stated_size
@@ -27,7 +27,7 @@ class Record3DParser(DataParser):
     def __init__(self, config: Record3DConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: float) -> Scene:
+    def parse(self, data: Path, downscale: float) -> ParsedScene:
         """The scene at 1/downscale of its images: at most `frames` of them, evenly through the recording."""
         files = recording(data)
         if files is None:

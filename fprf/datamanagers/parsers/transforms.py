@@ -20,7 +20,7 @@ from torch import Tensor
 from ...errors import DataError
 from ...interfaces import DataParser
 from ..images import IMAGE_SUFFIXES
-from ..scene import Scene
+from ..scene import ParsedScene
 from .colmap import cloud_of_model, read_cloud
 from .config import TransformsConfig
 from .files import NamedFiles, Record, as_record, path_inside, read_json, read_ply_points
@@ -50,7 +50,7 @@ class TransformsParser(DataParser):
     def __init__(self, config: TransformsConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: float) -> Scene:
+    def parse(self, data: Path, downscale: float) -> ParsedScene:
         """The scene at 1/downscale of the size that the file's intrinsics belong to."""
         # The frames of all files, by name.
         files = self._files(data)
@@ -94,7 +94,7 @@ class TransformsParser(DataParser):
 class GardenParser(DataParser):
     """Reads the scene that ships with the package, whatever folder is named."""
 
-    def parse(self, data: Path, downscale: float) -> Scene:
+    def parse(self, data: Path, downscale: float) -> ParsedScene:
         return TransformsParser(TransformsConfig()).parse(Path(str(resources.files("fprf") / "garden")), downscale)
 
 

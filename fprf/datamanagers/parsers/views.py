@@ -1,4 +1,4 @@
-"""From what a capture says of each view to a `Scene`: poses made exact, sizes and images checked against files, masks found.
+"""From what a capture says of each view to a `ParsedScene`: exact poses, sizes and images checked against files, masks.
 
 `masks/` says what is used (black is left out: people, cars, the capture's own shadow), `sky_masks/` what is sky (white). A mask
 of images/a/0001.jpg is masks/a/0001.jpg.png (as COLMAP has it), masks/a/0001.png or masks/a/0001.jpg. Images without one are
@@ -22,7 +22,7 @@ from ...rendering.cameras import Cameras
 from ...rendering.lens import FISHEYE, OPENCV, PINHOLE
 from ...rendering.splines import rotations
 from ..images import has_transparency, read_header
-from ..scene import Scene
+from ..scene import ParsedScene
 from .files import name_of
 
 
@@ -228,7 +228,7 @@ def assemble_scene(
     seen: NDArray[np.int64] | None = None,
     reduced: bool = False,
     notes: Sequence[str] = (),
-) -> Scene:
+) -> ParsedScene:
     """The scene of at least one view, in the given order; without a split every 8th view is held out.
 
     The files' headers are read: their size must be the camera's, unless `reduced` says that the image folder holds
@@ -262,7 +262,7 @@ def assemble_scene(
     # Every 8th, from the first on, is for testing (LLFF); but a single view is for training: there must be something to learn.
     held = [k % 8 == 0 and len(views) > 1 for k in range(len(views))]
     train, test = split or (index_tensor([not each for each in held]), index_tensor(held))
-    return Scene(
+    return ParsedScene(
         name=name_of(data),
         paths=tuple(view.path for view in views),
         cameras=delivered.scaled(downscale) if downscale != 1 else delivered,
