@@ -22,8 +22,9 @@ contract in `fprf.testing` checks an implementation, and fails with one sentence
 
     a stylizer           its config in `fprf/plugins/stylizers/config.py`, its class in a file beside; group fprf.stylizers
     a file format        one file in `fprf/splats/files`, a `CaptureFormat`; group fprf.captures
-    a kind of scene      a `RunConfig` (`fprf/config.py`) whose `build` gives a SceneLearner, and a function that opens its
-                         runs, as `open_fields` of `fprf/training/loading.py` does; groups fprf.methods and fprf.scenes
+    a kind of scene      a `RunConfig` (`fprf/config.py`) whose `build` gives a SceneLearner, which makes a Scene with its
+                         SceneViews, and a function that opens its runs, as `open_fields` of `fprf/training/loading.py`
+                         does; groups fprf.methods and fprf.scenes. `tests/test_scene_plugin.py` is a whole one
 
 and an entry point in the named group of `pyproject.toml`, where each group has a line that says the same.
 

@@ -1,1 +1,1 @@
-"""Fields of a scene: planes, content, semantics, layouts of blocks."""
+"""Fields of a scene: planes, content, semantics."""

@@ -32,7 +32,7 @@ _ALIKE = 0.05
 class SceneStyle(NamedTuple):
     """Statistics of the per-point content features, weighted by rendering weight, over the training views.
 
-    Regions are clusters of the scene's own semantics (design: two-sided dictionary). A scene without semantics has one
+    Regions are clusters of the scene's own semantics. A scene without semantics has one
     region and D = 0.
     """
 

@@ -1,4 +1,4 @@
-"""One exact pass over the trained scene: the statistics and regions that every style builds on (design: statistics in kind).
+"""One exact pass over the trained scene: the statistics and regions that every style builds on.
 A second one over pairs of neighbouring pixels tells which regions meet without an edge of colour between them.
 
 Features are those of the very samples that the renderer keeps, weighted by their rendering weights, on a fixed lattice of

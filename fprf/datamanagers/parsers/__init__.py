@@ -1,1 +1,1 @@
-"""One capture format a file."""
+"""Parsers of scene folders, photographs with poses: one format a file."""

@@ -71,7 +71,7 @@ def project_file(data: Path) -> Path | None:
 
 @dataclass(frozen=True, kw_only=True)
 class DataParserConfig(PluginConfig):
-    """Reads one capture format."""
+    """Reads one format of scene folders."""
 
     group: ClassVar[str] = "fprf.dataparsers"
 
