@@ -64,8 +64,7 @@ KINDS = {
     "glb": "mesh.glb and mesh.ply with vertex colours",
     "cameras": "transforms.json of Nerfstudio",
 }
-"""Kinds of files but those of Gaussians, whose kinds are the formats that are installed. `glb` means the mesh, `gltf` Gaussians.
-"""
+"""Kinds of files but those of Gaussians, which are the formats installed. `glb` means the mesh, `gltf` Gaussians."""
 FIT_MINUTES = 4.0
 _DEFAULT = ("ply", "splat", "glb", "cameras")
 _ENDINGS = {".glb": "glb", ".json": "cameras"}
