@@ -19,6 +19,7 @@ from torch import Tensor
 
 from ..datamanagers.images import Image, load_images, load_mask
 from ..datamanagers.scene import ParsedScene
+from ..memory import free_memory
 from ..ops.photometric import WINDOW
 from ..ops.rasterise.gsplat import target_on, usable
 from ..ops.rasterise.rendering import Pinhole
@@ -32,8 +33,9 @@ _WIDEST = 4.0
 """Tangent of the widest angle that a pinhole shows: 76 degrees."""
 _SHARPEST = cv2.INTER_LANCZOS4
 """Out of its lens and back into it a photograph of 135 x 240 pixels comes with 43 dB; by cubic interpolation with 40."""
-_KEPT = 1 << 31
-"""Bytes of photographs in the rasteriser's layout, some ten times as large as 8-bit pixels, that are kept between steps."""
+_KEPT, _KEPT_THERE = 1 << 31, 0.3
+"""Bytes of photographs in the rasteriser's layout, some ten times as large as 8-bit pixels, that are kept between steps; share
+of a CUDA device's free memory that they may take there."""
 _DULL = 0.5
 """Share of the usual ratio below which a photograph counts as blurred."""
 _BESIDE = 8
@@ -65,13 +67,15 @@ class _View(NamedTuple):
 class _Kept(OrderedDict[tuple[int, int], Target]):
     """Targets by scale and view, the least recently used first; all scales of a scene share it."""
 
-    bytes = 0
+    def __init__(self, room: int) -> None:
+        super().__init__()
+        self.room, self.bytes = room, 0
 
     def add(self, key: tuple[int, int], target: Target) -> None:
         """Keep a target; where there is no room, those go that were used longest ago."""
         self[key] = target
         self.bytes += _bytes(target)
-        while self.bytes > _KEPT and len(self) > 1:
+        while self.bytes > self.room and len(self) > 1:
             self.bytes -= _bytes(self.popitem(last=False)[1])
 
 
@@ -246,7 +250,10 @@ def make_levels(
         mask, sky = straightened(masks, view), straightened(skies or {}, view)
         pixels[view] = _View(camera, image, mask if valid is None else valid if mask is None else valid & mask, sky)
     blurred = blurred_views(scene.cameras, {view: images[view] for view in cameras}, count)
-    kept, make = _Kept(), partial(target_on, device) if device is not None and usable(device) else target_of
+    if device is None or not usable(device):
+        kept, make = _Kept(_KEPT), target_of
+    else:
+        kept, make = _Kept(int(_KEPT_THERE * (free_memory(device) or 0))), partial(target_on, device)
     return [_Scaled(pixels, k, kept, blurred[k], make) for k in range(count)]
 
 
