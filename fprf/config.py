@@ -170,7 +170,7 @@ class StatisticsConfig:
     rays: int = 65536
     """Rays, spread evenly over the training views."""
     regions: int = 16
-    """ParsedScene codes: clusters of the scene's own semantics."""
+    """Scene codes: clusters of the scene's own semantics."""
 
     def __post_init__(self) -> None:
         at_least("statistics.rays", self.rays, 64)
@@ -201,7 +201,7 @@ class RunConfig:
     """Fields whose value may be None, which `planned` decides before a run begins."""
 
     data: Path | None = None
-    """ParsedScene folder, which must be named; `garden` is the embedded one."""
+    """Scene folder, which must be named; `garden` is the embedded one."""
     output: Path | None = None
     """Run folder; by default runs/SCENE-METHOD. A folder with a run in it is resumed."""
     downscale: int | float | None = None
@@ -354,7 +354,7 @@ class TrainConfig(RunConfig):
     render: RenderConfig = RenderConfig()
     """Rendering and skipping."""
     statistics: StatisticsConfig = StatisticsConfig()
-    """ParsedScene statistics for styling."""
+    """Scene statistics for styling."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

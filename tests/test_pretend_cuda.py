@@ -69,6 +69,6 @@ def test_convolutions_are_in_tf32_unless_told_otherwise() -> None:
     with pretend_cuda():
         there = x.to(CUDA)
         assert float(F.conv2d(there, there)) == 1
-        with float32_convolutions():
+        with float32_convolutions(CUDA):
             assert float(F.conv2d(there, there)) == float(x * x)
     assert float(F.conv2d(x, x)) == float(x * x)

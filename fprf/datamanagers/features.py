@@ -264,8 +264,9 @@ def _device(encoder: Encoder) -> torch.device:
 @torch.no_grad()
 def _encode(encoder: Encoder, pixels: Annotated[Tensor, "H W 3"], view: int) -> Annotated[Tensor, "C h w"]:
     image = (pixels.float() / 255).permute(2, 0, 1)[None]
-    with float32_convolutions():
-        features: Tensor = encoder(image.to(_device(encoder)))
+    device = _device(encoder)
+    with float32_convolutions(device):
+        features: Tensor = encoder(image.to(device))
     # An encoder may be a stranger's: its mistakes are told here, not met as a strange scene.
     if features.ndim != 4 or features.shape[:2] != (1, encoder.channels) or not features.numel():
         raise PluginError(

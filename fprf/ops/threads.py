@@ -27,9 +27,9 @@ from numba.extending import intrinsic
 
 
 @cache
-def _sources() -> str:
+def sources(folder: Path = Path(__file__).parent) -> str:
     """Hash of the text that kernels are compiled from."""
-    texts = (file.read_bytes() for file in sorted(Path(__file__).parent.rglob("*.py")))
+    texts = (file.read_bytes() for file in sorted(folder.rglob("*.py")))
     return hashlib.sha256(b"".join(text for text in texts if b"\nimport torch" not in text)).hexdigest()
 
 
@@ -40,7 +40,7 @@ def cached_jit(**options: Any) -> Callable[[Any], Any]:
         code, enclosed = function.__code__, function.__closure__ or ()
         code = code.replace(co_freevars=(*code.co_freevars, "sources"))
         dated = FunctionType(
-            code, function.__globals__, function.__name__, function.__defaults__, (*enclosed, CellType(_sources()))
+            code, function.__globals__, function.__name__, function.__defaults__, (*enclosed, CellType(sources()))
         )
         dated.__module__, dated.__qualname__, dated.__doc__ = function.__module__, function.__qualname__, function.__doc__
         return numba.njit(cache=True, **options)(dated)

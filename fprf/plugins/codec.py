@@ -155,7 +155,9 @@ def _read(data: Any, hint: Any, path: str, packages: Mapping[str, str]) -> Any:
         for value, meant in allowed.items():
             if type(value) is type(data) and value == data:  # True == 1
                 return meant
-        raise ConfigError(f"{path}: {_shown(repr(data))} is not one of {', '.join(map(repr, allowed))}")
+        raise ConfigError(
+            f"{path}: {_shown(repr(data))} is not one of {', '.join(map(repr, allowed))}; write one of these there"
+        )
     # Plain values.
     if hint is Path:
         return Path(_expect(data, str, path))

@@ -51,7 +51,7 @@ class StyleNetwork(nn.Module):
 
     def forward(self, images: Annotated[Tensor, "B 3 H W"]) -> list[Annotated[Tensor, "B C h w"]]:
         """Activations of sRGB images in [0, 1], at every layer of `layers`."""
-        with float32_convolutions():
+        with float32_convolutions(images.device):
             found = [x for place, x in enumerate(self.encoder.activations(images)) if place in self._places]
         return [x / self.get_buffer(f"unit_{layer}") for x, layer in zip(found, self.layers, strict=True)]
 

@@ -70,7 +70,7 @@ def filtered_at(
     """Features and colours at pixels (row, column)."""
     height, width = photo.shape[:2]
     pixels = pixels.to(photo.device)
-    with float32_convolutions():
+    with float32_convolutions(photo.device):
         features: Tensor = encoder(photo.permute(2, 0, 1)[None])[0]
     # Features are filtered along the photograph's edges, as those of a scene are (guided filter).
     coefs = coefficients(features, photo, radius=_radius(photo), eps=GUIDED.eps, stride=GUIDED.stride)
@@ -92,7 +92,7 @@ def filtered_crop(
 @torch.no_grad()
 def filtered_whole(encoder: Encoder, photo: Annotated[Tensor, "H W 3"]) -> Annotated[Tensor, "N C"]:
     """Features at every pixel, row by row."""
-    with float32_convolutions():
+    with float32_convolutions(photo.device):
         features: Tensor = encoder(photo.permute(2, 0, 1)[None])[0]
     return upsample(features, photo, radius=_radius(photo), eps=GUIDED.eps, stride=GUIDED.stride).flatten(0, 1)
 

@@ -174,7 +174,7 @@ class CellPart(Part):
         tones, device = overview_tones(self.facts, start), device_of(config.device)
         learner = GaussianLearner(
             replace(config, cap=cap, rate=_RATE * config.rate),
-            make_levels(own, images, masks, near, skies),
+            make_levels(own, images, masks, near, skies, device=device),
             scene_scale(own),
             cap,
             cell.around,

@@ -11,7 +11,6 @@ from torch import Tensor
 from ..config import RunConfig
 from ..datamanagers.scene import ParsedScene
 from ..errors import CheckpointError, UsageError
-from ..ops.rasterise.gsplat import usable
 from ..rendering.cameras import Cameras
 from ..training import checkpoint
 from ..training.camera_optimizers import Poses, Tones, moved_cameras
@@ -45,7 +44,7 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
     assert isinstance(config, GaussiansConfig)  # by its kind
     if quality.max_memory:
         raise UsageError("--max-memory: is for runs of fields; leave it out")
-    root, preset, drawn_on = run.root, None if quality.quality is None else PRESETS[quality.quality], device_of(device)
+    root, preset = run.root, None if quality.quality is None else PRESETS[quality.quality]
     merged = None if preset is None else preset.merged
     # Levels of detail were written from what was verified.
     key = "" if merged is None else checkpoint.digest(run.checkpoints)
@@ -115,7 +114,7 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
         poses=fit,
         merged=merged,
         levels=functools.cache(levels),
-        drawn_on=drawn_on if usable(drawn_on) else torch.device("cpu"),
+        asked=device_of(device),
     )
     return LoadedRun(run, run.load_config()[1], known, saved.step, saved.seconds, shown)
 

@@ -103,9 +103,17 @@ def machine_speed() -> float:
 
 def device_speed(device: torch.device) -> Callable[[float], float]:
     """Speed of what trains, for images of so many pixels, relative to the machine of the constants."""
-    if not usable(device):
-        known = machine_speed()
-        return lambda many: known
+    try:
+        if usable(device):
+            return _card_speed(device)
+    except torch.OutOfMemoryError:  # training takes less than these steps
+        pass
+    known = machine_speed()
+    return lambda many: known
+
+
+def _card_speed(device: torch.device) -> Callable[[float], float]:
+    """The same of a CUDA device on which gsplat draws, by some steps there."""
     draw = np.random.default_rng(0)
     # Gaussians before a camera, about as wide as they lie apart.
     rows = 0.1 * draw.standard_normal((_FEWEST, 59), np.float32)

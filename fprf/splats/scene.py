@@ -15,6 +15,7 @@ from torch import Tensor
 from ..datamanagers.basis import Basis
 from ..datamanagers.scene import ParsedScene
 from ..interfaces import Encoder, Scene, SceneView, Values
+from ..ops.rasterise.gsplat import usable
 from ..rendering.cameras import Cameras, pixel_grid
 from ..rendering.renderer import enlarged
 from ..style.dictionary import Encoders
@@ -29,6 +30,7 @@ from .restyle import Colours, restyled_harmonics
 from .semantics import Semantics
 from .views import SeenMeans, draw, seen_means
 
+CPU = torch.device("cpu")
 _ROWS, _CHANNELS = 1 << 14, 128
 """Gaussians whose values are found, and channels that are drawn, at a time: bounds the memory."""
 
@@ -67,8 +69,8 @@ class SplatScene(Scene):
     """Exposures of the views, where a run has learnt them."""
     poses: Callable[[ParsedScene, Sequence[int]], Annotated[Tensor, "V 6"]] | None = None
     """Fits poses of views to their photographs (`fit_poses`); None = there are no photographs."""
-    drawn_on: torch.device = torch.device("cpu")
-    """Where views are drawn: the CPU, or a CUDA device on which gsplat draws."""
+    asked: torch.device = CPU
+    """Where views should be drawn: the CPU, or a CUDA device if gsplat draws there."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -81,7 +83,7 @@ class SplatScene(Scene):
     @property
     def device(self) -> torch.device:
         """The CPU."""
-        return torch.device("cpu")
+        return CPU
 
     @property
     def semantic_encoder(self) -> str:
@@ -92,6 +94,11 @@ class SplatScene(Scene):
     def shown(self) -> Gaussians:
         """The Gaussians in the scene's look, all in memory."""
         return self.part(slice(0, len(self.gaussians)))
+
+    @property
+    def drawn_on(self) -> torch.device:
+        """Where views are drawn: what was asked for, or the CPU. Whoever is first to ask may wait until gsplat is compiled."""
+        return self.asked if usable(self.asked) else CPU
 
     @cached_property
     def _there(self) -> Gaussians:
@@ -188,7 +195,10 @@ class SplatScene(Scene):
             return self
         # Of a view that was held out, what its exposure says.
         red, green, blue = self.tones(torch.tensor([view]))[0].tolist()
-        return replace(self, tone=(red, green, blue))
+        taken = replace(self, tone=(red, green, blue))
+        if self.merged is None:  # the same Gaussians, recoloured and copied once
+            vars(taken)["_there"] = self._there
+        return taken
 
     def fit_poses(
         self, captured: ParsedScene, views: Sequence[int], progress: Callable[[int, int, str], None]

@@ -141,7 +141,7 @@ def semantic_samples(
 
 
 def _encode(encoder: Encoder, image: Annotated[Tensor, "H W 3"]) -> Annotated[Tensor, "C h w"]:
-    with float32_convolutions():
+    with float32_convolutions(image.device):
         features: Tensor = encoder(image.permute(2, 0, 1)[None])
     return features[0].float()
 

@@ -104,7 +104,7 @@ def _computed(device: torch.device) -> dict[str, Tensor]:
     # Features of a picture, a step of training, and the view as it is and in the picture's style.
     encoder = encoder.to(device)
     image = _uniform(3, 48, 64).to(device)
-    with torch.no_grad(), float32_convolutions():
+    with torch.no_grad(), float32_convolutions(device):
         features: Tensor = encoder(image[None])[0]
     results = {"encoder": features, "training step": _gradients(model, cameras, image)}
     model.requires_grad_(False).eval()

@@ -47,7 +47,7 @@ class Task:
     root: str
     """Run folder."""
     data: str
-    """ParsedScene folder."""
+    """Scene folder."""
     part: int
     """Number of the part, or WHOLE."""
     minutes: float | None

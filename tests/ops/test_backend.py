@@ -40,7 +40,9 @@ def test_tf32_is_put_back_after_an_error(enabled: bool) -> None:
 
 def test_convolutions_are_in_float32_within_the_block() -> None:
     before = torch.backends.cudnn.conv.fp32_precision
-    with pytest.raises(KeyError), float32_convolutions():
+    with float32_convolutions(torch.device("cpu")):
+        assert torch.backends.cudnn.conv.fp32_precision == before
+    with pytest.raises(KeyError), float32_convolutions(torch.device("cuda:0")):
         assert torch.backends.cudnn.conv.fp32_precision == "ieee"
         raise KeyError
     assert torch.backends.cudnn.conv.fp32_precision == before

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from gsplat_stand_in import stand_in
+from pretend_cuda import pretend_cuda
 
 from benchmarks.town.write import write_town
 from fprf.blocks.partition import bisect_sightings
@@ -117,3 +119,6 @@ def test_cells_know_where_the_sky_is(town: Path, tmp_path: Path) -> None:
         assert sky is not None and float(sky.sum()) == width * min(max(30 - top, 0), height)
     bare = replace(part, config=replace(part.config, surroundings=0)).build()
     assert all(each.sky is None for each in bare.levels[0].values())
+    with pretend_cuda(), stand_in():
+        there = replace(part, config=replace(part.config, device="cuda:0")).build().levels[0]
+        assert all(each.there is not None and each.there.sky is not None for each in there.values())

@@ -97,7 +97,7 @@ def test_auto_trains_where_gsplat_draws(
             patched.setitem(sys.modules, "gsplat", None)
         other = open_run(tmp_path / "run", "auto").scene
         drawn, wanted = (each.render(scene.cameras.scaled(2), 1) for each in (other, scene))
-    assert other.drawn_on == (CUDA if installed else torch.device("cpu"))
+        assert other.drawn_on == (CUDA if installed else torch.device("cpu"))
     for name in ("rgb", "depth", "opacity"):
         assert getattr(drawn, name).device.type == "cpu"
         torch.testing.assert_close(getattr(drawn, name), getattr(wanted, name), rtol=1e-3, atol=2e-3)

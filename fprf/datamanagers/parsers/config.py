@@ -149,7 +149,8 @@ class GardenConfig(DataParserConfig):
     def recognises(self, data: Path) -> Recognised | None:
         """By the path `garden`, where there is no such folder, or one that a run of it has begun or left."""
         left = data.is_dir() and ((data / "config.json").is_file() or all(each.name.startswith(".") for each in data.iterdir()))
-        return Recognised(1.0, "the embedded scene") if data == Path("garden") and (left or not data.exists()) else None
+        mine = data == Path("garden") and (left or not data.exists())
+        return Recognised(0.1 if left else 1.0, "the embedded scene") if mine else None
 
     def build(self) -> DataParser:
         from .transforms import GardenParser

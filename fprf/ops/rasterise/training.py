@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from .. import photometric
 from ..simd import LANES, aligned
+from ..threads import sources
 from . import backward_kernels as backward
 from . import forward_kernels as forward
 from .forward_kernels import SIDE, SLOTS
@@ -291,17 +292,20 @@ def _exposed(image: Floats, area: int, factors: Annotated[Floats, "3"] | None) -
 
 
 def compile_beside(bands: int) -> "list[subprocess.Popen[bytes]]":
-    """Start compilation in two other processes, to be waited for before `learn`; none where numba's cache holds something."""
-    cache = Path(backward.cache_path(bands))
-    if any(cache.glob(f"{backward.__name__.rpartition('.')[2]}*.nbi")):
-        return []
+    """Start compilation in two other processes, to be waited for before `learn`; none where they did it already."""
     quiet = subprocess.DEVNULL
     line = [sys.executable, "-m", __name__, str(bands)]
-    return [subprocess.Popen([*line, part], stdin=quiet, stdout=quiet, stderr=quiet) for part in ("forward", "backward")]
+    parts = [part for part in ("forward", "backward") if not _mark(bands, part).is_file()]
+    return [subprocess.Popen([*line, part], stdin=quiet, stdout=quiet, stderr=quiet) for part in parts]
+
+
+def _mark(bands: int, part: str) -> Path:
+    """A file beside what was compiled from the text of today."""
+    return Path(backward.cache_path(bands)) / f"compiled-{part}-{bands}-{sources()[:16]}"
 
 
 def _compile(bands: int, part: str) -> None:
-    """Run half of a step on nothing: a tile, and a block of Gaussians of which none is drawn."""
+    """Run half of a step on nothing: a tile, and a block of Gaussians of which none is drawn; leave a mark."""
     camera = np.array([1, 0, 0, 0, 1, 0, 0, 0, 1, *[0] * 10, -1, 1, -1, 1, 1, 0], np.float32)
     planes, left = np.zeros(3 * SIDE * SIDE + photometric.slack(SIDE), np.float32), np.zeros(SIDE * SIDE, np.float32)
     blocks, first, second, splats = np.zeros((4, (FIXED + 3 * bands) * LANES), np.float32)
@@ -314,6 +318,11 @@ def _compile(bands: int, part: str) -> None:
         slope = photometric.loss(planes, planes, photometric.blurred(planes, SIDE, SIDE), SIDE, SIDE, 0.2)[2]
         sums = backward.composite_back(tiles, 3, splats, SLOTS, 6, planes, left, slope, left)
         backward.adam(tiles, blocks, (first, second, splats), bands, camera, sums, np.zeros(FIXED + 3 * bands, np.float32))
+    mark = _mark(bands, part)
+    if mark.parent.is_dir():  # numba may be told to keep nothing
+        for old in mark.parent.glob(f"compiled-{part}-{bands}-*"):
+            old.unlink(missing_ok=True)
+        mark.touch()
 
 
 if __name__ == "__main__":
