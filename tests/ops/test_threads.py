@@ -1,5 +1,7 @@
 """The cache of compiled kernels."""
 
+import importlib
+import sys
 from pathlib import Path
 
 import pytest
@@ -7,6 +9,9 @@ import pytest
 from fprf.ops import threads
 
 KERNEL = """
+VALUE = 0.0
+
+
 def scaled(x):
     return VALUE * x
 """
@@ -14,17 +19,20 @@ def scaled(x):
 
 def test_kernels_are_compiled_anew_when_another_file_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A constant of another file is compiled in: under the same sources what is kept is taken."""
-    path, found = tmp_path / "kernel.py", []
+    path, found = tmp_path / "kernel_of_a_test.py", []
     path.write_text(KERNEL)
-    for value, sources in ((2.0, "before"), (3.0, "before"), (3.0, "after")):
-        monkeypatch.setattr(threads, "sources", lambda sources=sources: sources)
-        names = {"VALUE": value, "__name__": "kernel"}
-        exec(compile(KERNEL, str(path), "exec"), names)
-        found.append(threads.cached_jit()(names["scaled"])(1.0))
+    monkeypatch.syspath_prepend(tmp_path)
+    module = importlib.import_module(path.stem)
+    for module.VALUE, text in ((2.0, "before"), (3.0, "before"), (3.0, "after")):
+        monkeypatch.setattr(threads, "sources", lambda text=text: text)
+        found.append(threads.cached_jit()(module.scaled)(1.0))
+    del sys.modules[path.stem]
     assert found == [2.0, 2.0, 3.0] and list((tmp_path / "__pycache__").glob("*.nbi"))
-    monkeypatch.undo()
+
+
+def test_sources_are_the_files_without_torch(tmp_path: Path) -> None:
     hashes = []
     for text in ("A = 1", "A = 2", "\nimport torch", ""):
-        path.write_text(text)
+        (tmp_path / "kernel.py").write_text(text)
         hashes.append(threads.sources.__wrapped__(tmp_path))
-    assert len(set(hashes)) == 3 and hashes[2] == hashes[3], "kernels don't read files with torch"
+    assert len(set(hashes)) == 3 and hashes[2] == hashes[3]
