@@ -70,7 +70,7 @@ class SplatScene(Scene):
     poses: Callable[[ParsedScene, Sequence[int]], Annotated[Tensor, "V 6"]] | None = None
     """Fits poses of views to their photographs (`fit_poses`); None = there are no photographs."""
     asked: torch.device = CPU
-    """Where views should be drawn: the CPU, or a CUDA device if gsplat draws there."""
+    """Device to draw views on: the CPU, or a CUDA device if gsplat draws there."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -97,7 +97,7 @@ class SplatScene(Scene):
 
     @property
     def drawn_on(self) -> torch.device:
-        """Where views are drawn: what was asked for, or the CPU. Whoever is first to ask may wait until gsplat is compiled."""
+        """Device that views are drawn on: what was asked for, or the CPU. The first call may wait until gsplat is compiled."""
         return self.asked if usable(self.asked) else CPU
 
     @cached_property

@@ -31,7 +31,7 @@ _BETAS, _EPS = (0.9, 0.99), 1e-15
 _COLUMNS = 3, 3, 4, 1
 """Columns of means, logarithms of scales, quaternions and logits; those of the harmonics follow."""
 _UPRIGHT = 1e-15
-"""What is added to w of a quaternion, so that one without a length is drawn, as if it turned nothing."""
+"""Added to w of a quaternion, so that one without a length is drawn, as if it turned nothing."""
 _SIGMA, _C1, _C2 = 1.5, 0.01**2, 0.03**2
 """SSIM: standard deviation of its window in pixels, and its two constants for colours in [0, 1]."""
 
@@ -81,7 +81,7 @@ def rasterise_gsplat(
 
 
 class _Guards(NamedTuple):
-    """What keeps Gaussians that are not finite, or far beyond everything, from being drawn."""
+    """Bounds by which Gaussians that are not finite, or far beyond everything, are left out."""
 
     most: Annotated[Tensor, "R"]
     """Largest size of each column; what is larger, or NaN, is not drawn."""
