@@ -48,7 +48,7 @@ def tf32(enabled: bool) -> Iterator[None]:
 
 @contextmanager
 def float32_convolutions(device: torch.device) -> Iterator[None]:
-    """Convolutions on CUDA in float32, not in torch's own choice, TF32; a setting of the whole process, put back after the block.
+    """Convolutions on CUDA in float32, not in TF32, torch's own choice; a setting of the process, put back after the block.
 
     TF32 shifts features by 6e-4 to 1e-3 of their spread, after which k-means may end elsewhere: a style moved by 0.17 of a
     colour in [0, 1]. Under noise of 3e-4, 55 of 252 clusterings of references moved; under that of float32 (1e-6) none did.
