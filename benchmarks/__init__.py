@@ -1,1 +1,3 @@
-"""Measurements that no user of the installed package runs: `python -m benchmarks NAME [flags]` in a clone of the repository."""
+"""Measurements that no user of the installed package runs: `python -m benchmarks NAME [flags]` in a clone of
+the repository.
+"""

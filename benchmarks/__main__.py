@@ -22,7 +22,8 @@ class Benchmark(NamedTuple):
     quick: str
     """Flags that `--quick` stands for: the whole way, in about a minute, with figures that mean nothing.
 
-    {town} is the folder of a small town, {run} a short training of a tiny model on it, {folder} one that is thrown away.
+    {town} is the folder of a small town, {run} a short training of a tiny model on it, {folder} one that is
+    thrown away.
     """
     needs: str = "nothing but fprf"
     """Data, extras and time; said before it starts."""
@@ -33,14 +34,23 @@ class Benchmark(NamedTuple):
 _RUN = "{run} --repeats 1 --rays 256 --device cpu"
 _TRAINED = "a run of fields; without one it trains fprf-lite on the town first"
 BENCHMARKS = {
-    "exports": Benchmark("exported files drawn again, against the scene's own renders", "{run} --views 1", _TRAINED),
-    "fuzz": Benchmark("every reader on a million mutated files", "--rounds 40", "hours for the million; Linux"),
+    "exports": Benchmark(
+        "exported files drawn again, against the scene's own renders", "{run} --views 1", _TRAINED
+    ),
+    "fuzz": Benchmark(
+        "every reader on a million mutated files", "--rounds 40", "hours for the million; Linux"
+    ),
     "fuzz_guided": Benchmark(
-        "every reader under libFuzzer", '--minutes 0.2 --only "image, png"', "the package atheris; Linux", ("atheris",)
+        "every reader under libFuzzer",
+        '--minutes 0.2 --only "image, png"',
+        "the package atheris; Linux",
+        ("atheris",),
     ),
     "gaussians": Benchmark("the rasteriser of 3D Gaussians: time and error", "--count 500 --times 2"),
     "kernels": Benchmark("what each compiled kernel brings end to end", "{run} --repeats 1", _TRAINED),
-    "kills": Benchmark("training that is killed a hundred times", "--kills 3 --steps 25", "ten minutes; Linux"),
+    "kills": Benchmark(
+        "training that is killed a hundred times", "--kills 3 --steps 25", "ten minutes; Linux"
+    ),
     "mutants": Benchmark(
         "how many small mistakes in the mathematics the tests notice",
         "--only fprf/rendering/splines.py --sample 2",
@@ -79,11 +89,15 @@ BENCHMARKS = {
         "painted triplets in --triplets; without them the town alone",
     ),
     "speed": Benchmark(
-        "training, views and styles against the naive path, with their errors", f"{_RUN} --points 500 --clusters 4", _TRAINED
+        "training, views and styles against the naive path, with their errors",
+        f"{_RUN} --points 500 --clusters 4",
+        _TRAINED,
     ),
     "splat_restyle": Benchmark("time and memory of restyling captures of Gaussians", "--synthetic 2000"),
     "stress": Benchmark(
-        "every stage on adversarial inputs, against a reference and a bound", f"{_RUN} --mutations 2 --flips 5", _TRAINED
+        "every stage on adversarial inputs, against a reference and a bound",
+        f"{_RUN} --mutations 2 --flips 5",
+        _TRAINED,
     ),
     "styles": Benchmark(
         "every stylizer on painted photographs and on runs",
@@ -91,7 +105,9 @@ BENCHMARKS = {
         "triplets, photographs and VGG-19's weights in --shared; without them a run of the town",
     ),
     "town": Benchmark(
-        "write a town as a scene folder", "{folder}/town --views 2 --width 24 --height 18", "a folder to write into"
+        "write a town as a scene folder",
+        "{folder}/town --views 2 --width 24 --height 18",
+        "a folder to write into",
     ),
     "tables": Benchmark("tables of the documents, made from the results", "--check", "a clone"),
 }
@@ -99,13 +115,16 @@ BENCHMARKS = {
 
 
 def main(args: list[str]) -> int:
-    """0 done; 2 for a mistake in the arguments or a package that is absent, which one line on standard error names."""
+    """0 done; 2 for a mistake in the arguments or a package that is absent, which one line on standard error
+    names.
+    """
     if not args or args[0] in ("-h", "--help"):
         width = max(map(len, BENCHMARKS))
         print("usage: python -m benchmarks NAME [--quick] [flags]\n")
         print("\n".join(f"  {name:<{width}}  {each.about}" for name, each in BENCHMARKS.items()))
         return 0 if args else 2
-    name, flags = args[0], args[1:]
+    name = args[0]
+    flags = args[1:]
     try:
         if name not in BENCHMARKS:
             raise UsageError(f"{name}: no such benchmark; allowed are {', '.join(BENCHMARKS)}")
@@ -119,13 +138,16 @@ def main(args: list[str]) -> int:
         with tempfile.TemporaryDirectory(prefix="fprf-quick-") as folder:
             if "--quick" in flags:
                 flags.remove("--quick")
-                town, run = cached_town(views=8, width=48, height=36), f"{folder}/run"
+                town = cached_town(views=8, width=48, height=36)
+                run = f"{folder}/run"
                 if "{run}" in chosen.quick:
                     from fprf.training.driver import train
 
                     from .kills import tiny
 
-                    train(replace(tiny(town, steps=20), output=Path(run), checkpoint_minutes=5.0), "fprf-lite")
+                    train(
+                        replace(tiny(town, steps=20), output=Path(run), checkpoint_minutes=5.0), "fprf-lite"
+                    )
                 flags = [*shlex.split(chosen.quick.format(town=town, run=run, folder=folder)), *flags]
             return importlib.import_module(f".{name}", __package__).main(flags) or 0
     except FprfError as error:

@@ -1,4 +1,6 @@
-"""What all benchmarks share: folders, arguments, the run that is measured, costs of commands, and the JSON that each writes."""
+"""What all benchmarks share: folders, arguments, the run that is measured, costs of commands, and the JSON
+that each writes.
+"""
 
 import argparse
 import json
@@ -28,13 +30,17 @@ from .town.write import scene_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("FPRF_SHARED", ROOT.parent / "shared"))
-"""Folder with `data` and `weights` that the repository does not hold: $FPRF_SHARED, or `shared` beside the checkout."""
+"""Folder with `data` and `weights` that the repository does not hold: $FPRF_SHARED, or `shared` beside the
+checkout.
+"""
 
 
 def arguments(name: str, about: str | None) -> argparse.ArgumentParser:
     """A parser whose help shows the benchmark's description as it is written."""
     return argparse.ArgumentParser(
-        prog=f"python -m benchmarks {name}", description=about, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog=f"python -m benchmarks {name}",
+        description=about,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
 
 
@@ -44,7 +50,9 @@ def origin(device: str = "cpu") -> dict[str, object]:
 
 
 def report(path: Path | None, figures: Mapping[str, Any], device: str = "cpu") -> None:
-    """Write figures as JSON, behind their origin; what they say themselves takes precedence. None writes nothing."""
+    """Write figures as JSON, behind their origin; what they say themselves takes precedence. None writes
+    nothing.
+    """
     if path is not None:
         write_json(path, {**origin(device), **figures})
 
@@ -68,16 +76,23 @@ class Cost(NamedTuple):
 
 
 def cost_of(*args: str | Path) -> Cost:
-    """Run `fprf ARGS` in a process of its own without showing its output. Raises FprfError with its last lines."""
-    words, start = [str(each) for each in args], time.perf_counter()
+    """Run `fprf ARGS` in a process of its own without showing its output. Raises FprfError with its last
+    lines.
+    """
+    words = [str(each) for each in args]
+    start = time.perf_counter()
     with tempfile.TemporaryFile() as said:
-        process = subprocess.Popen([sys.executable, "-m", "fprf", *words], stdout=subprocess.DEVNULL, stderr=said)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "fprf", *words], stdout=subprocess.DEVNULL, stderr=said
+        )
         _, status, used = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode:
             said.seek(0)
             lines = said.read().decode(errors="replace").splitlines()
-            raise FprfError(f"fprf {shlex.join(words)}: exit code {process.returncode}; {' | '.join(lines[-3:])}")
+            raise FprfError(
+                f"fprf {shlex.join(words)}: exit code {process.returncode}; {' | '.join(lines[-3:])}"
+            )
     return Cost(time.perf_counter() - start, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
 
 
@@ -88,7 +103,9 @@ class BenchConfig:
     run: Path | None = None
     """Run folder; none = --method is trained on --data for --steps first, in a folder that is thrown away."""
     data: Path | None = None
-    """Scene folder, where it has moved since training; without a run the one to train on (none = the town)."""
+    """Scene folder, where it has moved since training; without a run the one to train on (none = the
+    town).
+    """
     method: str = "fprf-lite"
     """Method to train where no run is given."""
     steps: int = 300
@@ -96,12 +113,15 @@ class BenchConfig:
     references: tuple[Path, ...] = ()
     """Photographs for styles; none = pictures of other towns."""
     repeats: int = 5
-    """Rounds: in each one everything that is compared runs once, in turn. Medians and quartiles are over them."""
+    """Rounds: in each one everything that is compared runs once, in turn. Medians and quartiles are over
+    them.
+    """
     rays: int = 8192
     """Rays of a timed view at most: larger views are measured at a smaller size."""
     clock: Literal["wall", "processor"] = "wall"
-    """wall, or processor: seconds that this process kept processors busy, all threads together, which other programs on the
-    machine hardly disturb. On the CPU alone."""
+    """wall, or processor: seconds that this process kept processors busy, all threads together, which other
+    programs on the machine hardly disturb. On the CPU alone.
+    """
     seed: int = 0
     """Draws of points and batches."""
     output: Path | None = None
@@ -132,8 +152,11 @@ _WIDTH = 150
 """Columns of a table that goes to a file."""
 
 
-def bench_run(prog: str, default: C, args: list[str], measure: Callable[[C, Path, Path, Progress], Outcome]) -> int:
-    """Measure the run that the arguments name, or a scene that is trained first; print the tables and write the JSON.
+def bench_run(
+    prog: str, default: C, args: list[str], measure: Callable[[C, Path, Path, Progress], Outcome]
+) -> int:
+    """Measure the run that the arguments name, or a scene that is trained first; print the tables and write
+    the JSON.
 
     `measure` gets the config, the run folder, a temporary folder and a function that shows progress.
     """
@@ -141,7 +164,9 @@ def bench_run(prog: str, default: C, args: list[str], measure: Callable[[C, Path
     config = parse(default, args, prog=prog, description=about, positional=("run",))
     with tempfile.TemporaryDirectory(prefix="fprf-bench-") as made:
         folder = Path(made)
-        root = config.run or train_run(folder / "run", config.method, config.data, steps=config.steps, device=config.device)
+        root = config.run or train_run(
+            folder / "run", config.method, config.data, steps=config.steps, device=config.device
+        )
         with Display() as display:
             outcome = measure(config, root, folder, display.count)
         for table in outcome.tables:
@@ -152,7 +177,9 @@ def bench_run(prog: str, default: C, args: list[str], measure: Callable[[C, Path
 
 
 def train_run(output: Path, method: str, data: Path | None, *, steps: int, device: str = "cpu") -> Path:
-    """Train fields for the steps; without data on the method's own, or else on the town. Returns the run folder."""
+    """Train fields for the steps; without data on the method's own, or else on the town. Returns the run
+    folder.
+    """
     chosen, name = field_method(method)
     scene = scene_folder(data or chosen.data or Path("town"))
     return train(replace(chosen, data=scene, output=output, steps=steps, minutes=None, device=device), name)

@@ -1,4 +1,6 @@
-"""Quality against training time as one drawing (SVG): `docs/images/minutes.svg`, written by `python -m benchmarks tables`."""
+"""Quality against training time as one drawing (SVG): `docs/images/minutes.svg`, written by `python -m
+benchmarks tables`.
+"""
 
 import math
 import re
@@ -19,7 +21,11 @@ PANELS = (
 )
 """Key of the results, title, ends and steps of the axis."""
 MINUTES = (1, 3, 10, 30)
-WIDTH, HEIGHT, MARGIN, TOP, GAP = 300, 230, 34, 34, 26
+WIDTH = 300
+HEIGHT = 230
+MARGIN = 34
+TOP = 34
+GAP = 26
 """Pixels of a panel's plot, beside, above and between them."""
 
 
@@ -45,26 +51,35 @@ def drawing(found: Any) -> str:
         return left + WIDTH * math.log(minutes / MINUTES[0]) / math.log(MINUTES[-1] / MINUTES[0])
 
     for i, (key, title, low, high, step) in enumerate(PANELS):
-        left, bottom = i * (MARGIN + WIDTH + GAP) + MARGIN, TOP + HEIGHT
+        left = i * (MARGIN + WIDTH + GAP) + MARGIN
+        bottom = TOP + HEIGHT
         parts.append(f'<text x="{left}" y="{TOP - 12}" font-weight="600" fill="#202124">{title}</text>')
         # The grid: values across, minutes upwards.
         for j in range(round((high - low) / step) + 1):
             value = low + j * step
             y = bottom - HEIGHT * (value - low) / (high - low)
             parts.append(f'<path d="M{left} {y:.1f}h{WIDTH}" stroke="#e0e0e0"/>')
-            parts.append(f'<text x="{left - 5}" y="{y + 4:.1f}" text-anchor="end" fill="#5f6368">{value:.3g}</text>')
+            parts.append(
+                f'<text x="{left - 5}" y="{y + 4:.1f}" text-anchor="end" fill="#5f6368">{value:.3g}</text>'
+            )
         for minutes in MINUTES:
             x = x_of(left, minutes)
             parts.append(f'<path d="M{x:.1f} {TOP}v{HEIGHT}" stroke="#e0e0e0"/>')
             unit = " min" if minutes == MINUTES[-1] else ""
-            parts.append(f'<text x="{x:.1f}" y="{bottom + 17}" text-anchor="middle" fill="#5f6368">{minutes}{unit}</text>')
+            parts.append(
+                f'<text x="{x:.1f}" y="{bottom + 17}" text-anchor="middle" fill="#5f6368">{minutes}{unit}</text>'
+            )
         for scene, colour in SCENES.items():
-            place = [(x_of(left, m), bottom - HEIGHT * (v - low) / (high - low)) for m, v in points(found, scene, key)]
+            place = [
+                (x_of(left, m), bottom - HEIGHT * (v - low) / (high - low))
+                for m, v in points(found, scene, key)
+            ]
             line = " ".join(f"{x:.1f},{y:.1f}" for x, y in place)
             parts.append(f'<polyline points="{line}" fill="none" stroke="{colour}" stroke-width="2"/>')
             parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{colour}"/>' for x, y in place]
     for i, (scene, colour) in enumerate(SCENES.items()):
-        x, y = MARGIN + i % 3 * (MARGIN + WIDTH + GAP), TOP + HEIGHT + 40 + 18 * (i // 3)
+        x = MARGIN + i % 3 * (MARGIN + WIDTH + GAP)
+        y = TOP + HEIGHT + 40 + 18 * (i // 3)
         parts.append(f'<path d="M{x} {y - 4}h22" stroke="{colour}" stroke-width="2"/>')
         parts.append(f'<text x="{x + 28}" y="{y}" fill="#202124">{scene}</text>')
     return "\n".join([*parts, "</svg>"]) + "\n"

@@ -2,8 +2,9 @@
 
     python -m benchmarks exports [RUN] [--references A.jpg] [--fit MINUTES] [--output FILE.json] [--picture FILE.jpg]
 
-`fprf export` writes splats and a mesh, plain and in one style; the views are held-out ones as pinholes. Figures are PSNR in dB:
-of the whole picture, over black where nothing is drawn, and of the pixels that are covered.
+`fprf export` writes splats and a mesh, plain and in one style; the views are held-out ones as pinholes.
+Figures are PSNR in dB: of the whole picture, over black where nothing is drawn, and of the pixels that are
+covered.
 """
 
 import json
@@ -63,27 +64,37 @@ class ExportsConfig:
 def main(argv: list[str]) -> None:
     """`python -m benchmarks exports [RUN] [flags]`."""
     about = __doc__ or ""
-    config = parse(ExportsConfig(), argv, prog="python -m benchmarks exports", description=about, positional=("run",))
+    config = parse(
+        ExportsConfig(), argv, prog="python -m benchmarks exports", description=about, positional=("run",)
+    )
     with tempfile.TemporaryDirectory(prefix="fprf-exports-") as made:
         folder = Path(made) / "files"
         run = config.run or train_run(Path(made) / "run", "fprf-lite", None, steps=config.steps)
         references = config.references or town_references(Path(made))[:1]
         opened = open_run(run, "cpu")
-        scene, known = opened.scene, opened.known
+        scene = opened.scene
+        known = opened.known
         if not known.test:
             raise UsageError(f"{run}: no held-out views to judge by")
         flags = ["--styles", "style=" + ",".join(map(str, references)), "--local", "true"]
         flags += ["--fit", str(config.fit)] if config.fit else []
         cost = cost_of("export", run, "ply", "splat", "glb", *flags, "--output", folder)
         sizes = {path.name: path.stat().st_size for path in sorted(folder.iterdir())}
-        found: dict[str, Any] = {"scene": known.name, "step": opened.step, "export": cost._asdict(), "bytes": sizes}
+        found: dict[str, Any] = {
+            "scene": known.name,
+            "step": opened.step,
+            "export": cost._asdict(),
+            "bytes": sizes,
+        }
         moved = np.asarray(json.loads((folder / "export.json").read_text()).get("origin", (0.0, 0.0, 0.0)))
         chosen = known.test[:: max(1, len(known.test) // config.views)][: config.views]
         cameras = [straight(known.cameras, view) for view in chosen]
         look = apply_style(scene, StyleFile(StyleConfig(references=references))).restyle
         rows = []
         for name, restyle in (("plain", None), ("style", look)):
-            found[name], row = judge(folder, "" if restyle is None else ".style", scene, restyle, cameras, moved)
+            found[name], row = judge(
+                folder, "" if restyle is None else ".style", scene, restyle, cameras, moved
+            )
             rows.append(np.concatenate(row, 1))
         print(json.dumps(found, indent=1))
         report(config.output, found)
@@ -101,12 +112,18 @@ def straight(cameras: Cameras, view: int) -> Cameras:
 def judge(
     folder: Path, end: str, scene: Scene, look: Restyle | None, cameras: list[Cameras], origin: Floats
 ) -> tuple[dict[str, dict[str, float]], list[Floats]]:
-    """Means over the views for each file of a look, and pictures of the first view: the scene's, then the files'."""
-    captures = {path.name: read_capture(path) for path in (folder / f"splats{end}.ply", folder / f"splats{end}.splat")}
+    """Means over the views for each file of a look, and pictures of the first view: the scene's, then the
+    files'.
+    """
+    captures = {
+        path.name: read_capture(path) for path in (folder / f"splats{end}.ply", folder / f"splats{end}.splat")
+    }
     [mesh] = trimesh.load_scene(folder / f"mesh{end}.glb", process=False).geometry.values()
     colour = np.asarray(mesh.visual.vertex_attributes["color"])[:, :3]
     linear = colour / np.iinfo(colour.dtype).max if colour.dtype.kind == "u" else colour
-    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+    shown = np.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055
+    )
     figures: dict[str, list[dict[str, float]]] = {}
     pictures: list[Floats] = []
     for camera in cameras:
@@ -118,13 +135,18 @@ def judge(
         for name, capture in captures.items():
             seen = draw(capture.gaussians, camera_of(local, 0), antialiased=capture.antialiased)
             drawn[name] = seen.image.clamp(0, 1).double().numpy(), seen.opacity.numpy()
-        drawn[f"mesh{end}.glb"] = draw_triangles(np.asarray(mesh.vertices), np.asarray(mesh.faces), shown, local)
+        drawn[f"mesh{end}.glb"] = draw_triangles(
+            np.asarray(mesh.vertices), np.asarray(mesh.faces), shown, local
+        )
         for name, (image, covered) in drawn.items():
             where = covered > 0.5
             figure = {"psnr": psnr(image - truth), "psnr_covered": psnr((image - truth)[where])}
             figures.setdefault(name, []).append(figure | {"covered": float(where.mean())})
         pictures = pictures or [truth, *(image for image, _ in drawn.values())]
-    means = {name: {key: float(np.mean([f[key] for f in every])) for key in every[0]} for name, every in figures.items()}
+    means = {
+        name: {key: float(np.mean([f[key] for f in every])) for key in every[0]}
+        for name, every in figures.items()
+    }
     return means, pictures
 
 
@@ -133,8 +155,11 @@ def psnr(error: Floats) -> float:
     return float(-10 * np.log10(max(float(np.square(error).mean()) if error.size else 0.0, 10**-9.9)))
 
 
-def draw_triangles(point: Floats, face: NDArray[np.integer[Any]], colour: Floats, camera: Cameras) -> tuple[Floats, Floats]:
-    """Image [H W 3] and where it is covered [H W], by a pinhole: colours of vertices are interpolated in the world.
+def draw_triangles(
+    point: Floats, face: NDArray[np.integer[Any]], colour: Floats, camera: Cameras
+) -> tuple[Floats, Floats]:
+    """Image [H W 3] and where it is covered [H W], by a pinhole: colours of vertices are interpolated in the
+    world.
 
     Triangles are seen from both sides; behind them is black.
     """
@@ -142,12 +167,18 @@ def draw_triangles(point: Floats, face: NDArray[np.integer[Any]], colour: Floats
     pose = camera.pose[0].numpy()
     local = (point - pose[:, 3]) @ (pose[:, :3] * [1, -1, -1])
     depth = local[:, 2]
-    pixel = float(camera.focal[0, 0]) * local[:, :2] / np.where(depth > 0, depth, 1)[:, None] + np.array([width, height]) / 2
+    pixel = (
+        float(camera.focal[0, 0]) * local[:, :2] / np.where(depth > 0, depth, 1)[:, None]
+        + np.array([width, height]) / 2
+    )
     face = face[(depth[face] > _NEAR).all(1)]
     low = np.ceil(pixel[face].min(1) - 0.5).clip(0, (width, height)).astype(int)
     high = np.floor(pixel[face].max(1) - 0.5).clip(-1, (width - 1, height - 1)).astype(int)
-    reach, some = (high - low + 1).max(1), ((high - low) >= 0).all(1)
-    where, far, shade = [np.zeros(0, int)], [np.zeros(0)], [np.zeros((0, 3))]
+    reach = (high - low + 1).max(1)
+    some = ((high - low) >= 0).all(1)
+    where = [np.zeros(0, int)]
+    far = [np.zeros(0)]
+    shade = [np.zeros((0, 3))]
     # Triangles of like size share a grid of candidate pixels.
     for side in (2**k for k in range(12)):
         group = np.flatnonzero(some & (reach <= side) & (reach > side // 2))
@@ -162,20 +193,28 @@ def draw_triangles(point: Floats, face: NDArray[np.integer[Any]], colour: Floats
             far.append(1 / inverse)
             shade.append((part[:, :, None] * colour[face[chunk]][row]).sum(1) / inverse[:, None])
     # The nearest candidate of each pixel that has one.
-    every, z, tint = np.concatenate(where), np.concatenate(far), np.concatenate(shade)
+    every = np.concatenate(where)
+    z = np.concatenate(far)
+    tint = np.concatenate(shade)
     order = np.lexsort((z, every))
     picked, first = np.unique(every[order], return_index=True)
-    image, covered = np.zeros((width * height, 3)), np.zeros(width * height)
-    image[picked], covered[picked] = tint[order[first]], 1.0
+    image = np.zeros((width * height, 3))
+    covered = np.zeros(width * height)
+    image[picked] = tint[order[first]]
+    covered[picked] = 1.0
     return image.reshape(height, width, 3), covered.reshape(height, width)
 
 
 def _barycentric(at: Floats, corner: Floats) -> Floats:
-    """Shares [F P 3] of the corners [F 3 2] at places [F P 2]; negative outside, also for triangles without area."""
+    """Shares [F P 3] of the corners [F 3 2] at places [F P 2]; negative outside, also for triangles without
+    area.
+    """
     a, b, c = (corner[:, None, k] for k in range(3))
 
     def area(u: Floats, v: Floats, w: Floats) -> Floats:
-        return (v[..., 0] - u[..., 0]) * (w[..., 1] - u[..., 1]) - (v[..., 1] - u[..., 1]) * (w[..., 0] - u[..., 0])
+        return (v[..., 0] - u[..., 0]) * (w[..., 1] - u[..., 1]) - (v[..., 1] - u[..., 1]) * (
+            w[..., 0] - u[..., 0]
+        )
 
     whole = area(a, b, c)
     parts = np.stack([area(b, c, at), area(c, a, at), area(a, b, at)], -1)

@@ -1,10 +1,12 @@
-"""Mutated files by the million: every reader must answer each with a value or with one line, and neither die, hang nor grow.
+"""Mutated files by the million: every reader must answer each with a value or with one line, and neither die,
+hang nor grow.
 
     python -m benchmarks fuzz [--rounds 1000000] [--seed 0] [--only NAME ...] [--output benchmarks/results/fuzz.json]
 
-Each reader runs in a process of its own, a few thousand mutations at a time, with 2 GiB of address space more than it has at
-its start. A process that dies is an entry in the report and the next one goes on behind it; so is one that is silent for five
-minutes. What an output file already holds of the same seed is gone on from: a night's run may be stopped.
+Each reader runs in a process of its own, a few thousand mutations at a time, with 2 GiB of address space more
+than it has at its start. A process that dies is an entry in the report and the next one goes on behind it; so
+is one that is silent for five minutes. What an output file already holds of the same seed is gone on from: a
+night's run may be stopped.
 """
 
 import json
@@ -30,7 +32,15 @@ ROOM = 2 << 30
 
 
 def fresh() -> dict[str, Any]:
-    return {"rounds": 0, "read": 0, "refused": 0, "faults": [], "slowest_seconds": 0.0, "grown_mib": 0.0, "cpu_seconds": 0.0}
+    return {
+        "rounds": 0,
+        "read": 0,
+        "refused": 0,
+        "faults": [],
+        "slowest_seconds": 0.0,
+        "grown_mib": 0.0,
+        "cpu_seconds": 0.0,
+    }
 
 
 def work(target: Target, first: int, rounds: int, seed: int, to: int) -> None:
@@ -43,7 +53,8 @@ def work(target: Target, first: int, rounds: int, seed: int, to: int) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (size + ROOM, size + ROOM))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     while first < rounds:
-        start, count = time.process_time(), min(CHUNK, rounds - first)
+        start = time.process_time()
+        count = min(CHUNK, rounds - first)
         found = fuzz(target, count, seed, first=first, quick=True)
         report = {
             "rounds": count,
@@ -75,7 +86,9 @@ def watch(
     silence: float = SILENCE,
     keep: Callable[[], None] = lambda: None,
 ) -> None:
-    """One child from where `total` stands, until it is done, dies or falls silent; `keep` is called now and then."""
+    """One child from where `total` stands, until it is done, dies or falls silent; `keep` is called now and
+    then.
+    """
     whole = target.file.read_bytes()
     from_child, to = os.pipe()
     child = os.fork()
@@ -103,7 +116,11 @@ def watch(
     if status:
         what = f"ended with {status}" if ready else f"was silent for {silence:.0f} s"
         first = total["rounds"]
-        add(total, fresh() | {"rounds": min(CHUNK, rounds - first), "faults": [f"{first} and on: the process {what}"]})
+        add(
+            total,
+            fresh()
+            | {"rounds": min(CHUNK, rounds - first), "faults": [f"{first} and on: the process {what}"]},
+        )
 
 
 def measure(folder: Path, rounds: int, seed: int, only: list[str], output: Path | None) -> dict[str, Any]:
@@ -134,5 +151,7 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--only", nargs="*", default=[], metavar="NAME")
     parser.add_argument("--output", type=Path)
     asked = parser.parse_args(argv)
-    with tempfile.TemporaryDirectory(prefix="fprf-fuzz-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
+    with tempfile.TemporaryDirectory(
+        prefix="fprf-fuzz-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None
+    ) as folder:
         measure(Path(folder) / "files", asked.rounds, asked.seed, asked.only, asked.output)

@@ -1,11 +1,12 @@
-"""Files that look for unread code: libFuzzer changes each reader's valid file and keeps what reaches lines not reached before.
+"""Files that look for unread code: libFuzzer changes each reader's valid file and keeps what reaches lines
+not reached before.
 
     python -m benchmarks fuzz_guided [--minutes 60] [--only NAME ...] [--corpus FOLDER] [--seal] [--output FILE]
 
-Needs `pip install atheris`. The minutes are shared equally among the readers; each runs in a process of its own, with 2 GiB of
-address space more than it has at its start, and an input may take ten seconds. A reader that fails is told with the bytes that
-did it, and goes on. What reached new code is kept in the corpus, where a later run takes it up; `--seal` puts a corpus
-into `tests/fuzz/corpus.zip`, which the tests read again.
+Needs `pip install atheris`. The minutes are shared equally among the readers; each runs in a process of its
+own, with 2 GiB of address space more than it has at its start, and an input may take ten seconds. A reader
+that fails is told with the bytes that did it, and goes on. What reached new code is kept in the corpus, where
+a later run takes it up; `--seal` puts a corpus into `tests/fuzz/corpus.zip`, which the tests read again.
 """
 
 import base64
@@ -43,7 +44,9 @@ def inside(name: str, corpora: list[str], options: list[str]) -> None:
 
     for module in THIRD_PARTY:
         importlib.import_module(module)
-    for module in [each for each in sys.modules if each.split(".")[0] == "fprf" or each == "benchmarks.readers"]:
+    for module in [
+        each for each in sys.modules if each.split(".")[0] == "fprf" or each == "benchmarks.readers"
+    ]:
         del sys.modules[module]  # this script's own, which nobody watched
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
         with atheris.instrument_imports(include=["fprf"]):
@@ -84,22 +87,41 @@ def search(name: str, corpus: Path, seconds: float) -> dict[str, Any]:
     """Search with one reader for so long, begun anew behind every fault; what came of it."""
     corpus.mkdir(parents=True, exist_ok=True)
     faults: list[dict[str, Any]] = []
-    rounds, reached, begun = 0, 0, time.monotonic()
+    rounds = 0
+    reached = 0
+    begun = time.monotonic()
     with tempfile.TemporaryDirectory() as found:
         while (left := seconds - (time.monotonic() - begun)) > 1 and len(faults) < 10:
-            options = [f"-max_total_time={int(left) + 1}", f"-timeout={PATIENCE}", "-rss_limit_mb=4096", "-print_final_stats=1"]
+            options = [
+                f"-max_total_time={int(left) + 1}",
+                f"-timeout={PATIENCE}",
+                "-rss_limit_mb=4096",
+                "-print_final_stats=1",
+            ]
             code, said = run(name, corpus, [*options, f"-artifact_prefix={found}/"])
             rounds += _last(r"stat::number_of_executed_units:\s*(\d+)", said)
             reached = max(reached, _last(r"\bcov: (\d+)", said))
             if code == 0:
                 break
             harmful = sorted(Path(found).iterdir())
-            named = (line for line in said.splitlines() if re.match(r"\w*(Error|Exception|Interrupt)\b", line))
+            named = (
+                line for line in said.splitlines() if re.match(r"\w*(Error|Exception|Interrupt)\b", line)
+            )
             line = next(named, said[-300:])
-            faults.append({"said": line[:300], "bytes": [base64.b64encode(path.read_bytes()).decode() for path in harmful]})
+            faults.append(
+                {
+                    "said": line[:300],
+                    "bytes": [base64.b64encode(path.read_bytes()).decode() for path in harmful],
+                }
+            )
             for path in harmful:
                 path.unlink()
-    return {"rounds": rounds, "reached": reached, "seconds": round(time.monotonic() - begun, 1), "faults": faults}
+    return {
+        "rounds": rounds,
+        "reached": reached,
+        "seconds": round(time.monotonic() - begun, 1),
+        "faults": faults,
+    }
 
 
 def seal(corpus: Path, to: Path) -> None:

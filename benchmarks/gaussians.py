@@ -1,13 +1,15 @@
-"""The rasteriser of 3D Gaussians: kernels against the plain torch form, time and error; and what a step of training costs.
+"""The rasteriser of 3D Gaussians: kernels against the plain torch form, time and error; and what a step of
+training costs.
 
     python -m benchmarks gaussians [--count 50000] [--threads 1] [--output FILE.json]
     python -m benchmarks gaussians --training [--threads 2] [--device cuda] [--output FILE.json]
 
-A cloud in front of a camera of 500 x 375 pixels; most Gaussians are a pixel or two wide, as in a trained scene. Seconds are the
-least of several calls: of wall time, and of processor time, which counts all threads. The plain form runs once.
+A cloud in front of a camera of 500 x 375 pixels; most Gaussians are a pixel or two wide, as in a trained
+scene. Seconds are the least of several calls: of wall time, and of processor time, which counts all threads.
+The plain form runs once.
 
-`--training` takes photographs and clouds of several sizes: seconds of a step, and MiB that the Gaussians and one photograph
-take, of a process of its own or, on a CUDA device, of torch's memory there.
+`--training` takes photographs and clouds of several sizes: seconds of a step, and MiB that the Gaussians and
+one photograph take, of a process of its own or, on a CUDA device, of torch's memory there.
 """
 
 import json
@@ -31,7 +33,10 @@ from fprf.ops.rasterise.training import target_of
 
 from .common import arguments, report
 
-WIDTH, HEIGHT, BANDS, CHANNELS = 500, 375, 4, 32
+WIDTH = 500
+HEIGHT = 375
+BANDS = 4
+CHANNELS = 32
 SIZES = (504, 378), (1008, 756), (1600, 1200)
 COUNTS = 60_000, 250_000, 1_000_000
 RATES = 1e-4
@@ -52,7 +57,8 @@ def cloud(count: int) -> Cloud:
     across = (torch.rand(count, 2, generator=draw) - 0.5) * torch.tensor([1.3, 1.0])
     means = torch.cat([across * depth[:, None], depth[:, None]], 1)
     pixel = depth / (0.8 * WIDTH)
-    # Standard deviations of about a pixel where there are 50 000; fewer are larger, so that they cover the image as well.
+    # Standard deviations of about a pixel where there are 50 000; fewer are larger, so that they cover the
+    # image as well.
     scales = (math.sqrt(50_000 / count) * pixel).log()[:, None] + 0.5 * normal(count, 3)
     return means, normal(count, 4), scales, 2 * normal(count), 0.4 * normal(count, BANDS, 3)
 
@@ -64,7 +70,8 @@ def camera() -> Pinhole:
 
 
 def least(call: Callable[[], object], times: int) -> dict[str, float]:
-    wall, processor = [], []
+    wall = []
+    processor = []
     for _ in range(times):
         before = time.perf_counter(), time.process_time()
         call()
@@ -81,13 +88,15 @@ def learn(given: Cloud, pull: Tensor) -> tuple[Tensor, ...]:
 
 
 def measure(count: int, times: int) -> dict[str, Any]:
-    given, pixels = cloud(count), torch.rand(HEIGHT, WIDTH, CHANNELS, generator=torch.Generator().manual_seed(1))
+    given = cloud(count)
+    pixels = torch.rand(HEIGHT, WIDTH, CHANNELS, generator=torch.Generator().manual_seed(1))
     pull = torch.randn(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(2))
 
     def render() -> Rasterised:
         return rasterise(*given, camera())
 
-    fast, slopes = render(), learn(given, pull)
+    fast = render()
+    slopes = learn(given, pull)
     lift(*given[:4], camera(), pixels)
     rows = {
         "render": least(render, times),
@@ -111,7 +120,9 @@ def measure(count: int, times: int) -> dict[str, Any]:
         "times_plain": rows["render_plain"]["processor_seconds"] / rows["render"]["processor_seconds"],
         "mean_error": float(apart.mean()),
         "largest_error": float(apart.max()),
-        "gradient_errors": [float((a.double() - b).norm() / b.norm()) for a, b in zip(slopes, wanted, strict=True)],
+        "gradient_errors": [
+            float((a.double() - b).norm() / b.norm()) for a, b in zip(slopes, wanted, strict=True)
+        ],
     }
 
 
@@ -180,7 +191,11 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--output", type=Path)
     args = parser.parse_args(argv)
     if args.training:
-        found = {"threads": args.threads, "device": args.device, "steps": training(args.times, args.threads, args.device)}
+        found = {
+            "threads": args.threads,
+            "device": args.device,
+            "steps": training(args.times, args.threads, args.device),
+        }
         report(args.output, found)
         return
     torch.set_num_threads(args.threads)

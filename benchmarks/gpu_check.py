@@ -2,8 +2,8 @@
 
     python benchmarks/gpu_check.py FOLDER
 
-Plug-ins, the built-in ones too, are found by a package's metadata. Where fprf is not installed, FOLDER gets what an
-installation would write; with it in PYTHONPATH the checkout works as it is.
+Plug-ins, the built-in ones too, are found by a package's metadata. Where fprf is not installed, FOLDER gets
+what an installation would write; with it in PYTHONPATH the checkout works as it is.
 """
 
 import importlib.metadata as metadata
@@ -19,7 +19,10 @@ NEEDED = ("torch", "numpy", "tyro", "rich", "cv2", "kornia", "trimesh", "safeten
 def main(folder: Path) -> int:
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
     if missing:
-        print(f"error: {', '.join(missing)} not found; install them, or name their wheels in PYTHONPATH", file=sys.stderr)
+        print(
+            f"error: {', '.join(missing)} not found; install them, or name their wheels in PYTHONPATH",
+            file=sys.stderr,
+        )
         return 2
     try:
         metadata.distribution("fprf")
@@ -32,7 +35,9 @@ def register(folder: Path) -> None:
     project = tomllib.loads(PROJECT.read_text())["project"]
     info = folder / f"{project['name']}-{project['version']}.dist-info"
     info.mkdir(parents=True)
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    )
     lines = []
     for group, points in project["entry-points"].items():
         lines += [f"[{group}]", *(f"{name} = {value}" for name, value in points.items())]

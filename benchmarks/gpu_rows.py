@@ -2,8 +2,8 @@
 
     python -m benchmarks.gpu_rows WORK --output FILE
 
-WORK holds steps.jsonl, a log of each step and, as far as the steps came, speed.json and the metrics.json of run, gaussians
-and long. Rows of what is missing are left out. The exit status is 1 where a step failed.
+WORK holds steps.jsonl, a log of each step and, as far as the steps came, speed.json and the metrics.json of
+run, gaussians and long. Rows of what is missing are left out. The exit status is 1 where a step failed.
 """
 
 import argparse
@@ -40,16 +40,30 @@ def steps(work: Path) -> list[dict[str, Any]]:
 
 def rows(work: Path, form: str) -> Iterator[Row]:
     """`form` names the tri-plane kernels that run here."""
-    run, measured = read(work / "run" / "metrics.json"), read(work / "speed.json")
+    run = read(work / "run" / "metrics.json")
+    measured = read(work / "speed.json")
     if run is not None:
         about = f"{run['method']} on {run['scene']}, {run['train_steps']} steps, {run['views']} views judged"
-        yield Row(name="training, features included", figure=run["train_seconds"] / 60, unit="min", note=about)
+        yield Row(
+            name="training, features included", figure=run["train_seconds"] / 60, unit="min", note=about
+        )
         yield Row(name="held-out PSNR", figure=run["psnr"], unit="dB", more_is_better=True, goal=26.0)
-    splats, log = read(work / "gaussians" / "metrics.json"), work / "gaussians.log"
+    splats = read(work / "gaussians" / "metrics.json")
+    log = work / "gaussians.log"
     if splats is not None:
-        by = "gsplat" if log.is_file() and "by gsplat" in log.read_text(errors="replace") else "the CPU's kernels"
+        by = (
+            "gsplat"
+            if log.is_file() and "by gsplat" in log.read_text(errors="replace")
+            else "the CPU's kernels"
+        )
         note = f"by {by}, {splats['train_steps']} steps, {splats['train_seconds'] / 60:.1f} min"
-        yield Row(name="held-out PSNR of 3D Gaussians", figure=splats["psnr"], unit="dB", note=note, more_is_better=True)
+        yield Row(
+            name="held-out PSNR of 3D Gaussians",
+            figure=splats["psnr"],
+            unit="dB",
+            note=note,
+            more_is_better=True,
+        )
     far = read(work / "long" / "metrics.json")
     if far is not None:
         note = f"{far['train_steps']} steps, {far['train_seconds'] / 60:.1f} min"
@@ -72,7 +86,9 @@ def rows(work: Path, form: str) -> Iterator[Row]:
             error_kind=of[name]["error_kind"],
             note=f"measured on views of {measured['settings']['view']}",
         )
-    first, dictionary = (of[f"new reference to {what}"]["figure"] for what in ("the first view", "its dictionary"))
+    first, dictionary = (
+        of[f"new reference to {what}"]["figure"] for what in ("the first view", "its dictionary")
+    )
     yield Row(name="a new style to its dictionary", figure=1e3 * dictionary, unit="ms")
     yield Row(name="a new style to its first frame", figure=1e3 * first, unit="ms", goal=100.0)
     for name, row in of.items():
@@ -83,8 +99,15 @@ def rows(work: Path, form: str) -> Iterator[Row]:
 
 def kernels(device: torch.device) -> str:
     """Which form of the tri-planes runs."""
-    points, table = torch.zeros(1, 3, device=device), torch.zeros(12, 8, device=device)
-    return "numba" if triplane.usable(points, table) else "triton" if triplane.triton_usable(points, table) else "plain"
+    points = torch.zeros(1, 3, device=device)
+    table = torch.zeros(12, 8, device=device)
+    return (
+        "numba"
+        if triplane.usable(points, table)
+        else "triton"
+        if triplane.triton_usable(points, table)
+        else "plain"
+    )
 
 
 def read(path: Path) -> Any:
@@ -92,22 +115,31 @@ def read(path: Path) -> Any:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("work", type=Path)
     parser.add_argument("--output", type=Path, required=True)
     options = parser.parse_args()
-    work, gone = options.work, steps(options.work)
+    work = options.work
+    gone = steps(options.work)
     speed = read(work / "speed.json") or {}
     device = torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
     form = kernels(device)
     found = list(rows(work, form))
     training = (read(work / "training.json") or {}).get("steps")
-    extra = {"steps": gone, "speed": speed.get("rows"), "counters": speed.get("counters"), "training_steps": training}
+    extra = {
+        "steps": gone,
+        "speed": speed.get("rows"),
+        "counters": speed.get("counters"),
+        "training_steps": training,
+    }
     settings = speed.get("settings", {}) | {"tri_planes": form}
     write_json(options.output, document("gpu", found, device=device, settings=settings, extra=extra))
     console = Console(highlight=False, width=120)
     ended = (
-        (each["step"], "passed" if each["passed"] else f"failed ({each['status']})", f"{each['seconds']} s") for each in gone
+        (each["step"], "passed" if each["passed"] else f"failed ({each['status']})", f"{each['seconds']} s")
+        for each in gone
     )
     console.print(table("steps", ("step", "", "took"), ended))
     console.print(rows_table("on this device", found))

@@ -1,9 +1,11 @@
-"""What each compiled kernel of `fprf.ops` brings, end to end: steps and views with one at a time switched to plain torch.
+"""What each compiled kernel of `fprf.ops` brings, end to end: steps and views with one at a time switched to
+plain torch.
 
-    OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m benchmarks kernels [RUN] [--data DIR] [--repeats 7] [--output FILE.json]
+    OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m benchmarks kernels [RUN] [--data DIR] [--repeats 7]
+    [--output FILE.json]
 
-Every form does the same work on the same model in one process, in turn, by the processor's clock. The fastest of all rounds
-counts, which other programs on the machine disturb least.
+Every form does the same work on the same model in one process, in turn, by the processor's clock. The fastest
+of all rounds counts, which other programs on the machine disturb least.
 """
 
 import tempfile
@@ -83,8 +85,10 @@ def tasks(subject: Subject, config: SpeedConfig) -> dict[str, Callable[[], objec
     """A training step, a plain view and a view in each style."""
     trained = subject.trained
     loop = loop_of(trained.config, subject.prepare(trained.config), fresh_model(trained))
-    camera, render = test_view(config, trained), trained.config.render
-    take, every = stepper(loop, trained.step), trained.config.loss.penalty_every
+    camera = test_view(config, trained)
+    render = trained.config.render
+    take = stepper(loop, trained.step)
+    every = trained.config.loss.penalty_every
 
     def steps() -> None:  # one of them has penalties
         for _ in range(every):
@@ -93,7 +97,10 @@ def tasks(subject: Subject, config: SpeedConfig) -> dict[str, Callable[[], objec
     calls: dict[str, Callable[[], object]] = {f"{every} training steps": steps}
     looks = {"view": None} | {
         f"view, {name}": apply_style(
-            trained, StyleFile(StyleConfig(references=subject.references, stylizer=stylizer, clusters=config.clusters))
+            trained,
+            StyleFile(
+                StyleConfig(references=subject.references, stylizer=stylizer, clusters=config.clusters)
+            ),
         ).restyle
         for name, stylizer in STYLES.items()
     }
@@ -111,7 +118,9 @@ def drawn(subject: Subject, camera: Cameras, render: RenderConfig, look: Restyle
 def main(argv: list[str]) -> None:
     """Measure and write."""
     parser = arguments("kernels", __doc__)
-    parser.add_argument("run", type=Path, nargs="?", help="run of fields; by default fprf-lite is trained on the town first")
+    parser.add_argument(
+        "run", type=Path, nargs="?", help="run of fields; by default fprf-lite is trained on the town first"
+    )
     parser.add_argument("--data", type=Path)
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--steps", type=int, default=300, help="of the run that is trained")
@@ -132,6 +141,11 @@ def main(argv: list[str]) -> None:
                     "times_slower": min(seconds[name]) / min(seconds[""]),
                 }
                 print(f"{task:24}{name or 'every kernel':48}{rows[name][task]}", flush=True)
-    about = {"scene": subject.trained.known.name, "step": subject.trained.step, "rounds": args.repeats, "clock": "processor"}
+    about = {
+        "scene": subject.trained.known.name,
+        "step": subject.trained.step,
+        "rounds": args.repeats,
+        "clock": "processor",
+    }
     forms = {name or "every kernel": row for name, row in rows.items()}
     report(args.output, {"run": about, "without": forms})

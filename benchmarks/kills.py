@@ -1,12 +1,14 @@
-"""Training that is killed again and again after its first checkpoint, many times within a save, and what is left of it.
+"""Training that is killed again and again after its first checkpoint, many times within a save, and what is
+left of it.
 
     python -m benchmarks kills [--kills 100] [--steps 300] [--seed 0] [--output benchmarks/results/kills.json]
 
-A whole `fprf train` of a tiny town (features, basis, training, statistics; a checkpoint after every step, so that saving is
-half of the time) is run once undisturbed. Then the same is started and killed with SIGKILL, started again, and so on until it
-ends; and all that until there were as many kills as asked for. Of every ten kills one falls anywhere between the start of the
-process and its first save, four at a random moment after it, and five as soon after such a moment as a half-written file is
-seen. Every end must be bitwise the undisturbed one: parameters, moments, scene statistics; nothing unfinished may be left.
+A whole `fprf train` of a tiny town (features, basis, training, statistics; a checkpoint after every step, so
+that saving is half of the time) is run once undisturbed. Then the same is started and killed with SIGKILL,
+started again, and so on until it ends; and all that until there were as many kills as asked for. Of every ten
+kills one falls anywhere between the start of the process and its first save, four at a random moment after
+it, and five as soon after such a moment as a half-written file is seen. Every end must be bitwise the
+undisturbed one: parameters, moments, scene statistics; nothing unfinished may be left.
 """
 
 import contextlib
@@ -58,14 +60,22 @@ def tiny(data: Path, steps: int) -> TrainConfig:
         checkpoint_minutes=1e-9,
         datamanager=RayBatchesConfig(rays=256, semantic_share=0.5),
         sampler=ProposalConfig(samples=(16,), final=8, resolutions=(8,), anneal_steps=10),
-        content=replace(lite.content, field=PlanesConfig(resolutions=(8, 16), channels=8, hidden=32, layers=1)),
-        semantic=replace(lite.semantic, field=SemanticPlanesConfig(resolutions=(8,), channels=8, hidden=16, layers=1), dim=8),
+        content=replace(
+            lite.content, field=PlanesConfig(resolutions=(8, 16), channels=8, hidden=32, layers=1)
+        ),
+        semantic=replace(
+            lite.semantic,
+            field=SemanticPlanesConfig(resolutions=(8,), channels=8, hidden=16, layers=1),
+            dim=8,
+        ),
         statistics=StatisticsConfig(rays=2048, regions=4),
     )
 
 
 def in_child(work: Callable[[], object], due: Callable[[float], bool] = lambda seconds: False) -> int:
-    """Run in a forked process, which is killed once `due` of its seconds says so; its exit code, or minus the signal."""
+    """Run in a forked process, which is killed once `due` of its seconds says so; its exit code, or minus the
+    signal.
+    """
     start = time.monotonic()
     process = os.fork()
     if process == 0:
@@ -88,7 +98,9 @@ def in_child(work: Callable[[], object], due: Callable[[float], bool] = lambda s
 
 
 def import_as(work: Callable[[], object], note: Path) -> None:
-    """Import here all that `work` imports, so that forked processes find it: most of a start would go to imports."""
+    """Import here all that `work` imports, so that forked processes find it: most of a start would go to
+    imports.
+    """
 
     def tell() -> None:
         work()
@@ -106,7 +118,8 @@ def import_as(work: Callable[[], object], note: Path) -> None:
 def moment(run: Path, kind: str, draw: random.Random, pace: float) -> Callable[[float], bool]:
     """When to kill a process: a function that says, of its age in seconds, whether it is time."""
     checkpoints = run / "checkpoints"
-    first, wait = max(saved(checkpoints), default=0), draw.uniform(0, pace if kind == "early" else SPAN)
+    first = max(saved(checkpoints), default=0)
+    wait = draw.uniform(0, pace if kind == "early" else SPAN)
     begun: list[float] = []
 
     def due(seconds: float) -> bool:
@@ -125,9 +138,14 @@ def contents(run: Path) -> dict[str, bytes]:
     """All numbers that a run ends with, by name."""
     last = saved(run / "checkpoints")[-1]
     whole = load(run / "checkpoints", last)
-    named = {**{f"model.{k}": v for k, v in whole.model.items()}, **{f"adam.{k}": v for k, v in whole.optimizer.items()}}
+    named = {
+        **{f"model.{k}": v for k, v in whole.model.items()},
+        **{f"adam.{k}": v for k, v in whole.optimizer.items()},
+    }
     found = {name: tensor.numpy().tobytes() for name, tensor in named.items()} | {"step": str(last).encode()}
-    return found | {name: (run / name).read_bytes() for name in ("style.safetensors", "basis.safetensors", "config.json")}
+    return found | {
+        name: (run / name).read_bytes() for name in ("style.safetensors", "basis.safetensors", "config.json")
+    }
 
 
 def strays(run: Path) -> list[str]:
@@ -160,7 +178,8 @@ def measure(
     if in_child(train("straight")):
         raise SystemExit("the undisturbed run failed")
     usual = time.monotonic() - start
-    wanted, draw = contents(folder / "straight"), random.Random(seed)
+    wanted = contents(folder / "straight")
+    draw = random.Random(seed)
     runs = equal = cut_saves = 0
     killed: list[tuple[str, int]] = []
     left: list[str] = []

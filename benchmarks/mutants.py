@@ -1,10 +1,12 @@
-"""How many small mistakes in the mathematics the tests notice: one operator, number or clamp is changed, the tests are run.
+"""How many small mistakes in the mathematics the tests notice: one operator, number or clamp is changed, the
+tests are run.
 
     python -m benchmarks mutants [--sample 40] [--kernels 16] [--seed 0] [--only MODULE ...] [--output mutants.json]
 
-Each module of MODULES has its tests. Of all its possible mistakes a sample is drawn, a function of (module, seed); compiled
-kernels get a smaller one, because each has to be compiled anew. A mistake is found where a test fails, or where the tests take
-ten times their time. With an output file that is there already, only what no test has found yet is tried again.
+Each module of MODULES has its tests. Of all its possible mistakes a sample is drawn, a function of (module,
+seed); compiled kernels get a smaller one, because each has to be compiled anew. A mistake is found where a
+test fails, or where the tests take ten times their time. With an output file that is there already, only what
+no test has found yet is tried again.
 """
 
 import ast
@@ -89,7 +91,8 @@ def mutated(source: str, mutation: Mutation) -> ast.Module:
 
 class _Replace(ast.NodeTransformer):
     def __init__(self, target: ast.AST, replacement: ast.AST) -> None:
-        self.target, self.replacement = target, replacement
+        self.target = target
+        self.replacement = replacement
 
     def visit(self, node: ast.AST) -> ast.AST:
         if node is self.target:
@@ -104,7 +107,11 @@ def _nodes(node: ast.AST) -> Iterator[ast.expr | ast.stmt]:
     if isinstance(node, ast.expr | ast.stmt):
         yield node
     if isinstance(node, ast.FunctionDef):
-        children: list[ast.AST] = [*node.args.defaults, *(d for d in node.args.kw_defaults if d is not None), *node.body]
+        children: list[ast.AST] = [
+            *node.args.defaults,
+            *(d for d in node.args.kw_defaults if d is not None),
+            *node.body,
+        ]
     elif isinstance(node, ast.ClassDef):
         children = list(node.body)
     elif isinstance(node, ast.AnnAssign):
@@ -122,11 +129,17 @@ def _nodes(node: ast.AST) -> Iterator[ast.expr | ast.stmt]:
 
 
 def _is_axis(node: ast.AST) -> TypeGuard[ast.UnaryOp]:
-    return isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) and isinstance(node.operand, ast.Constant)
+    return (
+        isinstance(node, ast.UnaryOp)
+        and isinstance(node.op, ast.USub)
+        and isinstance(node.operand, ast.Constant)
+    )
 
 
 def _is_all(node: ast.AST) -> bool:
-    return isinstance(node, ast.Assign) and any(isinstance(t, ast.Name) and t.id == "__all__" for t in node.targets)
+    return isinstance(node, ast.Assign) and any(
+        isinstance(t, ast.Name) and t.id == "__all__" for t in node.targets
+    )
 
 
 def _changes(node: ast.expr | ast.stmt) -> list[tuple[str, ast.AST]]:
@@ -167,14 +180,20 @@ def _calls(node: ast.Call) -> list[tuple[str, ast.AST]]:
     function = node.func
     made: list[tuple[str, ast.AST]] = []
     if isinstance(function, ast.Attribute):
-        name, owner = function.attr, function.value
+        name = function.attr
+        owner = function.value
         if name in CLAMPS:
             free = isinstance(owner, ast.Name) and owner.id in ("torch", "np", "math", "F")
             made.append((f"{name} left out", node.args[0] if free else owner))
         if name in SWAPS:
             made.append((f"{name} to {SWAPS[name]}", _with(node, func=_with(function, attr=SWAPS[name]))))
     elif isinstance(function, ast.Name) and function.id in SWAPS and function.id in ("min", "max"):
-        made.append((f"{function.id} to {SWAPS[function.id]}", _with(node, func=ast.Name(SWAPS[function.id], ast.Load()))))
+        made.append(
+            (
+                f"{function.id} to {SWAPS[function.id]}",
+                _with(node, func=ast.Name(SWAPS[function.id], ast.Load())),
+            )
+        )
     return made
 
 
@@ -219,7 +238,9 @@ class Changed(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     """Imports one module from another source, as if its file held it."""
 
     def __init__(self, name: str, path: Path, code: CodeType) -> None:
-        self.name, self.path, self.code = name, path, code
+        self.name = name
+        self.path = path
+        self.code = code
 
     def find_spec(
         self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -235,9 +256,11 @@ class Changed(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 @contextlib.contextmanager
 def compiled_anew(wanted: bool) -> Iterator[None]:
-    """What numba keeps is found by a function's own code: a change in what is compiled into it would not be noticed.
+    """What numba keeps is found by a function's own code: a change in what is compiled into it would not be
+    noticed.
 
-    Arrays are held to their bounds, as `tests/ops/test_operator_table.py` does: else what lies beside them decides.
+    Arrays are held to their bounds, as `tests/ops/test_operator_table.py` does: else what lies beside them
+    decides.
     """
     if not wanted:
         yield
@@ -247,7 +270,8 @@ def compiled_anew(wanted: bool) -> Iterator[None]:
     config: Any = numba.config
     base = "/dev/shm" if Path("/dev/shm").is_dir() else None
     usual = config.CACHE_DIR, config.BOUNDSCHECK
-    config.CACHE_DIR, config.BOUNDSCHECK = tempfile.mkdtemp(prefix="fprf-numba-", dir=base), 1
+    config.CACHE_DIR = tempfile.mkdtemp(prefix="fprf-numba-", dir=base)
+    config.BOUNDSCHECK = 1
     try:
         yield
     finally:
@@ -256,7 +280,9 @@ def compiled_anew(wanted: bool) -> Iterator[None]:
 
 
 def run_tests(module: str, code: CodeType | None, seconds: float, root: Path) -> tuple[int, float]:
-    """Run a module's tests in a forked process, with its code changed or as it is; exit code and processor time."""
+    """Run a module's tests in a forked process, with its code changed or as it is; exit code and processor
+    time.
+    """
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     with compiled_anew(module.endswith(COMPILED)):
         child = os.fork()
@@ -284,7 +310,9 @@ def _in_child(module: str, code: CodeType | None, seconds: float, root: Path) ->
     resource.setrlimit(resource.RLIMIT_AS, (ROOM, ROOM))
     os.chdir(root)
     sys.path[:0] = [str(root), str(root / "tests")]
-    for name in [name for name in sys.modules if name.partition(".")[0] == "fprf"]:  # those of reports, which are not changed
+    for name in [
+        name for name in sys.modules if name.partition(".")[0] == "fprf"
+    ]:  # those of reports, which are not changed
         del sys.modules[name]
     if code is not None:
         name = module.removesuffix(".py").replace("/", ".")
@@ -292,7 +320,9 @@ def _in_child(module: str, code: CodeType | None, seconds: float, root: Path) ->
     tests = [str(path) for name in MODULES[module] if (path := root / "tests" / name).exists()]
     if not tests:
         return 98
-    return int(pytest.main(["-x", "-q", "--assert=plain", "-p", "no:cacheprovider", "--hypothesis-seed=0", *tests]))
+    return int(
+        pytest.main(["-x", "-q", "--assert=plain", "-p", "no:cacheprovider", "--hypothesis-seed=0", *tests])
+    )
 
 
 def chosen(source: str, module: str, count: int, seed: int) -> tuple[list[Mutation], int]:
@@ -302,7 +332,9 @@ def chosen(source: str, module: str, count: int, seed: int) -> tuple[list[Mutati
     return sorted(draw.sample(every, min(count, len(every)))), len(every)
 
 
-def measure_module(module: str, count: int, seed: int, old: dict[str, Any], root: Path = ROOT) -> dict[str, Any]:
+def measure_module(
+    module: str, count: int, seed: int, old: dict[str, Any], root: Path = ROOT
+) -> dict[str, Any]:
     """Try a sample of a module's mistakes; those that `old` knows to be found are not tried again."""
     source = (root / module).read_text()
     digest = hashlib.sha256(source.encode()).hexdigest()[:16]
@@ -312,7 +344,8 @@ def measure_module(module: str, count: int, seed: int, old: dict[str, Any], root
     usual_code, usual = run_tests(module, None, 3000, root)
     if usual_code:
         raise SystemExit(f"{module}: its tests fail without any change ({usual_code})")
-    found, survived = [], []
+    found = []
+    survived = []
     for mutation in sample:
         name = mutation.name
         if name not in known:
@@ -341,14 +374,19 @@ def main(argv: list[str]) -> None:
     document: dict[str, Any] = {"modules": {}}
     if asked.output is not None and asked.output.exists():
         document = json.loads(asked.output.read_text())
-    document["command"] = f"python -m benchmarks mutants --sample {asked.sample} --kernels {asked.kernels} --seed {asked.seed}"
+    document["command"] = (
+        f"python -m benchmarks mutants --sample {asked.sample} --kernels {asked.kernels} --seed {asked.seed}"
+    )
     for module in MODULES:
         if asked.only and module not in asked.only:
             continue
         count = asked.kernels if module.endswith(COMPILED) else asked.sample
         row = measure_module(module, count, asked.seed, document["modules"].get(module, {}))
         document["modules"][module] = row
-        print(f"{module}: {len(row['found'])} of {row['tried']} found, of {row['possible']} possible", flush=True)
+        print(
+            f"{module}: {len(row['found'])} of {row['tried']} found, of {row['possible']} possible",
+            flush=True,
+        )
         document["tried"] = sum(each["tried"] for each in document["modules"].values())
         document["found"] = sum(len(each["found"]) for each in document["modules"].values())
         if asked.output is not None:

@@ -51,7 +51,13 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 from chromium import chromium
 
-TARGETS = {"psnr": 35.0, "frame_seconds": 0.7, "first_picture_seconds": 2.0, "sort_milliseconds": 40.0, "drop_seconds": 1.0}
+TARGETS = {
+    "psnr": 35.0,
+    "frame_seconds": 0.7,
+    "first_picture_seconds": 2.0,
+    "sort_milliseconds": 40.0,
+    "drop_seconds": 1.0,
+}
 PARTS = ("pictures", "frames", "million", "drop")
 DRAW = """async ([view, lens, width, height, options]) => {
   const { splats, scene, canvas } = fprf.place;
@@ -69,7 +75,9 @@ DRAW = """async ([view, lens, width, height, options]) => {
 
 WALK = (2, 13)
 """Cameras of a page, in its order, between which the film walks."""
-FRAMES, COLUMN, GAP = 18, (200, 356), 6
+FRAMES = 18
+COLUMN = (200, 356)
+GAP = 6
 """Frames one way, size of a column and room between columns, in pixels."""
 STEP = """async ([t, [from, to], width, height]) => {
   const { place, stage } = fprf, { splats, scene, canvas } = place;
@@ -90,13 +98,22 @@ def opened(browser: Any, scene: SplatScene, folder: Path) -> Any:
     """The page of a scene, as soon as all of it is there."""
     path = folder / "page.html"
     write_page(
-        path, Page(title="page", facts={}, views=[PageView("0", np.zeros((72, 128, 3), np.uint8))], styles=[], scene=scene)
+        path,
+        Page(
+            title="page",
+            facts={},
+            views=[PageView("0", np.zeros((72, 128, 3), np.uint8))],
+            styles=[],
+            scene=scene,
+        ),
     )
     page = browser.new_page(viewport={"width": 1280, "height": 800})
-    start, before = time.perf_counter(), processor_seconds()
+    start = time.perf_counter()
+    before = processor_seconds()
     page.goto(path.as_uri())
     page.wait_for_selector(".place.drawn", timeout=120_000)
-    page.first, page.first_processor = time.perf_counter() - start, processor_seconds() - before
+    page.first = time.perf_counter() - start
+    page.first_processor = processor_seconds() - before
     page.wait_for_timeout(2000)
     return page
 
@@ -107,13 +124,20 @@ def view_of(cameras: Cameras, view: int, near: float, size: tuple[int, int] | No
     width, height = size or (camera.width, camera.height)
     by = min(width / camera.width, height / camera.height)
     fx, fy, cx, cy = (float(camera.intrinsics[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    lens = [fx * by, fy * by, width / 2 + (cx - camera.width / 2) * by, height / 2 + (cy - camera.height / 2) * by]
+    lens = [
+        fx * by,
+        fy * by,
+        width / 2 + (cx - camera.width / 2) * by,
+        height / 2 + (cy - camera.height / 2) * by,
+    ]
     return [camera.world_to_camera.T.flatten().tolist(), lens, width, height]
 
 
 def picture_of(url: str) -> np.ndarray:
     """The RGB picture of a canvas's data URL."""
-    return np.asarray(cv2.imdecode(np.frombuffer(base64.b64decode(url.split(",")[1]), np.uint8), 1))[..., ::-1]
+    return np.asarray(cv2.imdecode(np.frombuffer(base64.b64decode(url.split(",")[1]), np.uint8), 1))[
+        ..., ::-1
+    ]
 
 
 def film(browser: Any, source: Path, output: Path) -> None:
@@ -125,7 +149,10 @@ def film(browser: Any, source: Path, output: Path) -> None:
     for step in range(FRAMES + 1):
         t = 0.5 - 0.5 * np.cos(np.pi * step / FRAMES)  # begins and ends at rest
         drawn = page.evaluate(STEP, [t, WALK, 2 * COLUMN[0], 2 * COLUMN[1]])
-        columns = [np.asarray(cv2.resize(picture_of(url), COLUMN, interpolation=cv2.INTER_AREA), np.uint8) for url in drawn]
+        columns = [
+            np.asarray(cv2.resize(picture_of(url), COLUMN, interpolation=cv2.INTER_AREA), np.uint8)
+            for url in drawn
+        ]
         gap = np.full((COLUMN[1], GAP, 3), 255, np.uint8)
         frames.append(np.hstack([part for column in columns for part in (gap, column)][1:]).astype(np.uint8))
     write_video(output, iter([*frames, *frames[-2:0:-1]]), fps=10)
@@ -138,20 +165,29 @@ def pictures(page: Any, scene: SplatScene, count: int) -> dict[str, float]:
         mine = picture_of(drawn) / 255
         camera = camera_of(scene.views, view, scene.near)
         theirs = (
-            draw(scene.gaussians, camera, antialiased=scene.antialiased, background=scene.background).image.clamp(0, 1).numpy()
+            draw(scene.gaussians, camera, antialiased=scene.antialiased, background=scene.background)
+            .image.clamp(0, 1)
+            .numpy()
         )
         found.append(float(-10 * np.log10(((mine - theirs) ** 2).mean())))
-    return {"views": len(found), "psnr_mean": round(statistics.fmean(found), 2), "psnr_worst": round(min(found), 2)}
+    return {
+        "views": len(found),
+        "psnr_mean": round(statistics.fmean(found), 2),
+        "psnr_worst": round(min(found), 2),
+    }
 
 
 def processor_seconds() -> float:
-    """Time that processes started from this one, and from those, have used: other than wall clocks, it bears a busy machine."""
+    """Time that processes started from this one, and from those, have used: other than wall clocks, it bears
+    a busy machine.
+    """
     rows = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):  # it has ended
             fields = path.read_text().rsplit(")", 1)[1].split()
             rows[int(path.parent.name)] = (int(fields[1]), int(fields[11]) + int(fields[12]))
-    ours, size = {os.getpid()}, 0
+    ours = {os.getpid()}
+    size = 0
     while size < len(ours):
         size = len(ours)
         ours |= {each for each, (parent, _) in rows.items() if parent in ours}
@@ -160,14 +196,18 @@ def processor_seconds() -> float:
 
 def frames(page: Any, scene: SplatScene, count: int) -> dict[str, float]:
     place = view_of(scene.views, len(scene.views) // 2, scene.near, (1280, 720))
-    said: dict[str, float] = {"gaussians": len(scene.gaussians), "first_picture_seconds": round(page.first, 2)}
+    said: dict[str, float] = {
+        "gaussians": len(scene.gaussians),
+        "first_picture_seconds": round(page.first, 2),
+    }
     said["first_picture_processor_seconds"] = round(page.first_processor, 2)
     for name, options in (
         ("moving", {"exact": False}),
         ("moving_half", {"exact": False, "share": 0.5}),
         ("resting", {"exact": True}),
     ):
-        times, used = [], []
+        times = []
+        used = []
         for _ in range(count):
             before = processor_seconds()
             times.append(page.evaluate(DRAW, [*place, {**options, "timed": True}])["seconds"])
@@ -179,16 +219,23 @@ def frames(page: Any, scene: SplatScene, count: int) -> dict[str, float]:
 
 def million(browser: Any, folder: Path, count: int) -> dict[str, float]:
     draw_ = torch.Generator().manual_seed(0)
-    parts = (torch.randn(count, 3, generator=draw_), torch.randn(count, 4, generator=draw_), torch.full((count, 3), -3.5))
+    parts = (
+        torch.randn(count, 3, generator=draw_),
+        torch.randn(count, 4, generator=draw_),
+        torch.full((count, 3), -3.5),
+    )
     gaussians = Gaussians(*parts, torch.full((count,), 2.0), 0.3 * torch.randn(count, 1, 3, generator=draw_))
     scene = look_at_capture(
         gaussians, True, BundledSemanticConfig().build(), LookConfig(views=4, size=(160, 120), inside=False)
     )
     page = opened(browser, scene, folder)
-    sorts = [page.evaluate(DRAW, [*view_of(scene.views, k, scene.near), {"timed": True}])["sort"] for k in range(4)]
+    sorts = [
+        page.evaluate(DRAW, [*view_of(scene.views, k, scene.near), {"timed": True}])["sort"] for k in range(4)
+    ]
     heap = page.evaluate("() => performance.memory.usedJSHeapSize") / 2**20
     size = (folder / "page.html").stat().st_size / 2**20
-    # Shapes and order on the graphics card and in the page, projected Gaussians, means and keys of the sorter.
+    # Shapes and order on the graphics card and in the page, projected Gaussians, means and keys of the
+    # sorter.
     held = count * (2 * 16 + 2 * 4 + 2 * 32 + 4 + 4 + 12 + 4 + 2) / 2**20
     sizes = {"heap_mib": round(heap, 1), "held_mib": round(held), "file_mib": round(size, 1)}
     return {"gaussians": count, "sort_milliseconds": round(min(sorts), 1), **sizes}
@@ -209,7 +256,9 @@ def drop(browser: Any, run: Path, reference: Path) -> dict[str, float]:
                 page.evaluate("() => { fprf.seen = fprf.place.splats.colours.get('Now'); }")
                 start = time.perf_counter()
                 page.set_input_files("#photographs", str(reference))
-                page.wait_for_function("() => fprf.place.splats.colours.get('Now') !== fprf.seen", timeout=60_000, polling=20)
+                page.wait_for_function(
+                    "() => fprf.place.splats.colours.get('Now') !== fprf.seen", timeout=60_000, polling=20
+                )
                 times.append(time.perf_counter() - start)
                 page.wait_for_timeout(3000)
                 assert before >= 0
@@ -225,13 +274,17 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--film", type=Path, nargs=2, metavar=("PAGE", "OUTPUT"))
     parser.add_argument("--few", action="store_true", help="few views, frames and Gaussians")
-    parser.add_argument("--output", type=Path, help="JSON to write; parts that are not run keep what is there")
+    parser.add_argument(
+        "--output", type=Path, help="JSON to write; parts that are not run keep what is there"
+    )
     args = parser.parse_args(argv)
     if args.film:
         with chromium() as browser:
             film(browser, *args.film)
         return
-    found: dict[str, Any] = json.loads(args.output.read_text()) if args.output and args.output.is_file() else {}
+    found: dict[str, Any] = (
+        json.loads(args.output.read_text()) if args.output and args.output.is_file() else {}
+    )
     found |= {"format": 1, "targets": TARGETS}
     few = 2 if args.few else 5
     with chromium() as browser, tempfile.TemporaryDirectory() as name:
@@ -243,7 +296,9 @@ def main(argv: list[str]) -> None:
             for part, measure in (("pictures", pictures), ("frames", frames)):
                 if part in args.parts:
                     load = round(os.getloadavg()[0], 2)
-                    found.setdefault(part, {})[run.name] = measure(page, scene, few) | {"load_average_before": load}
+                    found.setdefault(part, {})[run.name] = measure(page, scene, few) | {
+                        "load_average_before": load
+                    }
                     print(part, run.name, found[part][run.name], flush=True)
             page.close()
         if "million" in args.parts:

@@ -2,9 +2,9 @@
 
     python -m benchmarks paper --table ablation|guided-filter|clusters [--data SCENE --references A.jpg ...] [any field]
 
-A town is restyled by other towns and judged by its truth; another scene by photographs, judged by what is left of its structure
-and by VGG-19's relu1_1 and relu2_1 statistics, in regions that the run's semantic encoder finds in both. One reference and
-three, pictures alone and seconds are rows of `restyle`.
+A town is restyled by other towns and judged by its truth; another scene by photographs, judged by what is
+left of its structure and by VGG-19's relu1_1 and relu2_1 statistics, in regions that the run's semantic
+encoder finds in both. One reference and three, pictures alone and seconds are rows of `restyle`.
 """
 
 import math
@@ -68,7 +68,9 @@ from .town.write import scene_folder
 
 @dataclass(frozen=True, kw_only=True)
 class PaperConfig:
-    """A table of the paper, from short trainings of one scene: the method as it is, and with one thing changed."""
+    """A table of the paper, from short trainings of one scene: the method as it is, and with one thing
+    changed.
+    """
 
     table: Literal["ablation", "guided-filter", "clusters"] = "ablation"
     """Which."""
@@ -125,7 +127,8 @@ class SceneDecoderConfig(DecoderConfig):
 class SceneDecoder(Decoder):
     """rgb = sigmoid(W2 relu(W1 f + b1) + b2), every weight the scene's own; grey before it is trained.
 
-    Weights are kept times the root of their fan-in, since Adam moves each by the learning rate, whatever its size.
+    Weights are kept times the root of their fan-in, since Adam moves each by the learning rate, whatever its
+    size.
     """
 
     def __init__(self, channels: int, hidden: int, generator: torch.Generator) -> None:
@@ -199,7 +202,9 @@ def short_training(config: TrainConfig, folder: Path, progress: Progress) -> Sho
     learn(learner, run, schedule_of(config, len(prepared.scene.train)), report)
     model = learner.model.requires_grad_(False).eval()
     seconds = time.perf_counter() - start
-    run.save_tensors("style", to_tensors(measure_style(config, model, prepared.scene.cameras, prepared.scene.train)))
+    run.save_tensors(
+        "style", to_tensors(measure_style(config, model, prepared.scene.cameras, prepared.scene.train))
+    )
     if prepared.basis is not None:
         run.save_tensors("basis", prepared.basis.tensors())
     trained = Trained(run, config, "", run.load_known(), model, config.steps, seconds)
@@ -208,8 +213,10 @@ def short_training(config: TrainConfig, folder: Path, progress: Progress) -> Sho
 
 def held_out(trained: Trained, views: int) -> Row:
     """PSNR, SSIM and LPIPS of held-out views against their photographs."""
-    known, config = trained.known, trained.config
-    scene, found = read_scene(config), []
+    known = trained.known
+    config = trained.config
+    scene = read_scene(config)
+    found = []
     for view in (known.test or known.train)[:views]:
         render = render_view(trained.model, known.facts, known.cameras, view, config.render).rgb
         size = (render.shape[1], render.shape[0])
@@ -219,13 +226,19 @@ def held_out(trained: Trained, views: int) -> Row:
 
 
 def by_truth(short: Short, config: PaperConfig, folder: Path, stylizer: StylizerConfig, clusters: int) -> Row:
-    """Figures of a style from three other towns, means over the palettes: nearness to the truth, match rates, structure."""
+    """Figures of a style from three other towns, means over the palettes: nearness to the truth, match rates,
+    structure.
+    """
     trained, encoders = short
     folder.mkdir(exist_ok=True)
     side = int(trained.known.cameras.size.amax())
-    stage = set_stage(trained, trained.known, town_settings(trained.config), views=config.views, frames=0, longest=side)
+    stage = set_stage(
+        trained, trained.known, town_settings(trained.config), views=config.views, frames=0, longest=side
+    )
     width, height = (int(v) for v in trained.known.cameras.size[0])
-    labels, plain, rows = [each.labels for each in stage.truth], [view.restyled().rgb for view in stage.shown], []
+    labels = [each.labels for each in stage.truth]
+    plain = [view.restyled().rgb for view in stage.shown]
+    rows = []
     for light in config.palettes:
         shown = [photograph(place, light) for place in places(SEEDS, (width, height))["three"]]
         paths = [folder / f"{reference.name}.png" for reference in shown]
@@ -241,26 +254,41 @@ def by_truth(short: Short, config: PaperConfig, folder: Path, stylizer: Stylizer
         if found.taken is not None:
             known = dict(zip((path.name for path in paths), shown, strict=True))
             classes = code_classes(dictionary, known, encoders, trained.config.datamanager.guided)
-            taken = [winners(share, classes).view(like.shape) for share, like in zip(found.taken, labels, strict=True)]
+            taken = [
+                winners(share, classes).view(like.shape)
+                for share, like in zip(found.taken, labels, strict=True)
+            ]
             row |= match_rates(taken, labels, shown)._asdict()
-        rows.append({"": row | {"style_seconds": seconds + found.style_seconds, "view_seconds": found.view_seconds}})
+        rows.append(
+            {"": row | {"style_seconds": seconds + found.style_seconds, "view_seconds": found.view_seconds}}
+        )
     return mean_rows(rows)[""]
 
 
-def by_photographs(short: Short, config: PaperConfig, stylizers: Mapping[str, StylizerConfig], clusters: int) -> Row:
-    """Figures of each stylizer, its name before their keys: distance to the photographs' style, and the structure kept."""
+def by_photographs(
+    short: Short, config: PaperConfig, stylizers: Mapping[str, StylizerConfig], clusters: int
+) -> Row:
+    """Figures of each stylizer, its name before their keys: distance to the photographs' style, and the
+    structure kept.
+    """
     trained, encoders = short
     looks: dict[str, Restyle | None] = {PLAIN: None}
     for name, stylizer in stylizers.items():
-        style = StyleConfig(references=config.references, stylizer=stylizer, clusters=clusters, blend=config.blend)
+        style = StyleConfig(
+            references=config.references, stylizer=stylizer, clusters=clusters, blend=config.blend
+        )
         looks[name] = apply_style(trained, StyleFile(style), encoders).restyle
-    known, render = trained.known, trained.config.render
+    known = trained.known
+    render = trained.config.render
     views = (known.test or known.train)[: config.views]
     cached = (cache_view(trained.model, known.facts, known.cameras, view, render) for view in views)
     shown = [{name: view.restyled(look).rgb for name, look in looks.items()} for view in cached]
     plain = [pictures[PLAIN] for pictures in shown]
     side = max(plain[0].shape[:2])
-    images = [torch.from_numpy(shrink(load_image(path, upright=True), side)).float() / 255 for path in config.references]
+    images = [
+        torch.from_numpy(shrink(load_image(path, upright=True), side)).float() / 255
+        for path in config.references
+    ]
     observer = encoders.semantic if encoders.semantic is not None else encoders.content
     here, there = matched_regions(observer.cpu(), plain, images, regions=_REGIONS, seed=0)
     styled = {name: [pictures[name] for pictures in shown] for name in stylizers}
@@ -270,16 +298,22 @@ def by_photographs(short: Short, config: PaperConfig, stylizers: Mapping[str, St
 
 
 def styled(short: Short, config: PaperConfig, folder: Path, clusters: int) -> Row:
-    """The recommended stylizer on a training, and as `paper_*` the paper's own, which has nothing but features."""
+    """The recommended stylizer on a training, and as `paper_*` the paper's own, which has nothing but
+    features.
+    """
     if town_folder(short.trained.config) is None:
         stylizers: Mapping[str, StylizerConfig] = {"": RegionToneConfig(), "paper_": LocalAdainConfig()}
         return by_photographs(short, config, stylizers, clusters) if config.references else {}
     paper = by_truth(short, config, folder, LocalAdainConfig(), clusters)
-    shown = {f"paper_{key}": paper[key] for key in ("styled_psnr", "styled_delta_e", "structure") if key in paper}
+    shown = {
+        f"paper_{key}": paper[key] for key in ("styled_psnr", "styled_delta_e", "structure") if key in paper
+    }
     return by_truth(short, config, folder, RegionToneConfig(), clusters) | shown
 
 
-def rows_of(config: PaperConfig, base: TrainConfig, folder: Path, progress: Progress) -> Iterator[tuple[str, Row]]:
+def rows_of(
+    config: PaperConfig, base: TrainConfig, folder: Path, progress: Progress
+) -> Iterator[tuple[str, Row]]:
     """The rows of the table, from trainings with one seed."""
     for k, (name, change) in enumerate(TRAINED[config.table].items()):
         short = short_training(change(base), folder / f"run-{k}", progress)
@@ -320,7 +354,9 @@ def main(argv: list[str]) -> int:
     tables = []
     with Display() as display, tempfile.TemporaryDirectory(prefix="fprf-paper-") as made:
         for seed in config.trainings:
-            tables.append(dict(rows_of(config, replace(base, seed=seed), Path(made) / str(seed), display.count)))
+            tables.append(
+                dict(rows_of(config, replace(base, seed=seed), Path(made) / str(seed), display.count))
+            )
     document: dict[str, Any] = {
         "benchmark": "paper",
         "table": config.table,
@@ -339,8 +375,14 @@ def main(argv: list[str]) -> int:
         "rows": mean_rows(tables),
         **origin(config.device),
     }
-    columns = [each for each in COLUMNS if any(row.get(each[0]) is not None for row in document["rows"].values())]
-    console().print(printed(f"{config.table}, {name} on {config.data.name}, {config.steps} steps", document["rows"], columns))
+    columns = [
+        each for each in COLUMNS if any(row.get(each[0]) is not None for row in document["rows"].values())
+    ]
+    console().print(
+        printed(
+            f"{config.table}, {name} on {config.data.name}, {config.steps} steps", document["rows"], columns
+        )
+    )
     if config.output is not None:
         write_json(config.output, document)
     return 0

@@ -1,4 +1,6 @@
-"""Pareto: time against error for every knob of rendering, plain and restyled, and which settings no other one beats."""
+"""Pareto: time against error for every knob of rendering, plain and restyled, and which settings no other one
+beats.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,9 +26,28 @@ from fprf.training.views import render_view
 from .common import BenchConfig, Progress, bench_run
 from .report import Outcome, Spread, Watch, document, number, spread, table
 from .speed import plain_planes
-from .subject import count, difference, exact, find, plainly, settings, size_of, small_view, view_rays, watch_of
+from .subject import (
+    count,
+    difference,
+    exact,
+    find,
+    plainly,
+    settings,
+    size_of,
+    small_view,
+    view_rays,
+    watch_of,
+)
 
-BUDGETS = {"0": 0.0, "1/4096": 1 / 4096, "1/1024": 1 / 1024, "1/512": 1 / 512, "1/256": 1 / 256, "1/64": 1 / 64, "1/16": 1 / 16}
+BUDGETS = {
+    "0": 0.0,
+    "1/4096": 1 / 4096,
+    "1/1024": 1 / 1024,
+    "1/512": 1 / 512,
+    "1/256": 1 / 256,
+    "1/64": 1 / 64,
+    "1/16": 1 / 16,
+}
 CHUNKS = (1024, 4096, 32768)
 SIZES = (0.25, 0.5, 0.75)
 Draw = Callable[[Cameras], Annotated[Tensor, "H W 3"]]
@@ -60,7 +81,9 @@ class Point(NamedTuple):
 
 def knobs(trained: Trained, look: Restyle | None) -> Iterator[tuple[str, Draw]]:
     """Every value of every knob, by name."""
-    render, model, facts = trained.config.render, trained.model, trained.known.facts
+    render = trained.config.render
+    model = trained.model
+    facts = trained.known.facts
 
     def drawer(trained: Trained, render: RenderConfig) -> Draw:
         return lambda camera: render_view(trained.model, facts, camera, 0, render, look).rgb
@@ -79,7 +102,9 @@ def knobs(trained: Trained, look: Restyle | None) -> Iterator[tuple[str, Draw]]:
     def without_kernels(camera: Cameras) -> Tensor:
         width, height = (int(v) for v in camera.size[0])
         with plain_planes(model):
-            return plainly(model, facts, view_rays(model, camera, 0), render, look).view(height, width, 3).cpu()
+            return (
+                plainly(model, facts, view_rays(model, camera, 0), render, look).view(height, width, 3).cpu()
+            )
 
     yield "kernels none", without_kernels
     if look is not None:
@@ -88,7 +113,11 @@ def knobs(trained: Trained, look: Restyle | None) -> Iterator[tuple[str, Draw]]:
 
 
 def measure(
-    chosen: Mapping[str, Draw], cameras: Sequence[Cameras], truth: Tensor, watch: Watch, progress: Callable[[int, int], None]
+    chosen: Mapping[str, Draw],
+    cameras: Sequence[Cameras],
+    truth: Tensor,
+    watch: Watch,
+    progress: Callable[[int, int], None],
 ) -> list[Point]:
     """One point a setting; times are taken in turn. `truth` holds the exact colours of all views, flat."""
 
@@ -99,7 +128,9 @@ def measure(
     points = []
     for name, draw in chosen.items():
         away = difference(images(draw), truth)
-        points.append(Point(name, spread(taken[name]).map(lambda s: s / len(cameras)), away.largest, away.rms))
+        points.append(
+            Point(name, spread(taken[name]).map(lambda s: s / len(cameras)), away.largest, away.rms)
+        )
     return points
 
 
@@ -116,14 +147,19 @@ def pareto(config: ParetoConfig, root: Path, folder: Path, progress: Progress) -
     """Points and fronts."""
     subject = find(root, config, folder)
     trained = subject.trained
-    known, watch = trained.known, watch_of(config, trained)
-    cameras = [small_view(known.cameras, view, config.rays) for view in (known.test or known.train)[: config.views]]
+    known = trained.known
+    watch = watch_of(config, trained)
+    cameras = [
+        small_view(known.cameras, view, config.rays) for view in (known.test or known.train)[: config.views]
+    ]
     curves: dict[str, list[Point]] = {}
     for name, look in (
         ("plain", None),
         (
             "region-ot",
-            apply_style(trained, StyleFile(StyleConfig(references=subject.references, stylizer=RegionOtConfig()))).restyle,
+            apply_style(
+                trained, StyleFile(StyleConfig(references=subject.references, stylizer=RegionOtConfig()))
+            ).restyle,
         ),
     ):
         # Strength 0 is judged by the plain colours: it must cost nothing and change nothing.
@@ -135,7 +171,10 @@ def pareto(config: ParetoConfig, root: Path, folder: Path, progress: Progress) -
 
         def colours(look: Restyle | None) -> Tensor:
             return torch.cat(
-                [exact(trained.model, known.facts, view_rays(trained.model, c, 0), look).flatten() for c in cameras]
+                [
+                    exact(trained.model, known.facts, view_rays(trained.model, c, 0), look).flatten()
+                    for c in cameras
+                ]
             )
 
         curves[name] = measure(chosen, cameras, colours(look).cpu(), watch, told)
@@ -149,7 +188,11 @@ def pareto(config: ParetoConfig, root: Path, folder: Path, progress: Progress) -
             name: [
                 {
                     "name": point.name,
-                    **{key: float(f"{1e3 * value:.5g}") for key, value in point.seconds._asdict().items() if key != "rounds"},
+                    **{
+                        key: float(f"{1e3 * value:.5g}")
+                        for key, value in point.seconds._asdict().items()
+                        if key != "rounds"
+                    },
                     "largest_error": point.largest,
                     "rms_error": point.rms,
                 }
@@ -159,7 +202,9 @@ def pareto(config: ParetoConfig, root: Path, folder: Path, progress: Progress) -
         },
         "unit": "milliseconds",
         "fronts": fronts,
-        "counters_by_budget": {name: count(trained.model.parts, rays, budget) for name, budget in BUDGETS.items()},
+        "counters_by_budget": {
+            name: count(trained.model.parts, rays, budget) for name, budget in BUDGETS.items()
+        },
     }
     tables = []
     for name, points in curves.items():

@@ -38,9 +38,13 @@ class PeerConfig(ReportConfig):
     cameras: Path = Path("transforms.json")
     """Their cameras: a transforms.json whose file_path have the frames' stems. Pinholes."""
     plain: Path | None = None
-    """Folder of the same frames before they were stylised, by the same names: what consistency is relative to."""
+    """Folder of the same frames before they were stylised, by the same names: what consistency is relative
+    to.
+    """
     depth: Path | None = None
-    """Folder of NAME.npz (array `depth`) or NAME.npy: [H W], in the unit of the poses; 0 or infinite = nothing there."""
+    """Folder of NAME.npz (array `depth`) or NAME.npy: [H W], in the unit of the poses; 0 or infinite =
+    nothing there.
+    """
     depth_along: Literal["ray", "axis"] = "ray"
     """Kind of depth: distances along each pixel's ray, or along the camera's axis."""
     run: Path | None = None
@@ -54,35 +58,46 @@ class PeerConfig(ReportConfig):
 
 
 def read_pictures(folder: Path, names: Sequence[str] | None = None) -> Frames:
-    """All pictures of a folder, or those with these stems, in [0, 1]. Raises DataError for none, or a missing one."""
+    """All pictures of a folder, or those with these stems, in [0, 1]. Raises DataError for none, or a missing
+    one.
+    """
     files = {path.stem: path for path in sorted(folder.glob("*")) if path.suffix.lower() in IMAGE_SUFFIXES}
     if not files:
-        raise DataError(f"{folder}: no pictures ({' '.join(sorted(IMAGE_SUFFIXES))}); name the folder that the frames lie in")
+        raise DataError(
+            f"{folder}: no pictures ({' '.join(sorted(IMAGE_SUFFIXES))}); name the folder that the frames lie in"
+        )
     wanted = list(files) if names is None else list(names)
     missing = [name for name in wanted if name not in files]
     if missing:
-        raise DataError(f"{folder}: no picture named {missing[0]} ({len(missing)} are missing); name them as the frames")
+        raise DataError(
+            f"{folder}: no picture named {missing[0]} ({len(missing)} are missing); name them as the frames"
+        )
     return {name: torch.from_numpy(load_image(files[name])).float() / 255 for name in wanted}
 
 
 def read_cameras(path: Path, frames: Frames) -> Cameras:
     """The camera of each frame out of a transforms.json, at the size of the frame.
 
-    A frame belongs to the entry whose `file_path` has its stem; where no stem agrees and the numbers do, to the one at its
-    place by name. Pinholes alone. Raises DataError for what does not fit.
+    A frame belongs to the entry whose `file_path` has its stem; where no stem agrees and the numbers do, to
+    the one at its place by name. Pinholes alone. Raises DataError for what does not fit.
     """
     entries = {
-        Path(record.text("file_path") or "").stem: record for record in as_record(path, read_json(path)).records("frames")
+        Path(record.text("file_path") or "").stem: record
+        for record in as_record(path, read_json(path)).records("frames")
     }
     chosen = [entries[name] for name in frames if name in entries]
     if not chosen and len(entries) == len(frames):
         chosen = [entries[name] for name in sorted(entries)]
     if len(chosen) != len(frames):
-        raise DataError(f"{path}: cameras for {len(chosen)} of {len(frames)} frames; name the frames as the entries' file_path")
+        raise DataError(
+            f"{path}: cameras for {len(chosen)} of {len(frames)} frames; name the frames as the entries' file_path"
+        )
     sizes = [(image.shape[1], image.shape[0]) for image in frames.values()]
     views = [_camera(record, *size) for record, size in zip(chosen, sizes, strict=True)]
     return Cameras(
-        pose=torch.stack([torch.from_numpy(rigid_pose(r.where, r.matrix("transform_matrix"))) for r in chosen]),
+        pose=torch.stack(
+            [torch.from_numpy(rigid_pose(r.where, r.matrix("transform_matrix"))) for r in chosen]
+        ),
         focal=torch.tensor([focal for focal, _ in views], dtype=torch.float64),
         centre=torch.tensor([centre for _, centre in views], dtype=torch.float64),
         size=torch.tensor(sizes),
@@ -100,17 +115,22 @@ def read_depths(
     """
     depths = []
     for view, name in enumerate(names):
-        packed, plain = folder / f"{name}.npz", folder / f"{name}.npy"
+        packed = folder / f"{name}.npz"
+        plain = folder / f"{name}.npy"
         if packed.is_file():
             array = read_npz(packed, "depth")
         elif plain.is_file():
             array = read_npy(str(plain), read_bytes(plain))
         else:
-            raise DataError(f"{folder}: neither {packed.name} nor {plain.name}; write a depth for every frame")
+            raise DataError(
+                f"{folder}: neither {packed.name} nor {plain.name}; write a depth for every frame"
+            )
         depth = torch.from_numpy(array.astype("float64"))
         width, height = cameras.size[view].tolist()
         if depth.shape != (height, width):
-            raise DataError(f"{folder}/{name}: depth of shape {tuple(depth.shape)}, the frame has {height} rows of {width}")
+            raise DataError(
+                f"{folder}/{name}: depth of shape {tuple(depth.shape)}, the frame has {height} rows of {width}"
+            )
         if along == "axis":
             _, direction = grid_rays(cameras, view)
             depth = depth / (-direction @ cameras.pose[view, :, 2]).view(height, width)
@@ -119,18 +139,27 @@ def read_depths(
 
 
 def _camera(record: Record, width: int, height: int) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Focal lengths and centre in pixels of a frame that may be smaller or larger than the calibrated picture."""
+    """Focal lengths and centre in pixels of a frame that may be smaller or larger than the calibrated
+    picture.
+    """
     bent = [key for key in ("k1", "k2", "k3", "k4", "p1", "p2") if record.number(key)]
     if bent:
         raise DataError(f"{record.where}: {bent[0]} is not 0; only pinholes are judged, undistort the frames")
-    own_width, own_height = record.number("w") or width, record.number("h") or height
-    across, down = width / own_width, height / own_height
-    angle, fx = record.number("camera_angle_x"), record.number("fl_x")
+    own_width = record.number("w") or width
+    own_height = record.number("h") or height
+    across = width / own_width
+    down = height / own_height
+    angle = record.number("camera_angle_x")
+    fx = record.number("fl_x")
     if fx is None:
         if angle is None or not 0 < angle < math.pi:
-            raise DataError(f"{record.where}: no fl_x, and no camera_angle_x between 0 and pi; give the focal length as fl_x")
+            raise DataError(
+                f"{record.where}: no fl_x, and no camera_angle_x between 0 and pi; give the focal length as fl_x"
+            )
         fx = own_width / 2 / math.tan(angle / 2)
-    fy, cx, cy = record.number("fl_y"), record.number("cx"), record.number("cy")
+    fy = record.number("fl_y")
+    cx = record.number("cx")
+    cy = record.number("cy")
     centre = (own_width / 2 if cx is None else cx, own_height / 2 if cy is None else cy)
     return (fx * across, (fx if fy is None else fy) * down), (centre[0] * across, centre[1] * down)
 
@@ -143,12 +172,14 @@ Progress = Callable[[int, int, str], None]
 
 
 def peer(config: PeerConfig, progress: Progress) -> dict[str, Any]:
-    """The document. What cannot be said for lack of input is None, and `missing` names the flag that would tell.
+    """The document. What cannot be said for lack of input is None, and `missing` names the flag that would
+    tell.
 
     Raises DataError for frames, cameras and depths that do not fit each other.
     """
     frames = read_pictures(config.frames)
-    images, cameras = list(frames.values()), read_cameras(config.cameras, frames)
+    images = list(frames.values())
+    cameras = read_cameras(config.cameras, frames)
     plain, depths = _plain_and_depths(config, frames, cameras, progress)
     missing: dict[str, str] = {}
     document: dict[str, Any] = {
@@ -190,21 +221,30 @@ def _plain_and_depths(
         rendered = []
         for view in range(len(cameras)):
             progress(view, len(cameras), "rendering unstylised frames")
-            rendered.append(render_view(trained.model, trained.known.facts, cameras, view, trained.config.render))
+            rendered.append(
+                render_view(trained.model, trained.known.facts, cameras, view, trained.config.render)
+            )
         plain = [each.rgb for each in rendered] if plain is None else plain
         depths = [each.depth for each in rendered] if depths is None else depths
     for (name, own), image in zip(frames.items(), plain or frames.values(), strict=True):
         if image.shape != own.shape:
-            raise DataError(f"--plain: {name} is {_size(image)}, the stylised frame {_size(own)}; both must agree")
+            raise DataError(
+                f"--plain: {name} is {_size(image)}, the stylised frame {_size(own)}; both must agree"
+            )
     return plain, depths
 
 
 def _style(config: PeerConfig, styled: Sequence[Tensor], plain: Sequence[Tensor]) -> dict[str, float | None]:
-    """Distance to the references (1 = no change) and what is left of the frames' structure (1 = all of it)."""
-    references = [_reduced(torch.from_numpy(load_image(path, upright=True)).float() / 255) for path in config.references]
+    """Distance to the references (1 = no change) and what is left of the frames' structure (1 = all of
+    it).
+    """
+    references = [
+        _reduced(torch.from_numpy(load_image(path, upright=True)).float() / 255) for path in config.references
+    ]
     here, there = matched_regions(BundledSemanticConfig().build(), plain, references, regions=REGIONS, seed=0)
     judge = {"bundled-content": BundledContentConfig().build()}
-    before, target = list(zip(plain, here, strict=True)), list(zip(references, there, strict=True))
+    before = list(zip(plain, here, strict=True))
+    target = list(zip(references, there, strict=True))
     distances = style_distances(judge, before, {"frames": list(zip(styled, here, strict=True))}, target)
     kept = [structure(a, b) for a, b in zip(plain, styled, strict=True)]
     return {"style_distance": distances["frames"]["mean"], "structure": sum(kept) / len(kept)}
@@ -215,7 +255,9 @@ def _reduced(image: Tensor) -> Tensor:
     if scale >= 1:
         return image
     size = [max(1, round(side * scale)) for side in image.shape[:2]]
-    return torch.nn.functional.interpolate(image.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0)
+    return torch.nn.functional.interpolate(image.permute(2, 0, 1)[None], size, mode="area")[0].permute(
+        1, 2, 0
+    )
 
 
 def _size(image: Tensor) -> str:
@@ -241,15 +283,26 @@ _PUBLISHED = (("short", "t, t-1"), ("long", "t, t-7"))
 def peer_page(document: Mapping[str, Any]) -> str:
     """Markdown: what is known, and which flag would tell what is not."""
     width, height = document["size"]
-    lines = [f"{document['frames']} frames of {width}x{height}. {words(document['provenance'])}.", "", "| | |", "|---|---:|"]
+    lines = [
+        f"{document['frames']} frames of {width}x{height}. {words(document['provenance'])}.",
+        "",
+        "| | |",
+        "|---|---:|",
+    ]
     for part, key, label, form in _ROWS:
         value = None if document[part] is None else document[part][key]
         lines.append(f"| {label} | {'–' if value is None else format(value, form)} |")
     for key, label in _PUBLISHED:
         published = document["published"] and document["published"][key]
-        for figure, name, form in (("lpips", "LPIPS", ".4f"), ("rmse", "RMSE", ".4f"), ("e_warp", "E_warp", ".2e")):
+        for figure, name, form in (
+            ("lpips", "LPIPS", ".4f"),
+            ("rmse", "RMSE", ".4f"),
+            ("e_warp", "E_warp", ".2e"),
+        ):
             value = None if not published else published[figure]
-            lines.append(f"| as others report it: {name} ({label}) | {'–' if value is None else format(value, form)} |")
+            lines.append(
+                f"| as others report it: {name} ({label}) | {'–' if value is None else format(value, form)} |"
+            )
     if document["missing"]:
         lines += ["", *(f"- {part}: not known without {flag}" for part, flag in document["missing"].items())]
     return "\n".join(lines) + "\n"
@@ -258,7 +311,9 @@ def peer_page(document: Mapping[str, Any]) -> str:
 def main(argv: list[str]) -> int:
     """`python -m benchmarks peer FRAMES --cameras FILE`."""
     about = (PeerConfig.__doc__ or "").strip()
-    config = parse(PeerConfig(), argv, prog="python -m benchmarks peer", description=about, positional=("frames",))
+    config = parse(
+        PeerConfig(), argv, prog="python -m benchmarks peer", description=about, positional=("frames",)
+    )
     with Display() as display:
         document = peer(config, display.count)
     document["provenance"] = provenance(config.device)

@@ -43,8 +43,35 @@ from fprf.training import checkpoint
 
 WHOLE_EVERY = 16
 """Rounds of which one is read to the end, where a reader of the bytes alone is known."""
-WORDS = (b"NaN", b"1e400", b"-1", b"0", b"null", b"true", b"[]", b"{}", b"../../etc/passwd", b"\x00", b"\xff\xfe", b"9" * 40)
-VALUES = (b"0", b"-1", b"1e300", b"1e-300", b"null", b'"x"', b"[]", b"{}", b"true", b"0.5", b"65536", b"1e999", b"123456789012")
+WORDS = (
+    b"NaN",
+    b"1e400",
+    b"-1",
+    b"0",
+    b"null",
+    b"true",
+    b"[]",
+    b"{}",
+    b"../../etc/passwd",
+    b"\x00",
+    b"\xff\xfe",
+    b"9" * 40,
+)
+VALUES = (
+    b"0",
+    b"-1",
+    b"1e300",
+    b"1e-300",
+    b"null",
+    b'"x"',
+    b"[]",
+    b"{}",
+    b"true",
+    b"0.5",
+    b"65536",
+    b"1e999",
+    b"123456789012",
+)
 """What stands in the place of a number of a text."""
 _NUMBER = re.compile(rb"-?\d+(\.\d+)?")
 NUMBERS = tuple(struct.pack("<Q", value) for value in (0, 1, 2**28, 2**31, 2**63, 2**64 - 1))
@@ -82,7 +109,8 @@ def mutated(data: bytes, draw: random.Random) -> bytes:
     """The bytes with one to four harms, mostly one."""
     raw = bytearray(data)
     for _ in range(draw.choice((1, 1, 1, 2, 4))):
-        at, kind = draw.randrange(len(raw) + 1), draw.randrange(9)
+        at = draw.randrange(len(raw) + 1)
+        kind = draw.randrange(9)
         if kind > 6 and (found := list(_NUMBER.finditer(raw))):
             start, stop = draw.choice(found).span()
             raw[start:stop] = draw.choice(VALUES)
@@ -103,14 +131,17 @@ def mutated(data: bytes, draw: random.Random) -> bytes:
     return bytes(raw)
 
 
-def fuzz(target: Target, rounds: int, seed: int, *, first: int = 0, watch_memory: bool = False, quick: bool = False) -> Outcome:
+def fuzz(
+    target: Target, rounds: int, seed: int, *, first: int = 0, watch_memory: bool = False, quick: bool = False
+) -> Outcome:
     """Read `rounds` mutations of the target's file, from number `first` on; the file is put back at the end.
 
     `quick` ones go to the reader of the bytes where there is one, and each sixteenth through to the end.
     """
     whole = target.file.read_bytes()
     values = refusals = memory = 0
-    slowest, faults = 0.0, []
+    slowest = 0.0
+    faults = []
     try:
         for number in range(first, first + rounds):
             draw = random.Random(f"{target.name} {seed} {number}")  # nosec B311  # no secrets
@@ -144,7 +175,11 @@ def targets(folder: Path) -> list[Target]:
     found += [_image(folder / "images", suffix) for suffix in ("png", "jpg", "webp", "bmp", "tiff")]
     found += [_camera_path(folder / "paths"), _style(folder / "styles"), _config(folder / "configs")]
     found += _tensors(folder / "tensors")
-    found += [_checkpoint(folder / "checkpoints"), *_tables(folder / "tables"), _meganerf(folder / "meganerf")]
+    found += [
+        _checkpoint(folder / "checkpoints"),
+        *_tables(folder / "tables"),
+        _meganerf(folder / "meganerf"),
+    ]
     found += [_polycam(folder / "polycam"), _record3d(folder / "record3d"), *_odm(folder / "odm")]
     return [*found, *_gaussians(folder / "gaussians")]
 
@@ -172,21 +207,30 @@ def _colmap(folder: Path, *, binary: bool) -> list[Target]:
     parser = ColmapConfig().build()
     return [
         Target(
-            f"COLMAP {kind}.{suffix}", model / f"{kind}.{suffix}", lambda: parser.parse(folder, 1), lambda: read_model(model)
+            f"COLMAP {kind}.{suffix}",
+            model / f"{kind}.{suffix}",
+            lambda: parser.parse(folder, 1),
+            lambda: read_model(model),
         )
         for kind in ("cameras", "images", "points3D")
     ]
 
 
 def _colmap_binary(names: list[str]) -> dict[str, bytes]:
-    cameras = struct.pack("<Q", 1) + struct.pack("<IiQQ", 1, 1, SIDE, SIDE) + struct.pack("<4d", 30, 30, SIDE / 2, SIDE / 2)
+    cameras = (
+        struct.pack("<Q", 1)
+        + struct.pack("<IiQQ", 1, 1, SIDE, SIDE)
+        + struct.pack("<4d", 30, 30, SIDE / 2, SIDE / 2)
+    )
     images = struct.pack("<Q", len(names))
     for k, name in enumerate(names):
         images += struct.pack("<I7dI", k + 1, 1, 0, 0, 0, 0.3 * k, 0, 0, 1) + name.encode() + b"\0"
         images += struct.pack("<Q", 12) + b"".join(struct.pack("<ddq", 3, 4, point) for point in range(12))
     points = struct.pack("<Q", 12)
     for k in range(12):
-        points += struct.pack("<Q3d3Bd", k, k % 3 - 1.0, k % 4 - 1.5, 4 + 0.2 * k, 1, 2, 3, 0.5) + struct.pack("<QII", 1, 1, k)
+        points += struct.pack(
+            "<Q3d3Bd", k, k % 3 - 1.0, k % 4 - 1.5, 4 + 0.2 * k, 1, 2, 3, 0.5
+        ) + struct.pack("<QII", 1, 1, k)
     return {"cameras": cameras, "images": images, "points3D": points}
 
 
@@ -203,7 +247,16 @@ def _transforms(folder: Path) -> Target:
     for k, name in enumerate(_pictures(folder / "images", 3)):
         pose = [[1, 0, 0, 0.3 * k], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         frames.append({"file_path": f"images/{name}", "transform_matrix": pose, "near": 1.0, "far": 9.0})
-    document = {"w": SIDE, "h": SIDE, "fl_x": 30.0, "fl_y": 30.0, "cx": SIDE / 2, "cy": SIDE / 2, "k1": 0.01, "frames": frames}
+    document = {
+        "w": SIDE,
+        "h": SIDE,
+        "fl_x": 30.0,
+        "fl_y": 30.0,
+        "cx": SIDE / 2,
+        "cy": SIDE / 2,
+        "k1": 0.01,
+        "frames": frames,
+    }
     file = folder / "transforms.json"
     file.write_text(json.dumps(document))
     parser = TransformsConfig().build()
@@ -231,8 +284,15 @@ def _image(folder: Path, suffix: str) -> Target:
 def _camera_path(folder: Path) -> Target:
     folder.mkdir()
     file = folder / "path.json"
-    frames = [{"camera_to_world": [1, 0, 0, k, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], "fov": 60, "aspect": 1} for k in range(3)]
-    file.write_text(json.dumps({"camera_type": "perspective", "render_width": 9, "render_height": 9, "camera_path": frames}))
+    frames = [
+        {"camera_to_world": [1, 0, 0, k, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], "fov": 60, "aspect": 1}
+        for k in range(3)
+    ]
+    file.write_text(
+        json.dumps(
+            {"camera_type": "perspective", "render_width": 9, "render_height": 9, "camera_path": frames}
+        )
+    )
     return Target("camera path", file, lambda: read_camera_path(file))
 
 
@@ -240,7 +300,9 @@ def _style(folder: Path) -> Target:
     folder.mkdir()
     file = folder / "style.json"
     _paint(folder / "a.png", 0)
-    file.write_text(json.dumps({"format": 1, "style": {"references": ["a.png"], "strength": 0.5, "clusters": 4}}))
+    file.write_text(
+        json.dumps({"format": 1, "style": {"references": ["a.png"], "strength": 0.5, "clusters": 4}})
+    )
     return Target("style.json", file, lambda: read_style(file))
 
 
@@ -272,14 +334,24 @@ def _checkpoint(folder: Path) -> Target:
 
 
 def _tables(folder: Path) -> list[Target]:
-    """An archive of NumPy, a list of photographs, a record of TFRecord's (its checksums made to fit each mutation)."""
+    """An archive of NumPy, a list of photographs, a record of TFRecord's (its checksums made to fit each
+    mutation).
+    """
     folder.mkdir()
-    archive, table, example = folder / "points.npz", folder / "list.tsv", folder / "example"
+    archive = folder / "points.npz"
+    table = folder / "list.tsv"
+    example = folder / "example"
     stream = BytesIO()
     np.save(stream, np.arange(12.0).reshape(4, 3))
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr("points.npy", stream.getvalue())
-    rows = ("filename\tid\tsplit\tdataset", "a.jpg\t1\ttrain\tx", "b.jpg\t2\ttest\tx", "c.jpg\t\ttrain\tx", "")
+    rows = (
+        "filename\tid\tsplit\tdataset",
+        "a.jpg\t1\ttrain\tx",
+        "b.jpg\t2\ttest\tx",
+        "c.jpg\t\ttrain\tx",
+        "",
+    )
     table.write_text("\n".join(rows))
     example.write_bytes(_example())
     return [
@@ -309,19 +381,25 @@ def _read_record(file: Path) -> object:
     data = file.read_bytes()
     size = struct.pack("<Q", len(data))
     record = file.with_suffix(".record")
-    record.write_bytes(size + struct.pack("<I", masked(crc32c(size))) + data + struct.pack("<I", masked(crc32c(data))))
+    record.write_bytes(
+        size + struct.pack("<I", masked(crc32c(size))) + data + struct.pack("<I", masked(crc32c(data)))
+    )
     example = next(read_examples(record))
     return example.blob("name"), example.numbers("origin", 2), example.integer("width")
 
 
 def _meganerf(folder: Path) -> Target:
-    metadata, images = folder / "train" / "metadata", folder / "train" / "rgbs"
+    metadata = folder / "train" / "metadata"
+    images = folder / "train" / "rgbs"
     for place in (metadata, images):
         place.mkdir(parents=True)
     for k in range(2):
         _paint(images / f"{k}.png", k)
         pose = torch.tensor([[1, 0, 0, 0.3 * k], [0, 1, 0, 0], [0, 0, 1, 0]])
-        torch.save({"H": SIDE, "W": SIDE, "c2w": pose, "intrinsics": torch.tensor([30.0, 30, 12, 12])}, metadata / f"{k}.pt")
+        torch.save(
+            {"H": SIDE, "W": SIDE, "c2w": pose, "intrinsics": torch.tensor([30.0, 30, 12, 12])},
+            metadata / f"{k}.pt",
+        )
     parser = MegaNerfConfig().build()
     return Target("metadata of Mega-NeRF", metadata / "0.pt", lambda: parser.parse(folder, 1))
 
@@ -331,7 +409,11 @@ def _polycam(folder: Path) -> Target:
     cameras = folder / "keyframes" / "cameras"
     cameras.mkdir()
     for k, name in enumerate(names):
-        pose = {f"t_{row}{column}": float(row == column) + 0.3 * k * (column == 3) for row in range(3) for column in range(4)}
+        pose = {
+            f"t_{row}{column}": float(row == column) + 0.3 * k * (column == 3)
+            for row in range(3)
+            for column in range(4)
+        }
         lens = {"fx": 30.0, "fy": 30.0, "cx": SIDE / 2, "cy": SIDE / 2, "width": SIDE, "height": SIDE}
         (cameras / f"{Path(name).stem}.json").write_text(json.dumps(pose | lens))
     parser = PolycamConfig().build()
@@ -342,7 +424,13 @@ def _record3d(folder: Path) -> Target:
     _pictures(folder / "rgb", 3)
     poses = [[0.0, 0.0, 0.0, 1.0, 0.3 * k, 0.0, 0.0] for k in range(3)]
     lenses = [[30.0, 30.0, SIDE / 2, SIDE / 2]] * 3
-    document = {"w": SIDE, "h": SIDE, "K": [30, 0, 0, 0, 30, 0, 12, 12, 1], "poses": poses, "perFrameIntrinsicCoeffs": lenses}
+    document = {
+        "w": SIDE,
+        "h": SIDE,
+        "K": [30, 0, 0, 0, 30, 0, 12, 12, 1],
+        "poses": poses,
+        "perFrameIntrinsicCoeffs": lenses,
+    }
     file = folder / "metadata.json"
     file.write_text(json.dumps(document))
     parser = Record3DConfig().build()
@@ -360,12 +448,14 @@ def _odm(folder: Path) -> list[Target]:
         "c_x": 0.01,
         "k1": 0.01,
     }
-    shots, features = {}, []
+    shots = {}
+    features = []
     for k, name in enumerate(_pictures(folder / "full" / "images", 3)):
         shots[name] = {"camera": "v2", "rotation": [0.0, 0.0, 0.1 * k], "translation": [0.3 * k, 0.0, 1.0]}
         features.append({"properties": {"filename": name, **shots[name]}})
     points = {str(k): {"coordinates": [0.1 * k, 0.0, 5.0], "color": [1, 2, 3]} for k in range(4)}
-    whole, part = folder / "full" / "opensfm" / "reconstruction.json", folder / "report" / "odm_report" / "shots.geojson"
+    whole = folder / "full" / "opensfm" / "reconstruction.json"
+    part = folder / "report" / "odm_report" / "shots.geojson"
     _pictures(folder / "report" / "images", 3)
     for file, document in (
         (whole, [{"cameras": {"v2": camera}, "shots": shots, "points": points}]),
@@ -378,7 +468,9 @@ def _odm(folder: Path) -> list[Target]:
     return [
         Target("reconstruction of ODM", whole, lambda: parser.parse(folder / "full", 1)),
         Target("shots of ODM", part, lambda: parser.parse(folder / "report", 1)),
-        Target("cameras of ODM", folder / "report" / "cameras.json", lambda: parser.parse(folder / "report", 1)),
+        Target(
+            "cameras of ODM", folder / "report" / "cameras.json", lambda: parser.parse(folder / "report", 1)
+        ),
     ]
 
 
@@ -406,4 +498,6 @@ def _gaussians(folder: Path) -> list[Target]:
     index = {"filenames": ["meta.json"], "tree": {"lods": {"0": {"file": 0, "offset": 2, "count": 9}}}}
     (folder / "lod-meta.json").write_text(json.dumps(index))
     names += ["ascii.ply", "x.ksplat", "lod-meta.json"]
-    return [Target(f"Gaussians, {name}", folder / name, partial(read_capture, folder / name)) for name in names]
+    return [
+        Target(f"Gaussians, {name}", folder / name, partial(read_capture, folder / name)) for name in names
+    ]

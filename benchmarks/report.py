@@ -1,7 +1,8 @@
 """Reports of benchmarks: times, rows with goals, provenance, tables, contact sheets.
 
-Times are comparable on a busy machine: what is compared runs in turn, round after round, ratios are taken within a round, and
-the median and quartiles over the rounds are reported. One call of each before them does not count.
+Times are comparable on a busy machine: what is compared runs in turn, round after round, ratios are taken
+within a round, and the median and quartiles over the rounds are reported. One call of each before them does
+not count.
 """
 
 import os
@@ -75,8 +76,14 @@ class Watch(NamedTuple):
     clock: Clock = "wall"
 
     def once(self, call: Callable[[], object]) -> float:
-        """Seconds of one call, until the device has finished; a processor's clock says nothing of another device's time."""
-        now = time.process_time if self.clock == "processor" and self.device.type == "cpu" else time.perf_counter
+        """Seconds of one call, until the device has finished; a processor's clock says nothing of another
+        device's time.
+        """
+        now = (
+            time.process_time
+            if self.clock == "processor" and self.device.type == "cpu"
+            else time.perf_counter
+        )
         self._wait()
         start = now()
         call()
@@ -88,7 +95,9 @@ class Watch(NamedTuple):
         calls: Mapping[str, Callable[[], object]],
         progress: Callable[[int, int], None] = lambda done, total: None,
     ) -> dict[str, list[float]]:
-        """Seconds of every call in every round. The order turns by one a round: no call always follows the same."""
+        """Seconds of every call in every round. The order turns by one a round: no call always follows the
+        same.
+        """
         names = list(calls)
         seconds: dict[str, list[float]] = {name: [] for name in names}
         for call in calls.values():
@@ -200,7 +209,12 @@ def falls_short(rows: Iterable[Row]) -> list[str]:
 
 
 def document(
-    name: str, rows: Sequence[Row], *, device: torch.device, settings: Mapping[str, object], extra: Mapping[str, Any] = {}
+    name: str,
+    rows: Sequence[Row],
+    *,
+    device: torch.device,
+    settings: Mapping[str, object],
+    extra: Mapping[str, Any] = {},
 ) -> dict[str, Any]:
     """The JSON of a benchmark; `extra` comes after the rows."""
     return {
@@ -215,7 +229,9 @@ def document(
 
 def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
     """A plain table: the first column is text, the others are figures."""
-    made = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False, padding=(0, 3, 0, 0))
+    made = Table(
+        title=title, title_justify="left", title_style="bold", box=None, pad_edge=False, padding=(0, 3, 0, 0)
+    )
     for i, column in enumerate(columns):
         made.add_column(column, justify="right" if i else "left", no_wrap=i > 0)
     for row in rows:
@@ -224,7 +240,9 @@ def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> 
 
 
 def rows_table(title: str, rows: Sequence[Row]) -> Table:
-    """The rows as people read them, the spread as half the distance of the quartiles; what a peer is, the title says."""
+    """The rows as people read them, the spread as half the distance of the quartiles; what a peer is, the
+    title says.
+    """
     compared = any(row.peer is not None for row in rows)
     columns = ["", "figure", "", *(["peer", "faster"] if compared else []), "error", "goal"]
     made = table(title, columns, (_cells(row, compared) for row in rows))
@@ -252,18 +270,25 @@ def _rounded(value: float) -> float:
 
 
 def provenance(device: str) -> dict[str, object]:
-    """Origin of a report: versions, commit, machine; nothing in it depends on the time. `device` as configs name it."""
-    here, processor = device_of(device), platform.machine().replace("_", "-")
+    """Origin of a report: versions, commit, machine; nothing in it depends on the time. `device` as configs
+    name it.
+    """
+    here = device_of(device)
+    processor = platform.machine().replace("_", "-")
     return {
         "commit": commit(Path(__file__).parent),
         "fprf": __version__,
         "torch": torch.__version__,
-        "machine": torch.cuda.get_device_name(here) if here.type == "cuda" else f"{os.cpu_count()} {processor} cores",
+        "machine": torch.cuda.get_device_name(here)
+        if here.type == "cuda"
+        else f"{os.cpu_count()} {processor} cores",
     }
 
 
 def commit(folder: Path) -> str | None:
-    """Short hash of the checkout that a folder lies in, with `+` where known files were changed; None outside of one."""
+    """Short hash of the checkout that a folder lies in, with `+` where known files were changed; None outside
+    of one.
+    """
     try:
         answer = subprocess.run(  # nosec B607  # git as the user has it; fixed words
             ["git", "-C", str(folder), "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"],
@@ -306,18 +331,25 @@ def _figures(row: Mapping[str, Any], columns: Sequence[Column]) -> list[str]:
     return ["–" if row.get(key) is None else format(row[key], form) for key, _, form in columns]
 
 
-_BAR, _MARGIN, _GAP = 18, 62, 3
+_BAR = 18
+_MARGIN = 62
+_GAP = 3
 """Pixels above the columns, before the rows, and between pictures."""
-_INK, _PAPER = (40, 40, 40), 255
+_INK = (40, 40, 40)
+_PAPER = 255
 
 
 def contact_sheet(rows: Mapping[str, Sequence[Tensor]], columns: Sequence[str], *, height: int) -> Picture:
-    """Pictures [H W 3] in [0, 1] by row, each as tall as `height` pixels; a row may be shorter than there are columns.
+    """Pictures [H W 3] in [0, 1] by row, each as tall as `height` pixels; a row may be shorter than there are
+    columns.
 
     Columns are as wide as their widest picture.
     """
     drawn = {name: [_scaled(to_uint8(image), height) for image in row] for name, row in rows.items()}
-    widths = [max((row[i].shape[1] for row in drawn.values() if i < len(row)), default=0) for i in range(len(columns))]
+    widths = [
+        max((row[i].shape[1] for row in drawn.values() if i < len(row)), default=0)
+        for i in range(len(columns))
+    ]
     edges = [_MARGIN + sum(widths[:i]) + i * _GAP for i in range(len(columns) + 1)]
     page = np.full((_BAR + len(drawn) * (height + _GAP), edges[-1], 3), _PAPER, dtype=np.uint8)
     for left, name in zip(edges, columns, strict=False):
@@ -335,4 +367,13 @@ def _scaled(picture: Picture, height: int) -> Picture:
 
 
 def _write(page: Picture, text: str, at: tuple[int, int]) -> None:
-    cv2.putText(page, text.encode("ascii", "replace").decode(), at, cv2.FONT_HERSHEY_SIMPLEX, 0.36, _INK, 1, cv2.LINE_AA)
+    cv2.putText(
+        page,
+        text.encode("ascii", "replace").decode(),
+        at,
+        cv2.FONT_HERSHEY_SIMPLEX,
+        0.36,
+        _INK,
+        1,
+        cv2.LINE_AA,
+    )

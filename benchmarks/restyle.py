@@ -19,7 +19,13 @@ from fprf.interfaces import Scene, SceneView
 from fprf.io.images import Picture, to_uint8, write_image
 from fprf.methods import fprf_lite
 from fprf.plugins import registry
-from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
+from fprf.plugins.stylizers.config import (
+    AdainConfig,
+    LocalAdainConfig,
+    RegionOtConfig,
+    RegionToneConfig,
+    StylizerConfig,
+)
 from fprf.progress import Display
 from fprf.style.config import StyleConfig, labels
 from fprf.style.dictionary import Encoders, StyleDictionary, build_dictionary, encode_photograph
@@ -73,10 +79,14 @@ _SHARP = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class RestyleConfig(ReportConfig):
-    """Restyling judged by the truth: a town in the light of other towns, against itself in that very light."""
+    """Restyling judged by the truth: a town in the light of other towns, against itself in that very
+    light.
+    """
 
     run: Path | None = None
-    """Run folder, trained on a town (`python -m benchmarks town FOLDER`); none = fprf-lite is trained on one first."""
+    """Run folder, trained on a town (`python -m benchmarks town FOLDER`); none = fprf-lite is trained on one
+    first.
+    """
     minutes: float = 2.0
     """Training time, where no run is given."""
     palettes: tuple[str, ...] = ("autumn", "winter", "sunset", "night")
@@ -113,7 +123,9 @@ class RestyleConfig(ReportConfig):
         at_least("seeds", len(self.seeds), 3)
         for kind in self.missing:
             if kind not in CUT:
-                raise ConfigError(f"missing: {kind!r} is no kind of thing of the town; allowed are {', '.join(CUT)}")
+                raise ConfigError(
+                    f"missing: {kind!r} is no kind of thing of the town; allowed are {', '.join(CUT)}"
+                )
 
 
 Image = Annotated[Tensor, "H W 3"]
@@ -142,7 +154,9 @@ def lineup(recommended: StylizerConfig) -> dict[str, StylizerConfig]:
 def dictionary_of(
     paths: Sequence[Path], encoders: Encoders, *, clusters: int, blend: float, masks: Sequence[Path] = ()
 ) -> tuple[StyleDictionary, float]:
-    """The style dictionary of photographs on a scene, or of what masks select of them, and the seconds it took."""
+    """The style dictionary of photographs on a scene, or of what masks select of them, and the seconds it
+    took.
+    """
     start = time.perf_counter()
     photographs = [
         encode_photograph(path, encoders, name=name, mask=mask)
@@ -192,14 +206,24 @@ def in_scene(
 
 
 def one_by_one(
-    scene: Scene, plain: Sequence[Image], config: StylizerConfig, dictionary: StyleDictionary, encoders: Encoders
+    scene: Scene,
+    plain: Sequence[Image],
+    config: StylizerConfig,
+    dictionary: StyleDictionary,
+    encoders: Encoders,
 ) -> Shown:
-    """The stylizer on each picture as a photograph of its own: its own statistics and regions, the same dictionary."""
-    guided, decoder, regions, seed = encoders.guided, scene.decoder, len(encoders.scene_style.share), encoders.seed
+    """The stylizer on each picture as a photograph of its own: its own statistics and regions, the same
+    dictionary.
+    """
+    guided = encoders.guided
+    decoder = scene.decoder
+    regions = len(encoders.scene_style.share)
+    seed = encoders.seed
     taken = []
 
     def restyled(view: Image) -> Image:
-        view, semantic = view.to(encoders.device), None
+        view = view.to(encoders.device)
+        semantic = None
         if encoders.semantic is not None:
             semantic = encoded(view, encoders.semantic, guided, encoders.basis)
         size = (view.shape[0], view.shape[1])
@@ -222,11 +246,17 @@ def _each(views: Sequence[T], function: Callable[[T], Image]) -> tuple[list[Imag
     return pictures, (time.perf_counter() - start) / max(1, len(views))
 
 
-MATCHED, BOUND = "true classes", "best class maps"
+MATCHED = "true classes"
+BOUND = "best class maps"
 """No methods: they know classes, or even the truth (see `scores`)."""
 GOALS: Mapping[str, tuple[str, float, str, str]] = {
     "over_no_change_db": ("≥", 3.0, "dB", "PSNR over no change"),
-    "over_best_global_db": ("≥", 1.5, "dB", f"PSNR over the best of {GLOBAL[0]}, {GLOBAL[1]} and {GLOBAL[2]}"),
+    "over_best_global_db": (
+        "≥",
+        1.5,
+        "dB",
+        f"PSNR over the best of {GLOBAL[0]}, {GLOBAL[1]} and {GLOBAL[2]}",
+    ),
     "over_2d_db": ("≥", 1.5, "dB", "PSNR over itself on single pictures (2d)"),
     "match_inside": ("≥", 0.90, "", "match inside"),
     "consistency": ("≤", 0.05, "", "consistency"),
@@ -251,18 +281,24 @@ class Case(NamedTuple):
     """ΔE2000 by method and class."""
 
 
-def restyle(config: RestyleConfig, root: Path, folder: Path, progress: Progress) -> tuple[dict[str, Any], list[Case]]:
+def restyle(
+    config: RestyleConfig, root: Path, folder: Path, progress: Progress
+) -> tuple[dict[str, Any], list[Case]]:
     """The document and the cases. `folder` takes the references' files."""
     opened = open_run(root, config.device)
-    trained, scene = opened.run.load_config()[0], opened.scene
+    trained = opened.run.load_config()[0]
+    scene = opened.scene
     settings = town_settings(trained)
-    stage = set_stage(scene, opened.known, settings, views=config.views, frames=config.frames, longest=config.longest)
+    stage = set_stage(
+        scene, opened.known, settings, views=config.views, frames=config.frames, longest=config.longest
+    )
     encoders = scene.encoders()
     results = cases(config, stage, encoders, folder, progress)
     missing = without_kinds(config, stage, encoders, folder, progress) if config.missing else {}
     sets = dict.fromkeys(case.set for case in results)
     means = {name: mean_rows([case.rows for case in results if case.set == name]) for name in sets}
-    best, plain = list(lineup(config.stylizer))[-1], [view.restyled().rgb for view in stage.shown]
+    best = list(lineup(config.stylizer))[-1]
+    plain = [view.restyled().rgb for view in stage.shown]
     document = {
         "benchmark": "restyle",
         "settings": {
@@ -283,12 +319,18 @@ def restyle(config: RestyleConfig, root: Path, folder: Path, progress: Progress)
             "semantic_encoder": scene.semantic_encoder,
         },
         "recommended": best,
-        "reconstruction": score(plain, true_views(stage, settings.palette), [each.labels for each in stage.truth])[0],
+        "reconstruction": score(
+            plain, true_views(stage, settings.palette), [each.labels for each in stage.truth]
+        )[0],
         "means": means,
         "verdict": verdict(means[JUDGED], best),
         "missing": missing,
         "palettes": {
-            light: {case.set: {"rows": case.rows, "delta_e_by_class": case.classes} for case in results if case.light == light}
+            light: {
+                case.set: {"rows": case.rows, "delta_e_by_class": case.classes}
+                for case in results
+                if case.light == light
+            }
             for light in config.palettes
         },
     }
@@ -300,16 +342,26 @@ def restyle_sheet(found: Sequence[Case]) -> Picture:
     rows = [case for case in found if case.set == JUDGED]
     columns = [*("reference" for _ in rows[0].references), "truth", *rows[0].shown]
     pictures = {
-        case.light: [*(r.image for r in case.references), case.truth[0], *(views[0] for views in case.shown.values())]
+        case.light: [
+            *(r.image for r in case.references),
+            case.truth[0],
+            *(views[0] for views in case.shown.values()),
+        ]
         for case in rows
     }
     return contact_sheet(pictures, columns, height=min(120, rows[0].truth[0].shape[0]))
 
 
-def cases(config: RestyleConfig, stage: Stage, encoders: Encoders, folder: Path, progress: Progress) -> list[Case]:
-    """Every palette with every set of references. Raises UsageError for references that would show the run's own town."""
+def cases(
+    config: RestyleConfig, stage: Stage, encoders: Encoders, folder: Path, progress: Progress
+) -> list[Case]:
+    """Every palette with every set of references. Raises UsageError for references that would show the run's
+    own town.
+    """
     if stage.settings.seed in config.seeds:
-        raise UsageError(f"--seeds: {stage.settings.seed} is the town of the run itself; references show other towns")
+        raise UsageError(
+            f"--seeds: {stage.settings.seed} is the town of the run itself; references show other towns"
+        )
     width, height = (int(side) for side in stage.scene.cameras.size[0])
     chosen = places(config.seeds, (width, height))
     total = len(config.palettes) * len(chosen)
@@ -327,31 +379,39 @@ def cases(config: RestyleConfig, stage: Stage, encoders: Encoders, folder: Path,
     return results
 
 
-PAINTED, LIT = "paint alone", "light or paint"
+PAINTED = "paint alone"
+LIT = "light or paint"
 """The recommended stylizer with `bold` 1, and as it is."""
 
 
 def without_kinds(
     config: RestyleConfig, stage: Stage, encoders: Encoders, folder: Path, progress: Progress
 ) -> dict[str, dict[str, dict[str, Row]]]:
-    """PSNR inside and elsewhere by kind that is masked out of the one reference, by palette and method; and their means."""
+    """PSNR inside and elsewhere by kind that is masked out of the one reference, by palette and method; and
+    their means.
+    """
     width, height = (int(side) for side in stage.scene.cameras.size[0])
     place = places(config.seeds, (width, height))["one"][0]
     found: dict[str, dict[str, dict[str, Row]]] = {kind: {} for kind in config.missing}
     for number, light in enumerate(config.palettes):
         progress(number, len(config.palettes), f"references that lack something, {light}")
-        truth, reference = true_views(stage, light), photograph(place, light)
+        truth = true_views(stage, light)
+        reference = photograph(place, light)
         path = folder / f"{reference.name}.png"
         write_image(path, to_uint8(reference.image))
         for kind in config.missing:
             mask = folder / f"{reference.name}-without-{kind}.png"
             write_image(mask, to_uint8(without(reference, kind).float()[..., None].expand(-1, -1, 3)))
-            dictionary, _ = dictionary_of([path], encoders, clusters=config.clusters, blend=config.blend, masks=[mask])
+            dictionary, _ = dictionary_of(
+                [path], encoders, clusters=config.clusters, blend=config.blend, masks=[mask]
+            )
             shown = {PLAIN: nothing(stage.shown).pictures}
             for name, bold in ((PAINTED, 1.0), (LIT, StyleConfig.bold)):
                 made = in_scene(stage.scene, stage.shown, config.stylizer, dictionary, encoders, [path], bold)
                 shown[name] = made.pictures
-            found[kind][light] = {name: psnr_of_kind(views, stage, truth, kind) for name, views in shown.items()}
+            found[kind][light] = {
+                name: psnr_of_kind(views, stage, truth, kind) for name, views in shown.items()
+            }
     rows = [row for lights in found.values() for row in lights.values()]
     return {**found, "mean": {"all palettes": mean_rows(rows)}}
 
@@ -388,7 +448,8 @@ def _case(
     paths: Sequence[Path],
     truth: list[Tensor],
 ) -> Case:
-    scene, views = stage.scene, [*stage.shown, *stage.passed]
+    scene = stage.scene
+    views = [*stage.shown, *stage.passed]
     dictionary, spent = dictionary_of(paths, encoders, clusters=config.clusters, blend=config.blend)
     stylizers = lineup(config.stylizer)
     best = list(stylizers)[-1]
@@ -401,10 +462,14 @@ def _case(
     known = {path.name: reference for path, reference in zip(paths, references, strict=True)}
     classes = code_classes(dictionary, known, encoders, encoders.guided)
     count = len(stage.shown)
-    rows, by_class, shown = {}, {}, {name: each.pictures[:count] for name, each in found.items()}
+    rows = {}
+    by_class = {}
+    shown = {name: each.pictures[:count] for name, each in found.items()}
     labels = [each.labels for each in stage.truth]
     known_plain = list(zip(plain[:count], labels, strict=True))
-    shown[MATCHED] = true_class_maps(known_plain, [(reference.image, reference.classes) for reference in references])
+    shown[MATCHED] = true_class_maps(
+        known_plain, [(reference.image, reference.classes) for reference in references]
+    )
     shown[BOUND] = best_class_maps(known_plain, truth)
     for name in [*(each for each in shown if each != best), best]:
         rows[name], by_class[name] = score(shown[name], truth, labels)
@@ -426,13 +491,18 @@ def _rest(
     spent: float,
 ) -> Row:
     """Match rates, consistency and seconds; None where a method has none."""
-    row: Row = dict.fromkeys((*Matched._fields, "consistency", "warp_short", "warp_long", *PUBLISHED, *SECONDS))
+    row: Row = dict.fromkeys(
+        (*Matched._fields, "consistency", "warp_short", "warp_long", *PUBLISHED, *SECONDS)
+    )
     if method is None:
         return row
     count = len(stage.shown)
     if method.taken is not None:
         truth = [each.labels for each in stage.truth]
-        taken = [winners(share, classes).view(like.shape) for share, like in zip(method.taken[:count], truth, strict=True)]
+        taken = [
+            winners(share, classes).view(like.shape)
+            for share, like in zip(method.taken[:count], truth, strict=True)
+        ]
         row |= match_rates(taken, truth, references)._asdict()
         row["style_seconds"] = method.style_seconds + spent
     depths = [each.depth for each in stage.path_truth]
@@ -501,7 +571,8 @@ of the same cameras are scored by `python -m benchmarks peer`
 
 def restyle_page(document: Mapping[str, Any], *, picture: str | None = None) -> str:
     """Markdown; `picture` is the sheet's path as the page should name it."""
-    settings, parts = document["settings"], [_ABOUT]
+    settings = document["settings"]
+    parts = [_ABOUT]
     lights = ", ".join(document["palettes"])
     size = "x".join(str(side) for side in settings["view_size"])
     parts.append(
@@ -520,7 +591,11 @@ def restyle_page(document: Mapping[str, Any], *, picture: str | None = None) -> 
     for kind, lights in document["missing"].items():
         rows = mean_rows(list(lights.values()))
         heading = "any of them (mean)" if kind == "mean" else kind
-        parts += [f"## One reference without {heading}, mean over palettes\n", markdown(rows, LACKING, first="method"), ""]
+        parts += [
+            f"## One reference without {heading}, mean over palettes\n",
+            markdown(rows, LACKING, first="method"),
+            "",
+        ]
     own = document["reconstruction"]
     parts.append(f"Reconstruction: {own['psnr']:.2f} dB, SSIM {own['ssim']:.3f}, ΔE {own['delta_e']:.1f}.\n")
     if picture:
@@ -535,10 +610,13 @@ def restyle_page(document: Mapping[str, Any], *, picture: str | None = None) -> 
 
 def _verdict(document: Mapping[str, Any]) -> str:
     judged = document["verdict"]
-    lines = [f"Recommended: `{document['recommended']}`; the best global baseline is `{judged['best_global']}`.\n"]
+    lines = [
+        f"Recommended: `{document['recommended']}`; the best global baseline is `{judged['best_global']}`.\n"
+    ]
     lines += ["| with three references | reached | goal | |", "|---|---:|---:|---|"]
     for name, (sign, _, unit, label) in GOALS.items():
-        reached, met = judged["reached"][name], judged["met"][name]
+        reached = judged["reached"][name]
+        met = judged["met"][name]
         value = "–" if reached is None else f"{reached:.3g} {unit}".strip()
         verdict = {None: "not known", True: "met", False: "**not met**"}[met]
         lines.append(f"| {label} | {value} | {sign} {judged['goals'][name]:g} {unit} | {verdict} |")
@@ -547,26 +625,36 @@ def _verdict(document: Mapping[str, Any]) -> str:
 
 def _by_class(document: Mapping[str, Any]) -> str:
     tables = [sets["three"]["delta_e_by_class"] for sets in document["palettes"].values()]
-    methods, kinds = list(tables[0]), list(tables[0][next(iter(tables[0]))])
-    rows = {method: {kind: sum(t[method][kind] for t in tables) / len(tables) for kind in kinds} for method in methods}
+    methods = list(tables[0])
+    kinds = list(tables[0][next(iter(tables[0]))])
+    rows = {
+        method: {kind: sum(t[method][kind] for t in tables) / len(tables) for kind in kinds}
+        for method in methods
+    }
     return markdown(rows, [(kind, kind, ".1f") for kind in kinds], first="method")
 
 
 def main(argv: list[str]) -> int:
     """`python -m benchmarks restyle [RUN]`."""
     about = (RestyleConfig.__doc__ or "").strip()
-    config = parse(RestyleConfig(), argv, prog="python -m benchmarks restyle", description=about, positional=("run",))
+    config = parse(
+        RestyleConfig(), argv, prog="python -m benchmarks restyle", description=about, positional=("run",)
+    )
     with tempfile.TemporaryDirectory(prefix="fprf-restyle-") as made:
         root = config.run
         if root is None:
             run = Path(made) / "run"
-            town = replace(fprf_lite(), data=cached_town(), output=run, minutes=config.minutes, device=config.device)
+            town = replace(
+                fprf_lite(), data=cached_town(), output=run, minutes=config.minutes, device=config.device
+            )
             root = train(town, "fprf-lite")
         with Display() as display:
             document, found = restyle(config, root, Path(made), display.count)
     document["provenance"] = provenance(config.device)
     for name, rows in document["means"].items():
-        console().print(printed(f"mean over {len(config.palettes)} palettes, references: {name}", rows, COLUMNS))
+        console().print(
+            printed(f"mean over {len(config.palettes)} palettes, references: {name}", rows, COLUMNS)
+        )
     picture = None
     if config.sheet is not None:
         write_image(config.sheet, restyle_sheet(found))

@@ -1,13 +1,15 @@
-"""Methods on captures: trained one after the other for the same time or steps, judged on the same held-out views.
+"""Methods on captures: trained one after the other for the same time or steps, judged on the same held-out
+views.
 
     python -m benchmarks scenes [SCENE[:VIEWS] ...] [--sides "METHOD FLAGS" ...] [--minutes 2 | --steps N] [--output FILE.json]
 
-Each side is a method with flags of `fprf train`, in one word: `--sides fprf-lite "fprf-splats --cells 4"`. `SCENE:9` trains on
-nine of its training views, evenly through the capture, and on the sparse points that two of them saw; held-out views stay what
-they are. Images are reduced by whole numbers until the longer side has at most `--side` pixels. `--disturb 0.5 0.005` turns the
-training views by 0.5 degrees about random axes and shifts them by 0.5 % of the cameras' extent; `--fit-poses` fits the poses of
-held-out views before they are judged. Kernels are compiled and features are there before anything is timed. Each scene is an
-entry of the file with its own commit.
+Each side is a method with flags of `fprf train`, in one word: `--sides fprf-lite "fprf-splats --cells 4"`.
+`SCENE:9` trains on nine of its training views, evenly through the capture, and on the sparse points that two
+of them saw; held-out views stay what they are. Images are reduced by whole numbers until the longer side has
+at most `--side` pixels. `--disturb 0.5 0.005` turns the training views by 0.5 degrees about random axes and
+shifts them by 0.5 % of the cameras' extent; `--fit-poses` fits the poses of held-out views before they are
+judged. Kernels are compiled and features are there before anything is timed. Each scene is an entry of the
+file with its own commit.
 """
 
 import json
@@ -32,8 +34,12 @@ from .common import add_entry, arguments, cost_of
 
 def main(argv: list[str]) -> None:
     parser = arguments("scenes", __doc__)
-    parser.add_argument("scenes", nargs="*", default=["garden"], help="folders; FOLDER:N is thinned to N training views")
-    parser.add_argument("--sides", nargs="+", default=["fprf-lite", "fprf-splats"], help="methods with their flags")
+    parser.add_argument(
+        "scenes", nargs="*", default=["garden"], help="folders; FOLDER:N is thinned to N training views"
+    )
+    parser.add_argument(
+        "--sides", nargs="+", default=["fprf-lite", "fprf-splats"], help="methods with their flags"
+    )
     parser.add_argument("--minutes", type=float, default=2.0, help="of training, wall time")
     parser.add_argument("--steps", type=int, help="of training, in place of the minutes")
     parser.add_argument("--side", type=int, default=320, help="longest side of the images at most, in pixels")
@@ -51,18 +57,27 @@ def main(argv: list[str]) -> None:
         downscale = math.ceil(int(scene.cameras.size.max()) / asked.side)
         size = scene.cameras.scaled(downscale).size[0].tolist()
         views = int(count) if count else len(scene.train)
-        row: dict[str, Any] = {"training_views": views, "held_out_views": len(scene.test), "size": size, "limit": limit}
+        row: dict[str, Any] = {
+            "training_views": views,
+            "held_out_views": len(scene.test),
+            "size": size,
+            "limit": limit,
+        }
         with tempfile.TemporaryDirectory() as scratch:
             if count or any(asked.disturb):
                 degrees, share = asked.disturb
                 source = rewritten(source, Path(scratch) / source.name, views, degrees, share, asked.seed)
             for number, side in enumerate(asked.sides):
-                row[side] = judged(side, source, Path(scratch) / str(number), downscale, limit, fit_poses=asked.fit_poses)
+                row[side] = judged(
+                    side, source, Path(scratch) / str(number), downscale, limit, fit_poses=asked.fit_poses
+                )
         row["load_average"] = os.getloadavg()[0]
         add_entry(asked.output, Path(folder).name + (f", {count} views" if count else ""), row)
 
 
-def judged(side: str, data: Path, folder: Path, downscale: int, limit: list[str], *, fit_poses: bool) -> dict[str, Any]:
+def judged(
+    side: str, data: Path, folder: Path, downscale: int, limit: list[str], *, fit_poses: bool
+) -> dict[str, Any]:
     """Train one side and evaluate it; what both took and reached."""
     train = ["train", *shlex.split(side), "--data", str(data), "--downscale", str(downscale)]
     cost_of(*train, "--output", folder / "first", "--steps", "1")
@@ -81,10 +96,13 @@ def rewritten(source: Path, folder: Path, views: int, degrees: float, share: flo
     scene = parse_scene(source, 1, None)
     train = scene.train[np.linspace(0, len(scene.train) - 1, views).round().astype(np.int64)]
     kept = torch.cat([train, scene.test]).sort().values
-    pose, draw = scene.cameras.pose.clone(), torch.Generator().manual_seed(seed)
+    pose = scene.cameras.pose.clone()
+    draw = torch.Generator().manual_seed(seed)
     extent = float((pose[:, :, 3].amax(0) - pose[:, :, 3].amin(0)).norm())
     for view in train.tolist():
-        axis, way = torch.nn.functional.normalize(torch.randn(2, 3, generator=draw, dtype=torch.float64), dim=-1)
+        axis, way = torch.nn.functional.normalize(
+            torch.randn(2, 3, generator=draw, dtype=torch.float64), dim=-1
+        )
         pose[view, :, :3] = rotated(pose[view, :, :3].T, (math.radians(degrees) * axis).expand(3, 3)).T
         pose[view, :, 3] += share * extent * way
     (folder / "images").mkdir(parents=True)

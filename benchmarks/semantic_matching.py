@@ -1,12 +1,15 @@
-"""Which encoder finds like with like: the matching rate on painted triplets, and the classes of the town in every light.
+"""Which encoder finds like with like: the matching rate on painted triplets, and the classes of the town in
+every light.
 
     python -m benchmarks semantic_matching [--encoder NAME [--encoder.FIELD VALUE ...]] [--triplets DIR] [--output JSON]
 
-One encoder a call; its row replaces the row of the same encoder in the output. Without triplets the town alone is measured.
+One encoder a call; its row replaces the row of the same encoder in the output. Without triplets the town
+alone is measured.
 
-`confidence` is what the confidence of `fprf.style.light` says: each painted region that both photographs show is asked for
-twice, with the style photograph as it is, and without the region. A pixel of the region has a right match the first time and
-none the second; both times weigh alike. The rate of a bin of confidences is the share of the pixels with a right match in it.
+`confidence` is what the confidence of `fprf.style.light` says: each painted region that both photographs show
+is asked for twice, with the style photograph as it is, and without the region. A pixel of the region has a
+right match the first time and none the second; both times weigh alike. The rate of a bin of confidences is
+the share of the pixels with a right match in it.
 """
 
 import json
@@ -49,7 +52,9 @@ SIZE = (512, 384)
 
 
 class Triplet(NamedTuple):
-    """Two photographs [H W 3], sRGB in [0, 1], and their painted regions [H W], int64 in 0..8. Sizes may differ."""
+    """Two photographs [H W 3], sRGB in [0, 1], and their painted regions [H W], int64 in 0..8. Sizes may
+    differ.
+    """
 
     name: str
     content: Annotated[Tensor, "H W 3"]
@@ -66,8 +71,11 @@ def triplet_names(folder: Path) -> list[str]:
     return names
 
 
-def read_triplets(folder: Path, *, names: Sequence[str] = (), size: tuple[int, int] | None = SIZE) -> list[Triplet]:
-    """The triplets of a folder, or those named; photographs at `size` (None: as they are), regions always as painted.
+def read_triplets(
+    folder: Path, *, names: Sequence[str] = (), size: tuple[int, int] | None = SIZE
+) -> list[Triplet]:
+    """The triplets of a folder, or those named; photographs at `size` (None: as they are), regions always as
+    painted.
 
     Raises DataError for a file that is absent, unreadable or painted in other colours.
     """
@@ -91,7 +99,9 @@ def read_regions(path: Path) -> Annotated[Tensor, "H W"]:
     for region, colour in enumerate(_CODES):
         found[code == colour] = region
     if (found < 0).any():
-        raise DataError(f"{path}: {float((found < 0).mean()):.1%} of the pixels have none of the colours {', '.join(COLOURS)}")
+        raise DataError(
+            f"{path}: {float((found < 0).mean()):.1%} of the pixels have none of the colours {', '.join(COLOURS)}"
+        )
     return torch.from_numpy(found)
 
 
@@ -115,42 +125,60 @@ def matching_rate(
     style_labels: Annotated[Tensor, "M"],
     regions: Sequence[int],
 ) -> float:
-    """Mean hit rate over the regions, in [0, 1]. Chance: 1 / len(regions). Cells of other labels only count as centre.
+    """Mean hit rate over the regions, in [0, 1]. Chance: 1 / len(regions). Cells of other labels only count
+    as centre.
 
     Raises DataError where a region has no cell on one of the sides.
     """
     for region in regions:
         if not (bool((content_labels == region).any()) and bool((style_labels == region).any())):
-            raise DataError(f"semantic matching: no cell of region {region} in one of the images; leave the region out")
+            raise DataError(
+                f"semantic matching: no cell of region {region} in one of the images; leave the region out"
+            )
     centre = torch.cat([content, style]).mean(0)
-    near, far = F.normalize(content - centre, dim=1), F.normalize(style - centre, dim=1)
+    near = F.normalize(content - centre, dim=1)
+    far = F.normalize(style - centre, dim=1)
     scores = []
     for region in regions:
         like = near @ far[style_labels == region].T
         scores.append(like.topk(min(_NEAREST, like.shape[1]), dim=1).values.mean(1))
     found = torch.stack(scores, 1).argmax(1)
-    hits = [float((found[content_labels == region] == place).double().mean()) for place, region in enumerate(regions)]
+    hits = [
+        float((found[content_labels == region] == place).double().mean())
+        for place, region in enumerate(regions)
+    ]
     return math.fsum(hits) / len(hits)
 
 
 def shared_regions(triplet: Triplet) -> list[int]:
     """Regions that fill at least 1 % of both images with whole cells of 16 pixels."""
     shares = []
-    for regions, image in ((triplet.content_regions, triplet.content), (triplet.style_regions, triplet.style)):
+    for regions, image in (
+        (triplet.content_regions, triplet.content),
+        (triplet.style_regions, triplet.style),
+    ):
         cells = whole_cells(regions, (image.shape[0] // _COARSE, image.shape[1] // _COARSE))
         shares.append(
-            {r for r in set(cells.flatten().tolist()) if r != MIXED and float((cells == r).double().mean()) >= _SHARE}
+            {
+                r
+                for r in set(cells.flatten().tolist())
+                if r != MIXED and float((cells == r).double().mean()) >= _SHARE
+            }
         )
     return sorted(shares[0] & shares[1])
 
 
 @torch.no_grad()
-def semantic_matching(encoder: Encoder, triplets: Sequence[Triplet]) -> dict[str, float | int | dict[str, float]]:
-    """`matching` (mean rate), `chance`, `triplets` (those with at least two shared regions), `per_triplet` by name.
+def semantic_matching(
+    encoder: Encoder, triplets: Sequence[Triplet]
+) -> dict[str, float | int | dict[str, float]]:
+    """`matching` (mean rate), `chance`, `triplets` (those with at least two shared regions), `per_triplet` by
+    name.
 
     Raises DataError where no triplet has two regions to tell apart.
     """
-    rates, chances = {}, []
+    rates = {}
+    chances = []
     for triplet in triplets:
         regions = shared_regions(triplet)
         if len(regions) < 2:
@@ -165,7 +193,9 @@ def semantic_matching(encoder: Encoder, triplets: Sequence[Triplet]) -> dict[str
         )
         chances.append(1 / len(regions))
     if not rates:
-        raise DataError("semantic matching: no pair of images shares two regions; there is nothing to tell apart")
+        raise DataError(
+            "semantic matching: no pair of images shares two regions; there is nothing to tell apart"
+        )
     return {
         "matching": math.fsum(rates.values()) / len(rates),
         "chance": math.fsum(chances) / len(chances),
@@ -180,9 +210,11 @@ def class_match(
     known: Annotated[Tensor, "M C"],
     known_labels: Annotated[Tensor, "M"],
 ) -> tuple[float, dict[int, float]]:
-    """Share of cells whose nearest class centroid of the known side is their own class: overall, and class by class.
+    """Share of cells whose nearest class centroid of the known side is their own class: overall, and class by
+    class.
 
-    MIXED cells, and cells of classes that the known side lacks, don't count. Raises DataError where none is left.
+    MIXED cells, and cells of classes that the known side lacks, don't count. Raises DataError where none is
+    left.
     """
     classes = sorted(set(known_labels.tolist()) - {MIXED})
     inside = torch.isin(labels, torch.tensor(classes, dtype=labels.dtype, device=labels.device))
@@ -193,23 +225,30 @@ def class_match(
     here = features[inside] - features[inside].mean(0)
     nearest = (F.normalize(here, dim=1) @ F.normalize(centroids, dim=1).T).argmax(1)
     right = torch.tensor(classes, device=labels.device)[nearest] == labels[inside]
-    kinds = {c: float(right[labels[inside] == c].double().mean()) for c in classes if bool((labels[inside] == c).any())}
+    kinds = {
+        c: float(right[labels[inside] == c].double().mean())
+        for c in classes
+        if bool((labels[inside] == c).any())
+    }
     return float(right.double().mean()), kinds
 
 
 def palette_match(
     cells: Mapping[str, tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N"]]], known: str
 ) -> dict[str, float | dict[str, float]]:
-    """`class_match` of every palette but `known`, whose centroids are used: `match` and `class_mean` over the palettes,
-    `per_palette`, and `itself`, that of the known palette: what the classes' overlap alone costs.
+    """`class_match` of every palette but `known`, whose centroids are used: `match` and `class_mean` over the
+    palettes, `per_palette`, and `itself`, that of the known palette: what the classes' overlap alone costs.
     """
-    rates, means = {}, []
+    rates = {}
+    means = []
     for name, (features, labels) in cells.items():
         if name != known:
             rates[name], kinds = class_match(features, labels, *cells[known])
             means.append(math.fsum(kinds.values()) / len(kinds))
     if not rates:
-        raise DataError(f"class match: {known!r} is the only palette; render at least one other to compare with")
+        raise DataError(
+            f"class match: {known!r} is the only palette; render at least one other to compare with"
+        )
     return {
         "match": math.fsum(rates.values()) / len(rates),
         "class_mean": math.fsum(means) / len(means),
@@ -220,7 +259,9 @@ def palette_match(
 
 def _features(encoder: Encoder, image: Annotated[Tensor, "H W 3"]) -> Annotated[Tensor, "C h w"]:
     found: Tensor = encoder(image.permute(2, 0, 1)[None]).float()
-    height, width = (min(n, max(1, side // _FINEST)) for n, side in zip(found.shape[-2:], image.shape[:2], strict=True))
+    height, width = (
+        min(n, max(1, side // _FINEST)) for n, side in zip(found.shape[-2:], image.shape[:2], strict=True)
+    )
     return F.adaptive_avg_pool2d(found, (height, width))[0]
 
 
@@ -228,7 +269,8 @@ def _features(encoder: Encoder, image: Annotated[Tensor, "H W 3"]) -> Annotated[
 def town_cells(
     encoder: Encoder, palettes: Sequence[str], *, seeds: Sequence[int], views: int, size: tuple[int, int]
 ) -> dict[str, tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N"]]]:
-    """Features and class ids (MIXED at borders) of all cells, by palette; `size` is (width, height) of a view.
+    """Features and class ids (MIXED at borders) of all cells, by palette; `size` is (width, height) of a
+    view.
 
     Raises DataError for a palette that does not exist.
     """
@@ -247,7 +289,10 @@ def town_cells(
     return {name: (torch.cat(parts), torch.cat(labels)) for name, parts in features.items()}
 
 
-_CHANNELS, _REGIONS, _STEP, _BINS = 31, 16, 5, 10
+_CHANNELS = 31
+_REGIONS = 16
+_STEP = 5
+_BINS = 10
 """Principal components and regions, as of a capture; pixels between samples; bins of confidence."""
 _FEWEST = 50
 """Samples that a style must have left."""
@@ -261,7 +306,9 @@ def measured_confidence(encoder: Encoder, triplet: Triplet) -> tuple[list[Tensor
     here, _, _, kinds = _sampled(triplet.content, triplet.content_regions, encoder, basis)
     there, beyond, colour, shown = _sampled(triplet.style, triplet.style_regions, encoder, basis)
     scene = scene_style(here[:, :3], here, torch.ones(len(here)), None, _REGIONS, 0)
-    regions, right, wrong = shared_regions(triplet), [], []
+    regions = shared_regions(triplet)
+    right = []
+    wrong = []
     for gone in (None, *regions):
         left = shown != gone if gone is not None else torch.ones_like(shown, dtype=torch.bool)
         if int(left.sum()) < _FEWEST:
@@ -269,7 +316,9 @@ def measured_confidence(encoder: Encoder, triplet: Triplet) -> tuple[list[Tensor
         dictionary = build_dictionary(
             [Reference("style", there[left, :3], there[left], colour=colour[left], beyond=beyond[left])]
         )
-        light = light_of(scene, dictionary, RegionToneConfig(), (scene.region_mean, scene.region_covariance), bold=0.5)
+        light = light_of(
+            scene, dictionary, RegionToneConfig(), (scene.region_mean, scene.region_covariance), bold=0.5
+        )
         assert light is not None  # a photograph has several regions
         sure = light.confidence(here)[:, 0]
         if gone is None:
@@ -289,7 +338,8 @@ def rates(encoder: Encoder, triplets: Sequence[Triplet]) -> dict[str, object]:
     for triplet in triplets:
         if len(shared_regions(triplet)) > 1:
             found = measured_confidence(encoder, triplet)
-            right, wrong = right + found[0], wrong + found[1]
+            right = right + found[0]
+            wrong = wrong + found[1]
     edges = torch.linspace(0, 1, _BINS + 1)
     counts = []
     for side in (right, wrong):
@@ -313,8 +363,11 @@ def _sampled(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Semantics, what lies beyond the basis, colours and painted regions at every n-th pixel."""
     height, width = image.shape[:2]
-    y, x = torch.meshgrid(torch.arange(_STEP // 2, height, _STEP), torch.arange(_STEP // 2, width, _STEP), indexing="ij")
-    x, y = x.flatten(), y.flatten()
+    y, x = torch.meshgrid(
+        torch.arange(_STEP // 2, height, _STEP), torch.arange(_STEP // 2, width, _STEP), indexing="ij"
+    )
+    x = x.flatten()
+    y = y.flatten()
     semantic, beyond = semantic_samples(image, torch.stack([x, y], 1), encoder, basis, GuidedConfig())
     kinds = painted[y * painted.shape[0] // height, x * painted.shape[1] // width]
     return semantic, beyond, image[y, x], kinds
@@ -374,7 +427,9 @@ def measure(config: BenchmarkConfig) -> dict[str, object]:
 
 def main(argv: list[str]) -> int:
     torch.set_num_threads(1)
-    config = parse(BenchmarkConfig(), argv, prog="python -m benchmarks semantic_matching", description=__doc__ or "")
+    config = parse(
+        BenchmarkConfig(), argv, prog="python -m benchmarks semantic_matching", description=__doc__ or ""
+    )
     row = measure(config)
     print(json.dumps({**row, "goals": GOALS}, indent=1))
     if config.output is not None:

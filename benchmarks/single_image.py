@@ -1,7 +1,8 @@
-"""Restyling of single pictures: a photograph as a scene of one point a pixel, and colour transfer between pictures.
+"""Restyling of single pictures: a photograph as a scene of one point a pixel, and colour transfer between
+pictures.
 
-What tells pixels apart is given from outside, as features (`encoded`). `reinhard` and `histogram_matching` are the baselines of
-restyling; colours [N 3] are sRGB in [0, 1], `style` is any set of pixels.
+What tells pixels apart is given from outside, as features (`encoded`). `reinhard` and `histogram_matching`
+are the baselines of restyling; colours [N 3] are sRGB in [0, 1], `style` is any set of pixels.
 """
 
 from typing import Annotated, NamedTuple
@@ -45,12 +46,16 @@ class Flat(NamedTuple):
 def encoded(
     image: Annotated[Tensor, "H W 3"], encoder: Encoder, guided: GuidedConfig, basis: Basis | None = None
 ) -> Annotated[Tensor, "N C"]:
-    """Features at every pixel through the guided filter, as a scene's targets are; projected on the basis first."""
+    """Features at every pixel through the guided filter, as a scene's targets are; projected on the basis
+    first.
+    """
     maps: Tensor = encoder(image.permute(2, 0, 1)[None])[0].float()
     if basis is not None:
         maps = basis.project(maps.flatten(1).T).T.reshape(-1, *maps.shape[1:])
     radius = round(guided.radius * min(image.shape[:2]))
-    return upsample(maps, image, radius=radius, eps=guided.eps, stride=min(guided.stride, _CELL)).flatten(0, 1)
+    return upsample(maps, image, radius=radius, eps=guided.eps, stride=min(guided.stride, _CELL)).flatten(
+        0, 1
+    )
 
 
 def flat_scene(
@@ -75,8 +80,12 @@ class _Colours(Decoder):
         return content.clamp(0, 1)
 
 
-def flat_look(flat: Flat, dictionary: StyleDictionary, config: StylizerConfig, decoder: Decoder | None) -> Restyle:
-    """Restyle the photograph as `fprf stylize` would. Without a decoder its content is its colours, as in `splats.restyle`."""
+def flat_look(
+    flat: Flat, dictionary: StyleDictionary, config: StylizerConfig, decoder: Decoder | None
+) -> Restyle:
+    """Restyle the photograph as `fprf stylize` would. Without a decoder its content is its colours, as in
+    `splats.restyle`.
+    """
     device = flat.content.device
     stylizer = config.build(dictionary=dictionary, scene=flat.style).to(device)
     light = None
@@ -86,20 +95,36 @@ def flat_look(flat: Flat, dictionary: StyleDictionary, config: StylizerConfig, d
         light = None if light is None else light.to(device)
     if decoder is None:
         maps = region_maps(
-            stylizer, dictionary, flat.style, config, torch.ones(len(flat.style.share), len(dictionary.names)).bool()
+            stylizer,
+            dictionary,
+            flat.style,
+            config,
+            torch.ones(len(flat.style.share), len(dictionary.names)).bool(),
         )
         return Restyle(stylizer, features=config.features if maps is None else 0.0, colours=maps, light=light)
     smoothing = config.smoothing(flat.style)
     colours = colour_maps(
-        stylizer, dictionary, flat.style, decoder, features=config.features, share=config.colours, smoothing=smoothing
+        stylizer,
+        dictionary,
+        flat.style,
+        decoder,
+        features=config.features,
+        share=config.colours,
+        smoothing=smoothing,
     )
-    return Restyle(stylizer, features=config.features, colours=None if colours is None else colours.to(device), light=light)
+    return Restyle(
+        stylizer,
+        features=config.features,
+        colours=None if colours is None else colours.to(device),
+        light=light,
+    )
 
 
 @torch.no_grad()
 def render_flat(flat: Flat, look: Restyle, decoder: Decoder | None) -> Annotated[Tensor, "H W 3"]:
     """The photograph in a new style, in [0, 1]."""
-    parts, decoder = [], decoder or _Colours()
+    parts = []
+    decoder = decoder or _Colours()
     for start in range(0, len(flat.content), _CHUNK):
         rows = slice(start, start + _CHUNK)
         semantic = flat.semantic[rows] if flat.semantic is not None and Want.SEMANTIC in look.needs else None
@@ -112,20 +137,25 @@ _STILL = 1e-3
 
 
 def reinhard(content: Annotated[Tensor, "N 3"], style: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "N 3"]:
-    """Mean and deviation of every channel of CIE Lab from the style (Reinhard et al. 2001); clipped to the gamut.
+    """Mean and deviation of every channel of CIE Lab from the style (Reinhard et al. 2001); clipped to the
+    gamut.
 
     Raises DataError where a side has no pixel.
     """
     _filled(content, style)
-    here, there = _lab(content), _lab(style)
+    here = _lab(content)
+    there = _lab(style)
     deviation = here.std(0, correction=0)
     gain = torch.where(deviation > _STILL, there.std(0, correction=0) / deviation.clamp_min(_STILL), 1.0)
     moved = (here - here.mean(0)) * gain + there.mean(0)
-    # A colour beyond the gamut is clipped; so are the intermediate values of Lab's cubes, which must not be negative.
+    # A colour beyond the gamut is clipped; so are the intermediate values of Lab's cubes, which must not be
+    # negative.
     return lab_to_rgb(moved.T.reshape(1, 3, -1, 1), clip=True)[0, :, :, 0].T.clamp(0, 1)
 
 
-def histogram_matching(content: Annotated[Tensor, "N 3"], style: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "N 3"]:
+def histogram_matching(
+    content: Annotated[Tensor, "N 3"], style: Annotated[Tensor, "M 3"]
+) -> Annotated[Tensor, "N 3"]:
     """Each channel of sRGB gets the style's distribution: a colour goes to the one of the same rank.
 
     Equal values stay equal (they take the middle of their ranks). Raises DataError where a side has no pixel.
@@ -145,7 +175,9 @@ def histogram_matching(content: Annotated[Tensor, "N 3"], style: Annotated[Tenso
 
 def _filled(content: Tensor, style: Tensor) -> None:
     if len(content) == 0 or len(style) == 0:
-        raise DataError(f"colour transfer: {len(content)} pixels and {len(style)} of the style; both need at least one")
+        raise DataError(
+            f"colour transfer: {len(content)} pixels and {len(style)} of the style; both need at least one"
+        )
 
 
 def _lab(colours: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:

@@ -79,7 +79,9 @@ def grid_sample_lookup(
         product: Tensor | None = None
         for plane, (a, b) in zip(planes, triplane.AXES, strict=True):
             at = torch.stack([points[:, a], points[:, b]], -1)[None, None]
-            value = F.grid_sample(plane.permute(2, 0, 1)[None], at, align_corners=True, padding_mode="border")[0, :, 0].T
+            value = F.grid_sample(
+                plane.permute(2, 0, 1)[None], at, align_corners=True, padding_mode="border"
+            )[0, :, 0].T
             product = value if product is None else product * value
         assert product is not None
         scales.append(product)
@@ -87,7 +89,9 @@ def grid_sample_lookup(
 
 
 @contextmanager
-def replaced(module: nn.Module, name: str, around: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Iterator[None]:
+def replaced(
+    module: nn.Module, name: str, around: Callable[[Callable[..., Any]], Callable[..., Any]]
+) -> Iterator[None]:
     """A method of one module wrapped for a while; its class, and every other module, stay as they are."""
     setattr(module, name, around(getattr(module, name)))
     try:
@@ -109,7 +113,9 @@ def plain_planes(*models: nn.Module) -> Iterator[None]:
 
 
 def without_skipping(config: TrainConfig) -> TrainConfig:
-    """The same training with nothing left out: every sample, every ray's semantics, every term at every step."""
+    """The same training with nothing left out: every sample, every ray's semantics, every term at every
+    step.
+    """
     if any(field.name == "semantic_share" for field in fields(config.datamanager)):
         config = slots.replace(config, "datamanager.semantic_share", 1.0)
     return replace(
@@ -140,19 +146,29 @@ GOAL = 8.0
 
 def triplane_rows(config: SpeedConfig, trained: Trained) -> list[Row]:
     """Milliseconds of forward and backward together, on the largest planes of the model."""
-    planes, device = largest_planes(trained.model), trained.model.device
+    planes = largest_planes(trained.model)
+    device = trained.model.device
     if planes is None:
         return []
     points = draw_points(config.points, config.seed, device)
     table = planes.table.detach().clone()
-    calls = {name: partial(forward_backward, form, points, table, planes.resolutions) for name, form in FORMS.items()}
+    calls = {
+        name: partial(forward_backward, form, points, table, planes.resolutions)
+        for name, form in FORMS.items()
+    }
     seconds = watch_of(config, trained).in_turn(calls)
     truth = forward_backward(triplane.lookup_reference, points.double(), table.double(), planes.resolutions)
     rows = []
     for peer in ("grid_sample", "reference"):
         rows.append(
             replace(
-                _compared(f"tri-plane forward + backward, against {peer}", "ms", _milliseconds, seconds["ours"], seconds[peer]),
+                _compared(
+                    f"tri-plane forward + backward, against {peer}",
+                    "ms",
+                    _milliseconds,
+                    seconds["ours"],
+                    seconds[peer],
+                ),
                 ratio_goal=GOAL if peer == "grid_sample" and device.type == "cpu" else None,
                 error=_error(calls["ours"](), truth),
                 error_kind="largest error of value or gradient against float64, relative to the largest of each",
@@ -164,7 +180,10 @@ def triplane_rows(config: SpeedConfig, trained: Trained) -> list[Row]:
 
 
 def forward_backward(
-    lookup: Lookup, points: Annotated[Tensor, "N 3"], table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]
+    lookup: Lookup,
+    points: Annotated[Tensor, "N 3"],
+    table: Annotated[Tensor, "rows F"],
+    resolutions: Sequence[int],
 ) -> tuple[Tensor, Tensor]:
     """Values, and the table's gradient of half the sum of their squares."""
     leaf = table.detach().requires_grad_()
@@ -187,7 +206,8 @@ def draw_points(count: int, seed: int, device: torch.device) -> Annotated[Tensor
 
 def _error(computed: tuple[Tensor, Tensor], truth: tuple[Tensor, Tensor]) -> float:
     return max(
-        float((a.double() - b).abs().max() / b.abs().max().clamp_min(1e-30)) for a, b in zip(computed, truth, strict=True)
+        float((a.double() - b).abs().max() / b.abs().max().clamp_min(1e-30))
+        for a, b in zip(computed, truth, strict=True)
     )
 
 
@@ -200,13 +220,15 @@ _FAST = 100.0
 def cached_rows(config: SpeedConfig, subject: Subject, styles: dict[str, StylizerConfig]) -> list[Row]:
     """A cached view in each style, beside rendering it anew."""
     trained = subject.trained
-    known, render = trained.known, trained.config.render
+    known = trained.known
+    render = trained.config.render
     camera = small_view(known.cameras, (known.test or known.train)[0], CACHED)
     whole = int(camera.size[0].prod()) > 0.9 * CACHED
     view = cache_view(trained.model, known.facts, camera, 0, render)
     looks = {
         name: apply_style(
-            trained, StyleFile(StyleConfig(references=subject.references, stylizer=s, clusters=config.clusters))
+            trained,
+            StyleFile(StyleConfig(references=subject.references, stylizer=s, clusters=config.clusters)),
         ).restyle
         for name, s in styles.items()
     }
@@ -219,7 +241,13 @@ def cached_rows(config: SpeedConfig, subject: Subject, styles: dict[str, Stylize
     for name in looks:
         rows.append(
             replace(
-                _compared(f"cached view restyled, {name}", "ms", _milliseconds, seconds[name], seconds[f"anew {name}"]),
+                _compared(
+                    f"cached view restyled, {name}",
+                    "ms",
+                    _milliseconds,
+                    seconds[name],
+                    seconds[f"anew {name}"],
+                ),
                 goal=_FAST if whole else None,
                 error=difference(calls[name](), calls[f"anew {name}"]()).largest,
                 error_kind="largest colour difference from the view rendered anew",
@@ -233,10 +261,21 @@ def _milliseconds(seconds: float) -> float:
     return 1e3 * seconds
 
 
-def _compared(name: str, unit: str, figure: Callable[[float], float], own: Sequence[float], peer: Sequence[float]) -> Row:
+def _compared(
+    name: str, unit: str, figure: Callable[[float], float], own: Sequence[float], peer: Sequence[float]
+) -> Row:
     """A monotonic figure of the seconds of each round, beside that of a peer."""
-    ours, theirs = spread(own).map(figure), figure(spread(peer).median)
-    return Row(name=name, figure=ours.median, low=ours.low, high=ours.high, unit=unit, peer=theirs, ratio=ratio(peer, own))
+    ours = spread(own).map(figure)
+    theirs = figure(spread(peer).median)
+    return Row(
+        name=name,
+        figure=ours.median,
+        low=ours.low,
+        high=ours.high,
+        unit=unit,
+        peer=theirs,
+        ratio=ratio(peer, own),
+    )
 
 
 Progress = Callable[[int, int, str], None]
@@ -269,7 +308,10 @@ def speed(config: SpeedConfig, root: Path, folder: Path, progress: Progress) -> 
     rows += triplane_rows(config, subject.trained)
     progress(5, 5, "done")
     trained = subject.trained
-    about = settings(config, trained, missing) | {"view": size_of(test_view(config, trained)), "points": config.points}
+    about = settings(config, trained, missing) | {
+        "view": size_of(test_view(config, trained)),
+        "points": config.points,
+    }
     made = document("speed", rows, device=trained.model.device, settings=about, extra={"counters": counters})
     return Outcome(made, [rows_table("speed, beside the naive path", rows)])
 
@@ -279,14 +321,16 @@ def _training(config: SpeedConfig, subject: Subject, prepared: Prepared) -> Row:
     plain = without_skipping(trained.config)
     ours = loop_of(trained.config, prepared, fresh_model(trained))
     naive = loop_of(plain, subject.prepare(plain), fresh_model(trained))
-    take, walk = stepper(ours, trained.step), stepper(naive, trained.step)
+    take = stepper(ours, trained.step)
+    walk = stepper(naive, trained.step)
 
     def naively() -> None:
         with plain_planes(naive.model):
             walk()
 
     seconds = watch_of(config, trained).in_turn({"ours": take, "naive": naively})
-    rays, naive_rays = len(ours.manager.batch(trained.step).rgb), len(naive.manager.batch(0).rgb)
+    rays = len(ours.manager.batch(trained.step).rgb)
+    naive_rays = len(naive.manager.batch(0).rgb)
     row = _compared("train", "rays/s", lambda s: rays / s, seconds["ours"], seconds["naive"])
     return replace(
         row,
@@ -309,15 +353,21 @@ def _gradient_error(subject: Subject, prepared: Prepared) -> float:
 
 
 def _rendering(config: SpeedConfig, subject: Subject) -> tuple[list[Row], dict[str, float]]:
-    trained, camera = subject.trained, test_view(config, subject.trained)
+    trained = subject.trained
+    camera = test_view(config, subject.trained)
     pixels = int(camera.size[0].prod())
     looks: dict[str, Restyle | None] = {"render": None}
     for name, stylizer in STYLES.items():
         made = apply_style(
-            trained, StyleFile(StyleConfig(references=subject.references, stylizer=stylizer, clusters=config.clusters))
+            trained,
+            StyleFile(
+                StyleConfig(references=subject.references, stylizer=stylizer, clusters=config.clusters)
+            ),
         )
         looks[f"stylised, {name}"] = made.restyle
-    model, facts, render = trained.model, trained.known.facts, trained.config.render
+    model = trained.model
+    facts = trained.known.facts
+    render = trained.config.render
     rays = view_rays(model, camera, 0)
     calls: dict[str, Callable[[], Tensor]] = {}
     for name, look in looks.items():
@@ -343,25 +393,34 @@ def _drawn(model: Model, facts: Facts, camera: Cameras, render: RenderConfig, lo
     return render_view(model, facts, camera, 0, render, look).rgb
 
 
-def _naively(model: Model, facts: Facts, camera: Cameras, render: RenderConfig, look: Restyle | None) -> Tensor:
+def _naively(
+    model: Model, facts: Facts, camera: Cameras, render: RenderConfig, look: Restyle | None
+) -> Tensor:
     with plain_planes(model):
         return plainly(model, facts, view_rays(model, camera, 0), render, look).cpu()
 
 
 def _restyling(config: SpeedConfig, subject: Subject) -> list[Row]:
     """A new photograph: to its dictionary, to the first picture."""
-    trained, camera = subject.trained, test_view(config, subject.trained)
+    trained = subject.trained
+    camera = test_view(config, subject.trained)
     made: dict[str, Stylizer] = {}
 
     def dictionary() -> None:
         made["new"] = apply_style(
             trained,
-            StyleFile(StyleConfig(references=subject.references[:1], stylizer=RegionOtConfig(), clusters=config.clusters)),
+            StyleFile(
+                StyleConfig(
+                    references=subject.references[:1], stylizer=RegionOtConfig(), clusters=config.clusters
+                )
+            ),
         ).restyle.stylizer
 
     def first() -> None:
         dictionary()
-        render_view(trained.model, trained.known.facts, camera, 0, trained.config.render, Restyle(made["new"]))
+        render_view(
+            trained.model, trained.known.facts, camera, 0, trained.config.render, Restyle(made["new"])
+        )
 
     seconds = watch_of(config, trained).in_turn({"dictionary": dictionary, "first": first})
     rows = []

@@ -37,21 +37,33 @@ def main(argv: list[str]) -> None:
     parser = arguments("splat_restyle", __doc__)
     parser.add_argument("--captures", type=Path, nargs="*", default=[])
     parser.add_argument("--synthetic", type=int, nargs="*", default=[115_000, 1_000_000])
-    parser.add_argument("--references", type=Path, nargs="+", help="photographs; by default pictures of towns")
+    parser.add_argument(
+        "--references", type=Path, nargs="+", help="photographs; by default pictures of towns"
+    )
     parser.add_argument("--output", type=Path)
     parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args(argv)
     if options.one:
         print(json.dumps(measured(options.one, options.references)))
         return
-    rows, single = [], {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+    rows = []
+    single = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as folder:
         references = options.references or town_references(Path(folder))
         for count in options.synthetic:
             options.captures.append(Path(folder) / f"synthetic-{count}.splat")
             made_up(options.captures[-1], count)
         for path in options.captures:
-            words = [sys.executable, "-m", "benchmarks", "splat_restyle", "--one", path, "--references", *references]
+            words = [
+                sys.executable,
+                "-m",
+                "benchmarks",
+                "splat_restyle",
+                "--one",
+                path,
+                "--references",
+                *references,
+            ]
             said = subprocess.run(words, stdout=subprocess.PIPE, text=True, check=True, env=single).stdout
             rows.append(json.loads(said.splitlines()[-1]))
             print(rows[-1], flush=True)
@@ -64,10 +76,14 @@ def made_up(path: Path, count: int) -> None:
     around = torch.nn.functional.normalize(torch.randn(count, 3, generator=draw), dim=1)
     bumps = 1 + 0.15 * (around * 5).sin().prod(1, keepdim=True)
     ground = torch.rand(count, 1, generator=draw) < 0.4
-    flat = (4 * torch.rand(count, 3, generator=draw) - 2) * torch.tensor([1.0, 0.0, 1.0]) + torch.tensor([0.0, 1.1, 0.0])
+    flat = (4 * torch.rand(count, 3, generator=draw) - 2) * torch.tensor([1.0, 0.0, 1.0]) + torch.tensor(
+        [0.0, 1.1, 0.0]
+    )
     means = torch.where(ground, flat, around * bumps)
     colour = torch.where(ground, torch.tensor([0.5, 0.45, 0.4]), torch.tensor([0.3, 0.5, 0.25]))
-    colour = colour + 0.15 * (means * 9).sin().prod(1, keepdim=True) + 0.05 * torch.randn(count, 3, generator=draw)
+    colour = (
+        colour + 0.15 * (means * 9).sin().prod(1, keepdim=True) + 0.05 * torch.randn(count, 3, generator=draw)
+    )
     size = (6.0 / count) ** 0.5
     scales = torch.full((count, 3), size).log() + 0.3 * torch.randn(count, 3, generator=draw)
     parts = (
@@ -88,7 +104,12 @@ def measured(path: Path, references: list[Path]) -> dict[str, Any]:
     encoder = SEMANTICS.build()
     with tempfile.TemporaryDirectory() as folder:  # compiles
         made_up(Path(folder) / "x.splat", 2000)
-        look_at_capture(read_capture(Path(folder) / "x.splat").gaussians, False, encoder, LookConfig(views=1, size=(64, 48)))
+        look_at_capture(
+            read_capture(Path(folder) / "x.splat").gaussians,
+            False,
+            encoder,
+            LookConfig(views=1, size=(64, 48)),
+        )
     start = time.process_time()
     scene = look_at_capture(capture.gaussians, capture.antialiased, encoder, LookConfig())
     scene.found()

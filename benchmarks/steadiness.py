@@ -2,9 +2,9 @@
 
     score = mean over short and long of max(0, error(stylised) - error(plain))  +  max(0, 1 - sharpness)
 
-Only places that the unstylised render itself shows alike count. Colours are compared as means over windows, since a texture
-finer than a pixel differs in every frame. Sharpness is the steepest change of colour in a neighbourhood over the range of
-colours there. Frames are warped as in `fprf.evaluation.metrics`.
+Only places that the unstylised render itself shows alike count. Colours are compared as means over windows,
+since a texture finer than a pixel differs in every frame. Sharpness is the steepest change of colour in a
+neighbourhood over the range of colours there. Frames are warped as in `fprf.evaluation.metrics`.
 
 `published` is consistency as other papers report it. A blurred or dull film scores well there.
 
@@ -25,7 +25,8 @@ from fprf.errors import DataError, NumericsError
 from fprf.evaluation.metrics import lpips, warp
 from fprf.rendering.cameras import Cameras
 
-SHORT, LONG = 1, 7
+SHORT = 1
+LONG = 7
 """Frames between the two views of a pair (Lai et al. 2018, and every peer since)."""
 
 _ALIKE = 0.1
@@ -54,7 +55,9 @@ class Steadiness(NamedTuple):
     """Share of the pixels that counted, between neighbours."""
 
 
-def steadiness(plain: Frames, styled: Frames, depths: Sequence[Annotated[Tensor, "H W"]], cameras: Cameras) -> Steadiness:
+def steadiness(
+    plain: Frames, styled: Frames, depths: Sequence[Annotated[Tensor, "H W"]], cameras: Cameras
+) -> Steadiness:
     """Of a path. Depths are world distances along the unit ray (0 or infinite = nothing there).
 
     Raises DataError where the numbers of frames differ, NumericsError for colours that are not finite.
@@ -66,9 +69,15 @@ def steadiness(plain: Frames, styled: Frames, depths: Sequence[Annotated[Tensor,
         )
     for frame in (*plain, *styled):
         if not bool(frame.isfinite().all()):
-            raise NumericsError("steadiness: a frame holds colours that are not finite; nothing can be judged by it")
+            raise NumericsError(
+                "steadiness: a frame holds colours that are not finite; nothing can be judged by it"
+            )
     near, far = (_errors(plain, styled, depths, cameras, gap) for gap in (SHORT, LONG))
-    added = [max(0.0, each.styled - each.plain) for each in (near, far) if each.styled is not None and each.plain is not None]
+    added = [
+        max(0.0, each.styled - each.plain)
+        for each in (near, far)
+        if each.styled is not None and each.plain is not None
+    ]
     sharp = sharpness(plain, styled)
     lost = 0.0 if sharp is None else max(0.0, 1 - sharp)
     score = math.fsum(added) / len(added) + lost if added else None
@@ -76,10 +85,13 @@ def steadiness(plain: Frames, styled: Frames, depths: Sequence[Annotated[Tensor,
 
 
 def sharpness(plain: Frames, styled: Frames) -> float | None:
-    """Steepness of the stylised frames' edges over that of the plain ones' (the median over places where both have an edge)."""
+    """Steepness of the stylised frames' edges over that of the plain ones' (the median over places where both
+    have an edge).
+    """
     ratios = []
     for before, after in zip(plain, styled, strict=True):
-        (steep, edge), (steep_after, edge_after) = _steepness(before), _steepness(after)
+        (steep, edge) = _steepness(before)
+        (steep_after, edge_after) = _steepness(after)
         both = edge & edge_after
         ratios.append((steep_after[both] / steep[both]).double())
     all_ratios = torch.cat(ratios) if ratios else torch.empty(0)
@@ -93,7 +105,8 @@ class _Errors(NamedTuple):
 
 
 def _errors(plain: Frames, styled: Frames, depths: Sequence[Tensor], cameras: Cameras, gap: int) -> _Errors:
-    squared, spread = [0.0, 0.0], [0.0, 0.0]
+    squared = [0.0, 0.0]
+    spread = [0.0, 0.0]
     counted = pixels = 0
     for a, b in zip(range(len(plain)), range(gap, len(plain)), strict=False):
         there, valid = warp(plain[b], depths[a], depths[b], cameras, a, b)
@@ -101,7 +114,8 @@ def _errors(plain: Frames, styled: Frames, depths: Sequence[Tensor], cameras: Ca
         # Share of the window around each pixel that counts; beyond the frame nothing does.
         within = F.avg_pool2d(valid[None, None].double(), _WINDOW, 1, _WINDOW // 2)[0, 0]
         full = valid & (within >= 0.5)
-        counted, pixels = counted + int(full.sum()), pixels + full.numel()
+        counted = counted + int(full.sum())
+        pixels = pixels + full.numel()
         moved, _ = warp(styled[b], depths[a], depths[b], cameras, a, b)
         for i, (here, warped) in enumerate(((plain[a], there), (styled[a], moved))):
             first, second = (_window_mean(x, valid, within)[full].double() for x in (here, warped))
@@ -115,11 +129,17 @@ def _window_mean(
     image: Annotated[Tensor, "H W 3"], valid: Annotated[Tensor, "H W"], within: Annotated[Tensor, "H W"]
 ) -> Annotated[Tensor, "H W 3"]:
     kept = torch.where(valid[..., None], image.double(), 0.0).permute(2, 0, 1)[None]
-    return F.avg_pool2d(kept, _WINDOW, 1, _WINDOW // 2)[0].permute(1, 2, 0) / within[..., None].clamp_min(1e-9)
+    return F.avg_pool2d(kept, _WINDOW, 1, _WINDOW // 2)[0].permute(1, 2, 0) / within[..., None].clamp_min(
+        1e-9
+    )
 
 
-def _steepness(image: Annotated[Tensor, "H W 3"]) -> tuple[Annotated[Tensor, "H W"], Annotated[Tensor, "H W"]]:
-    """Steepest change between neighbours over the range of colours, in the window of each pixel; and where there is an edge."""
+def _steepness(
+    image: Annotated[Tensor, "H W 3"],
+) -> tuple[Annotated[Tensor, "H W"], Annotated[Tensor, "H W"]]:
+    """Steepest change between neighbours over the range of colours, in the window of each pixel; and where
+    there is an edge.
+    """
     rows = image.double().permute(2, 0, 1)[None]
     reach = (_highest(rows) + _highest(-rows)).norm(dim=1)[0]
     across = F.pad((rows[..., 1:] - rows[..., :-1]).norm(dim=1), (0, 1))
@@ -137,15 +157,19 @@ def _highest(maps: Annotated[Tensor, "1 C H W"]) -> Annotated[Tensor, "1 C H W"]
 def published(
     images: Sequence[Annotated[Tensor, "H W 3"]], depths: Sequence[Annotated[Tensor, "H W"]], cameras: Cameras
 ) -> dict[str, dict[str, float | int | None]]:
-    """`short` and `long`: `rmse`, `e_warp` (both of colours in [0, 1]), `lpips` and the number of `pairs` compared.
+    """`short` and `long`: `rmse`, `e_warp` (both of colours in [0, 1]), `lpips` and the number of `pairs`
+    compared.
 
     Raises DataError where images, depths and cameras differ in number.
     """
     if not len(images) == len(depths) == len(cameras):
-        raise DataError(f"{len(images)} images, {len(depths)} depths, {len(cameras)} cameras: one of each per frame is needed")
+        raise DataError(
+            f"{len(images)} images, {len(depths)} depths, {len(cameras)} cameras: one of each per frame is needed"
+        )
     summary: dict[str, dict[str, float | int | None]] = {}
     for name, gap in (("short", SHORT), ("long", LONG)):
-        squares, perceived = [], []
+        squares = []
+        perceived = []
         for t in range(gap, len(images)):
             there, valid = warp(images[t - gap], depths[t], depths[t - gap], cameras, t, t - gap)
             if bool(valid.any()):

@@ -86,13 +86,22 @@ def stress(config: StressConfig, root: Path, folder: Path, progress: Progress) -
         "falls_short": [f"{check.stage}: {check.input}" for check in broken],
     }
     title = f"{len(checks)} checks, {len(broken)} broken"
-    shown = table(title, ("", "input", "reference", "bound", "measured", ""), (_cells(check) for check in checks))
+    shown = table(
+        title, ("", "input", "reference", "bound", "measured", ""), (_cells(check) for check in checks)
+    )
     return Outcome(document, [shown])
 
 
 def _cells(check: Check) -> list[str]:
     bound = f"{'≥' if check.at_least else '≤'} {check.bound:.3g} {check.unit}"
-    return [check.stage, check.input, check.reference, bound, f"{check.measured:.3g}", "" if check.passed else "BROKEN"]
+    return [
+        check.stage,
+        check.input,
+        check.reference,
+        bound,
+        f"{check.measured:.3g}",
+        "" if check.passed else "BROKEN",
+    ]
 
 
 def readers(folder: Path, rounds: int, seed: int) -> list[Check]:
@@ -101,15 +110,22 @@ def readers(folder: Path, rounds: int, seed: int) -> list[Check]:
     for target in targets(folder):
         found = fuzz(target, rounds, seed)
         told = f"{rounds} mutations: {found.values} read, {found.refusals} refused in one line"
-        rows.append(_file_row(f"{target.name}, {told}", "a value or one line", len(found.faults), 0, "others"))
+        rows.append(
+            _file_row(f"{target.name}, {told}", "a value or one line", len(found.faults), 0, "others")
+        )
     return rows
 
 
 def damage(folder: Path, flips: int, seed: int) -> list[Check]:
     """Flipped bits in a file of tensors with its checksums."""
     folder.mkdir(parents=True, exist_ok=True)
-    path, draw = folder / "sealed.safetensors", random.Random(seed)  # nosec B311  # no secrets
-    made = {"planes": cases.normal(16, 64, seed=28), "mean": cases.normal(64, seed=29), "step": torch.tensor([7])}
+    path = folder / "sealed.safetensors"  # nosec B311  # no secrets
+    draw = random.Random(seed)  # nosec B311  # no secrets
+    made = {
+        "planes": cases.normal(16, 64, seed=28),
+        "mean": cases.normal(64, seed=29),
+        "step": torch.tensor([7]),
+    }
     tensorfiles.save(path, made, sealed=True)
     whole = path.read_bytes()
     found = wrong = 0
@@ -123,7 +139,15 @@ def damage(folder: Path, flips: int, seed: int) -> list[Check]:
             found += 1
         else:
             wrong += any(name not in read or not torch.equal(read[name], t) for name, t in made.items())
-    return [_file_row(f"{flips} flipped bits in sealed tensors, {found} refused", "never wrong numbers", wrong, 0, "wrong")]
+    return [
+        _file_row(
+            f"{flips} flipped bits in sealed tensors, {found} refused",
+            "never wrong numbers",
+            wrong,
+            0,
+            "wrong",
+        )
+    ]
 
 
 def _file_row(name: str, reference: str, measured: float, bound: float, unit: str) -> Check:
@@ -134,15 +158,27 @@ OFFSET = (1e6, -3e6, 5e5)
 """Metres: of the size of UTM coordinates."""
 
 
-def invariants(trained: Trained, scene: ParsedScene | None, cameras: Cameras, references: tuple[Path, ...]) -> list[Check]:
+def invariants(
+    trained: Trained, scene: ParsedScene | None, cameras: Cameras, references: tuple[Path, ...]
+) -> list[Check]:
     """Of one view; what needs the scene's images or points is left out without them."""
-    model, facts = trained.model, trained.known.facts
+    model = trained.model
+    facts = trained.known.facts
     rays = view_rays(model, cameras, 0)
     plain = colours(model, facts, rays, trained.config.render)
     whole = colours(model, facts, rays, replace(trained.config.render, budget=0.0))
     rows = [
-        _row("float32, nothing skipped", "float64", decibels(whole, exact(model, facts, rays)), 100.0, "dB", at_least=True),
-        _row("as configured, samples skipped", "float64", _largest(plain, exact(model, facts, rays)), 1 / 256),
+        _row(
+            "float32, nothing skipped",
+            "float64",
+            decibels(whole, exact(model, facts, rays)),
+            100.0,
+            "dB",
+            at_least=True,
+        ),
+        _row(
+            "as configured, samples skipped", "float64", _largest(plain, exact(model, facts, rays)), 1 / 256
+        ),
         *_orders(trained, rays, plain),
         *_threads(trained, rays, plain),
     ]
@@ -156,10 +192,13 @@ def colours(
     model: Model, facts: Facts, rays: Rays, config: RenderConfig, look: Restyle | None = None
 ) -> Annotated[Tensor, "R 3"]:
     """Colours in [0, 1], chunk by chunk, as views are rendered."""
-    background, found = background_of(facts, rays.near.device), []
+    background = background_of(facts, rays.near.device)
+    found = []
     for start in range(0, len(rays.near), config.chunk):
         part = Rays(*(x[start : start + config.chunk] for x in rays))
-        out = render_rays(part, model.parts, want=Want.COLOUR, budget=config.budget, background=background, restyle=look)
+        out = render_rays(
+            part, model.parts, want=Want.COLOUR, budget=config.budget, background=background, restyle=look
+        )
         assert out.rgb is not None
         found.append(out.rgb)
     return torch.cat(found).clamp(0, 1)
@@ -174,7 +213,9 @@ def decibels(found: Tensor, truth: Tensor) -> float:
 def _orders(trained: Trained, rays: Rays, plain: Tensor) -> list[Check]:
     """The same rays in another order, and in other chunks."""
     order = torch.randperm(len(plain), generator=torch.Generator().manual_seed(0)).to(plain.device)
-    shuffled = colours(trained.model, trained.known.facts, Rays(*(x[order] for x in rays)), trained.config.render)
+    shuffled = colours(
+        trained.model, trained.known.facts, Rays(*(x[order] for x in rays)), trained.config.render
+    )
     small = replace(trained.config.render, chunk=max(1, len(plain) // 7))
     parts = colours(trained.model, trained.known.facts, rays, small)
     return [
@@ -202,14 +243,17 @@ def _worlds(trained: Trained, scene: ParsedScene, cameras: Cameras, plain: Tenso
         # The first and the last view say which way a capture runs, and so which of two equal spaces it has.
         inner = torch.randperm(len(scene.paths) - 2, generator=torch.Generator().manual_seed(1)) + 1
         order = torch.cat([torch.tensor([0]), inner, torch.tensor([len(scene.paths) - 1])])
-        worlds.append(("views between the first and the last in another order", _reordered(scene, order), cameras))
+        worlds.append(
+            ("views between the first and the last in another order", _reordered(scene, order), cameras)
+        )
     for name, scale, offset in (
         ("world 1e6 m away", 1.0, torch.tensor(OFFSET, dtype=torch.float64)),
         ("world 1e6 times larger", 1e6, torch.zeros(3, dtype=torch.float64)),
         ("world 1e6 times smaller", 1e-6, torch.zeros(3, dtype=torch.float64)),
     ):
         worlds.append((name, _moved(scene, scale, offset), _placed(cameras, scale, offset)))
-    rows, model = [], trained.model
+    rows = []
+    model = trained.model
     for name, other, view in worlds:
         own = model.space
         model.space = find_space(other)
@@ -222,15 +266,30 @@ def _worlds(trained: Trained, scene: ParsedScene, cameras: Cameras, plain: Tenso
 
 
 def _styles(trained: Trained, rays: Rays, plain: Tensor, references: tuple[Path, ...]) -> list[Check]:
-    model, facts, config = trained.model, trained.known.facts, trained.config.render
-    there = apply_style(trained, StyleFile(StyleConfig(references=references, stylizer=RegionOtConfig()))).restyle
-    back = apply_style(trained, StyleFile(StyleConfig(references=references[::-1], stylizer=RegionOtConfig()))).restyle
-    none = apply_style(trained, StyleFile(StyleConfig(references=references, stylizer=RegionOtConfig(), strength=0.0))).restyle
+    model = trained.model
+    facts = trained.known.facts
+    config = trained.config.render
+    there = apply_style(
+        trained, StyleFile(StyleConfig(references=references, stylizer=RegionOtConfig()))
+    ).restyle
+    back = apply_style(
+        trained, StyleFile(StyleConfig(references=references[::-1], stylizer=RegionOtConfig()))
+    ).restyle
+    none = apply_style(
+        trained, StyleFile(StyleConfig(references=references, stylizer=RegionOtConfig(), strength=0.0))
+    ).restyle
     styled, turned, still = (colours(model, facts, rays, config, look) for look in (there, back, none))
     return [
         _row("references in another order", "the same image", _largest(turned, styled), 1e-6),
         _row("strength 0", "the plain image, bit for bit", _largest(still, plain), 0.0),
-        _row("restyled, float32, nothing skipped", "float64", _styled_error(trained, rays, there), 60.0, "dB", at_least=True),
+        _row(
+            "restyled, float32, nothing skipped",
+            "float64",
+            _styled_error(trained, rays, there),
+            60.0,
+            "dB",
+            at_least=True,
+        ),
     ]
 
 
@@ -273,9 +332,23 @@ def _largest(found: Tensor, truth: Tensor) -> float:
     return float((found.double() - truth.double()).abs().max())
 
 
-def _row(name: str, reference: str, measured: float, bound: float, unit: str = "of [0, 1]", *, at_least: bool = False) -> Check:
+def _row(
+    name: str,
+    reference: str,
+    measured: float,
+    bound: float,
+    unit: str = "of [0, 1]",
+    *,
+    at_least: bool = False,
+) -> Check:
     return Check(
-        stage="pipeline", input=name, reference=reference, measured=measured, bound=bound, unit=unit, at_least=at_least
+        stage="pipeline",
+        input=name,
+        reference=reference,
+        measured=measured,
+        bound=bound,
+        unit=unit,
+        at_least=at_least,
     )
 
 

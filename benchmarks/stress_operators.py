@@ -10,7 +10,13 @@ from torch import Tensor
 
 from fprf.errors import FprfError
 from fprf.ops.guided import upsample
-from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
+from fprf.plugins.stylizers.config import (
+    AdainConfig,
+    LocalAdainConfig,
+    RegionOtConfig,
+    RegionToneConfig,
+    StylizerConfig,
+)
 from fprf.rendering.stepfun import resample, transmittance_weights
 from fprf.style.dictionary import whole_style
 from fprf.style.matching import point_shares
@@ -45,7 +51,9 @@ class Check:
 
     def json(self) -> dict[str, object]:
         """The row for a file; a measure that is not finite becomes text."""
-        measured: object = float(f"{self.measured:.4g}") if math.isfinite(self.measured) else str(self.measured)
+        measured: object = (
+            float(f"{self.measured:.4g}") if math.isfinite(self.measured) else str(self.measured)
+        )
         return {
             "stage": self.stage,
             "input": self.input,
@@ -59,8 +67,11 @@ class Check:
 
 
 def relative(found: Tensor, truth: Tensor, floor: float = 0.0) -> float:
-    """Largest relative error where the truth is above `floor`; infinite where something is not finite, 0 of nothing."""
-    found, truth = found.double(), truth.double()
+    """Largest relative error where the truth is above `floor`; infinite where something is not finite, 0 of
+    nothing.
+    """
+    found = found.double()
+    truth = truth.double()
     if not bool(found.isfinite().all()):
         return math.inf
     at = truth.abs() > floor
@@ -70,7 +81,8 @@ def relative(found: Tensor, truth: Tensor, floor: float = 0.0) -> float:
 
 def scaled(found: Tensor, truth: Tensor) -> float:
     """Largest error as a share of the largest true value."""
-    found, truth = found.double(), truth.double()
+    found = found.double()
+    truth = truth.double()
     if not bool(found.isfinite().all()):
         return math.inf
     return float((found - truth).abs().max() / truth.abs().max().clamp_min(torch.finfo(torch.float64).tiny))
@@ -90,11 +102,16 @@ FAINT = 1e-30
 def exact_weights(density: Annotated[Tensor, "R S"], t: Annotated[Tensor, "R E"]) -> Annotated[Tensor, "R S"]:
     """w = exp(-sum of what lies before) (1 - exp(-tau)), in float64.
 
-    Where a gradient is asked for, as a difference of exponentials: autograd of expm1 is wrong where the medium is opaque.
+    Where a gradient is asked for, as a difference of exponentials: autograd of expm1 is wrong where the
+    medium is opaque.
     """
     tau = density * (t[:, 1:] - t[:, :-1]).double()
     before = torch.nn.functional.pad(tau[:, :-1], (1, 0)).cumsum(-1)
-    return torch.exp(-before) - torch.exp(-(before + tau)) if tau.requires_grad else torch.exp(-before) * -torch.expm1(-tau)
+    return (
+        torch.exp(-before) - torch.exp(-(before + tau))
+        if tau.requires_grad
+        else torch.exp(-before) * -torch.expm1(-tau)
+    )
 
 
 def weights() -> list[Check]:
@@ -104,7 +121,9 @@ def weights() -> list[Check]:
         truth = exact_weights(density.double(), t)
         tau = (density.double() * (t[:, 1:] - t[:, :-1]).double()).cumsum(-1)
         if len(density):
-            rows.append(_ray_row(name, "float64", _law(transmittance_weights(density, t), truth, tau), 1.0, "4u(1+τ)"))
+            rows.append(
+                _ray_row(name, "float64", _law(transmittance_weights(density, t), truth, tau), 1.0, "4u(1+τ)")
+            )
     density, t = _grid()
     density.requires_grad_(True)
     found = transmittance_weights(density, t)
@@ -125,14 +144,34 @@ def sampling() -> list[Check]:
         truth = resample(s.double(), w.double(), 48, padding=1e-3, generator=None)
         away = (found.double() - truth).abs().max()
         error = float(away) if bool(found.isfinite().all()) else float("inf")
-        rows.append(Check(stage="sampling", input=name, reference="float64", measured=error, bound=2e-5, unit="of [0, 1]"))
+        rows.append(
+            Check(
+                stage="sampling",
+                input=name,
+                reference="float64",
+                measured=error,
+                bound=2e-5,
+                unit="of [0, 1]",
+            )
+        )
         astray = float(((found < 0) | (found > 1)).sum() + (found.diff(dim=1) < 0).sum())
-        rows.append(Check(stage="sampling", input=name, reference="sorted, inside", measured=astray, bound=0, unit="edges"))
+        rows.append(
+            Check(
+                stage="sampling",
+                input=name,
+                reference="sorted, inside",
+                measured=astray,
+                bound=0,
+                unit="edges",
+            )
+        )
     return rows
 
 
 def _ray_row(name: str, reference: str, measured: float, bound: float, unit: str) -> Check:
-    return Check(stage="rendering", input=name, reference=reference, measured=measured, bound=bound, unit=unit)
+    return Check(
+        stage="rendering", input=name, reference=reference, measured=measured, bound=bound, unit=unit
+    )
 
 
 def _law(found: Tensor, truth: Tensor, tau: Tensor) -> float:
@@ -219,15 +258,33 @@ def statistics() -> list[Check]:
         mean, variance = _two_passes(x, mass)
         found = moments(x, mass)
         error = max(relative(found.mean, mean), relative(covariance(found).diagonal(), variance))
-        rows.append(_row("statistics", f"mean {ratio:g} deviations away", "two passes in float64", error, 1e-12))
+        rows.append(
+            _row("statistics", f"mean {ratio:g} deviations away", "two passes in float64", error, 1e-12)
+        )
         order = torch.randperm(len(x), generator=torch.Generator().manual_seed(2))
         parts = empty(8)
         for piece in torch.split(order, 777):
             parts = merge(parts, moments(x[piece], mass[piece]))
         error = max(relative(parts.mean, found.mean), scaled(parts.scatter, found.scatter))
-        rows.append(_row("statistics", f"mean {ratio:g} deviations away", "the same in 52 parts, shuffled", error, 1e-12))
+        rows.append(
+            _row(
+                "statistics",
+                f"mean {ratio:g} deviations away",
+                "the same in 52 parts, shuffled",
+                error,
+                1e-12,
+            )
+        )
     flat = moments(torch.full((1000, 4), 1e4), torch.ones(1000))
-    rows.append(_row("statistics", "constant channels", "variance 0", float(covariance(flat).diagonal().abs().max()), 0.0))
+    rows.append(
+        _row(
+            "statistics",
+            "constant channels",
+            "variance 0",
+            float(covariance(flat).diagonal().abs().max()),
+            0.0,
+        )
+    )
     one = moments(_draw(1, 4), torch.ones(1))
     rows.append(_row("statistics", "one row", "variance 0", float(covariance(one).abs().max()), 0.0))
     return rows
@@ -259,14 +316,25 @@ def matching() -> list[Check]:
     """Shares of style codes, for scores up to 1e5 temperatures apart."""
     rows = []
     for norm, temperature in _SCORES:
-        x, keys = norm * _unit(512, 64, 3), norm * _unit(10, 64, 4)
+        x = norm * _unit(512, 64, 3)
+        keys = norm * _unit(10, 64, 4)
         logits = (x.double() @ keys.double().T) / temperature
-        found, truth = point_shares(x, keys, temperature), torch.softmax(logits, 1)
+        found = point_shares(x, keys, temperature)
+        truth = torch.softmax(logits, 1)
         law = 2 * U * float(logits.abs().max()) + 8 * U
         name = f"norms {norm:g}, temperature {temperature:g}"
         error = math.inf if unsound(found) else float((found.double() - truth).abs().max()) / law
         rows.append(_row("matching", name, "softmax in float64", error, 1.0, "2u max|logit| + 8u"))
-        rows.append(_row("matching", name, "rows sum to 1", float((found.double().sum(1) - 1).abs().max()) / U, 16.0, "u"))
+        rows.append(
+            _row(
+                "matching",
+                name,
+                "rows sum to 1",
+                float((found.double().sum(1) - 1).abs().max()) / U,
+                16.0,
+                "u",
+            )
+        )
     one = point_shares(_unit(8, 64, 5), _unit(1, 64, 6), 1.0)
     rows.append(_row("matching", "one code", "1", float((one - 1).abs().max()), 0.0))
     twins = point_shares(_unit(8, 64, 5), _unit(1, 64, 6).repeat(2, 1), 1.0)
@@ -282,12 +350,15 @@ def stylizers() -> list[Check]:
         "region-ot": RegionOtConfig(),
     }
     rows = []
-    content, semantic = cases.normal(400, 8, seed=12), cases.normal(400, 4, seed=13)
+    content = cases.normal(400, 8, seed=12)
+    semantic = cases.normal(400, 4, seed=13)
     scene = _whole(cases.scene(4, 8, 4))
     for name, config in kinds.items():
         stylizer = config.build(dictionary=own_style(scene, 0.0), scene=scene)
         styled = stylizer(content, semantic if Want.SEMANTIC in stylizer.needs else None)
-        rows.append(_row("stylizers", f"{name}, the scene's own style", "the features", scaled(styled, content), 1e-5))
+        rows.append(
+            _row("stylizers", f"{name}, the scene's own style", "the features", scaled(styled, content), 1e-5)
+        )
     for name, config in (kinds | {"local-adain": LocalAdainConfig()}).items():
         for what, (here, there) in _extremes().items():
             stylizer = config.build(dictionary=own_style(there, 0.0), scene=here)
@@ -316,13 +387,17 @@ def guided() -> list[Check]:
         plain = upsample(features, guide, radius=8, eps=eps)
         rows.append(_row("guided filter", name, "finite", unsound(plain), 0.0, "non-finite"))
         lifted = upsample(features + 50, guide, radius=8, eps=eps) - 50
-        rows.append(_row("guided filter", f"{name}, features + 50", "the same without", scaled(lifted, plain), bound))
+        rows.append(
+            _row("guided filter", f"{name}, features + 50", "the same without", scaled(lifted, plain), bound)
+        )
     tiny = upsample(features[:, :1, :1], picture[:5, :5], radius=30, eps=1e-3)
     rows.append(_row("guided filter", "5 x 5 pixels, radius 30", "finite", unsound(tiny), 0.0, "non-finite"))
     return rows
 
 
-def _row(stage: str, name: str, reference: str, measured: float, bound: float, unit: str = "relative") -> Check:
+def _row(
+    stage: str, name: str, reference: str, measured: float, bound: float, unit: str = "relative"
+) -> Check:
     return Check(stage=stage, input=name, reference=reference, measured=measured, bound=bound, unit=unit)
 
 
@@ -331,11 +406,14 @@ def _draw(rows: int, columns: int) -> Tensor:
 
 
 def _unit(rows: int, columns: int, seed: int) -> Tensor:
-    return torch.nn.functional.normalize(torch.randn(rows, columns, generator=torch.Generator().manual_seed(seed)), dim=1)
+    return torch.nn.functional.normalize(
+        torch.randn(rows, columns, generator=torch.Generator().manual_seed(seed)), dim=1
+    )
 
 
 def _two_passes(x: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
-    x, mass = x.double(), mass.double()
+    x = x.double()
+    mass = mass.double()
     share = mass / mass.sum()
     mean = share @ x
     return mean, share @ (x - mean).square()
@@ -360,7 +438,9 @@ def _extremes() -> dict[str, tuple[SceneStyle, SceneStyle]]:
     usual = cases.scene(4, 8, 4)
 
     def times(scale: float) -> SceneStyle:
-        return usual._replace(covariance=scale * usual.covariance, region_covariance=scale * usual.region_covariance)
+        return usual._replace(
+            covariance=scale * usual.covariance, region_covariance=scale * usual.region_covariance
+        )
 
     return {
         "scene without variance": (times(0.0), usual),

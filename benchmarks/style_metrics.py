@@ -1,26 +1,30 @@
-"""How pictures differ in style: structure, CIEDE2000, style distance and contrast, of images [H W 3] in [0, 1].
+"""How pictures differ in style: structure, CIEDE2000, style distance and contrast, of images [H W 3] in [0,
+1].
 
-Structure is SSIM's second factor, of luminances that are first brought to one mean and deviation, because a style may make a
-picture darker and flatter as a whole:
+Structure is SSIM's second factor, of luminances that are first brought to one mean and deviation, because a
+style may make a picture darker and flatter as a whole:
 
     structure = mean over windows of (2 σ_ab + K) / (σ_a² + σ_b² + K)
 
-CIEDE2000 after Sharma, Wu and Dalal 2005, with k_L = k_C = k_H = 1 in float64; Lab is that of the illuminant D65, with
-a lightness from 0 to 100. A difference of 1 is just visible, 10 is another shade, 50 another colour.
+CIEDE2000 after Sharma, Wu and Dalal 2005, with k_L = k_C = k_H = 1 in float64; Lab is that of the illuminant
+D65, with a lightness from 0 to 100. A difference of 1 is just visible, 10 is another shade, 50 another
+colour.
 
 Style distance: how far a picture's feature statistics are from its references', region by region.
 
-Features of each layer are described in each region by mean and deviation (or, with `full`, by their covariance), and two
-regions are compared by the Fréchet (2-Wasserstein) distance of the Gaussians:
+Features of each layer are described in each region by mean and deviation (or, with `full`, by their
+covariance), and two regions are compared by the Fréchet (2-Wasserstein) distance of the Gaussians:
 
     d² = |μ_a - μ_b|² + |σ_a - σ_b|²          per channel
     d² = |μ_a - μ_b|² + tr(C_a + C_b - 2 (C_a^½ C_b C_a^½)^½)                                      with covariances
 
-Regions are averaged by their share of the content and divided by the same for the unstylised picture: 0 = the reference's own
-statistics, 1 = no change. Layers count alike. Use an encoder that took no part in the styling.
+Regions are averaged by their share of the content and divided by the same for the unstylised picture: 0 = the
+reference's own statistics, 1 = no change. Layers count alike. Use an encoder that took no part in the
+styling.
 
-`matched_regions` finds regions that pictures share: clusters of the references' cells under a semantic encoder; a cell of the
-content takes the region whose direction its own is most like. Both sides are centred on their own mean.
+`matched_regions` finds regions that pictures share: clusters of the references' cells under a semantic
+encoder; a cell of the content takes the region whose direction its own is most like. Both sides are centred
+on their own mean.
 """
 
 import math
@@ -47,7 +51,9 @@ _INSIDE = 2
 def mean_scores(
     pictures: Sequence[Annotated[Tensor, "H W 3"]], truth: Sequence[Annotated[Tensor, "H W 3"]]
 ) -> tuple[dict[str, float], Annotated[Tensor, "N"]]:
-    """`image_metrics`, means over the views, and `delta_e`, the mean over all pixels; and that of each pixel of all views."""
+    """`image_metrics`, means over the views, and `delta_e`, the mean over all pixels; and that of each pixel
+    of all views.
+    """
     row = mean_metrics([image_metrics(a, b) for a, b in zip(pictures, truth, strict=True)])
     apart = torch.cat([delta_e(a, b).flatten() for a, b in zip(pictures, truth, strict=True)])
     return {**row, "delta_e": float(apart.mean())}, apart
@@ -73,9 +79,11 @@ def structure(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"]) -> f
             f"structure: pictures of shape {tuple(a.shape)} and {tuple(b.shape)}; both must be [H W 3] of one size, with "
             f"sides of at least {2 * _REACH + 1} pixels"
         )
-    x, y = _standard(a), _standard(b)
+    x = _standard(a)
+    y = _standard(b)
     means = [_windows(each) for each in (x, y, x * x, y * y, x * y)]
-    var_x, var_y = means[2] - means[0] ** 2, means[3] - means[1] ** 2
+    var_x = means[2] - means[0] ** 2
+    var_y = means[3] - means[1] ** 2
     shared = means[4] - means[0] * means[1]
     return float(((2 * shared + _K) / (var_x + var_y + _K)).mean().clamp(-1, 1))
 
@@ -120,23 +128,32 @@ def srgb_to_lab(rgb: Annotated[Tensor, "... 3"]) -> Annotated[Tensor, "... 3"]:
     return torch.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], -1)
 
 
-def delta_e_2000(first: Annotated[Tensor, "... 3"], second: Annotated[Tensor, "... 3"]) -> Annotated[Tensor, "..."]:
+def delta_e_2000(
+    first: Annotated[Tensor, "... 3"], second: Annotated[Tensor, "... 3"]
+) -> Annotated[Tensor, "..."]:
     """Difference of Lab colours."""
     light1, a1, b1 = first.double().unbind(-1)
     light2, a2, b2 = second.double().unbind(-1)
     chroma = (torch.hypot(a1, b1) + torch.hypot(a2, b2)) / 2
     stretch = 1.5 - 0.5 * _dulled(chroma)
-    a1, a2 = a1 * stretch, a2 * stretch
-    c1, c2 = torch.hypot(a1, b1), torch.hypot(a2, b2)
-    h1, h2 = torch.atan2(b1, a1) % (2 * math.pi), torch.atan2(b2, a2) % (2 * math.pi)
+    a1 = a1 * stretch
+    a2 = a2 * stretch
+    c1 = torch.hypot(a1, b1)
+    c2 = torch.hypot(a2, b2)
+    h1 = torch.atan2(b1, a1) % (2 * math.pi)
+    h2 = torch.atan2(b2, a2) % (2 * math.pi)
     coloured = (c1 * c2) > 0
     apart = h2 - h1
-    turn = torch.where(apart > math.pi, apart - 2 * math.pi, torch.where(apart < -math.pi, apart + 2 * math.pi, apart))
+    turn = torch.where(
+        apart > math.pi, apart - 2 * math.pi, torch.where(apart < -math.pi, apart + 2 * math.pi, apart)
+    )
     turn = torch.where(coloured, turn, 0.0)
-    d_light, d_chroma = light2 - light1, c2 - c1
+    d_light = light2 - light1
+    d_chroma = c2 - c1
     d_hue = 2 * (c1 * c2).sqrt() * torch.sin(turn / 2)
 
-    light, c = (light1 + light2) / 2, (c1 + c2) / 2
+    light = (light1 + light2) / 2
+    c = (c1 + c2) / 2
     middle = torch.where(apart.abs() > math.pi, (h1 + h2 + 2 * math.pi) / 2 % (2 * math.pi), (h1 + h2) / 2)
     hue = torch.where(coloured, middle, h1 + h2)
     weight = (
@@ -147,10 +164,13 @@ def delta_e_2000(first: Annotated[Tensor, "... 3"], second: Annotated[Tensor, ".
         - 0.20 * torch.cos(4 * hue - math.radians(63))
     )
     s_light = 1 + 0.015 * (light - 50) ** 2 / (20 + (light - 50) ** 2).sqrt()
-    s_chroma, s_hue = 1 + 0.045 * c, 1 + 0.015 * c * weight
+    s_chroma = 1 + 0.045 * c
+    s_hue = 1 + 0.015 * c * weight
     blue = math.radians(30) * torch.exp(-(((torch.rad2deg(hue) - 275) / 25) ** 2))
     twist = -torch.sin(2 * blue) * 2 * _dulled(c)
-    l, k, h = d_light / s_light, d_chroma / s_chroma, d_hue / s_hue
+    l = d_light / s_light
+    k = d_chroma / s_chroma
+    h = d_hue / s_hue
     return (l * l + k * k + h * h + twist * k * h).clamp_min(0).sqrt()
 
 
@@ -165,13 +185,18 @@ _CELLS = 8
 """A region needs so many cells of a layer on both sides: fewer say nothing of a style."""
 
 Labelled = Sequence[tuple[Annotated[Tensor, "H W 3"], Annotated[Tensor, "G F"]]]
-"""Pictures, each with the region of its pixels (or of cells of any size); the same ids mean the same on all sides."""
+"""Pictures, each with the region of its pixels (or of cells of any size); the same ids mean the same on all
+sides.
+"""
 
 
 def whole_cells(regions: Annotated[Tensor, "H W"], size: tuple[int, int]) -> Annotated[Tensor, "h w"]:
-    """The region of every cell of a grid of `size` (height, width) over the image; MIXED where there are several."""
+    """The region of every cell of a grid of `size` (height, width) over the image; MIXED where there are
+    several.
+    """
     pixels = regions[None, None].double()
-    highest, lowest = F.adaptive_max_pool2d(pixels, size), -F.adaptive_max_pool2d(-pixels, size)
+    highest = F.adaptive_max_pool2d(pixels, size)
+    lowest = -F.adaptive_max_pool2d(-pixels, size)
     return torch.where(highest == lowest, highest, MIXED)[0, 0].long()
 
 
@@ -189,12 +214,14 @@ def region_statistics(encoder: Encoder, pictures: Labelled) -> dict[int, RegionS
 
     Raises DataError where no picture has a cell that lies wholly in one region.
     """
-    features, labels = [], []
+    features = []
+    labels = []
     for image, regions in pictures:
         maps: Tensor = encoder(image.permute(2, 0, 1)[None])[0]
         features.append(maps.flatten(1).T)
         labels.append(whole_cells(regions, (maps.shape[1], maps.shape[2])).flatten())
-    cells, label = torch.cat(features), torch.cat(labels)
+    cells = torch.cat(features)
+    label = torch.cat(labels)
     kinds = sorted(set(label.tolist()) - {MIXED})
     if not kinds:
         raise DataError("style distance: no cell lies wholly in one region; use larger pictures or regions")
@@ -223,12 +250,15 @@ def region_contrasts(pictures: Labelled) -> dict[int, Contrast]:
     found: dict[int, list[tuple[Tensor, Tensor]]] = {}
     for image, regions in pictures:
         near = F.interpolate(regions[None, None].double(), image.shape[:2], mode="nearest-exact")
-        padded, side = F.pad(near, (_INSIDE,) * 4, mode="replicate"), 2 * _INSIDE + 1
+        padded = F.pad(near, (_INSIDE,) * 4, mode="replicate")
+        side = 2 * _INSIDE + 1
         inside = (F.max_pool2d(padded, side, 1) == -F.max_pool2d(-padded, side, 1))[0, 0]
         light = luma(image.flatten(0, 1)).view(image.shape[:2])
         # Forward differences; the last row and column repeat themselves and are left out.
         steps = (light[:-1, 1:] - light[:-1, :-1]).abs() + (light[1:, :-1] - light[:-1, :-1]).abs()
-        inside, kinds, light = inside[:-1, :-1], near[0, 0, :-1, :-1].long(), light[:-1, :-1]
+        inside = inside[:-1, :-1]
+        kinds = near[0, 0, :-1, :-1].long()
+        light = light[:-1, :-1]
         for kind in sorted(set(kinds[inside].tolist())):
             here = inside & (kinds == kind)
             found.setdefault(kind, []).append((light[here], steps[here] / 2))
@@ -243,12 +273,17 @@ def region_contrasts(pictures: Labelled) -> dict[int, Contrast]:
 def contrast_kept(
     plain: Mapping[int, Contrast], styled: Mapping[int, Contrast], style: Mapping[int, Contrast]
 ) -> dict[str, float | None]:
-    """Shares of the plain picture's mean gradient (`gradient_kept`) and range of luma (`range_kept`) that are left.
+    """Shares of the plain picture's mean gradient (`gradient_kept`) and range of luma (`range_kept`) that are
+    left.
 
-    Means over the regions whose range is no less in the style than in the plain picture, by their pixels; None where there is
-    no such region.
+    Means over the regions whose range is no less in the style than in the plain picture, by their pixels;
+    None where there is no such region.
     """
-    kept = [(each, styled[k]) for k, each in plain.items() if k in style and style[k].range >= each.range > 0 < each.gradient]
+    kept = [
+        (each, styled[k])
+        for k, each in plain.items()
+        if k in style and style[k].range >= each.range > 0 < each.gradient
+    ]
     pixels = sum(each.pixels for each, _ in kept)
     if not pixels:
         return {"gradient_kept": None, "range_kept": None}
@@ -259,7 +294,9 @@ def contrast_kept(
 
 
 def gaussian_distance(a: RegionStatistics, b: RegionStatistics, *, full: bool = False) -> float:
-    """The 2-Wasserstein distance of two regions: of means and deviations, or with `full` of means and covariances."""
+    """The 2-Wasserstein distance of two regions: of means and deviations, or with `full` of means and
+    covariances.
+    """
     apart = float((a.mean - b.mean).square().sum())
     if not full:
         deviations = [each.covariance.diagonal().clamp_min(0).sqrt() for each in (a, b)]
@@ -278,7 +315,8 @@ def relative_distance(
 ) -> float | None:
     """Distance to the style over that of the unstylised picture, regions by their share of it; one layer.
 
-    None where no region has enough cells on all sides, or the unstylised picture has the style's statistics already.
+    None where no region has enough cells on all sides, or the unstylised picture has the style's statistics
+    already.
     """
     regions = [
         r
@@ -291,7 +329,12 @@ def relative_distance(
 
 
 def style_distances(
-    judges: Mapping[str, Encoder], plain: Labelled, styled: Mapping[str, Labelled], style: Labelled, *, full: bool = False
+    judges: Mapping[str, Encoder],
+    plain: Labelled,
+    styled: Mapping[str, Labelled],
+    style: Labelled,
+    *,
+    full: bool = False,
 ) -> dict[str, dict[str, float | None]]:
     """For every method of `styled`: the relative distance by judge (a layer each), and their mean as `mean`.
 
@@ -299,9 +342,12 @@ def style_distances(
     """
     rows: dict[str, dict[str, float | None]] = {name: {} for name in styled}
     for judge, encoder in judges.items():
-        before, target = region_statistics(encoder, plain), region_statistics(encoder, style)
+        before = region_statistics(encoder, plain)
+        target = region_statistics(encoder, style)
         for name, pictures in styled.items():
-            rows[name][judge] = relative_distance(before, region_statistics(encoder, pictures), target, full=full)
+            rows[name][judge] = relative_distance(
+                before, region_statistics(encoder, pictures), target, full=full
+            )
     for row in rows.values():
         known = [value for value in row.values() if value is not None]
         row["mean"] = math.fsum(known) / len(known) if known else None
@@ -323,7 +369,9 @@ def matched_regions(
     seed: int,
 ) -> tuple[list[Annotated[Tensor, "h w"]], list[Annotated[Tensor, "g f"]]]:
     """Region ids of the encoder's cells, in the contents and in the styles; at most `regions` of them."""
-    here, there = ([encoder(image.permute(2, 0, 1)[None])[0].float() for image in side] for side in (contents, styles))
+    here, there = (
+        [encoder(image.permute(2, 0, 1)[None])[0].float() for image in side] for side in (contents, styles)
+    )
     clusters = kmeans(_directions(there), regions, seed=seed)
     like = _directions(here) @ torch.nn.functional.normalize(clusters.centres, dim=1).T
     return _maps(like.argmax(1), here), _maps(clusters.label, there)
@@ -334,7 +382,9 @@ def _directions(maps: Sequence[Annotated[Tensor, "C h w"]]) -> Annotated[Tensor,
     return unit(cells, cells.mean(0))
 
 
-def _maps(label: Annotated[Tensor, "N"], like: Sequence[Annotated[Tensor, "C h w"]]) -> list[Annotated[Tensor, "h w"]]:
+def _maps(
+    label: Annotated[Tensor, "N"], like: Sequence[Annotated[Tensor, "C h w"]]
+) -> list[Annotated[Tensor, "h w"]]:
     sizes = [each.shape[1:] for each in like]
     parts = torch.split_with_sizes(label, [height * width for height, width in sizes])
     return [part.reshape(size) for part, size in zip(parts, sizes, strict=True)]

@@ -1,15 +1,18 @@
-"""Restyling side by side: every stylizer, and transfers of colour alone, on painted photographs and on trained runs.
+"""Restyling side by side: every stylizer, and transfers of colour alone, on painted photographs and on
+trained runs.
 
     python -m benchmarks styles [RUN ...] [--shared DIR] [--sheets DIR] [--output JSON] [any field]
 
-structure, ssim: kept of the unstylised picture, 1 = all of it. gradient_kept, range_kept: contrast inside of regions (mean
-gradient; from the 1 % to the 99 % quantile of luma), where the references have as much. style_distance: to the references,
-region by region, 1 = no change, in the eyes of VGG-19, which no shipped part of the product uses. consistency: warp error
-between neighbouring views. false_edges: share of the pairs of pixels on one even surface that the style moves apart.
+structure, ssim: kept of the unstylised picture, 1 = all of it. gradient_kept, range_kept: contrast inside of
+regions (mean gradient; from the 1 % to the 99 % quantile of luma), where the references have as much.
+style_distance: to the references, region by region, 1 = no change, in the eyes of VGG-19, which no shipped
+part of the product uses. consistency: warp error between neighbouring views. false_edges: share of the pairs
+of pixels on one even surface that the style moves apart.
 
-Without the triplets of --shared and without runs, a short training of the town is restyled. Of a town the references are other
-towns, and the regions are the true classes; of other scenes the references are the photographs that suit them, and the regions
-are those that a semantic encoder finds in both. Sheets show other people's photographs: they are written only where asked for.
+Without the triplets of --shared and without runs, a short training of the town is restyled. Of a town the
+references are other towns, and the regions are the true classes; of other scenes the references are the
+photographs that suit them, and the regions are those that a semantic encoder finds in both. Sheets show other
+people's photographs: they are written only where asked for.
 """
 
 import json
@@ -35,7 +38,13 @@ from fprf.evaluation.metrics import WarpError, ssim
 from fprf.interfaces import Decoder, Encoder
 from fprf.io.images import shrink, to_uint8, write_image
 from fprf.plugins.decoders.config import MlpDecoderConfig
-from fprf.plugins.encoders.config import SEMANTICS, BundledContentConfig, EncoderConfig, RandomConfig, Vgg19Config
+from fprf.plugins.encoders.config import (
+    SEMANTICS,
+    BundledContentConfig,
+    EncoderConfig,
+    RandomConfig,
+    Vgg19Config,
+)
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import Reference as Samples
 from fprf.style.dictionary import build_dictionary
@@ -102,8 +111,8 @@ class Exhibit(NamedTuple):
 
 
 def judge_exhibit(exhibit: Exhibit, judges: Mapping[str, Encoder], *, full: bool = False) -> dict[str, Row]:
-    """By method: `structure`, `ssim` and `false_edges` (means over the views), `contrast_kept`, and `style_distance`, also by
-    judge and, with `full`, of whole covariances.
+    """By method: `structure`, `ssim` and `false_edges` (means over the views), `contrast_kept`, and
+    `style_distance`, also by judge and, with `full`, of whole covariances.
 
     Raises DataError where the lists of views differ in length.
     """
@@ -114,7 +123,9 @@ def judge_exhibit(exhibit: Exhibit, judges: Mapping[str, Encoder], *, full: bool
     styled = {name: list(zip(views, exhibit.regions, strict=True)) for name, views in exhibit.styled.items()}
     style = list(zip(exhibit.references, exhibit.reference_regions, strict=True))
     kinds = {"style_distance": False, "full_distance": True} if full else {"style_distance": False}
-    distances = {name: style_distances(judges, plain, styled, style, full=exact) for name, exact in kinds.items()}
+    distances = {
+        name: style_distances(judges, plain, styled, style, full=exact) for name, exact in kinds.items()
+    }
     rows: dict[str, Row] = {}
     contrasts = region_contrasts(plain), region_contrasts(style)
     for name, views in exhibit.styled.items():
@@ -141,13 +152,17 @@ def _luminance_ssim(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"]
 _SIGMA = 1.0
 """Pixels that both pictures are blurred by: noise is no edge."""
 _REACH = 12
-"""Ends of a pair lie so many-th of the shorter side apart: further than a soft border between regions is wide."""
-_EVEN, _CUT = 0.05, 0.1
+"""Ends of a pair lie so many-th of the shorter side apart: further than a soft border between regions is
+wide.
+"""
+_EVEN = 0.05
+_CUT = 0.1
 """Largest differences of a channel in [0, 1]: thirteen and twenty-six 8-bit steps."""
 
 
 def false_edges(plain: Annotated[Tensor, "H W 3"], styled: Annotated[Tensor, "H W 3"]) -> float | None:
-    """Share of the pairs on one surface, along rows and columns, that the style cuts, in [0, 1]; None where there are none.
+    """Share of the pairs on one surface, along rows and columns, that the style cuts, in [0, 1]; None where
+    there are none.
 
     Raises DataError for pictures of different sizes, or smaller than 12 pixels.
     """
@@ -162,7 +177,9 @@ def false_edges(plain: Annotated[Tensor, "H W 3"], styled: Annotated[Tensor, "H 
     kernel = kernel / kernel.sum()
     blurred = []
     for picture in (plain, styled):
-        padded = F.pad(picture.detach().cpu().float().permute(2, 0, 1)[:, None], (3, 3, 3, 3), mode="replicate")
+        padded = F.pad(
+            picture.detach().cpu().float().permute(2, 0, 1)[:, None], (3, 3, 3, 3), mode="replicate"
+        )
         blurred.append(F.conv2d(F.conv2d(padded, kernel.view(1, 1, 1, -1)), kernel.view(1, 1, -1, 1))[:, 0])
     pairs = cuts = 0
     for axis in (1, 2):
@@ -179,17 +196,24 @@ def judges_of(shared: Path) -> dict[str, Encoder]:
     """VGG-19 where its weights are; untrained convolutions, which see colours and grain, elsewhere."""
     weights = shared / "weights/vgg19_imagenet.safetensors"
     if weights.is_file():
-        return {layer: Vgg19Config(layer=layer, weights=weights).build() for layer in ("relu1_1", "relu2_1", "relu3_1")}
+        return {
+            layer: Vgg19Config(layer=layer, weights=weights).build()
+            for layer in ("relu1_1", "relu2_1", "relu3_1")
+        }
     return {f"random stride {n}": RandomConfig(channels=64, stride=n).build() for n in (1, 2, 4)}
 
 
-DIM, REGIONS, CLUSTERS = 32, 16, 20
+DIM = 32
+REGIONS = 16
+CLUSTERS = 20
 """Of `fprf-lite`: semantic components, regions of a scene, codes of a reference."""
 SOURCES = ("painted", "encoder")
 
 
 def painted(regions: Annotated[Tensor, "H W"], kinds: int, size: tuple[int, int]) -> Annotated[Tensor, "N D"]:
-    """One channel a region, 1 where a pixel of a picture of `size` (height, width) lies in it: the nearest painted one."""
+    """One channel a region, 1 where a pixel of a picture of `size` (height, width) lies in it: the nearest
+    painted one.
+    """
     near = F.interpolate(regions[None, None].double(), size, mode="nearest-exact")[0, 0].long()
     return F.one_hot(near.flatten(), kinds).float()
 
@@ -202,15 +226,22 @@ def flat_reference(
     *,
     samples: int = 20_000,
 ) -> Samples:
-    """A photograph's features, and its colours, as a reference; about `samples` pixels of it, in even steps."""
+    """A photograph's features, and its colours, as a reference; about `samples` pixels of it, in even
+    steps.
+    """
     some = slice(0, None, max(1, len(content) // samples))
     parts = content.new_zeros(len(content[some]), 0) if semantic is None else semantic[some]
     return Samples(name, content[some], parts, colour=None if colour is None else colour[some])
 
 
-def restyled(triplet: Triplet, content: Encoder, semantic: Encoder, decoder: Decoder, source: str) -> dict[str, Tensor]:
-    """The content photograph by every stylizer, its parts told apart by the painted regions or by the encoder."""
-    guided, size = GuidedConfig(), (triplet.content.shape[0], triplet.content.shape[1])
+def restyled(
+    triplet: Triplet, content: Encoder, semantic: Encoder, decoder: Decoder, source: str
+) -> dict[str, Tensor]:
+    """The content photograph by every stylizer, its parts told apart by the painted regions or by the
+    encoder.
+    """
+    guided = GuidedConfig()
+    size = (triplet.content.shape[0], triplet.content.shape[1])
     pair = (triplet.content, triplet.style)
     here, there = (encoded(image, content, guided) for image in pair)
     if source == "painted":
@@ -226,16 +257,20 @@ def restyled(triplet: Triplet, content: Encoder, semantic: Encoder, decoder: Dec
     samples = flat_reference("style", there, where_there, triplet.style.reshape(-1, 3))
     dictionary = build_dictionary([samples], clusters=len(COLOURS) if source == "painted" else CLUSTERS)
     return {
-        name: render_flat(flat, flat_look(flat, dictionary, config, decoder), decoder) for name, config in STYLIZERS.items()
+        name: render_flat(flat, flat_look(flat, dictionary, config, decoder), decoder)
+        for name, config in STYLIZERS.items()
     }
 
 
 def triplets(config: StylesConfig, judges: Mapping[str, Encoder]) -> dict[str, object]:
-    """Figures of every stylizer on painted photographs, by the source of the regions; empty where there are none."""
+    """Figures of every stylizer on painted photographs, by the source of the regions; empty where there are
+    none.
+    """
     folder = config.shared / "data/pst"
     if not config.triplets or not folder.is_dir():
         return {}
-    content, semantic = config.content.build(), config.semantic.build()
+    content = config.content.build()
+    semantic = config.semantic.build()
     decoder = MlpDecoderConfig().build(encoder=content.identity, channels=content.channels)
     names = triplet_names(folder)
     kept = min(config.triplets, len(names))
@@ -252,10 +287,18 @@ def triplets(config: StylesConfig, judges: Mapping[str, Encoder]) -> dict[str, o
         common |= {k: v.pictures[0] for k, v in transfers([triplet.content], [triplet.style]).items()}
         theirs = folder / "dpst_result" / f"{name}.jpg"
         if theirs.is_file():  # what the paper of the triplets made of it
-            image = torch.from_numpy(load_image(theirs, (triplet.content.shape[1], triplet.content.shape[0]))).float() / 255
+            image = (
+                torch.from_numpy(
+                    load_image(theirs, (triplet.content.shape[1], triplet.content.shape[0]))
+                ).float()
+                / 255
+            )
             common["luan et al."] = image
         made = {source: restyled(triplet, content, semantic, decoder, source) for source in SOURCES}
-        every = {**common, **{f"{source}/{k}": image for source in SOURCES for k, image in made[source].items()}}
+        every = {
+            **common,
+            **{f"{source}/{k}": image for source in SOURCES for k, image in made[source].items()},
+        }
         exhibit = Exhibit(
             plain=[triplet.content],
             styled={k: [image] for k, image in every.items()},
@@ -265,7 +308,9 @@ def triplets(config: StylesConfig, judges: Mapping[str, Encoder]) -> dict[str, o
         )
         rows = judge_exhibit(exhibit, judges, full=config.full)
         for source in SOURCES:
-            found[source][name] = {k: rows[k] for k in common} | {k: rows[f"{source}/{k}"] for k in made[source]}
+            found[source][name] = {k: rows[k] for k in common} | {
+                k: rows[f"{source}/{k}"] for k in made[source]
+            }
         shown[name] = {"style": triplet.style, **every}
     if config.sheets is not None:
         write_sheet(config.sheets / "triplets.jpg", shown)
@@ -280,9 +325,13 @@ LIGHTS: Sequence[tuple[str, ...]] = (
     ("autumn",), ("winter",), ("sunset",), ("night",), ("autumn", "night"), ("winter", "sunset"),
 )  # fmt: skip
 """Six references: four lights, and two at once."""
-SEED, WALK, VIEW, SIZE = 7, 10, 4, (384, 288)
+SEED = 7
+WALK = 10
+VIEW = 4
+SIZE = (384, 288)
 """The town of the references, the length of the walk, the view of it, and its width and height."""
-SINGLE, SEVERAL = 4, 2
+SINGLE = 4
+SEVERAL = 2
 """References of a scene: so many alone, so many sets of several."""
 SHARED_REGIONS = 6
 """Regions that views and references are compared in, where nobody knows the true ones."""
@@ -309,11 +358,15 @@ def references_of(trained: Trained, config: StylesConfig, folder: Path) -> Itera
                 write_image(path, to_uint8(reference.image))
             yield References("+".join(names), paths, [r.image for r in found], [r.classes for r in found])
         return
-    pairings, styles, scene = config.shared / "data/pairings.json", config.shared / "data/styles", trained.known.name
+    pairings = config.shared / "data/pairings.json"
+    styles = config.shared / "data/styles"
+    scene = trained.known.name
     known = json.loads(pairings.read_text(encoding="utf-8")) if pairings.is_file() else {}
     if scene not in known:
         listed = ", ".join(name for name in known if name != "note") or "none"
-        raise DataError(f"{pairings}: no references for the scene {scene!r} (it has {listed}); name a file that has")
+        raise DataError(
+            f"{pairings}: no references for the scene {scene!r} (it has {listed}); name a file that has"
+        )
     for names in [*([name] for name in known[scene]["S"][:SINGLE]), *known[scene]["M"][:SEVERAL]]:
         paths = tuple(styles / f"{name}.jpg" for name in names)
         images = [torch.from_numpy(shrink(load_image(path), config.longest)).float() / 255 for path in paths]
@@ -329,11 +382,14 @@ def town_of(trained: Trained) -> Path | None:
 def run_figures(root: Path, config: StylesConfig, judges: Mapping[str, Encoder]) -> dict[str, object]:
     """Figures of every stylizer on neighbouring views, in the middle of the capture, in each style."""
     trained = load_run(root, "cpu")
-    known, encoders, truth = trained.known, trained.encoders(), town_of(trained)
+    known = trained.known
+    encoders = trained.encoders()
+    truth = town_of(trained)
     cameras = known.cameras.scaled(max(1.0, float(known.cameras.size.amax()) / config.longest))
     first = max(0, (len(cameras) - config.views) // 2)
     chosen = list(range(first, min(len(cameras), first + config.views)))
-    near, pairs = cameras.select(torch.tensor(chosen)), [(i, i + 1) for i in range(len(chosen) - 1)]
+    near = cameras.select(torch.tensor(chosen))
+    pairs = [(i, i + 1) for i in range(len(chosen) - 1)]
     cached = [cache_view(trained.model, known.facts, cameras, view, trained.config.render) for view in chosen]
     plain = [view.restyled().rgb for view in cached]
     cases: dict[str, dict[str, Row]] = {}
@@ -347,19 +403,27 @@ def run_figures(root: Path, config: StylesConfig, judges: Mapping[str, Encoder])
                 styled[name] = [view.restyled(look).rgb for view in cached]
             if style.classes is None or truth is None:
                 observer = config.semantic.build()
-                regions, there = matched_regions(observer, plain, style.images, regions=SHARED_REGIONS, seed=0)
+                regions, there = matched_regions(
+                    observer, plain, style.images, regions=SHARED_REGIONS, seed=0
+                )
             else:
                 regions = [torch.from_numpy(read_truth(truth, v)[1].astype("int64")) for v in chosen]
                 there = style.classes
-            rows = judge_exhibit(Exhibit(plain, styled, regions, style.images, there), judges, full=config.full)
+            rows = judge_exhibit(
+                Exhibit(plain, styled, regions, style.images, there), judges, full=config.full
+            )
             for name, pictures in styled.items():
-                error, depths = WarpError(near), [view.restyled().depth for view in cached]
+                error = WarpError(near)
+                depths = [view.restyled().depth for view in cached]
                 for a, b in pairs:
                     error.add(a, b, pictures[a], pictures[b], depths[a], depths[b])
                 warped = error.summary()
                 rows[name] |= {"consistency_rmse": warped["rmse"], "consistency_relative": warped["relative"]}
             cases[style.name] = rows
-            shown[style.name] = {"reference": style.images[0], **{name: views[0] for name, views in styled.items()}}
+            shown[style.name] = {
+                "reference": style.images[0],
+                **{name: views[0] for name, views in styled.items()},
+            }
     if config.sheets is not None:
         write_sheet(config.sheets / f"run-{root.name}.jpg", shown)
     means = show(root.name, list(cases.values()))
@@ -385,7 +449,9 @@ def show(title: str, tables: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
 def write_sheet(path: Path, rows: Mapping[str, Mapping[str, Tensor]]) -> None:
     """One row a style or triplet, one column a method."""
     columns = list(next(iter(rows.values())))
-    write_image(path, contact_sheet({name: list(row.values()) for name, row in rows.items()}, columns, height=144))
+    write_image(
+        path, contact_sheet({name: list(row.values()) for name, row in rows.items()}, columns, height=144)
+    )
 
 
 def main(argv: list[str]) -> int:
@@ -393,13 +459,17 @@ def main(argv: list[str]) -> int:
     torch.set_num_threads(1)
     start = time.perf_counter()
     count = next((i for i, word in enumerate(argv) if word.startswith("-")), len(argv))
-    config = parse(StylesConfig(), argv[count:], prog="python -m benchmarks styles [RUN ...]", description=__doc__ or "")
+    config = parse(
+        StylesConfig(), argv[count:], prog="python -m benchmarks styles [RUN ...]", description=__doc__ or ""
+    )
     config = replace(config, runs=(*map(Path, argv[:count]), *config.runs))
     judges = judges_of(config.shared)
     with tempfile.TemporaryDirectory(prefix="fprf-styles-") as made:
         painted_figures = triplets(config, judges)
         if not painted_figures and not config.runs:
-            config = replace(config, runs=(train_run(Path(made) / "town", "fprf-lite", Path("town"), steps=config.steps),))
+            config = replace(
+                config, runs=(train_run(Path(made) / "town", "fprf-lite", Path("town"), steps=config.steps),)
+            )
         document = {
             "benchmark": "styles",
             "judges": list(judges),

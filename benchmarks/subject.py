@@ -1,4 +1,5 @@
-"""Subject of a benchmark: a trained run, its images where they are at hand, references; single training steps and views.
+"""Subject of a benchmark: a trained run, its images where they are at hand, references; single training steps
+and views.
 
 The exact result of a view is the run's own image, sampled as it was trained, in float64 with nothing skipped.
 """
@@ -45,8 +46,9 @@ class Subject(NamedTuple):
     data: Path
     """Folder of its images."""
     prepare: Callable[[TrainConfig], Prepared]
-    """Images and features for the run's config, or one that differs in its batches. Raises FprfError where they are not
-    at hand."""
+    """Images and features for the run's config, or one that differs in its batches. Raises FprfError where
+    they are not at hand.
+    """
 
 
 def find(root: Path, config: BenchConfig, folder: Path) -> Subject:
@@ -55,14 +57,18 @@ def find(root: Path, config: BenchConfig, folder: Path) -> Subject:
     data = config.data or trained.config.data or Path(trained.known.data)
 
     def prepared(chosen: TrainConfig) -> Prepared:
-        chosen, saved = replace(chosen, data=data), trained.known.facts
+        chosen = replace(chosen, data=data)
+        saved = trained.known.facts
         made = prepare(chosen, read_scene(chosen, saved), saved)
         if tuple(view_names(made.scene.paths)) != trained.known.names:
             raise UsageError(f"{data}: its images are not those of the run; name the folder with --data")
         for kind in ("content_encoder", "semantic_encoder"):
-            own, now = getattr(trained.known.facts, kind), getattr(made.facts, kind)
+            own = getattr(trained.known.facts, kind)
+            now = getattr(made.facts, kind)
             if own != now:
-                raise WeightsError(f"{kind.replace('_', ' ')}: the run was trained with {own}, this is {now}; train it again")
+                raise WeightsError(
+                    f"{kind.replace('_', ' ')}: the run was trained with {own}, this is {now}; train it again"
+                )
         return made
 
     return Subject(trained, config.references or town_references(folder / "references"), data, prepared)
@@ -153,7 +159,9 @@ def stepper(loop: FieldLearner, first: int) -> Callable[[], None]:
     return take
 
 
-def colour_gradient(model: Model, prepared: Prepared, config: TrainConfig, batch: Batch, rays: Rays, step: int) -> Tensor:
+def colour_gradient(
+    model: Model, prepared: Prepared, config: TrainConfig, batch: Batch, rays: Rays, step: int
+) -> Tensor:
     """Gradient of the colour loss of a batch in all that the content field learns, flat.
 
     Samples are not jittered: draws in float32 and float64 would differ.
@@ -170,7 +178,12 @@ def colour_gradient(model: Model, prepared: Prepared, config: TrainConfig, batch
     loss = (out.rgb - batch.rgb.to(out.rgb)).square().mean()
     parameters = [p for p in model.field.parameters() if p.requires_grad]
     gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
-    return torch.cat([(torch.zeros_like(p) if g is None else g).flatten() for p, g in zip(parameters, gradients, strict=True)])
+    return torch.cat(
+        [
+            (torch.zeros_like(p) if g is None else g).flatten()
+            for p, g in zip(parameters, gradients, strict=True)
+        ]
+    )
 
 
 def batch_rays(model: Model, prepared: Prepared, batch: Batch) -> Rays:
@@ -210,11 +223,15 @@ def plainly(
 
 
 @torch.inference_mode()
-def _colours(model: Model, facts: Facts, rays: Rays, budget: float, chunk: int, look: Restyle | None) -> Tensor:
+def _colours(
+    model: Model, facts: Facts, rays: Rays, budget: float, chunk: int, look: Restyle | None
+) -> Tensor:
     background = background_of(facts, rays.near.device)
     rgb = []
     for part in _chunks(rays, chunk):
-        out = render_rays(part, model.parts, want=Want.COLOUR, budget=budget, background=background, restyle=look)
+        out = render_rays(
+            part, model.parts, want=Want.COLOUR, budget=budget, background=background, restyle=look
+        )
         assert out.rgb is not None
         rgb.append(out.rgb)
     return torch.cat(rgb).clamp(0, 1)
@@ -222,11 +239,14 @@ def _colours(model: Model, facts: Facts, rays: Rays, budget: float, chunk: int, 
 
 @torch.inference_mode()
 def count(parts: Parts, rays: Rays, budget: float) -> dict[str, float]:
-    """Shares of the samples that a budget keeps (for the content network), of the rays that keep none; kept ones a ray."""
+    """Shares of the samples that a budget keeps (for the content network), of the rays that keep none; kept
+    ones a ray.
+    """
     samples = kept = empty = 0
     for part in _chunks(rays, CHUNK):
         marched = march(part, parts, budget=budget)
-        samples, kept = samples + marched.weights.numel(), kept + len(marched.kept.ray)
+        samples = samples + marched.weights.numel()
+        kept = kept + len(marched.kept.ray)
         empty += len(part.near) - len(torch.unique(marched.kept.ray))
     return {
         "kept_samples_share": kept / max(1, samples),

@@ -1,4 +1,5 @@
-"""Write the tables of the documents from the results, between `<!-- table: NAME -->` and `<!-- end -->`, and a drawing.
+"""Write the tables of the documents from the results, between `<!-- table: NAME -->` and `<!-- end -->`, and
+a drawing.
 
     python -m benchmarks tables [--check]
 
@@ -22,9 +23,14 @@ Rows = Iterable[Iterable[str]]
 
 
 def splat_training(found: Any) -> Rows:
-    """Training of Gaussians in the fewest, the most, and five minutes: what was planned, and how near it comes."""
+    """Training of Gaussians in the fewest, the most, and five minutes: what was planned, and how near it
+    comes.
+    """
     yield "capture", "size", "minutes", "steps", "Gaussians", "PSNR", "SSIM", "LPIPS", "memory"
-    minutes = {name: float(re.findall(r"--minutes ([\d.]+)|$", row["command"])[0] or 0) for name, row in found.items()}
+    minutes = {
+        name: float(re.findall(r"--minutes ([\d.]+)|$", row["command"])[0] or 0)
+        for name, row in found.items()
+    }
     for name, row in found.items():
         beside = [minutes[other] for other in found if found[other]["scene"] == row["scene"]]
         if minutes[name] not in (min(beside), 5.0, max(beside)):
@@ -57,13 +63,24 @@ def methods(found: Any) -> Rows:
     for scene, row in found.items():
         pair = [row["fprf-splats"], row["fprf-lite"]]
         bold = ["**" if each["psnr"] == max(other["psnr"] for other in pair) else "" for each in pair]
-        told = [f"{mark}{each['psnr']:.2f} dB{mark}, {each['ssim']:.3f}" for mark, each in zip(bold, pair, strict=True)]
+        told = [
+            f"{mark}{each['psnr']:.2f} dB{mark}, {each['ssim']:.3f}"
+            for mark, each in zip(bold, pair, strict=True)
+        ]
         yield scene, str(row["training_views"]), "x".join(map(str, row["size"])), *told
 
 
 def restyle_town_gaussians(found: Any) -> Rows:
     """Restyled town against its truth, with one and with three references."""
-    yield "style", "one: over no change", "LPIPS", "right class inside", "three: over no change", "LPIPS", "right class inside"
+    yield (
+        "style",
+        "one: over no change",
+        "LPIPS",
+        "right class inside",
+        "three: over no change",
+        "LPIPS",
+        "right class inside",
+    )
     ways = [found["means"][many] for many in ("one", "three")]
     for name in ways[0]:
         cells = []
@@ -95,7 +112,9 @@ TABLES: Mapping[str, Callable[[Any], Rows]] = {
 def markdown(rows: Rows) -> str:
     """A table whose first row is its head; columns but the first are aligned to the right."""
     head, *rest = [list(row) for row in rows]
-    return "".join("| " + " | ".join(line) + " |\n" for line in [head, ["---", *["---:"] * (len(head) - 1)], *rest])
+    return "".join(
+        "| " + " | ".join(line) + " |\n" for line in [head, ["---", *["---:"] * (len(head) - 1)], *rest]
+    )
 
 
 def filled(page: str, results: Path = RESULTS) -> str:

@@ -13,10 +13,11 @@ __all__ = ["__version__", "load", "read"]
 def load(
     run: str | Path, *, device: str = "auto", quality: Literal["draft", "standard", "best"] | None = None
 ) -> "TrainedScene":
-    """A trained run, ready to restyle and render; needs neither its images nor, before `stylize`, its encoders.
+    """A trained run, ready to restyle and render; needs neither its images nor, before `stylize`, its
+    encoders.
 
-    `device` is cpu, cuda, mps or auto; `quality` trades time for error as in `fprf render`. Raises CheckpointError where
-    `run` is no run folder or holds no checkpoint.
+    `device` is cpu, cuda, mps or auto; `quality` trades time for error as in `fprf render`. Raises
+    CheckpointError where `run` is no run folder or holds no checkpoint.
     """
     # torch is imported when a scene is
     from functools import cache
@@ -30,11 +31,16 @@ def load(
 
 
 def read(
-    path: str | Path, *, views: int = 32, up: tuple[float, float, float] | None = None, inside: bool | None = None
+    path: str | Path,
+    *,
+    views: int = 32,
+    up: tuple[float, float, float] | None = None,
+    inside: bool | None = None,
 ) -> "FinishedCapture":
     """A finished capture of 3D Gaussians, ready to restyle and write: a file of any format that is installed.
 
-    `views`, `up` and `inside` are those of `fprf restyle`: how it is looked at. Raises DataError where it cannot be read.
+    `views`, `up` and `inside` are those of `fprf restyle`: how it is looked at. Raises DataError where it
+    cannot be read.
     """
     from .api import FinishedCapture
     from .splats.config import LookConfig

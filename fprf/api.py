@@ -6,7 +6,8 @@
     shot = autumn.render(scene.camera("0015"))
     shot.save("autumn.png")
 
-Scenes never change: what restyles one returns another, and both share the trained model. Tensors are on the CPU.
+Scenes never change: what restyles one returns another, and both share the trained model. Tensors are on the
+CPU.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -72,7 +73,9 @@ class TrainedScene:
     styled: Styled | None = None
     """The style with its dictionary and codes; None = as it was captured."""
     encoders: Callable[[], Encoders] = field(kw_only=True, repr=False)
-    """Encoders of the run, loaded at the first style and kept for the next; one function for all styles of a loaded scene."""
+    """Encoders of the run, loaded at the first style and kept for the next; one function for all styles of a
+    loaded scene.
+    """
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -81,7 +84,9 @@ class TrainedScene:
 
     @property
     def cameras(self) -> Cameras:
-        """Cameras of the captured views, in the order of `names`: as all cameras here, in the capture's coordinates."""
+        """Cameras of the captured views, in the order of `names`: as all cameras here, in the capture's
+        coordinates.
+        """
         return self.trained.known.cameras.shifted(self.trained.scene.origin)
 
     @property
@@ -93,31 +98,44 @@ class TrainedScene:
         """One captured camera, by number or name. Raises UsageError where there is none."""
         if isinstance(view, str):
             if view not in self.names:
-                raise UsageError(f"camera {view!r}: no such view{nearest(view, list(self.names))}; `names` lists them")
+                raise UsageError(
+                    f"camera {view!r}: no such view{nearest(view, list(self.names))}; `names` lists them"
+                )
             view = self.names.index(view)
         if not 0 <= view < len(self.names):
             raise UsageError(f"camera {view}: no such view; numbers go from 0 to {len(self.names) - 1}")
         return self.cameras.select(torch.tensor([view]))
 
     def camera_at(
-        self, position: Sequence[float], target: Sequence[float], *, fov: float = 60.0, width: int = 640, height: int = 480
+        self,
+        position: Sequence[float],
+        target: Sequence[float],
+        *,
+        fov: float = 60.0,
+        width: int = 640,
+        height: int = 480,
     ) -> Cameras:
-        """A pinhole camera at a place (capture's coordinates) that looks at another; `fov` is its vertical angle in degrees.
+        """A pinhole camera at a place (capture's coordinates) that looks at another; `fov` is its vertical
+        angle in degrees.
 
-        Up is where the captured cameras have it. Raises UsageError where position and target are one, ConfigError for an
-        angle or a size that no camera has.
+        Up is where the captured cameras have it. Raises UsageError where position and target are one,
+        ConfigError for an angle or a size that no camera has.
         """
         between("fov", fov, 1e-3, 179.0)
         at_least("width", width, 1)
         at_least("height", height, 1)
         here, there = (torch.tensor([list(place)], dtype=torch.float64) for place in (position, target))
         if here.shape != (1, 3) or there.shape != (1, 3) or bool(torch.equal(here, there)):
-            raise UsageError(f"camera_at: position {position} and target {target} must be two places of three numbers each")
+            raise UsageError(
+                f"camera_at: position {position} and target {target} must be two places of three numbers each"
+            )
         pose = look_at(here, there, upwards(self.cameras))
         return pinhole(pose, width=width, height=height, fov=fov)
 
     def path(self, motion: str, frames: int = 120, split: Split = "all") -> Cameras:
-        """Cameras of a flight: spiral, orbit, interpolate, dataset, or a camera-path JSON file. Raises UsageError."""
+        """Cameras of a flight: spiral, orbit, interpolate, dataset, or a camera-path JSON file. Raises
+        UsageError.
+        """
         return make_path(self.cameras, self.trained.known.split(split), motion, frames)
 
     def stylize(
@@ -135,12 +153,13 @@ class TrainedScene:
         keep: Sequence[str] = (),
         preset: str | None = None,
     ) -> "TrainedScene":
-        """The scene in the style of photographs, or of all in a folder; all arguments but `preset` are fields of `StyleConfig`.
+        """The scene in the style of photographs, or of all in a folder; all arguments but `preset` are fields
+        of `StyleConfig`.
 
         A preset, such as "gentle", replaces what it sets (`fprf.style.config.PRESETS`).
 
-        Raises UsageError for no references, an unknown preset or wishes that the scene does not know, DataError for
-        unreadable photographs, WeightsError where the encoders at hand are not the scene's.
+        Raises UsageError for no references, an unknown preset or wishes that the scene does not know,
+        DataError for unreadable photographs, WeightsError where the encoders at hand are not the scene's.
         """
         style = StyleConfig(
             references=tuple(Path(path) for path in references),
@@ -157,7 +176,9 @@ class TrainedScene:
         return self.apply(style if preset is None else with_preset(style, preset))
 
     def apply(self, style: StyleConfig | PathLike) -> "TrainedScene":
-        """The scene in a style that is written down: a config, or a style.json of `fprf stylize`. Raises as `stylize`."""
+        """The scene in a style that is written down: a config, or a style.json of `fprf stylize`. Raises as
+        `stylize`.
+        """
         if isinstance(style, StyleConfig):
             return replace(self, styled=apply_style(self.trained.scene, StyleFile(style), self.encoders()))
         path = Path(style)
@@ -166,11 +187,16 @@ class TrainedScene:
         return replace(self, styled=apply_style(self.trained.scene, file, self.encoders(), (path.resolve(),)))
 
     def towards(self, other: "TrainedScene", at: float) -> "TrainedScene":
-        """On the way from this style (0) to that of `other` (1), point by point. Raises UsageError without two styles."""
+        """On the way from this style (0) to that of `other` (1), point by point. Raises UsageError without
+        two styles.
+        """
         if self.styled is None or other.styled is None or self.encoders is not other.encoders:
-            raise UsageError("towards: both must be styles of one loaded scene; call `stylize` on the same scene for each")
+            raise UsageError(
+                "towards: both must be styles of one loaded scene; call `stylize` on the same scene for each"
+            )
         mix = mixed(self.styled, other.styled, at)
-        # What is between two styles already is no longer what its file says: `save_style` tells a mix by this.
+        # What is between two styles already is no longer what its file says: `save_style` tells a mix by
+        # this.
         saved = mix.controls.saved
         saved = saved._replace(style=replace(saved.style, between=None))
         return replace(self, styled=mix._replace(controls=mix.controls._replace(saved=saved)))
@@ -183,33 +209,46 @@ class TrainedScene:
         """Write the style as a style.json. Raises UsageError without one, or for a mix made by `towards`."""
         styled = self._style("save_style")
         if len(styled.restyle.parts) > 1 and styled.controls.saved.style.between is None:
-            raise UsageError("save_style: a mix has no file of its own; save both styles, and give one `between` and `at`")
+            raise UsageError(
+                "save_style: a mix has no file of its own; save both styles, and give one `between` and `at`"
+            )
         write_style(Path(path), styled.controls.saved)
 
     def _repr_html_(self) -> str:
         """The scene in a notebook: a page to walk through, of Gaussians; a picture of a field."""
         from .page.writer import notebook_html
 
-        known, styled = self.trained.known, self.styled
+        known = self.trained.known
+        styled = self.styled
         views = known.test or known.train
-        look = None if styled is None else (" + ".join(Path(name).stem for name in self.references) or "style", styled.restyle)
+        look = (
+            None
+            if styled is None
+            else (" + ".join(Path(name).stem for name in self.references) or "style", styled.restyle)
+        )
         return notebook_html(self.trained.scene, known.name, views[len(views) // 2], look)
 
     def render(self, camera: Cameras | int | str) -> Shot:
-        """One view: of a camera, or of a captured one by number or name. Raises UsageError for several cameras."""
+        """One view: of a camera, or of a captured one by number or name. Raises UsageError for several
+        cameras.
+        """
         return next(self.film(self._single("render", camera)))
 
     def film(self, cameras: Cameras) -> Iterator[Shot]:
         """Views of many cameras, one after the other, each when it is asked for."""
         # Cameras are the capture's; the scene is drawn about its origin, where float32 is fine enough.
-        scene, cameras = self.trained.scene.restyled(self.restyle), self._local(cameras)
+        scene = self.trained.scene.restyled(self.restyle)
+        cameras = self._local(cameras)
         for view in range(len(cameras)):
             made = scene.render(cameras, view)
             yield Shot(made.rgb, made.depth, made.opacity)
 
     def matches(self, camera: Cameras | int | str) -> MatchMap:
-        """Style codes that each pixel of a view takes; `styled.codes` names them. Raises UsageError without a style."""
-        styled, one = self._style("matches"), self._single("matches", camera)
+        """Style codes that each pixel of a view takes; `styled.codes` names them. Raises UsageError without a
+        style.
+        """
+        styled = self._style("matches")
+        one = self._single("matches", camera)
         return match_map(self.trained.scene, styled, 0, self._local(one))
 
     @property
@@ -248,12 +287,17 @@ class FinishedCapture:
 
     @property
     def gaussians(self) -> Gaussians:
-        """The Gaussians as the file has them, about `capture.origin`; `.numpy()` of its tensors is the same memory."""
+        """The Gaussians as the file has them, about `capture.origin`; `.numpy()` of its tensors is the same
+        memory.
+        """
         read = self.capture.gaussians
         if self.harmonics is None:
             return read
-        finite, new = read.finite, self.harmonics
-        return read.recoloured(new if len(new) == len(read) else read.harmonics.index_copy(0, finite.nonzero()[:, 0], new))
+        finite = read.finite
+        new = self.harmonics
+        return read.recoloured(
+            new if len(new) == len(read) else read.harmonics.index_copy(0, finite.nonzero()[:, 0], new)
+        )
 
     def restyled(
         self,
@@ -267,7 +311,8 @@ class FinishedCapture:
     ) -> "FinishedCapture":
         """The capture, as it was read, in the style of photographs; arguments as those of `fprf restyle`.
 
-        Raises UsageError for no references, DataError for unreadable photographs and where nothing can be seen.
+        Raises UsageError for no references, DataError for unreadable photographs and where nothing can be
+        seen.
         """
         seen = self.seen or cache(lambda: open_captures([self.capture.path], self.look, first=self.capture))
         style = StyleConfig(
@@ -282,11 +327,14 @@ class FinishedCapture:
         return replace(self, harmonics=seen().harmonics(0, self.capture, styled.restyle), seen=seen)
 
     def recoloured(self, harmonics: Annotated[Tensor, "N K 3"]) -> "FinishedCapture":
-        """The capture with harmonics of your own for all Gaussians. Raises DataError where they are of other shapes."""
+        """The capture with harmonics of your own for all Gaussians. Raises DataError where they are of other
+        shapes.
+        """
         return replace(self, harmonics=self.capture.gaussians.recoloured(harmonics).harmonics)
 
     def write(self, path: PathLike) -> list[str]:
-        """Write a file, whole or not at all; its ending says the format. Returns what the format does not hold, as phrases.
+        """Write a file, whole or not at all; its ending says the format. Returns what the format does not
+        hold, as phrases.
 
         In the format that was read everything but colours stays as it was, bit for bit.
         """

@@ -83,15 +83,26 @@ class LossConfig:
     distortion: float = 1e-3
     """Weights should gather at one place along a ray."""
     depth: float = 0.1
-    """Rays through points of the reconstruction should end there (where `datamanager.depth_share` draws such rays). It falls to
-    a hundredth in the course of training."""
+    """Rays through points of the reconstruction should end there (where `datamanager.depth_share` draws such
+    rays). It falls to a hundredth in the course of training.
+    """
     sky: float = 0.1
     """Rays into the sky should meet nothing before it (where the capture has masks of its sky)."""
     extra: LossTermConfig | None = None
     """A loss term of an installed package, by name."""
 
     def __post_init__(self) -> None:
-        weights = ("rgb", "content", "semantic", "variation", "proposal_variation", "interlevel", "distortion", "depth", "sky")
+        weights = (
+            "rgb",
+            "content",
+            "semantic",
+            "variation",
+            "proposal_variation",
+            "interlevel",
+            "distortion",
+            "depth",
+            "sky",
+        )
         for name in weights:
             at_least(f"loss.{name}", getattr(self, name), 0.0)
         names = [name for name, _ in self.penalties]
@@ -103,7 +114,9 @@ class LossConfig:
             at_least(f"loss.penalties: {name}", weight, 0.0)
         at_least("loss.penalty_every", self.penalty_every, 1)
         if self.rgb == self.content == self.semantic == 0:
-            raise ConfigError("loss: rgb, content and semantic are all 0, so nothing would be learnt; raise one of them")
+            raise ConfigError(
+                "loss: rgb, content and semantic are all 0, so nothing would be learnt; raise one of them"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,8 +130,9 @@ class OptimizerConfig:
     warm_up: int = 512
     """Steps of linear warm-up."""
     hold: int | None = None
-    """Step from which the rate also falls as 1 / sqrt(step); none = only the cosine. Keeps long runs of small batches
-    stable."""
+    """Step from which the rate also falls as 1 / sqrt(step); none = only the cosine. Keeps long runs of small
+    batches stable.
+    """
     beta2: float = 0.99
     """Decay of the squared-gradient average."""
     eps: float = 1e-12
@@ -144,12 +158,15 @@ class RenderConfig:
     resolution: float = 1.0
     """Share of an image's width and height that is rendered, in (0, 1]; what lies between is interpolated."""
     chunk: int = 8192
-    """Rays rendered at a time on the CPU; an accelerator takes as many as half of its free memory holds, but no fewer."""
+    """Rays rendered at a time on the CPU; an accelerator takes as many as half of its free memory holds, but
+    no fewer.
+    """
     background: tuple[float, float, float] | None = None
     """Colour behind everything; none = white where images have transparency, else nothing is assumed."""
     tone: tuple[float, float, float] | None = None
-    """Factors that rendered red, green and blue are multiplied by; none = the scene as its views have it in common. `--tone`
-    of a view says them where they were learnt."""
+    """Factors that rendered red, green and blue are multiplied by; none = the scene as its views have it in
+    common. `--tone` of a view says them where they were learnt.
+    """
 
     def __post_init__(self) -> None:
         between("render.budget", self.budget, 0.0, 0.5)
@@ -177,7 +194,16 @@ class StatisticsConfig:
         at_least("statistics.regions", self.regions, 1)
 
 
-RESUMABLE = ("steps", "minutes", "output", "data", "device", "device_memory", "precision", "checkpoint_minutes")
+RESUMABLE = (
+    "steps",
+    "minutes",
+    "output",
+    "data",
+    "device",
+    "device_memory",
+    "precision",
+    "checkpoint_minutes",
+)
 """Fields of a run's config that may differ when a run is resumed."""
 FREE_IN_BLOCKS = (*RESUMABLE, "blocks", "executor", "statistics", "render")
 """Fields of a config that do not decide what a block of given bounds and rays learns."""
@@ -189,14 +215,16 @@ _WHOLE_PIXELS = 640 * 360
 class RunConfig:
     """Fields of every run, whatever its scene is made of.
 
-    A kind of scene is a subclass with `build`, returned by a method (entry point in `fprf.methods`), and a function that opens
-    its runs, by the name `kind` in the group `fprf.scenes` (`training.loading.open_run`).
+    A kind of scene is a subclass with `build`, returned by a method (entry point in `fprf.methods`), and a
+    function that opens its runs, by the name `kind` in the group `fprf.scenes` (`training.loading.open_run`).
     """
 
     kind: ClassVar[str] = ""
     """Entry point in `fprf.scenes` of the function that opens such a run."""
     untrained: ClassVar[tuple[str, ...]] = ()
-    """Fields that may differ when a run is resumed, beside RESUMABLE: nothing that is trained depends on them."""
+    """Fields that may differ when a run is resumed, beside RESUMABLE: nothing that is trained depends on
+    them.
+    """
     open: ClassVar[tuple[str, ...]] = ("downscale",)
     """Fields whose value may be None, which `planned` decides before a run begins."""
 
@@ -205,8 +233,9 @@ class RunConfig:
     output: Path | None = None
     """Run folder; by default runs/SCENE-METHOD. A folder with a run in it is resumed."""
     downscale: int | float | None = None
-    """Factor, at least 1, by which the delivered images are reduced; none = found from their size and number, the rays of the
-    training and the device (docs/formats.md), and saved with the run."""
+    """Factor, at least 1, by which the delivered images are reduced; none = found from their size and number,
+    the rays of the training and the device (docs/formats.md), and saved with the run.
+    """
     steps: int | None = 30_000
     """Optimiser steps; none only where a kind of scene says for itself how many."""
     minutes: float | None = None
@@ -236,10 +265,12 @@ class RunConfig:
     ) -> "SceneLearner | Partition":
         """Build what learns a scene, with its images read; imports its implementation.
 
-        `saved` are the facts of a run that goes on: nothing that was measured for them is measured again. `progress` is told
-        `(done, total, what)` of what takes long.
+        `saved` are the facts of a run that goes on: nothing that was measured for them is measured again.
+        `progress` is told `(done, total, what)` of what takes long.
         """
-        raise ConfigError(f"{type(self).__name__} does not say how it is trained; its method has to give a config that does")
+        raise ConfigError(
+            f"{type(self).__name__} does not say how it is trained; its method has to give a config that does"
+        )
 
     @property
     def trained_on(self) -> str:
@@ -262,15 +293,23 @@ class RunConfig:
         return self.steps
 
     def find_downscale(self, scene: "ParsedScene", device: str) -> int:
-        """Factor, at least 1, by which the images of a scene, at their own size, are reduced where none is said.
+        """Factor, at least 1, by which the images of a scene, at their own size, are reduced where none is
+        said.
 
-        `device` is a kind of device: cpu, cuda, mps. Here the smallest at which no image has more pixels than 640 x 360.
+        `device` is a kind of device: cpu, cuda, mps. Here the smallest at which no image has more pixels than
+        640 x 360.
         """
         return max(1, math.ceil(math.sqrt(int(scene.cameras.size.prod(1).max()) / _WHOLE_PIXELS)))
 
     def planned(self, scene: "ParsedScene", device: "torch.device") -> "RunConfig":
-        """The config with what it leaves open decided, from a scene at its own size and the device that will train."""
-        return self if self.downscale is not None else replace(self, downscale=self.find_downscale(scene, device.type))
+        """The config with what it leaves open decided, from a scene at its own size and the device that will
+        train.
+        """
+        return (
+            self
+            if self.downscale is not None
+            else replace(self, downscale=self.find_downscale(scene, device.type))
+        )
 
     def described(self) -> str:
         """Describe the plan beyond the views and their size, for the line that is shown before training."""
@@ -281,7 +320,8 @@ class RunConfig:
         return *RESUMABLE, *self.untrained
 
     def needs(self) -> list[Need]:
-        """Packages and weights that training needs and that are not here, each opened by the path of its slot.
+        """Packages and weights that training needs and that are not here, each opened by the path of its
+        slot.
 
         Raises PluginError where a plug-in cannot say what it needs.
         """
@@ -290,7 +330,9 @@ class RunConfig:
             try:
                 needs = () if slot.value is None else tuple(slot.value.needs())
             except Exception as error:  # a stranger's
-                raise PluginError(f"{slot.path}: cannot say what it needs ({type(error).__name__}: {error})") from error
+                raise PluginError(
+                    f"{slot.path}: cannot say what it needs ({type(error).__name__}: {error})"
+                ) from error
             missing += [need._replace(what=f"{slot.path}: {need.what}") for need in needs]
         return missing
 
@@ -311,7 +353,9 @@ _ACCELERATOR = _Pace(rays=1e6, features=0.2, least=1e6)
 PASSES = 4
 """Rays that larger images must leave for each of their pixels."""
 _FEATURE_SHARE = 0.5
-"""Share of a time limit that features may take before images are reduced below `least`, to a quarter of it at most."""
+"""Share of a time limit that features may take before images are reduced below `least`, to a quarter of it at
+most.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -325,10 +369,13 @@ class TrainConfig(RunConfig):
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
     device_memory: float = 0.5
-    """Share of a GPU's free memory that images and feature targets may take in training; where they need more they stay in host
-    memory, and each batch is copied one step ahead."""
+    """Share of a GPU's free memory that images and feature targets may take in training; where they need more
+    they stay in host memory, and each batch is copied one step ahead.
+    """
     precision: Literal["float32", "tf32"] = "float32"
-    """Of matrix products on CUDA in training: tf32 rounds their factors to 11 bits. docs/measurements.md has the error."""
+    """Of matrix products on CUDA in training: tf32 rounds their factors to 11 bits. docs/measurements.md has
+    the error.
+    """
     datamanager: DataManagerConfig = RayBatchesConfig()
     """Feeds training."""
     sampler: SamplerConfig = ProposalConfig()
@@ -346,11 +393,14 @@ class TrainConfig(RunConfig):
     optimizer: OptimizerConfig = OptimizerConfig()
     """Optimiser and learning rates."""
     tones: bool | None = None
-    """Learn how bright and how coloured each view was taken, starting from its exposure; the scene is what they have in common.
-    none = where exposures differ, as the capture says or as its sparse points show."""
+    """Learn how bright and how coloured each view was taken, starting from its exposure; the scene is what
+    they have in common. none = where exposures differ, as the capture says or as its sparse points show.
+    """
     poses: float = 0.0
-    """Refine the cameras' poses with the scene, at this share of the learning rate (in radians, and in distances that views
-    commonly see); 0 = they are as the capture says, 0.02 suits poses that are off by some pixels."""
+    """Refine the cameras' poses with the scene, at this share of the learning rate (in radians, and in
+    distances that views commonly see); 0 = they are as the capture says, 0.02 suits poses that are off by
+    some pixels.
+    """
     render: RenderConfig = RenderConfig()
     """Rendering and skipping."""
     statistics: StatisticsConfig = StatisticsConfig()
@@ -378,7 +428,8 @@ class TrainConfig(RunConfig):
         plan = make_plan(scene, self.blocks) if self.blocks.cuts else None
         if plan is None or len(plan.cells) == 1:
             return FieldLearner(self, prepare(self, scene, saved, progress), device)
-        # One basis and one unit of the losses, of all training views, so that features mean the same in each block.
+        # One basis and one unit of the losses, of all training views, so that features mean the same in each
+        # block.
         prepared = prepare(self, scene, saved, progress, space=plan.space)
         return Blocks(self, scene, plan, prepared.facts, prepared.basis)
 
@@ -395,10 +446,11 @@ class TrainConfig(RunConfig):
         return self.datamanager.masks
 
     def find_downscale(self, scene: "ParsedScene", device: str) -> int:
-        """Factor at which training sees each pixel often enough, and at which features take no more than their time.
+        """Factor at which training sees each pixel often enough, and at which features take no more than
+        their time.
 
-        From the mean of the training images: the square root of their pixels over those wanted, rounded to a whole factor, so
-        that images up to 2.25 times as large as wanted stay as they are.
+        From the mean of the training images: the square root of their pixels over those wanted, rounded to a
+        whole factor, so that images up to 2.25 times as large as wanted stay as they are.
         """
         sizes = scene.cameras.size[scene.train]
         if not len(sizes):
@@ -420,7 +472,9 @@ class TrainConfig(RunConfig):
         return *(FREE_IN_BLOCKS if anew else RESUMABLE), *self.untrained
 
     def needs(self) -> list[Need]:
-        """The same, and a decoder for the content encoder, whose weights are read where both could be built."""
+        """The same, and a decoder for the content encoder, whose weights are read where both could be
+        built.
+        """
         missing = super().needs()
         if any(need.what.startswith(("content.encoder", "content.decoder")) for need in missing):
             return missing

@@ -17,7 +17,8 @@ The command line turns each into one line on standard error and exit code 2.
 class FprfError(Exception):
     """The root: its text is complete and meant for the user.
 
-    Names that come from files stand in it; what a terminal would not print of them (line breaks, escapes) is spelled out.
+    Names that come from files stand in it; what a terminal would not print of them (line breaks, escapes) is
+    spelled out.
     """
 
     def __init__(self, text: str) -> None:

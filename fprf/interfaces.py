@@ -1,7 +1,8 @@
-"""What every plug-in must do: one abstract class a kind, with shapes. The one file that a plug-in author reads.
+"""What every plug-in must do: one abstract class a kind, with shapes. The one file that a plug-in author
+reads.
 
-A plug-in is built by its config's `build(...)`; configs live in the `config.py` next to the built-ins and import no torch. A
-contract in `fprf.testing` checks an implementation, and fails with one sentence:
+A plug-in is built by its config's `build(...)`; configs live in the `config.py` next to the built-ins and
+import no torch. A contract in `fprf.testing` checks an implementation, and fails with one sentence:
 
     kind        class            from -> to                                  contract
     images      Encoder          [B 3 H W] -> [B C h w]                      check_encoder
@@ -23,8 +24,9 @@ contract in `fprf.testing` checks an implementation, and fails with one sentence
     a stylizer           its config in `fprf/plugins/stylizers/config.py`, its class in a file beside; group fprf.stylizers
     a file format        one file in `fprf/splats/files`, a `CaptureFormat`; group fprf.captures
     a kind of scene      a `RunConfig` (`fprf/config.py`) whose `build` gives a SceneLearner, which makes a Scene with its
-                         SceneViews, and a function that opens its runs, as `open_fields` of `fprf/training/loading.py`
-                         does; groups fprf.methods and fprf.scenes. `tests/test_scene_plugin.py` is a whole one
+                         SceneViews, and a function that opens its runs, as `open_fields` of
+                         `fprf/training/loading.py` does; groups fprf.methods and fprf.scenes.
+                         `tests/test_scene_plugin.py` is a whole one
 
 and an entry point in the named group of `pyproject.toml`, where each group has a line that says the same.
 
@@ -33,8 +35,8 @@ and an entry point in the named group of `pyproject.toml`, where each group has 
     N M     points               D       semantic channels    K       regions of the scene
     R E     rays, edges          L       latent channels      H W     pixels; h w cells of features
 
-Tensors are float32 unless their inputs are of another type; device and type of results follow the inputs. A function of points
-treats each alone: the same in any batch, and of none none.
+Tensors are float32 unless their inputs are of another type; device and type of results follow the inputs. A
+function of points treats each alone: the same in any batch, and of none none.
 """
 
 from abc import ABC, abstractmethod
@@ -68,15 +70,19 @@ Result = TypeVar("Result")
 
 
 class Encoder(nn.Module, ABC):
-    """Images to features. Frozen; deterministic; normalises its input itself; may be called by several threads at once.
+    """Images to features. Frozen; deterministic; normalises its input itself; may be called by several
+    threads at once.
 
-    Takes images of any size from one pixel on, and keeps their aspect; features of an image do not depend on its batch.
+    Takes images of any size from one pixel on, and keeps their aspect; features of an image do not depend on
+    its batch.
     """
 
     @property
     @abstractmethod
     def identity(self) -> str:
-        """Identity of an encoder: name, layer, settings and a hash of the weights. Keys caches and decoders."""
+        """Identity of an encoder: name, layer, settings and a hash of the weights. Keys caches and
+        decoders.
+        """
 
     @property
     @abstractmethod
@@ -85,17 +91,24 @@ class Encoder(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
-        """Features of sRGB images in [0, 1], aligned to the whole image: cell (i, j) covers its h-th and w-th part."""
+        """Features of sRGB images in [0, 1], aligned to the whole image: cell (i, j) covers its h-th and w-th
+        part.
+        """
 
-    def cutout(self, image: Annotated[Tensor, "B 3 H W"], opacity: Annotated[Tensor, "B H W"]) -> Annotated[Tensor, "B C h w"]:
-        """Features of what images show that are transparent in places; colours are premultiplied by the opacity in [0, 1].
+    def cutout(
+        self, image: Annotated[Tensor, "B 3 H W"], opacity: Annotated[Tensor, "B H W"]
+    ) -> Annotated[Tensor, "B C h w"]:
+        """Features of what images show that are transparent in places; colours are premultiplied by the
+        opacity in [0, 1].
 
-        This mean over a white and a black backdrop serves any encoder: neither alone decides what a single thing is. Override
-        it where an encoder can leave the backdrop out. Cells that show nothing may hold anything finite.
+        This mean over a white and a black backdrop serves any encoder: neither alone decides what a single
+        thing is. Override it where an encoder can leave the backdrop out. Cells that show nothing may hold
+        anything finite.
         """
         behind = 1 - opacity[:, None]
         features: Tensor = self((image + behind).clamp(0, 1))
-        # Where less than 1/200 shows through, both backdrops give one picture, and encoders take most of the time.
+        # Where less than 1/200 shows through, both backdrops give one picture, and encoders take most of the
+        # time.
         if float(behind.mean((1, 2, 3)).amax()) > 0.005:
             features = (features + self(image.clamp(0, 1))) / 2
         return features
@@ -108,24 +121,29 @@ class Regularised(nn.Module, ABC):
     def penalties(self) -> dict[str, Tensor]:
         """Regularisers by name, each a scalar, the same names at each call.
 
-        The weights of 'variation' and 'proposal_variation' are `loss.variation` and `loss.proposal_variation`; any other name
-        has weight 1 unless `loss.penalties` names it, so the scalar should include its own weight. One name in several parts
-        is added up.
+        The weights of 'variation' and 'proposal_variation' are `loss.variation` and
+        `loss.proposal_variation`; any other name has weight 1 unless `loss.penalties` names it, so the scalar
+        should include its own weight. One name in several parts is added up.
         """
 
 
 class ContentField(Regularised):
     """Points to density and content features (paper, scene content field). Stateless between calls.
 
-    Every parameter has a gradient, through the density or the content, and is drawn from the seed of `build` alone.
+    Every parameter has a gradient, through the density or the content, and is drawn from the seed of `build`
+    alone.
     """
 
     @abstractmethod
     def density(self, points: Annotated[Tensor, "N 3"]) -> FieldSample:
-        """Density per space unit, at least 0, and a latent [N L] for `content`, at points of the unit cube [-1, 1]^3."""
+        """Density per space unit, at least 0, and a latent [N L] for `content`, at points of the unit cube
+        [-1, 1]^3.
+        """
 
     @abstractmethod
-    def content(self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "M C"]:
+    def content(
+        self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]
+    ) -> Annotated[Tensor, "M C"]:
         """Content features of some of the points, by their latents and unit viewing directions."""
 
 
@@ -138,29 +156,37 @@ class SemanticField(Regularised):
 
 
 class Sampler(Regularised):
-    """Rays to sample edges. May own proposal fields, which live in the unit cube: `space.locate` leads there."""
+    """Rays to sample edges. May own proposal fields, which live in the unit cube: `space.locate` leads
+    there.
+    """
 
     @property
     def fields(self) -> nn.ModuleList:
-        """The fields that `forward` asks for density, points of the unit cube [N 3] to [N]; none unless it says so.
+        """The fields that `forward` asks for density, points of the unit cube [N 3] to [N]; none unless it
+        says so.
 
         A scene of blocks puts others in their place, which route points to the blocks' own.
         """
         return nn.ModuleList()
 
     @abstractmethod
-    def forward(self, rays: Rays, *, space: "Space", step: int | None, generator: torch.Generator | None) -> Sampled:
-        """Edges `s` in [0, 1] and `t` in [near, far] of each ray, [R E] with E >= 2, sorted; t = space.distance(s, near, far).
+    def forward(
+        self, rays: Rays, *, space: "Space", step: int | None, generator: torch.Generator | None
+    ) -> Sampled:
+        """Edges `s` in [0, 1] and `t` in [near, far] of each ray, [R E] with E >= 2, sorted; t =
+        space.distance(s, near, far).
 
-        `step` is that of the training, None in a view. A function of rays, step and generator; None = deterministic.
+        `step` is that of the training, None in a view. A function of rays, step and generator; None =
+        deterministic.
         """
 
 
 class Decoder(nn.Module, ABC):
-    """Content features to colour, point by point (paper, D_VGG): those of the scene as it is, and those of a style.
+    """Content features to colour, point by point (paper, D_VGG): those of the scene as it is, and those of a
+    style.
 
-    `build` returns parameters that all scenes share with `requires_grad` False; those with `requires_grad` True belong to one
-    scene, are trained with it and are saved in its checkpoints.
+    `build` returns parameters that all scenes share with `requires_grad` False; those with `requires_grad`
+    True belong to one scene, are trained with it and are saved in its checkpoints.
     """
 
     @abstractmethod
@@ -171,10 +197,11 @@ class Decoder(nn.Module, ABC):
 class Stylizer(nn.Module, ABC):
     """Content features to stylised content features, point by point. Knows nothing of rays.
 
-    On Gaussians the content is the colour, C = 3, and a style is one affine map of colours for each of them, which acts on
-    their harmonics. It is found from what becomes of black and of each channel alone, so either `forward` is affine in content
-    where semantics are given, f(a x + (1 - a) y) = a f(x) + (1 - a) f(y), or the config has `colours` above 0, which carries
-    the colours of each region over in the place of it (`splats.restyle`).
+    On Gaussians the content is the colour, C = 3, and a style is one affine map of colours for each of them,
+    which acts on their harmonics. It is found from what becomes of black and of each channel alone, so either
+    `forward` is affine in content where semantics are given, f(a x + (1 - a) y) = a f(x) + (1 - a) f(y), or
+    the config has `colours` above 0, which carries the colours of each region over in the place of it
+    (`splats.restyle`).
     """
 
     @property
@@ -183,13 +210,16 @@ class Stylizer(nn.Module, ABC):
         """`Want.CONTENT`, with `Want.SEMANTIC` if it reads semantic features."""
 
     @abstractmethod
-    def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
+    def forward(
+        self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
+    ) -> Annotated[Tensor, "N C"]:
         """The features in the new style, at full strength. `semantic` is None unless `needs` asks for it."""
 
     def shared(
         self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
     ) -> tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N K"] | None]:
-        """`forward`, and the points' shares of the scene's regions (`style.scene_style.Membership`), if it has found them.
+        """`forward`, and the points' shares of the scene's regions (`style.scene_style.Membership`), if it
+        has found them.
 
         What follows, such as strengths and colours by region, then need not find them again.
         """
@@ -200,15 +230,18 @@ class Stylizer(nn.Module, ABC):
         """Attention of each point to each style code, at least 0; rows sum to 1."""
 
     def region_match(self, keys: Annotated[Tensor, "K D"]) -> Annotated[Tensor, "K T"]:
-        """Share of each style code in each of the scene's regions, whose mean semantics are `keys`; rows sum to 1.
+        """Share of each style code in each of the scene's regions, whose mean semantics are `keys`; rows sum
+        to 1.
 
-        A stylizer that mixes regions point by point returns what it mixes: `match` of the keys, which lie in several regions,
-        is mixed already.
+        A stylizer that mixes regions point by point returns what it mixes: `match` of the keys, which lie in
+        several regions, is mixed already.
         """
         return self.match(keys)
 
 
-Values: TypeAlias = Callable[[Annotated[Tensor, "M D"], Annotated[Tensor, "M 3"] | None], Annotated[Tensor, "M X"]]
+Values: TypeAlias = Callable[
+    [Annotated[Tensor, "M D"], Annotated[Tensor, "M 3"] | None], Annotated[Tensor, "M X"]
+]
 """Anything that follows from semantics, and from positions in the world where they are given."""
 
 
@@ -232,8 +265,8 @@ class SceneView(ABC):
 class Scene(ABC):
     """A trained representation of any kind with its views: all that verbs, styles and viewers need of it.
 
-    It is never changed: `restyled` returns another scene, which shares everything that a style does not touch. Views are
-    rows of any `Cameras`; results are on the CPU.
+    It is never changed: `restyled` returns another scene, which shares everything that a style does not
+    touch. Views are rows of any `Cameras`; results are on the CPU.
     """
 
     @property
@@ -248,7 +281,9 @@ class Scene(ABC):
 
     @property
     def origin(self) -> Origin:
-        """Of the local frame that its cameras are in: the capture's own coordinates less this (see `rendering.local_frame`)."""
+        """Of the local frame that its cameras are in: the capture's own coordinates less this (see
+        `rendering.local_frame`).
+        """
         return (0.0, 0.0, 0.0)
 
     @property
@@ -262,26 +297,35 @@ class Scene(ABC):
         """Identity of the encoder of its semantics; empty where it has none."""
 
     def gaussian_rows(self) -> "GaussianRows | None":
-        """The Gaussians that it is made of, in its look, for files of them; None where it is made of something else."""
+        """The Gaussians that it is made of, in its look, for files of them; None where it is made of
+        something else.
+        """
         return None
 
     @abstractmethod
     def render(self, cameras: "Cameras", view: int, *, resolution: float | None = None) -> View:
         """One view in the scene's look.
 
-        `resolution` is the share of its width and height that is rendered, in (0, 1], before it is enlarged; None = as the
-        scene is set.
+        `resolution` is the share of its width and height that is rendered, in (0, 1], before it is enlarged;
+        None = as the scene is set.
         """
 
     @abstractmethod
     def paint(
-        self, cameras: "Cameras", view: int, pixel: Annotated[Tensor, "R 2"], values: Values, *, semantic: bool = True
+        self,
+        cameras: "Cameras",
+        view: int,
+        pixel: Annotated[Tensor, "R 2"],
+        values: Values,
+        *,
+        semantic: bool = True,
     ) -> tuple[Annotated[Tensor, "R X"], Annotated[Tensor, "R"]]:
-        """Composite anything that follows from semantics, such as shares of regions for a map: means over what each pixel sees,
-        and the opacity.
+        """Composite anything that follows from semantics, such as shares of regions for a map: means over
+        what each pixel sees, and the opacity.
 
-        Pixels that see nothing get 0. `values` is given features without channels where the scene has no semantics or
-        `semantic` is false, and positions where styles of this kind of scene may differ from place to place.
+        Pixels that see nothing get 0. `values` is given features without channels where the scene has no
+        semantics or `semantic` is false, and positions where styles of this kind of scene may differ from
+        place to place.
         """
 
     @abstractmethod
@@ -295,9 +339,11 @@ class Scene(ABC):
     def fit_poses(
         self, captured: "ParsedScene", views: Sequence[int], progress: Callable[[int, int, str], None]
     ) -> Annotated[Tensor, "V 6"]:
-        """Turns (radians) and shifts (world units), float64, that bring renders of some views nearest to their photographs.
+        """Turns (radians) and shifts (world units), float64, that bring renders of some views nearest to
+        their photographs.
 
-        `captured` has the photographs; those of all other views are 0. Raises UsageError where the scene cannot say.
+        `captured` has the photographs; those of all other views are 0. Raises UsageError where the scene
+        cannot say.
         """
         raise UsageError("--fit-poses: this kind of scene fits no poses; leave it out")
 
@@ -317,11 +363,15 @@ class Scene(ABC):
 
     @abstractmethod
     def measured(self) -> "tuple[SceneStyle, Basis | None]":
-        """Statistics and regions of the scene as it was captured, and the basis of its semantics (None without any)."""
+        """Statistics and regions of the scene as it was captured, and the basis of its semantics (None
+        without any).
+        """
 
     @abstractmethod
     def encoders(self) -> "Encoders":
-        """Encoders for references, in the terms of `measured`. Raises WeightsError where those at hand are others."""
+        """Encoders for references, in the terms of `measured`. Raises WeightsError where those at hand are
+        others.
+        """
 
 
 class State(NamedTuple):
@@ -353,14 +403,16 @@ class Figures(NamedTuple):
 class Learner(ABC):
     """Anything that is learnt step by step; `training.driver.learn` does the rest.
 
-    Every draw is a function of (seed, index), so that `state` and the number of steps are all that a resumed training needs.
+    Every draw is a function of (seed, index), so that `state` and the number of steps are all that a resumed
+    training needs.
     """
 
     @property
     @abstractmethod
     def device(self) -> torch.device:
-        """Device of its parameters. On the CPU figures are read after each step; elsewhere twice a second, since the host
-        waits for the device."""
+        """Device of its parameters. On the CPU figures are read after each step; elsewhere twice a second,
+        since the host waits for the device.
+        """
 
     @abstractmethod
     def step(self, index: int, share: float) -> None:
@@ -383,7 +435,9 @@ class Learner(ABC):
 
 
 class SceneLearner(Learner):
-    """A scene that is being learnt, built by `RunConfig.build`; `training.driver.train` owns its run folder."""
+    """A scene that is being learnt, built by `RunConfig.build`; `training.driver.train` owns its run
+    folder.
+    """
 
     @property
     @abstractmethod
@@ -391,7 +445,9 @@ class SceneLearner(Learner):
         """Facts found before the first step, for scene.json."""
 
     def begin(self, run: "Run") -> str:
-        """Write further files of the run before the first step; return a line about what will be learnt, or nothing."""
+        """Write further files of the run before the first step; return a line about what will be learnt, or
+        nothing.
+        """
         return ""
 
     def finish(self, run: "Run", display: "Display") -> None:
@@ -400,7 +456,9 @@ class SceneLearner(Learner):
 
 
 class Partition(ABC):
-    """A scene that is trained in parts, each a task of its own: what `RunConfig.build` gives in the place of a learner."""
+    """A scene that is trained in parts, each a task of its own: what `RunConfig.build` gives in the place of
+    a learner.
+    """
 
     @property
     @abstractmethod
@@ -409,7 +467,8 @@ class Partition(ABC):
 
     @abstractmethod
     def train(self, run: "Run", display: "Display", *, spent: float) -> None:
-        """Train what is not finished, and write what a render needs; `spent` seconds of the time limit are over.
+        """Train what is not finished, and write what a render needs; `spent` seconds of the time limit are
+        over.
 
         config.json and scene.json are written.
         """
@@ -428,13 +487,20 @@ class LossTerm(ABC):
 
     @abstractmethod
     def __call__(
-        self, rendered: Rendered, batch: Batch, parts: "Parts", *, step: int, generator: torch.Generator | None
+        self,
+        rendered: Rendered,
+        batch: Batch,
+        parts: "Parts",
+        *,
+        step: int,
+        generator: torch.Generator | None,
     ) -> Tensor:
         """The unweighted term, a scalar: by convention a mean over the rays.
 
-        Gradients go through `weights` [R S] of `rendered`, its colour and its features, not through depth and opacity.
-        `semantic`, and targets of the batch, are None where the scene or the method has none. `parts` are the scene's space
-        and networks. Draws come from the generator of the step; None = deterministic.
+        Gradients go through `weights` [R S] of `rendered`, its colour and its features, not through depth and
+        opacity. `semantic`, and targets of the batch, are None where the scene or the method has none.
+        `parts` are the scene's space and networks. Draws come from the generator of the step; None =
+        deterministic.
         """
 
 
@@ -443,7 +509,9 @@ class BlockLayout(ABC):
 
     @abstractmethod
     def cut(self, site: Site) -> list[Cell]:
-        """At least one cell in the frame of the site, all with one border; one alone means that the scene is not cut."""
+        """At least one cell in the frame of the site, all with one border; one alone means that the scene is
+        not cut.
+        """
 
 
 class DataParser(ABC):
@@ -466,12 +534,13 @@ class DataManager(ABC):
     def batch(self, step: int) -> Batch:
         """The pixels of a step: a pure function of (seed, step), so that a resumed run sees the same ones.
 
-        In host memory, or on the device of `to`. For an accelerator those in host memory are drawn by another thread, one step
-        ahead.
+        In host memory, or on the device of `to`. For an accelerator those in host memory are drawn by another
+        thread, one step ahead.
         """
 
     def to(self, device: torch.device, *, room: int) -> "DataManager":
-        """A data manager of the same batches that draws them on a device, from at most `room` bytes held there.
+        """A data manager of the same batches that draws them on a device, from at most `room` bytes held
+        there.
 
         By default itself, which draws in host memory.
         """

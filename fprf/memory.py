@@ -1,10 +1,12 @@
-"""Memory: what is freed is kept; where there is too little, less is taken at once if that gives the same, else told.
+"""Memory: what is freed is kept; where there is too little, less is taken at once if that gives the same,
+else told.
 
-Every library says it differently: Python and NumPy raise MemoryError, torch a RuntimeError on the CPU and one of its own on a
-GPU, OpenCV its error -4. None of them is imported here.
+Every library says it differently: Python and NumPy raise MemoryError, torch a RuntimeError on the CPU and one
+of its own on a GPU, OpenCV its error -4. None of them is imported here.
 
-By default the system takes what is freed back. A step frees and asks for the same tens of megabytes again, and each page that
-comes back is cleared anew: a tenth of a training step. So freed memory stays with the process, up to `TRIM` bytes.
+By default the system takes what is freed back. A step frees and asks for the same tens of megabytes again,
+and each page that comes back is cleared anew: a tenth of a training step. So freed memory stays with the
+process, up to `TRIM` bytes.
 """
 
 import ctypes
@@ -23,7 +25,9 @@ if TYPE_CHECKING:
 LEAST = 1024
 """Rays below which parts are not halved: their share of the memory is small beside the model's."""
 _RAY = 192 << 10
-"""Bytes a ray on an accelerator, at most: in plain torch `fprf` with nothing skipped takes 173 KiB, `fprf-lite` 21."""
+"""Bytes a ray on an accelerator, at most: in plain torch `fprf` with nothing skipped takes 173 KiB,
+`fprf-lite` 21.
+"""
 _SHARE = 0.5
 """Of an accelerator's free memory, what a chunk of rays may take."""
 _TEXT = re.compile(
@@ -36,14 +40,19 @@ _OPENCV_NO_MEMORY = -4
 TRIM = 2**29
 """Freed memory beyond this goes back to the system."""
 _LARGEST = (2**27, 2**25)
-"""Pieces up to this size come from memory that was freed before; older C libraries refuse more than the second."""
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+"""Pieces up to this size come from memory that was freed before; older C libraries refuse more than the
+second.
+"""
+_TRIM_THRESHOLD = -1
+_MMAP_THRESHOLD = -3
 _GIB = 1 << 30
 _Found = TypeVar("_Found")
 
 
 def keep_memory() -> bool:
-    """Ask the C library to keep what is freed, unless the user decided otherwise; False where it is not GNU's."""
+    """Ask the C library to keep what is freed, unless the user decided otherwise; False where it is not
+    GNU's.
+    """
     if not sys.platform.startswith("linux") or any(name.startswith("MALLOC_") for name in os.environ):
         return False
     try:
@@ -59,7 +68,9 @@ def out_of_memory(error: BaseException) -> bool:
         return True
     if getattr(error, "code", None) == _OPENCV_NO_MEMORY and type(error).__module__ == "cv2":
         return True
-    if isinstance(error, SystemError) and error.__cause__ is not None:  # numba's, of an error in a parallel loop
+    if (
+        isinstance(error, SystemError) and error.__cause__ is not None
+    ):  # numba's, of an error in a parallel loop
         return out_of_memory(error.__cause__)
     return isinstance(error, RuntimeError) and _TEXT.search(str(error)) is not None
 
@@ -71,8 +82,9 @@ def wanted(error: BaseException) -> int | None:
 
 
 def in_parts(count: int, size: int, work: Callable[[slice], _Found]) -> Iterator[_Found]:
-    """`work` of one slice after the other that together are `count` things, `size` at a time; half as many, down to LEAST,
-    from where there was not enough memory on. What is worked out of a thing must not depend on the others.
+    """`work` of one slice after the other that together are `count` things, `size` at a time; half as many,
+    down to LEAST, from where there was not enough memory on. What is worked out of a thing must not depend on
+    the others.
 
     Raises OutOfMemoryError where there is not enough for LEAST either.
     """
@@ -92,7 +104,9 @@ def in_parts(count: int, size: int, work: Callable[[slice], _Found]) -> Iterator
 
 
 def chunk_size(size: int, device: "torch.device") -> int:
-    """Rays to render at a time: `size` on the CPU; on an accelerator what half of its free memory holds, at least `size`."""
+    """Rays to render at a time: `size` on the CPU; on an accelerator what half of its free memory holds, at
+    least `size`.
+    """
     free = free_memory(device)
     return size if free is None else max(size, int(_SHARE * free) // _RAY)
 
@@ -112,7 +126,9 @@ def free_memory(device: "torch.device") -> int | None:
 
 def shortage(what: str, error: BaseException, remedy: str) -> OutOfMemoryError:
     """One line: what was going on, what it took, what there is, and what to do."""
-    more, held, card = wanted(error), peak(), _GPU.search(str(error))
+    more = wanted(error)
+    held = peak()
+    card = _GPU.search(str(error))
     if card is not None:  # what the process and the machine have says nothing of it
         asked = "" if more is None else f", {more / _GIB:.2f} GiB more were wanted"
         return OutOfMemoryError(f"{what}: not enough memory{asked} ({card[0]}); {remedy}")

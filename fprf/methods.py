@@ -1,8 +1,9 @@
-"""Methods: functions that return a complete config. Each says only how it differs from the one it starts from.
+"""Methods: functions that return a complete config. Each says only how it differs from the one it starts
+from.
 
-`config.json` holds a config with its method, the version that wrote it and the packages of its plug-ins. Duplicate keys, NaN,
-unknown keys and foreign formats are refused. A file is read as the class of config that its method returns, so a method whose
-config has fields of its own must be installed.
+`config.json` holds a config with its method, the version that wrote it and the packages of its plug-ins.
+Duplicate keys, NaN, unknown keys and foreign formats are refused. A file is read as the class of config that
+its method returns, so a method whose config has fields of its own must be installed.
 """
 
 import json
@@ -11,7 +12,15 @@ from pathlib import Path
 
 import msgspec
 
-from .config import ContentConfig, LossConfig, OptimizerConfig, RenderConfig, RunConfig, SemanticConfig, TrainConfig
+from .config import (
+    ContentConfig,
+    LossConfig,
+    OptimizerConfig,
+    RenderConfig,
+    RunConfig,
+    SemanticConfig,
+    TrainConfig,
+)
 from .datamanagers.config import RayBatchesConfig
 from .errors import ConfigError, FprfError, PluginError
 from .fields.config import PlanesConfig, SemanticPlanesConfig
@@ -24,7 +33,8 @@ from .plugins.samplers.config import ProposalConfig
 from .splats.config import GaussiansConfig
 
 _METHODS = "fprf.methods"
-_FORMAT, _VERSION = 1, version("fprf")
+_FORMAT = 1
+_VERSION = version("fprf")
 
 
 class _ConfigFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -40,14 +50,18 @@ class _ConfigFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def fprf() -> TrainConfig:
-    """The paper's sizes: VGG-19 relu2_1 content, DINOv2 semantics, tri-planes 64 to 512, 256 + 128 + 48 samples.
+    """The paper's sizes: VGG-19 relu2_1 content, DINOv2 semantics, tri-planes 64 to 512, 256 + 128 + 48
+    samples.
 
-    As in the paper it learns from pixels alone. Where exposures differ, `--tones none` learns them; with few photographs,
-    `--datamanager.depth-share 0.25` asks a quarter of the rays to end at sparse points, as `fprf-lite` does with its rays.
+    As in the paper it learns from pixels alone. Where exposures differ, `--tones none` learns them; with few
+    photographs, `--datamanager.depth-share 0.25` asks a quarter of the rays to end at sparse points, as
+    `fprf-lite` does with its rays.
     """
     content = ContentConfig(decoder=MlpDecoderConfig(objective="paper"))
     manager = RayBatchesConfig(depth_share=0.0)
-    return TrainConfig(content=content, datamanager=manager, tones=False, render=RenderConfig(train_budget=0.0))
+    return TrainConfig(
+        content=content, datamanager=manager, tones=False, render=RenderConfig(train_budget=0.0)
+    )
 
 
 def fprf_lite() -> TrainConfig:
@@ -58,16 +72,22 @@ def fprf_lite() -> TrainConfig:
         sampler=ProposalConfig(samples=(48,), final=14, resolutions=(128,), anneal_steps=500),
         content=ContentConfig(encoder=BundledContentConfig(), field=_LITE_PLANES, moves_density=False),
         semantic=SemanticConfig(field=_LEAN_SEMANTICS, dim=32, samples=2),
-        # At twice this rate fox diverged after 450 steps (24.8 -> 17.7 dB); it must fall with the steps, not the minutes.
+        # At twice this rate fox diverged after 450 steps (24.8 -> 17.7 dB); it must fall with the steps, not
+        # the minutes.
         optimizer=OptimizerConfig(rate=1e-2, final=0.05, warm_up=100, hold=500),
-        # Strong smoothing: few rays and steps must not leave floaters before cameras (fox, one minute: 21.5 -> 27.1 dB). With
-        # more of it, or planes that end at 256, pictures stay blurred however long one trains (fox: 27 -> 29.7 dB).
-        loss=LossConfig(content=3e-3, variation=5e-4, proposal_variation=1e-3, distortion=1e-2, penalty_every=8),
+        # Strong smoothing: few rays and steps must not leave floaters before cameras (fox, one minute: 21.5
+        # -> 27.1 dB). With more of it, or planes that end at 256, pictures stay blurred however long one
+        # trains (fox: 27 -> 29.7 dB).
+        loss=LossConfig(
+            content=3e-3, variation=5e-4, proposal_variation=1e-3, distortion=1e-2, penalty_every=8
+        ),
     )
 
 
 def fprf_splats() -> GaussiansConfig:
-    """3D Gaussians instead of fields, made for a CPU: seconds to minutes a scene; a file that `fprf restyle` takes."""
+    """3D Gaussians instead of fields, made for a CPU: seconds to minutes a scene; a file that `fprf restyle`
+    takes.
+    """
     return GaussiansConfig()
 
 
@@ -76,23 +96,33 @@ _LITE_PLANES = PlanesConfig(channels=16, hidden=64, layers=1)
 
 
 def save_config(path: Path, config: RunConfig, method: str) -> None:
-    """Write the config, synced and then renamed into place, so that a reader finds the old file or the new one.
+    """Write the config, synced and then renamed into place, so that a reader finds the old file or the new
+    one.
 
     Raises ConfigError where the config has fields of its own and `method` would not give them back.
     """
     packages = packages_of(config)
     if type(config) is not TrainConfig:
         if type(method_config(method)) is not type(config):
-            raise ConfigError(f"method {method!r} gives no {type(config).__name__}, so its fields could not be read again")
+            raise ConfigError(
+                f"method {method!r} gives no {type(config).__name__}, so its fields could not be read again"
+            )
         packages["method"] = registry.entry(_METHODS, method).package
-    whole = {"format": _FORMAT, "fprf": _VERSION, "method": method, "plugins": packages, "config": to_json(config)}
+    whole = {
+        "format": _FORMAT,
+        "fprf": _VERSION,
+        "method": method,
+        "plugins": packages,
+        "config": to_json(config),
+    }
     write_text(path, json.dumps(whole, indent=1, allow_nan=False) + "\n")
 
 
 def load_config(path: Path) -> tuple[RunConfig, str]:
     """The config of a file and the name of its method.
 
-    Raises ConfigError naming the file and the field, PluginError where the method is needed and not installed.
+    Raises ConfigError naming the file and the field, PluginError where the method is needed and not
+    installed.
     """
     whole = read_json(path)
     try:
@@ -128,7 +158,9 @@ def method_config(name: str) -> RunConfig:
     except FprfError as fault:
         raise PluginError(f"{_METHODS}: {name!r} ({origin}): {fault}") from fault
     except (Exception, SystemExit) as fault:  # a stranger's function
-        raise PluginError(f"{_METHODS}: {name!r} ({origin}) failed: {type(fault).__name__}: {fault}") from fault
+        raise PluginError(
+            f"{_METHODS}: {name!r} ({origin}) failed: {type(fault).__name__}: {fault}"
+        ) from fault
     if not isinstance(config, RunConfig):
         raise PluginError(f"{_METHODS}: {name!r} ({origin}) gives {type(config).__name__}, not a RunConfig")
     return config

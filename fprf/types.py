@@ -1,10 +1,11 @@
 """Data that flows between the parts. Letters, used in every signature:
 
-R rays · S samples of a ray · E = S+1 edges · N points · C content channels · D semantic channels of the field ·
-L latent channels · T style codes · K scene regions · V views · H W pixels · B images · Z cells · P sparse points.
+R rays · S samples of a ray · E = S+1 edges · N points · C content channels · D semantic channels of the field
+· L latent channels · T style codes · K scene regions · V views · H W pixels · B images · Z cells · P sparse
+points.
 
-Images are [H W 3] sRGB in [0, 1] float32, channels last; encoders alone take [B 3 H W]. Camera axes are OpenGL's
-(x right, y up, the camera looks along -z); pixel centres lie at +0.5.
+Images are [H W 3] sRGB in [0, 1] float32, channels last; encoders alone take [B 3 H W]. Camera axes are
+OpenGL's (x right, y up, the camera looks along -z); pixel centres lie at +0.5.
 """
 
 from collections.abc import Mapping
@@ -68,7 +69,8 @@ class Site(NamedTuple):
 class Cell:
     """A box of a partitioned scene: a block of fields or a cell of Gaussians. Neighbours share faces.
 
-    Point x lies in it where low <= frame x < high; all are float64. Of blocks the frame is that of the scene's space.
+    Point x lies in it where low <= frame x < high; all are float64. Of blocks the frame is that of the
+    scene's space.
     """
 
     low: Annotated[Tensor, "3"]

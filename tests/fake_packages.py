@@ -14,11 +14,17 @@ class Packages:
         self.root = root
 
     def install(
-        self, name: str, points: Mapping[str, Mapping[str, str]], *, code: Mapping[str, str] | None = None, version: str = "1"
+        self,
+        name: str,
+        points: Mapping[str, Mapping[str, str]],
+        *,
+        code: Mapping[str, str] | None = None,
+        version: str = "1",
     ) -> None:
         """Modules by name, and entry points by group."""
         text = "".join(
-            f"[{group}]\n" + "".join(f"{key} = {value}\n" for key, value in named.items()) for group, named in points.items()
+            f"[{group}]\n" + "".join(f"{key} = {value}\n" for key, value in named.items())
+            for group, named in points.items()
         )
         self.raw(name, text, version)
         for module, source in (code or {}).items():

@@ -1,4 +1,5 @@
-"""gsplat's `rasterization` without a GPU: the parameters of it that fprf names, in plain torch, strict about what it is given.
+"""gsplat's `rasterization` without a GPU: the parameters of it that fprf names, in plain torch, strict about
+what it is given.
 
 Every Gaussian is composited in every pixel, on any device and in any float type, with gradients by autograd.
 """
@@ -18,8 +19,9 @@ from fprf.ops.rasterise import gsplat as rasterise_gsplat
 
 
 class Splats(NamedTuple):
-    """Gaussians of one view: half widths in pixels (0 where they are not drawn), positions, depths, inverse covariances
-    (xx, xy, yy), and what the blur takes from their opacities."""
+    """Gaussians of one view: half widths in pixels (0 where they are not drawn), positions, depths, inverse
+    covariances (xx, xy, yy), and what the blur takes from their opacities.
+    """
 
     radii: Tensor
     means: Tensor
@@ -29,7 +31,15 @@ class Splats(NamedTuple):
 
 
 def project(
-    means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int, eps2d: float, near: float
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    eps2d: float,
+    near: float,
 ) -> Splats:
     w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
     columns = [
@@ -41,7 +51,8 @@ def project(
     centres = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     depths = centres[:, 2]
     ahead = torch.where(depths > near, depths, 1.0)
-    focal, middle = K.diagonal()[:2], K[:2, 2]
+    focal = K.diagonal()[:2]
+    middle = K[:2, 2]
     tangents = centres[:, :2] / ahead[:, None]
     beyond = torch.stack([0.15 * width / focal[0], 0.15 * height / focal[1]])
     size = torch.stack([width - middle[0], height - middle[1]])
@@ -54,7 +65,9 @@ def project(
     conics = torch.stack([covariance[:, 1, 1], -covariance[:, 0, 1], covariance[:, 0, 0]], 1) / whole[:, None]
     places = tangents * focal + middle
     radii = (3.33 * covariance.detach().diagonal(dim1=1, dim2=2).sqrt()).ceil()
-    outside = ((places + radii <= 0) | (places - radii >= torch.stack([middle[0] + size[0], middle[1] + size[1]]))).any(1)
+    outside = (
+        (places + radii <= 0) | (places - radii >= torch.stack([middle[0] + size[0], middle[1] + size[1]]))
+    ).any(1)
     radii = torch.where((outside | (depths <= near))[:, None], 0.0, radii).int()
     return Splats(radii, places, depths, conics, (sharp / whole).clamp_min(1e-12).sqrt())
 
@@ -64,7 +77,9 @@ def harmonics(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
     return (basis[..., None] * coefficients[:, : basis.shape[1]]).sum(1)
 
 
-def composite(splats: Splats, opacities: Tensor, values: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+def composite(
+    splats: Splats, opacities: Tensor, values: Tensor, width: int, height: int
+) -> tuple[Tensor, Tensor]:
     """[H W D] and [H W], front to back."""
     order = torch.where((splats.radii > 0).all(1), splats.depths.detach(), torch.inf).argsort(stable=True)
     drawn = (splats.radii[order] > 0).all(1)[:, None, None]
@@ -96,22 +111,33 @@ def rasterization(
     render_mode: Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"] = "RGB",
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-    count, channels = len(means), colors.shape[-1]
+    count = len(means)
+    channels = colors.shape[-1]
     given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
     given |= {"viewmats": viewmats, "Ks": Ks} | ({} if backgrounds is None else {"backgrounds": backgrounds})
-    shapes = {"means": (count, 3), "quats": (count, 4), "scales": (count, 3), "opacities": (count,), "Ks": (1, 3, 3)}
+    shapes = {
+        "means": (count, 3),
+        "quats": (count, 4),
+        "scales": (count, 3),
+        "opacities": (count,),
+        "Ks": (1, 3, 3),
+    }
     shapes |= {"viewmats": (1, 4, 4), "backgrounds": (1, channels), "colors": (count, channels)}
     if sh_degree is not None:
         shapes["colors"] = (count, (sh_degree + 1) ** 2, 3)
     for name, tensor in given.items():
         assert tuple(tensor.shape) == shapes[name], f"{name}: {tuple(tensor.shape)}, not {shapes[name]}"
-        assert (tensor.dtype, tensor.device) == (means.dtype, means.device), f"{name}: {tensor.dtype} on {tensor.device}"
+        assert (tensor.dtype, tensor.device) == (means.dtype, means.device), (
+            f"{name}: {tensor.dtype} on {tensor.device}"
+        )
     assert means.is_floating_point() and type(width) is type(height) is int and near_plane > 0 and not packed
     assert render_mode in ("RGB", "RGB+D") and rasterize_mode in ("classic", "antialiased")
     # Values are looked at where that is no wait of a device.
     if means.device.type == "cpu":
         assert all(bool(tensor.isfinite().all()) for tensor in given.values() if tensor is not backgrounds)
-        assert bool((scales > 0).all() & (opacities > 0).all() & (opacities < 1).all() & (quats.norm(dim=1) > 0).all())
+        assert bool(
+            (scales > 0).all() & (opacities > 0).all() & (opacities < 1).all() & (quats.norm(dim=1) > 0).all()
+        )
         assert viewmats[0, 3].tolist() == [0, 0, 0, 1] and Ks[0, 2].tolist() == [0, 0, 1]
 
     splats = project(means, quats, scales, viewmats[0], Ks[0], width, height, eps2d, near_plane)
@@ -124,7 +150,11 @@ def rasterization(
         opacities = opacities * splats.compensations
     image, alpha = composite(splats, opacities, colors, width, height)
     if backgrounds is not None:
-        behind = backgrounds[0] if render_mode == "RGB" else torch.cat([backgrounds[0], torch.zeros_like(backgrounds[0, :1])])
+        behind = (
+            backgrounds[0]
+            if render_mode == "RGB"
+            else torch.cat([backgrounds[0], torch.zeros_like(backgrounds[0, :1])])
+        )
         image = image + (1 - alpha)[..., None] * behind
     return image[None], alpha[None, ..., None], {"radii": splats.radii[None]}
 

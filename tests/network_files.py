@@ -19,7 +19,9 @@ class Draw:
     def convolution(self, name: str, outputs: int, inputs: int, size: int, *, bias: bool = False) -> None:
         """`inputs` of each group."""
         scale = (1.5 / (inputs * size * size)) ** 0.5
-        self.tensors[f"{name}.weight"] = scale * torch.randn(outputs, inputs, size, size, generator=self.generator)
+        self.tensors[f"{name}.weight"] = scale * torch.randn(
+            outputs, inputs, size, size, generator=self.generator
+        )
         if bias:
             self.tensors[f"{name}.bias"] = 0.1 * torch.randn(outputs, generator=self.generator)
 
@@ -33,7 +35,8 @@ class Draw:
 
 def mobilenet_tensors(*, folded: bool, width: int = 4) -> dict[str, Tensor]:
     """torchvision's names and norms, or DeepLab's backbone without."""
-    draw, start = Draw(1), "backbone." if folded else "features."
+    draw = Draw(1)
+    start = "backbone." if folded else "features."
 
     def put(place: str, number: int, outputs: int, inputs: int, size: int) -> None:
         draw.convolution(f"{start}{place}.{number}", outputs, inputs, size, bias=folded)
@@ -57,9 +60,13 @@ LAYERS = {0: "1_1", 2: "1_2", 5: "2_1", 7: "2_2", 10: "3_1"}
 
 def vgg_convolutions(widths: Mapping[int, int], *, seed: int = 3, biased: bool = True) -> dict[str, Tensor]:
     """Convolutions of so many filters at places of torchvision's `features`."""
-    generator, tensors, inputs = torch.Generator().manual_seed(seed), {}, 3
+    generator = torch.Generator().manual_seed(seed)
+    tensors = {}
+    inputs = 3
     for place, outputs in widths.items():
-        tensors[f"features.{place}.weight"] = torch.randn(outputs, inputs, 3, 3, generator=generator) / (3 * inputs**0.5)
+        tensors[f"features.{place}.weight"] = torch.randn(outputs, inputs, 3, 3, generator=generator) / (
+            3 * inputs**0.5
+        )
         bias = 0.1 * torch.randn(outputs, generator=generator) if biased else torch.zeros(outputs)
         tensors[f"features.{place}.bias"] = bias
         inputs = outputs

@@ -20,8 +20,10 @@ HEIC = base64.b64decode(
     "D0L/eaGTFLfe4BICqBta62eaBnmoFA3RO/X81REUrbr7NtkYAAAABkV4aWYAAE1NACoAAAAIAAIBEAACAAAACAAAACYBEgADAAAAAQAGAAAAAAAAUGhv"
     "bmUgOQA="
 )
-"""64 x 48 pixels stored, red on the left, green over blue on the right, rotated upright by the format (`irot`) as by its EXIF
-orientation 6: it shows 48 x 64, red above, blue left of green below. Model "Phone 9"."""
+"""64 x 48 pixels stored, red on the left, green over blue on the right, rotated upright by the format
+(`irot`) as by its EXIF orientation 6: it shows 48 x 64, red above, blue left of green below. Model "Phone
+9".
+"""
 
 
 def exif_block(orientation: int) -> bytes:
@@ -30,7 +32,9 @@ def exif_block(orientation: int) -> bytes:
 
 
 def turned_jpeg(path: Path, stored: np.ndarray, orientation: int) -> np.ndarray:
-    """Write BGR pixels as a JPEG with an orientation; what it shows upright, RGB [H W 3], as decoders deliver it."""
+    """Write BGR pixels as a JPEG with an orientation; what it shows upright, RGB [H W 3], as decoders deliver
+    it.
+    """
     plain = bytes(cv2.imencode(".jpg", stored)[1])
     exif = exif_block(orientation)
     path.write_bytes(plain[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + plain[2:])
@@ -39,16 +43,21 @@ def turned_jpeg(path: Path, stored: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Stored pixels [H W C] as they are shown: EXIF 2.3, tag 0x0112, says where the first row and column belong."""
+    """Stored pixels [H W C] as they are shown: EXIF 2.3, tag 0x0112, says where the first row and column
+    belong.
+    """
     turns = {2: pixels[:, ::-1], 3: pixels[::-1, ::-1], 4: pixels[::-1]}
     columns = {5: pixels, 6: pixels[::-1], 7: pixels[::-1, ::-1], 8: pixels[:, ::-1]}
-    shown = columns[orientation].transpose(1, 0, 2) if orientation in columns else turns.get(orientation, pixels)
+    shown = (
+        columns[orientation].transpose(1, 0, 2) if orientation in columns else turns.get(orientation, pixels)
+    )
     return np.ascontiguousarray(shown)
 
 
 def oriented(image: Image.Image, form: str, orientation: int, **options: object) -> bytes:
     """The file of an image with an EXIF orientation."""
-    exif, out = Image.Exif(), io.BytesIO()
+    exif = Image.Exif()
+    out = io.BytesIO()
     exif[0x0112] = orientation
     where = {"tiffinfo": {0x0112: orientation}} if form == "TIFF" else {"exif": exif}
     image.save(out, form, **where, **options)

@@ -1,20 +1,23 @@
-"""CUDA's device rules without a GPU: tensors that say `cuda:0`, compute on the CPU, and refuse what a GPU would refuse.
+"""CUDA's device rules without a GPU: tensors that say `cuda:0`, compute on the CPU, and refuse what a GPU
+would refuse.
 
     with pretend_cuda() as seen:
         train(..., device="cuda:0")
     print(seen.syncs)      # what would have made the host wait, by operator
     print(seen.uploads)    # copies from the host to the device, by operator
 
-Mixing devices raises, `.numpy()` raises, `.item()`, `nonzero`, indexing by a mask and copies to the host work and are
-counted. Real values flow, so whole training runs, renders and restyles can be driven through it and compared with the
-CPU. Works with a CPU-only torch.
+Mixing devices raises, `.numpy()` raises, `.item()`, `nonzero`, indexing by a mask and copies to the host work
+and are counted. Real values flow, so whole training runs, renders and restyles can be driven through it and
+compared with the CPU. Works with a CPU-only torch.
 
-Name the device with its index ("cuda:0"): a CPU-only torch has no guard that could find the index of "cuda" alone; `auto`
-names it. Convolutions round their factors to TF32 unless torch is told otherwise, as on a card; their gradients do not.
+Name the device with its index ("cuda:0"): a CPU-only torch has no guard that could find the index of "cuda"
+alone; `auto` names it. Convolutions round their factors to TF32 unless torch is told otherwise, as on a card;
+their gradients do not.
 
-What it cannot show: memory (`mem_get_info` answers `memory`), streams, CUDA's own draws (generators are the CPU's), autocast
-(wrappers have no autocast key), and other threads: operators there are neither counted nor pretended. Numbers that reach a
-kernel as arguments (`x + 1.0`, `torch.full`) are no copies, on a card neither.
+What it cannot show: memory (`mem_get_info` answers `memory`), streams, CUDA's own draws (generators are the
+CPU's), autocast (wrappers have no autocast key), and other threads: operators there are neither counted nor
+pretended. Numbers that reach a kernel as arguments (`x + 1.0`, `torch.full`) are no copies, on a card
+neither.
 """
 
 import contextlib
@@ -42,7 +45,12 @@ SYNCS = (
 )
 RESHAPED = ("squeeze_", "unsqueeze_", "t_", "transpose_")
 CONVOLUTION = "aten.convolution.default"
-INDEXED = ("aten.index.Tensor", "aten.index_put.default", "aten.index_put_.default", "aten._index_put_impl_.default")
+INDEXED = (
+    "aten.index.Tensor",
+    "aten.index_put.default",
+    "aten.index_put_.default",
+    "aten._index_put_impl_.default",
+)
 
 
 class Pretended(torch.Tensor):
@@ -54,7 +62,12 @@ class Pretended(torch.Tensor):
     @staticmethod
     def __new__(cls, inner: torch.Tensor) -> "Pretended":
         return torch.Tensor._make_wrapper_subclass(
-            cls, inner.size(), strides=inner.stride(), storage_offset=inner.storage_offset(), dtype=inner.dtype, device="meta"
+            cls,
+            inner.size(),
+            strides=inner.stride(),
+            storage_offset=inner.storage_offset(),
+            dtype=inner.dtype,
+            device="meta",
         )
 
     def __init__(self, inner: torch.Tensor) -> None:
@@ -170,12 +183,16 @@ def _tf32(x: torch.Tensor) -> torch.Tensor:
 
 def _wrapped(x: torch.Tensor) -> torch.Tensor:
     if x.dtype == torch.float64 and Pretended.where == MPS:
-        raise TypeError("Cannot convert a MPS Tensor to float64 dtype as the MPS framework doesn't support float64.")
+        raise TypeError(
+            "Cannot convert a MPS Tensor to float64 dtype as the MPS framework doesn't support float64."
+        )
     return x if isinstance(x, Pretended) else Pretended(x)
 
 
 def _masked(args) -> bool:
-    """Whether indices are found from a mask: CUDA waits for their number, unless one value is written to all."""
+    """Whether indices are found from a mask: CUDA waits for their number, unless one value is written to
+    all.
+    """
     mask = any(isinstance(x, torch.Tensor) and x.dtype in (torch.bool, torch.uint8) for x in args[1])
     return mask and (len(args) < 3 or args[2].dim() > 0)
 
@@ -192,10 +209,13 @@ class _Mode(TorchDispatchMode):
 
 @contextlib.contextmanager
 def pretend_cuda(memory: int = 1 << 34, *, mps: bool = False) -> Iterator[_Mode]:
-    """Within it, `cuda:0` is a device of so many free bytes. Generators of it are the CPU's; inference mode is `no_grad`, which
-    wrappers allow. With `mps` it is Apple's device instead, `mps:0`, which has no float64.
+    """Within it, `cuda:0` is a device of so many free bytes. Generators of it are the CPU's; inference mode
+    is `no_grad`, which wrappers allow. With `mps` it is Apple's device instead, `mps:0`, which has no
+    float64.
     """
-    real, made, given = torch.Generator, torch.tensor, torch.as_tensor
+    real = torch.Generator
+    made = torch.tensor
+    given = torch.as_tensor
 
     class Generator:
         def __new__(cls, device="cpu"):

@@ -17,7 +17,8 @@ from fprf.splats.photographs import camera_of as pinhole_of
 def camera_of(scene: Scene, view: int) -> Camera:
     """A captured camera as a client's."""
     camera = pinhole_of(scene.cameras, view)
-    pose, lens = camera.world_to_camera, camera.intrinsics
+    pose = camera.world_to_camera
+    lens = camera.intrinsics
     axes = tuple(tuple(row) for row in pose[:3, :3].tolist())
     place = tuple((-pose[:3, :3].T @ pose[:3, 3]).tolist())
     numbers = tuple(float(lens[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))

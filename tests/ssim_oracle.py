@@ -15,9 +15,12 @@ def ssim_oracle(a: np.ndarray, b: np.ndarray, *, means: bool = True) -> float:
     found = []
     for i in range(a.shape[0] - 10):
         for j in range(a.shape[1] - 10):
-            p, q = a[i : i + 11, j : j + 11], b[i : i + 11, j : j + 11]
-            mp, mq = (window * p).sum((0, 1)), (window * q).sum((0, 1))
-            vp, vq = (window * (p - mp) ** 2).sum((0, 1)), (window * (q - mq) ** 2).sum((0, 1))
+            p = a[i : i + 11, j : j + 11]
+            q = b[i : i + 11, j : j + 11]
+            mp = (window * p).sum((0, 1))
+            mq = (window * q).sum((0, 1))
+            vp = (window * (p - mp) ** 2).sum((0, 1))
+            vq = (window * (q - mq) ** 2).sum((0, 1))
             first = (2 * mp * mq + 1e-4) / (mp**2 + mq**2 + 1e-4) if means else 1.0
             found.append(first * (2 * (window * (p - mp) * (q - mq)).sum((0, 1)) + 9e-4) / (vp + vq + 9e-4))
     return float(np.mean(found))

@@ -23,7 +23,9 @@ def points(n: int = 300, *, seed: int = 0) -> tuple[Tensor, Tensor]:
     """Content [n 6] and semantics [n 4], both far from 0."""
     g = torch.Generator().manual_seed(seed)
     kind = torch.randint(0, 3, (n,), generator=g)
-    content = torch.randn(3, 6, generator=g)[kind] * 2 + torch.randn(n, 6, generator=g) * (kind[:, None] + 1) + 5
+    content = (
+        torch.randn(3, 6, generator=g)[kind] * 2 + torch.randn(n, 6, generator=g) * (kind[:, None] + 1) + 5
+    )
     return content, torch.eye(3, 4)[kind] * 3 + torch.randn(n, 4, generator=g) * 0.5 + 1
 
 

@@ -32,7 +32,16 @@ def test_five_lines_do_what_the_verbs_do(world: World, tmp_path: Path) -> None:
     shot.save(tmp_path / "dusk.png")
 
     shutil.copytree(world.run, tmp_path / "run")
-    args = ["stylize", str(tmp_path / "run"), "--references", str(world.references[0]), "--strength", "0.8", "--views", "0008"]
+    args = [
+        "stylize",
+        str(tmp_path / "run"),
+        "--references",
+        str(world.references[0]),
+        "--strength",
+        "0.8",
+        "--views",
+        "0008",
+    ]
     assert cli.main([*args, "--output", str(tmp_path / "verb"), "--device", "cpu"]) == 0
     mine, theirs = (cv2.imread(str(path)) for path in (tmp_path / "dusk.png", tmp_path / "verb" / "0008.png"))
     assert mine.shape == (24, 32, 3) and np.array_equal(mine, theirs)
@@ -71,7 +80,8 @@ def test_a_style_file_goes_out_and_comes_back(scene: TrainedScene, world: World,
 
 def test_matches_of_any_camera(scene: TrainedScene, world: World) -> None:
     styled = scene.stylize(world.references)
-    captured, moved = styled.matches("0002"), styled.matches(styled.path("orbit", 5).select(torch.tensor([2])))
+    captured = styled.matches("0002")
+    moved = styled.matches(styled.path("orbit", 5).select(torch.tensor([2])))
     codes = len(styled.styled.codes.reference)  # type: ignore[union-attr]
     assert captured.taken.shape == moved.taken.shape == (24, 32, codes)
     assert not torch.equal(captured.taken, moved.taken)
@@ -80,7 +90,8 @@ def test_matches_of_any_camera(scene: TrainedScene, world: World) -> None:
 
 
 def test_a_camera_of_ones_own_looks_where_it_should(scene: TrainedScene) -> None:
-    position, target = scene.cameras.pose[0, :, 3].tolist(), [20.0, 1.0, 2.0]
+    position = scene.cameras.pose[0, :, 3].tolist()
+    target = [20.0, 1.0, 2.0]
     camera = scene.camera_at(position, target, fov=50, width=40, height=20)
     pixel, depth = project(camera, torch.tensor([0]), torch.tensor([target], dtype=torch.float64))
     assert torch.allclose(pixel, torch.tensor([[20.0, 10.0]], dtype=torch.float64)) and float(depth) > 0

@@ -1,4 +1,6 @@
-"""The pinned versions must be installable together with every extra: what is declared, and what installed packages want."""
+"""The pinned versions must be installable together with every extra: what is declared, and what installed
+packages want.
+"""
 
 import importlib.metadata as metadata
 import tomllib
@@ -9,7 +11,9 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
-LINES = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if line and not line.startswith("#")]
+LINES = [
+    line for line in (ROOT / "constraints.txt").read_text().splitlines() if line and not line.startswith("#")
+]
 PINS = {canonicalize_name(line.partition("==")[0]): line.partition("==")[2] for line in LINES}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 PARTS = (PROJECT["dependencies"], *PROJECT["optional-dependencies"].values())

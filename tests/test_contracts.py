@@ -1,4 +1,6 @@
-"""The contracts themselves: built-ins and plain plug-ins keep to them, and each breach is told. Parsers: tests/datamanagers."""
+"""The contracts themselves: built-ins and plain plug-ins keep to them, and each breach is told. Parsers:
+tests/datamanagers.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,7 +15,17 @@ from fprf import testing
 from fprf.blocks.config import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig
 from fprf.datamanagers.config import RayBatchesConfig
 from fprf.fields.config import ContentFieldConfig, PlanesConfig, SemanticPlanesConfig
-from fprf.interfaces import BlockLayout, ContentField, DataManager, Decoder, Encoder, Executor, LossTerm, Sampler, Stylizer
+from fprf.interfaces import (
+    BlockLayout,
+    ContentField,
+    DataManager,
+    Decoder,
+    Encoder,
+    Executor,
+    LossTerm,
+    Sampler,
+    Stylizer,
+)
 from fprf.plugins import registry
 from fprf.plugins.decoders.config import DecoderConfig
 from fprf.plugins.encoders.config import EncoderConfig, RandomConfig
@@ -46,7 +58,9 @@ BUILT_IN: list[tuple[Callable[[Any], None], Any]] = [
 ]
 
 
-@pytest.mark.parametrize(("check", "config"), BUILT_IN, ids=lambda value: getattr(value, "__name__", type(value).__name__))
+@pytest.mark.parametrize(
+    ("check", "config"), BUILT_IN, ids=lambda value: getattr(value, "__name__", type(value).__name__)
+)
 def test_built_ins_keep_to_the_contract(check: Callable[[Any], None], config: Any) -> None:
     check(config)
 
@@ -57,7 +71,9 @@ class Linear(ContentField):
     def __init__(self, wrong: str, channels: int, seed: int) -> None:
         super().__init__()
         generator = None if wrong == "seed" else torch.Generator().manual_seed(seed)
-        self.weight, self.wrong, self.calls = nn.Parameter(torch.rand(3, channels, generator=generator)), wrong, 0
+        self.weight = nn.Parameter(torch.rand(3, channels, generator=generator))
+        self.wrong = wrong
+        self.calls = 0
         if wrong == "idle":
             self.spare = nn.Parameter(torch.ones(()))
 
@@ -104,7 +120,8 @@ class Term(LossTerm):
         self, rendered: Rendered, batch: Batch, parts: Parts, *, step: int, generator: torch.Generator | None
     ) -> Tensor:
         assert rendered.weights is not None
-        weights, opacity = rendered.weights, rendered.weights.sum(1)
+        weights = rendered.weights
+        opacity = rendered.weights.sum(1)
         value = opacity.square().mean()
         wrongs: dict[str, Callable[[], Tensor]] = {
             "item": lambda: value * (1 if value.item() > 0 else 2),
@@ -132,8 +149,11 @@ class Pixels(DataManager):
     """The built-in one, with one thing wrong."""
 
     def __init__(self, inner: DataManager, wrong: str) -> None:
-        self.inner, self.wrong, self.calls = inner, wrong, 0
-        self.content_store, self.semantic_store = inner.content_store, inner.semantic_store
+        self.inner = inner
+        self.wrong = wrong
+        self.calls = 0
+        self.content_store = inner.content_store
+        self.semantic_store = inner.semantic_store
 
     def batch(self, step: int) -> Batch:
         self.calls += 1
@@ -329,7 +349,11 @@ OTHERS: list[tuple[Callable[[Any], None], Any, str]] = [
     (testing.check_sampler, giving(SamplerConfig, Backwards()), "must be sorted"),
     (testing.check_stylizer, giving(StylizerConfig, Averaging()), "must not depend on the others"),
     (testing.check_layout, giving(LayoutConfig, Halves()), "same border"),
-    (partial(testing.check_decoder, encoder="any", channels=6), giving(DecoderConfig, Bright()), r"in \[0, 1\]"),
+    (
+        partial(testing.check_decoder, encoder="any", channels=6),
+        giving(DecoderConfig, Bright()),
+        r"in \[0, 1\]",
+    ),
     (testing.check_executor, giving(ExecutorConfig, Silent()), "must reach the caller"),
 ]
 

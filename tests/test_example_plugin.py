@@ -24,10 +24,22 @@ EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "plugin"
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    source, target = tmp_path_factory.mktemp("source") / "plugin", tmp_path_factory.mktemp("site")
+    source = tmp_path_factory.mktemp("source") / "plugin"
+    target = tmp_path_factory.mktemp("site")
     shutil.copytree(EXAMPLE, source, ignore=shutil.ignore_patterns("build", "*.egg-info", "__pycache__"))
-    command = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-build-isolation", "--no-index", "--quiet"]
-    ended = subprocess.run([*command, "--target", str(target), str(source)], capture_output=True, text=True, check=False)
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--no-deps",
+        "--no-build-isolation",
+        "--no-index",
+        "--quiet",
+    ]
+    ended = subprocess.run(
+        [*command, "--target", str(target), str(source)], capture_output=True, text=True, check=False
+    )
     if ended.returncode and "No module named pip" in ended.stderr:
         pytest.skip("pip is not installed in this environment")
     assert ended.returncode == 0, ended.stderr
@@ -82,6 +94,8 @@ def test_choosing_it_imports_no_torch(site: Path) -> None:
         "print(code, 'torch' in sys.modules, file=sys.stderr)"
     )
     script = f"import sys; sys.path.insert(0, {str(site)!r})\n{code}"
-    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False)
+    ended = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False
+    )
     assert "--semantic.encoder.orientations INT" in ended.stdout
     assert ended.stderr.strip() == "0 False"

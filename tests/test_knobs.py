@@ -1,6 +1,8 @@
-"""Every field that shapes what is learnt: a second value survives JSON and the command line, and changes something.
+"""Every field that shapes what is learnt: a second value survives JSON and the command line, and changes
+something.
 
-What it changes is named beside it; a field without an entry fails the test, so that no dead knob can be added.
+What it changes is named beside it; a field without an entry fails the test, so that no dead knob can be
+added.
 """
 
 from dataclasses import replace
@@ -77,11 +79,15 @@ SECOND: dict[str, tuple[Any, str]] = {
     "statistics.rays": (64, "style"),
     "statistics.regions": (1, "style"),
 }
-"""A second value of every field of `fprf-lite` that shapes what is learnt, valid for the tiny config too; where it shows."""
+"""A second value of every field of `fprf-lite` that shapes what is learnt, valid for the tiny config too;
+where it shows.
+"""
 
 
 def differ(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
-    return a.keys() != b.keys() or any(a[name].shape != b[name].shape or not torch.equal(a[name], b[name]) for name in a)
+    return a.keys() != b.keys() or any(
+        a[name].shape != b[name].shape or not torch.equal(a[name], b[name]) for name in a
+    )
 
 
 def spelled(value: Any) -> list[str]:
@@ -115,7 +121,9 @@ def _trained() -> dict[int, dict[str, torch.Tensor]]:
 
 
 @pytest.mark.parametrize("path", shown("training"))
-def test_it_changes_the_training(path: str, world: World, tmp_path: Path, _trained: dict[int, dict[str, torch.Tensor]]) -> None:
+def test_it_changes_the_training(
+    path: str, world: World, tmp_path: Path, _trained: dict[int, dict[str, torch.Tensor]]
+) -> None:
     """Parameters after a few steps differ."""
 
     def after(config: TrainConfig, folder: Path) -> dict[str, torch.Tensor]:
@@ -130,7 +138,9 @@ def test_it_changes_the_training(path: str, world: World, tmp_path: Path, _train
     config = replaced(base, path, SECOND[path][0])
     if path.startswith("datamanager."):
         made = config.datamanager
-        assert isinstance(made, type(world.config.datamanager)) and isinstance(world.prepared.manager, RayBatches)
+        assert isinstance(made, type(world.config.datamanager)) and isinstance(
+            world.prepared.manager, RayBatches
+        )
         world = replace(world, prepared=prepared_for(config))
     assert differ(_trained[soon], after(config, tmp_path / "other"))
 
@@ -149,7 +159,8 @@ def test_it_changes_the_targets(path: str, world: World) -> None:
 
 @pytest.mark.parametrize("path", shown("style"))
 def test_it_changes_the_style(path: str, world: World) -> None:
-    trained, scene = world.load(), world.prepared.scene
+    trained = world.load()
+    scene = world.prepared.scene
     first, second = (
         measure_style(config, trained.model, scene.cameras, scene.train)._asdict()
         for config in (world.config, replaced(world.config, path, SECOND[path][0]))
@@ -160,7 +171,9 @@ def test_it_changes_the_style(path: str, world: World) -> None:
 @pytest.mark.parametrize("where", ["points", "masks"])
 def test_it_counts_where_the_capture_has_them(where: str, world: World, tmp_path: Path) -> None:
     """Rays through points and the loss on those; masks of what is used and of the sky."""
-    scene, base, found = replace(world.prepared.scene, seen=None), replace(world.config, steps=5), []
+    scene = replace(world.prepared.scene, seen=None)
+    base = replace(world.config, steps=5)
+    found = []
     if where == "masks":
         width, height = scene.cameras.size[0].tolist()
         half = np.zeros((height, width, 3), np.uint8)
@@ -174,5 +187,7 @@ def test_it_counts_where_the_capture_has_them(where: str, world: World, tmp_path
             scene=scene, content=None, semantic=None, dim=8, cache=tmp_path / "cache", seed=config.seed
         )
         there = replace(world, prepared=world.prepared._replace(scene=scene, manager=manager))
-        found.append(checkpoint.load(trained_for(there, tmp_path / f"run{name}", config).checkpoints, 5).model)
+        found.append(
+            checkpoint.load(trained_for(there, tmp_path / f"run{name}", config).checkpoints, 5).model
+        )
     assert len(found) == 3 and all(differ(found[0], other) for other in found[1:])

@@ -1,4 +1,6 @@
-"""Packages import each other in one direction, also within functions; help and configs import nothing heavy."""
+"""Packages import each other in one direction, also within functions; help and configs import nothing
+heavy.
+"""
 
 import ast
 import subprocess
@@ -18,9 +20,13 @@ ORDER = (
     *("training", "splats", "pretraining", "reconstruction", "evaluation", "export"),
     *("page", "api", "cli", "__main__"),
 )
-"""Layers from the lowest to the highest. Imports within functions, such as those of `build`, may lead anywhere."""
+"""Layers from the lowest to the highest. Imports within functions, such as those of `build`, may lead
+anywhere.
+"""
 MECHANISM = ("config.py", "methods.py")
-"""Files of any package that belong to the configs, as do the modules of `plugins` itself: none of them imports torch."""
+"""Files of any package that belong to the configs, as do the modules of `plugins` itself: none of them
+imports torch.
+"""
 
 
 def layer(parts: tuple[str, ...]) -> str:
@@ -41,7 +47,9 @@ def imported(file: Path) -> Iterator[tuple[str, ...]]:
             base = (*here[: len(here) - node.level + 1], *(node.module.split(".") if node.module else ()))
             for alias in node.names:
                 whole = (*base, alias.name)
-                module = (ROOT.joinpath(*whole).with_suffix(".py").is_file() or ROOT.joinpath(*whole).is_dir()) and alias.name
+                module = (
+                    ROOT.joinpath(*whole).with_suffix(".py").is_file() or ROOT.joinpath(*whole).is_dir()
+                ) and alias.name
                 yield whole if module else base
 
 
@@ -58,7 +66,9 @@ def test_imports_lead_to_lower_layers() -> None:
 
 
 def imports(tree: ast.AST) -> Iterator[ast.ImportFrom]:
-    """Relative imports anywhere in a module but in a config's `build`, which finds its implementation, and for types alone."""
+    """Relative imports anywhere in a module but in a config's `build`, which finds its implementation, and
+    for types alone.
+    """
     for node in ast.iter_child_nodes(tree):
         for_types = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
         if for_types or (isinstance(node, ast.FunctionDef) and node.name == "build"):
@@ -69,17 +79,24 @@ def imports(tree: ast.AST) -> Iterator[ast.ImportFrom]:
 
 
 def test_no_module_imports_itself_by_way_of_others() -> None:
-    names = {".".join(("fprf", *file.relative_to(ROOT).with_suffix("").parts)): file for file in ROOT.rglob("*.py")}
+    names = {
+        ".".join(("fprf", *file.relative_to(ROOT).with_suffix("").parts)): file for file in ROOT.rglob("*.py")
+    }
     modules = {name.removesuffix(".__init__"): file for name, file in names.items()}
     leads: dict[str, set[str]] = {name: set() for name in modules}
     for name, file in modules.items():
         package = name.split(".") if file.name == "__init__.py" else name.split(".")[:-1]
         for node in imports(ast.parse(file.read_text())):
-            base = ".".join([*package[: len(package) - node.level + 1], *(node.module or "").split(".")]).removesuffix(".")
-            leads[name] |= {f"{base}.{each.name}" if f"{base}.{each.name}" in modules else base for each in node.names} - {name}
+            base = ".".join(
+                [*package[: len(package) - node.level + 1], *(node.module or "").split(".")]
+            ).removesuffix(".")
+            leads[name] |= {
+                f"{base}.{each.name}" if f"{base}.{each.name}" in modules else base for each in node.names
+            } - {name}
 
     def reached(start: str) -> set[str]:
-        found, todo = set(), [start]
+        found = set()
+        todo = [start]
         while todo:
             new = leads[todo.pop()] - found
             found |= new
@@ -87,7 +104,11 @@ def test_no_module_imports_itself_by_way_of_others() -> None:
         return found
 
     reach = {name: reached(name) for name in modules}
-    circles = {tuple(sorted(other for other in reach[name] if name in reach[other])) for name in modules if name in reach[name]}
+    circles = {
+        tuple(sorted(other for other in reach[name] if name in reach[other]))
+        for name in modules
+        if name in reach[name]
+    }
     assert not circles
 
 
@@ -117,7 +138,11 @@ def _fresh(code: str) -> list[str]:
     """Run in a new interpreter, in which warnings are errors; lines on standard error."""
     before = f"import sys\ndef report(what): print(what, *({{*{HEAVY!r}}} & {{*sys.modules}}), sep='|', file=sys.stderr)\n"
     ended = subprocess.run(
-        [sys.executable, "-W", "error", "-c", before + code], capture_output=True, text=True, timeout=240, check=False
+        [sys.executable, "-W", "error", "-c", before + code],
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
     )
     assert ended.returncode == 0, ended.stderr
     return ended.stderr.splitlines()
@@ -130,7 +155,9 @@ def test_configs_import_nothing_heavy(code: str) -> None:
 
 
 def test_help_and_parsing_import_nothing_heavy() -> None:
-    code = f"from fprf.cli.main import main\nfor args in {COMMANDS!r}:\n    report(f'{{args}} {{main(args)}}')"
+    code = (
+        f"from fprf.cli.main import main\nfor args in {COMMANDS!r}:\n    report(f'{{args}} {{main(args)}}')"
+    )
     lines = [line for line in _fresh(code) if line.startswith("[")]
     codes = [2 if args in (["train"], ["train", "fprf", "--stpes", "3"]) else 0 for args in COMMANDS]
     assert lines == [f"{args} {code}" for args, code in zip(COMMANDS, codes, strict=True)]

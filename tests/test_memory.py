@@ -1,4 +1,6 @@
-"""What libraries say when memory is short, parts that get smaller, the one line at the end; freed memory is kept."""
+"""What libraries say when memory is short, parts that get smaller, the one line at the end; freed memory is
+kept.
+"""
 
 import subprocess
 import sys
@@ -18,7 +20,9 @@ CUDA = "CUDA out of memory. Tried to allocate 1.50 GiB. GPU 0 has a total capaci
 
 
 def opencv(code: int) -> cv2.error:
-    error = cv2.error("OpenCV(5.0.0): error: Failed to allocate 2700000000 bytes in function 'OutOfMemoryError'")
+    error = cv2.error(
+        "OpenCV(5.0.0): error: Failed to allocate 2700000000 bytes in function 'OutOfMemoryError'"
+    )
     error.code = code
     return error
 
@@ -35,7 +39,11 @@ def caused(error: Exception, cause: Exception) -> Exception:
         (MemoryError(), True, None),
         (RuntimeError(TORCH), True, 4096),
         (torch.OutOfMemoryError(CUDA), True, 3 << 29),
-        (RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"), True, None),
+        (
+            RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"),
+            True,
+            None,
+        ),
         (RuntimeError("std::bad_alloc"), True, None),
         (opencv(-4), True, 2_700_000_000),
         (opencv(-215), False, 2_700_000_000),
@@ -67,7 +75,10 @@ def test_everything_is_done_once_and_in_order_whatever_fits(count: int, size: in
     assert [each for part in found for each in part] == list(range(count))
     assert tried == sorted(tried, reverse=True), "once smaller, always smaller"
     assert all(part >= min(size, LEAST) for part in tried)
-    assert all(tried.count(part) >= 1 and part in {max(LEAST, size >> k) for k in range(20)} | {size} for part in tried)
+    assert all(
+        tried.count(part) >= 1 and part in {max(LEAST, size >> k) for k in range(20)} | {size}
+        for part in tried
+    )
 
 
 def test_other_errors_and_too_little_for_the_least_are_raised() -> None:
@@ -81,7 +92,9 @@ def test_other_errors_and_too_little_for_the_least_are_raised() -> None:
     with pytest.raises(ZeroDivisionError):
         list(in_parts(5, 2, broken))
     tried: list[int] = []
-    with pytest.raises(OutOfMemoryError, match=r"1024 rays at a time: not enough memory; .* wanted 0.00 GiB more"):
+    with pytest.raises(
+        OutOfMemoryError, match=r"1024 rays at a time: not enough memory; .* wanted 0.00 GiB more"
+    ):
         list(in_parts(10_000, 5000, short))
     assert tried == [5000, 2500, 1250, 1024]
     with pytest.raises(OutOfMemoryError, match="300 rays at a time"):
@@ -89,7 +102,8 @@ def test_other_errors_and_too_little_for_the_least_are_raised() -> None:
 
 
 def test_chunks_follow_the_memory_of_an_accelerator_alone() -> None:
-    cpu, cuda = torch.device("cpu"), torch.device("cuda:0")
+    cpu = torch.device("cpu")
+    cuda = torch.device("cuda:0")
     assert chunk_size(8192, cpu) == 8192 and free_memory(cpu) is None
     with pretend_cuda(memory=24 << 30):
         assert free_memory(cuda) == 24 << 30
@@ -117,7 +131,9 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 
 def faults(how: str) -> str:
-    ended = subprocess.run([sys.executable, "-c", FAULTS, how], capture_output=True, text=True, check=True, timeout=60)
+    ended = subprocess.run(
+        [sys.executable, "-c", FAULTS, how], capture_output=True, text=True, check=True, timeout=60
+    )
     return ended.stdout.strip()
 
 

@@ -56,7 +56,8 @@ def test_waits_and_copies_are_counted(what: dict[str, Callable[[], object]], nam
 
 
 @pytest.mark.parametrize(
-    "wrong", [lambda: ones(3) + torch.ones(3), lambda: ones(3).numpy(), lambda: torch.stack([ones(2), torch.ones(2)])]
+    "wrong",
+    [lambda: ones(3) + torch.ones(3), lambda: ones(3).numpy(), lambda: torch.stack([ones(2), torch.ones(2)])],
 )
 def test_what_cuda_refuses_is_refused(wrong: Callable[[], object]) -> None:
     with pretend_cuda(), pytest.raises((RuntimeError, TypeError)):

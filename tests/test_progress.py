@@ -43,4 +43,10 @@ def test_a_terminal_sees_a_bar_and_no_json(monkeypatch: pytest.MonkeyPatch) -> N
         display.training(report(7, 0.5))
         display.count(1, 2, "rendering")
     text = screen.getvalue()
-    assert "a town [of] 3" in text and "step 7" in text and "20.12 dB" in text and "rendering" in text and "{" not in text
+    assert (
+        "a town [of] 3" in text
+        and "step 7" in text
+        and "20.12 dB" in text
+        and "rendering" in text
+        and "{" not in text
+    )

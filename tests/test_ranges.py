@@ -1,4 +1,6 @@
-"""Checks of ranges, the sentences of errors, and that every config refuses what lies outside of its ranges by name."""
+"""Checks of ranges, the sentences of errors, and that every config refuses what lies outside of its ranges by
+name.
+"""
 
 import copy
 import math
@@ -15,7 +17,14 @@ from hypothesis import strategies as st
 from benchmarks.restyle import RestyleConfig
 from fprf.blocks.config import AdaptiveConfig, GridConfig
 from fprf.checks import at_least, between, positive
-from fprf.config import LossConfig, OptimizerConfig, RenderConfig, SemanticConfig, StatisticsConfig, TrainConfig
+from fprf.config import (
+    LossConfig,
+    OptimizerConfig,
+    RenderConfig,
+    SemanticConfig,
+    StatisticsConfig,
+    TrainConfig,
+)
 from fprf.errors import CheckpointError, ConfigError, FprfError
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.plugins.encoders.config import ConcatConfig, DinoConfig, Dinov2Config, RandomConfig, Vgg19Config
@@ -29,7 +38,13 @@ from tools.distil.config import DistilConfig
 
 PLANES: dict[str, list[Any]] = {"resolutions": [(), (64, 1)], "channels": [0], "hidden": [0], "layers": [-1]}
 OUTSIDE: dict[type, dict[str, list[Any]]] = {
-    TrainConfig: {"downscale": [0], "steps": [-1], "seed": [2**31], "minutes": [0.0, inf], "checkpoint_minutes": [0.0]},
+    TrainConfig: {
+        "downscale": [0],
+        "steps": [-1],
+        "seed": [2**31],
+        "minutes": [0.0, inf],
+        "checkpoint_minutes": [0.0],
+    },
     SemanticConfig: {"dim": [0], "samples": [0]},
     LossConfig: {
         "rgb": [-1.0],
@@ -38,7 +53,12 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
         "penalties": [(("a", -1.0),), (("variation", 1.0),)],
     },
     OptimizerConfig: {"rate": [0.0], "final": [1.5], "beta2": [-0.1], "eps": [0.0]},
-    RenderConfig: {"budget": [0.6], "train_budget": [-0.1], "chunk": [0], "background": [(0.0, 1.5, 0.0), (0.0, nan, 0.0)]},
+    RenderConfig: {
+        "budget": [0.6],
+        "train_budget": [-0.1],
+        "chunk": [0],
+        "background": [(0.0, 1.5, 0.0), (0.0, nan, 0.0)],
+    },
     StatisticsConfig: {"rays": [3], "regions": [0]},
     QualityConfig: {"max_memory": [0.0], "resolution": [0.0, 1.5]},
     PlanesConfig: PLANES | {"degree": [0, 5]},
@@ -68,7 +88,8 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
     RayConfig: {"workers": [0], "processors": [0.0], "retries": [-1], "gpus": [-1.0]},
     DistilConfig: {name: [0] for name in ("minutes", "steps", "batch", "rate", "crops")}
     | {"seed": [-1], "photos": [1], "size": [8]},
-    PretrainDecoderConfig: {name: [-1] for name in ("noise", "style", "content")} | {"crops": [1], "pairs": [0]},
+    PretrainDecoderConfig: {name: [-1] for name in ("noise", "style", "content")}
+    | {"crops": [1], "pairs": [0]},
     StyleConfig: {
         "strength": [1.1],
         "at": [nan],
@@ -80,7 +101,12 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
     },
     RestyleConfig: {"frames": [7], "seeds": [(1, 2)], "blend": [1.1], "palettes": [()], "longest": [8]},
 }
-ROWS = [(kind, name, value) for kind, fields in OUTSIDE.items() for name, values in fields.items() for value in values]
+ROWS = [
+    (kind, name, value)
+    for kind, fields in OUTSIDE.items()
+    for name, values in fields.items()
+    for value in values
+]
 
 
 @pytest.mark.parametrize(("kind", "name", "value"), ROWS)
@@ -117,7 +143,11 @@ def test_what_passes(value: float, low: float, high: float) -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_what_is_not_a_number_never_passes(value: float) -> None:
-    for check in (lambda: positive("x", value), lambda: at_least("x", value, -1e308), lambda: between("x", value, 0, 1e308)):
+    for check in (
+        lambda: positive("x", value),
+        lambda: at_least("x", value, -1e308),
+        lambda: between("x", value, 0, 1e308),
+    ):
         assert not passes(check)
 
 

@@ -19,7 +19,11 @@ from fprf.plugins.samplers.config import ProposalConfig
 from fprf.plugins.slots import replace, slots
 from fprf.testing import check_config
 
-METHODS = [name for name in registry.installed("fprf.methods") if registry.entry("fprf.methods", name).package[:5] == "fprf "]
+METHODS = [
+    name
+    for name in registry.installed("fprf.methods")
+    if registry.entry("fprf.methods", name).package[:5] == "fprf "
+]
 PLUGINS = [(group, name) for group in KINDS for name in registry.installed(group)]
 
 
@@ -72,7 +76,9 @@ def test_a_plugin_can_be_chosen_and_all_its_fields_set(group: str, name: str) ->
     default, _ = load_method("fprf-lite")
     chosen = registry.load_object(group, name)
     assert isinstance(chosen, type)
-    places = [slot.path for slot in slots(default) if slot.kind.group == group and issubclass(chosen, slot.kind)]
+    places = [
+        slot.path for slot in slots(default) if slot.kind.group == group and issubclass(chosen, slot.kind)
+    ]
     if not places:
         pytest.skip(f"no slot of the knob tree takes {group}")
     config = replace(default, places[0], chosen())
@@ -81,7 +87,8 @@ def test_a_plugin_can_be_chosen_and_all_its_fields_set(group: str, name: str) ->
 
 def test_the_papers_method_has_the_papers_sizes() -> None:
     config = fprf()
-    field, sampler = config.content.field, config.sampler
+    field = config.content.field
+    sampler = config.sampler
     assert isinstance(field, PlanesConfig) and field.resolutions == (64, 128, 256, 512)
     assert isinstance(sampler, ProposalConfig) and (*sampler.samples, sampler.final) == (256, 128, 48)
     assert config.content.encoder == Vgg19Config(layer="relu2_1") and config.semantic.encoder == SEMANTICS

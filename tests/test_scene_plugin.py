@@ -168,9 +168,26 @@ class PlaneView(SceneView):
 def trained(world: World, folder: Path) -> Iterator[Path]:
     """Install the package and train a plane; its run folder."""
     with packages_in(folder / "site") as packages:
-        points = {"fprf.methods": {"plane": "acme_plane:plane"}, "fprf.scenes": {"plane": "acme_plane:open_plane"}}
+        points = {
+            "fprf.methods": {"plane": "acme_plane:plane"},
+            "fprf.scenes": {"plane": "acme_plane:open_plane"},
+        }
         packages.install("acme-plane", points, code={"acme_plane": PLANE})
-        assert main(["train", "plane", "--data", str(world.town), "--output", str(folder / "run"), "--downscale", "1"]) == 0
+        assert (
+            main(
+                [
+                    "train",
+                    "plane",
+                    "--data",
+                    str(world.town),
+                    "--output",
+                    str(folder / "run"),
+                    "--downscale",
+                    "1",
+                ]
+            )
+            == 0
+        )
         yield folder / "run"
 
 
@@ -179,22 +196,42 @@ def run(world: World, tmp_path: Path) -> Iterator[Path]:
     yield from trained(world, tmp_path)
 
 
-def test_every_verb_takes_a_kind_of_scene_from_another_package(run: Path, world: World, tmp_path: Path) -> None:
+def test_every_verb_takes_a_kind_of_scene_from_another_package(
+    run: Path, world: World, tmp_path: Path
+) -> None:
     dusk = ["--references", str(world.references[0])]
     assert main(["eval", str(run)]) == 0
     metrics = json.loads((run / "metrics.json").read_text())
-    assert metrics["method"] == "plane" and metrics["train_steps"] == 20 and metrics["views"] == 2 and metrics["psnr"] > 10
+    assert (
+        metrics["method"] == "plane"
+        and metrics["train_steps"] == 20
+        and metrics["views"] == 2
+        and metrics["psnr"] > 10
+    )
     assert main(["stylize", str(run), *dusk, "--views", "0000", "--output", str(tmp_path / "dusk")]) == 0
-    plain, styled = (load_image(next(folder.rglob("0000*.png"))) for folder in (run / "renders", tmp_path / "dusk"))
+    plain, styled = (
+        load_image(next(folder.rglob("0000*.png"))) for folder in (run / "renders", tmp_path / "dusk")
+    )
     assert styled.shape == plain.shape and abs(styled.astype(float) - plain.astype(float)).mean() > 3
-    film = ["--path", "interpolate", "--frames", "2", "--show", "colour", "depth", "--output", str(tmp_path / "film")]
+    film = [
+        "--path",
+        "interpolate",
+        "--frames",
+        "2",
+        "--show",
+        "colour",
+        "depth",
+        "--output",
+        str(tmp_path / "film"),
+    ]
     assert main(["render", str(run), *dusk, *film]) == 0
     assert len(list((tmp_path / "film").glob("*.png"))) >= 2
     assert main(["gallery", str(run), *dusk, "--output", str(tmp_path / "page.html")]) == 0
     assert main(["export", str(run), "cameras", "--images", "--output", str(tmp_path / "files")]) == 0
     assert len(list((tmp_path / "files" / "images").glob("*.png"))) == 10
     assert fprf.load(run).render("0000").rgb.shape == (24, 32, 3)
-    opened, client = open_run(run, "cpu", QualityConfig()), Listener()
+    opened = open_run(run, "cpu", QualityConfig())
+    client = Listener()
     with Session(replace(view_of_run(opened), pixels=32), client.post) as session:
         session.upload(world.references[0].read_bytes(), "dusk")
         session.handle("browser", View(camera=camera_of(opened.scene, 0), captured=True))
@@ -206,7 +243,16 @@ def test_every_verb_takes_a_kind_of_scene_from_another_package(run: Path, world:
 
 def test_it_goes_on_like_any_other(run: Path, world: World, tmp_path: Path) -> None:
     assert main(["train", str(run / "config.json"), "--steps", "30"]) == 0
-    words = ["--data", str(world.town), "--output", str(tmp_path / "once"), "--downscale", "1", "--steps", "30"]
+    words = [
+        "--data",
+        str(world.town),
+        "--output",
+        str(tmp_path / "once"),
+        "--downscale",
+        "1",
+        "--steps",
+        "30",
+    ]
     assert main(["train", "plane", *words]) == 0
     resumed, once = (fprf.load(each).trained for each in (run, tmp_path / "once"))
     assert resumed.step == once.step == 30

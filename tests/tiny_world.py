@@ -1,4 +1,6 @@
-"""A town of ten pictures of 32 x 24 pixels and a model of a few thousand numbers, trained for 15 steps: made once a session."""
+"""A town of ten pictures of 32 x 24 pixels and a model of a few thousand numbers, trained for 15 steps: made
+once a session.
+"""
 
 import json
 from collections.abc import Callable
@@ -53,8 +55,10 @@ class Altered(DataManager):
     """A data manager with changed batches."""
 
     def __init__(self, inner: DataManager, change: Change) -> None:
-        self.inner, self.change = inner, change
-        self.content_store, self.semantic_store = inner.content_store, inner.semantic_store
+        self.inner = inner
+        self.change = change
+        self.content_store = inner.content_store
+        self.semantic_store = inner.semantic_store
 
     def batch(self, step: int) -> Batch:
         return self.change(step, self.inner.batch(step))
@@ -68,7 +72,9 @@ class Altered(DataManager):
 
 def spoilt(value: float, *steps: int) -> Change:
     """Colours of some steps are all this value."""
-    return lambda step, batch: batch._replace(rgb=torch.full_like(batch.rgb, value)) if step in steps else batch
+    return lambda step, batch: (
+        batch._replace(rgb=torch.full_like(batch.rgb, value)) if step in steps else batch
+    )
 
 
 def stopping(at: int) -> Change:
@@ -93,7 +99,9 @@ def tiny(data: Path, output: Path) -> TrainConfig:
         device="cpu",
         datamanager=RayBatchesConfig(rays=256, semantic_share=0.5),
         sampler=ProposalConfig(samples=(16,), final=8, resolutions=(8,), anneal_steps=10),
-        content=replace(lite.content, field=PlanesConfig(resolutions=(8, 16), channels=8, hidden=32, layers=1)),
+        content=replace(
+            lite.content, field=PlanesConfig(resolutions=(8, 16), channels=8, hidden=32, layers=1)
+        ),
         semantic=replace(
             lite.semantic,
             encoder=BundledSemanticConfig(),  # the quickest one that ships
@@ -166,8 +174,12 @@ def taught(
     return learner.model
 
 
-def save_checkpoint(root: Path, model: nn.Module, optimizer: torch.optim.Optimizer, *, step: int, seconds: float) -> Path:
-    return checkpoint.write(root, model.state_dict(), checkpoint.moments_of(optimizer), step=step, seconds=seconds)
+def save_checkpoint(
+    root: Path, model: nn.Module, optimizer: torch.optim.Optimizer, *, step: int, seconds: float
+) -> Path:
+    return checkpoint.write(
+        root, model.state_dict(), checkpoint.moments_of(optimizer), step=step, seconds=seconds
+    )
 
 
 def parameters(run: Run, step: int) -> dict[str, torch.Tensor]:
@@ -175,8 +187,13 @@ def parameters(run: Run, step: int) -> dict[str, torch.Tensor]:
     from fprf.training.checkpoint import load
 
     saved = load(run.checkpoints, step)
-    named = {**{f"model.{k}": v for k, v in saved.model.items()}, **{f"adam.{k}": v for k, v in saved.optimizer.items()}}
-    return {name: tensor.clone() for name, tensor in named.items()}  # else they are maps of files that tests spoil
+    named = {
+        **{f"model.{k}": v for k, v in saved.model.items()},
+        **{f"adam.{k}": v for k, v in saved.optimizer.items()},
+    }
+    return {
+        name: tensor.clone() for name, tensor in named.items()
+    }  # else they are maps of files that tests spoil
 
 
 def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:

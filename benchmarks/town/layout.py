@@ -1,8 +1,8 @@
 """A town from a seed: which solids stand where.
 
-The street runs along x from -8 to 42 m and ends in a square before a church; houses, front gardens, trees and lamps line
-it on both sides (y < 0 and y > 0); a wood all around hides the horizon, so that every ray ends within about 80 m. A longer
-street begins further back.
+The street runs along x from -8 to 42 m and ends in a square before a church; houses, front gardens, trees and
+lamps line it on both sides (y < 0 and y > 0); a wood all around hides the horizon, so that every ray ends
+within about 80 m. A longer street begins further back.
 """
 
 import math
@@ -11,11 +11,30 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .shapes import LANTERN, Face, Finish, Lot, Material, Shape, bush, car, church, forest, hedge, house, lamp, tree
+from .shapes import (
+    LANTERN,
+    Face,
+    Finish,
+    Lot,
+    Material,
+    Shape,
+    bush,
+    car,
+    church,
+    forest,
+    hedge,
+    house,
+    lamp,
+    tree,
+)
 
-ROAD_HALF, WALK_HALF, KERB = 3.4, 5.4, 0.22
+ROAD_HALF = 3.4
+WALK_HALF = 5.4
+KERB = 0.22
 """Half widths of the road and of road plus sidewalks, and the width of the kerb, in metres."""
-START, END, SQUARE_HALF = -8.0, 41.0, 9.0
+START = -8.0
+END = 41.0
+SQUARE_HALF = 9.0
 """Start of the houses (in the shortest town), end of the road at the square, and half the square's width."""
 CROSSING = 13.0
 """Start of the zebra crossing."""
@@ -110,14 +129,19 @@ def _avenue(start: float, rng: np.random.Generator) -> tuple[list[Shape], list[t
 
 def _wood(start: float, rng: np.random.Generator) -> list[Shape]:
     """Overlapping crowns on a rectangle around the town."""
-    low, high = np.array([start - 9.0, -27.0]), np.array([70.0, 27.0])
+    low = np.array([start - 9.0, -27.0])
+    high = np.array([70.0, 27.0])
     shapes: list[Shape] = []
     for x in np.arange(low[0], high[0], 4.0):
         for y in (low[1], high[1]):
-            shapes.append(forest(float(x), float(y) + float(rng.uniform(-1, 1)), float(rng.uniform(3.4, 4.6)), rng))
+            shapes.append(
+                forest(float(x), float(y) + float(rng.uniform(-1, 1)), float(rng.uniform(3.4, 4.6)), rng)
+            )
     for y in np.arange(low[1], high[1], 4.0):
         for x in (low[0], high[0]):
-            shapes.append(forest(float(x) + float(rng.uniform(-1, 1)), float(y), float(rng.uniform(3.4, 4.6)), rng))
+            shapes.append(
+                forest(float(x) + float(rng.uniform(-1, 1)), float(y), float(rng.uniform(3.4, 4.6)), rng)
+            )
     return shapes
 
 

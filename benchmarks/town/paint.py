@@ -1,4 +1,6 @@
-"""Colour (sRGB) and emitted light (linear) of surface points, by material: facades, roofs, foliage, cars, ground."""
+"""Colour (sRGB) and emitted light (linear) of surface points, by material: facades, roofs, foliage, cars,
+ground.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +61,8 @@ def _sidewalk(x: Array, y: Array, look: Palette) -> Colours:
 
 def paint_ground(points: Array, look: Palette) -> Colours:
     """Colours [N 3] of points of the ground."""
-    x, y = points[:, 0], points[:, 1]
+    x = points[:, 0]
+    y = points[:, 1]
     kind = ground_class(points)
     colour = np.empty((len(points), 3), dtype=np.float32)
     for label, painter in ((LAWN, _lawn), (ROAD, _road), (SIDEWALK, _sidewalk)):
@@ -67,14 +70,18 @@ def paint_ground(points: Array, look: Palette) -> Colours:
         colour[at] = painter(x[at], y[at], look)
     if look.littering > 0:
         share = np.array([0.0, 1.0, 0.3, 0.6], dtype=np.float32)[kind] * np.float32(look.littering)
-        fallen = step(0.6 * noise2(6.5 * x, 6.5 * y, 41) + 0.4 * noise2(0.7 * x, 0.7 * y, 43) + 0.72 * share, 0.72, 0.82)
+        fallen = step(
+            0.6 * noise2(6.5 * x, 6.5 * y, 41) + 0.4 * noise2(0.7 * x, 0.7 * y, 43) + 0.72 * share, 0.72, 0.82
+        )
         hue = mix(np.array(look.litter) * 0.75, np.array(look.litter) * 1.25, noise2(6 * x, 6 * y, 45))
         colour = mix(colour, hue, fallen * 0.85)
     if look.snowing > 0:
         share = np.array([0.0, 1.0, 0.36, 0.72], dtype=np.float32)[kind] * np.float32(look.snowing)
         track = band(np.abs(y) - 1.05, 0.35, 0.25) + band(np.abs(y) - 2.55, 0.35, 0.25)
         share -= np.where(kind == ROAD, 0.22 * track, 0).astype(np.float32)
-        lies = step((0.6 * fractal2(0.6 * x, 1.4 * y, 51) + 0.4 * noise2(4 * x, 4 * y, 55)) * 0.7 + share, 0.55, 0.82)
+        lies = step(
+            (0.6 * fractal2(0.6 * x, 1.4 * y, 51) + 0.4 * noise2(4 * x, 4 * y, 55)) * 0.7 + share, 0.55, 0.82
+        )
         tone = 0.94 + 0.06 * fractal2(1.6 * x, 1.6 * y, 53)
         colour = mix(colour, np.array(look.snow) * tone[:, None], lies * 0.95)
     return colour
@@ -114,7 +121,9 @@ def _bare(style: int, tint: NDArray[np.int64], u: Array, v: Array, look: Palette
 def _timber(u: Array, v: Array, parts: Parts, pitch: Array) -> NDArray[np.float32]:
     """Beams of a half-timbered wall: posts between the windows, sills, and braces in every other bay."""
     floor = v - PLINTH
-    posts = band(np.abs(parts.across) - pitch / 2, 0.12) + band(np.abs(parts.across) - parts.half - 0.09, 0.08)
+    posts = band(np.abs(parts.across) - pitch / 2, 0.12) + band(
+        np.abs(parts.across) - parts.half - 0.09, 0.08
+    )
     level = floor % STOREY
     sills = band(np.minimum(level, STOREY - level), 0.12) + band(level - 0.24 * STOREY, 0.07)
     slant = (np.abs(parts.across) - parts.half - 0.1) - (level - 0.25 * STOREY) * 0.32
@@ -136,7 +145,8 @@ def _window(parts: Parts, key: NDArray[np.float32], look: Palette) -> tuple[Colo
 
 
 def _door(parts: Parts, tint: NDArray[np.int64], look: Palette) -> Colours:
-    side, up = np.abs(parts.across), parts.up
+    side = np.abs(parts.across)
+    up = parts.up
     panel = band(side - 0.25, 0.16) * np.maximum(band(up - 0.55, 0.32), band(up - 1.3, 0.28))
     light = band(side, 0.40) * band(up - 1.92, 0.16)
     colour = _choose(look.doors, tint) * (1 - 0.32 * panel)[:, None]
@@ -145,13 +155,17 @@ def _door(parts: Parts, tint: NDArray[np.int64], look: Palette) -> Colours:
     return mix(colour, np.array(look.trim), frame)
 
 
-def paint_walls(faces: FaceTable, face: NDArray[np.integer], points: Array, look: Palette) -> tuple[Colours, Colours]:
+def paint_walls(
+    faces: FaceTable, face: NDArray[np.integer], points: Array, look: Palette
+) -> tuple[Colours, Colours]:
     """Colours and emitted light, [N 3] each, of points on facades."""
     u, v = on_face(faces, face, points)
     parts = facade_parts(faces, face, u, v)
-    tint, style = faces.tint[face], faces.style[face]
+    tint = faces.tint[face]
+    style = faces.style[face]
     wide = faces.extent[face][:, 0]
-    columns, storeys = faces.columns[face], faces.storeys[face]
+    columns = faces.columns[face]
+    storeys = faces.storeys[face]
     colour = np.empty((len(points), 3), dtype=np.float32)
     for kind in range(5):
         at = np.flatnonzero(style == kind)
@@ -164,7 +178,9 @@ def paint_walls(faces: FaceTable, face: NDArray[np.integer], points: Array, look
     cornice = band(np.minimum(level, STOREY - level), 0.1) * house * ((style == _PLASTER) | (style == _BRICK))
     corner = band(np.minimum(u, wide - u), 0.16) * house * (style != _TIMBER)
     sill = band(parts.up + 0.06, 0.06) * band(parts.across, parts.half + 0.12)
-    lintel = band(parts.up - parts.tall - 0.09, 0.09) * band(parts.across, parts.half + 0.1) * (style != _TIMBER)
+    lintel = (
+        band(parts.up - parts.tall - 0.09, 0.09) * band(parts.across, parts.half + 0.1) * (style != _TIMBER)
+    )
     above = (parts.storey >= 0) & (parts.storey < np.maximum(storeys, 1)) & (columns > 0) & ~parts.door
     opening = np.maximum(sill, lintel) * (above & ~((parts.column == faces.door[face]) & (parts.storey == 0)))
     colour = mix(colour, np.array(look.trim) * 0.95, np.maximum(np.maximum(cornice, corner), opening) * 0.85)
@@ -185,7 +201,8 @@ def paint_walls(faces: FaceTable, face: NDArray[np.integer], points: Array, look
     return (colour * grime[:, None]).astype(np.float32), glow
 
 
-_WOOD_RATE, _LEAF_RATE = 1.2, 4.2
+_WOOD_RATE = 1.2
+_LEAF_RATE = 4.2
 """Noise cells per metre in the distant wood and in near crowns."""
 
 
@@ -198,7 +215,9 @@ def foliage_normals(points: Array, normals: Colours, distant: NDArray[np.bool_])
     return np.asarray(bent / np.linalg.norm(bent, axis=1, keepdims=True), np.float32)
 
 
-def _foliage(town: Town, face: NDArray[np.integer], points: Array, normals: Colours, look: Palette) -> Colours:
+def _foliage(
+    town: Town, face: NDArray[np.integer], points: Array, normals: Colours, look: Palette
+) -> Colours:
     pairs = np.array(look.leaves, dtype=np.float32)[town.faces.tint[face]]
     distant = town.faces.style[face] == 1
     rate = np.where(distant, _WOOD_RATE, _LEAF_RATE)[:, None]
@@ -209,7 +228,9 @@ def _foliage(town: Town, face: NDArray[np.integer], points: Array, normals: Colo
     return _snowed(colour, fine, normals, look, 0.85)
 
 
-def _snowed(colour: Colours, noise: NDArray[np.float32], normals: Colours, look: Palette, most: float) -> Colours:
+def _snowed(
+    colour: Colours, noise: NDArray[np.float32], normals: Colours, look: Palette, most: float
+) -> Colours:
     """Snow on what faces upward."""
     if look.snowing == 0:
         return colour
@@ -246,7 +267,11 @@ def _car(kind: Material, town: Town, face: NDArray[np.integer], points: Array, l
     shade = mix(np.array(look.glass[0]) * 0.8, np.array(look.glass[1]), step(v / high, 0.1, 1.2))
     side = town.faces.style[face] == 1
     edge = np.minimum(high - v, np.minimum(u, wide - u))
-    frame = np.where(side, np.maximum(band(u - 0.52 * wide, 0.05), 1 - step(high - v, 0.04, 0.1)), 1 - step(edge, 0.04, 0.1))
+    frame = np.where(
+        side,
+        np.maximum(band(u - 0.52 * wide, 0.05), 1 - step(high - v, 0.04, 0.1)),
+        1 - step(edge, 0.04, 0.1),
+    )
     return mix(shade, paint, frame)
 
 
@@ -261,7 +286,9 @@ def _plain(kind: Material, points: Array, look: Palette) -> Colours:
     return (base * (0.82 + 0.18 * fractal3(points, 2.0, 113))[:, None]).astype(np.float32)
 
 
-def paint(town: Town, face: NDArray[np.integer], points: Array, normals: Colours, look: Palette) -> tuple[Colours, Colours]:
+def paint(
+    town: Town, face: NDArray[np.integer], points: Array, normals: Colours, look: Palette
+) -> tuple[Colours, Colours]:
     """Colours (sRGB) and emitted light (linear), [N 3] each, of points on faces [N], none of them the sky."""
     colour = np.zeros((len(points), 3), dtype=np.float32)
     glow = np.zeros_like(colour)
@@ -270,7 +297,9 @@ def paint(town: Town, face: NDArray[np.integer], points: Array, normals: Colours
         at = np.flatnonzero(kinds == kind)
         if len(at) == 0:
             continue
-        f, p, n = face[at], points[at], normals[at]
+        f = face[at]
+        p = points[at]
+        n = normals[at]
         if kind == Material.GROUND:
             colour[at] = paint_ground(p, look)
         elif kind == Material.FACADE:
@@ -280,7 +309,9 @@ def paint(town: Town, face: NDArray[np.integer], points: Array, normals: Colours
         elif kind == Material.FOLIAGE:
             colour[at] = _foliage(town, f, p, n, look)
         elif kind in (Material.PAINT, Material.GLASS, Material.TYRE):
-            colour[at] = _snowed(_car(kind, town, f, p, look), np.full(len(at), 0.5, np.float32), n, look, 0.9)
+            colour[at] = _snowed(
+                _car(kind, town, f, p, look), np.full(len(at), 0.5, np.float32), n, look, 0.9
+            )
         else:
             colour[at] = _plain(kind, p, look)
         if kind == Material.LANTERN:

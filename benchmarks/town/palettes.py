@@ -58,12 +58,27 @@ class Palette:
         (0.96, 0.74, 0.38),
         (0.88, 0.76, 0.72),
     )
-    bricks: tuple[Colour, ...] = ((0.60, 0.35, 0.28), (0.66, 0.44, 0.33), (0.55, 0.37, 0.32), (0.72, 0.56, 0.43))
+    bricks: tuple[Colour, ...] = (
+        (0.60, 0.35, 0.28),
+        (0.66, 0.44, 0.33),
+        (0.55, 0.37, 0.32),
+        (0.72, 0.56, 0.43),
+    )
     stone: Colour = (0.76, 0.70, 0.60)
     timber: Colour = (0.30, 0.20, 0.14)
     trim: Colour = (0.92, 0.90, 0.85)
-    shutters: tuple[Colour, ...] = ((0.22, 0.40, 0.34), (0.25, 0.36, 0.52), (0.50, 0.22, 0.18), (0.40, 0.30, 0.22))
-    doors: tuple[Colour, ...] = ((0.45, 0.15, 0.12), (0.14, 0.30, 0.26), (0.36, 0.24, 0.14), (0.16, 0.24, 0.42))
+    shutters: tuple[Colour, ...] = (
+        (0.22, 0.40, 0.34),
+        (0.25, 0.36, 0.52),
+        (0.50, 0.22, 0.18),
+        (0.40, 0.30, 0.22),
+    )
+    doors: tuple[Colour, ...] = (
+        (0.45, 0.15, 0.12),
+        (0.14, 0.30, 0.26),
+        (0.36, 0.24, 0.14),
+        (0.16, 0.24, 0.42),
+    )
     glass: tuple[Colour, Colour] = ((0.16, 0.21, 0.27), (0.52, 0.62, 0.72))
     """At the foot and at the head of a pane."""
     lit: float = 0.0
@@ -72,7 +87,12 @@ class Palette:
     """Colour of lit windows and lamps."""
     lamps: float = 0.0
     """Linear intensity of a lamp at one metre."""
-    roofs: tuple[Colour, ...] = ((0.60, 0.34, 0.25), (0.50, 0.30, 0.25), (0.66, 0.42, 0.30), (0.38, 0.39, 0.43))
+    roofs: tuple[Colour, ...] = (
+        (0.60, 0.34, 0.25),
+        (0.50, 0.30, 0.25),
+        (0.66, 0.42, 0.30),
+        (0.38, 0.39, 0.43),
+    )
     leaves: tuple[tuple[Colour, Colour], ...] = (
         ((0.18, 0.28, 0.13), (0.45, 0.55, 0.26)),
         ((0.21, 0.32, 0.15), (0.54, 0.61, 0.32)),
@@ -206,5 +226,7 @@ PALETTES: dict[str, Palette] = {
 def palette(name: str) -> Palette:
     """The palette of a name, or DataError."""
     if name not in PALETTES:
-        raise DataError(f"town palette '{name}': there is none of that name; choose one of {', '.join(PALETTES)}")
+        raise DataError(
+            f"town palette '{name}': there is none of that name; choose one of {', '.join(PALETTES)}"
+        )
     return PALETTES[name]

@@ -1,9 +1,9 @@
 """Views of the town: camera poses, ray tracing, light and sky, and pictures with exact depth and labels.
 
-Rays are traced in float64, vectorised over the pixels that a solid can cover. Every operation is elementwise, so the depth of
-a ray does not depend on which other rays are traced beside it. Surfaces are Lambertian: the radiance of a surface point is a
-function of the point alone, so all views agree on it. Haze too depends on the place (how far outside the street it lies), not
-on the camera.
+Rays are traced in float64, vectorised over the pixels that a solid can cover. Every operation is elementwise,
+so the depth of a ray does not depend on which other rays are traced beside it. Surfaces are Lambertian: the
+radiance of a surface point is a function of the point alone, so all views agree on it. Haze too depends on
+the place (how far outside the street it lies), not on the camera.
 """
 
 import math
@@ -42,7 +42,9 @@ class Hits(NamedTuple):
 
 
 def directions(view: View, samples: int) -> tuple[Array, Array, Array]:
-    """Unit world directions x, y, z, each [samples·H samples·W], through a regular grid of samples per pixel side."""
+    """Unit world directions x, y, z, each [samples·H samples·W], through a regular grid of samples per pixel
+    side.
+    """
     columns = (np.arange(view.width * samples) + 0.5) / samples - view.width / 2
     rows = (np.arange(view.height * samples) + 0.5) / samples - view.height / 2
     a, b = np.meshgrid(columns / view.focal, -rows / view.focal)
@@ -53,7 +55,9 @@ def directions(view: View, samples: int) -> tuple[Array, Array, Array]:
 
 
 def _enter(shape: Shape, o: tuple[Array, ...], d: tuple[Array, ...]) -> tuple[Array, NDArray[np.int32] | int]:
-    """Distance at which rays enter a solid from outside (inf = never) and the face, counted within the solid."""
+    """Distance at which rays enter a solid from outside (inf = never) and the face, counted within the
+    solid.
+    """
     if isinstance(shape, Polyhedron):
         return _enter_polyhedron(shape, o, d)
     if isinstance(shape, Ellipsoid):
@@ -65,7 +69,8 @@ def _enter(shape: Shape, o: tuple[Array, ...], d: tuple[Array, ...]) -> tuple[Ar
             p[0] * p[0] + p[1] * p[1] + p[2] * p[2] - 1.0,
         )
         return np.where(t > _NEAR, t, np.inf), 0
-    px, py = o[0] - shape.centre[0], o[1] - shape.centre[1]
+    px = o[0] - shape.centre[0]
+    py = o[1] - shape.centre[1]
     t = _root(d[0] * d[0] + d[1] * d[1], px * d[0] + py * d[1], px * px + py * py - shape.radius**2)
     with np.errstate(invalid="ignore"):
         z = o[2] + t * d[2]
@@ -79,9 +84,12 @@ def _root(a: Array, b: Array, c: Array) -> Array:
         return np.where(square > 0, (-b - np.sqrt(square)) / a, np.inf)
 
 
-def _enter_polyhedron(shape: Polyhedron, o: tuple[Array, ...], d: tuple[Array, ...]) -> tuple[Array, NDArray[np.int32]]:
+def _enter_polyhedron(
+    shape: Polyhedron, o: tuple[Array, ...], d: tuple[Array, ...]
+) -> tuple[Array, NDArray[np.int32]]:
     size = d[0].shape
-    enter, leave = np.full(size, -np.inf), np.full(size, np.inf)
+    enter = np.full(size, -np.inf)
+    leave = np.full(size, np.inf)
     face = np.zeros(size, dtype=np.int32)
     for k, (n, offset) in enumerate(zip(shape.normals, shape.offsets, strict=True)):
         slope = sum(n[i] * d[i] for i in range(3) if n[i] != 0.0)
@@ -99,12 +107,14 @@ def _enter_polyhedron(shape: Polyhedron, o: tuple[Array, ...], d: tuple[Array, .
 
 def _windows(town: Town, view: View, samples: int) -> NDArray[np.int64]:
     """Per solid the pixel rectangle [row, row end, column, column end] outside which no ray can meet it."""
-    low, high = np.stack([s.low for s in town.shapes]), np.stack([s.high for s in town.shapes])
+    low = np.stack([s.low for s in town.shapes])
+    high = np.stack([s.high for s in town.shapes])
     bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
     corners = np.where(bits, high[:, None], low[:, None]) - view.pose[:, 3]
     local = corners @ view.pose[:, :3]
     ends = np.array([(a, a | 1 << k) for a in range(8) for k in range(3) if not a >> k & 1])
-    a, b = local[:, ends[:, 0]], local[:, ends[:, 1]]
+    a = local[:, ends[:, 0]]
+    b = local[:, ends[:, 1]]
     near = -0.01
     with np.errstate(divide="ignore", invalid="ignore"):
         s = (near - a[..., 2:]) / (b[..., 2:] - a[..., 2:])
@@ -117,7 +127,10 @@ def _windows(town: Town, view: View, samples: int) -> NDArray[np.int64]:
     for value, size in ((y, view.height), (x, view.width)):
         least = np.where(np.isfinite(value), value, np.inf).min(1)
         most = np.where(np.isfinite(value), value, -np.inf).max(1)
-        bounds += [np.clip(least * samples - 1, 0, size * samples), np.clip(most * samples + 2, 0, size * samples)]
+        bounds += [
+            np.clip(least * samples - 1, 0, size * samples),
+            np.clip(most * samples + 2, 0, size * samples),
+        ]
     rectangle = np.where(seen[:, None], np.stack(bounds, 1), 0.0)
     return np.floor(rectangle).astype(np.int64)
 
@@ -146,18 +159,23 @@ def _across(sun: Array) -> tuple[Array, Array]:
     return level, np.cross(sun, level)
 
 
-def shadowed(town: Town, points: Array, sun: Array, foliage: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], ...]:
-    """Masks: something solid, and foliage, stands between points [N 3] and the sun (a unit vector towards it).
+def shadowed(
+    town: Town, points: Array, sun: Array, foliage: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], ...]:
+    """Masks: something solid, and foliage, stands between points [N 3] and the sun (a unit vector towards
+    it).
 
     `foliage` says of each solid whether it lets some light through.
     """
     frame = np.stack([*_across(sun), sun])
     place = points @ frame.T
     order = np.argsort(place[:, 0], kind="stable")
-    place, points = place[order], points[order]
+    place = place[order]
+    points = points[order]
     dark = np.zeros((2, len(points)), dtype=np.bool_)
     for shape, leafy in zip(town.shapes, foliage, strict=True):
-        middle, half = frame @ (shape.low + shape.high) / 2, np.abs(frame) @ (shape.high - shape.low) / 2
+        middle = frame @ (shape.low + shape.high) / 2
+        half = np.abs(frame) @ (shape.high - shape.low) / 2
         start, stop = np.searchsorted(place[:, 0], [middle[0] - half[0], middle[0] + half[0]])
         near = np.abs(place[start:stop, 1] - middle[1]) <= half[1]
         near &= (place[start:stop, 2] < middle[2] + half[2]) & ~dark[int(leafy), start:stop]
@@ -176,7 +194,8 @@ FIELD_OF_VIEW = 75.0
 """Horizontal, in degrees."""
 _YAW = (0.0, 43.0, -22.0, 22.0, -43.0)
 """Degrees to the left of the street's direction, in turn: five of them, so that every 8th view meets all."""
-_FROM, _TO = -2.0, 24.0
+_FROM = -2.0
+_TO = 24.0
 _EVERY = 8
 
 
@@ -186,11 +205,13 @@ def is_test(view: int) -> bool:
 
 
 def walk(*, seed: int, views: int, width: int, height: int, extra: float = 0.0) -> list[View]:
-    """Poses up the street and back down again, always facing its far end; looks to a side come from across the road.
+    """Poses up the street and back down again, always facing its far end; looks to a side come from across
+    the road.
 
     In a street that is `extra` metres longer the walk begins as much further back.
 
-    The walk starts a tenth into its loop: the rearmost views, which see what no other does, are then for training.
+    The walk starts a tenth into its loop: the rearmost views, which see what no other does, are then for
+    training.
     """
     rng = np.random.default_rng([0x3A1C, seed])
     focal = width / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
@@ -207,7 +228,8 @@ def walk(*, seed: int, views: int, width: int, height: int, extra: float = 0.0) 
 
 def _pose(place: NDArray[np.float64], yaw: float, pitch: float) -> NDArray[np.float64]:
     """Camera to world [3 4], OpenGL axes, from degrees of yaw (leftward from +x) and pitch (upward)."""
-    a, b = math.radians(yaw), math.radians(pitch)
+    a = math.radians(yaw)
+    b = math.radians(pitch)
     forward = np.array([math.cos(a) * math.cos(b), math.sin(a) * math.cos(b), math.sin(b)])
     right = np.array([math.sin(a), -math.cos(a), 0.0])
     return np.column_stack([right, np.cross(right, forward), -forward, place])
@@ -218,7 +240,8 @@ Colours = NDArray[np.float32]
 
 def sun_direction(look: Palette) -> Array:
     """Unit vector towards the sun."""
-    a, e = math.radians(look.azimuth), math.radians(look.elevation)
+    a = math.radians(look.azimuth)
+    e = math.radians(look.elevation)
     return np.array([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)])
 
 
@@ -229,7 +252,9 @@ def sky(direction: Array, look: Palette) -> Colours:
     colour = np.array(look.horizon) * (1 - rise) + np.array(look.zenith) * rise
     # Clouds lie on a plane overhead; flattened towards the horizon, where they would alias.
     plane = direction[:, :2] / (height + 0.28)[:, None] * 2.2
-    puff = 0.7 * fractal2(plane[:, 0], plane[:, 1], 131) + 0.3 * fractal2(3 * plane[:, 0], 3 * plane[:, 1], 133)
+    puff = 0.7 * fractal2(plane[:, 0], plane[:, 1], 131) + 0.3 * fractal2(
+        3 * plane[:, 0], 3 * plane[:, 1], 133
+    )
     cover = step(puff, 0.78 - 0.45 * look.cloudiness, 1.02 - 0.45 * look.cloudiness)[:, None] * 0.85
     toward = np.clip(direction @ sun_direction(look), 0, 1)[:, None]
     colour = colour + np.array(look.glow) * (toward**6 + 1.5 * toward**60)
@@ -265,7 +290,8 @@ def _occlusion(town: Town, points: Array, ground: NDArray[np.bool_]) -> NDArray[
     open_ = np.ones(len(points), dtype=np.float32)
     at = np.flatnonzero(ground)
     at = at[np.argsort(points[at, 0], kind="stable")]  # then what one footprint can reach lies together
-    x, y = points[at, 0].astype(np.float32), points[at, 1].astype(np.float32)
+    x = points[at, 0].astype(np.float32)
+    y = points[at, 1].astype(np.float32)
     least = np.ones(len(at), dtype=np.float32)
     for low_x, low_y, high_x, high_y, height in town.footprints.astype(np.float32):
         reach = min(0.5 * float(height), 2.0)
@@ -316,7 +342,9 @@ def shade(town: Town, look: Palette, face: NDArray[np.integer], points: Array) -
     if look.lamps > 0:
         light = light + _lamplight(town, points, normals, look)
     colour = srgb_to_linear(albedo).astype(np.float32) * light * look.exposure + glow * look.exposure
-    outside = np.maximum(np.abs(points[:, 1]) - 9.0, np.maximum(town.start - points[:, 0], points[:, 0] - END))
+    outside = np.maximum(
+        np.abs(points[:, 1]) - 9.0, np.maximum(town.start - points[:, 0], points[:, 0] - END)
+    )
     haze = (1 - np.exp(-np.maximum(outside, 0) / 40.0 * 2.0)) * look.haziness
     hazy = np.array(look.haze) * haze[:, None]
     return np.asarray(_encode(colour) * (1 - haze[:, None]) + hazy, np.float32)
@@ -351,7 +379,9 @@ def colours(town: Town, view: View, look: Palette, samples: int) -> NDArray[np.f
     """sRGB in [0, 1] of samples x samples rays per pixel: [samples·H samples·W 3]."""
     d = directions(view, samples)
     hits = cast(town, view, d, samples)
-    ray, face, distance = np.stack(d, -1).reshape(-1, 3), hits.face.ravel(), hits.distance.ravel()
+    ray = np.stack(d, -1).reshape(-1, 3)
+    face = hits.face.ravel()
+    distance = hits.distance.ravel()
     result = np.empty((len(ray), 3), dtype=np.float32)
     at = np.flatnonzero(face >= 0)
     result[at] = shade(town, look, face[at], view.pose[:, 3] + distance[at, None] * ray[at])

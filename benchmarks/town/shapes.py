@@ -1,7 +1,7 @@
 """Convex solids of the town, and the houses, trees, lamps and cars that are made of them.
 
-A face has a frame: an origin (its lowest, leftmost corner as seen from outside), u to the right, v up the face, and its
-extent in metres along both. Textures, windows and doors are laid out in these coordinates.
+A face has a frame: an origin (its lowest, leftmost corner as seen from outside), u to the right, v up the
+face, and its extent in metres along both. Textures, windows and doors are laid out in these coordinates.
 """
 
 import math
@@ -74,7 +74,9 @@ class Ellipsoid(NamedTuple):
 
 
 class Cylinder(NamedTuple):
-    """Vertical cylinder between low and high; open at both ends, which are hidden in the ground and in other solids."""
+    """Vertical cylinder between low and high; open at both ends, which are hidden in the ground and in other
+    solids.
+    """
 
     centre: Array
     radius: float
@@ -91,7 +93,9 @@ def _face(finish: Finish, normal: Array, corners: Array) -> Face:
     u = np.array([1.0, 0.0, 0.0]) if abs(normal[2]) > 0.999 else np.cross(up, normal)
     u = u / np.linalg.norm(u)
     v = np.cross(normal, u)
-    a, b, c = corners @ u, corners @ v, float(corners[0] @ normal)
+    a = corners @ u
+    b = corners @ v
+    c = float(corners[0] @ normal)
     origin = u * a.min() + v * b.min() + normal * c
     return Face(finish, origin, u, v, np.array([np.ptp(a), np.ptp(b)]))
 
@@ -106,14 +110,16 @@ def extrude(
         axis: 0, 1 or 2.
         start: where the sweep begins along the axis.
         stop: where it ends.
-        finishes: K + 2: one per side (from corner k to k + 1), then the cap at `start`, then the one at `stop`.
+        finishes: K + 2: one per side (from corner k to k + 1), then the cap at `start`, then the one at
+        `stop`.
     """
     across = [i for i in range(3) if i != axis]
     corner = np.asarray(profile, dtype=np.float64)
     rings = np.empty((2, len(corner), 3))
     rings[:, :, across] = corner
     rings[0, :, axis], rings[1, :, axis] = start, stop
-    normals, faces = [], []
+    normals = []
+    faces = []
     for k in range(len(corner)):
         m = (k + 1) % len(corner)
         edge = corner[m] - corner[k]
@@ -146,7 +152,8 @@ def pyramid(low: Sequence[float], high: Sequence[float], finish: Finish) -> Poly
     base = np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
     ring = np.column_stack([base, np.full(4, low[2])])
     apex = np.array([*base.mean(0), high[2]])
-    normals, faces = [], []
+    normals = []
+    faces = []
     for k in range(4):
         corners = np.stack([ring[k], ring[(k + 1) % 4], apex])
         normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
@@ -165,25 +172,33 @@ def _round(finish: Finish, low: Array, high: Array, curve: Array) -> tuple[Face,
 
 def ellipsoid(centre: Sequence[float], radii: Sequence[float], finish: Finish) -> Ellipsoid:
     """An ellipsoid of one finish."""
-    middle, radius = np.asarray(centre, float), np.asarray(radii, float)
-    low, high = middle - radius, middle + radius
+    middle = np.asarray(centre, float)
+    radius = np.asarray(radii, float)
+    low = middle - radius
+    high = middle + radius
     return Ellipsoid(middle, radius, _round(finish, low, high, radius**-2), low, high)
 
 
 def cylinder(x: float, y: float, low: float, high: float, radius: float, finish: Finish) -> Cylinder:
     """A post of one finish at (x, y) from height low to high."""
-    bottom, top = np.array([x - radius, y - radius, low]), np.array([x + radius, y + radius, high])
-    return Cylinder(np.array([x, y]), radius, _round(finish, bottom, top, np.array([1.0, 1.0, 0.0])), bottom, top)
+    bottom = np.array([x - radius, y - radius, low])
+    top = np.array([x + radius, y + radius, high])
+    return Cylinder(
+        np.array([x, y]), radius, _round(finish, bottom, top, np.array([1.0, 1.0, 0.0])), bottom, top
+    )
 
 
-PLINTH, STOREY = 0.4, 2.8
+PLINTH = 0.4
+STOREY = 2.8
 """Metres of wall below the first floor, and per floor."""
 _EAVE = 0.4
 _HIDDEN = Finish(Material.TRIM)
 
 
 class Lot(NamedTuple):
-    """Place of a house: x from start to stop, its front at |y| = front on one side (-1 or 1) of the street."""
+    """Place of a house: x from start to stop, its front at |y| = front on one side (-1 or 1) of the
+    street.
+    """
 
     start: float
     stop: float
@@ -197,7 +212,9 @@ def _wall(wall: Finish, width: float, door: bool) -> Finish:
     return wall._replace(columns=columns, door=columns // 2 if door else -1)
 
 
-def _gabled(lot: Lot, low: float, high: float, eave: float, rise: float, along: bool, roof: Finish, wall: Finish) -> Shape:
+def _gabled(
+    lot: Lot, low: float, high: float, eave: float, rise: float, along: bool, roof: Finish, wall: Finish
+) -> Shape:
     gable = wall._replace(columns=1, storeys=0, door=-1, shutters=0)
     x = (lot.start - _EAVE, lot.stop + _EAVE)
     y = (low - _EAVE, high + _EAVE)
@@ -217,8 +234,10 @@ def house(lot: Lot, style: int, rng: np.random.Generator) -> list[Shape]:
         shutters=int(rng.random() < 0.45),
     )
     low, high = sorted((lot.side * lot.front, lot.side * (lot.front + lot.depth)))
-    width, height = lot.stop - lot.start, PLINTH + STOREY * storeys
-    face, flank = _wall(wall, width, True), _wall(wall, lot.depth, False)
+    width = lot.stop - lot.start
+    height = PLINTH + STOREY * storeys
+    face = _wall(wall, width, True)
+    flank = _wall(wall, lot.depth, False)
     back = face._replace(door=-1)
     ends = (face, back) if lot.side > 0 else (back, face)
     shapes: list[Shape] = [
@@ -229,7 +248,11 @@ def house(lot: Lot, style: int, rng: np.random.Generator) -> list[Shape]:
         sides = [_HIDDEN] * 5
         over = 0.2
         shapes.append(
-            box((lot.start - over, low - over, height - 0.1), (lot.stop + over, high + over, height + 0.3), [*sides, roof])
+            box(
+                (lot.start - over, low - over, height - 0.1),
+                (lot.stop + over, high + over, height + 0.3),
+                [*sides, roof],
+            )
         )
         return shapes
     roof = Finish(Material.ROOF, style=0, tint=int(rng.integers(0, 4)))
@@ -248,7 +271,14 @@ def house(lot: Lot, style: int, rng: np.random.Generator) -> list[Shape]:
 
 
 def _dormers(
-    lot: Lot, low: float, high: float, height: float, rise: float, wall: Finish, roof: Finish, rng: np.random.Generator
+    lot: Lot,
+    low: float,
+    high: float,
+    height: float,
+    rise: float,
+    wall: Finish,
+    roof: Finish,
+    rng: np.random.Generator,
 ) -> list[Shape]:
     if rng.random() < 0.4:
         return []
@@ -259,9 +289,13 @@ def _dormers(
     count = max(1, int((lot.stop - lot.start) / 3.4))
     for k in range(count):
         x = lot.start + (k + 0.5) * (lot.stop - lot.start) / count
-        base, eave, ridge = height + 0.15, height + 0.45 * rise + 0.35, height + 0.45 * rise + 1.15
+        base = height + 0.15
+        eave = height + 0.45 * rise + 0.35
+        ridge = height + 0.45 * rise + 1.15
         blank = face._replace(columns=0)
-        shapes.append(box((x - 0.7, y[0], base), (x + 0.7, y[1], eave), [face, blank, face, blank, _HIDDEN, _HIDDEN]))
+        shapes.append(
+            box((x - 0.7, y[0], base), (x + 0.7, y[1], eave), [face, blank, face, blank, _HIDDEN, _HIDDEN])
+        )
         profile = [(x - 0.95, eave - 0.06), (x + 0.95, eave - 0.06), (x, ridge)]
         reach = (y[0] - 0.2, y[1]) if lot.side > 0 else (y[0], y[1] + 0.2)
         shapes.append(extrude(profile, 1, *reach, [_HIDDEN, roof, roof, blank, blank]))
@@ -272,14 +306,24 @@ def church(x: float, rng: np.random.Generator) -> list[Shape]:
     """A church that closes the street: a tower with a spire before a nave, its front at x."""
     stone = Finish(Material.FACADE, style=4, tint=int(rng.integers(0, 8)))
     slate = Finish(Material.ROOF, style=0, tint=3)
-    y, half, tall = float(rng.uniform(-0.6, 0.6)), 2.6, float(rng.uniform(12.0, 15.0))
+    y = float(rng.uniform(-0.6, 0.6))
+    half = 2.6
+    tall = float(rng.uniform(12.0, 15.0))
     front = stone._replace(columns=1, storeys=4, door=0)
     flank = stone._replace(columns=1, storeys=4)
     nave = stone._replace(columns=3, storeys=1)
-    tower = box((x, y - half, 0), (x + 2 * half, y + half, tall), [flank, flank, flank, front, _HIDDEN, _HIDDEN])
-    spire = pyramid((x - 0.25, y - half - 0.25, tall - 0.1), (x + 2 * half + 0.25, y + half + 0.25, tall + 7.0), slate)
-    wide, long, high = 5.6, 13.0, 5.5
-    hall = box((x + 3, y - wide, 0), (x + 3 + long, y + wide, high), [nave, nave, nave, nave, _HIDDEN, _HIDDEN])
+    tower = box(
+        (x, y - half, 0), (x + 2 * half, y + half, tall), [flank, flank, flank, front, _HIDDEN, _HIDDEN]
+    )
+    spire = pyramid(
+        (x - 0.25, y - half - 0.25, tall - 0.1), (x + 2 * half + 0.25, y + half + 0.25, tall + 7.0), slate
+    )
+    wide = 5.6
+    long = 13.0
+    high = 5.5
+    hall = box(
+        (x + 3, y - wide, 0), (x + 3 + long, y + wide, high), [nave, nave, nave, nave, _HIDDEN, _HIDDEN]
+    )
     profile = [(y - wide - 0.4, high - 0.1), (y + wide + 0.4, high - 0.1), (y, high + 5.0)]
     blank = stone._replace(columns=0)
     cover: Polyhedron = extrude(profile, 0, x + 2.7, x + 3.3 + long, [_HIDDEN, slate, slate, blank, blank])
@@ -291,7 +335,9 @@ LANTERN = 4.0
 
 
 def tree(x: float, y: float, size: float, rng: np.random.Generator) -> list[Shape]:
-    """A round crown of several ellipsoids, about 2 + 2 size metres high, or a slim poplar, 5.6 + 2 size high."""
+    """A round crown of several ellipsoids, about 2 + 2 size metres high, or a slim poplar, 5.6 + 2 size
+    high.
+    """
     leaf = Finish(Material.FOLIAGE, tint=int(rng.integers(0, 6)))
     bark = Finish(Material.TRUNK)
     if rng.random() < 0.2:
@@ -309,7 +355,8 @@ def tree(x: float, y: float, size: float, rng: np.random.Generator) -> list[Shap
     count = 7
     for k in range(count):
         angle = turn + 2.4 * k
-        away, up = float(rng.uniform(0.5, 0.75)) * size, (0.3 + 1.1 * k / count) * size
+        away = float(rng.uniform(0.5, 0.75)) * size
+        up = (0.3 + 1.1 * k / count) * size
         radius = float(rng.uniform(0.42, 0.62)) * size
         centre = (x + away * math.cos(angle), y + away * math.sin(angle), stem + up)
         shapes.append(ellipsoid(centre, (radius, radius, 0.85 * radius), leaf))
@@ -357,7 +404,9 @@ def car(x: float, y: float, axis: int, rng: np.random.Generator) -> list[Shape]:
         placed = [(middle + facing * a, b) for a, b in points]
         return placed if facing > 0 else placed[::-1]
 
-    body = profile([(-2.05, 0.28), (2.05, 0.28), (2.1, 0.62), (1.95, 0.8), (0.95, 0.98), (-1.95, 0.98), (-2.1, 0.7)])
+    body = profile(
+        [(-2.05, 0.28), (2.05, 0.28), (2.1, 0.62), (1.95, 0.8), (0.95, 0.98), (-1.95, 0.98), (-2.1, 0.7)]
+    )
     cabin = profile([(-1.75, 0.95), (1.05, 0.95), (0.35, 1.5), (-1.15, 1.5)])
     top = 2 if facing > 0 else 0
     cover = [glass, glass, glass, glass]
@@ -369,7 +418,10 @@ def car(x: float, y: float, axis: int, rng: np.random.Generator) -> list[Shape]:
     ]
     for along in (-1.3, 1.3):
         for beside in (-0.78, 0.78):
-            a, b = middle + along, side + beside
-            centre, radii = ((a, b, 0.33), (0.34, 0.13, 0.34)) if axis == 0 else ((b, a, 0.33), (0.13, 0.34, 0.34))
+            a = middle + along
+            b = side + beside
+            centre, radii = (
+                ((a, b, 0.33), (0.34, 0.13, 0.34)) if axis == 0 else ((b, a, 0.33), (0.13, 0.34, 0.34))
+            )
             shapes.append(ellipsoid(centre, radii, Finish(Material.TYRE)))
     return shapes

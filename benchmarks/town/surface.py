@@ -1,6 +1,8 @@
-"""Surface points of the town: classes, coordinates on a face, parts of a facade; and noise and patterns to paint them with.
+"""Surface points of the town: classes, coordinates on a face, parts of a facade; and noise and patterns to
+paint them with.
 
-Noise and patterns are deterministic functions of coordinates in metres, with values in [0, 1] unless said otherwise.
+Noise and patterns are deterministic functions of coordinates in metres, with values in [0, 1] unless said
+otherwise.
 """
 
 from typing import NamedTuple
@@ -13,7 +15,20 @@ from .shapes import PLINTH, Material
 
 SKY, LAWN, ROAD, SIDEWALK, FACADE, ROOF, FOLIAGE, TRUNK, WINDOW, LAMP, DOOR, CAR = range(12)
 
-CLASSES = ("sky", "lawn", "road", "sidewalk", "facade", "roof", "foliage", "trunk", "window", "lamp", "door", "car")
+CLASSES = (
+    "sky",
+    "lawn",
+    "road",
+    "sidewalk",
+    "facade",
+    "roof",
+    "foliage",
+    "trunk",
+    "window",
+    "lamp",
+    "door",
+    "car",
+)
 """Names by id."""
 
 
@@ -57,15 +72,18 @@ class Parts(NamedTuple):
 def on_face(faces: FaceTable, face: NDArray[np.integer], points: Array) -> tuple[Array, Array]:
     """Coordinates u, v in metres of points [N 3] on their faces [N]."""
     off = points - faces.origin[face]
-    u, v = faces.u[face], faces.v[face]
+    u = faces.u[face]
+    v = faces.v[face]
     return (off * u).sum(1), (off * v).sum(1)
 
 
 def facade_parts(faces: FaceTable, face: NDArray[np.integer], u: Array, v: Array) -> Parts:
     """The openings of walls: rows of windows, a door, or the small window of a gable or a dormer."""
     wide, high = faces.extent[face].T
-    columns, storeys = faces.columns[face], faces.storeys[face]
-    stone, gable = faces.style[face] == _STONE, storeys == 0
+    columns = faces.columns[face]
+    storeys = faces.storeys[face]
+    stone = faces.style[face] == _STONE
+    gable = storeys == 0
     pitch = wide / np.maximum(columns, 1)
     column = np.clip(np.floor(u / pitch), 0, np.maximum(columns, 1) - 1).astype(np.int64)
     across = u - (column + 0.5) * pitch
@@ -85,12 +103,15 @@ def facade_parts(faces: FaceTable, face: NDArray[np.integer], u: Array, v: Array
     window = within & inside & arch & ~entry
     beside = (np.abs(across) >= half + 0.02) & (np.abs(across) < half + 0.42) & (up > 0) & (up < tall)
     shutter = within & beside & (faces.shutters[face] == 1) & ~gable & ~(entry & (v < 2.35)) & ~stone & ~entry
-    return Parts(window, door, shutter, across, np.where(door, v, up), half, np.where(door, 2.35, tall), column, storey)
+    return Parts(
+        window, door, shutter, across, np.where(door, v, up), half, np.where(door, 2.35, tall), column, storey
+    )
 
 
 def ground_class(points: Array) -> NDArray[np.uint8]:
     """Road, sidewalk (the square too) or lawn, by place."""
-    x, y = points[:, 0], np.abs(points[:, 1])
+    x = points[:, 0]
+    y = np.abs(points[:, 1])
     paved = (y < WALK_HALF) | ((x > END) & (x < END + 22.0) & (y < SQUARE_HALF))
     road = (y < ROAD_HALF) & (x < END)
     return np.where(road, ROAD, np.where(paved, SIDEWALK, LAWN)).astype(np.uint8)
@@ -119,7 +140,11 @@ _PRIMES = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)
 
 def hashed(seed: int, *cell: NDArray[np.int64]) -> Values:
     """A uniform number per integer cell: up to three coordinates."""
-    h = np.full(np.broadcast_shapes(*(c.shape for c in cell)), (seed * 0x27D4EB2F + 0x165667B1) & 0xFFFFFFFF, np.uint32)
+    h = np.full(
+        np.broadcast_shapes(*(c.shape for c in cell)),
+        (seed * 0x27D4EB2F + 0x165667B1) & 0xFFFFFFFF,
+        np.uint32,
+    )
     for c, prime in zip(cell, _PRIMES, strict=False):
         h = (h ^ c.astype(np.uint32)) * np.uint32(prime)
         h ^= h >> np.uint32(15)
@@ -136,7 +161,8 @@ def _split(x: NDArray[np.floating]) -> tuple[NDArray[np.int64], Values]:
 
 def noise2(x: NDArray[np.floating], y: NDArray[np.floating], seed: int) -> Values:
     """Smooth value noise with unit cells."""
-    (i, a), (j, b) = _split(x), _split(y)
+    (i, a) = _split(x)
+    (j, b) = _split(y)
     low = hashed(seed, i, j) * (1 - a) + hashed(seed, i + 1, j) * a
     high = hashed(seed, i, j + 1) * (1 - a) + hashed(seed, i + 1, j + 1) * a
     return np.asarray(low * (1 - b) + high * b, np.float32)
@@ -144,7 +170,9 @@ def noise2(x: NDArray[np.floating], y: NDArray[np.floating], seed: int) -> Value
 
 def noise3(x: NDArray[np.floating], y: NDArray[np.floating], z: NDArray[np.floating], seed: int) -> Values:
     """Smooth value noise with unit cells in space."""
-    (i, a), (j, b), (k, c) = _split(x), _split(y), _split(z)
+    (i, a) = _split(x)
+    (j, b) = _split(y)
+    (k, c) = _split(z)
 
     def plane(m: NDArray[np.int64]) -> Values:
         low = hashed(seed, i, j, m) * (1 - a) + hashed(seed, i + 1, j, m) * a
@@ -162,7 +190,9 @@ def fractal2(x: NDArray[np.floating], y: NDArray[np.floating], seed: int) -> Val
 def fractal3(p: NDArray[np.floating], rate: float, seed: int) -> Values:
     """Two octaves of noise3 at points [N 3], with `rate` cells per metre."""
     x, y, z = p.T * rate
-    return noise3(x, y, z, seed) * np.float32(0.65) + noise3(2.3 * x, 2.3 * y, 2.3 * z, seed + 1) * np.float32(0.35)
+    return noise3(x, y, z, seed) * np.float32(0.65) + noise3(
+        2.3 * x, 2.3 * y, 2.3 * z, seed + 1
+    ) * np.float32(0.35)
 
 
 def step(x: NDArray[np.floating], low: float, high: float) -> Values:
@@ -177,9 +207,17 @@ def band(x: NDArray[np.floating], half: float | NDArray[np.floating], soft: floa
 
 
 def cells(
-    u: NDArray[np.floating], v: NDArray[np.floating], width: float, height: float, joint: float, shift: float, seed: int
+    u: NDArray[np.floating],
+    v: NDArray[np.floating],
+    width: float,
+    height: float,
+    joint: float,
+    shift: float,
+    seed: int,
 ) -> tuple[Values, Values]:
-    """Bricks, slabs, tiles: a number per cell, and 1 in the joints. Every other row moves by `shift` of a cell."""
+    """Bricks, slabs, tiles: a number per cell, and 1 in the joints. Every other row moves by `shift` of a
+    cell.
+    """
     row = np.floor(v / height)
     column = u / width + shift * (row % 2)
     across = (column - np.floor(column) - 0.5) * width

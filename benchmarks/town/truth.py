@@ -1,13 +1,17 @@
-"""Ground truth of restyling: a trained town, its true looks in other palettes, references from other towns, and scores.
+"""Ground truth of restyling: a trained town, its true looks in other palettes, references from other towns,
+and scores.
 
-The truth of a palette is the same town rendered in it through the same cameras. Shadows and lit windows follow from the
-palette's sun and the town's geometry; no photograph of another town tells them, so that part of the distance cannot be closed.
+The truth of a palette is the same town rendered in it through the same cameras. Shadows and lit windows
+follow from the palette's sun and the town's geometry; no photograph of another town tells them, so that part
+of the distance cannot be closed.
 
-References: `one` is a view along a street of another town. `three` are views of three towns, of which one shows mostly façades,
-one plants, one road and sky; each is the view of a walk (façades and plants through a longer lens) that shows most of its part.
+References: `one` is a view along a street of another town. `three` are views of three towns, of which one
+shows mostly façades, one plants, one road and sky; each is the view of a walk (façades and plants through a
+longer lens) that shows most of its part.
 
-Match rates: a style code's class is the most frequent one among the reference's pixels nearest to its key. A pixel of a view is
-right if the code that it takes most of has its own true class. Classes that no reference shows do not count.
+Match rates: a style code's class is the most frequent one among the reference's pixels nearest to its key. A
+pixel of a view is right if the code that it takes most of has its own true class. Classes that no reference
+shows do not count.
 """
 
 import json
@@ -78,9 +82,18 @@ class Stage(NamedTuple):
 
 
 def set_stage(
-    scene: Scene, known: Known, settings: TownSettings, *, views: int, frames: int, longest: int, stride: float = 1.0
+    scene: Scene,
+    known: Known,
+    settings: TownSettings,
+    *,
+    views: int,
+    frames: int,
+    longest: int,
+    stride: float = 1.0,
 ) -> Stage:
-    """Held-out views, evenly spread, and a path that begins at one of them (no frames, no path; longer steps with `stride`)."""
+    """Held-out views, evenly spread, and a path that begins at one of them (no frames, no path; longer steps
+    with `stride`).
+    """
     town = build_town(settings.seed, settings.extra)
     held_out = known.test or known.train
     count = min(views, len(held_out))
@@ -94,7 +107,10 @@ def set_stage(
 
     def true(of: Cameras) -> list[Truth]:
         geometries = [geometry(town, town_view(of, i)) for i in range(len(of))]
-        return [Truth(torch.from_numpy(depth), torch.from_numpy(labels.astype("int64"))) for depth, labels in geometries]
+        return [
+            Truth(torch.from_numpy(depth), torch.from_numpy(labels.astype("int64")))
+            for depth, labels in geometries
+        ]
 
     return Stage(scene, settings, town, judged, cached(judged), true(judged), path, cached(path), true(path))
 
@@ -106,7 +122,9 @@ def town_folder(config: RunConfig) -> Path | None:
 
 
 def town_settings(config: RunConfig) -> TownSettings:
-    """The town that a run was trained on. Raises UsageError where there is none, DataError for a bad record."""
+    """The town that a run was trained on. Raises UsageError where there is none, DataError for a bad
+    record.
+    """
     folder = town_folder(config)
     if folder is None:
         raise UsageError(
@@ -117,16 +135,21 @@ def town_settings(config: RunConfig) -> TownSettings:
     try:
         return TownSettings(**json.loads(record.read_text(encoding="utf-8"))["settings"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{record}: {error}; remove the folder {folder} and let it be rendered again") from error
+        raise DataError(
+            f"{record}: {error}; remove the folder {folder} and let it be rendered again"
+        ) from error
 
 
 def town_view(cameras: Cameras, view: int) -> View:
     """The town's own camera of a view. Raises DataError for one that is no centred pinhole."""
     width, height = (int(v) for v in cameras.size[view])
-    focal, centre = cameras.focal[view].tolist(), cameras.centre[view].tolist()
+    focal = cameras.focal[view].tolist()
+    centre = cameras.centre[view].tolist()
     off = max(abs(focal[1] / focal[0] - 1), abs(2 * centre[0] / width - 1), abs(2 * centre[1] / height - 1))
     if int(cameras.lens[view]) != 0 or off > _OFF:
-        raise DataError(f"view {view}: no centred pinhole with square pixels at {width}x{height}; choose another --longest")
+        raise DataError(
+            f"view {view}: no centred pinhole with square pixels at {width}x{height}; choose another --longest"
+        )
     return View(cameras.pose[view].cpu().numpy(), (focal[0] + focal[1]) / 2, width, height)
 
 
@@ -138,7 +161,9 @@ def true_views(stage: Stage, light: str) -> list[Annotated[Tensor, "H W 3"]]:
 
 
 def short_path(start: Cameras, frames: int, stride: float = 1.0) -> Cameras:
-    """A few steps onward from a camera, slowly turning to the left: neighbouring frames see nearly the same."""
+    """A few steps onward from a camera, slowly turning to the left: neighbouring frames see nearly the
+    same.
+    """
     path = start.select(torch.zeros(frames, dtype=torch.int64))
     pose = path.pose.clone()
     ahead = -start.pose[0, :2, 2]
@@ -146,7 +171,11 @@ def short_path(start: Cameras, frames: int, stride: float = 1.0) -> Cameras:
     for step in range(frames):
         k = stride * step
         turn = pose.new_tensor(
-            [[math.cos(k * _TURN), -math.sin(k * _TURN), 0], [math.sin(k * _TURN), math.cos(k * _TURN), 0], [0, 0, 1]]
+            [
+                [math.cos(k * _TURN), -math.sin(k * _TURN), 0],
+                [math.sin(k * _TURN), math.cos(k * _TURN), 0],
+                [0, 0, 1],
+            ]
         )
         pose[step, :, :3] = turn @ pose[step, :, :3]
         pose[step, :2, 3] += k * _STEP * ahead
@@ -185,7 +214,9 @@ def places(seeds: Sequence[int], size: tuple[int, int]) -> dict[str, tuple[Place
     width, height = size
     street = walk(seed=seeds[0], views=_WALK, width=width, height=height)[_STREET_VIEW]
     references = {"one": (Place("street", seeds[0], street),), "three": ()}
-    return references | {"three": tuple(_most(part, seed, size) for part, seed in zip(PARTS, seeds, strict=False))}
+    return references | {
+        "three": tuple(_most(part, seed, size) for part, seed in zip(PARTS, seeds, strict=False))
+    }
 
 
 def photograph(place: Place, light: str) -> Reference:
@@ -196,7 +227,9 @@ def photograph(place: Place, light: str) -> Reference:
 
 
 def shows(labels: NDArray[np.uint8], part: str) -> float:
-    """Share of a view that its part fills; of several things that must all be seen, counts the one seen least."""
+    """Share of a view that its part fills; of several things that must all be seen, counts the one seen
+    least.
+    """
     shares = [float(np.mean(labels == kind)) for kind in PARTS[part]]
     return sum(shares) if part != "street" else 2 * min(shares[0] + shares[1], shares[2])
 
@@ -204,19 +237,34 @@ def shows(labels: NDArray[np.uint8], part: str) -> float:
 def _most(part: str, seed: int, size: tuple[int, int]) -> Place:
     width, height = size
     town = build_town(seed)
-    best, place = -1.0, None
+    best = -1.0
+    place = None
     for view in walk(seed=seed, views=_WALK, width=width, height=height):
         long = view._replace(focal=view.focal * _LENS[part])
         ratio = _SEARCHED / width
         small = View(long.pose, long.focal * ratio, _SEARCHED, max(1, round(height * ratio)))
         seen = shows(geometry(town, small)[1], part)
         if seen > best:
-            best, place = seen, Place(part, seed, long)
+            best = seen
+            place = Place(part, seed, long)
     assert place is not None
     return place
 
 
-KINDS = {SKY: 0, LAWN: 1, FOLIAGE: 1, TRUNK: 1, ROAD: 2, SIDEWALK: 2, FACADE: 3, ROOF: 3, WINDOW: 3, DOOR: 3, LAMP: 4, CAR: 5}
+KINDS = {
+    SKY: 0,
+    LAWN: 1,
+    FOLIAGE: 1,
+    TRUNK: 1,
+    ROAD: 2,
+    SIDEWALK: 2,
+    FACADE: 3,
+    ROOF: 3,
+    WINDOW: 3,
+    DOOR: 3,
+    LAMP: 4,
+    CAR: 5,
+}
 """Classes that belong together: sky, plants, ground, buildings, lamps, cars."""
 CUT = {"sky": 0, "plants": 1, "ground": 2, "houses": 3}
 """Kinds that references can be without."""
@@ -238,10 +286,14 @@ def kinds_of(labels: Annotated[Tensor, "H W"]) -> Annotated[Tensor, "H W"]:
     return kind[labels]
 
 
-def psnr_of_kind(pictures: Sequence[Annotated[Tensor, "H W 3"]], stage: Stage, truth: Sequence[Tensor], kind: str) -> Row:
+def psnr_of_kind(
+    pictures: Sequence[Annotated[Tensor, "H W 3"]], stage: Stage, truth: Sequence[Tensor], kind: str
+) -> Row:
     """PSNR in dB over all pixels of a kind together (`inside`), and over all others (`elsewhere`)."""
     inside = torch.cat([(kinds_of(each.labels) == CUT[kind]).flatten() for each in stage.truth])
-    apart = torch.cat([(a - b).double().square().mean(-1).flatten() for a, b in zip(pictures, truth, strict=True)])
+    apart = torch.cat(
+        [(a - b).double().square().mean(-1).flatten() for a, b in zip(pictures, truth, strict=True)]
+    )
     return {
         name: -10 * math.log10(max(float(apart[where].mean()), 1e-10)) if bool(where.any()) else None
         for name, where in (("inside", inside), ("elsewhere", ~inside))
@@ -254,7 +306,9 @@ class Matched(NamedTuple):
     match: float | None
     """Pixels that take a code of their own class."""
     match_inside: float | None
-    """The same of pixels that are no nearer than two pixels to another class: encoders see cells, not pixels."""
+    """The same of pixels that are no nearer than two pixels to another class: encoders see cells, not
+    pixels.
+    """
     match_border: float | None
     """The same of the other pixels: how sharply what is told apart is told apart."""
     match_kind: float | None
@@ -265,13 +319,17 @@ class Matched(NamedTuple):
 def code_classes(
     dictionary: StyleDictionary, references: Mapping[str, Reference], encoders: Encoders, guided: GuidedConfig
 ) -> Annotated[Tensor, "T"]:
-    """Class of each code, int64. References go by the dictionary's names. Raises DataError where semantics are missing."""
+    """Class of each code, int64. References go by the dictionary's names. Raises DataError where semantics
+    are missing.
+    """
     if encoders.semantic is None or encoders.basis is None:
         raise DataError("match rates: the scene has no semantics; train it with a semantic encoder")
     code_labels = torch.full((len(dictionary.keys),), -1, dtype=torch.int64)
     for i, name in enumerate(dictionary.names):
         own = (dictionary.reference == i).nonzero().squeeze(1)
-        semantic = encoded(references[name].image.to(encoders.device), encoders.semantic, guided, encoders.basis)
+        semantic = encoded(
+            references[name].image.to(encoders.device), encoders.semantic, guided, encoders.basis
+        )
         nearest = torch.cdist(semantic, dictionary.keys[own].to(semantic)).argmin(1).cpu()
         for place, code in enumerate(own.tolist()):
             kinds = references[name].classes.flatten()[nearest == place]
@@ -289,17 +347,23 @@ def interior(labels: Annotated[Tensor, "H W"]) -> Annotated[Tensor, "H W"]:
     """Pixels whose surroundings are all of their own class, bool."""
     side = 2 * _REACH + 1
     padded = F.pad(labels[None, None].double(), (_REACH,) * 4, mode="replicate")
-    highest, lowest = F.max_pool2d(padded, side, 1), -F.max_pool2d(-padded, side, 1)
+    highest = F.max_pool2d(padded, side, 1)
+    lowest = -F.max_pool2d(-padded, side, 1)
     return (highest == lowest)[0, 0]
 
 
 def match_rates(
-    found: Sequence[Annotated[Tensor, "H W"]], truth: Sequence[Annotated[Tensor, "H W"]], references: Sequence[Reference]
+    found: Sequence[Annotated[Tensor, "H W"]],
+    truth: Sequence[Annotated[Tensor, "H W"]],
+    references: Sequence[Reference],
 ) -> Matched:
     """Rates over all pixels of the views together."""
     counted = [torch.bincount(reference.classes.flatten()) for reference in references]
-    shown = sorted({k for each in counted for k in (each >= _SHOWN * each.sum()).nonzero().flatten().tolist()})
-    taken, true = torch.cat([x.flatten() for x in found]), torch.cat([x.flatten() for x in truth])
+    shown = sorted(
+        {k for each in counted for k in (each >= _SHOWN * each.sum()).nonzero().flatten().tolist()}
+    )
+    taken = torch.cat([x.flatten() for x in found])
+    true = torch.cat([x.flatten() for x in truth])
     counts = torch.isin(true, torch.tensor(shown))
     inside = torch.cat([interior(x).flatten() for x in truth])
     return Matched(
@@ -333,17 +397,21 @@ def score(
 
 
 def best_class_maps(plain: Labelled, truth: Sequence[Picture]) -> list[Picture]:
-    """The plain pictures after the affine map of colours of each true class that is nearest to the truth (least squares).
+    """The plain pictures after the affine map of colours of each true class that is nearest to the truth
+    (least squares).
 
-    It knows the truth: a bound on what moving the colours of classes as wholes can reach, with this reconstruction.
+    It knows the truth: a bound on what moving the colours of classes as wholes can reach, with this
+    reconstruction.
     """
     here, kinds = _flat(plain)
     there = torch.cat([image.reshape(-1, 3) for image in truth]).double()
     moved = torch.empty_like(here)
     for kind in set(kinds.tolist()):
         inside = kinds == kind
-        a, b = here[inside], there[inside]
-        middle, target = a.mean(0), b.mean(0)
+        a = here[inside]
+        b = there[inside]
+        middle = a.mean(0)
+        target = b.mean(0)
         spread = (a - middle).T @ (a - middle) / len(a) + _RIDGE * torch.eye(3, dtype=torch.float64)
         matrix = torch.linalg.solve(spread, (a - middle).T @ (b - target) / len(a))
         moved[inside] = (a - middle) @ matrix + target
@@ -351,7 +419,8 @@ def best_class_maps(plain: Labelled, truth: Sequence[Picture]) -> list[Picture]:
 
 
 def true_class_maps(plain: Labelled, references: Labelled) -> list[Picture]:
-    """The plain pictures with the colours of each true class carried to those of the same class in the references.
+    """The plain pictures with the colours of each true class carried to those of the same class in the
+    references.
 
     What perfect matching would give. Classes that no reference shows take all colours of the references.
     """
@@ -368,7 +437,9 @@ def true_class_maps(plain: Labelled, references: Labelled) -> list[Picture]:
 
 
 def mean_rows(tables: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
-    """Mean of every figure of every method over tables; where a table does not have it, or has None, it is left out there."""
+    """Mean of every figure of every method over tables; where a table does not have it, or has None, it is
+    left out there.
+    """
     gathered: dict[str, dict[str, list[float]]] = {}
     for table in tables:
         for method, row in table.items():

@@ -1,4 +1,5 @@
-"""A town as a scene folder that any reader of Nerfstudio's format understands, with the truth beside the images.
+"""A town as a scene folder that any reader of Nerfstudio's format understands, with the truth beside the
+images.
 
 transforms.json           cameras, split
 images/0000.png           sRGB
@@ -29,7 +30,9 @@ from .render import Picture, View, directions, is_test, render, walk
 from .surface import CLASSES
 
 _EDITION = 1
-"""Counts the looks of the town: raised with every change to its pictures, so that cached folders are rendered anew."""
+"""Counts the looks of the town: raised with every change to its pictures, so that cached folders are rendered
+anew.
+"""
 _POINTS = 256
 """Surface points kept per training view."""
 _RECORD = "town.json"
@@ -76,14 +79,19 @@ def _complete(folder: Path, settings: TownSettings) -> bool:
 
 
 def read_truth(folder: Path, view: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Depth [H W] (inf = sky) and labels [H W] of a view of a town folder. Raises DataError where they are missing."""
-    depth, label = folder / "depth" / f"{view:04d}.npz", folder / "labels" / f"{view:04d}.png"
+    """Depth [H W] (inf = sky) and labels [H W] of a view of a town folder. Raises DataError where they are
+    missing.
+    """
+    depth = folder / "depth" / f"{view:04d}.npz"
+    label = folder / "labels" / f"{view:04d}.png"
     try:
         with np.load(depth) as stored:
             distance = np.asarray(stored["depth"], dtype=np.float32)
         kinds = cv2.imdecode(np.frombuffer(label.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
     except (OSError, ValueError, KeyError) as error:
-        raise DataError(f"{depth}: {error}; remove the folder {folder} and let it be rendered again") from error
+        raise DataError(
+            f"{depth}: {error}; remove the folder {folder} and let it be rendered again"
+        ) from error
     if kinds is None:
         raise DataError(f"{label}: not an image; remove the folder {folder} and let it be rendered again")
     return distance, np.asarray(kinds, dtype=np.uint8)
@@ -119,7 +127,9 @@ def _transforms(views: list[View]) -> dict[str, object]:
     }
 
 
-def _surface(view: View, picture: Picture, rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+def _surface(
+    view: View, picture: Picture, rng: np.random.Generator
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     at = np.flatnonzero(np.isfinite(picture.depth))
     at = rng.permutation(at)[:_POINTS]
     ray = np.stack(directions(view, 1), -1).reshape(-1, 3)[at]
@@ -129,7 +139,13 @@ def _surface(view: View, picture: Picture, rng: np.random.Generator) -> tuple[ND
 
 def _fill(folder: Path, settings: TownSettings, look: Palette) -> None:
     town = build_town(settings.seed, settings.extra)
-    views = walk(seed=settings.seed, views=settings.views, width=settings.width, height=settings.height, extra=settings.extra)
+    views = walk(
+        seed=settings.seed,
+        views=settings.views,
+        width=settings.width,
+        height=settings.height,
+        extra=settings.extra,
+    )
     rng = np.random.default_rng([0x9015, settings.seed])
     for name in ("images", "depth", "labels"):
         (folder / name).mkdir()
@@ -153,12 +169,16 @@ def _fill(folder: Path, settings: TownSettings, look: Palette) -> None:
     _save_json(folder / _RECORD, {"settings": asdict(settings), "classes": list(CLASSES)})
 
 
-def write_town(folder: Path, *, seed: int, palette: str, views: int, width: int, height: int, extra: float = 0.0) -> None:
+def write_town(
+    folder: Path, *, seed: int, palette: str, views: int, width: int, height: int, extra: float = 0.0
+) -> None:
     """Renders a town into a folder, all or nothing; a complete one of the same settings is left as it is.
 
     Raises DataError where the folder holds something else, or can't be written.
     """
-    settings = TownSettings(seed=seed, palette=palette, views=views, width=width, height=height, extra=float(extra))
+    settings = TownSettings(
+        seed=seed, palette=palette, views=views, width=width, height=height, extra=float(extra)
+    )
     look = palette_of(palette)
     if _complete(folder, settings):
         return
@@ -172,14 +192,26 @@ def write_town(folder: Path, *, seed: int, palette: str, views: int, width: int,
             _fill(fresh, settings, look)
             _place(fresh, folder, settings)
     except OSError as error:
-        raise DataError(f"{folder}: can't be written ({error}); free some space or name another folder") from error
+        raise DataError(
+            f"{folder}: can't be written ({error}); free some space or name another folder"
+        ) from error
 
 
 def cached_town(
-    *, seed: int = 0, palette: str = "day", views: int = 40, width: int = 160, height: int = 120, extra: float = 0.0
+    *,
+    seed: int = 0,
+    palette: str = "day",
+    views: int = 40,
+    width: int = 160,
+    height: int = 120,
+    extra: float = 0.0,
 ) -> Path:
-    """The folder of a town in the user's cache ($XDG_CACHE_HOME/fprf or ~/.cache/fprf), rendered where it is not there yet."""
-    settings = TownSettings(seed=seed, palette=palette, views=views, width=width, height=height, extra=float(extra))
+    """The folder of a town in the user's cache ($XDG_CACHE_HOME/fprf or ~/.cache/fprf), rendered where it is
+    not there yet.
+    """
+    settings = TownSettings(
+        seed=seed, palette=palette, views=views, width=width, height=height, extra=float(extra)
+    )
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fprf"
     folder = cache / f"town-{settings.key}" / "town"
     write_town(folder, seed=seed, palette=palette, views=views, width=width, height=height, extra=extra)
@@ -193,14 +225,18 @@ def scene_folder(data: Path) -> Path:
 
 def main(argv: list[str]) -> int:
     """`python -m benchmarks town FOLDER`: a town as a scene folder, with the truth beside its images."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks town", description="Render a town into a folder.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks town", description="Render a town into a folder."
+    )
     parser.add_argument("folder", type=Path, help="empty or new")
     parser.add_argument("--seed", type=int, default=0, help="decides where houses, trees and cars stand")
     parser.add_argument("--palette", default="day", choices=sorted(PALETTES), help="light and colours")
     parser.add_argument("--views", type=int, default=40, help="number of images")
     parser.add_argument("--width", type=int, default=160, help="pixels across an image")
     parser.add_argument("--height", type=int, default=120, help="pixels down an image")
-    parser.add_argument("--extra", type=float, default=0.0, help="metres by which the street is longer than the usual 49")
+    parser.add_argument(
+        "--extra", type=float, default=0.0, help="metres by which the street is longer than the usual 49"
+    )
     options = vars(parser.parse_args(argv))
     write_town(options.pop("folder"), **options)
     return 0

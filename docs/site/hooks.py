@@ -1,5 +1,6 @@
-"""What MkDocs is told beyond the files in docs/: the README as the first page, a page for each verb made from its own flags,
-and files of the repository that pages link to."""
+"""What MkDocs is told beyond the files in docs/: the README as the first page, a page for each verb made from
+its own flags, and files of the repository that pages link to.
+"""
 
 import contextlib
 import importlib
@@ -40,7 +41,9 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Adds what does not lie in docs/."""
     for source, page in FRONT.items():
-        files.append(File.generated(config, page, content=moved((ROOT / source).read_text("utf-8"), source, page)))
+        files.append(
+            File.generated(config, page, content=moved((ROOT / source).read_text("utf-8"), source, page))
+        )
     for verb, about in VERBS.items():
         files.append(File.generated(config, f"verbs/{verb}.md", content=verb_page(verb, about)))
     wanted = {path for file in list(files) if file.is_documentation_page() for path in linked(file)}
@@ -56,13 +59,19 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Any, config: MkDocsConfig, files: Files) -> str:
     """Links from docs/ to the rest of the repository lead to its copies on the site."""
     uri = page.file.src_uri
-    return markdown if uri in FRONT.values() or uri.startswith("verbs/") else moved(markdown, f"docs/{uri}", uri)
+    return (
+        markdown if uri in FRONT.values() or uri.startswith("verbs/") else moved(markdown, f"docs/{uri}", uri)
+    )
 
 
 def linked(file: File) -> set[str]:
     """Files of the repository, by their place on the site, that a page leads to."""
     uri = file.src_uri
-    text = file.content_string if file.generated_by else moved((ROOT / "docs" / uri).read_text("utf-8"), f"docs/{uri}", uri)
+    text = (
+        file.content_string
+        if file.generated_by
+        else moved((ROOT / "docs" / uri).read_text("utf-8"), f"docs/{uri}", uri)
+    )
     targets = {posixpath.normpath(posixpath.join(posixpath.dirname(uri), m[1])) for m in LINK.finditer(text)}
     return {target for target in targets if target.startswith("repository/")}
 
@@ -95,7 +104,11 @@ def verb_page(verb: str, about: Verb) -> str:
     word = {"pretrain": ["decoder"], "train": ["fprf-lite"]}.get(verb, [])
     lines += ["", "```text", help_of(verb, word), "```"]
     if verb == "train":
-        lines += ["", "Defaults are those of `fprf-lite`. Fields of other plug-ins follow from what fills a slot:", ""]
+        lines += [
+            "",
+            "Defaults are those of `fprf-lite`. Fields of other plug-ins follow from what fills a slot:",
+            "",
+        ]
         lines += ["`fprf train METHOD --semantic.encoder vgg19 --help` shows them."]
     return "\n".join([*lines, ""])
 

@@ -1,4 +1,5 @@
-"""Block layouts: how a scene is cut. One block over the whole scene is the default. `build` imports the implementation.
+"""Block layouts: how a scene is cut. One block over the whole scene is the default. `build` imports the
+implementation.
 
 Lengths are in world units: metres, or whatever the capture's poses are in.
 """

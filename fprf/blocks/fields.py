@@ -1,12 +1,14 @@
-"""Fields of a scene of blocks: points go to the members that they belong to, density and features are blended, then decoded.
+"""Fields of a scene of blocks: points go to the members that they belong to, density and features are
+blended, then decoded.
 
-Densities blend by the weights of the router: sigma = sum_i w_i sigma_i. Features blend by what each member emits there,
-f = sum_i w_i sigma_i f_i / sum_i w_i sigma_i: a block that finds a place empty has no say about its colour. Shares are formed
-in log space, since densities span thirty orders of magnitude.
+Densities blend by the weights of the router: sigma = sum_i w_i sigma_i. Features blend by what each member
+emits there, f = sum_i w_i sigma_i f_i / sum_i w_i sigma_i: a block that finds a place empty has no say about
+its colour. Shares are formed in log space, since densities span thirty orders of magnitude.
 
-A block starts as the surroundings it is trained in: what they have learnt of its place is not learnt again. Planes are laid
-anew over the block's chart, each node with the value that the old planes have there; networks are copied. The finer nodes then
-hold the coarse scene, which training sharpens. Parts that consist of anything else start from their seed.
+A block starts as the surroundings it is trained in: what they have learnt of its place is not learnt again.
+Planes are laid anew over the block's chart, each node with the value that the old planes have there; networks
+are copied. The finer nodes then hold the coarse scene, which training sharpens. Parts that consist of
+anything else start from their seed.
 """
 
 from abc import ABC, abstractmethod
@@ -28,7 +30,9 @@ from .routing import Chart, Group, Router
 class Member(nn.Module):
     """Fields and sampler of one block, and where they apply. Points are those of the scene's space."""
 
-    def __init__(self, chart: Chart, sampler: Sampler, field: ContentField, semantic: SemanticField | None) -> None:
+    def __init__(
+        self, chart: Chart, sampler: Sampler, field: ContentField, semantic: SemanticField | None
+    ) -> None:
         super().__init__()
         self.chart = chart
         self.sampler = sampler
@@ -58,7 +62,9 @@ class ResidentMembers(Members):
 
 
 def emission(density: Annotated[Tensor, "n m"], weight: Annotated[Tensor, "n m"]) -> Annotated[Tensor, "n m"]:
-    """Share of each member in what is emitted at a point; rows sum to 1, also where no member has any density."""
+    """Share of each member in what is emitted at a point; rows sum to 1, also where no member has any
+    density.
+    """
     tiny = torch.finfo(density.dtype).tiny
     return torch.softmax(density.clamp_min(tiny).log() + weight.log(), -1)
 
@@ -66,17 +72,21 @@ def emission(density: Annotated[Tensor, "n m"], weight: Annotated[Tensor, "n m"]
 class BlockedField(ContentField):
     """Density and content. A latent is the point, then the latent of its member.
 
-    Points that several members share are looked up again for their content: only those that are kept, and few lie in borders.
+    Points that several members share are looked up again for their content: only those that are kept, and few
+    lie in borders.
     """
 
     def __init__(self, members: Members, router: Router) -> None:
         super().__init__()
-        self.members, self.router = members, router
+        self.members = members
+        self.router = router
         self.held = nn.ModuleList(members.held)
 
     def density(self, points: Annotated[Tensor, "N 3"]) -> FieldSample:
         """Blended density; points are those of the scene's space."""
-        groups, densities, latents = self.router(points), [], []
+        groups = self.router(points)
+        densities = []
+        latents = []
         for group in groups:
             here = points[group.at]
             members = [self.members.member(number) for number in group.members]
@@ -86,9 +96,13 @@ class BlockedField(ContentField):
         density, latent = (_joined([group.at for group in groups], parts) for parts in (densities, latents))
         return FieldSample(density, latent)
 
-    def content(self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "M C"]:
-        points, own = latent[:, :3].detach(), latent[:, 3:]
-        groups, contents = self.router(points), []
+    def content(
+        self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]
+    ) -> Annotated[Tensor, "M C"]:
+        points = latent[:, :3].detach()
+        own = latent[:, 3:]
+        groups = self.router(points)
+        contents = []
         for group in groups:
             # One member alone decodes what its density was found with.
             if group.weight is None:
@@ -96,7 +110,8 @@ class BlockedField(ContentField):
                 contents.append(self.members.member(group.members[0]).field.content(own[at], view[at]))
                 continue
             # Several are looked up again: the latent holds one of them.
-            samples, features = [], []
+            samples = []
+            features = []
             for number in group.members:
                 member = self.members.member(number)
                 sample = member.field.density(member.chart.locate(points[group.at]))
@@ -117,13 +132,17 @@ class BlockedSemantic(SemanticField):
 
     def __init__(self, members: Members, router: Router) -> None:
         super().__init__()
-        self.members, self.router = members, router
+        self.members = members
+        self.router = router
 
     def forward(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N D"]:
         """Blended features at points of the scene's space."""
-        groups, outputs = self.router(points), []
+        groups = self.router(points)
+        outputs = []
         for group in groups:
-            here, features, densities = points[group.at], [], []
+            here = points[group.at]
+            features = []
+            densities = []
             for number in group.members:
                 member = self.members.member(number)
                 assert member.semantic is not None
@@ -136,7 +155,9 @@ class BlockedSemantic(SemanticField):
 
     def penalties(self) -> dict[str, Tensor]:
         """Penalties of the members in memory, added up."""
-        return add_penalties(member.semantic.penalties() for member in self.members.held if member.semantic is not None)
+        return add_penalties(
+            member.semantic.penalties() for member in self.members.held if member.semantic is not None
+        )
 
 
 def _blended(densities: list[Tensor], group: Group) -> Annotated[Tensor, "n"]:
@@ -175,13 +196,18 @@ class _Routed(nn.Module):
 
     def __init__(self, members: Members, router: Router, level: int) -> None:
         super().__init__()
-        self.members, self.router, self.level = members, router, level
+        self.members = members
+        self.router = router
+        self.level = level
 
     def forward(self, points: Tensor) -> Tensor:
-        groups, outputs = self.router(points), []
+        groups = self.router(points)
+        outputs = []
         for group in groups:
             members = [self.members.member(number) for number in group.members]
-            densities = [each.sampler.fields[self.level](each.chart.locate(points[group.at])) for each in members]
+            densities = [
+                each.sampler.fields[self.level](each.chart.locate(points[group.at])) for each in members
+            ]
             outputs.append(_blended(densities, group))
         return _joined([group.at for group in groups], outputs)
 
@@ -191,7 +217,8 @@ class BlockedSampler(Sampler):
 
     def __init__(self, inner: Sampler, members: Members, router: Router) -> None:
         super().__init__()
-        self.members, self.router = members, router
+        self.members = members
+        self.router = router
         self.inner = inner
         for level in range(len(inner.fields)):
             inner.fields[level] = _Routed(members, router, level)
@@ -216,14 +243,18 @@ class BlockedSampler(Sampler):
 def inherit(member: Member, around: Member) -> None:
     """Let a member of the same config start as `around` is where it lies."""
     for name in ("sampler", "field", "semantic"):
-        own, other = getattr(member, name), getattr(around, name)
+        own = getattr(member, name)
+        other = getattr(around, name)
         if own is None or other is None:
             continue
-        # Only parts that consist of planes, linear maps and offsets: of others nobody knows what depends on the chart.
+        # Only parts that consist of planes, linear maps and offsets: of others nobody knows what depends on
+        # the chart.
         modules = [module for module in own.modules() if isinstance(module, Planes | nn.Linear)]
         known = {id(parameter) for module in modules for parameter in module.parameters()}
         planes = any(isinstance(module, Planes) for module in modules)
-        if not planes or not all(id(parameter) in known or parameter.ndim == 1 for parameter in own.parameters()):
+        if not planes or not all(
+            id(parameter) in known or parameter.ndim == 1 for parameter in own.parameters()
+        ):
             continue
         # Networks are copied, planes are resampled where the block lies.
         own.load_state_dict(other.state_dict())
@@ -235,12 +266,14 @@ def inherit(member: Member, around: Member) -> None:
 
 def resample_planes(planes: Planes, chart: Chart, old: Chart) -> Annotated[Tensor, "rows F"]:
     """The table of planes over `chart` that say what `planes` say over `old`, exact at the nodes."""
-    middle, half = (chart.low + chart.high) / 2, (chart.high - chart.low) / 2
+    middle = (chart.low + chart.high) / 2
+    half = (chart.high - chart.low) / 2
     parts = []
     for grids in split(planes.table.detach(), planes.resolutions):
         nodes = torch.linspace(-1, 1, grids.shape[1], dtype=torch.float64)
         for grid, (a, b) in zip(grids, AXES, strict=True):
-            # Nodes [R R 3] of the plane in the new cube, at 0 along the third axis, and where they lie in the old one.
+            # Nodes [R R 3] of the plane in the new cube, at 0 along the third axis, and where they lie in the
+            # old one.
             cube = torch.zeros(len(nodes), len(nodes), 3, dtype=torch.float64)
             cube[..., a], cube[..., b] = nodes[None, :], nodes[:, None]
             at = old.locate((cube * half + middle).view(-1, 3)).view(cube.shape)

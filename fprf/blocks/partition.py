@@ -1,18 +1,20 @@
-"""A partition of a scene: boxes that are trained apart, of fields (blocks) and of Gaussians (cells), and their file.
+"""A partition of a scene: boxes that are trained apart, of fields (blocks) and of Gaussians (cells), and
+their file.
 
-Blocks lie in the scene's space, the same for all, so that their densities blend as they are, and cut it seen from above; what
-none of them holds is surroundings. Sparse points reach as far as the eye does; most of a scene's detail lies where its cameras
-are. So the region that is cut is the cameras' bounds widened by REACH, but no wider than the points there are. A region weighs
-half by the pixels of the cameras that stand in it and half by its share of the sparse points: cameras say where pixels come
-from, points where they end.
+Blocks lie in the scene's space, the same for all, so that their densities blend as they are, and cut it seen
+from above; what none of them holds is surroundings. Sparse points reach as far as the eye does; most of a
+scene's detail lies where its cameras are. So the region that is cut is the cameras' bounds widened by REACH,
+but no wider than the points there are. A region weighs half by the pixels of the cameras that stand in it and
+half by its share of the sparse points: cameras say where pixels come from, points where they end.
 
-Which tiles of which views a block learns from follows from cameras and sparse points alone, before any image is decoded. A
-tile's rays reach BEYOND times as far as the farthest point that is seen in it or its neighbours, and without end where nothing
-is (the sky).
+Which tiles of which views a block learns from follows from cameras and sparse points alone, before any image
+is decoded. A tile's rays reach BEYOND times as far as the farthest point that is seen in it or its
+neighbours, and without end where nothing is (the sky).
 
-Cells of Gaussians cover all of space: it is bisected along the principal axes of the reconstruction's points, so that the
-points of each cell were seen about equally often, and outer cells have no end. A cell learns from the windows of photographs
-that show its points and a border around it, so its cost follows from its windows alone (compare VastGaussian, Lin et al.
+Cells of Gaussians cover all of space: it is bisected along the principal axes of the reconstruction's points,
+so that the points of each cell were seen about equally often, and outer cells have no end. A cell learns from
+the windows of photographs that show its points and a border around it, so its cost follows from its windows
+alone (compare VastGaussian, Lin et al.
 2024).
 """
 
@@ -41,7 +43,9 @@ from .config import AdaptiveConfig, GridConfig, LayoutConfig
 from .routing import chart_of
 
 REACH = 1.0
-"""Units beyond the cameras that still belong to the region; a unit is the distance that views commonly see."""
+"""Units beyond the cameras that still belong to the region; a unit is the distance that views commonly
+see.
+"""
 OUTLIERS = 0.01
 """Share of the points on either side that is left out: reconstructions have strays."""
 FEW = 16
@@ -54,7 +58,8 @@ SEEN = 8
 """Points of a cell that a view shows, at least, where the cell learns from it."""
 OWN = 0.15
 """Share of the points in a window that are the cell's own, at least."""
-LEAST, ROOM = 64, 6
+LEAST = 64
+ROOM = 6
 """Least width and height of a window; pixels around the points in it."""
 FLAT = 0.3
 """Cameras spread over a plane if their third extent is below this share of their second ..."""
@@ -78,32 +83,42 @@ Box = tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]
 """Lowest and highest corner."""
 
 
-def bisect(box: Box, state: State, place: Callable[[Box, State], tuple[int, float, State, State] | None]) -> list[Box]:
+def bisect(
+    box: Box, state: State, place: Callable[[Box, State], tuple[int, float, State, State] | None]
+) -> list[Box]:
     """Halve a box again and again, in the order of the tree.
 
-    `place` says across which axis a box is cut, where, and the states of both halves; None where it stays whole.
+    `place` says across which axis a box is cut, where, and the states of both halves; None where it stays
+    whole.
     """
     cut = place(box, state)
     if cut is None:
         return [box]
     axis, at, first, second = cut
     low, high = box
-    middle_high, middle_low = high.clone(), low.clone()
+    middle_high = high.clone()
+    middle_low = low.clone()
     middle_high[axis] = middle_low[axis] = at
     return bisect((low, middle_high), first, place) + bisect((middle_low, high), second, place)
 
 
 def bounds(site: Site) -> Box:
-    """Region that is cut into blocks: around the cameras, shrunk to the points there as far as all cameras stay inside."""
-    low, high = site.position.amin(0) - REACH, site.position.amax(0) + REACH
+    """Region that is cut into blocks: around the cameras, shrunk to the points there as far as all cameras
+    stay inside.
+    """
+    low = site.position.amin(0) - REACH
+    high = site.position.amax(0) + REACH
     inside = site.points[((site.points >= low) & (site.points <= high)).all(1)]
     if len(inside) < FEW:
         return low, high
     inside = inside[:: -(-len(inside) // _ROWS)]
     ends = inside.quantile(torch.tensor([OUTLIERS, 1 - OUTLIERS], dtype=inside.dtype), 0)
     room = PADDING * (ends[1] - ends[0]) + 1e-6
-    least, most = site.position.amin(0), site.position.amax(0)
-    return torch.maximum(low, torch.minimum(ends[0], least) - room), torch.minimum(high, torch.maximum(ends[1], most) + room)
+    least = site.position.amin(0)
+    most = site.position.amax(0)
+    return torch.maximum(low, torch.minimum(ends[0], least) - room), torch.minimum(
+        high, torch.maximum(ends[1], most) + room
+    )
 
 
 def _blocks(boxes: Sequence[Box], margin: float) -> list[Cell]:
@@ -124,8 +139,13 @@ class GridLayout(BlockLayout):
         if self.config.size is not None:
             counts = [max(1, round(float(high[a] - low[a]) * site.unit / self.config.size)) for a in range(2)]
         margin = self.config.margin * min(float(high[a] - low[a]) / n for a, n in enumerate(counts))
-        low, high = low - margin, high + margin  # what is found on the region's border lies inside its blocks
-        sides = [torch.linspace(float(low[a]), float(high[a]), n + 1, dtype=low.dtype) for a, n in enumerate(counts)]
+        # what is found on the region's border lies inside its blocks
+        low = low - margin
+        high = high + margin
+        sides = [
+            torch.linspace(float(low[a]), float(high[a]), n + 1, dtype=low.dtype)
+            for a, n in enumerate(counts)
+        ]
         lows = torch.cartesian_prod(sides[0][:-1], sides[1][:-1], low[2:])
         highs = torch.cartesian_prod(sides[0][1:], sides[1][1:], high[2:])
         # Cells that no camera stands in, and where next to nothing was found, are surroundings.
@@ -147,19 +167,26 @@ class AdaptiveLayout(BlockLayout):
     def cut(self, site: Site) -> list[Cell]:
         """The leaves that weigh anything, in the order of the tree."""
         low, high = bounds(site)
-        smallest = 0.1 * float((high - low)[:2].amax()) if self.config.smallest is None else self.config.smallest / site.unit
+        smallest = (
+            0.1 * float((high - low)[:2].amax())
+            if self.config.smallest is None
+            else self.config.smallest / site.unit
+        )
         # Places seen from above, and the training pixels that each stands for.
         points = site.points[((site.points >= low) & (site.points <= high)).all(1)]
-        rays, share = site.rays.double(), 0.5 if len(points) else 1.0
+        rays = site.rays.double()
+        share = 0.5 if len(points) else 1.0
         each = points.new_full((len(points),), 0.5 * float(rays.sum()) / max(1, len(points)))
-        place, weight = torch.cat([site.position[:, :2], points[:, :2]]), torch.cat([share * rays, each])
+        place = torch.cat([site.position[:, :2], points[:, :2]])
+        weight = torch.cat([share * rays, each])
 
         def inside(box: Box) -> Annotated[Tensor, "N"]:
             return ((place >= box[0][:2]) & (place < box[1][:2])).all(1)
 
         def halved(box: Box, _: None) -> tuple[int, float, None, None] | None:
             extent = (box[1] - box[0])[:2]
-            axis, here = int(extent.argmax()), inside(box)
+            axis = int(extent.argmax())
+            here = inside(box)
             load = float(weight[here].sum())
             if load <= self.config.rays or float(extent[axis]) < 2 * smallest:
                 return None
@@ -168,15 +195,26 @@ class AdaptiveLayout(BlockLayout):
             order = values.argsort()
             total = weight[here][order].cumsum(0)
             at = float(values[order[int(torch.searchsorted(total, total[-1] / 2))]])
-            return axis, min(max(at, float(box[0][axis]) + smallest), float(box[1][axis]) - smallest), None, None
+            return (
+                axis,
+                min(max(at, float(box[0][axis]) + smallest), float(box[1][axis]) - smallest),
+                None,
+                None,
+            )
 
-        leaves = [box for box in bisect((low, high), None, halved) if float(weight[inside(box)].sum()) > 0] or [(low, high)]
-        # The border is that of the smallest side that may be: another budget moves no block that it does not split.
+        leaves = [
+            box for box in bisect((low, high), None, halved) if float(weight[inside(box)].sum()) > 0
+        ] or [(low, high)]
+        # The border is that of the smallest side that may be: another budget moves no block that it does not
+        # split.
         margin = self.config.margin * smallest if len(leaves) > 1 else 0.0
         # What is found on the region's border lies inside its blocks.
         return _blocks(
             [
-                (torch.where(first <= low, first - margin, first), torch.where(last >= high, last + margin, last))
+                (
+                    torch.where(first <= low, first - margin, first),
+                    torch.where(last >= high, last + margin, last),
+                )
                 for first, last in leaves
             ],
             margin,
@@ -184,13 +222,17 @@ class AdaptiveLayout(BlockLayout):
 
 
 def level_axes(cameras: Cameras) -> Annotated[Tensor, "3 3"]:
-    """Rows: along the capture, across, up. Over a plane (drones) its normal is up; along a line (streets) the cameras' own."""
+    """Rows: along the capture, across, up. Over a plane (drones) its normal is up; along a line (streets) the
+    cameras' own.
+    """
     offset = cameras.pose[:, :, 3] - cameras.pose[:, :, 3].mean(0)
     _, extent, rows = torch.linalg.svd(offset, full_matrices=True)
     if len(extent) < 3 or extent[2] > FLAT * extent[1] or extent[1] < WIDE * extent[0]:
         return axes(cameras)
-    up, along = rows[2], rows[0]
-    upright, ahead = cameras.pose[:, :, 1].mean(0), -cameras.pose[:, :, 2].mean(0)
+    up = rows[2]
+    along = rows[0]
+    upright = cameras.pose[:, :, 1].mean(0)
+    ahead = -cameras.pose[:, :, 2].mean(0)
     # Cameras stand upright, or look down: one of the two tells which side of the plane the sky is on.
     if (upright @ up - ahead @ up) < 0:
         up = -up
@@ -200,21 +242,30 @@ def level_axes(cameras: Cameras) -> Annotated[Tensor, "3 3"]:
 
 
 def open_space(scene: ParsedScene, sightings: Sightings | None) -> Space:
-    """The space of kind `open`. Raises DataError where all cameras stand in one place and nothing says how far they see."""
-    # A unit is the distance that views commonly see: of points, else as the capture says, else of the cameras' spacing.
+    """The space of kind `open`. Raises DataError where all cameras stand in one place and nothing says how
+    far they see.
+    """
+    # A unit is the distance that views commonly see: of points, else as the capture says, else of the
+    # cameras' spacing.
     position = scene.cameras.pose[:, :, 3]
-    centre, turn = position.mean(0), level_axes(scene.cameras)
+    centre = position.mean(0)
+    turn = level_axes(scene.cameras)
     nearest = None
     if sightings is not None:
         unit = float(sightings.distance.median())
         nearest = float(sightings.distance.sort().values[int(NEAREST * len(sightings.distance))])
     elif scene.depths is not None:
-        unit, nearest = float(scene.depths.prod(-1).sqrt().median()), float(scene.depths[:, 0].amin())
+        unit = float(scene.depths.prod(-1).sqrt().median())
+        nearest = float(scene.depths[:, 0].amin())
     else:
         apart = torch.cdist(position[:: max(1, len(position) // SOME)], position)
-        unit = SPACINGS * float(apart.topk(2, largest=False).values[:, 1].median()) if len(position) > 1 else 0.0
+        unit = (
+            SPACINGS * float(apart.topk(2, largest=False).values[:, 1].median()) if len(position) > 1 else 0.0
+        )
     if unit <= ROUNDING * max(1.0, float(position.abs().amax())):
-        raise DataError(f"{scene.name}: all cameras stand in one place and there are no points; capture from several places")
+        raise DataError(
+            f"{scene.name}: all cameras stand in one place and there are no points; capture from several places"
+        )
     # Nothing nearer than half of the nearest point is looked at.
     near = NEAR if nearest is None else min(NEAR, max(1e-3, 0.5 * nearest / unit))
     first, second, third = ((float(row[0]), float(row[1]), float(row[2])) for row in turn)
@@ -244,10 +295,11 @@ def tile_rays(
     Annotated[Tensor, "M TILES TILES"],
     Annotated[Tensor, "M TILES TILES"],
 ]:
-    """Origins and directions of the rays through the middles of the tiles [row, column] of some views, in the space.
+    """Origins and directions of the rays through the middles of the tiles [row, column] of some views, in the
+    space.
 
-    Then upper bounds of their lengths, space units (inf where nothing is known), and the pixels of each tile (int64; 0 outside
-    of the image). Float32 is enough here.
+    Then upper bounds of their lengths, space units (inf where nothing is known), and the pixels of each tile
+    (int64; 0 outside of the image). Float32 is enough here.
     """
     cameras = scene.cameras
     size = cameras.size[views].double()
@@ -268,7 +320,8 @@ def tile_rays(
         slot = torch.full((len(cameras),), -1, dtype=torch.int64)
         slot[views] = torch.arange(len(views))
         mine = slot[sightings.view] >= 0
-        view, pixels = sightings.view[mine], sightings.pixel[mine]
+        view = sightings.view[mine]
+        pixels = sightings.pixel[mine]
         column, row = tile_of(cameras, view, pixels).unbind(1)
         at = (slot[view] * TILES + row) * TILES + column
         far = torch.zeros(len(views), TILES, TILES)
@@ -276,7 +329,12 @@ def tile_rays(
         around = F.max_pool2d(far[:, None], 3, stride=1, padding=1)[:, 0]
         reach = torch.where(around > 0, BEYOND * around, reach)
     direction = rays.direction.view(-1, TILES, TILES, 3)
-    return rays.origin.view(direction.shape)[:, :1, :1], direction, reach, rows[:, :, None] * columns[:, None, :]
+    return (
+        rays.origin.view(direction.shape)[:, :1, :1],
+        direction,
+        reach,
+        rows[:, :, None] * columns[:, None, :],
+    )
 
 
 def pixel_mask(seen: Annotated[Tensor, "TILES TILES"], size: tuple[int, int]) -> Annotated[Tensor, "H W"]:
@@ -312,7 +370,9 @@ class Plan:
 
 
 def make_plan(scene: ParsedScene, layout: LayoutConfig) -> Plan:
-    """Cut the scene and find out who sees what. Raises ConfigError where a block would have nothing to learn from."""
+    """Cut the scene and find out who sees what. Raises ConfigError where a block would have nothing to learn
+    from.
+    """
     # Geometry alone: no image is decoded to find out who sees what.
     sightings = find_sightings(scene)
     space = open_space(scene, sightings)
@@ -332,18 +392,29 @@ def make_plan(scene: ParsedScene, layout: LayoutConfig) -> Plan:
     # A block that no pixel sees would learn nothing: it is part of the surroundings.
     used = [block for block in range(len(cells)) if int((seen[:, block] * pixels).sum())]
     if not used:
-        raise ConfigError(f"{scene.name}: no training view sees any block of this layout; choose another --blocks")
-    return Plan(space=space, cells=[cells[block] for block in used], views=scene.train, seen=seen[:, used], pixels=pixels)
+        raise ConfigError(
+            f"{scene.name}: no training view sees any block of this layout; choose another --blocks"
+        )
+    return Plan(
+        space=space,
+        cells=[cells[block] for block in used],
+        views=scene.train,
+        seen=seen[:, used],
+        pixels=pixels,
+    )
 
 
 def bisect_sightings(scene: ParsedScene, count: int) -> list[Cell]:
-    """`count` cells, each with about as many sightings of points. Raises ConfigError where the points do not allow that."""
+    """`count` cells, each with about as many sightings of points. Raises ConfigError where the points do not
+    allow that.
+    """
     sightings = find_sightings(scene)
     if sightings is None or len(sightings.view) < SEEN * count:
         raise ConfigError(
             f"cells: {scene.name} has too few points of a reconstruction for {count} cells; train it in one piece"
         )
-    # Sightings [O] come view by view; `ends` says where each view begins. `local` are their points along principal axes.
+    # Sightings [O] come view by view; `ends` says where each view begins. `local` are their points along
+    # principal axes.
     ends = torch.searchsorted(sightings.view, torch.arange(len(scene.cameras) + 1))
     centred = sightings.point - sightings.point.mean(0)
     frame = torch.linalg.eigh(centred.T @ centred).eigenvectors.T.flip(0).contiguous()
@@ -361,12 +432,14 @@ def bisect_sightings(scene: ParsedScene, count: int) -> list[Cell]:
     endless = torch.full((3,), math.inf, dtype=torch.float64)
     cells = []
     for low, high in bisect((-endless, endless), count, halved):
-        # The cell learns what lies within a border around it as well, so that nothing is missing at its faces.
+        # The cell learns what lies within a border around it as well, so that nothing is missing at its
+        # faces.
         inside = ((local >= low) & (local < high)).all(1)
         first, last = _extent(local[inside])
         border = BORDER * (last - first)
         near = ((local >= low - border) & (local < high + border)).all(1)
-        # A view's window is around the points in the cell and its border, where enough of what it shows is the cell's own.
+        # A view's window is around the points in the cell and its border, where enough of what it shows is
+        # the cell's own.
         windows: dict[int, Window] = {}
         for view in torch.unique(sightings.view[near]).tolist():
             of_view = slice(int(ends[view]), int(ends[view + 1]))
@@ -389,7 +462,8 @@ def bisect_sightings(scene: ParsedScene, count: int) -> list[Cell]:
     for view in sorted({view for cell in cells for view in cell.windows}):
         own = [k for k, cell in enumerate(cells) if view in cell.windows]
         window = np.array([cells[k].windows[view] for k in own])
-        lows, highs = window[:, :2], window[:, :2] + window[:, 2:]
+        lows = window[:, :2]
+        highs = window[:, :2] + window[:, 2:]
         lows = np.where(lows == lows.min(0), 0, lows)
         highs = np.where(highs == highs.max(0), scene.cameras.size[view].numpy(), highs)
         for k, (left, top), (wide, tall) in zip(own, lows.tolist(), (highs - lows).tolist(), strict=True):
@@ -404,7 +478,9 @@ def _extent(values: Annotated[Tensor, "N K"]) -> tuple[Annotated[Tensor, "K"], A
 
 
 def _interval(first: float, last: float, size: int) -> tuple[int, int]:
-    """Start and length of a part of [0, size) around [first, last], at least LEAST long where there is room."""
+    """Start and length of a part of [0, size) around [first, last], at least LEAST long where there is
+    room.
+    """
     start = max(0, math.floor(first) - ROOM)
     length = min(max(math.ceil(last) + ROOM - start, LEAST), size)
     return min(start, size - length), length
@@ -416,7 +492,9 @@ _Windows = tuple[tuple[int, int, int, int, int], ...]
 
 
 def write_cells(file: Path, cells: Sequence[Cell]) -> bool:
-    """Write a partition; True where the file holds another one. Raises CheckpointError where that cannot be read."""
+    """Write a partition; True where the file holds another one. Raises CheckpointError where that cannot be
+    read.
+    """
     document = {
         "format": _FORMAT,
         "frame": cells[0].frame.tolist(),
@@ -451,7 +529,9 @@ def read_cells(file: Path) -> list[Cell]:
                 high=_corner(each["high"], math.inf),
                 border=_corner(each["border"], 0.0),
                 frame=frame,
-                windows={v: (x, y, w, h) for v, x, y, w, h in from_json(each["windows"], _Windows, path="windows")},
+                windows={
+                    v: (x, y, w, h) for v, x, y, w, h in from_json(each["windows"], _Windows, path="windows")
+                },
             )
             for each in document["cells"]
         ]

@@ -1,17 +1,20 @@
-"""Routing of points to their blocks. Points are handed out in groups: all points of a group have the same members.
+"""Routing of points to their blocks. Points are handed out in groups: all points of a group have the same
+members.
 
-`to_single` sends all points to one member. `InsetRouter` is for training a block: inside its reach the block, outside of it
-the surroundings. `BlendRouter` is for rendering: weights of `windows`, whose smooth change from block to block leaves no seam.
-It looks points up in a table of the ground plan, so its cost does not grow with the number of blocks, and names only the blocks
-that the points need: the others are never loaded.
+`to_single` sends all points to one member. `InsetRouter` is for training a block: inside its reach the block,
+outside of it the surroundings. `BlendRouter` is for rendering: weights of `windows`, whose smooth change from
+block to block leaves no seam. It looks points up in a table of the ground plan, so its cost does not grow
+with the number of blocks, and names only the blocks that the points need: the others are never loaded.
 
-Windows: A block reaches a border b beyond its cell. Along each axis its window rises by a smoothstep from 0 at the end of
-that reach to 1 two borders inside, so it is 1/2 on the cell's face; neighbours that share a face have windows S and 1 - S
-there. Where windows sum to less than 1 the surroundings have the rest; where cells overlap they sum to more and are scaled.
-The weights are continuous, and so is whatever is blended by them.
+Windows: A block reaches a border b beyond its cell. Along each axis its window rises by a smoothstep from 0
+at the end of that reach to 1 two borders inside, so it is 1/2 on the cell's face; neighbours that share a
+face have windows S and 1 - S there. Where windows sum to less than 1 the surroundings have the rest; where
+cells overlap they sum to more and are scaled. The weights are continuous, and so is whatever is blended by
+them.
 
-Charts: A block's chart is affine: its cell with the border fills the cube, so that no node of its planes lies where it has no
-say. The chart of the surroundings contracts: all blocks together fill the inner half, everything else the rest.
+Charts: A block's chart is affine: its cell with the border fills the cube, so that no node of its planes lies
+where it has no say. The chart of the surroundings contracts: all blocks together fill the inner half,
+everything else the rest.
 
 All points are those of the scene's space, and so are the axes of cells.
 """
@@ -62,7 +65,9 @@ class Chart:
     contracted: bool = False
 
     def locate(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
-        """Points of the space to the cube; a block's chart takes those inside its box alone to points inside the cube."""
+        """Points of the space to the cube; a block's chart takes those inside its box alone to points inside
+        the cube.
+        """
         middle, half, _, _ = self._on(points)
         # The middle is taken off before anything is scaled: float32 keeps what is left of a large coordinate.
         y = (points - middle) / half
@@ -74,12 +79,17 @@ class Chart:
         return ((points >= low) & (points <= high)).all(-1)
 
     def _on(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Middle, half size, low and high with the dtype and device of points, copied once, not in each training step."""
+        """Middle, half size, low and high with the dtype and device of points, copied once, not in each
+        training step.
+        """
         key = (points.dtype, points.device)
         if key not in self._copies:
             with torch.inference_mode(False):
-                low, high = self.low, self.high
-                middle, half, low, high = (each.to(points) for each in ((low + high) / 2, (high - low) / 2, low, high))
+                low = self.low
+                high = self.high
+                middle, half, low, high = (
+                    each.to(points) for each in ((low + high) / 2, (high - low) / 2, low, high)
+                )
                 self._copies[key] = middle, half, low, high
         return self._copies[key]
 
@@ -121,8 +131,8 @@ def to_single(points: Annotated[Tensor, "N 3"]) -> list[Group]:
 class InsetRouter:
     """Member 0 inside of a chart's box, member 1 outside.
 
-    On an accelerator both members are evaluated at all points, one of them with weight 0: the host would have to wait for the
-    number of points inside.
+    On an accelerator both members are evaluated at all points, one of them with weight 0: the host would have
+    to wait for the number of points inside.
     """
 
     def __init__(self, chart: Chart) -> None:
@@ -145,22 +155,25 @@ class BlendRouter:
         charts = [chart_of(cell) for cell in cells]
         low = torch.stack([chart.low for chart in charts]).amin(0)[:2]
         high = torch.stack([chart.high for chart in charts]).amax(0)[:2]
-        self.low, self.step = low, float((high - low).amax()) / TABLE
+        self.low = low
+        self.step = float((high - low).amax()) / TABLE
         counts = ((high - low) / self.step).ceil().long().clamp_min(1)
-        self.columns, self.rows = int(counts[0]), int(counts[1])
+        self.columns = int(counts[0])
+        self.rows = int(counts[1])
         # The middle of each square; it reaches half a diagonal around there, at any height.
         column, row = (torch.arange(count, dtype=torch.float64) + 0.5 for count in (self.columns, self.rows))
         y, x = torch.meshgrid(low[1] + row * self.step, low[0] + column * self.step, indexing="ij")
         middle = torch.stack([x, y, torch.zeros_like(x)], -1).view(-1, 3)
         room = middle.new_tensor([0.75 * self.step, 0.75 * self.step, torch.inf])
         touched = [Chart(chart.low - room, chart.high + room).inside(middle) for chart in charts]
-        # The set of blocks whose reach, seen from above, may touch each square. Rows come sorted; the empty set is first,
-        # whether or not a square has it: it is what lies beyond the table.
+        # The set of blocks whose reach, seen from above, may touch each square. Rows come sorted; the empty
+        # set is first, whether or not a square has it: it is what lies beyond the table.
         sets, number = torch.unique(torch.stack(touched, 1), dim=0, return_inverse=True)
         self.sets = [tuple(each.nonzero()[:, 0].tolist()) for each in sets]
         self.table = number
         if self.sets[0]:
-            self.table, self.sets = number + 1, [(), *self.sets]
+            self.table = number + 1
+            self.sets = [(), *self.sets]
 
     def __call__(self, points: Annotated[Tensor, "N 3"]) -> list[Group]:
         """Groups by the blocks near each point; points that one member has alone come without weights."""
@@ -170,11 +183,16 @@ class BlendRouter:
         square = torch.where(inside[:, None], at, torch.zeros_like(at)).long()
         kind = self.table.to(points.device)[square[:, 1] * self.columns + square[:, 0]]
         kind = torch.where(inside, kind, torch.zeros_like(kind))
-        # Of each set of blocks that is met only these are weighed, and only those with a say are ever fetched.
+        # Of each set of blocks that is met only these are weighed, and only those with a say are ever
+        # fetched.
         groups = []
         present = torch.bincount(kind, minlength=len(self.sets)).nonzero()[:, 0].tolist()
         for number in present:
-            index = (kind == number).nonzero()[:, 0] if len(present) > 1 else torch.arange(len(points), device=points.device)
+            index = (
+                (kind == number).nonzero()[:, 0]
+                if len(present) > 1
+                else torch.arange(len(points), device=points.device)
+            )
             named = (*self.sets[number], len(self.cells))
             if len(named) == 1:
                 groups.append(Group(named, index, None))

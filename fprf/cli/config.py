@@ -8,10 +8,11 @@ from ..plugins.config import PluginConfig
 
 @dataclass(frozen=True, kw_only=True)
 class CommandConfig(PluginConfig):
-    """A verb: `fprf NAME` parses its fields as flags and calls `run`. Its docstring is the first text of `--help`.
+    """A verb: `fprf NAME` parses its fields as flags and calls `run`. Its docstring is the first text of
+    `--help`.
 
-    Fields may be slots. The built-in verbs are listed in `fprf.cli.VERBS` with their usage, which help shows without
-    importing them and an entry point cannot hold.
+    Fields may be slots. The built-in verbs are listed in `fprf.cli.VERBS` with their usage, which help shows
+    without importing them and an entry point cannot hold.
     """
 
     group: ClassVar[str] = "fprf.commands"

@@ -47,7 +47,12 @@ class DemoConfig:
 
 def run(args: list[str]) -> int:
     """Train the garden, or resume, then measure, restyle, export and write the page."""
-    config = parse(DemoConfig(), args, prog="fprf demo", description="Train, restyle and show a garden that ships with fprf.")
+    config = parse(
+        DemoConfig(),
+        args,
+        prog="fprf demo",
+        description="Train, restyle and show a garden that ships with fprf.",
+    )
     start = time.perf_counter()
     from ..datamanagers.images import load_image
     from ..io.atomic import write_json
@@ -63,11 +68,14 @@ def run(args: list[str]) -> int:
 
     garden = Path(str(files("fprf") / "garden"))
     output = config.output / "run"
-    training = replace(fprf_splats(), data=garden, downscale=config.downscale, output=output, minutes=config.minutes)
+    training = replace(
+        fprf_splats(), data=garden, downscale=config.downscale, output=output, minutes=config.minutes
+    )
     root = train(training, "fprf-splats")
     metrics = evaluate(EvalConfig(run=root, images=False))
     opened = open_gaussians(Run(root), training, "cpu", QualityConfig())
-    scene, views = opened.scene, opened.known.test
+    scene = opened.scene
+    views = opened.known.test
     names = {garden / "references" / f"{name}.jpg": name for name in LOOKS}
     chosen = [(name, StyleFile(StyleConfig(references=(path,)))) for path, name in names.items()]
     chosen.append(("all together", StyleFile(StyleConfig(references=tuple(names)))))
@@ -78,7 +86,8 @@ def run(args: list[str]) -> int:
         styles = page_styles(scene, chosen, views, names, display)
         for style, look, _ in styles:
             assert isinstance(look, SplatScene)
-            # For viewers that do not compensate opacities; these depend on no colour, so that the views are looked at once.
+            # For viewers that do not compensate opacities; these depend on no colour, so that the views are
+            # looked at once.
             plain = scene.seen.plain(look.shown)
             write_gaussians(config.output / f"{style.name.replace(' ', '-')}.ply", plain, origin=scene.origin)
         shown_views = page_views(opened, views, display)

@@ -84,9 +84,16 @@ def run(args: list[str]) -> int:
         findings = method_needs(str(target))
     else:
         findings = scene_folder(target)
-    console, bad = Console(highlight=False), False
+    console = Console(highlight=False)
+    bad = False
     for finding in findings:
-        mark = "[green]ok[/]      " if not finding.remedy else "[yellow]optional[/]" if finding.optional else "[red]problem[/] "
+        mark = (
+            "[green]ok[/]      "
+            if not finding.remedy
+            else "[yellow]optional[/]"
+            if finding.optional
+            else "[red]problem[/] "
+        )
         bad |= bool(finding.remedy) and not finding.optional
         console.print(f"{mark}  [bold]{escape(finding.what):<14}[/] {escape(finding.found)}", soft_wrap=True)
         if finding.remedy:
@@ -107,12 +114,16 @@ def machine() -> Iterator[Finding]:
             yield Finding(name, version(name))
         except PackageNotFoundError:
             remedy = f'pip install "fprf[{extra}]"' if extra else f"pip install '{requirement}'"
-            yield Finding(name, f"not installed{f' (extra {extra})' if extra else ''}", remedy, optional=bool(extra))
+            yield Finding(
+                name, f"not installed{f' (extra {extra})' if extra else ''}", remedy, optional=bool(extra)
+            )
     try:
         import torch
 
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        yield Finding("processor", f"{platform.machine()}, {cores} cores usable, {torch.get_num_threads()} threads")
+        yield Finding(
+            "processor", f"{platform.machine()}, {cores} cores usable, {torch.get_num_threads()} threads"
+        )
         if torch.cuda.is_available():
             for at in range(torch.cuda.device_count()):
                 device = torch.cuda.get_device_properties(at)
@@ -121,7 +132,9 @@ def machine() -> Iterator[Finding]:
             yield Finding("mps", "Apple GPU")
         elif Path("/proc/driver/nvidia/version").is_file() and torch.version.cuda is None:
             remedy = "pip install --force-reinstall torch --index-url https://download.pytorch.org/whl/cu126"
-            yield Finding("cuda", "an NVIDIA GPU is here, but torch was built without CUDA", remedy, optional=True)
+            yield Finding(
+                "cuda", "an NVIDIA GPU is here, but torch was built without CUDA", remedy, optional=True
+            )
         else:
             yield Finding("accelerator", "none: `--device auto` takes the processor")
     except Exception as error:  # a broken installation is a finding, not a crash
@@ -132,8 +145,12 @@ def machine() -> Iterator[Finding]:
     free = shutil.disk_usage(Path.cwd()).free
     clean = "fprf doctor --clean    # deletes feature targets, which are made again when needed"
     yield Finding("disk", f"{free / 1024**3:.1f} GiB free here", clean if free < _LEAST_DISK else "")
-    folder, most = cache_folder() / "features", 2 * CACHED_BYTES / _MIB  # content and semantics
-    yield Finding("features", f"{_size(folder) / _MIB:.0f} MiB of at most {most:.0f} in {folder}; --clean deletes them")
+    # content and semantics
+    folder = cache_folder() / "features"
+    most = 2 * CACHED_BYTES / _MIB
+    yield Finding(
+        "features", f"{_size(folder) / _MIB:.0f} MiB of at most {most:.0f} in {folder}; --clean deletes them"
+    )
     count = sum(len(registry.installed(group)) for group in registry.groups())
     yield Finding("plug-ins", f"{count} installed; `fprf plugins --check` loads each")
     for complaint in registry.unreadable():
@@ -141,7 +158,8 @@ def machine() -> Iterator[Finding]:
 
 
 def self_test(name: str) -> Iterator[Finding]:
-    """Report a device's kernels and precision, and compare a tiny training step, render and restyle on it with the CPU's.
+    """Report a device's kernels and precision, and compare a tiny training step, render and restyle on it
+    with the CPU's.
 
     Raises PluginError for a device that is not here.
     """
@@ -158,9 +176,17 @@ def self_test(name: str) -> Iterator[Finding]:
             yield Finding(what, found)
         outcomes = compare(device)
     except Exception as error:
-        yield Finding("self-test", f"{device} fails: {type(error).__name__}: {(str(error).splitlines() or [''])[0]}", remedy)
+        yield Finding(
+            "self-test",
+            f"{device} fails: {type(error).__name__}: {(str(error).splitlines() or [''])[0]}",
+            remedy,
+        )
         return
-    wrong = [f"{each.what} is off by {each.error:.2g}, {each.allowed:g} is allowed" for each in outcomes if not each.right]
+    wrong = [
+        f"{each.what} is off by {each.error:.2g}, {each.allowed:g} is allowed"
+        for each in outcomes
+        if not each.right
+    ]
     if wrong:
         yield Finding("self-test", f"{device} differs from the CPU: {'; '.join(wrong)}", remedy)
         return
@@ -171,14 +197,20 @@ def self_test(name: str) -> Iterator[Finding]:
 
 
 def method_needs(name: str) -> Iterator[Finding]:
-    """Packages and weights that training by a method needs. Raises PluginError for a method that cannot be loaded."""
+    """Packages and weights that training by a method needs. Raises PluginError for a method that cannot be
+    loaded.
+    """
     from ..methods import method_config
 
     config = method_config(name)
     for need in config.needs():
         later = ", is downloaded when it is needed" if need.downloaded else " is missing"
         yield Finding("needs", need.what + later, need.remedy, optional=need.downloaded)
-    filled = (f"{slot.path} {registry.name_of(slot.kind.group, type(slot.value))}" for slot in slots(config) if slot.value)
+    filled = (
+        f"{slot.path} {registry.name_of(slot.kind.group, type(slot.value))}"
+        for slot in slots(config)
+        if slot.value
+    )
     yield Finding("method", f"{name}: {', '.join(filled)}")
     yield Finding("next", f"fprf train {name} --data FOLDER")
 
@@ -188,7 +220,9 @@ def _size(folder: Path) -> int:
 
 
 def scene_folder(data: Path) -> Iterator[Finding]:
-    """Format, views, split, points and readable images of a scene. Raises DataError where it cannot be parsed."""
+    """Format, views, split, points and readable images of a scene. Raises DataError where it cannot be
+    parsed.
+    """
     from ..datamanagers.images import load_images, useless_masks
     from ..datamanagers.parsers.config import DataParserConfig, parse_scene, recognise
     from ..datamanagers.scene import find_sightings, sparser
@@ -199,7 +233,9 @@ def scene_folder(data: Path) -> Iterator[Finding]:
     count = len(scene.paths)
     # A capture of many crops has as many sizes: the first three and a number are told.
     sizes = sorted({(int(w), int(h)) for w, h in scene.cameras.size.tolist()})
-    shown = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (f" and {len(sizes) - 3} more" if len(sizes) > 3 else "")
+    shown = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (
+        f" and {len(sizes) - 3} more" if len(sizes) > 3 else ""
+    )
     lenses = sorted({("pinhole", "OpenCV", "fisheye")[lens] for lens in scene.cameras.lens.tolist()})
     yield Finding("views", f"{count} of {shown} pixels, {' and '.join(lenses)} lens")
     yield Finding("split", f"{len(scene.train)} to train, {len(scene.test)} held out")
@@ -207,7 +243,9 @@ def scene_folder(data: Path) -> Iterator[Finding]:
         yield Finding("note", note)
     # Points begin the first Gaussians, where training views see them.
     if scene.points is None or not len(scene.points):
-        yield Finding("points", "none; bounds come from the cameras, first Gaussians from matches between views")
+        yield Finding(
+            "points", "none; bounds come from the cameras, first Gaussians from matches between views"
+        )
     else:
         sightings = find_sightings(sparser(scene))
         seeing = 0 if sightings is None else len({*sightings.view.tolist()})

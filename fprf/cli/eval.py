@@ -37,12 +37,15 @@ class EvalConfig(QualityConfig):
     data: Path | None = None
     """Scene folder, where it has moved since training."""
     fit_poses: bool = False
-    """Fit each view's own pose to its image first, the scene as it is: for captures whose poses are rough, or were refined.
-    metrics.json then says how far they were moved."""
+    """Fit each view's own pose to its image first, the scene as it is: for captures whose poses are rough, or
+    were refined. metrics.json then says how far they were moved.
+    """
     images: bool = True
     """Write the renders to RUN/renders/SPLIT."""
     tensorboard: Path | None = None
-    """A folder for how training went, as event files of TensorBoard (extra tensorboard): `tensorboard --logdir` shows them."""
+    """A folder for how training went, as event files of TensorBoard (extra tensorboard): `tensorboard
+    --logdir` shows them.
+    """
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
 
@@ -66,7 +69,8 @@ def run(args: list[str]) -> int:
 
 
 def evaluate(config: EvalConfig) -> dict[str, Any]:
-    """Judge a run of any kind; write metrics.json and, if they are wanted, the renders, and return what is written.
+    """Judge a run of any kind; write metrics.json and, if they are wanted, the renders, and return what is
+    written.
 
     Raises UsageError where the images at hand are not those of the run, or the split has no views.
     """
@@ -80,7 +84,8 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
     from ..training.run import view_names
 
     opened = open_run(config.run, config.device, config)
-    scene, known = opened.scene, opened.known
+    scene = opened.scene
+    known = opened.known
     # The photographs are read as training read them, at their own size and about the origin of the run.
     trained = opened.run.load_config()[0]
     trained = replace(trained, data=config.data or trained.data)
@@ -88,24 +93,28 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
     if tuple(view_names(captured.paths)) != known.names:
         raise UsageError(f"{trained.data}: its images are not those of the run; name the folder with --data")
     # What a person looks at are the photographs, whatever size they were trained at.
-    longest, before = captured.cameras.size.amax(1, keepdim=True), known.cameras.size
+    longest = captured.cameras.size.amax(1, keepdim=True)
+    before = known.cameras.size
     wanted = config.size or max(_LONGEST, int(before.max()))
     captured = replace(captured, cameras=captured.cameras.scaled((longest.double() / wanted).clamp_min(1)))
     known = replace(known, cameras=known.cameras.resized(captured.cameras.size))
-    views, fitted = known.views(config.split), {}
+    views = known.views(config.split)
+    fitted = {}
 
     def save(view: int, image: "Image") -> None:
         if config.images:
             write_image(config.run / "renders" / config.split / f"{known.names[view]}.png", image)
 
-    # Poses of held-out views were never refined with the scene: they may be fitted to it, which changes no colour of it.
+    # Poses of held-out views were never refined with the scene: they may be fitted to it, which changes no
+    # colour of it.
     with Display() as display:
         if config.fit_poses:
             moves = scene.fit_poses(captured, views, display.count)
             known = replace(known, cameras=moved_cameras(known.cameras, moves))
             poses = {}
             for view in views:
-                turn, shift = float(moves[view, :3].norm()), float(moves[view, 3:].norm())
+                turn = float(moves[view, :3].norm())
+                shift = float(moves[view, 3:].norm())
                 poses[known.names[view]] = {"turn_degrees": math.degrees(turn), "shift": shift}
             fitted = {"fitted_poses": poses}
         found = judge(scene, known, captured, views, display.count, save, masks=trained.masked)
@@ -127,15 +136,18 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
 
 
 def write_scalars(folder: Path, histories: "Sequence[History]") -> int:
-    """One run of TensorBoard for the training and each of its parts; how many values were written. Event files that lie
-    there are replaced, nothing else.
+    """One run of TensorBoard for the training and each of its parts; how many values were written. Event
+    files that lie there are replaced, nothing else.
 
-    Times are those of training, so that a resumed run has no gap. Raises UsageError without the package `tensorboard`.
+    Times are those of training, so that a resumed run has no gap. Raises UsageError without the package
+    `tensorboard`.
     """
     try:
         from torch.utils.tensorboard.writer import SummaryWriter
     except ImportError as fault:
-        raise UsageError("--tensorboard: the package tensorboard is not installed; pip install 'fprf[tensorboard]'") from fault
+        raise UsageError(
+            "--tensorboard: the package tensorboard is not installed; pip install 'fprf[tensorboard]'"
+        ) from fault
     written = 0
     for history in histories:
         place = folder / (history.name or "training")
@@ -156,15 +168,27 @@ def write_scalars(folder: Path, histories: "Sequence[History]") -> int:
 
 def _print(metrics: dict[str, object]) -> None:
     table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 3, 0, 0))
-    units = {"psnr": "dB", "cc_psnr": "dB", "ssim": "", "lpips": "", "seconds_per_view": "s", "rays_per_second": "rays/s"}
-    for key, unit in (units | {"kept_samples_share": "", "peak_rss_mib": "MiB", "train_seconds": "s"}).items():
+    units = {
+        "psnr": "dB",
+        "cc_psnr": "dB",
+        "ssim": "",
+        "lpips": "",
+        "seconds_per_view": "s",
+        "rays_per_second": "rays/s",
+    }
+    for key, unit in (
+        units | {"kept_samples_share": "", "peak_rss_mib": "MiB", "train_seconds": "s"}
+    ).items():
         value = metrics[key]
         assert isinstance(value, float)
         table.add_row(key, f"{value:,.3f}" if value < 1000 else f"{value:,.0f}", unit)
     warped = metrics["consistency"]
     assert isinstance(warped, dict)
     if warped["rmse"] is not None:
-        table.add_row("consistency rmse", f"{warped['rmse']:.4f}", f"over {warped['valid_share']:.0%} of the pixels")
-    judged, trained = str(metrics["size"]), str(metrics["trained_size"])
+        table.add_row(
+            "consistency rmse", f"{warped['rmse']:.4f}", f"over {warped['valid_share']:.0%} of the pixels"
+        )
+    judged = str(metrics["size"])
+    trained = str(metrics["trained_size"])
     table.add_row("size", judged, "" if judged == trained else f"trained at {trained}")
     Console(highlight=False).print(table)

@@ -1,4 +1,6 @@
-"""`fprf export RUN [ply splat glb cameras ...]`: a scene, plain or restyled, as files that other programs open."""
+"""`fprf export RUN [ply splat glb cameras ...]`: a scene, plain or restyled, as files that other programs
+open.
+"""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -23,17 +25,20 @@ if TYPE_CHECKING:
 
 _DESCRIPTION = f"""A scene as files that other programs open, in the capture's own frame.
 
-Kinds may follow the run: {", ".join(ending[1:] for ending in endings() if ending[1:] not in KINDS)} = 3D Gaussians; {
-    "; ".join(f"{name} = {what}" for name, what in KINDS.items())
-}.
+Kinds may follow the run: {
+    ", ".join(ending[1:] for ending in endings() if ending[1:] not in KINDS)
+} = 3D Gaussians; {"; ".join(f"{name} = {what}" for name, what in KINDS.items())}.
 A look of the scene is a file: splats.ply as it is, splats.NAME.ply in a style, with the same Gaussians in the same order."""
 
 
 def run(args: list[str]) -> int:
     """Render views, fit Gaussians to them or mesh them where that is wanted, write the files."""
     words = ("run", "kinds")
-    config, file = read_flags(ExportConfig(), args, prog="fprf export", description=_DESCRIPTION, positional=words)
-    # What is to be written, and under which names, is settled before the run is opened: mistakes cost no time.
+    config, file = read_flags(
+        ExportConfig(), args, prog="fprf export", description=_DESCRIPTION, positional=words
+    )
+    # What is to be written, and under which names, is settled before the run is opened: mistakes cost no
+    # time.
     what = plan(config.kinds, config.output or config.run / "exports")
     styles = named_styles(config.styles, file)
     if config.references:  # the style of the flags
@@ -43,9 +48,13 @@ def run(args: list[str]) -> int:
         if names.count(name) > 1:
             raise UsageError(f"--styles {name}: two styles of this name; give each its own")
         if any(ending.startswith(f".{name.lower()}.") for ending in endings()):
-            raise UsageError(f"--styles {name}: splats.{name}.ply is the name of another format; give the style another one")
+            raise UsageError(
+                f"--styles {name}: splats.{name}.ply is the name of another format; give the style another one"
+            )
     if what.single is not None and len(styles) > 1:
-        raise UsageError(f"--output {what.single}: one file holds one style, {len(styles)} are asked for; name a folder")
+        raise UsageError(
+            f"--output {what.single}: one file holds one style, {len(styles)} are asked for; name a folder"
+        )
     from ..io.atomic import write_json
     from ..splats.files.base import check_needs, format_of
     from ..style.restyle import apply_style
@@ -59,7 +68,10 @@ def run(args: list[str]) -> int:
     opened = open_run(config.run, config.device)
     # All looks share one geometry; a single file holds the last of them.
     encoders = opened.scene.encoders() if styles else None
-    looks = [_Look("", None), *(_Look(name, apply_style(opened.scene, each, encoders).restyle) for name, each in styles)]
+    looks = [
+        _Look("", None),
+        *(_Look(name, apply_style(opened.scene, each, encoders).restyle) for name, each in styles),
+    ]
     looks = looks[-1 if what.single else 0 :]
     made: dict[str, Any] = {"run": opened.known.name, "step": opened.step, "styles": names}
     with Display() as display:
@@ -90,7 +102,9 @@ class _Look(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Export:
-    """What every kind of file is made from. Methods write the files of one kind, if it is wanted, and return their counts."""
+    """What every kind of file is made from. Methods write the files of one kind, if it is wanted, and return
+    their counts.
+    """
 
     config: ExportConfig
     what: Plan
@@ -103,7 +117,8 @@ class _Export:
         """Training views, at most as many as are asked for, spread evenly over their order."""
         import torch
 
-        train, most = self.opened.known.train, self.config.views
+        train = self.opened.known.train
+        most = self.config.views
         if len(train) > most:
             train = tuple(train[round(k * (len(train) - 1) / (most - 1))] for k in range(most))
         return self.opened.scene.cameras.select(torch.tensor(train))
@@ -112,8 +127,11 @@ class _Export:
         """Depth and colours of the views."""
         from ..export.mesh import default_reach, render_maps
 
-        reach = default_reach(self.opened.known.facts.space) if self.config.reach is None else self.config.reach
-        scene, report = self.opened.scene.restyled(look.restyle), partial(self.display.count, what="rendering depth")
+        reach = (
+            default_reach(self.opened.known.facts.space) if self.config.reach is None else self.config.reach
+        )
+        scene = self.opened.scene.restyled(look.restyle)
+        report = partial(self.display.count, what="rendering depth")
         return render_maps(scene, self.views, side=self.config.side, reach=reach, report=report)
 
     @cached_property
@@ -122,17 +140,25 @@ class _Export:
         return self.maps(_Look("", None))
 
     def gaussians(self) -> dict[str, Any]:
-        """Gaussians as they are, or fitted to the scene's own renders; the same in each look, but for their colours."""
+        """Gaussians as they are, or fitted to the scene's own renders; the same in each look, but for their
+        colours.
+        """
         from ..splats.files import write_gaussians
 
-        config, scene, paths, losses, count = self.config, self.opened.scene, [], dict[str, None](), 0
+        config = self.config
+        scene = self.opened.scene
+        paths = []
+        losses = dict[str, None]()
+        count = 0
         own = scene.gaussian_rows() is not None
         if not self.what.formats:
             return {}
         # Gaussians are written as they are, and never fitted to renders of themselves.
         if own and config.fit:
             raise UsageError("--fit: the run is of Gaussians already; leave it out")
-        rows = (scene.restyled(look.restyle).gaussian_rows() for look in self.looks) if own else self._fitted()
+        rows = (
+            (scene.restyled(look.restyle).gaussian_rows() for look in self.looks) if own else self._fitted()
+        )
         for look, gaussians in zip(self.looks, rows, strict=True):
             assert gaussians is not None
             count = gaussians.count
@@ -173,7 +199,8 @@ class _Export:
         from ..export.mesh import build_mesh, vertex_colours, write_mesh
 
         report = partial(self.display.count, what="building the mesh")
-        # Geometry comes from the scene as it is, whatever the style: meshes of all looks have the same vertices.
+        # Geometry comes from the scene as it is, whatever the style: meshes of all looks have the same
+        # vertices.
         mesh = build_mesh(self.plain, edge=self.config.mesh_edge, report=report)
         for look in self.looks:
             colour = vertex_colours(self.plain if look.restyle is None else self.maps(look), mesh)
@@ -190,9 +217,11 @@ class _Export:
         from ..rendering.local_frame import added_and_beside, write_offset
         from ..rendering.paths import transforms
 
-        known, scene = self.opened.known, self.opened.scene.restyled(self.looks[-1].restyle)
+        known = self.opened.known
+        scene = self.opened.scene.restyled(self.looks[-1].restyle)
         files = [f"images/{name}.png" for name in scene.names]
-        # Names are those of the captured views, so that a scene folder of renders can be compared with the captured one.
+        # Names are those of the captured views, so that a scene folder of renders can be compared with the
+        # captured one.
         for view, file in enumerate(files if self.config.images else ()):
             self.display.count(view, len(files), "rendering views")
             write_image(self.what.folder / file, to_uint8(scene.render(scene.cameras, view).rgb))

@@ -32,7 +32,9 @@ class GalleryConfig(StyledRunConfig):
     styles: tuple[Path, ...] = ()
     """Style files (style.json), each one more style."""
     split: Literal["some", "test", "train", "all"] = "some"
-    """Views to choose from. some: at most 8 training views, spread evenly; test: those held out from training."""
+    """Views to choose from. some: at most 8 training views, spread evenly; test: those held out from
+    training.
+    """
     most: int = 6
     """Views that are shown, evenly taken from the split."""
     views: tuple[str, ...] = ()
@@ -52,7 +54,9 @@ class GalleryConfig(StyledRunConfig):
 
 def run(args: list[str]) -> int:
     """Render the views in every style, write the page."""
-    config, file = read_flags(GalleryConfig(), args, prog="fprf gallery", description=_DESCRIPTION, positional=("run",))
+    config, file = read_flags(
+        GalleryConfig(), args, prog="fprf gallery", description=_DESCRIPTION, positional=("run",)
+    )
     output = config.output if config.output is not None else config.run / "gallery.html"
     if output.suffix.lower() != ".html":
         raise UsageError(f"--output {output}: the page is an .html file; give such a name")
@@ -62,7 +66,8 @@ def run(args: list[str]) -> int:
     from ..training.loading import open_run
 
     opened = open_run(config.run, config.device, config)
-    known, scene = opened.known, opened.scene
+    known = opened.known
+    scene = opened.scene
     views = known.views(config.split, config.views)
     # Evenly from the split; views that are named are all shown.
     most = len(views) if config.views else min(config.most, len(views))
@@ -116,7 +121,8 @@ def _chosen(config: GalleryConfig, together: StyleFile) -> list[tuple[str, Style
 
 
 def _called(paths: Sequence[Path]) -> dict[Path, str]:
-    """Names of photographs: their stems; where two agree, their whole names, with a number where these agree as well.
+    """Names of photographs: their stems; where two agree, their whole names, with a number where these agree
+    as well.
 
     None is called as the scene without a style is.
     """
@@ -142,7 +148,8 @@ def page_views(opened: "LoadedRun[Scene]", views: Sequence[int], display: Displa
     from ..training.prepare import read_scene
     from ..training.run import view_names
 
-    scene, known = opened.scene, opened.known
+    scene = opened.scene
+    known = opened.known
     photographs: dict[int, Picture] = {}
     try:
         captured = read_scene(opened.run.load_config()[0])
@@ -168,8 +175,8 @@ def page_styles(
 ) -> "list[tuple[Style, Scene, float]]":
     """Each style on the views, with match maps; the scene in that style; the seconds that the style took.
 
-    `called` are the names of all photographs. A photograph that is in several styles is encoded once, which counts as time of
-    the first of them.
+    `called` are the names of all photographs. A photograph that is in several styles is encoded once, which
+    counts as time of the first of them.
     """
     from ..io.images import to_uint8
     from ..page.writer import Style
@@ -179,7 +186,8 @@ def page_styles(
     from ..style.restyle import apply_style
 
     # Encoders are loaded once, and photographs encoded once, for all styles.
-    encoders, made = scene.encoders(), []
+    encoders = scene.encoders()
+    made = []
     encoded: dict[tuple[Path, Path], Reference] = {}
     for i, (name, file) in enumerate(chosen):
         display.count(i, len(chosen), "restyling")
@@ -192,7 +200,8 @@ def page_styles(
         paths = dict(zip(labels(file.style.references), file.style.references, strict=True))
         names = [label for label in styled.codes.names if label in paths]
         # Match maps say which photograph is where: there is something to say where there are several.
-        rows, maps = [], []
+        rows = []
+        maps = []
         for view in views if len(styled.codes.names) > 1 else ():
             matched = match_map(scene, styled, view)
             maps.append(match_picture(matched, styled.codes))

@@ -1,10 +1,11 @@
-"""The command line: `fprf VERB ...`. A verb's module is imported when it is used; `--help` imports nothing heavy.
+"""The command line: `fprf VERB ...`. A verb's module is imported when it is used; `--help` imports nothing
+heavy.
 
-Packages add verbs in the entry-point group `fprf.commands` (`cli/config.py`); a built-in verb takes precedence over one
-of the same name.
+Packages add verbs in the entry-point group `fprf.commands` (`cli/config.py`); a built-in verb takes
+precedence over one of the same name.
 
-Exit codes: 0 done, 1 our fault, 2 what the user can mend (a mistake, too little memory; one line on standard error),
-130 interrupted, 141 where nobody reads the output any more.
+Exit codes: 0 done, 1 our fault, 2 what the user can mend (a mistake, too little memory; one line on standard
+error), 130 interrupted, 141 where nobody reads the output any more.
 """
 
 import importlib
@@ -25,8 +26,11 @@ _GROUP = "fprf.commands"
 
 _PIPE_CLOSED = 141
 """Exit status of a program that SIGPIPE ended."""
-_SPINS, _BLOCK_MS = "1000", "0"
-"""Spinning of a thread that waits for others: rounds of GNU's OpenMP, some 20 microseconds; milliseconds of LLVM's."""
+_SPINS = "1000"
+_BLOCK_MS = "0"
+"""Spinning of a thread that waits for others: rounds of GNU's OpenMP, some 20 microseconds; milliseconds of
+LLVM's.
+"""
 
 
 class Verb(NamedTuple):
@@ -69,7 +73,9 @@ def main(args: Sequence[str] | None = None) -> int:
     except SystemExit as end:  # `fprf VERB --help` ends this way
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     except BrokenPipeError:  # the reader left, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else the interpreter complains when it ends
+        os.dup2(
+            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+        )  # else the interpreter complains when it ends
         return _PIPE_CLOSED
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -82,14 +88,18 @@ def main(args: Sequence[str] | None = None) -> int:
             return 2
         # Too little memory is nobody's fault: one line says what it took.
         if out_of_memory(error):
-            print(f"error: {shortage('fprf', error, 'close other programs, or take a larger --downscale')}", file=sys.stderr)
+            print(
+                f"error: {shortage('fprf', error, 'close other programs, or take a larger --downscale')}",
+                file=sys.stderr,
+            )
             return 2
         if not debug:
             frames = traceback.extract_tb(error.__traceback__)
             place = f" ({frames[-1].filename}:{frames[-1].lineno} in {frames[-1].name})" if frames else ""
             print(f"internal error: {type(error).__name__}: {error}{place}", file=sys.stderr)
             print(
-                "This is a fault of fprf or of a plug-in. Run it again with --debug and report the traceback.", file=sys.stderr
+                "This is a fault of fprf or of a plug-in. Run it again with --debug and report the traceback.",
+                file=sys.stderr,
             )
         return 1
 
@@ -104,14 +114,16 @@ def _run(args: list[str]) -> int:
         return 0
     # OpenCV would tell damaged images a second time, beside our one line.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "FATAL")
-    # Threads that wait for others give way soon, unless the user decided otherwise. By default OpenMP's spin for milliseconds:
-    # where 20 other programs used the two cores a training step took 2304 ms, and 236 ms with this; alone it costs a twentieth.
+    # Threads that wait for others give way soon, unless the user decided otherwise. By default OpenMP's spin
+    # for milliseconds: where 20 other programs used the two cores a training step took 2304 ms, and 236 ms
+    # with this; alone it costs a twentieth.
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)
         os.environ.setdefault("KMP_BLOCKTIME", _BLOCK_MS)
     keep_memory()
     # Each verb's module is imported when it is asked for: help and mistakes cost no torch.
-    verb, rest = args[0], args[1:]
+    verb = args[0]
+    rest = args[1:]
     if verb in VERBS:
         return int(importlib.import_module(f".{verb}", __package__).run(rest))
     # Verbs of packages are configs: their fields are the flags, their docstring is the help.
@@ -124,13 +136,17 @@ def _run(args: list[str]) -> int:
 
     config = make(_GROUP, verb, CommandConfig)
     about = inspect.getdoc(type(config)) or ""
-    return parse(config, rest, prog=f"fprf {verb}", description=about, positional=config.positional).run() or 0
+    return (
+        parse(config, rest, prog=f"fprf {verb}", description=about, positional=config.positional).run() or 0
+    )
 
 
 def packaged() -> dict[str, str]:
     """Verbs of packages: name to the packages that provide it. Imports nothing."""
     return {
-        name: " and ".join(each.package for each in entries) for name, entries in installed(_GROUP).items() if name not in VERBS
+        name: " and ".join(each.package for each in entries)
+        for name, entries in installed(_GROUP).items()
+        if name not in VERBS
     }
 
 
@@ -145,7 +161,10 @@ def _help() -> str:
         "",
         "usage: fprf VERB [ARGUMENTS]",
         "",
-        *(f"  {bold}{name:<{width}}{plain}  {verb.usage:<{broad}}  {dim}{verb.summary}{plain}" for name, verb in VERBS.items()),
+        *(
+            f"  {bold}{name:<{width}}{plain}  {verb.usage:<{broad}}  {dim}{verb.summary}{plain}"
+            for name, verb in VERBS.items()
+        ),
         "",
         *(f"  {bold}{name:<{width}}{plain}  {dim}of {package}{plain}" for name, package in others.items()),
         *([""] if others else []),

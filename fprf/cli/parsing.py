@@ -29,7 +29,14 @@ _COLUMNS = 100
 """Widest help text: a page, not a wide screen."""
 _TRUTHS = (["True"], ["False"], ["true"], ["false"])
 _NONES = (["none"], ["None"])
-_SCALARS = {bool: "True or False", int: "a whole number", float: "a number", str: "a text", Path: "a path", type(None): "none"}
+_SCALARS = {
+    bool: "True or False",
+    int: "a whole number",
+    float: "a number",
+    str: "a text",
+    Path: "a path",
+    type(None): "none",
+}
 
 
 class Flag(NamedTuple):
@@ -57,7 +64,9 @@ def flags_of(config: Any, prefix: str = "") -> dict[str, Flag]:
     """Every leaf of the tree by the flag's text."""
     flags: dict[str, Flag] = {}
     for field in dataclasses.fields(config):
-        value, path, hint = getattr(config, field.name), f"{prefix}{field.name}", hints_of(type(config))[field.name]
+        value = getattr(config, field.name)
+        path = f"{prefix}{field.name}"
+        hint = hints_of(type(config))[field.name]
         if dataclasses.is_dataclass(value):
             flags |= flags_of(value, f"{path}.")
         elif not any(is_slot(each) for each in members(hint)):
@@ -69,7 +78,8 @@ def flags_of(config: Any, prefix: str = "") -> dict[str, Flag]:
 def spell(args: Sequence[str], flags: dict[str, Flag]) -> list[str]:
     """The arguments as tyro spells them.
 
-    `none` is None, `true` is True, a bare `--path.switch` is `--path.switch True`, `--path.no-switch` is its opposite.
+    `none` is None, `true` is True, a bare `--path.switch` is `--path.switch True`, `--path.no-switch` is its
+    opposite.
     """
     spelled: list[str] = []
     for at, arg in enumerate(args):
@@ -92,7 +102,9 @@ def spell(args: Sequence[str], flags: dict[str, Flag]) -> list[str]:
 
 
 def explain(refusal: str, config: Any, args: Sequence[str], *, positional: Sequence[str], prog: str) -> str:
-    """One line for what tyro refused: an unknown flag, a value that does not fit, a value too many or too few."""
+    """One line for what tyro refused: an unknown flag, a value that does not fit, a value too many or too
+    few.
+    """
     flags = flags_of(config)
     # An unknown flag first: it is named whatever else is wrong.
     for arg in args:
@@ -105,7 +117,9 @@ def explain(refusal: str, config: Any, args: Sequence[str], *, positional: Seque
     for flag in flags.values():
         if re.search(rf"(?<![\w.-]){re.escape(flag.text)}(?![\w.-])", text):
             given = _given(flag, args)
-            return f"{' '.join([flag.text, *given])}: {'it takes' if given else 'needs a value:'} {flag.takes}"
+            return (
+                f"{' '.join([flag.text, *given])}: {'it takes' if given else 'needs a value:'} {flag.takes}"
+            )
     if "equired" in text and positional:
         return f"{prog}: {positional[0].upper()} is missing; `{prog} --help` says what it takes"
     if stray := re.search(r"Unrecognized options: (.*?)(?: Perhaps | For full |$)", text):
@@ -167,12 +181,15 @@ def _words(hint: Any) -> str:
     return _SCALARS.get(hint, str(hint))
 
 
-def parse(default: C, args: Sequence[str], *, prog: str, description: str, positional: tuple[str, ...] = ()) -> C:
+def parse(
+    default: C, args: Sequence[str], *, prog: str, description: str, positional: tuple[str, ...] = ()
+) -> C:
     """The default, a frozen dataclass tree, changed by the arguments.
 
-    `--path.to.slot NAME` chooses a plug-in, `--path.to.field VALUE` sets a field, in any order and also with `=`;
-    `none` empties whatever may be None. Fields named in `positional` are given without a flag, in that order, and must
-    be given. `--help` prints all of it and exits. Raises UsageError, PluginError or ConfigError with one line.
+    `--path.to.slot NAME` chooses a plug-in, `--path.to.field VALUE` sets a field, in any order and also with
+    `=`; `none` empties whatever may be None. Fields named in `positional` are given without a flag, in that
+    order, and must be given. `--help` prints all of it and exits. Raises UsageError, PluginError or
+    ConfigError with one line.
     """
     # Slots first: what fills them decides which flags there are.
     config, rest = resolve(default, args)
@@ -194,18 +211,24 @@ def parse(default: C, args: Sequence[str], *, prog: str, description: str, posit
         # A range error names its field; here the flag that caused it, where the arguments tell which.
         field, _, reason = str(fault).partition(": ")
         given = {_dashed(arg.partition("=")[0]) for arg in rest if arg.startswith("--")}
-        fits = [text for text, flag in flags.items() if text in given and f".{flag.path}".endswith(f".{field}")]
+        fits = [
+            text for text, flag in flags.items() if text in given and f".{flag.path}".endswith(f".{field}")
+        ]
         raise ConfigError(f"{fits[0]}: {reason}" if len(fits) == 1 and reason else str(fault)) from fault
     sys.stderr.write(heard.getvalue())
     return parsed
 
 
 def load_method(name: str) -> "tuple[RunConfig, str]":
-    """The config of a method, or of a saved `config.json` with the name of the method that it started from."""
+    """The config of a method, or of a saved `config.json` with the name of the method that it started
+    from.
+    """
     if name.endswith(".json"):
         return load_config(Path(name))
     if (Path(name) / "config.json").is_file() and name not in registry.installed("fprf.methods"):
-        raise UsageError(f"{name}: is a folder, not a method; to train with its config name {Path(name) / 'config.json'}")
+        raise UsageError(
+            f"{name}: is a folder, not a method; to train with its config name {Path(name) / 'config.json'}"
+        )
     return method_config(name), name
 
 
@@ -213,13 +236,15 @@ def _tyro(config: C, args: list[str], *, prog: str, description: str, positional
     import tyro
 
     tyro.extras.set_accent_color("cyan")
-    shown, chosen = _with_positional(config, positional), _slot_flags(list(slots(config)))
+    shown = _with_positional(config, positional)
+    chosen = _slot_flags(list(slots(config)))
 
     def main(config: Any, plug_ins: Any) -> Any:
         return config
 
     main.__defaults__ = (shown, chosen)
-    main.__annotations__ = {  # name="" and not OmitArgPrefixes for the config: that one strips every nested prefix
+    # name="" and not OmitArgPrefixes for the config: that one strips every nested prefix
+    main.__annotations__ = {
         "config": Annotated[type(shown), tyro.conf.arg(name="")],
         "plug_ins": Annotated[type(chosen), tyro.conf.arg(name="plug-in"), tyro.conf.OmitArgPrefixes],
     }
@@ -231,12 +256,15 @@ def _tyro(config: C, args: list[str], *, prog: str, description: str, positional
 
 
 def _with_positional(config: Any, names: tuple[str, ...]) -> Any:
-    """The config with some fields marked as positional, in a subclass that checks nothing yet; None and () can be left out."""
+    """The config with some fields marked as positional, in a subclass that checks nothing yet; None and ()
+    can be left out.
+    """
     import tyro
 
     if not names:
         return config
-    hints, optional = hints_of(type(config)), (None, ())
+    hints = hints_of(type(config))
+    optional = (None, ())
     marked = []
     for name in names:
         hint = None if getattr(config, name) in optional else "(required)"
@@ -262,7 +290,9 @@ def _slot_flags(filled: list[Slot]) -> Any:
     for slot in filled:
         about = f"{first_line(slot.kind)} One of {', '.join(slot.choices)}."
         arg = tyro.conf.arg(name=slot.path, metavar="NAME", help=about)
-        rows.append((slot.path.replace(".", "_"), Annotated[str, arg], dataclasses.field(default=_filled_by(slot))))
+        rows.append(
+            (slot.path.replace(".", "_"), Annotated[str, arg], dataclasses.field(default=_filled_by(slot)))
+        )
     kind = dataclasses.make_dataclass("PlugIns", rows, frozen=True, kw_only=True)
     kind.__doc__ = "What fills each slot, by name; its own fields are flags above. `fprf plugins` lists all."
     return kind()

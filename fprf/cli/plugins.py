@@ -1,4 +1,6 @@
-"""`fprf plugins`: what is installed, from metadata alone; `--check` imports each and says what is wrong with it."""
+"""`fprf plugins`: what is installed, from metadata alone; `--check` imports each and says what is wrong with
+it.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,7 +27,8 @@ from ..splats.config import CAPTURES
 from .config import CommandConfig
 from .parsing import load_method, parse
 
-METHODS, SCENES = "fprf.methods", "fprf.scenes"
+METHODS = "fprf.methods"
+SCENES = "fprf.scenes"
 KINDS: dict[str, tuple[type[PluginConfig], ...]] = {
     "fprf.fields": (ContentFieldConfig, SemanticFieldConfig),
     "fprf.samplers": (SamplerConfig,),
@@ -39,7 +42,9 @@ KINDS: dict[str, tuple[type[PluginConfig], ...]] = {
     "fprf.losses": (LossTermConfig,),
     "fprf.commands": (CommandConfig,),
 }
-"""The groups of configs, and what a plug-in of each must derive from. Formats of captures, which import torch, stand apart."""
+"""The groups of configs, and what a plug-in of each must derive from. Formats of captures, which import
+torch, stand apart.
+"""
 
 
 class Row(NamedTuple):
@@ -93,7 +98,9 @@ def rows() -> Iterator[Row]:
 
 
 def faults() -> Iterator[tuple[Row, str]]:
-    """Load each plug-in, build its config from defaults, and yield those that cannot be used, with the reason."""
+    """Load each plug-in, build its config from defaults, and yield those that cannot be used, with the
+    reason.
+    """
     from ..splats.files.base import CaptureFormat
     from .main import VERBS
 
@@ -112,7 +119,9 @@ def faults() -> Iterator[tuple[Row, str]]:
                 if not (isinstance(loaded, type) and issubclass(loaded, KINDS[row.group])):
                     registry.load(row.group, row.name, KINDS[row.group][0])
                 if row.name == "none":
-                    raise PluginError(f"{row.group}: 'none' ({origin}) can never be chosen: none empties a slot")
+                    raise PluginError(
+                        f"{row.group}: 'none' ({origin}) can never be chosen: none empties a slot"
+                    )
                 if row.group == CommandConfig.group and row.name in VERBS:
                     verb = f"{row.group}: {row.name!r} ({origin})"
                     raise PluginError(f"{verb} is never called: fprf has a verb of that name; rename it")

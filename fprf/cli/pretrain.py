@@ -34,7 +34,11 @@ def run(args: list[str]) -> int:
 
 
 def pretrain(
-    default: C, args: list[str], prog: str, about: str, train: Callable[[C, Path, Callable[[str], None]], Report]
+    default: C,
+    args: list[str],
+    prog: str,
+    about: str,
+    train: Callable[[C, Path, Callable[[str], None]], Report],
 ) -> int:
     """Parse the arguments, train, and write and print the report; 0 when the weights are written."""
     config = parse(default, args, prog=prog, description=about)
@@ -47,11 +51,17 @@ def pretrain(
     from ..pretraining.loop import training_folder
     from ..training.run import lock_folder
 
-    begun, folder = time.monotonic(), training_folder(config.output)
+    begun = time.monotonic()
+    folder = training_folder(config.output)
     # Checkpoints stay until everything is written: a full disk costs no training.
     with lock_folder(folder):
         measured = train(config, config.output, say)
-        report = {"weights": str(config.output), **measured, "seed": config.seed, "seconds": round(time.monotonic() - begun, 1)}
+        report = {
+            "weights": str(config.output),
+            **measured,
+            "seed": config.seed,
+            "seconds": round(time.monotonic() - begun, 1),
+        }
         # The weights by their bare name, since both may be moved.
         told = {"kind": prog.split()[-1], **report, "weights": config.output.name}
         write_json(config.output.with_name(config.output.stem + ".report.json"), told)

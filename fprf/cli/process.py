@@ -34,15 +34,21 @@ class ProcessConfig(SfmConfig):
 
 def run(args: list[str]) -> int:
     """Choose, match, reconstruct; report what was dropped; check that the scene can be read."""
-    config = parse(ProcessConfig(), args, prog="fprf process", description=_DESCRIPTION, positional=("source",))
+    config = parse(
+        ProcessConfig(), args, prog="fprf process", description=_DESCRIPTION, positional=("source",)
+    )
     if find_spec("pycolmap") is None:
-        raise UsageError("fprf process: pycolmap is not installed; install it with: pip install 'pycolmap>=4'")
+        raise UsageError(
+            "fprf process: pycolmap is not installed; install it with: pip install 'pycolmap>=4'"
+        )
     from ..io.atomic import write_json
     from ..reconstruction.colmap import find_features, find_matches, find_poses
     from ..reconstruction.images import gather_images, lost_files
     from ..reconstruction.scene_folder import MatchTables, SceneFolder, State, report
 
-    place = SceneFolder(config.output if config.output is not None else Path("scenes") / config.source.resolve().stem)
+    place = SceneFolder(
+        config.output if config.output is not None else Path("scenes") / config.source.resolve().stem
+    )
     state = State.load(place)
     models: list[dict[str, Any]] = []
     matching: str = config.matching
@@ -77,7 +83,9 @@ def run(args: list[str]) -> int:
 
 
 def _check(root: Path) -> None:
-    """Read the scene as training will, and print the commands that come next. Raises DataError where it cannot be read."""
+    """Read the scene as training will, and print the commands that come next. Raises DataError where it
+    cannot be read.
+    """
     from ..datamanagers.parsers.config import parse_scene
     from ..splats.config import GaussiansConfig
     from ..training.driver import default_output

@@ -23,9 +23,12 @@ if TYPE_CHECKING:
     from ..style.restyle import Styled
     from ..training.loading import LoadedRun
 
-_NO_FOLDERS = frozenset({".avi", ".bmp", ".exr", ".jpeg", ".jpg", ".m4v", ".mkv", ".mov", ".mpg", ".png", ".tif", ".webm"})
+_NO_FOLDERS = frozenset(
+    {".avi", ".bmp", ".exr", ".jpeg", ".jpg", ".m4v", ".mkv", ".mov", ".mpg", ".png", ".tif", ".webm"}
+)
 """Endings that nobody gives a folder."""
-_PROBES, _PROBE_RESOLUTION = 4, 0.25
+_PROBES = 4
+_PROBE_RESOLUTION = 0.25
 """Frames, and their size, that the range of depths is taken from: one range for a whole film."""
 
 
@@ -44,8 +47,9 @@ class RenderVerbConfig(StyledRunConfig):
     """Settings of `fprf render`."""
 
     output: Path = Path("render.mp4")
-    """A film (.mp4), an animated picture (.gif .webp .apng), or a folder for numbered frames. Frames that an interrupted
-    render left are not made again."""
+    """A film (.mp4), an animated picture (.gif .webp .apng), or a folder for numbered frames. Frames that an
+    interrupted render left are not made again.
+    """
     path: str = "interpolate"
     """spiral, orbit, interpolate, dataset, or a camera-path JSON file of Nerfstudio."""
     split: Literal["test", "train", "all"] = "all"
@@ -57,9 +61,13 @@ class RenderVerbConfig(StyledRunConfig):
     style: Path | None = None
     """A style file, as `fprf stylize` writes it; flags come over it."""
     keyframes: Path | None = None
-    """Styles along the path: a JSON file that gives frames their style files; between them one fades into the other."""
+    """Styles along the path: a JSON file that gives frames their style files; between them one fades into the
+    other.
+    """
     styles: tuple[str, ...] = ()
-    """Further looks beside it: NAME=PHOTO,PHOTO, NAME=STYLE.json, or the word plain for the scene as it is."""
+    """Further looks beside it: NAME=PHOTO,PHOTO, NAME=STYLE.json, or the word plain for the scene as it
+    is.
+    """
     show: tuple[Literal["colour", "depth", "normals", "match"], ...] = ("colour",)
     """Layers of each frame, from left to right."""
     format: Literal["png", "jpg"] = "png"
@@ -72,13 +80,17 @@ class RenderVerbConfig(StyledRunConfig):
         if not self.show:
             raise ConfigError("show: name at least one of colour, depth, normals, match")
         if self.keyframes is not None and (self.references or self.style):
-            raise ConfigError("keyframes: names styles of its own; leave out --references and --style, or --keyframes")
+            raise ConfigError(
+                "keyframes: names styles of its own; leave out --references and --style, or --keyframes"
+            )
 
 
 def run(args: list[str]) -> int:
     """Make the path, render it, write the film or the frames."""
     description = "Fly through a trained scene, plain or restyled, to a film or frames."
-    config, file = read_flags(RenderVerbConfig(), args, prog="fprf render", description=description, positional=("run",))
+    config, file = read_flags(
+        RenderVerbConfig(), args, prog="fprf render", description=description, positional=("run",)
+    )
     from ..datamanagers.images import load_image
     from ..io.images import write_image
     from ..io.maps import depth_limits, side_by_side
@@ -87,7 +99,9 @@ def run(args: list[str]) -> int:
     from ..training.loading import open_run
 
     if config.output.suffix.lower() in _NO_FOLDERS:
-        raise UsageError(f"--output {config.output}: films end in {' '.join(FILMS)}; give such a name, or a folder for frames")
+        raise UsageError(
+            f"--output {config.output}: films end in {' '.join(FILMS)}; give such a name, or a folder for frames"
+        )
     if config.fps is not None and config.fps > MAX_FPS:
         raise UsageError(f"--fps {config.fps:g}: a film has at most {MAX_FPS} frames a second")
     opened = open_run(config.run, config.device, config)
@@ -99,9 +113,14 @@ def run(args: list[str]) -> int:
     if fps is None:
         fps = 24.0 if config.path in MOTIONS else read_camera_path(Path(config.path))[1]
     # Captured views keep the stem of their image.
-    names = [known.names[view] for view in views] if config.path == "dataset" else [f"{i:05d}" for i in range(len(cameras))]
+    names = (
+        [known.names[view] for view in views]
+        if config.path == "dataset"
+        else [f"{i:05d}" for i in range(len(cameras))]
+    )
     takes = _takes(opened.scene, config, file)
-    # Frames of a film wait in a folder beside it, hidden as nobody's own is, which goes when the film is whole.
+    # Frames of a film wait in a folder beside it, hidden as nobody's own is, which goes when the film is
+    # whole.
     whole = config.output.suffix.lower() in FILMS
     folder = config.output.with_name(f".{config.output.stem}.frames") if whole else config.output
     paths = [folder / f"{name}.{'png' if whole else config.format}" for name in names]
@@ -121,7 +140,9 @@ def run(args: list[str]) -> int:
             left = (time.perf_counter() - start) / done * (len(todo) - done) if done else None
             display.count(done, len(todo), "rendering", seconds_left=left)
             # Each frame is written as soon as it is done, so that an interrupted film goes on.
-            write_image(path, side_by_side(_panels(opened.scene, cameras, paths.index(path), takes, config, limits)))
+            write_image(
+                path, side_by_side(_panels(opened.scene, cameras, paths.index(path), takes, config, limits))
+            )
         display.count(len(todo), len(todo), "rendering")
         made = str(config.output)
         if whole:
@@ -141,7 +162,9 @@ def _panels(
     config: RenderVerbConfig,
     limits: tuple[float, float] | None,
 ) -> "list[Picture]":
-    """Panels of one frame in the order of `config.show`: colour and match maps once for each take, geometry once for all."""
+    """Panels of one frame in the order of `config.show`: colour and match maps once for each take, geometry
+    once for all.
+    """
     from ..io.images import to_uint8
     from ..io.maps import depth_image
     from ..rendering.cameras import normals
@@ -159,20 +182,35 @@ def _panels(
         elif channel == "normals":
             # In camera axes: red to the right, green up, blue towards the viewer; grey where nothing is.
             turned = normals(cameras, frame, geometry.depth).double() @ cameras.pose[frame, :, :3]
-            cover = geometry.opacity[..., None].clamp(0, 1).double() * (turned.norm(dim=-1, keepdim=True) > 0.5)
+            cover = geometry.opacity[..., None].clamp(0, 1).double() * (
+                turned.norm(dim=-1, keepdim=True) > 0.5
+            )
             shown.append(to_uint8(0.5 + 0.5 * turned * cover))
         else:
             styles = [take.styled for take in takes if take.styled is not None]
-            shown += [match_picture(match_map(scene, styled, frame, cameras), styled.codes) for styled in styles]
+            shown += [
+                match_picture(match_map(scene, styled, frame, cameras), styled.codes) for styled in styles
+            ]
     return shown
 
 
 def _key(opened: "LoadedRun[Scene]", config: RenderVerbConfig, cameras: "Cameras") -> str:
-    """A hash of all that frames depend on: the run's state, the path, every setting, and every file that they name."""
+    """A hash of all that frames depend on: the run's state, the path, every setting, and every file that they
+    name.
+    """
     digest = hashlib.sha256(f"{opened.run.root.resolve()} {opened.step} {opened.seconds}".encode())
-    settings = {name: value for name, value in vars(config).items() if name not in ("output", "device", "fps", "run")}
+    settings = {
+        name: value for name, value in vars(config).items() if name not in ("output", "device", "fps", "run")
+    }
     digest.update(repr(sorted(settings.items())).encode() + (opened.run.root / "config.json").read_bytes())
-    for tensor in (cameras.pose, cameras.focal, cameras.centre, cameras.size, cameras.distortion, cameras.lens):
+    for tensor in (
+        cameras.pose,
+        cameras.focal,
+        cameras.centre,
+        cameras.size,
+        cameras.distortion,
+        cameras.lens,
+    ):
         digest.update(tensor.numpy().tobytes())
     # Files count by their content: a photograph that has changed under its name makes other frames.
     named = [*config.references, *config.masks, config.style, config.between, config.keyframes]
@@ -206,7 +244,9 @@ def _takes(scene: "Scene", config: RenderVerbConfig, file: "StyleFile") -> "list
             takes.append(_styled_take(scene, name, named))
     takes = takes or [Take("plain", lambda frame: scene)]
     if "match" in config.show and not any(take.styled is not None for take in takes):
-        raise UsageError("--show match: needs a style that holds throughout; name one with --references, --style or --styles")
+        raise UsageError(
+            "--show match: needs a style that holds throughout; name one with --references, --style or --styles"
+        )
     return takes
 
 

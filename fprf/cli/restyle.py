@@ -1,4 +1,6 @@
-"""`fprf restyle CAPTURE... --references A.jpg B.jpg --output OUT`: new colours for finished captures of 3D Gaussians."""
+"""`fprf restyle CAPTURE... --references A.jpg B.jpg --output OUT`: new colours for finished captures of 3D
+Gaussians.
+"""
 
 import functools
 import time
@@ -39,15 +41,23 @@ class RestyleConfig(StyleConfig, LookConfig):
     """Flags of `fprf restyle`: the capture, the style and the files to write."""
 
     captures: tuple[Path, ...] = ()
-    """The captures: files of Gaussians, or SOG folders. Several take one style together, so that neighbours stay alike."""
+    """The captures: files of Gaussians, or SOG folders. Several take one style together, so that neighbours
+    stay alike.
+    """
     output: Path | None = None
-    """The restyled capture; its ending says the format. A folder for several captures, or where it is one already."""
+    """The restyled capture; its ending says the format. A folder for several captures, or where it is one
+    already.
+    """
     style: Path | None = None
-    """A style file, such as the style.json of an earlier run, of this scene or another; flags come over it."""
+    """A style file, such as the style.json of an earlier run, of this scene or another; flags come over
+    it.
+    """
     stylizer: StylizerConfig = RegionToneConfig(centred=False)
     """Method that changes the colours of the capture."""
     match_light: bool = False
-    """Take exposure and white balance of the references alone: one gain for each channel of the whole scene."""
+    """Take exposure and white balance of the references alone: one gain for each channel of the whole
+    scene.
+    """
     each: bool = False
     """Each reference is a style of its own; its name is added to those of the files."""
     page: Path | None = None
@@ -55,9 +65,13 @@ class RestyleConfig(StyleConfig, LookConfig):
     megabytes: float = 16.0
     """Size of that page, at most; Gaussians that show least are left out of it."""
     explain: bool = False
-    """Also list the scene's regions with what each takes: a table, and explain.json and explain.png beside the output."""
+    """Also list the scene's regions with what each takes: a table, and explain.json and explain.png beside
+    the output.
+    """
     cache: Path | None = None
-    """Folder for what is found out about captures, so that the next style takes a second; by default the user's cache."""
+    """Folder for what is found out about captures, so that the next style takes a second; by default the
+    user's cache.
+    """
 
     def __post_init__(self) -> None:
         StyleConfig.__post_init__(self)
@@ -77,7 +91,9 @@ class _Restyled(NamedTuple):
 
 def run(args: list[str]) -> int:
     """Look at the captures, or take what the cache knows of them; build each style; write files and page."""
-    config, file = read_flags(RestyleConfig(), args, prog="fprf restyle", description=_DESCRIPTION, positional=("captures",))
+    config, file = read_flags(
+        RestyleConfig(), args, prog="fprf restyle", description=_DESCRIPTION, positional=("captures",)
+    )
     outputs = _outputs(config)
     from ..memory import peak
     from ..splats.captures import light_alone, neighbouring_light, open_captures
@@ -96,28 +112,41 @@ def run(args: list[str]) -> int:
         report = functools.partial(display.count, what="looking")
         seen = open_captures(config.captures, config, cache=config.cache, progress=report, say=display.say)
         scene = seen.scene
-        scene.found()  # views are encoded now, or read from the cache: the time is reported apart from that of styles
+        # views are encoded now, or read from the cache: the time is reported apart from that of styles
+        scene.found()
         looked = time.perf_counter() - begun
         gain = None
-        if config.match_light and photographed and all(format_name(path) is not None for path in photographed):
+        if (
+            config.match_light
+            and photographed
+            and all(format_name(path) is not None for path in photographed)
+        ):
             gain = neighbouring_light(seen, photographed)
-            display.say(f"--match-light: {'where the captures meet' if gain is not None else 'by the means of all colours'}")
-        named, made, encoders = _styles(config, file), list[_Restyled](), scene.encoders()
+            display.say(
+                f"--match-light: {'where the captures meet' if gain is not None else 'by the means of all colours'}"
+            )
+        named = _styles(config, file)
+        made = list[_Restyled]()
+        encoders = scene.encoders()
         for name, each in named:
             start = time.perf_counter()
             styled = apply_style(scene, each, encoders)
             styled = light_alone(styled, gain) if config.match_light else styled
             made.append(_Restyled(name, styled, scene.restyled(styled.restyle), time.perf_counter() - start))
         # File by file, each in all styles: one of them is in memory at a time.
-        left, losses, steps = Counter[str](), dict[str, None](), len(config.captures) * len(named)
+        left = Counter[str]()
+        losses = dict[str, None]()
+        steps = len(config.captures) * len(named)
         for k, path in enumerate(config.captures if outputs or len(config.captures) == 1 else ()):
             capture = seen.first if k == 0 else read_capture(path)
             faulty = False
             for i, one in enumerate(made if outputs else ()):
                 display.count(k * len(named) + i, steps, "restyling")
                 start = time.perf_counter()
-                # The style's name goes before the ending; a SOG folder gets a folder of that name, and holds its style.json.
-                output, stem = outputs[k], stem_of(outputs[k])
+                # The style's name goes before the ending; a SOG folder gets a folder of that name, and holds
+                # its style.json.
+                output = outputs[k]
+                stem = stem_of(outputs[k])
                 folder = output.name.lower() == "meta.json"
                 if one.name and folder:
                     output = output.parent / one.name / output.name
@@ -143,11 +172,15 @@ def run(args: list[str]) -> int:
         for one in made:
             print_explained(parent / one.name, one.styled.controls.regions, one.styled)
         if not made:
-            print_explained(parent, Regions(scene, *scene.measured(), file.regions, file.semantic_encoder), None)
+            print_explained(
+                parent, Regions(scene, *scene.measured(), file.regions, file.semantic_encoder), None
+            )
     if config.page is not None:
         _write_page(config.page, config, scene, made)
     each_seconds = sum(each.seconds for each in made) / max(1, len(made))
-    missing = "".join(f", {each}" for each in (*(f"{number} {what}" for what, number in left.items()), *losses))
+    missing = "".join(
+        f", {each}" for each in (*(f"{number} {what}" for what, number in left.items()), *losses)
+    )
     files = f" in {len(config.captures)} files" if len(config.captures) > 1 else ""
     print(
         f"{seen.count} Gaussians{files}{missing}; looked at in {looked:.1f} s, {each_seconds:.2f} s for each of {len(made)} "
@@ -171,7 +204,9 @@ def _outputs(config: RestyleConfig) -> list[Path]:
     if config.page is not None and config.page.suffix.lower() != ".html":
         raise UsageError(f"--page {config.page}: the page is an .html file; give such a name")
     if not config.references and not config.explain:
-        raise UsageError("--references: at least one photograph is needed, for example --references autumn.jpg night.jpg")
+        raise UsageError(
+            "--references: at least one photograph is needed, for example --references autumn.jpg night.jpg"
+        )
     if config.output is None:
         return []
     from ..splats.files.base import check_needs, format_of
@@ -188,7 +223,9 @@ def _outputs(config: RestyleConfig) -> list[Path]:
                 outputs[-1] = inside.with_suffix(".ply")
         same = [path for path in outputs if outputs.count(path) > 1]
         if same:
-            raise UsageError(f"--output {config.output}: several captures would be written as {same[0]}; give them other names")
+            raise UsageError(
+                f"--output {config.output}: several captures would be written as {same[0]}; give them other names"
+            )
         if any(path.resolve() in [each.resolve() for each in config.captures] for path in outputs):
             raise UsageError(f"--output {config.output}: the captures lie there; name another folder")
         return outputs
@@ -196,7 +233,9 @@ def _outputs(config: RestyleConfig) -> list[Path]:
         raise UsageError(f"--output {config.output}: {len(config.captures)} captures need a folder; name one")
     if format_name(config.output) is None:
         known_endings = ", ".join(endings())
-        raise UsageError(f"--output {config.output}: no file of Gaussians by its name; known endings are {known_endings}")
+        raise UsageError(
+            f"--output {config.output}: no file of Gaussians by its name; known endings are {known_endings}"
+        )
     if not (form := format_of(config.output)).writes:
         raise UsageError(
             f"--output {config.output}: files of this format are read, not written; name a .ply, .spz, .sog or .glb"
@@ -217,9 +256,11 @@ def _with_views(config: RestyleConfig, file: StyleFile) -> StyleFile:
 
     # Photographs stay; in the place of a capture or run stand its views, with masks of what they show.
     rows: list[tuple[Path, Path, float]] = []
-    numbers_of, stems = list[range](), [stem_of(path) for path in style.references]
+    numbers_of = list[range]()
+    stems = [stem_of(path) for path in style.references]
     beside = config.output or config.page or Path("x")
-    weights, masks = style.weights or (1.0,) * len(style.references), style.masks or (NO_MASK,) * len(style.references)
+    weights = style.weights or (1.0,) * len(style.references)
+    masks = style.masks or (NO_MASK,) * len(style.references)
     for i, (path, mask, weight) in enumerate(zip(style.references, masks, weights, strict=True)):
         before = len(rows)
         if path not in scenes:
@@ -229,7 +270,9 @@ def _with_views(config: RestyleConfig, file: StyleFile) -> StyleFile:
         if mask != NO_MASK:
             raise UsageError(f"--masks: {mask} is for one photograph, {path} gives several views; write none")
         name = stems[i] if stems.count(stems[i]) == 1 else f"{stems[i]}-{i}"
-        pictures, covers, shares = reference_views(path, config, beside.parent / f"{stem_of(beside)}.references" / name)
+        pictures, covers, shares = reference_views(
+            path, config, beside.parent / f"{stem_of(beside)}.references" / name
+        )
         # All views of a scene weigh as much as one photograph.
         rows += [
             (picture, cover, weight * share / sum(shares))
@@ -240,14 +283,20 @@ def _with_views(config: RestyleConfig, file: StyleFile) -> StyleFile:
     def expanded(field: str, texts: Sequence[str]) -> tuple[str, ...]:
         # What is said of a capture holds for each of its views.
         pairs = [parse_region_value(field, text) for text in texts]
-        return tuple(f"{region}={k}" for region, of in pairs for k in numbers_of[find_reference(of, style.references)])
+        return tuple(
+            f"{region}={k}" for region, of in pairs for k in numbers_of[find_reference(of, style.references)]
+        )
 
-    pin, forbid = expanded("pin", style.pin), expanded("forbid", style.forbid)
+    pin = expanded("pin", style.pin)
+    forbid = expanded("forbid", style.forbid)
     pictures, covers, numbers = zip(*rows, strict=True)
-    # A capture shows what there is, not a mood: where no photograph is among them, everything takes its match.
+    # A capture shows what there is, not a mood: where no photograph is among them, everything takes its
+    # match.
     bold = 1.0 if len(scenes) == len(style.references) and style.bold == StyleConfig().bold else style.bold
     return file._replace(
-        style=replace(style, references=pictures, masks=covers, weights=numbers, pin=pin, forbid=forbid, bold=bold)
+        style=replace(
+            style, references=pictures, masks=covers, weights=numbers, pin=pin, forbid=forbid, bold=bold
+        )
     )
 
 
@@ -256,7 +305,8 @@ def _styles(config: RestyleConfig, file: StyleFile) -> list[tuple[str, StyleFile
     if not config.each:
         return [("", file)] if config.references else []
     # Without dots: x.compressed would make another format of a .ply.
-    alone, stems = [], [path.stem.replace(".", "_") for path in config.references]
+    alone = []
+    stems = [path.stem.replace(".", "_") for path in config.references]
     for i, path in enumerate(config.references):
         style = replace(file.style, references=(path,), weights=(), masks=file.style.masks[i : i + 1])
         name = stems[i] if stems.count(stems[i]) == 1 else f"{stems[i]}-{i}"
@@ -270,14 +320,16 @@ def _write_page(path: Path, config: RestyleConfig, scene: "SplatScene", made: Se
     from ..io.images import to_uint8
     from ..page.writer import Page, PageView, Reference, Style, write_page
 
-    # Views lie on rings around the scene or within it, the nearer ones first: from these the things can be told.
+    # Views lie on rings around the scene or within it, the nearer ones first: from these the things can be
+    # told.
     nearer = max(min(_SHOWN, len(scene.names)), len(scene.names) // 2)
     most = min(_SHOWN, nearer)
     views = sorted({round((k + 0.5) * nearer / most - 0.5) for k in range(most)})
     cameras = scene.cameras.scaled(0.5)
     before = [to_uint8(scene.render(cameras, view).rgb) for view in views]
     after = [[to_uint8(each.scene.render(cameras, view).rgb) for view in views] for each in made]
-    names, styles = labels(config.references), []
+    names = labels(config.references)
+    styles = []
     for k, (each, pictures) in enumerate(zip(made, after, strict=True)):
         of = [names[k]] if config.each else each.styled.dictionary.names
         name = each.name or " + ".join(Path(label).stem for label in of)
@@ -285,11 +337,16 @@ def _write_page(path: Path, config: RestyleConfig, scene: "SplatScene", made: Se
         styles.append(Style(name, pictures, harmonics, references=of))
     page = Page(
         title=stem_of(config.captures[0]) or "capture",
-        facts={"Gaussians": len(scene.gaussians), "Regions": len(scene.measured()[0].share), "Styles": len(styles)},
+        facts={
+            "Gaussians": len(scene.gaussians),
+            "Regions": len(scene.measured()[0].share),
+            "Styles": len(styles),
+        },
         views=[PageView(scene.names[view], picture) for view, picture in zip(views, before, strict=True)],
         styles=styles,
         references=[
-            Reference(label, load_image(path, upright=True)) for label, path in zip(names, config.references, strict=True)
+            Reference(label, load_image(path, upright=True))
+            for label, path in zip(names, config.references, strict=True)
         ],
         scene=scene,
         start=views[0],

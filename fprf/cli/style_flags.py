@@ -1,4 +1,6 @@
-"""Flags of the verbs that restyle: a style file first, where one is named, then a preset, then every flag over both."""
+"""Flags of the verbs that restyle: a style file first, where one is named, then a preset, then every flag
+over both.
+"""
 
 import re
 import sys
@@ -16,8 +18,11 @@ from .parsing import parse
 
 C = TypeVar("C", bound=StyleConfig)
 
-_LONGEST, _JOINED = 60, 80
-"""Characters of a style's name that users choose, and of one that is made of those of its photographs: file names carry it."""
+_LONGEST = 60
+_JOINED = 80
+"""Characters of a style's name that users choose, and of one that is made of those of its photographs: file
+names carry it.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,14 +44,16 @@ def read_flags(
 ) -> tuple[C, StyleFile]:
     """The verb's config and the style that it asks for; `--style FILE` gives the values that no flag gives.
 
-    `--gentle`, or another name of `PRESETS`, sets what that preset sets, over the file and below every other flag.
-    A flag of many values may stand several times: `--pin 3=a.jpg --pin 5=b.jpg` is `--pin 3=a.jpg 5=b.jpg`. Folders among
-    the references stand for the images in them. Raises what `parse`, `with_folders` and `read_style` raise, and DataError
-    where a photograph of the file is no longer the one it was.
+    `--gentle`, or another name of `PRESETS`, sets what that preset sets, over the file and below every other
+    flag. A flag of many values may stand several times: `--pin 3=a.jpg --pin 5=b.jpg` is `--pin 3=a.jpg
+    5=b.jpg`. Folders among the references stand for the images in them. Raises what `parse`, `with_folders`
+    and `read_style` raise, and DataError where a photograph of the file is no longer the one it was.
     """
-    # Defaults from the style file, then the stylizer, which decides what a preset sets, then the preset, then all other flags.
-    # Whether cosines are centred is up to the verb: where neither file nor flag says it, its own default holds.
-    path, centred = _style_flag(args), getattr(default.stylizer, "centred", True)
+    # Defaults from the style file, then the stylizer, which decides what a preset sets, then the preset, then
+    # all other flags. Whether cosines are centred is up to the verb: where neither file nor flag says it, its
+    # own default holds.
+    path = _style_flag(args)
+    centred = getattr(default.stylizer, "centred", True)
     file = read_style(path, centred=centred) if path is not None else StyleFile(StyleConfig())
     if path is not None:
         default = replace(default, **_styles(file.style))
@@ -59,7 +66,9 @@ def read_flags(
         print(f"{flag}: {preset_flags(flags[flag])}")
         default = with_preset(default, flags[flag])
     args = [arg for arg in args if arg not in flags]
-    meanings = [f"{flag} stands for {preset_flags(name)}; other flags come over it." for flag, name in flags.items()]
+    meanings = [
+        f"{flag} stands for {preset_flags(name)}; other flags come over it." for flag, name in flags.items()
+    ]
     about = "\n\n".join([description, *meanings])
     config = parse(default, _joined(args, default), prog=prog, description=about, positional=positional)
     config = with_folders(config, say)
@@ -83,8 +92,14 @@ def _styles(config: StyleConfig) -> dict[str, Any]:
 
 
 def _joined(args: Sequence[str], config: StyleConfig) -> list[str]:
-    """The arguments with each flag of many values once, with all of its values: otherwise the last one alone would count."""
-    many = {f"--{field.name.replace('_', '-')}" for field in fields(config) if isinstance(getattr(config, field.name), tuple)}
+    """The arguments with each flag of many values once, with all of its values: otherwise the last one alone
+    would count.
+    """
+    many = {
+        f"--{field.name.replace('_', '-')}"
+        for field in fields(config)
+        if isinstance(getattr(config, field.name), tuple)
+    }
     rest: list[str] = []
     values: dict[str, list[str]] = {}
     into = rest
@@ -113,10 +128,11 @@ def _style_flag(args: Sequence[str]) -> Path | None:
 
 
 def named_styles(texts: Sequence[str], base: StyleFile) -> list[tuple[str, StyleFile]]:
-    """Styles from NAME=STYLE.json or NAME=PHOTO[,PHOTO ...], by name; photographs go with the other settings of `base`.
+    """Styles from NAME=STYLE.json or NAME=PHOTO[,PHOTO ...], by name; photographs go with the other settings
+    of `base`.
 
-    Folders stand for the images in them; those that cannot be read are named on standard error. Raises UsageError for another
-    form, and what reading a style file raises.
+    Folders stand for the images in them; those that cannot be read are named on standard error. Raises
+    UsageError for another form, and what reading a style file raises.
     """
     styles = []
     for text in texts:
@@ -138,7 +154,8 @@ def named_styles(texts: Sequence[str], base: StyleFile) -> list[tuple[str, Style
 
 
 def style_name(style: Path | None, references: Sequence[Path]) -> str:
-    """Name of a style: that of its file, of a style.json its folder's; without a file the stems of its photographs, joined.
+    """Name of a style: that of its file, of a style.json its folder's; without a file the stems of its
+    photographs, joined.
 
     Cut to what every file system takes.
     """

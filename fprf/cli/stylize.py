@@ -31,9 +31,13 @@ class StylizeConfig(StyledRunConfig):
     """Views to restyle, and their style."""
 
     style: Path | None = None
-    """A style file, such as the style.json of an earlier run, of this scene or another; flags come over it."""
+    """A style file, such as the style.json of an earlier run, of this scene or another; flags come over
+    it.
+    """
     output: Path | None = None
-    """Folder for what is made; by default RUN/styles/NAME, with the name of the style file's folder or of the references."""
+    """Folder for what is made; by default RUN/styles/NAME, with the name of the style file's folder or of the
+    references.
+    """
     split: Literal["some", "test", "train", "all"] = "some"
     """Views to restyle. some: at most 8 training views, spread evenly; test: those held out from training."""
     views: tuple[str, ...] = ()
@@ -41,14 +45,18 @@ class StylizeConfig(StyledRunConfig):
     explain: bool = False
     """Render nothing; list the scene's regions with what each takes: a table, explain.json, explain.png."""
     match_only: bool = False
-    """Render nothing; map what each pixel takes: VIEW-match.png, VIEW-score.png, VIEW-confidence.png, VIEW-entropy.png."""
+    """Render nothing; map what each pixel takes: VIEW-match.png, VIEW-score.png, VIEW-confidence.png,
+    VIEW-entropy.png.
+    """
     matches: bool = True
     """Also write which reference each pixel takes, as VIEW-match.png."""
 
 
 def run(args: list[str]) -> int:
     """Build the style; explain it, map it, or render the views; write style.json."""
-    config, file = read_flags(StylizeConfig(), args, prog="fprf stylize", description=_DESCRIPTION, positional=("run",))
+    config, file = read_flags(
+        StylizeConfig(), args, prog="fprf stylize", description=_DESCRIPTION, positional=("run",)
+    )
     from ..style.dictionary import save_dictionary
     from ..style.regions import Regions
     from ..style.restyle import apply_style
@@ -57,11 +65,14 @@ def run(args: list[str]) -> int:
     opened = open_run(config.run, config.device, config)
     scene = opened.scene
     views = opened.known.views(config.split, config.views)
-    output = config.output or config.run / "styles" / (style_name(config.style, config.references) or "regions")
+    output = config.output or config.run / "styles" / (
+        style_name(config.style, config.references) or "regions"
+    )
     if config.explain and not config.references:  # regions alone: no style is built
         print_explained(output, Regions(scene, *scene.measured()), None)
         return 0
-    # The whole style: references encoded and clustered, matched with the scene's regions. Views come after, each on its own.
+    # The whole style: references encoded and clustered, matched with the scene's regions. Views come after,
+    # each on its own.
     start = time.perf_counter()
     styled = apply_style(scene, file)
     seconds = time.perf_counter() - start
@@ -80,18 +91,23 @@ def run(args: list[str]) -> int:
     return 0
 
 
-def _make(scene: "Scene", output: Path, styled: "Styled", views: list[int], config: StylizeConfig) -> dict[str, Any]:
+def _make(
+    scene: "Scene", output: Path, styled: "Styled", views: list[int], config: StylizeConfig
+) -> dict[str, Any]:
     """Pictures and match maps of the views; what was matched and how long it took."""
     from ..io.images import to_uint8, write_image
     from ..style.match_maps import match_map, match_picture, match_pictures, summarize
 
     shown = not config.match_only
-    rendering, matching, summaries = 0.0, 0.0, {}
+    rendering = 0.0
+    matching = 0.0
+    summaries = {}
     restyled = scene.restyled(styled.restyle) if shown else scene
     with Display() as display:
         for i, view in enumerate(views):
             display.count(i, len(views), "restyling" if shown else "matching")
-            start, name = time.perf_counter(), scene.names[view]
+            start = time.perf_counter()
+            name = scene.names[view]
             if shown:
                 picture = restyled.render(scene.cameras, view)
                 rendering += time.perf_counter() - start
@@ -103,7 +119,9 @@ def _make(scene: "Scene", output: Path, styled: "Styled", views: list[int], conf
                 matching += time.perf_counter() - start
                 summaries[name] = summarize(matched, styled.codes)
                 codes = styled.codes
-                pictures = {"match": match_picture(matched, codes)} if shown else match_pictures(matched, codes)
+                pictures = (
+                    {"match": match_picture(matched, codes)} if shown else match_pictures(matched, codes)
+                )
                 for which, map_picture in pictures.items():
                     write_image(output / f"{name}-{which}.png", map_picture)
         display.count(len(views), len(views), "restyling" if shown else "matching")
@@ -116,7 +134,9 @@ def _make(scene: "Scene", output: Path, styled: "Styled", views: list[int], conf
 
 
 def print_explained(output: Path, regions: "Regions", styled: "Styled | None") -> None:
-    """Show a scene's regions with what they take: a table on standard output, explain.json and explain.png in `output`."""
+    """Show a scene's regions with what they take: a table on standard output, explain.json and explain.png in
+    `output`.
+    """
     from ..io.atomic import write_json
     from ..io.images import write_image
     from ..io.maps import contact_sheet
@@ -126,7 +146,11 @@ def print_explained(output: Path, regions: "Regions", styled: "Styled | None") -
     names = styled.dictionary.names if styled is not None else ()
     table = [_HEAD if styled else _HEAD[:3]]
     for region in explained:
-        cells = [str(region.number), f"{region.share:.1%}", f"{region.view}:{region.pixel[0]},{region.pixel[1]}"]
+        cells = [
+            str(region.number),
+            f"{region.share:.1%}",
+            f"{region.view}:{region.pixel[0]},{region.pixel[1]}",
+        ]
         if region.taken:
             best = [taken for taken in region.taken if taken.share >= _SHOWN][:3] or list(region.taken[:1])
             takes = ", ".join(f"{taken.name} {taken.share:.0%} (score {taken.score:.2f})" for taken in best)
@@ -136,6 +160,9 @@ def print_explained(output: Path, regions: "Regions", styled: "Styled | None") -
     widths = [max(len(cell) for cell in column) for column in zip(*table, strict=True)]
     for row in table:
         print("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
-    write_json(output / "explain.json", {"references": list(names), "regions": [region_row(region) for region in explained]})
+    write_json(
+        output / "explain.json",
+        {"references": list(names), "regions": [region_row(region) for region in explained]},
+    )
     write_image(output / "explain.png", contact_sheet([region_tile(region, names) for region in explained]))
     print(f"the same with pictures in {output / 'explain.png'} and explain.json")

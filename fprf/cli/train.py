@@ -13,8 +13,11 @@ from ..plugins import registry
 from .parsing import first_line, load_method, parse
 
 DEFAULT_METHOD = "fprf-splats"
-"""Where none is named: the best quality for the time on every capture that was measured (docs/measurements.md)."""
-VIEW, CHANGED = "--view", "--changed-images"
+"""Where none is named: the best quality for the time on every capture that was measured
+(docs/measurements.md).
+"""
+VIEW = "--view"
+CHANGED = "--changed-images"
 
 
 def run(args: list[str]) -> int:
@@ -50,14 +53,20 @@ def run(args: list[str]) -> int:
 
 @contextmanager
 def viewed(run: Path) -> Iterator[None]:
-    """`fprf view RUN --follow` beside the block, in a process of its own: whatever becomes of it, training goes on."""
+    """`fprf view RUN --follow` beside the block, in a process of its own: whatever becomes of it, training
+    goes on.
+    """
     from ..training.driver import is_watched
 
     # An interrupt at the terminal is training's; the viewer is then ended here.
-    process = subprocess.Popen([sys.executable, "-m", "fprf", "view", str(run), "--follow"], start_new_session=True)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "fprf", "view", str(run), "--follow"], start_new_session=True
+    )
     try:
         yield
-        while sys.stderr.isatty() and process.poll() is None and is_watched(run):  # Ctrl-C ends the page as well
+        while (
+            sys.stderr.isatty() and process.poll() is None and is_watched(run)
+        ):  # Ctrl-C ends the page as well
             time.sleep(0.5)
     finally:
         process.terminate()

@@ -1,4 +1,6 @@
-"""`fprf view [RUN|CAPTURE.ply]`: a scene in the browser, or the page that makes one; a photograph dropped on it restyles it."""
+"""`fprf view [RUN|CAPTURE.ply]`: a scene in the browser, or the page that makes one; a photograph dropped on
+it restyles it.
+"""
 
 import contextlib
 import functools
@@ -31,8 +33,9 @@ class ViewConfig(QualityConfig):
     """The run to show, and access to it."""
 
     run: Path | None = None
-    """Run folder, or a capture of 3D Gaussians: .ply .splat .spz .sog .glb .ksplat, or a SOG folder; none = a start page in
-    the browser, which takes photographs, a video, a capture or a run."""
+    """Run folder, or a capture of 3D Gaussians: .ply .splat .spz .sog .glb .ksplat, or a SOG folder; none = a
+    start page in the browser, which takes photographs, a video, a capture or a run.
+    """
     output: Path = Path("my_scenes")
     """Folder of what the start page makes, with a folder for each scene."""
     up: tuple[float, float, float] | None = None
@@ -42,7 +45,9 @@ class ViewConfig(QualityConfig):
     semantic: GaussianSemanticsConfig = GaussianSemanticsConfig()
     """Semantics of a capture; a run has its own."""
     stylizer: StylizerConfig | None = None
-    """Stylizer that puts styles onto regions; none = region-tone, as `fprf stylize` and `fprf restyle` have it."""
+    """Stylizer that puts styles onto regions; none = region-tone, as `fprf stylize` and `fprf restyle` have
+    it.
+    """
     references: tuple[Path, ...] = ()
     """At most 12 photographs, or folders of them, to begin with: on the shelf, and all in the mix."""
     host: str = "127.0.0.1"
@@ -50,11 +55,15 @@ class ViewConfig(QualityConfig):
     port: int = 8080
     """Port to listen on; 0 = any that is free."""
     token: str | None = None
-    """Secret that the address must carry (?token=...), at least 16 characters; none = made where one is needed."""
+    """Secret that the address must carry (?token=...), at least 16 characters; none = made where one is
+    needed.
+    """
     pixels: int = 640
     """Longest side of the sharpest picture, 64 to 2048."""
     follow: bool = False
-    """Wait for the first checkpoint of a training that has only begun. A run in training is followed without."""
+    """Wait for the first checkpoint of a training that has only begun. A run in training is followed
+    without.
+    """
     max_memory: float | None = None
     """MiB that blocks of a large scene may take; none = no limit."""
     device: str = "auto"
@@ -69,7 +78,9 @@ class ViewConfig(QualityConfig):
 
 def run(args: list[str]) -> int:
     """Serve until interrupted."""
-    description = "Look at a run in the browser; without one, make a scene there of photographs, a video or a capture."
+    description = (
+        "Look at a run in the browser; without one, make a scene there of photographs, a video or a capture."
+    )
     config = parse(ViewConfig(), args, prog="fprf view", description=description, positional=("run",))
     # Other ends than an interrupt clean up too; one that is ignored, as under nohup, stays so.
     for name in ("SIGTERM", "SIGHUP"):
@@ -89,13 +100,19 @@ def run(args: list[str]) -> int:
         if config.follow and path is not None and is_capture(path):
             raise UsageError(f"--follow: {path} is a capture, which no training goes on with; leave it out")
         if path is not None and not (config.follow or is_capture(path) or (path / "config.json").is_file()):
-            raise CheckpointError(f"{path}: no config.json here, so it is no run folder; `fprf train` makes one")
-        if any(each.is_dir() for each in config.references):  # decoding needs a library that the page does not wait for
+            raise CheckpointError(
+                f"{path}: no config.json here, so it is no run folder; `fprf train` makes one"
+            )
+        if any(
+            each.is_dir() for each in config.references
+        ):  # decoding needs a library that the page does not wait for
             from ..datamanagers.images import photographs
 
             config = replace(config, references=tuple(photographs(config.references, say)))
         if len(config.references) > SHELF:
-            raise UsageError(f"--references: {len(config.references)} photographs; the shelf takes {SHELF}: name fewer")
+            raise UsageError(
+                f"--references: {len(config.references)} photographs; the shelf takes {SHELF}: name fewer"
+            )
         print(server.address, flush=True)
         load = functools.partial(_load, config, server.notify)
         try:
@@ -143,7 +160,8 @@ def _load(config: ViewConfig, notify: Callable[[str], None], path: Path, name: s
         if done == 0:
             notify("looking at the capture, once; a photograph can be dropped already")
 
-    capture, look = read_capture(path), LookConfig(up=config.up, inside=config.inside, semantic=config.semantic)
+    capture = read_capture(path)
+    look = LookConfig(up=config.up, inside=config.inside, semantic=config.semantic)
     scene = open_capture(capture, look, progress=progress)
     name = name or path.resolve().name.partition(".")[0]
     style = StyleConfig(stylizer=config.stylizer or RegionToneConfig(centred=False))

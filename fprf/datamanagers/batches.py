@@ -1,11 +1,12 @@
 """Training batches: random pixels of all training views with their colours and feature targets.
 
-A batch is a pure function of (seed, step): its generator is seeded by BLAKE2b of the two, so any step can be drawn without the
-ones before, a resumed run sees the same pixels, and neighbouring seeds or steps share nothing. A GPU that holds the images
-draws with a generator of its own: the same on every run there, but other pixels than on the CPU.
+A batch is a pure function of (seed, step): its generator is seeded by BLAKE2b of the two, so any step can be
+drawn without the ones before, a resumed run sees the same pixels, and neighbouring seeds or steps share
+nothing. A GPU that holds the images draws with a generator of its own: the same on every run there, but other
+pixels than on the CPU.
 
-Pixels of many images lie in a mapped file without a name, which ends with its process: the system keeps of it what memory there
-is to spare, so thousands of images need not fit.
+Pixels of many images lie in a mapped file without a name, which ends with its process: the system keeps of it
+what memory there is to spare, so thousands of images need not fit.
 """
 
 import copy
@@ -48,7 +49,8 @@ def allocate_pixels(pixels: int, folder: Path, held: int = HELD) -> Annotated[Te
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
             if hasattr(os, "posix_fallocate"):
-                # Blocks for all of it now: a write to a mapped file that the disk has no room for would end the process.
+                # Blocks for all of it now: a write to a mapped file that the disk has no room for would end
+                # the process.
                 os.posix_fallocate(file.fileno(), 0, size)
             else:
                 os.ftruncate(file.fileno(), size)
@@ -69,19 +71,24 @@ class PixelRuns:
 
     @staticmethod
     def of(masks: Iterable[tuple[int, Tensor]]) -> "PixelRuns":
-        """Of masks of any shape, each with the number of its first entry, which rise; a run may go on in the next mask."""
+        """Of masks of any shape, each with the number of its first entry, which rise; a run may go on in the
+        next mask.
+        """
         # Where a mask changes runs begin and end; runs that touch across masks become one.
-        starts, ends = [], []
+        starts = []
+        ends = []
         for first, mask in masks:
             edge = torch.zeros(1, dtype=torch.bool)
             change = torch.cat([edge, mask.reshape(-1), edge]).diff().nonzero()[:, 0] + first
             starts.append(change[::2])
             ends.append(change[1::2])
         none = torch.zeros(0, dtype=torch.int64)
-        start, end = torch.cat([none, *starts]), torch.cat([none, *ends])
+        start = torch.cat([none, *starts])
+        end = torch.cat([none, *ends])
         apart = torch.ones(len(start) + 1, dtype=torch.bool)
         apart[1:-1] = start[1:] != end[:-1]
-        start, end = start[apart[:-1]], end[apart[1:]]
+        start = start[apart[:-1]]
+        end = end[apart[1:]]
         return PixelRuns(start, end - start)
 
     def __len__(self) -> int:
@@ -91,7 +98,9 @@ class PixelRuns:
     def to(self, device: torch.device) -> "PixelRuns":
         """The same set on a device."""
         there = copy.copy(self)
-        there._start, there._after, there._before = (x.to(device) for x in (self._start, self._after, self._before))
+        there._start, there._after, there._before = (
+            x.to(device) for x in (self._start, self._after, self._before)
+        )
         return there
 
     def pick(self, rank: Annotated[Tensor, "R"]) -> Annotated[Tensor, "R"]:
@@ -112,10 +121,13 @@ class PixelRuns:
 DECODE = 16
 
 
-def generator_of(seed: int, step: int, device: torch.device | None = None, *, purpose: str = "pixels") -> torch.Generator:
+def generator_of(
+    seed: int, step: int, device: torch.device | None = None, *, purpose: str = "pixels"
+) -> torch.Generator:
     """The generator of one step's draws, on the CPU unless a device is given.
 
-    Its seed is a hash of purpose, seed and step, since the CPU's generator looks at 32 bits of its seed alone.
+    Its seed is a hash of purpose, seed and step, since the CPU's generator looks at 32 bits of its seed
+    alone.
     """
     name = f"fprf {purpose} {seed} {step}".encode()
     number = int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "little") >> 1
@@ -146,8 +158,8 @@ class RayBatches(DataManager):
     """Pixels drawn uniformly, with replacement, from all pixels of the training views.
 
     Images are held as uint8, one after the other, in a mapped file where they are many; feature coefficients
-    stay in mapped files under `cache`. Pixels that a capture's masks leave out are never drawn. Transparent ones show the
-    background, white by default. `progress(done, total, what)` is told how far features are.
+    stay in mapped files under `cache`. Pixels that a capture's masks leave out are never drawn. Transparent
+    ones show the background, white by default. `progress(done, total, what)` is told how far features are.
     """
 
     def __init__(
@@ -169,7 +181,9 @@ class RayBatches(DataManager):
             raise DataError(f"{scene.name}: no training views; at least one image must not be held out")
         self.background = background or (WHITE if scene.alpha else None)
         """Colour (RGB in [0, 1]) behind transparent pixels; None for opaque scenes."""
-        self._config, self._scene, self._seed = config, scene, seed
+        self._config = config
+        self._scene = scene
+        self._seed = seed
         # Views lie in slots one after the other: pixel p of slot k is number ends[k - 1] + p.
         self._views = scene.train.tolist()
         self._sizes = scene.cameras.size[scene.train]
@@ -188,14 +202,22 @@ class RayBatches(DataManager):
         every = PixelRuns(torch.zeros(1, dtype=torch.int64), self._ends[-1:])
         self._chosen = self._runs(masks, unmasked=True, seen=seen) if masks or seen is not None else every
         if not len(self._chosen):
-            raise DataError(f"{scene.name}: none of {len(self._views)} training views shows what is to be learnt")
+            raise DataError(
+                f"{scene.name}: none of {len(self._views)} training views shows what is to be learnt"
+            )
         sky = self._runs(skies, unmasked=False) if skies else None
         marked, distance = self._marked() if config.depth_share > 0 else (None, None)
-        self._source = _Source(self._pixels, scene.train, self._sizes, self._ends, self._chosen, sky, marked, distance)
+        self._source = _Source(
+            self._pixels, scene.train, self._sizes, self._ends, self._chosen, sky, marked, distance
+        )
         # Features are those of the very pixels above, which are not decoded again for each encoder.
-        features = partial(extract, views=self._views, image=self._stored, config=config.guided, progress=progress)
+        features = partial(
+            extract, views=self._views, image=self._stored, config=config.guided, progress=progress
+        )
         self.content_store = None if content is None else features(cache / "content", encoder=content)
-        self.semantic_store = None if semantic is None else features(cache / "semantic", encoder=semantic, dim=dim, basis=basis)
+        self.semantic_store = (
+            None if semantic is None else features(cache / "semantic", encoder=semantic, dim=dim, basis=basis)
+        )
 
     def batch(self, step: int) -> Batch:
         """The pixels of a step; the first `semantic_share` of them carry semantics."""
@@ -203,10 +225,13 @@ class RayBatches(DataManager):
         device = source.pixels.device
         # Pixels among all that may be drawn.
         generator = generator_of(self._seed, step, device)
-        at = source.chosen.pick(torch.randint(len(source.chosen), (self._config.rays,), generator=generator, device=device))
+        at = source.chosen.pick(
+            torch.randint(len(source.chosen), (self._config.rays,), generator=generator, device=device)
+        )
         distance = None
         if source.marked is not None and source.distance is not None:
-            # Some through sparse points, as the last rays: the first ones carry semantics, which must stay an even sample.
+            # Some through sparse points, as the last rays: the first ones carry semantics, which must stay an
+            # even sample.
             count = round(self._config.depth_share * len(at))
             mark = torch.randint(len(source.marked), (count,), generator=generator, device=device)
             at = torch.cat([at[: len(at) - count], source.marked[mark]])
@@ -217,15 +242,19 @@ class RayBatches(DataManager):
         width, height = source.size[slot].unbind(1)
         local = at - (source.ends[slot] - width * height)
         pixel = torch.stack([local % width, local // width], 1) + 0.5
-        view, rgb = source.view[slot], source.pixels[at].float() / 255
+        view = source.view[slot]
+        rgb = source.pixels[at].float() / 255
         share = round(self._config.semantic_share * len(at))
-        content, semantic = self.content_store, self.semantic_store
+        content = self.content_store
+        semantic = self.semantic_store
         return Batch(
             view=view,
             pixel=pixel,
             rgb=rgb,
             content=content.at(view, pixel, rgb) if content is not None else None,
-            semantic=semantic.at(view[:share], pixel[:share], rgb[:share]) if semantic is not None and share else None,
+            semantic=semantic.at(view[:share], pixel[:share], rgb[:share])
+            if semantic is not None and share
+            else None,
             distance=distance,
             sky=None if source.sky is None else source.sky.holds(at),
         )
@@ -258,9 +287,11 @@ class RayBatches(DataManager):
         end = int(self._ends[slot])
         return self._pixels[end - width * height : end].reshape(height, width, 3)
 
-    def _runs(self, paths: Sequence[Path | None], *, unmasked: bool, seen: Callable[[int], Tensor] | None = None) -> PixelRuns:
-        """The training pixels that are bright in their view's mask, and that `seen` allows; of a view without a mask
-        they are as `unmasked` says.
+    def _runs(
+        self, paths: Sequence[Path | None], *, unmasked: bool, seen: Callable[[int], Tensor] | None = None
+    ) -> PixelRuns:
+        """The training pixels that are bright in their view's mask, and that `seen` allows; of a view without
+        a mask they are as `unmasked` says.
         """
 
         def masks() -> Iterator[tuple[int, Tensor]]:
@@ -274,9 +305,11 @@ class RayBatches(DataManager):
         return PixelRuns.of(masks())
 
     def _marked(self) -> tuple[Annotated[Tensor, "O"], Annotated[Tensor, "O"]] | tuple[None, None]:
-        """Pixels that are learnt from and show a sparse point, and its world distance along the ray; None where none does.
+        """Pixels that are learnt from and show a sparse point, and its world distance along the ray; None
+        where none does.
 
-        Of a reconstruction that says who saw what, points count that two of these views saw: one alone says nothing of depth.
+        Of a reconstruction that says who saw what, points count that two of these views saw: one alone says
+        nothing of depth.
         """
         seen = self._scene.seen
         if seen is not None:
@@ -288,7 +321,8 @@ class RayBatches(DataManager):
         # From a view and a pixel to the number among all training pixels.
         slots = torch.full((len(self._scene.cameras),), -1, dtype=torch.int64)
         slots[self._scene.train] = torch.arange(len(self._views))
-        slot, pixel = slots[sightings.view], sightings.pixel.long()
+        slot = slots[sightings.view]
+        pixel = sightings.pixel.long()
         width, height = self._sizes[slot].unbind(1)
         at = self._ends[slot] - width * height + pixel[:, 1] * width + pixel[:, 0]
         kept = self._chosen.holds(at)

@@ -1,4 +1,5 @@
-"""From a scene's cameras and points to its space: kind, centre, scale, near and far are found, never asked for.
+"""From a scene's cameras and points to its space: kind, centre, scale, near and far are found, never asked
+for.
 
 forward-facing (all cameras look one way, and stand close together against the depth of what they see)   -> ndc
 images with transparency (a bounded object)                                                              -> box
@@ -24,23 +25,33 @@ FORWARD_SPREAD = 0.5
 BOX_SHARE = 0.45
 """Half the side of an object's box, as a share of the cameras' distance to its centre."""
 FAR = 1e3
-"""Farthest distance in the contraction, in units of the scene's inner radius: beyond it disparity is below 1e-3."""
+"""Farthest distance in the contraction, in units of the scene's inner radius: beyond it disparity is below
+1e-3.
+"""
 NEAR = 0.05
 """Nearest distance in the contraction where nothing is known of depths, in units of the inner radius."""
 MARGIN = 1.02
 """Bounds are this much wider than what the training rays span, so that no training point lies on a border."""
 DEPTHS = 1 << 22
-"""About how many depths of points are looked at; a large capture has billions, and quantile() takes 16 million."""
+"""About how many depths of points are looked at; a large capture has billions, and quantile() takes 16
+million.
+"""
 _MOST = 1 << 24
 """Points whose spread is measured, at most: as many as quantile() takes."""
 ROUNDING = 1e-12
-"""Cameras closer together than this share of their coordinates stand in one place: the rest is float64's rounding."""
+"""Cameras closer together than this share of their coordinates stand in one place: the rest is float64's
+rounding.
+"""
 
 
 def focus(cameras: Cameras) -> tuple[Annotated[Tensor, "3"], float]:
-    """The point nearest to all optical axes, and how well it is determined: smallest over largest eigenvalue."""
-    # Least squares: sum_i (1 - a_i a_i^T)(x - o_i) = 0 with the axes a_i, about the cameras' mean, where float64 is finest.
-    middle, axis = cameras.pose[:, :, 3].mean(0), -cameras.pose[:, :, 2]
+    """The point nearest to all optical axes, and how well it is determined: smallest over largest
+    eigenvalue.
+    """
+    # Least squares: sum_i (1 - a_i a_i^T)(x - o_i) = 0 with the axes a_i, about the cameras' mean, where
+    # float64 is finest.
+    middle = cameras.pose[:, :, 3].mean(0)
+    axis = -cameras.pose[:, :, 2]
     origin = cameras.pose[:, :, 3] - middle
     axis = axis / axis.norm(dim=-1, keepdim=True)
     across = torch.eye(3, dtype=axis.dtype) - axis[:, :, None] * axis[:, None, :]
@@ -49,11 +60,15 @@ def focus(cameras: Cameras) -> tuple[Annotated[Tensor, "3"], float]:
     # A least-squares ridge of 1e-9 keeps parallel axes solvable: the answer is then the cameras' own centre.
     ridge = 1e-9 * values[-1].clamp_min(1e-12) * torch.eye(3, dtype=axis.dtype)
     target = (across @ origin[:, :, None]).sum(0)
-    return middle + torch.linalg.solve(matrix + ridge, target)[:, 0], float(values[0] / values[-1].clamp_min(1e-12))
+    return middle + torch.linalg.solve(matrix + ridge, target)[:, 0], float(
+        values[0] / values[-1].clamp_min(1e-12)
+    )
 
 
 def find_space(scene: ParsedScene) -> Space:
-    """The space of a scene. Raises DataError where cameras leave it undefined (all of them in one place, no points)."""
+    """The space of a scene. Raises DataError where cameras leave it undefined (all of them in one place, no
+    points).
+    """
     kind = find_kind(scene)
     if kind != "box":
         return _ndc(scene) if kind == "ndc" else _contraction(scene)
@@ -87,7 +102,9 @@ def find_kind(scene: ParsedScene) -> Kind:
 
 
 def _depths(scene: ParsedScene) -> Tensor | None:
-    """Depths that the capture knows: of its sparse points in every camera, or the middle of its near and far."""
+    """Depths that the capture knows: of its sparse points in every camera, or the middle of its near and
+    far.
+    """
     if scene.points is not None and len(scene.points) >= 8:
         pose = scene.cameras.pose
         points = scene.points[:: max(1, len(pose) * len(scene.points) // DEPTHS)]
@@ -102,9 +119,13 @@ def _depths(scene: ParsedScene) -> Tensor | None:
 
 
 def axes(cameras: Cameras) -> Tensor:
-    """Rows: the direction along which the cameras spread, third axis, mean up. Planes then follow streets and walls."""
+    """Rows: the direction along which the cameras spread, third axis, mean up. Planes then follow streets and
+    walls.
+    """
     up = cameras.pose[:, :, 1].mean(0)
-    if up.norm() < 0.3:  # a full turn about the optical axis, or nadir views from all sides: any axis is as good
+    if (
+        up.norm() < 0.3
+    ):  # a full turn about the optical axis, or nadir views from all sides: any axis is as good
         up = torch.tensor([0.0, 0.0, 1.0], dtype=up.dtype)
     up = up / up.norm()
     # The direction of most spread across the vertical.
@@ -114,7 +135,9 @@ def axes(cameras: Cameras) -> Tensor:
     along = along - (along @ up) * up
     if along.norm() < 1e-6:
         along = torch.linalg.svd(up[None], full_matrices=True).Vh[1]
-    if (flat[-1] - flat[0]) @ along < 0:  # a singular vector has either sign: onwards through the capture is the same anywhere
+    if (
+        flat[-1] - flat[0]
+    ) @ along < 0:  # a singular vector has either sign: onwards through the capture is the same anywhere
         along = -along
     along = along / along.norm()
     return torch.stack([along, torch.linalg.cross(up, along), up])
@@ -137,14 +160,18 @@ def _contraction(scene: ParsedScene) -> Space:
         spread = float(((some - centre) @ rotation.T).abs().amax(-1).quantile(0.5))
         radius = max(radius, min(spread, 3 * radius if radius > 0 else spread))
     if radius <= ROUNDING * float(position.abs().amax()):
-        raise DataError(f"{scene.name}: all cameras stand in one place and there are no points; capture from several places")
+        raise DataError(
+            f"{scene.name}: all cameras stand in one place and there are no points; capture from several places"
+        )
     nearest = _nearest(scene)
     near = NEAR if nearest is None else min(NEAR, 0.5 * nearest / radius)
     return Space("contraction", _three(centre), _rows(rotation), 1 / radius, max(near, 1e-3), FAR)
 
 
 def _nearest(scene: ParsedScene) -> float | None:
-    """Nearest depth that the capture says, else that of its sparse points but for a thousandth, which may be wrong."""
+    """Nearest depth that the capture says, else that of its sparse points but for a thousandth, which may be
+    wrong.
+    """
     if scene.depths is not None:
         return float(scene.depths[:, 0].amin())
     depth = _depths(scene)
@@ -175,8 +202,10 @@ def _ndc(scene: ParsedScene) -> Space:
         rays = whole.rays(*rays_through(cameras, torch.full((4,), view), corner))
         ends += [rays.origin, rays.origin + rays.direction]
     spread = torch.cat(ends).double()
-    low, high = spread.amin(0), spread.amax(0)
-    middle, half = (low + high) / 2, (high - low) / 2 * MARGIN
+    low = spread.amin(0)
+    high = spread.amax(0)
+    middle = (low + high) / 2
+    half = (high - low) / 2 * MARGIN
     (left, bottom, _), (right_end, top, _) = (middle - half).tolist(), (middle + half).tolist()
     return replace(whole, low=(left, bottom, -1.0), high=(right_end, top, 1.0))
 

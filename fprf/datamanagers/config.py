@@ -28,7 +28,9 @@ class GuidedConfig:
     eps: float = 1e-3
     """Regularisation in squared colour units, colours in [0, 1]; at least 1e-6."""
     stride: int = 8
-    """Pixels between stored coefficients; at most a fifth of the window is used, so small images keep their accuracy."""
+    """Pixels between stored coefficients; at most a fifth of the window is used, so small images keep their
+    accuracy.
+    """
 
     def __post_init__(self) -> None:
         between("guided.radius", self.radius, 0.0, 1.0)
@@ -45,8 +47,9 @@ class DataManagerConfig(PluginConfig):
     parser: DataParserConfig | None = None
     """Format of the scene folder; none = recognised from what lies in it."""
     masks: bool = True
-    """Leave out, in training and metrics, what the capture's masks name (`masks/` beside the images, or `mask_path`), and
-    keep the sky empty where `sky_masks/` show it."""
+    """Leave out, in training and metrics, what the capture's masks name (`masks/` beside the images, or
+    `mask_path`), and keep the sky empty where `sky_masks/` show it.
+    """
     guided: GuidedConfig = GuidedConfig()
     """Edge-aware upsampling of the targets, and of references alike."""
 
@@ -64,12 +67,14 @@ class DataManagerConfig(PluginConfig):
         seen: Callable[[int], Tensor] | None = None,
         background: tuple[float, float, float] | None = None,
     ) -> DataManager:
-        """The data manager; features are computed into `cache` unless they lie there already. `dim` is the number of
-        principal semantic components that the field learns; `progress(done, total, what)` is told of the features.
+        """The data manager; features are computed into `cache` unless they lie there already. `dim` is the
+        number of principal semantic components that the field learns; `progress(done, total, what)` is told
+        of the features.
 
-        For a block of a larger scene, `basis` is the whole scene's, instead of one of these views; `seen(view)` says which
-        pixels [H W] of a training view batches are drawn from, instead of all. `background` is what transparent pixels show,
-        RGB in [0, 1]; white by default."""
+        For a block of a larger scene, `basis` is the whole scene's, instead of one of these views;
+        `seen(view)` says which pixels [H W] of a training view batches are drawn from, instead of all.
+        `background` is what transparent pixels show, RGB in [0, 1]; white by default.
+        """
         raise NotImplementedError
 
     def batch_rays(self) -> int:
@@ -86,7 +91,9 @@ class RayBatchesConfig(DataManagerConfig):
     semantic_share: float = 1.0
     """Share of the rays that also carry a semantic target."""
     depth_share: float = 0.25
-    """Share of the rays that are drawn through sparse points of the reconstruction, where there are any, for `loss.depth`."""
+    """Share of the rays that are drawn through sparse points of the reconstruction, where there are any, for
+    `loss.depth`.
+    """
 
     def __post_init__(self) -> None:
         between("datamanager.depth_share", self.depth_share, 0.0, 1.0)

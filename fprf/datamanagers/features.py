@@ -1,15 +1,16 @@
 """Feature targets of every view of a scene, at any pixel, for a few megabytes an image.
 
-Extraction runs the encoder once a view at the image's own size and keeps guided-filter coefficients (`ops.guided`) in half
-precision in files; `FeatureStore.at` reads the cells around the pixels of a batch and applies them. Full-size feature maps
-never exist. Semantic features are projected on principal components of the training views before they are kept.
+Extraction runs the encoder once a view at the image's own size and keeps guided-filter coefficients
+(`ops.guided`) in half precision in files; `FeatureStore.at` reads the cells around the pixels of a batch and
+applies them. Full-size feature maps never exist. Semantic features are projected on principal components of
+the training views before they are kept.
 
-A file is named by the hash of everything that it was made from, holds checksums (`io.tensorfiles`), and appears under its
-name only when it is whole. So whatever an interrupted run, a second writer or a bad disk leaves behind is either right or
-made again; nothing is ever found by position.
+A file is named by the hash of everything that it was made from, holds checksums (`io.tensorfiles`), and
+appears under its name only when it is whole. So whatever an interrupted run, a second writer or a bad disk
+leaves behind is either right or made again; nothing is ever found by position.
 
-Half precision keeps 11 bits of each number, so numbers are made small first: b is taken at mid-grey (colours are then in
-[-0.5, 0.5]) and relative to its mean, and each channel is divided by its largest coefficient.
+Half precision keeps 11 bits of each number, so numbers are made small first: b is taken at mid-grey (colours
+are then in [-0.5, 0.5]) and relative to its mean, and each channel is divided by its largest coefficient.
 """
 
 # The checker takes compiled functions to have one argument.
@@ -41,12 +42,15 @@ GREY = 0.5
 LANES = 8
 # Part of every key: raise it when the same inputs give other files.
 FORMAT = "fprf-features-1"
-# Stored numbers stay within +-TOP: far from half precision's 65504, and its 24 bits below 1 are left for the small ones.
+# Stored numbers stay within +-TOP: far from half precision's 65504, and its 24 bits below 1 are left for the
+# small ones.
 TOP = 4096.0
 
 
 class Entry(NamedTuple):
-    """A view's features: F = scale (A (I - GREY) + b) + centre, with A and b interpolated over s x t cells."""
+    """A view's features: F = scale (A (I - GREY) + b) + centre, with A and b interpolated over s x t
+    cells.
+    """
 
     coefs: Annotated[Tensor, "s t 4 P"]
     """float16: A for red, green, blue, then b; P is C rounded up to a multiple of LANES, zeros beyond C."""
@@ -88,7 +92,8 @@ def read_kept(folder: Path, key: str) -> dict[str, Tensor] | None:
 
 
 def keep_within(folder: Path, size: int, used: Collection[str]) -> None:
-    """Delete the files that were used longest ago until at most `size` bytes are left, but none whose key is in `used`.
+    """Delete the files that were used longest ago until at most `size` bytes are left, but none whose key is
+    in `used`.
 
     Whoever has one mapped keeps it on POSIX; on Windows it stays.
     """
@@ -112,12 +117,14 @@ Progress = Callable[[int, int, str], None]
 
 BASIS_VIEWS = 64
 BASIS_CELLS = 32_768
-# Features met while fitting the basis are remembered up to this, so that small scenes are encoded once, not twice.
+# Features met while fitting the basis are remembered up to this, so that small scenes are encoded once, not
+# twice.
 REMEMBER_BYTES = 1 << 28
 MOMENT_PIXELS = 2048
 CACHED_BYTES = 1 << 30
 """Most bytes of the files in a folder; those of the views at hand stay whatever they take."""
-# A and b move within a window's fifth: measured on photographs, a coarser grid costs more than 1.5 % of the features' spread.
+# A and b move within a window's fifth: measured on photographs, a coarser grid costs more than 1.5 % of the
+# features' spread.
 CELLS_PER_WINDOW = 5
 
 
@@ -155,7 +162,9 @@ class FeatureStore:
         self._packed: tuple[guided.Packed, Tensor] | None = None
 
     def to(self, device: torch.device) -> "FeatureStore":
-        """The same targets, with the coefficients on a device as well: `at` of tensors there computes there."""
+        """The same targets, with the coefficients on a device as well: `at` of tensors there computes
+        there.
+        """
         shapes = torch.tensor([coefs.shape[:2] for coefs in self._coefs])
         ends = shapes.prod(1).cumsum(0)
         packed = torch.empty(int(ends[-1]), *self._coefs[0].shape[2:], dtype=torch.float16, device=device)
@@ -170,9 +179,9 @@ class FeatureStore:
     def at(
         self, view: Annotated[Tensor, "R"], pixel: Annotated[Tensor, "R 2"], rgb: Annotated[Tensor, "R 3"]
     ) -> Annotated[Tensor, "R C"]:
-        """Features, float32, raw. `view` counts in the scene; pixel is x, y with centres at +0.5; rgb in [0, 1] is the
-        image's own colour there. Raises DataError for a view that is not in the store; on the device of `to` views are not
-        checked, since the host would wait.
+        """Features, float32, raw. `view` counts in the scene; pixel is x, y with centres at +0.5; rgb in [0,
+        1] is the image's own colour there. Raises DataError for a view that is not in the store; on the
+        device of `to` views are not checked, since the host would wait.
         """
         if self._packed is not None and view.device == self._packed[1].device:
             # On the device everything is there already, and the host does not look at the views.
@@ -185,7 +194,9 @@ class FeatureStore:
         slot = self._numbers[asked.clamp(0, len(self._numbers) - 1)]
         missing = asked[self._slots[slot] != asked]
         if len(missing):
-            raise DataError(f"feature store: view {int(missing.min())} has no features; {len(self._coefs)} training views have")
+            raise DataError(
+                f"feature store: view {int(missing.min())} has no features; {len(self._coefs)} training views have"
+            )
         # The kernel takes contiguous float32 on the CPU, colours about mid-grey as they are stored.
         positions, colours = (x.detach().cpu().float().contiguous() for x in (pixel, rgb))
         out = torch.empty(len(view), self.channels)
@@ -208,9 +219,10 @@ def extract(
 ) -> FeatureStore:
     """The store of some views, made in `folder` as far as it is not there yet.
 
-    `image` gives a view as uint8; `dim` asks for that many principal components (fewer, where the encoder has fewer), of
-    these views unless the `basis` of a larger scene is given. A run that is cut off goes on where it stopped. Raises
-    NumericsError where the encoder's features are not finite, PluginError where they are not of the shape it promises.
+    `image` gives a view as uint8; `dim` asks for that many principal components (fewer, where the encoder has
+    fewer), of these views unless the `basis` of a larger scene is given. A run that is cut off goes on where
+    it stopped. Raises NumericsError where the encoder's features are not finite, PluginError where they are
+    not of the shape it promises.
     """
     folder.mkdir(parents=True, exist_ok=True)
     # Unfinished files of processes that died go; those of the last hour may belong to a living writer.
@@ -241,7 +253,8 @@ def extract(
         stride = min(config.stride, max(1, (2 * radius + 1) // CELLS_PER_WINDOW))
         settings = f"radius {radius} eps {config.eps!r} stride {stride} fineness {guided.FINENESS}"
         keys[view] = key = digest(prints[view], encoder.identity, settings, projection, *place)
-        tensors, features = read_kept(folder, key), remembered.pop(view, None)
+        tensors = read_kept(folder, key)
+        features = remembered.pop(view, None)
         if tensors is None or tensors.keys() != set(Entry._fields):
             features = _encode(encoder, pixels, view) if features is None else features
             made = _make(features, pixels, basis, radius=radius, eps=config.eps, stride=stride)._asdict()
@@ -274,18 +287,23 @@ def _encode(encoder: Encoder, pixels: Annotated[Tensor, "H W 3"], view: int) -> 
             f"it promises [1 {encoder.channels} h w]: report it to its author"
         )
     if not torch.isfinite(features).all():
-        raise NumericsError(f"encoder {encoder.identity}: features of view {view} are not finite; check image and weights")
+        raise NumericsError(
+            f"encoder {encoder.identity}: features of view {view} are not finite; check image and weights"
+        )
     return features[0].float()
 
 
-def _make(features: Tensor, pixels: Tensor, basis: Basis | None, *, radius: int, eps: float, stride: int) -> Entry:
+def _make(
+    features: Tensor, pixels: Tensor, basis: Basis | None, *, radius: int, eps: float, stride: int
+) -> Entry:
     """A view's entry: coefficients in storage form, and moments measured on what they will answer."""
     if basis is not None:
         features = basis.project(features.movedim(0, -1)).movedim(-1, 0)
     guide = pixels.float() / 255
     size = (int(pixels.shape[0]), int(pixels.shape[1]))
     coefs = guided.coefficients(features, guide, radius=radius, eps=eps, stride=stride)
-    # b at mid-grey and about its mean, each channel by its largest number: half precision keeps 11 bits of what is left.
+    # b at mid-grey and about its mean, each channel by its largest number: half precision keeps 11 bits of
+    # what is left.
     runs = coefs.detach().cpu().float().transpose(2, 3).clone()
     runs[..., 3, :] += GREY * runs[..., :3, :].sum(2)
     centre = runs[..., 3, :].mean((0, 1))
@@ -319,7 +337,8 @@ def _basis(
         return Basis.from_tensors(kept)
     # As many cells of each view, drawn evenly.
     generator = torch.Generator().manual_seed(0)
-    samples, held = [], 0
+    samples = []
+    held = 0
     for view in chosen:
         features = _encode(encoder, image(view), view)
         held += features.numel() * 4

@@ -1,11 +1,15 @@
 """Image files to 8-bit arrays [H W 3], sRGB, at the size that a scene's cameras have.
 
-Pillow decodes them; of a file with several images the first one counts. What a file's pixels are is decided in `_decode`:
+Pillow decodes them; of a file with several images the first one counts. What a file's pixels are is decided
+in `_decode`:
 
-- Photographs of captures are taken as COLMAP takes them, because their cameras were calibrated so: the EXIF orientation of
-  JPEG, PNG, WebP and TIFF is ignored. Photographs without a camera, such as references, are turned upright.
-- HEIC and AVIF store their rotation in the image itself (`irot`, `imir`), which every decoder applies: always upright.
-- Colours of an embedded ICC profile become sRGB. A profile that is broken or does not fit the pixels is ignored.
+- Photographs of captures are taken as COLMAP takes them, because their cameras were calibrated so: the EXIF
+  orientation of JPEG, PNG, WebP and TIFF is ignored. Photographs without a camera, such as references, are
+  turned upright.
+- HEIC and AVIF store their rotation in the image itself (`irot`, `imir`), which every decoder applies: always
+  upright.
+- Colours of an embedded ICC profile become sRGB. A profile that is broken or does not fit the pixels is
+  ignored.
 - Transparency is straight (not premultiplied) and composited before any reduction, which averages areas.
 
 Opening a file reads its header only, so that sizes are checked before anything is decoded.
@@ -42,7 +46,9 @@ from ..errors import DataError
 if TYPE_CHECKING:
     from .scene import ParsedScene
 
-IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif", ".hif", ".avif"})
+IMAGE_SUFFIXES = frozenset(
+    {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif", ".hif", ".avif"}
+)
 """Suffixes of images in a folder's list, in lower case. What a file is, its content says."""
 MAX_PIXELS = 100_000_000
 """Files that claim more are refused before they are decoded."""
@@ -69,8 +75,9 @@ _READERS: dict[str, tuple[bytes, Callable[[IO[bytes]], ImageFile]]] = {
     "AVIF": (rb".{4}ftyp(.{4}){0,9}avi[fs]", AvifImageFile),
     "HEIC": (rb".{4}ftyp(.{4}){0,9}(hei[cmsx]|hev[cmsx]|mif1|msf1)", _open_heif),
 }
-"""Each format's first bytes and reader. `PIL.Image.open` is not used: it warns of large images, tries formats that we don't
-want, and HEIC would have to be registered."""
+"""Each format's first bytes and reader. `PIL.Image.open` is not used: it warns of large images, tries formats
+that we don't want, and HEIC would have to be registered.
+"""
 _TURNS = {
     2: PIL.Image.Transpose.FLIP_LEFT_RIGHT,
     3: PIL.Image.Transpose.ROTATE_180,
@@ -97,24 +104,31 @@ class ImageHeader(NamedTuple):
 
 
 def read_header(path: Path) -> ImageHeader:
-    """The header of an image file. Raises DataError where the file is absent, empty, or of no known format."""
+    """The header of an image file. Raises DataError where the file is absent, empty, or of no known
+    format.
+    """
     with opened(path) as file:
         return header_of(file, path)
 
 
 def header_of(file: IO[bytes], name: object) -> ImageHeader:
-    """The header of an open file. Raises DataError, which begins with `name`, where it is empty or of no known format."""
+    """The header of an open file. Raises DataError, which begins with `name`, where it is empty or of no
+    known format.
+    """
     kind, image = open_image(file, name)
     width, height = image.size
     if isinstance(image, TiffImageFile):  # Pillow gives the size that they have upright
-        width, height = image.tag_v2[Tag.ImageWidth], image.tag_v2[Tag.ImageLength]
+        width = image.tag_v2[Tag.ImageWidth]
+        height = image.tag_v2[Tag.ImageLength]
     elif kind == "AVIF" and exif_orientation(image) > 4:
         width, height = height, width
     return ImageHeader(width, height, image.has_transparency_data, kind)
 
 
 def open_image(file: IO[bytes], name: object) -> tuple[str, ImageFile]:
-    """The format of an open file and its first image, of which only the header was read. Raises DataError as `header_of`."""
+    """The format of an open file and its first image, of which only the header was read. Raises DataError as
+    `header_of`.
+    """
     # The first bytes say the format, whatever the name says.
     file.seek(0)
     head = file.read(64)
@@ -131,7 +145,9 @@ def open_image(file: IO[bytes], name: object) -> tuple[str, ImageFile]:
 
 
 def kind_of(head: bytes) -> str:
-    """The format of a file by its first 64 bytes: JPEG, PNG, WebP, BMP, TIFF, AVIF or HEIC; empty for another."""
+    """The format of a file by its first 64 bytes: JPEG, PNG, WebP, BMP, TIFF, AVIF or HEIC; empty for
+    another.
+    """
     return next((kind for kind, (first, _) in _READERS.items() if re.match(first, head, re.DOTALL)), "")
 
 
@@ -144,9 +160,9 @@ def load_image(
 ) -> Image:
     """An image [H W 3] in sRGB, 0 to 255, resized to `size` (width, height), or as delivered without one.
 
-    16-bit files are rounded to 8 bits, grey ones repeated. Transparent pixels show `background` (RGB in [0, 1]; white
-    by default). `upright` obeys EXIF orientation. Raises DataError where the file is absent, truncated, damaged, of no
-    known format or over 1e8 pixels.
+    16-bit files are rounded to 8 bits, grey ones repeated. Transparent pixels show `background` (RGB in [0,
+    1]; white by default). `upright` obeys EXIF orientation. Raises DataError where the file is absent,
+    truncated, damaged, of no known format or over 1e8 pixels.
     """
     colour, alpha = _decode(path, upright)
     rgb = colour if colour.mode == "RGB" else colour.convert("RGB")
@@ -178,15 +194,18 @@ def has_transparency(path: Path) -> bool:
 def load_mask(path: Path, size: tuple[int, int] | None = None, *, upright: bool = False) -> NDArray[np.bool_]:
     """A mask [H W] at `size` (width, height), or as delivered without one: true where it is white or opaque.
 
-    Alpha decides where it varies; else the luminance of the colours, also of a palette's. True is what is above a half.
-    Where nothing is, as with labels 0 and 1 or red painted on black, it is what is brighter than the darkest pixel (than
-    black, in a mask of one colour); not in JPEG and the like, where that would be noise. The nearest pixel is taken.
-    Raises DataError as `load_image` does, and where the shape is not that of `size`.
+    Alpha decides where it varies; else the luminance of the colours, also of a palette's. True is what is
+    above a half. Where nothing is, as with labels 0 and 1 or red painted on black, it is what is brighter
+    than the darkest pixel (than black, in a mask of one colour); not in JPEG and the like, where that would
+    be noise. The nearest pixel is taken. Raises DataError as `load_image` does, and where the shape is not
+    that of `size`.
     """
     colour, alpha = _decode(path, upright, np.ceil)  # so that 1 of 65535 is not black
     width, height = colour.size
     if size is not None and abs(size[0] * height - size[1] * width) > width + height + size[0] + size[1]:
-        raise DataError(f"{path}: {width}x{height} pixels do not fit an image of {size[0]}x{size[1]}; mend it")
+        raise DataError(
+            f"{path}: {width}x{height} pixels do not fit an image of {size[0]}x{size[1]}; mend it"
+        )
     # What varies decides: alpha, else luminance, else the darker of both.
     grey = np.asarray(colour.convert("L"))
     if alpha is not None:
@@ -196,12 +215,17 @@ def load_mask(path: Path, size: tuple[int, int] | None = None, *, upright: bool 
     if grey.max() <= half and read_header(path).kind in ("PNG", "BMP", "TIFF"):
         half = int(grey.min()) if np.ptp(grey) else 0
     bright = (grey > half).astype(np.uint8)
-    return np.asarray(bright if size is None else cv2.resize(bright, size, interpolation=cv2.INTER_NEAREST)).astype(np.bool_)
+    return np.asarray(
+        bright if size is None else cv2.resize(bright, size, interpolation=cv2.INTER_NEAREST)
+    ).astype(np.bool_)
 
 
 def useless_masks(scene: "ParsedScene") -> str:
-    """Describe masks that leave no pixel of any view, or every pixel of all; empty for others and without masks."""
-    # Masks of one colour, all of the same, mean that white and black were swapped, or that nothing was painted.
+    """Describe masks that leave no pixel of any view, or every pixel of all; empty for others and without
+    masks.
+    """
+    # Masks of one colour, all of the same, mean that white and black were swapped, or that nothing was
+    # painted.
     first = None
     for path in scene.masks:
         share = 1.0 if path is None else float(load_mask(path).mean())
@@ -219,13 +243,15 @@ def useless_masks(scene: "ParsedScene") -> str:
 def load_images(
     scene: "ParsedScene", background: Sequence[float] | None = None, views: Sequence[int] | None = None
 ) -> list[Image]:
-    """Views of a scene (all, in the scene's order, where none are named) at their cameras' sizes, which may differ.
+    """Views of a scene (all, in the scene's order, where none are named) at their cameras' sizes, which may
+    differ.
 
     Raises DataError as `load_image` does, and where a file's shape has changed since the scene was parsed.
     """
 
     def load(view: int) -> Image:
-        path, (width, height) = scene.paths[view], scene.cameras.size[view].tolist()
+        path = scene.paths[view]
+        (width, height) = scene.cameras.size[view].tolist()
         header = read_header(path)
         # Both sides were rounded to whole pixels: a larger deviation is another shape, not another scale.
         if abs(width * header.height - height * header.width) > 0.5 * (header.width + header.height) + 1e-6:
@@ -240,11 +266,15 @@ def load_images(
 
 
 def image_names(folder: Path) -> list[str]:
-    """Sorted names of the images directly in a folder, hidden files left out; DataError where there is none."""
+    """Sorted names of the images directly in a folder, hidden files left out; DataError where there is
+    none.
+    """
     try:
         entries = os.listdir(folder)
     except OSError as error:
-        raise DataError(f"{folder}: no such image folder ({error.strerror}); name it or put the images there") from error
+        raise DataError(
+            f"{folder}: no such image folder ({error.strerror}); name it or put the images there"
+        ) from error
     # Hidden files are what other systems leave behind, such as ._0001.jpg.
     names = sorted(n for n in entries if Path(n).suffix.lower() in IMAGE_SUFFIXES and not n.startswith("."))
     if not names:
@@ -255,10 +285,11 @@ def image_names(folder: Path) -> list[str]:
 
 
 def photographs(paths: Sequence[Path], report: Callable[[str], None]) -> list[Path]:
-    """The files among the paths and the images in the folders, each once; those of a folder in the order of their names.
+    """The files among the paths and the images in the folders, each once; those of a folder in the order of
+    their names.
 
-    An image in a folder that cannot be read is left out, and `report` is given the reason. Raises DataError for a folder
-    without a readable image.
+    An image in a folder that cannot be read is left out, and `report` is given the reason. Raises DataError
+    for a folder without a readable image.
     """
 
     def fault(path: Path) -> str:
@@ -277,7 +308,9 @@ def photographs(paths: Sequence[Path], report: Callable[[str], None]) -> list[Pa
         for reason in filter(None, faults.values()):
             report(f"left out: {reason}")
         if images and all(faults.values()):
-            raise DataError(f"{path}: none of its {len(images)} images can be read; the first one: {faults[images[0]]}")
+            raise DataError(
+                f"{path}: none of its {len(images)} images can be read; the first one: {faults[images[0]]}"
+            )
         listed |= dict.fromkeys([image for image in images if not faults[image]] if images else [path])
     return list(listed)
 
@@ -285,7 +318,8 @@ def photographs(paths: Sequence[Path], report: Callable[[str], None]) -> list[Pa
 def _decode(
     path: Path, upright: bool, rounded: Callable[[NDArray[np.float32]], NDArray[np.float32]] = np.rint
 ) -> tuple[PIL.Image.Image, PIL.Image.Image | None]:
-    """The colours of a file in mode L, RGB or CMYK, sRGB where it has a profile, and its alpha in mode L where it has one.
+    """The colours of a file in mode L, RGB or CMYK, sRGB where it has a profile, and its alpha in mode L
+    where it has one.
 
     Colours of 16 bits become 8 with `rounded`.
     """
@@ -294,25 +328,32 @@ def _decode(
         # For TIFF Pillow has a limit of its own, above which it warns.
         most = min(MAX_PIXELS, PIL.Image.MAX_IMAGE_PIXELS or MAX_PIXELS) if kind == "TIFF" else MAX_PIXELS
         if image.width * image.height > most:
-            raise DataError(f"{path}: {image.width}x{image.height} pixels; at most {most:.0e} are read: reduce the image")
+            raise DataError(
+                f"{path}: {image.width}x{image.height} pixels; at most {most:.0e} are read: reduce the image"
+            )
         with _decoding(kind, path, 8 * image.width * image.height):
             if kind == "PNG":
                 image.verify()  # the checksums, which loading ignores; it uses the image up
                 image = open_image(file, path)[1]
-                if "transparency" in image.info:  # Pillow scales grey of 2 and 4 bits, but not the transparent one
+                if (
+                    "transparency" in image.info
+                ):  # Pillow scales grey of 2 and 4 bits, but not the transparent one
                     image.info["transparency"] *= {"L;2": 85, "L;4": 17}.get(str(image.tile[0].args), 1)
             deep = ";16" in str(image.tile)
             # Decode, and find the orientation by which the pixels are still to be turned.
             stored = exif_orientation(image) if kind == "TIFF" else 1
             image.load()
             if kind == "TIFF":
-                # Pillow has turned them: they are turned back. 6 and 8 are each other's inverse, the rest their own.
+                # Pillow has turned them: they are turned back. 6 and 8 are each other's inverse, the rest
+                # their own.
                 stored = 1 if upright else {6: 8, 8: 6}.get(stored, stored)
             elif kind == "AVIF" or (upright and kind != "HEIC"):
                 stored = exif_orientation(image)
             turn = _TURNS.get(stored)
-    # Grey of 16 bits and what is transparent in it; colours of 16 bits; transparency of the others; then few modes are left.
-    profile, alpha = image.info.get("icc_profile"), None
+    # Grey of 16 bits and what is transparent in it; colours of 16 bits; transparency of the others; then few
+    # modes are left.
+    profile = image.info.get("icc_profile")
+    alpha = None
     pixels: PIL.Image.Image = image
     if image.mode.startswith("I;16"):
         values = np.asarray(image)
@@ -326,7 +367,8 @@ def _decode(
     if alpha is None and pixels.has_transparency_data:
         grey = pixels.mode in ("1", "L", "LA")
         pixels = pixels.convert("RGBA")
-        alpha, pixels = pixels.getchannel("A"), pixels.getchannel("R") if grey else pixels.convert("RGB")
+        alpha = pixels.getchannel("A")
+        pixels = pixels.getchannel("R") if grey else pixels.convert("RGB")
     if pixels.mode not in ("L", "RGB", "CMYK"):
         pixels = pixels.convert("L" if pixels.mode == "1" else "RGB")
     # To sRGB, and upright.
@@ -336,7 +378,8 @@ def _decode(
             pixels = pixels.convert("RGB")
         pixels = pixels if transform is None or pixels.mode != mode else transform.apply(pixels)
     if turn is not None:
-        pixels, alpha = pixels.transpose(turn), alpha and alpha.transpose(turn)
+        pixels = pixels.transpose(turn)
+        alpha = alpha and alpha.transpose(turn)
     return pixels, alpha
 
 
@@ -353,7 +396,9 @@ def exif_orientation(image: ImageFile) -> int:
 def _from_16_bits(
     path: Path, image: PIL.Image.Image, rounded: Callable[[NDArray[np.float32]], NDArray[np.float32]]
 ) -> PIL.Image.Image:
-    """Colours of 16 bits, rounded, by OpenCV: Pillow keeps their upper 8 bits only. Pillow's where the two disagree."""
+    """Colours of 16 bits, rounded, by OpenCV: Pillow keeps their upper 8 bits only. Pillow's where the two
+    disagree.
+    """
     flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
     found = cv2.imdecode(np.fromfile(path, dtype=np.uint8), flags)
     if found is None or found.dtype != np.uint16 or found.shape[2:] not in ((3,), (4,)):
@@ -366,7 +411,9 @@ def _from_16_bits(
 
 @lru_cache(maxsize=16)
 def _transform(profile: bytes) -> tuple[str, ImageCms.ImageCmsTransform | None]:
-    """The mode that a profile is for, and the transform to sRGB; None for sRGB itself and for what is broken."""
+    """The mode that a profile is for, and the transform to sRGB; None for sRGB itself and for what is
+    broken.
+    """
     try:
         given = ImageCms.ImageCmsProfile(BytesIO(profile))
         mode = {"GRAY": "L", "RGB": "RGB", "CMYK": "CMYK"}[given.profile.xcolor_space.strip()]
@@ -387,14 +434,18 @@ def opened(path: Path) -> Iterator[IO[bytes]]:
     try:
         file = path.open("rb")
     except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
+        raise DataError(
+            f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
+        ) from error
     with file:
         yield file
 
 
 @contextmanager
 def _decoding(kind: str, name: object, room: int = 0) -> Iterator[None]:
-    """Whatever a decoder raises over the bytes of a stranger, as a DataError; MemoryError where `room` bytes are not there."""
+    """Whatever a decoder raises over the bytes of a stranger, as a DataError; MemoryError where `room` bytes
+    are not there.
+    """
     try:
         yield
     except (DataError, MemoryError):
@@ -404,14 +455,20 @@ def _decoding(kind: str, name: object, room: int = 0) -> Iterator[None]:
             f"{name}: is HEIC, which needs the package pillow-heif: pip install pillow-heif, or convert the image to JPEG"
         ) from error
     except Exception as error:
-        np.empty(room, np.uint8)  # raises MemoryError where that is what the decoder lacked: few of them say so
+        np.empty(
+            room, np.uint8
+        )  # raises MemoryError where that is what the decoder lacked: few of them say so
         reason = " ".join(str(error).lower().split()) or type(error).__name__
-        raise DataError(f"{name}: the {kind} data cannot be decoded: {reason}; copy or export the image again") from error
+        raise DataError(
+            f"{name}: the {kind} data cannot be decoded: {reason}; copy or export the image again"
+        ) from error
 
 
 @contextmanager
 def silent() -> Iterator[None]:
-    """Suppress Pillow's warnings of EXIF blocks. Filters are of the process, so one thread at a time changes them."""
+    """Suppress Pillow's warnings of EXIF blocks. Filters are of the process, so one thread at a time changes
+    them.
+    """
     with _WARNINGS, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield

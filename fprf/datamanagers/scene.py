@@ -1,10 +1,13 @@
-"""A parsed scene: where its images lie, how they were taken, what is for training, which sparse points its views see.
+"""A parsed scene: where its images lie, how they were taken, what is for training, which sparse points its
+views see.
 
-Reconstructions say which views see a point. Where one does not, points are projected and only the nearest layer counts: in each
-tile of an image those no farther than LAYER times the nearest. It takes the wall before the street behind it.
+Reconstructions say which views see a point. Where one does not, points are projected and only the nearest
+layer counts: in each tile of an image those no farther than LAYER times the nearest. It takes the wall before
+the street behind it.
 
-Exposure is measured where several views see the same point. A sighting's brightness is b = g(view) + a(point) in the logarithm
-of sRGB; least squares gives both, twice: the second time without outliers (highlights, points that something hides).
+Exposure is measured where several views see the same point. A sighting's brightness is b = g(view) + a(point)
+in the logarithm of sRGB; least squares gives both, twice: the second time without outliers (highlights,
+points that something hides).
 """
 
 import math
@@ -42,7 +45,9 @@ class ParsedScene:
     exposure: Annotated[Tensor, "V"] | None = None
     """Exposure of each view, where the capture says: light is in proportion to it. float64, above 0."""
     masks: tuple[Path | None, ...] = ()
-    """A mask of each view, black where pixels are left out; None = all are used. Empty where the capture has none."""
+    """A mask of each view, black where pixels are left out; None = all are used. Empty where the capture has
+    none.
+    """
     sky_masks: tuple[Path | None, ...] = ()
     """The same of sky, which is white."""
     alpha: bool = False
@@ -50,13 +55,19 @@ class ParsedScene:
     notes: tuple[str, ...] = ()
     """Decisions taken while the capture was read, a line each, for the user."""
     origin: Origin = (0.0, 0.0, 0.0)
-    """Subtracted from the capture's coordinates, along its own axes: cameras and points are relative to it."""
+    """Subtracted from the capture's coordinates, along its own axes: cameras and points are relative to
+    it.
+    """
 
 
 def in_local_frame(scene: ParsedScene) -> ParsedScene:
-    """The scene about its `local_origin`: projected metres (UTM) and Earth-centred ones are beyond float32."""
+    """The scene about its `local_origin`: projected metres (UTM) and Earth-centred ones are beyond
+    float32.
+    """
     further = local_origin(scene.cameras.pose[:, :, 3], scene.points)
-    return at_origin(scene, (scene.origin[0] + further[0], scene.origin[1] + further[1], scene.origin[2] + further[2]))
+    return at_origin(
+        scene, (scene.origin[0] + further[0], scene.origin[1] + further[1], scene.origin[2] + further[2])
+    )
 
 
 def at_origin(scene: ParsedScene, origin: Origin) -> ParsedScene:
@@ -99,7 +110,10 @@ def find_sightings(scene: ParsedScene) -> Sightings | None:
     if scene.seen is not None:
         kept = scene.seen[torch.isin(scene.seen[:, 0], scene.train)]
         kept = kept[kept[:, 0].argsort(stable=True)]
-        parts = [_sighted(scene.cameras, view, scene.points[point]) for view, point in torch.split(kept.T, PIECE, 1)]
+        parts = [
+            _sighted(scene.cameras, view, scene.points[point])
+            for view, point in torch.split(kept.T, PIECE, 1)
+        ]
     else:
         points = scene.points[:: max(1, len(scene.points) * len(scene.train) // PROJECTIONS)]
         parts = [_nearest(scene.cameras, view, points) for view in scene.train.tolist()]
@@ -107,7 +121,9 @@ def find_sightings(scene: ParsedScene) -> Sightings | None:
     return sightings if len(sightings.view) else None
 
 
-def tile_of(cameras: Cameras, view: Annotated[Tensor, "O"], pixel: Annotated[Tensor, "O 2"]) -> Annotated[Tensor, "O 2"]:
+def tile_of(
+    cameras: Cameras, view: Annotated[Tensor, "O"], pixel: Annotated[Tensor, "O 2"]
+) -> Annotated[Tensor, "O 2"]:
     """Column and row of the tile that a pixel lies in: TILES along the longer side, square."""
     size = cameras.size[view]
     side = size.amax(-1, keepdim=True).double() / TILES
@@ -130,7 +146,9 @@ def _nearest(cameras: Cameras, view: int, points: Tensor) -> Sightings:
     sightings = _sighted(cameras, torch.full((len(points),), view), points)
     column, row = tile_of(cameras, sightings.view, sightings.pixel).unbind(1)
     tile = row * TILES + column
-    least = sightings.distance.new_full((TILES * TILES,), torch.inf).scatter_reduce(0, tile, sightings.distance, "amin")
+    least = sightings.distance.new_full((TILES * TILES,), torch.inf).scatter_reduce(
+        0, tile, sightings.distance, "amin"
+    )
     front = sightings.distance <= LAYER * least[tile]
     return Sightings(*(x[front] for x in sightings))
 
@@ -143,20 +161,25 @@ LEAST = 16
 """Sightings of a view that its exposure is measured from, at least."""
 MOST = 1 << 19
 """Pairs of a view and a point that are looked at, about."""
-DARK, BRIGHT = 0.03, 0.97
+DARK = 0.03
+BRIGHT = 0.97
 """sRGB outside of which a pixel says nothing: noise, or clipped."""
 
 
 def exposures_differ(exposure: Annotated[Tensor, "V"] | None) -> bool:
-    """True where views were taken so differently that each needs a factor of its own; not where nothing is known."""
+    """True where views were taken so differently that each needs a factor of its own; not where nothing is
+    known.
+    """
     return exposure is not None and len(exposure) > 1 and GAMMA * float(exposure.log().std()) > DIFFERENT
 
 
 def with_exposure(scene: ParsedScene, image: Callable[[int], Annotated[Tensor, "H W 3"]]) -> ParsedScene:
-    """The scene with the exposure of its views, measured where the capture does not say it; unchanged without points.
+    """The scene with the exposure of its views, measured where the capture does not say it; unchanged without
+    points.
 
-    `image(view)` is a training view, in [0, 1]. Held-out views take the mean of their neighbours in the order of names, as far
-    as training views resemble theirs: pictures taken one after the other do, those of a collection do not.
+    `image(view)` is a training view, in [0, 1]. Held-out views take the mean of their neighbours in the order
+    of names, as far as training views resemble theirs: pictures taken one after the other do, those of a
+    collection do not.
     """
     if scene.exposure is not None or len(scene.train) < 2:
         return scene
@@ -171,7 +194,8 @@ def with_exposure(scene: ParsedScene, image: Callable[[int], Annotated[Tensor, "
     alike = (1 - gain[train].diff().square().mean() / (2 * gain[train].var()).clamp_min(1e-12)).clamp(0, 1)
     # A held-out view is as bright as the ones before and after, as far as those resemble each other.
     after = torch.searchsorted(train, scene.test)
-    before, after = train[(after - 1).clamp_min(0)], train[after.clamp_max(len(train) - 1)]
+    before = train[(after - 1).clamp_min(0)]
+    after = train[after.clamp_max(len(train) - 1)]
     gain[scene.test] = alike * (gain[before] + gain[after]) / 2
     return replace(scene, exposure=(gain / GAMMA).exp())
 
@@ -190,7 +214,9 @@ def sparser(scene: ParsedScene) -> ParsedScene:
 def _gains(
     sightings: Sightings, scene: ParsedScene, image: Callable[[int], Annotated[Tensor, "H W 3"]]
 ) -> Annotated[Tensor, "V"] | None:
-    """g of the training views, 0 of those that too few sightings tell of; None where none is left. float64."""
+    """g of the training views, 0 of those that too few sightings tell of; None where none is left.
+    float64.
+    """
     # Brightness b of each sighting, where its pixel is neither dark nor clipped.
     rgb = torch.full((len(sightings.view), 3), torch.nan, dtype=torch.float64)
     for view in scene.train.tolist():
@@ -198,7 +224,8 @@ def _gains(
         x, y = sightings.pixel[at].long().unbind(1)
         rgb[at] = image(view)[y, x].double()
     kept = ((rgb >= DARK) & (rgb <= BRIGHT)).all(1)
-    view, bright = sightings.view[kept], rgb[kept].log().mean(1)
+    view = sightings.view[kept]
+    bright = rgb[kept].log().mean(1)
     point = torch.unique(sightings.point[kept], dim=0, return_inverse=True)[1]
     # Twice: the second time without what the first fit calls outliers. Points that one view saw say nothing.
     gain = None
@@ -209,15 +236,21 @@ def _gains(
         if not len(view):
             break
         gain, error = _solve(view, point, bright, len(scene.paths))
-        inlier = error.abs() <= 3 * error.abs().median() / 0.6745  # of a normal error three standard deviations
-        view, point, bright = view[inlier], point[inlier], bright[inlier]
+        inlier = (
+            error.abs() <= 3 * error.abs().median() / 0.6745
+        )  # of a normal error three standard deviations
+        view = view[inlier]
+        point = point[inlier]
+        bright = bright[inlier]
     return gain
 
 
 def _solve(
     view: Annotated[Tensor, "O"], point: Annotated[Tensor, "O"], bright: Annotated[Tensor, "O"], views: int
 ) -> tuple[Annotated[Tensor, "V"], Annotated[Tensor, "O"]]:
-    """g of the views and what it leaves of each sighting, by conjugate gradients on the equations without the points."""
+    """g of the views and what it leaves of each sighting, by conjugate gradients on the equations without the
+    points.
+    """
     seen = torch.bincount(point).clamp_min(1).double()
 
     def centred(values: Tensor) -> Tensor:
@@ -227,17 +260,21 @@ def _solve(
     def gathered(values: Tensor) -> Tensor:
         return values.new_zeros(views).index_add(0, view, values)
 
-    # With the mean over each point's sightings taken out of g and b alike, a drops out; conjugate gradients on what is left.
+    # With the mean over each point's sightings taken out of g and b alike, a drops out; conjugate gradients
+    # on what is left.
     gain = bright.new_zeros(views)
     residual = gathered(centred(bright))
-    direction, power = residual, float(residual @ residual)
+    direction = residual
+    power = float(residual @ residual)
     limit = 1e-12 * power
     for _ in range(min(views, 200)):
         if power <= limit or not math.isfinite(power):
             break
         moved = gathered(centred(direction[view]))
         length = power / float(direction @ moved)
-        gain, residual = gain + length * direction, residual - length * moved
-        last, power = power, float(residual @ residual)
+        gain = gain + length * direction
+        residual = residual - length * moved
+        last = power
+        power = float(residual @ residual)
         direction = residual + power / last * direction
     return gain, centred(bright - gain[view])

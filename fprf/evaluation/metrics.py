@@ -1,20 +1,23 @@
-"""Renders against photographs and each other: PSNR, SSIM, LPIPS and consistency of images [H W 3] in [0, 1]; `fprf eval`.
+"""Renders against photographs and each other: PSNR, SSIM, LPIPS and consistency of images [H W 3] in [0, 1];
+`fprf eval`.
 
-PSNR = -10 log10(mean squared error), in decibels. SSIM after Wang et al. 2004: Gaussian window of 11 pixels (σ 1.5),
-K = (0.01, 0.03), dynamic range 1, mean over channels and over the windows that lie wholly inside. LPIPS 0.1 with AlexNet
-(Zhang et al. 2018, arXiv:1801.03924), with the weights of its authors:
+PSNR = -10 log10(mean squared error), in decibels. SSIM after Wang et al. 2004: Gaussian window of 11 pixels
+(σ 1.5), K = (0.01, 0.03), dynamic range 1, mean over channels and over the windows that lie wholly inside.
+LPIPS 0.1 with AlexNet (Zhang et al. 2018, arXiv:1801.03924), with the weights of its authors:
 
     LPIPS(a, b) = Σ_layers mean over pixels of Σ_channels w_c (f_c(a) / |f(a)| - f_c(b) / |f(b)|)²
 
-f: activations of the five convolutions, w ≥ 0: the learned heads. 0 for equal images, about 0.7 for unrelated ones.
+f: activations of the five convolutions, w ≥ 0: the learned heads. 0 for equal images, about 0.7 for unrelated
+ones.
 
-Consistency of views: a pixel p of view a is lifted to the world by a's depth and looked up in view b, at p'. It counts where b
-sees the same place: inside b's frame, in front of it, and at the depth that b itself has there (occlusion).
+Consistency of views: a pixel p of view a is lifted to the world by a's depth and looked up in view b, at p'.
+It counts where b sees the same place: inside b's frame, in front of it, and at the depth that b itself has
+there (occlusion).
 
     RMSE = sqrt( Σ_pairs Σ_valid |I_a(p) - I_b(p')|² / (3 Σ_pairs #valid) )
 
-Relative to the contrast of what was compared (a dull image scores well for nothing) it is 0 for perfect agreement, sqrt(2) for
-unrelated colours.
+Relative to the contrast of what was compared (a dull image scores well for nothing) it is 0 for perfect
+agreement, sqrt(2) for unrelated colours.
 """
 
 import math
@@ -41,25 +44,33 @@ from ..training.run import Known
 from ..types import View
 
 PSNR_CAP = 99.0
-"""PSNR of identical images, in dB: means over views stay finite. Reached at a mean squared error of 1.3e-10."""
+"""PSNR of identical images, in dB: means over views stay finite. Reached at a mean squared error of
+1.3e-10.
+"""
 
 _WINDOW = 11
 _LPIPS_WEIGHTS = Path(__file__).parent / "weights" / "lpips-alex.safetensors"
-_STRIDES, _PADS = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)
+_STRIDES = (4, 1, 1, 1, 1)
+_PADS = (2, 2, 1, 1, 1)
 _POOLED = (2, 3)
 """Convolutions after a pooling."""
-_SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+_SHIFT = (-0.030, -0.088, -0.188)
+_SCALE = (0.458, 0.448, 0.450)
 """Of colours in [-1, 1]: ImageNet's mean and deviation."""
 _EPS = 1e-10
 """Added to lengths, as the authors do: a feature may be 0."""
 _SMALLEST = 31
 """Pixels of a side that the second pooling leaves one of."""
 _SAME_PLACE = 0.02
-"""Share of the distance below which two surfaces count as one. Bilinear depth on a slope is off by far less."""
+"""Share of the distance below which two surfaces count as one. Bilinear depth on a slope is off by far
+less.
+"""
 
 
 def _pair(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Both images as they are compared: on one device, in float32 at least. Raises DataError for unlike shapes."""
+    """Both images as they are compared: on one device, in float32 at least. Raises DataError for unlike
+    shapes.
+    """
     if a.shape != b.shape or a.ndim != 3 or a.shape[-1] != 3 or a.numel() == 0:
         raise DataError(
             f"images of shape {tuple(a.shape)} and {tuple(b.shape)} cannot be compared; both must be [H W 3] of one size"
@@ -70,19 +81,28 @@ def _pair(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 def _finite(name: str, value: float) -> float:
     if not math.isfinite(value):
-        raise NumericsError(f"{name} is {value}: an image holds values that are not finite, or nothing of it counts")
+        raise NumericsError(
+            f"{name} is {value}: an image holds values that are not finite, or nothing of it counts"
+        )
     return value
 
 
 def psnr(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"]) -> float:
-    """Peak signal-to-noise ratio in dB, at most `PSNR_CAP`; symmetric. Raises NumericsError for NaN and infinities."""
+    """Peak signal-to-noise ratio in dB, at most `PSNR_CAP`; symmetric. Raises NumericsError for NaN and
+    infinities.
+    """
     first, second = _pair(a, b)
     error = _finite("psnr", float((first - second).square().mean()))
     return min(PSNR_CAP, -10 * math.log10(error)) if error > 0 else PSNR_CAP
 
 
-def ssim(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"], where: Annotated[Tensor, "H W"] | None = None) -> float:
-    """Structural similarity in [-1, 1], 1 for identical images; symmetric. Of windows about `where` alone, if given.
+def ssim(
+    a: Annotated[Tensor, "H W 3"],
+    b: Annotated[Tensor, "H W 3"],
+    where: Annotated[Tensor, "H W"] | None = None,
+) -> float:
+    """Structural similarity in [-1, 1], 1 for identical images; symmetric. Of windows about `where` alone, if
+    given.
 
     An image with a side below 11 pixels is judged with the largest odd window that fits. Raises as `psnr`.
     """
@@ -90,7 +110,8 @@ def ssim(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"], where: An
     # The window must be odd, and fit.
     shortest = min(first.shape[:2])
     window = min(_WINDOW, shortest - 1 + shortest % 2)
-    x, y = first.permute(2, 0, 1)[None], second.permute(2, 0, 1)[None]
+    x = first.permute(2, 0, 1)[None]
+    y = second.permute(2, 0, 1)[None]
     # No eps: K keeps the denominator above 9e-8, and kornia's 1e-12 would cost black images 1e-5.
     windows = _ssim_map(x, y, window, eps=0.0, padding="valid")
     if where is not None:
@@ -103,10 +124,16 @@ def ssim(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"], where: An
 
 
 @torch.no_grad()
-def lpips(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"], where: Annotated[Tensor, "H W"] | None = None) -> float:
-    """LPIPS of sRGB images in [0, 1], at least 0, symmetric; `where`: mean over the cells that lie there, by their share.
+def lpips(
+    a: Annotated[Tensor, "H W 3"],
+    b: Annotated[Tensor, "H W 3"],
+    where: Annotated[Tensor, "H W"] | None = None,
+) -> float:
+    """LPIPS of sRGB images in [0, 1], at least 0, symmetric; `where`: mean over the cells that lie there, by
+    their share.
 
-    Images with a side below 31 pixels are enlarged. Raises DataError for unlike shapes, NumericsError for NaN and infinities.
+    Images with a side below 31 pixels are enlarged. Raises DataError for unlike shapes, NumericsError for NaN
+    and infinities.
     """
     a, b = _pair(a, b)
     # Both images as one batch; small ones are enlarged, since the second pooling would leave nothing of them.
@@ -129,7 +156,9 @@ def lpips(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"], where: A
     return _finite("lpips", total)
 
 
-def _activations(weights: Mapping[str, Tensor], images: Annotated[Tensor, "B 3 H W"]) -> Iterator[Annotated[Tensor, "B C h w"]]:
+def _activations(
+    weights: Mapping[str, Tensor], images: Annotated[Tensor, "B 3 H W"]
+) -> Iterator[Annotated[Tensor, "B C h w"]]:
     """Of AlexNet's convolutions, one after the other."""
     shift, scale = (images.new_tensor(each).view(1, 3, 1, 1) for each in (_SHIFT, _SCALE))
     x = (2 * images - 1 - shift) / scale
@@ -146,15 +175,17 @@ def _weights() -> Mapping[str, Tensor]:
 
 
 def image_metrics(
-    render: Annotated[Tensor, "H W 3"], truth: Annotated[Tensor, "H W 3"], where: Annotated[Tensor, "H W"] | None = None
+    render: Annotated[Tensor, "H W 3"],
+    truth: Annotated[Tensor, "H W 3"],
+    where: Annotated[Tensor, "H W"] | None = None,
 ) -> dict[str, float]:
     """Every metric of one view, by name. Pixels that are not `where` (a capture's mask) are left out.
 
-    `cc_psnr` is the PSNR in the photograph's own exposure and white balance: after the factor of each channel that brings the
-    render nearest to it (nerfstudio's name; there an affine map is fitted).
+    `cc_psnr` is the PSNR in the photograph's own exposure and white balance: after the factor of each channel
+    that brings the render nearest to it (nerfstudio's name; there an affine map is fitted).
 
-    Windows of SSIM and cells of LPIPS about pixels that are left out still see them: the same in both images. Raises DataError
-    where the mask leaves nothing.
+    Windows of SSIM and cells of LPIPS about pixels that are left out still see them: the same in both images.
+    Raises DataError where the mask leaves nothing.
     """
     if where is None:
         corrected = _exposed_as(render, truth)
@@ -165,10 +196,13 @@ def image_metrics(
             "lpips": lpips(render, truth),
         }
     if not bool(where.any()):
-        raise DataError("a mask leaves nothing of a view that is to be judged; leave the view out, or its mask")
+        raise DataError(
+            "a mask leaves nothing of a view that is to be judged; leave the view out, or its mask"
+        )
     # Pixels that are left out are made equal, so that windows over them see no difference.
     filled = torch.where(where[..., None], render, truth)
-    seen, shown = truth[where][None], render[where][None]
+    seen = truth[where][None]
+    shown = render[where][None]
     return {
         "psnr": psnr(shown, seen),
         "cc_psnr": psnr(_exposed_as(shown, seen), seen),
@@ -177,7 +211,9 @@ def image_metrics(
     }
 
 
-def _exposed_as(render: Annotated[Tensor, "H W 3"], truth: Annotated[Tensor, "H W 3"]) -> Annotated[Tensor, "H W 3"]:
+def _exposed_as(
+    render: Annotated[Tensor, "H W 3"], truth: Annotated[Tensor, "H W 3"]
+) -> Annotated[Tensor, "H W 3"]:
     """A render times f = sum(render truth) / sum(render^2) of each channel, the least squares."""
     first, second = _pair(render, truth)
     square = first.square().double().sum((0, 1))
@@ -186,7 +222,8 @@ def _exposed_as(render: Annotated[Tensor, "H W 3"], truth: Annotated[Tensor, "H 
 
 
 def mean_metrics(views: Iterable[Mapping[str, float]]) -> dict[str, float]:
-    """Mean of every metric over views, each view counting once (the mean of PSNRs, not the PSNR of the mean error).
+    """Mean of every metric over views, each view counting once (the mean of PSNRs, not the PSNR of the mean
+    error).
 
     Raises DataError where there is no view; KeyError where the views carry different metrics.
     """
@@ -206,15 +243,21 @@ def warp(
 ) -> tuple[Annotated[Tensor, "H W 3"], Annotated[Tensor, "H W"]]:
     """View b as view a would see it, and a mask of where that can be said; 0 elsewhere.
 
-    `image_b` is looked up at the pixels of view a; bilinear, so exact where b's image is linear between pixel centres. Depths
-    are world distances along the unit ray; 0 or not finite = nothing there. Raises DataError for sizes that are not the
-    cameras'.
+    `image_b` is looked up at the pixels of view a; bilinear, so exact where b's image is linear between pixel
+    centres. Depths are world distances along the unit ray; 0 or not finite = nothing there. Raises DataError
+    for sizes that are not the cameras'.
     """
-    for view, what, shape in ((b, "image", image_b.shape[:2]), (a, "depth", depth_a.shape), (b, "depth", depth_b.shape)):
+    for view, what, shape in (
+        (b, "image", image_b.shape[:2]),
+        (a, "depth", depth_a.shape),
+        (b, "depth", depth_b.shape),
+    ):
         width, height = cameras.size[view].tolist()
         if tuple(shape) != (height, width):
             found = "x".join(str(side) for side in reversed(shape))
-            raise DataError(f"view {view}: the {what} is {found}, its camera {width}x{height}; render at the camera's size")
+            raise DataError(
+                f"view {view}: the {what} is {found}, its camera {width}x{height}; render at the camera's size"
+            )
     # Lift view a's pixels to the world by its depth, and look at them from view b.
     origin, direction = grid_rays(cameras, a)
     depth = depth_a.reshape(-1).to(origin)
@@ -225,7 +268,8 @@ def warp(
     # Half a pixel from the border there is no neighbour to interpolate with. The slack is rounding.
     inside = ((there >= 0.5 - 1e-6) & (there <= size - 0.5 + 1e-6)).all(dim=-1) & (ahead > 0)
     pixel = torch.where(inside[:, None], there, size / 2)
-    # Where b's own depth differs from the point's distance, something else is in front or the point is not there.
+    # Where b's own depth differs from the point's distance, something else is in front or the point is not
+    # there.
     distance = (points - cameras.pose[b, :, 3]).norm(dim=-1)
     met = look_up(torch.where(torch.isfinite(depth_b), depth_b, 0.0)[..., None], pixel)[:, 0]
     same = (met - distance).abs() <= _SAME_PLACE * distance
@@ -235,7 +279,9 @@ def warp(
 
 
 class WarpError:
-    """Consistency over pairs of views of `cameras`, added one by one, so that no more than two renders are held at a time."""
+    """Consistency over pairs of views of `cameras`, added one by one, so that no more than two renders are
+    held at a time.
+    """
 
     def __init__(self, cameras: Cameras) -> None:
         self.cameras = cameras
@@ -254,20 +300,27 @@ class WarpError:
         """Warp view b into view a and compare. Raises DataError for sizes that are not the cameras'."""
         warped, valid = warp(image_b, depth_a, depth_b, self.cameras, a, b)
         count = int(valid.sum())
-        self.pixels, self.compared, self.pairs = self.pixels + valid.numel(), self.compared + count, self.pairs + 1
+        self.pixels = self.pixels + valid.numel()
+        self.compared = self.compared + count
+        self.pairs = self.pairs + 1
         if count:
-            here, there = image_a[valid].double(), warped[valid].double()
+            here = image_a[valid].double()
+            there = warped[valid].double()
             self.squared += float((here - there).square().sum())
-            self.variation += sum(float((colour - colour.mean(dim=0)).square().sum()) for colour in (here, there)) / 2
+            self.variation += (
+                sum(float((colour - colour.mean(dim=0)).square().sum()) for colour in (here, there)) / 2
+            )
 
     def summary(self) -> dict[str, float | int | None]:
         """Warp error: `rmse` (of [0, 1]), `relative` (to the contrast), `valid_share`, `pairs`.
 
-        The errors are None where no pixel could be compared, `relative` also where all compared colours are alike. Raises
-        NumericsError for colours that are not finite.
+        The errors are None where no pixel could be compared, `relative` also where all compared colours are
+        alike. Raises NumericsError for colours that are not finite.
         """
         if not math.isfinite(self.squared):
-            raise NumericsError("consistency: a render holds colours that are not finite; nothing can be judged by it")
+            raise NumericsError(
+                "consistency: a render holds colours that are not finite; nothing can be judged by it"
+            )
         return {
             "rmse": math.sqrt(self.squared / (3 * self.compared)) if self.compared else None,
             "relative": math.sqrt(self.squared / self.variation) if self.variation > 0 else None,
@@ -286,19 +339,24 @@ def judge(
     *,
     masks: bool = True,
 ) -> dict[str, Any]:
-    """Metrics of views of a scene: means, and each by name. Their images, in the light that they were taken in, go to `save`.
+    """Metrics of views of a scene: means, and each by name. Their images, in the light that they were taken
+    in, go to `save`.
 
-    `captured` has the photographs; pixels that its `masks` leave out do not count. Seconds are those of rendering alone.
-    Consistency warps each view into the next one of the list by the rendered depth.
+    `captured` has the photographs; pixels that its `masks` leave out do not count. Seconds are those of
+    rendering alone. Consistency warps each view into the next one of the list by the rendered depth.
     """
     cameras = known.cameras
     before: View | None = None
-    rows, seconds, kept, pixels = {}, 0.0, 0.0, 0
+    rows = {}
+    seconds = 0.0
+    kept = 0.0
+    pixels = 0
     warped = WarpError(cameras.select(torch.tensor(list(views), dtype=torch.int64)))
     for i, view in enumerate(views):
         progress(i, len(views), "rendering")
         # As it was taken: in its exposure and tone. Only rendering is timed.
-        taken, start = scene.as_taken(view), time.perf_counter()
+        taken = scene.as_taken(view)
+        start = time.perf_counter()
         render = taken.render(cameras, view)
         seconds += time.perf_counter() - start
         save(view, to_uint8(render.rgb))

@@ -31,22 +31,31 @@ class ExportConfig(StyleConfig):
     side: int = 400
     """Longest side in pixels of the renders that a mesh is made of."""
     reach: float | None = None
-    """Distance from a view, in world units, beyond which everything is sky; none = 20 times the scene's inner radius."""
+    """Distance from a view, in world units, beyond which everything is sky; none = 20 times the scene's inner
+    radius.
+    """
     fit: float | None = None
-    """Minutes of fitting Gaussians to the scene's own renders, and a third of it again for each style; none = 4. For scenes
-    that are not made of Gaussians."""
+    """Minutes of fitting Gaussians to the scene's own renders, and a third of it again for each style; none =
+    4. For scenes that are not made of Gaussians.
+    """
     fit_cap: int = 60_000
     """Gaussians that are fitted, at most."""
     plain: bool = False
-    """Gaussians get the opacities that views show, for viewers that do not compensate opacities (Mip-Splatting), most among
-    them; others show thin Gaussians too heavily. Not exact: leave it out where fprf reads the file again."""
+    """Gaussians get the opacities that views show, for viewers that do not compensate opacities
+    (Mip-Splatting), most among them; others show thin Gaussians too heavily. Not exact: leave it out where
+    fprf reads the file again.
+    """
     local: bool = False
-    """Of a capture whose coordinates are too large for float32 (projected metres): write all files relative to the run's
-    origin, each with NAME.offset.json beside it, for programs that do not read float64 positions or a node's translation."""
+    """Of a capture whose coordinates are too large for float32 (projected metres): write all files relative
+    to the run's origin, each with NAME.offset.json beside it, for programs that do not read float64 positions
+    or a node's translation.
+    """
     mesh_edge: float | None = None
     """Edge of the mesh's lattice in world units, above 0; none = twice the median pixel's on the surface."""
     images: bool = False
-    """With cameras: also render every view, in the style if there is one, so that other methods can train on them."""
+    """With cameras: also render every view, in the style if there is one, so that other methods can train on
+    them.
+    """
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
 
@@ -64,7 +73,9 @@ KINDS = {
     "glb": "mesh.glb and mesh.ply with vertex colours",
     "cameras": "transforms.json of Nerfstudio",
 }
-"""Kinds of files but those of Gaussians, which are the formats installed. `glb` means the mesh, `gltf` Gaussians."""
+"""Kinds of files but those of Gaussians, which are the formats installed. `glb` means the mesh, `gltf`
+Gaussians.
+"""
 FIT_MINUTES = 4.0
 _DEFAULT = ("ply", "splat", "glb", "cameras")
 _ENDINGS = {".glb": "glb", ".json": "cameras"}
@@ -84,7 +95,9 @@ class Plan(NamedTuple):
         return tuple(kind for kind in self.kinds if kind not in KINDS)
 
     def paths(self, base: str, look: str, *suffixes: str) -> list[Path]:
-        """Name the files of a look: mesh.ply for the scene as it is, mesh.dusk.ply in the look `dusk`; or the single one."""
+        """Name the files of a look: mesh.ply for the scene as it is, mesh.dusk.ply in the look `dusk`; or the
+        single one.
+        """
         if self.single is not None:
             return [self.single]
         return [self.folder / f"{base}{f'.{look}' if look else ''}{suffix}" for suffix in suffixes]
@@ -99,7 +112,9 @@ def plan(kinds: Sequence[str], output: Path) -> Plan:
     known = [*formats, *KINDS]
     for kind in kinds:
         if kind not in known:
-            raise UsageError(f"fprf export: {kind!r} is nothing to export{nearest(kind, known)} (kinds: {', '.join(known)})")
+            raise UsageError(
+                f"fprf export: {kind!r} is nothing to export{nearest(kind, known)} (kinds: {', '.join(known)})"
+            )
     wanted = [*dict.fromkeys(kinds)]
     kind_of_file = format_name(output) or _ENDINGS.get(output.suffix.lower())
     if kind_of_file is None or output.is_dir():

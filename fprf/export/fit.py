@@ -1,7 +1,7 @@
 """3D Gaussians fitted to a scene of any kind: trained against its own renders, from points on its surfaces.
 
-Geometry is learnt once, from the first look; a further look learns colours alone, so that all of its files hold the same
-Gaussians in the same order.
+Geometry is learnt once, from the first look; a further look learns colours alone, so that all of its files
+hold the same Gaussians in the same order.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -36,15 +36,20 @@ _SKY = 3.0
 
 
 def seen_points(maps: Maps, most: int) -> Points:
-    """Places and colours of random pixels of views, at most so many; where a view sees nothing, of a dome of sky."""
+    """Places and colours of random pixels of views, at most so many; where a view sees nothing, of a dome of
+    sky.
+    """
     # Where each pixel's ray meets a surface (infinite where none), its direction, and its colour.
-    place, colour, middle = [], [], maps.cameras.pose[:, :, 3].mean(0)
+    place = []
+    colour = []
+    middle = maps.cameras.pose[:, :, 3].mean(0)
     for view, depth in enumerate(maps.depth):
         origin, direction = grid_rays(maps.cameras, view)
         place.append(torch.cat([origin + direction * depth.view(-1, 1), direction], 1))
         colour.append(maps.rgb[view].view(-1, 3))
     every = torch.randperm(sum(map(len, place)), generator=torch.Generator().manual_seed(0))[:most]
-    (at, direction), shade = torch.split(torch.cat(place)[every], 3, 1), torch.cat(colour)[every]
+    (at, direction) = torch.split(torch.cat(place)[every], 3, 1)
+    shade = torch.cat(colour)[every]
     # What sees no surface is put on a dome beyond all that there is.
     solid = at.isfinite().all(1)
     far = _SKY * float((at[solid] - middle).norm(dim=1).max()) if bool(solid.any()) else 1.0
@@ -64,26 +69,29 @@ def fit_gaussians(
 ) -> Iterator[Gaussians]:
     """Gaussians of each look, trained for `minutes` after rendering.
 
-    What is rendered are `views` and as many between them. Gaussians begin where `maps` of the views have surfaces; there are at
-    most `cap` in the end.
+    What is rendered are `views` and as many between them. Gaussians begin where `maps` of the views have
+    surfaces; there are at most `cap` in the end.
     """
     # The scene is photographed from the views and between them, and learnt like any other.
     cameras = _with_midpoints(views)
     every = torch.arange(len(cameras))
     paths = (Path("scene"),) * len(cameras)
     parsed = ParsedScene(name="scene", paths=paths, cameras=cameras, train=every, test=every[:0])
-    draw, points = np.random.default_rng(0), seen_points(maps, max(1, round(_BEGIN * cap)))
+    draw = np.random.default_rng(0)
+    points = seen_points(maps, max(1, round(_BEGIN * cap)))
     near = find_near(parsed, points)
     config = GaussiansConfig(cap=cap, background=background or (0.0, 0.0, 0.0))
     scale = scene_scale(parsed)
     learner = None
     for number, look in enumerate(looks):
-        shown, images = scene.restyled(look), {}
+        shown = scene.restyled(look)
+        images = {}
         for view in range(len(cameras)):
             report(view, len(cameras), "rendering views")
             images[view] = to_uint8(shown.render(cameras, view).rgb)
         levels = make_levels(parsed, images, {}, near)
-        # The first look decides the geometry; in further ones the same Gaussians learn their colours at full size.
+        # The first look decides the geometry; in further ones the same Gaussians learn their colours at full
+        # size.
         if learner is None:
             learner = GaussianLearner(config, levels, scale, cap)
             learner.begin_at(points, draw)
@@ -103,9 +111,12 @@ def fit_gaussians(
 
 
 def _with_midpoints(cameras: Cameras) -> Cameras:
-    """The views, and one half-way from each to its nearest neighbour that looks about the same way: a field shows any view."""
+    """The views, and one half-way from each to its nearest neighbour that looks about the same way: a field
+    shows any view.
+    """
     pose = cameras.pose
-    centre, turns = pose[:, :, 3], pose[:, :, :3]
+    centre = pose[:, :, 3]
+    turns = pose[:, :, :3]
     alike = torch.einsum("va,wa->vw", turns[:, :, 2], turns[:, :, 2])
     apart = torch.cdist(centre, centre).masked_fill(alike < _ALIKE, torch.inf).fill_diagonal_(torch.inf)
     distance, other = apart.min(1)
@@ -114,4 +125,6 @@ def _with_midpoints(cameras: Cameras) -> Cameras:
     between = torch.cat([left @ right, ((centre + centre[other]) / 2)[:, :, None]], 2)
     chosen = (distance < torch.inf).nonzero()[:, 0]
     added = replace(cameras, pose=between).select(chosen)
-    return Cameras(*(torch.cat([getattr(part, field.name) for part in (cameras, added)]) for field in fields(Cameras)))
+    return Cameras(
+        *(torch.cat([getattr(part, field.name) for part in (cameras, added)]) for field in fields(Cameras))
+    )

@@ -1,14 +1,16 @@
-"""Triangles of a scene's near surfaces: renders of its views, fused to a truncated signed distance, whose zero is meshed.
+"""Triangles of a scene's near surfaces: renders of its views, fused to a truncated signed distance, whose
+zero is meshed.
 
-Signed distance (Curless and Levoy 1996), on a sparse lattice, positive towards the cameras: of a lattice point the depth that a
-view has at its pixel, less its distance, times the cosine at which the ray meets the surface; averaged over views.
+Signed distance (Curless and Levoy 1996), on a sparse lattice, positive towards the cameras: of a lattice
+point the depth that a view has at its pixel, less its distance, times the cosine at which the ray meets the
+surface; averaged over views.
 
-Surface nets (Gibson 1998): a cell is the cube of 8 neighbouring lattice points; one whose corners have both signs has a vertex,
-the mean of the places where its edges cross zero. Each lattice edge that crosses zero gives a quad of the 4 cells round it, if
-all of them are there.
+Surface nets (Gibson 1998): a cell is the cube of 8 neighbouring lattice points; one whose corners have both
+signs has a vertex, the mean of the places where its edges cross zero. Each lattice edge that crosses zero
+gives a quad of the 4 cells round it, if all of them are there.
 
-Letters: M lattice points, P points, N vertices, F triangles. World axes and units about the run's origin, float64. Depths are
-distances along the unit ray through a pixel's centre.
+Letters: M lattice points, P points, N vertices, F triangles. World axes and units about the run's origin,
+float64. Depths are distances along the unit ray through a pixel's centre.
 """
 
 import math
@@ -37,9 +39,13 @@ Report = Callable[[int, int], None]
 _SOLID = 0.5
 """Pixels of a smaller opacity see nothing."""
 _TORN = 1.25
-"""Neighbouring pixels whose depths differ by more than this factor lie on different surfaces: far ground falls away fast."""
+"""Neighbouring pixels whose depths differ by more than this factor lie on different surfaces: far ground
+falls away fast.
+"""
 _NEAR = 6.0
-"""Pixels more than so many times as wide as the median one stay out: far surfaces are known too coarsely for a mesh."""
+"""Pixels more than so many times as wide as the median one stay out: far surfaces are known too coarsely for
+a mesh.
+"""
 _FINE = 2.0
 """Edge of the lattice in widths of the median pixel on the surface, unless the user says otherwise."""
 _BLOCK = 4
@@ -55,7 +61,9 @@ _SPAN = 1 << 18
 _TRUNCATION = 3.0
 """Distances are cut at so many edges."""
 _STEEP = 0.1
-"""Smallest cosine that distances are multiplied with: below, a depth map knows little of the surface's place."""
+"""Smallest cosine that distances are multiplied with: below, a depth map knows little of the surface's
+place.
+"""
 _CLEAR = 0.3
 """Weight of a view that looks past a lattice point, against one that sees a surface there head-on."""
 _LOOSE = 2e-3
@@ -92,7 +100,9 @@ def default_reach(space: Space) -> float:
 def render_maps(scene: Scene, cameras: Cameras, *, side: int, reach: float, report: Report) -> Maps:
     """Render views, reduced to `side` pixels on the longest; what is farther than `reach` is sky."""
     size = cameras.size.double()
-    small = cameras.resized((size / (size.amax(1, keepdim=True) / side).clamp_min(1)).round().clamp_min(1).to(cameras.size))
+    small = cameras.resized(
+        (size / (size.amax(1, keepdim=True) / side).clamp_min(1)).round().clamp_min(1).to(cameras.size)
+    )
     maps = Maps(small, [], [])
     for view in range(len(small)):
         report(view, len(small))
@@ -115,9 +125,12 @@ def build_mesh(maps: Maps, *, edge: float | None = None, report: Report = lambda
     size = torch.bincount(piece[face[:, 0]], minlength=len(at))
     face = face[size[piece[face[:, 0]]] >= max(8, _LOOSE * len(face))]
     if not len(face):
-        raise DataError("export: no surface for a mesh; train longer, raise --mesh-edge, or export ply or splat instead")
+        raise DataError(
+            "export: no surface for a mesh; train longer, raise --mesh-edge, or export ply or splat instead"
+        )
     used, corner = torch.unique(face, return_inverse=True)
-    point, face = origin + width * at[used], corner.view(-1, 3)
+    point = origin + width * at[used]
+    face = corner.view(-1, 3)
     # Normals are sums of the triangles', which the cross product weighs by area.
     a, b, c = (point[face[:, k]] - origin for k in range(3))
     normal = torch.zeros_like(point)
@@ -129,11 +142,12 @@ def build_mesh(maps: Maps, *, edge: float | None = None, report: Report = lambda
 def vertex_colours(maps: Maps, mesh: Mesh) -> Annotated[Tensor, "N 3"]:
     """sRGB in [0, 1]: means over the views that see a vertex, those most that have the most pixels on it.
 
-    One view alone would give neighbours the exposures of different pictures. Where no view sees a vertex, those count that miss
-    it least.
+    One view alone would give neighbours the exposures of different pictures. Where no view sees a vertex,
+    those count that miss it least.
     """
     # A view's weight: its pixels on the surface there, and steeply less where it sees something else.
-    total, share = torch.zeros(len(mesh.point), 3, dtype=torch.float64), torch.zeros(len(mesh.point), 1, dtype=torch.float64)
+    total = torch.zeros(len(mesh.point), 3, dtype=torch.float64)
+    share = torch.zeros(len(mesh.point), 1, dtype=torch.float64)
     for view, rgb in enumerate(maps.rgb):
         gap, distance, pixel = _gaps(maps, view, mesh.point)
         towards = (maps.cameras.pose[view, :, 3] - mesh.point) / distance[:, None]
@@ -145,7 +159,9 @@ def vertex_colours(maps: Maps, mesh: Mesh) -> Annotated[Tensor, "N 3"]:
     return (total / share.clamp_min(1e-300)).float().clamp(0, 1)
 
 
-def _gaps(maps: Maps, view: int, point: Annotated[Tensor, "P 3"]) -> tuple[Tensor, Tensor, Annotated[Tensor, "P 2"]]:
+def _gaps(
+    maps: Maps, view: int, point: Annotated[Tensor, "P 3"]
+) -> tuple[Tensor, Tensor, Annotated[Tensor, "P 2"]]:
     """How far points lie before the surface that a view sees there [P], their distance [P], and their pixels.
 
     Infinite where the view sees nothing, NaN outside of it; negative where something hides the point.
@@ -163,13 +179,22 @@ def _gaps(maps: Maps, view: int, point: Annotated[Tensor, "P 3"]) -> tuple[Tenso
     return gap, distance, pixel
 
 
-def _lattice(maps: Maps, edge: float | None) -> tuple[Annotated[Tensor, "M 3"], Annotated[Tensor, "3"], float]:
-    """Lattice points near what is seen, the place of (0, 0, 0), and the edge: doubled until they are few enough."""
-    origin, seen = maps.cameras.pose[:, :, 3].mean(0), []
+def _lattice(
+    maps: Maps, edge: float | None
+) -> tuple[Annotated[Tensor, "M 3"], Annotated[Tensor, "3"], float]:
+    """Lattice points near what is seen, the place of (0, 0, 0), and the edge: doubled until they are few
+    enough.
+    """
+    origin = maps.cameras.pose[:, :, 3].mean(0)
+    seen = []
     # The lattice is as fine as the pixels on the surface are; what is seen too coarsely stays out.
-    width = torch.cat([(depth / maps.cameras.focal[view].mean())[depth.isfinite()] for view, depth in enumerate(maps.depth)])
+    width = torch.cat(
+        [(depth / maps.cameras.focal[view].mean())[depth.isfinite()] for view, depth in enumerate(maps.depth)]
+    )
     if not len(width):
-        raise DataError("export: no view sees a surface within reach; raise --reach, or train longer (see `fprf eval`)")
+        raise DataError(
+            "export: no view sees a surface within reach; raise --reach, or train longer (see `fprf eval`)"
+        )
     finest = float(width.median())
     for view, depth in enumerate(maps.depth):
         centre, direction = grid_rays(maps.cameras, view)
@@ -177,10 +202,13 @@ def _lattice(maps: Maps, edge: float | None) -> tuple[Annotated[Tensor, "M 3"], 
         seen.append((centre + direction * depth.view(-1, 1))[near] - origin)
     edge = _FINE * finest if edge is None else edge
     while True:
-        # A block counts where several views see something in or beside it: what one alone sees is the air before an edge.
+        # A block counts where several views see something in or beside it: what one alone sees is the air
+        # before an edge.
         around = _AROUND * edge * torch.cartesian_prod(*(torch.tensor([-1.0, 1.0], dtype=torch.float64),) * 3)
         each = (((points[:, None] + around).view(-1, 3) / (edge * _BLOCK)).floor().long() for points in seen)
-        block, views = torch.unique(torch.cat([torch.unique(b, dim=0) for b in each]), dim=0, return_counts=True)
+        block, views = torch.unique(
+            torch.cat([torch.unique(b, dim=0) for b in each]), dim=0, return_counts=True
+        )
         block = block[views >= _AGREE]
         if len(block) * _BLOCK**3 <= _MOST:
             break
@@ -193,12 +221,20 @@ def _lattice(maps: Maps, edge: float | None) -> tuple[Annotated[Tensor, "M 3"], 
 def _signed_distance(
     maps: Maps, cell: Annotated[Tensor, "M 3"], origin: Tensor, edge: float, report: Report
 ) -> tuple[Annotated[Tensor, "M"], Tensor]:
-    """Mask of the lattice points that enough views say something of, and their distances, in truncations: [-1, 1], float32."""
+    """Mask of the lattice points that enough views say something of, and their distances, in truncations:
+    [-1, 1], float32.
+    """
     far = _TRUNCATION * edge
-    total, weight, count = torch.zeros(len(cell)), torch.zeros(len(cell)), torch.zeros(len(cell), dtype=torch.int16)
+    total = torch.zeros(len(cell))
+    weight = torch.zeros(len(cell))
+    count = torch.zeros(len(cell), dtype=torch.int16)
     for view, depth in enumerate(maps.depth):
         report(view, len(maps.depth))
-        facing = -(normals(maps.cameras, view, depth).view(-1, 3) * grid_rays(maps.cameras, view)[1]).sum(-1).view(depth.shape)
+        facing = (
+            -(normals(maps.cameras, view, depth).view(-1, 3) * grid_rays(maps.cameras, view)[1])
+            .sum(-1)
+            .view(depth.shape)
+        )
         for part in torch.split(torch.arange(len(cell)), _CHUNK):
             gap, distance, pixel = _gaps(maps, view, origin + edge * cell[part].double())
             close = gap.abs() < far / _STEEP
@@ -208,7 +244,8 @@ def _signed_distance(
             # Far in front of a surface nobody asks how it lies; behind it the view knows nothing.
             value = torch.where(close, (gap * slope / far).clamp(max=1), torch.where(gap > 0, 1.0, torch.nan))
             seen = value >= -1
-            here, share = part[seen], (slope / distance.square())[seen].float()
+            here = part[seen]
+            share = (slope / distance.square())[seen].float()
             total[here] += share * value[seen].float()
             weight[here] += share
             count[here] += 1
@@ -226,12 +263,14 @@ def surface_nets(
 ) -> tuple[Annotated[Tensor, "N 3"], Annotated[Tensor, "F 3"]]:
     """Vertices in lattice coordinates (float64) and triangles (int64), counter-clockwise seen from outside.
 
-    Lattice points are integers within `_SPAN`, each at most once. What borders on a point without a value is open.
+    Lattice points are integers within `_SPAN`, each at most once. What borders on a point without a value is
+    open.
     """
     if not len(cell):
         return torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.int64)
     key, order = _keys(cell).sort()
-    cell, value = cell[order], value[order].double()
+    cell = cell[order]
+    value = value[order].double()
     inside = value < 0
 
     def find(wanted: Annotated[Tensor, "... 3"]) -> Annotated[Tensor, "..."]:
@@ -251,23 +290,28 @@ def surface_nets(
     vertex[crossed] = torch.arange(int(crossed.sum()))
     corner = value[find(cell[crossed][:, None] + _CORNERS)]
     # On each of the 12 edges of a cell the zero lies where the values say, if their signs differ.
-    (first, second), place = torch.tensor(_EDGES).T, _CORNERS.double()
+    (first, second) = torch.tensor(_EDGES).T
+    place = _CORNERS.double()
     crosses = (corner[:, first] < 0) != (corner[:, second] < 0)
     part = corner[:, first] / torch.where(crosses, corner[:, first] - corner[:, second], 1.0)
     along = place[first] + part[..., None] * (place[second] - place[first])
     mean = (along * crosses[..., None]).sum(1) / crosses.sum(1, keepdim=True)
     at = cell[crossed].double() + mean
-    # Two triangles for each lattice edge that crosses zero, split along the shorter diagonal; one axis after the other.
+    # Two triangles for each lattice edge that crosses zero, split along the shorter diagonal; one axis after
+    # the other.
     faces = []
     for step in torch.eye(3, dtype=torch.int64):
-        b, c = step.roll(1), step.roll(2)
+        b = step.roll(1)
+        c = step.roll(2)
         ahead = find(cell + step)
         crosses = (ahead >= 0) & (inside != inside[ahead.clamp_min(0)])
         around = find(cell[crosses][:, None] - torch.stack([b + c, c, torch.zeros_like(b), b]))
         corner = torch.where(around >= 0, vertex[around.clamp_min(0)], -1)
         whole = (corner >= 0).all(1)
-        corner, outwards = corner[whole], inside[crosses][whole]
-        # Round the edge the four cells run counter-clockwise seen from its far end, which is outside if its start is inside.
+        corner = corner[whole]
+        outwards = inside[crosses][whole]
+        # Round the edge the four cells run counter-clockwise seen from its far end, which is outside if its
+        # start is inside.
         corner = torch.where(outwards[:, None], corner, corner.flip(1))
         one, other = ((at[corner[:, k]] - at[corner[:, k + 2]]).norm(dim=-1) for k in (0, 1))
         corner = torch.where((one <= other)[:, None], corner, corner.roll(-1, 1))
@@ -283,7 +327,8 @@ def _keys(cell: Annotated[Tensor, "... 3"]) -> Annotated[Tensor, "..."]:
 
 def _components(count: int, face: Annotated[Tensor, "F 3"]) -> Annotated[Tensor, "count"]:
     """For each vertex the smallest index of those that it is connected with."""
-    label, pair = torch.arange(count), torch.cat([face[:, [0, 1]], face[:, [1, 2]], face[:, [2, 0]]])
+    label = torch.arange(count)
+    pair = torch.cat([face[:, [0, 1]], face[:, [1, 2]], face[:, [2, 0]]])
     while True:
         least = torch.minimum(label[pair[:, 0]], label[pair[:, 1]])
         new = label.clone()
@@ -297,7 +342,9 @@ def _components(count: int, face: Annotated[Tensor, "F 3"]) -> Annotated[Tensor,
         label = new
 
 
-def write_mesh(path: Path, mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin: Origin, *, local: bool = False) -> None:
+def write_mesh(
+    path: Path, mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin: Origin, *, local: bool = False
+) -> None:
     """Write a .ply, in the world or `local`, with 8-bit sRGB colours, or a .glb (see `_glb`)."""
     added, beside = added_and_beside(origin, local)
     if path.suffix.lower() == ".glb":
@@ -308,8 +355,13 @@ def write_mesh(path: Path, mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin:
         rows = np.empty(len(mesh.point), [("real", "<f4", 6), ("shade", "u1", 3)])
         rows["real"] = torch.cat([mesh.point, mesh.normal.double()], 1).float().numpy()
         rows["shade"] = (colour.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
-        named = [*((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")), *((c, "u1") for c in ("red", "green", "blue"))]
-        write_bytes(path, ply_file({"vertex": in_world(rows.view(named), mesh.point.numpy(), added), "face": faces}))
+        named = [
+            *((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")),
+            *((c, "u1") for c in ("red", "green", "blue")),
+        ]
+        write_bytes(
+            path, ply_file({"vertex": in_world(rows.view(named), mesh.point.numpy(), added), "face": faces})
+        )
     write_offset(path, beside)
 
 
@@ -326,23 +378,33 @@ def _glb(mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin: Origin) -> bytes:
         mesh.point.float().numpy(),
         mesh.face.numpy(),
         vertex_normals=mesh.normal.numpy(),
-        # trimesh rounds colours to 8 bits, which band in the dark where they are linear: they go in as an attribute.
+        # trimesh rounds colours to 8 bits, which band in the dark where they are linear: they go in as an
+        # attribute.
         vertex_attributes={"_COLOR_0": np.rint(shade * 65535).astype("<u2")},
         process=False,
     )
 
     def processed(tree: dict[str, Any]) -> None:
-        """Make the attribute the vertices' colours and the material unlit, and move the mesh to its origin."""
+        """Make the attribute the vertices' colours and the material unlit, and move the mesh to its
+        origin.
+        """
         [primitive] = tree["meshes"][0]["primitives"]
         primitive["attributes"]["COLOR_0"] = colours = primitive["attributes"].pop("_COLOR_0")
         tree["accessors"][colours]["normalized"] = True
-        primitive["material"], rough = 0, {"metallicFactor": 0.0, "roughnessFactor": 1.0}
-        material = {"doubleSided": True, "pbrMetallicRoughness": rough, "extensions": {"KHR_materials_unlit": {}}}
+        primitive["material"] = 0
+        rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+        material = {
+            "doubleSided": True,
+            "pbrMetallicRoughness": rough,
+            "extensions": {"KHR_materials_unlit": {}},
+        }
         tree["materials"], tree["extensionsUsed"] = [material], ["KHR_materials_unlit"]
         for node in tree["nodes"]:
             if "mesh" in node and any(origin):
                 node["translation"] = list(origin)
 
-    data = body.export(file_type="glb", include_normals=True, unitize_normals=False, tree_postprocessor=processed)
+    data = body.export(
+        file_type="glb", include_normals=True, unitize_normals=False, tree_postprocessor=processed
+    )
     assert isinstance(data, bytes)
     return data

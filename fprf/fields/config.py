@@ -37,7 +37,9 @@ class SemanticFieldConfig(PluginConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class PlanesConfig(ContentFieldConfig):
-    """K-Planes: the product of three planes at several scales, then a small network (paper, content field)."""
+    """K-Planes: the product of three planes at several scales, then a small network (paper, content
+    field).
+    """
 
     resolutions: tuple[int, ...] = (64, 128, 256, 512)
     """Nodes along each side of the planes, coarse to fine."""

@@ -1,11 +1,13 @@
-"""Fields on tri-planes (`ops.triplane`): content and density, semantics (paper), and the proposals of the sampler.
+"""Fields on tri-planes (`ops.triplane`): content and density, semantics (paper), and the proposals of the
+sampler.
 
-A point x of the cube [-1, 1]^3 has at each scale the product over three planes, P_xy(x, y) P_xz(x, z) P_yz(y, z), of their
-bilinear samples there (K-Planes, Fridovich-Keil et al. 2023, Section 3.1); the features of all scales side by side are its
-latent. Density is exp of a linear map of the latent; content and semantics are networks on it.
+A point x of the cube [-1, 1]^3 has at each scale the product over three planes, P_xy(x, y) P_xz(x, z) P_yz(y,
+z), of their bilinear samples there (K-Planes, Fridovich-Keil et al. 2023, Section 3.1); the features of all
+scales side by side are its latent. Density is exp of a linear map of the latent; content and semantics are
+networks on it.
 
-N points · M samples of rays that are kept · L = scales x channels of the latent · C content channels · D semantic channels.
-Inputs are float32 on any device; density is per unit of the scene's space.
+N points · M samples of rays that are kept · L = scales x channels of the latent · C content channels · D
+semantic channels. Inputs are float32 on any device; density is per unit of the scene's space.
 """
 
 import math
@@ -22,8 +24,9 @@ from ..types import FieldSample
 from .config import PlanesConfig, SemanticPlanesConfig
 
 MAX_LOG_DENSITY = 15.0
-"""exp(15) = 3e6 per space unit is opaque within a micro-unit: above it nothing looks different, and gradients of exp would
-overflow."""
+"""exp(15) = 3e6 per space unit is opaque within a micro-unit: above it nothing looks different, and gradients
+of exp would overflow.
+"""
 
 
 class _Exp(torch.autograd.Function):
@@ -42,7 +45,9 @@ class _Exp(torch.autograd.Function):
 
 
 def density(raw: Annotated[Tensor, "N"]) -> Annotated[Tensor, "N"]:
-    """exp(raw - 1), capped at exp(15): the start is thin, so that light reaches the whole scene (K-Planes)."""
+    """exp(raw - 1), capped at exp(15): the start is thin, so that light reaches the whole scene
+    (K-Planes).
+    """
     result: Tensor = _Exp.apply(raw - 1)  # type: ignore[no-untyped-call]
     return result
 
@@ -58,7 +63,9 @@ def linear(inputs: int, outputs: int, *, generator: torch.Generator) -> nn.Linea
 
 
 def mlp(inputs: int, hidden: int, layers: int, outputs: int, *, generator: torch.Generator) -> nn.Sequential:
-    """`layers` hidden ReLU layers of width `hidden`, then a linear one; hidden weights keep the variance through ReLU."""
+    """`layers` hidden ReLU layers of width `hidden`, then a linear one; hidden weights keep the variance
+    through ReLU.
+    """
     parts: list[nn.Module] = []
     for _ in range(layers):
         layer = linear(inputs, hidden, generator=generator)
@@ -83,7 +90,8 @@ class Planes(nn.Module):
         super().__init__()
         self.resolutions = tuple(resolutions)
         self.out = len(self.resolutions) * channels
-        # Positive start (K-Planes): a product of three zero-mean planes would start with no signal and no gradient.
+        # Positive start (K-Planes): a product of three zero-mean planes would start with no signal and no
+        # gradient.
         table = torch.empty(triplane.rows(self.resolutions), channels).uniform_(0.1, 0.5, generator=generator)
         self.table = nn.Parameter(table)
 
@@ -124,11 +132,14 @@ class PlanesField(ContentField):
         """Density per space unit; the latent is the plane feature."""
         return FieldSample(*self.planes.density(points, self.to_density.weight[0]))
 
-    def content(self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "M C"]:
+    def content(
+        self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]
+    ) -> Annotated[Tensor, "M C"]:
         """Content features seen from a direction, f(latent, harmonics(view)) + offset."""
         # Samples of one ray follow each other and share the direction: what it adds is computed once a ray.
         first, run = dense.runs(view)
-        maps, shared = weights(self.to_content), spherical_harmonics(view.index_select(0, first), self.degree)
+        maps = weights(self.to_content)
+        shared = spherical_harmonics(view.index_select(0, first), self.degree)
         biases = [None] * (len(maps) - 1) + [self.offset]
         return dense.network(latent, maps, biases, shared=shared, row=run)
 

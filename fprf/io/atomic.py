@@ -16,7 +16,9 @@ _UNFINISHED = re.compile(r"\..{1,40}\.[0-9a-f]{8}(\.\w+)?|\.tmp\w{6}")
 
 
 def unwritable(path: Path, error: OSError, needed: int | None = None) -> DataError:
-    """Error for a system that refuses to write at `path`; `needed` are the bytes of the file, where they are known."""
+    """Error for a system that refuses to write at `path`; `needed` are the bytes of the file, where they are
+    known.
+    """
     reason = os.strerror(error.errno) if error.errno else str(error)
     try:
         folder = next(p for p in (path.absolute(), *path.absolute().parents) if p.is_dir())
@@ -24,7 +26,9 @@ def unwritable(path: Path, error: OSError, needed: int | None = None) -> DataErr
     except (OSError, StopIteration):
         free = ""
     wants = "" if needed is None else f", {-(-needed // 1024)} KiB are needed"
-    return DataError(f"{path}: cannot be written ({reason}{wants}{free}); make room, or choose a folder that can be written to")
+    return DataError(
+        f"{path}: cannot be written ({reason}{wants}{free}); make room, or choose a folder that can be written to"
+    )
 
 
 def remove_unfinished(folder: Path) -> None:
@@ -50,19 +54,24 @@ def _flush(path: Path, mode: int) -> None:
 
 @contextmanager
 def atomic_path(final: Path) -> Iterator[Path]:
-    """A hidden name beside `final` to write to; it becomes `final` when the block ends, and is removed if it fails.
+    """A hidden name beside `final` to write to; it becomes `final` when the block ends, and is removed if it
+    fails.
 
-    Keeps the ending of the name, which encoders choose their format by. Creates the folder. A reader sees the old file
-    or the new one, whenever the process dies. Raises DataError where `final` is a folder, its folder is a file, or the
-    system refuses: a full disk, a folder without permission, a name that is too long. Errors of the block about other files
-    are passed on.
+    Keeps the ending of the name, which encoders choose their format by. Creates the folder. A reader sees the
+    old file or the new one, whenever the process dies. Raises DataError where `final` is a folder, its folder
+    is a file, or the system refuses: a full disk, a folder without permission, a name that is too long.
+    Errors of the block about other files are passed on.
     """
     try:
         if final.is_dir():
-            raise DataError(f"{final}: a folder is in the place of a file to be written; remove it or choose another name")
+            raise DataError(
+                f"{final}: a folder is in the place of a file to be written; remove it or choose another name"
+            )
         final.parent.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
-        raise DataError(f"{final}: {error.filename} is a file, not a folder; choose another output") from error
+        raise DataError(
+            f"{final}: {error.filename} is a file, not a folder; choose another output"
+        ) from error
     except OSError as error:
         raise unwritable(final, error) from error
     # The stem is cut so that a name of the longest length allowed (255 bytes) still has a temporary one.
@@ -78,7 +87,8 @@ def atomic_path(final: Path) -> Iterator[Path]:
             temporary.unlink()
         if not isinstance(error, OSError):
             raise
-        # Errors about another file, a pipe or a network are the block's own; an error of a file that is open names none.
+        # Errors about another file, a pipe or a network are the block's own; an error of a file that is open
+        # names none.
         if error.filename is None:
             refused = error.errno is not None and not isinstance(error, (ConnectionError, TimeoutError))
         else:
@@ -86,7 +96,9 @@ def atomic_path(final: Path) -> Iterator[Path]:
         if block_ended or refused:
             raise unwritable(final, error) from error
         raise
-    if os.name != "posix":  # a folder cannot be opened there; the rename is then as durable as the system makes it
+    if (
+        os.name != "posix"
+    ):  # a folder cannot be opened there; the rename is then as durable as the system makes it
         return
     try:
         _flush(final.parent, os.O_RDONLY)
@@ -105,7 +117,8 @@ def write_bytes(path: Path, data: bytes) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text with the line ends it has, whole or not at all.
 
-    In a locale without UTF-8, names of files reach Python as escaped bytes: they are written as the bytes that they are.
+    In a locale without UTF-8, names of files reach Python as escaped bytes: they are written as the bytes
+    that they are.
     """
     write_bytes(path, text.encode(errors="surrogateescape"))
 
@@ -118,5 +131,7 @@ def write_json(path: Path, value: object) -> None:
     try:
         text = json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False)
     except ValueError as error:
-        raise NumericsError(f"{path}: {error}; every figure must be finite, or null where there is none") from error
+        raise NumericsError(
+            f"{path}: {error}; every figure must be finite, or null where there is none"
+        ) from error
     write_text(path, text + "\n")

@@ -26,11 +26,15 @@ _ENDINGS: dict[str, Format] = {".png": "png", ".jpg": "jpg", ".jpeg": "jpg", ".w
 
 
 def to_uint8(image: Annotated[Tensor, "H W 3"]) -> Picture:
-    """A float image as a picture: clipped to [0, 1] and rounded. Raises NumericsError where a value is not finite."""
+    """A float image as a picture: clipped to [0, 1] and rounded. Raises NumericsError where a value is not
+    finite.
+    """
     pixels = image.detach().to("cpu", torch.float32)
     if not bool(torch.isfinite(pixels).all()):
         share = float((~torch.isfinite(pixels)).float().mean())
-        raise NumericsError(f"an image of shape {tuple(image.shape)} has {share:.2%} values that are not finite")
+        raise NumericsError(
+            f"an image of shape {tuple(image.shape)} has {share:.2%} values that are not finite"
+        )
     # Half to even would move 0.5/255 steps unevenly; +0.5 and floor is what every image library does.
     pictured: Picture = (pixels.clamp(0, 1) * 255 + 0.5).to(torch.uint8).contiguous().numpy()
     return pictured
@@ -39,7 +43,9 @@ def to_uint8(image: Annotated[Tensor, "H W 3"]) -> Picture:
 def checked(picture: Picture) -> Picture:
     """The picture itself, if it is one. Raises DataError."""
     if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or 0 in picture.shape:
-        raise DataError(f"a picture must be uint8 of shape [H W 3]; found {picture.dtype} of shape {picture.shape}")
+        raise DataError(
+            f"a picture must be uint8 of shape [H W 3]; found {picture.dtype} of shape {picture.shape}"
+        )
     return picture
 
 
@@ -47,7 +53,9 @@ def encode(picture: Picture, form: Format) -> bytes:
     """The file of a picture. PNG is exact; JPEG (92) and WebP (84) are for the eye."""
     done, data = cv2.imencode(f".{form}", cv2.cvtColor(checked(picture), cv2.COLOR_RGB2BGR), _OPTIONS[form])
     if not done:
-        raise DataError(f"{form} cannot hold a picture of {picture.shape[1]}x{picture.shape[0]} pixels; use png")
+        raise DataError(
+            f"{form} cannot hold a picture of {picture.shape[1]}x{picture.shape[0]} pixels; use png"
+        )
     return bytes(data.tobytes())
 
 

@@ -1,6 +1,7 @@
 """Depth and matching as pictures: what the geometry is, and which reference each place took its style from.
 
-Several pictures as one: thumbnails of a scene's regions with what they take from references, or a view in several styles.
+Several pictures as one: thumbnails of a scene's regions with what they take from references, or a view in
+several styles.
 """
 
 import math
@@ -30,15 +31,21 @@ _COLOURS = (
     (0.000, 0.447, 0.698),  # blue
     (0.941, 0.894, 0.259),  # yellow
 )
-"""Okabe and Ito's colours, told apart with any of the usual colour blindnesses; ordered for contrast between neighbours."""
+"""Okabe and Ito's colours, told apart with any of the usual colour blindnesses; ordered for contrast between
+neighbours.
+"""
 
 
 def palette(count: int) -> Annotated[Tensor, "T 3"]:
-    """sRGB colours in [0, 1] of `count` references. From the eighth on the hues repeat, a third darker or lighter."""
+    """sRGB colours in [0, 1] of `count` references. From the eighth on the hues repeat, a third darker or
+    lighter.
+    """
     rows = []
     for index in range(count):
-        colour, turn = torch.tensor(_COLOURS[index % len(_COLOURS)]), index // len(_COLOURS)
-        # 1st repeat darker, 2nd lighter, 3rd darker still: lightness then is all that is left to tell them apart.
+        colour = torch.tensor(_COLOURS[index % len(_COLOURS)])
+        turn = index // len(_COLOURS)
+        # 1st repeat darker, 2nd lighter, 3rd darker still: lightness then is all that is left to tell them
+        # apart.
         strength = 1 - 0.65 ** ((turn + 1) // 2)
         rows.append(torch.lerp(colour, torch.full((3,), float(turn % 2 == 0)), strength))
     return torch.stack(rows) if rows else torch.zeros(0, 3)
@@ -47,11 +54,15 @@ def palette(count: int) -> Annotated[Tensor, "T 3"]:
 def depth_limits(
     depths: Sequence[Annotated[Tensor, "H W"]], opacities: Sequence[Annotated[Tensor, "H W"]]
 ) -> tuple[float, float]:
-    """Disparity (1 / depth) range of several views, so that they share one scale: 1st and 99th percentile where solid.
+    """Disparity (1 / depth) range of several views, so that they share one scale: 1st and 99th percentile
+    where solid.
 
     (0, 1) where nothing is solid in any view.
     """
-    seen = [(1 / depth[_solid(depth, opacity)]).cpu().numpy() for depth, opacity in zip(depths, opacities, strict=True)]
+    seen = [
+        (1 / depth[_solid(depth, opacity)]).cpu().numpy()
+        for depth, opacity in zip(depths, opacities, strict=True)
+    ]
     disparity = np.concatenate([np.zeros(0, np.float32), *seen])
     if not len(disparity):
         return 0.0, 1.0
@@ -60,20 +71,27 @@ def depth_limits(
 
 
 def depth_image(
-    depth: Annotated[Tensor, "H W"], opacity: Annotated[Tensor, "H W"], limits: tuple[float, float] | None = None
+    depth: Annotated[Tensor, "H W"],
+    opacity: Annotated[Tensor, "H W"],
+    limits: tuple[float, float] | None = None,
 ) -> Picture:
-    """Depth (any unit, > 0) as colour: near is bright, far is dark, nothing is grey. `limits` as from `depth_limits`.
+    """Depth (any unit, > 0) as colour: near is bright, far is dark, nothing is grey. `limits` as from
+    `depth_limits`.
 
-    The colour is even in disparity, which is how much a place moves between views. Inferno: perceptually even, legible
-    in greyscale and to the colour-blind.
+    The colour is even in disparity, which is how much a place moves between views. Inferno: perceptually
+    even, legible in greyscale and to the colour-blind.
     """
     low, high = depth_limits([depth], [opacity]) if limits is None else limits
     solid = _solid(depth, opacity, 0.0)
-    disparity = torch.where(solid, 1 / torch.where(solid, depth, torch.ones_like(depth)), torch.zeros_like(depth))
+    disparity = torch.where(
+        solid, 1 / torch.where(solid, depth, torch.ones_like(depth)), torch.zeros_like(depth)
+    )
     # A plane square to the view has one disparity: shown as halfway, not as noise.
     even = (disparity - low) / (high - low) if high > low else torch.full_like(disparity, 0.5)
     # Inferno's first steps are black: stay off them, so that far places keep some hue.
-    return _over_empty(_mapped(even.clamp(0, 1) * 235 + 20, cv2.COLORMAP_INFERNO), torch.where(solid, opacity, 0.0))
+    return _over_empty(
+        _mapped(even.clamp(0, 1) * 235 + 20, cv2.COLORMAP_INFERNO), torch.where(solid, opacity, 0.0)
+    )
 
 
 def match_image(
@@ -83,14 +101,17 @@ def match_image(
     opacity: Annotated[Tensor, "H W"] | None = None,
     kept: Annotated[Tensor, "H W"] | None = None,
 ) -> Picture:
-    """Picture of the reference of each pixel: its hue (`palette`), the code of it as a shade, doubt as darkness.
+    """Picture of the reference of each pixel: its hue (`palette`), the code of it as a shade, doubt as
+    darkness.
 
-    `attention` as `Stylizer.match` gives it (rows sum to 1); `reference` is the dictionary's; `kept` is how much of each
-    pixel takes no style at all, shown pale. Raises DataError for numbers that do not fit together.
+    `attention` as `Stylizer.match` gives it (rows sum to 1); `reference` is the dictionary's; `kept` is how
+    much of each pixel takes no style at all, shown pale. Raises DataError for numbers that do not fit
+    together.
     """
     _fitting(attention, reference, names)
     # Each code has its reference's hue, from a quarter darker to a quarter lighter in the order of the codes.
-    hues, colours = palette(len(names)), torch.empty(len(reference), 3)
+    hues = palette(len(names))
+    colours = torch.empty(len(reference), 3)
     for index in range(len(names)):
         codes = (reference.cpu() == index).nonzero()[:, 0]
         for place, code in enumerate(codes.tolist()):
@@ -108,7 +129,9 @@ def match_image(
 def scale_image(
     values: Annotated[Tensor, "H W"], low: float, high: float, opacity: Annotated[Tensor, "H W"] | None = None
 ) -> Picture:
-    """Numbers as colour on a fixed scale: `low` and below dark blue, `high` and above yellow (viridis), nothing grey."""
+    """Numbers as colour on a fixed scale: `low` and below dark blue, `high` and above yellow (viridis),
+    nothing grey.
+    """
     even = ((values.detach().cpu().float() - low) / (high - low)).nan_to_num(0.0).clamp(0, 1)
     return _over_empty(_mapped(even * 255, cv2.COLORMAP_VIRIDIS), opacity)
 
@@ -119,8 +142,9 @@ def match_summary(
     names: Sequence[str],
     opacity: Annotated[Tensor, "H W"] | None = None,
 ) -> dict[str, object]:
-    """Use of the references: their `share` of the attention (sums to 1), the mean of the best code's attention
-    (`mean_score`, 1 = certain) and the mean `entropy` in bits (0 = certain). Pixels count by their opacity.
+    """Use of the references: their `share` of the attention (sums to 1), the mean of the best code's
+    attention (`mean_score`, 1 = certain) and the mean `entropy` in bits (0 = certain). Pixels count by their
+    opacity.
     """
     _fitting(attention, reference, names)
     weights = attention.detach().cpu()
@@ -131,21 +155,29 @@ def match_summary(
     codes = weighted_sum(weights, each) / total
     shares = torch.zeros(len(names), dtype=torch.float64).index_add_(0, reference.cpu(), codes)
     return {
-        "references": [{"name": name, "share": float(share)} for name, share in zip(names, shares, strict=True)],
+        "references": [
+            {"name": name, "share": float(share)} for name, share in zip(names, shares, strict=True)
+        ],
         "mean_score": float((weights.amax(dim=-1) * each).sum()) / total,
         "entropy_bits": float((_entropy(weights) * each).sum()) / total / math.log(2),
     }
 
 
-def weighted_sum(values: Annotated[Tensor, "H W T"], weight: Annotated[Tensor, "H W"]) -> Annotated[Tensor, "T"]:
+def weighted_sum(
+    values: Annotated[Tensor, "H W T"], weight: Annotated[Tensor, "H W"]
+) -> Annotated[Tensor, "T"]:
     """Sum over the pixels, in float64; the products of a row are summed in the precision of `values`."""
     return torch.bmm(weight.to(values.dtype)[:, None], values)[:, 0].double().sum(0)
 
 
 _SIDE = 240
 """Width of a tile in pixels; pictures are enlarged or reduced to it."""
-_LINE, _GAP, _BAR = 17, 8, 6
-_INK, _PAPER, _FAINT = (30, 32, 36), (250, 250, 248), (215, 216, 218)
+_LINE = 17
+_GAP = 8
+_BAR = 6
+_INK = (30, 32, 36)
+_PAPER = (250, 250, 248)
+_FAINT = (215, 216, 218)
 _OUTLINE = (255, 214, 10)
 _COLUMNS = 4
 
@@ -165,8 +197,13 @@ def highlight(picture: Picture, inside: Annotated[Tensor, "H W"]) -> Picture:
     `inside` lies in [0, 1], at any size.
     """
     height, width = checked(picture).shape[:2]
-    share = np.clip(cv2.resize(inside.detach().cpu().float().numpy(), (width, height), interpolation=cv2.INTER_LINEAR), 0, 1)
-    # Outside half as bright and without colour, mixed by the share; then the edge of what is more than half inside.
+    share = np.clip(
+        cv2.resize(inside.detach().cpu().float().numpy(), (width, height), interpolation=cv2.INTER_LINEAR),
+        0,
+        1,
+    )
+    # Outside half as bright and without colour, mixed by the share; then the edge of what is more than half
+    # inside.
     grey = cv2.cvtColor(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB).astype(np.float32)
     dim = 0.35 * grey + 40
     mixed = np.asarray(dim + (picture - dim) * share[..., None]).clip(0, 255).astype(np.uint8)
@@ -184,7 +221,8 @@ def contact_sheet(tiles: Sequence[Tile]) -> Picture:
     rows = math.ceil(len(drawn) / columns)
     page = np.full((rows * (height + _GAP) + _GAP, columns * (_SIDE + _GAP) + _GAP, 3), _PAPER, np.uint8)
     for i, each in enumerate(drawn):
-        top, left = _GAP + (i // columns) * (height + _GAP), _GAP + (i % columns) * (_SIDE + _GAP)
+        top = _GAP + (i // columns) * (height + _GAP)
+        left = _GAP + (i % columns) * (_SIDE + _GAP)
         page[top : top + len(each), left : left + _SIDE] = each
     return page
 
@@ -203,7 +241,9 @@ def _tile(tile: Tile) -> Picture:
             edge += share
     # As much of each line as the tile is wide.
     for i, line in enumerate(tile.lines):
-        text, scale, font = line.encode("ascii", "replace").decode(), 0.42, cv2.FONT_HERSHEY_SIMPLEX
+        text = line.encode("ascii", "replace").decode()
+        scale = 0.42
+        font = cv2.FONT_HERSHEY_SIMPLEX
         while text and cv2.getTextSize(text, font, scale, 1)[0][0] > _SIDE - 2:
             text = text[:-1]
         cv2.putText(below, text, (1, _BAR + _LINE * i + 14), font, scale, _INK, 1, cv2.LINE_AA)
@@ -215,9 +255,13 @@ _SEAM = 2
 
 
 def side_by_side(pictures: Sequence[Picture]) -> Picture:
-    """The pictures from left to right, with a thin line between them. Raises DataError where their heights differ."""
+    """The pictures from left to right, with a thin line between them. Raises DataError where their heights
+    differ.
+    """
     if len({checked(picture).shape[0] for picture in pictures}) != 1:
-        raise DataError(f"pictures of heights {[picture.shape[0] for picture in pictures]} cannot lie beside each other")
+        raise DataError(
+            f"pictures of heights {[picture.shape[0] for picture in pictures]} cannot lie beside each other"
+        )
     line = np.full((pictures[0].shape[0], _SEAM, 3), 255, np.uint8)
     parts = [part for picture in pictures for part in (line, picture)][1:]
     return np.concatenate(parts, axis=1)
@@ -248,6 +292,10 @@ def _entropy(weights: Annotated[Tensor, "H W T"]) -> Annotated[Tensor, "H W"]:
 
 def _fitting(attention: Tensor, reference: Tensor, names: Sequence[str]) -> None:
     if attention.ndim != 3 or attention.shape[-1] != len(reference) or not len(reference):
-        raise DataError(f"attention {tuple(attention.shape)} does not fit {len(reference)} style codes; it must be [H W T]")
+        raise DataError(
+            f"attention {tuple(attention.shape)} does not fit {len(reference)} style codes; it must be [H W T]"
+        )
     if int(reference.min()) < 0 or int(reference.max()) >= len(names):
-        raise DataError(f"style codes name reference {int(reference.max())}, but there are {len(names)} references")
+        raise DataError(
+            f"style codes name reference {int(reference.max())}, but there are {len(names)} references"
+        )

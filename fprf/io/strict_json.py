@@ -9,12 +9,25 @@ from typing import Any
 
 from ..errors import CheckpointError, ConfigError
 
-_UNEXPECTED = (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, ConfigError)
-"""Errors of a block that takes a value apart which is not what it expects; RuntimeError is what torch raises."""
+_UNEXPECTED = (
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    ArithmeticError,
+    RuntimeError,
+    ConfigError,
+)
+"""Errors of a block that takes a value apart which is not what it expects; RuntimeError is what torch
+raises.
+"""
 
 
 def parse_json(text: str, *, nan: bool = False) -> Any:
-    """Parse a JSON value, NaN and infinities too where `nan` allows them. Raises ValueError, and nothing else."""
+    """Parse a JSON value, NaN and infinities too where `nan` allows them. Raises ValueError, and nothing
+    else.
+    """
 
     def constant(text: str) -> float:
         if not nan:
@@ -30,7 +43,9 @@ def parse_json(text: str, *, nan: bool = False) -> Any:
         return members
 
     try:
-        value = json.loads(text, object_pairs_hook=unique, parse_constant=constant, parse_float=_real, parse_int=_whole)
+        value = json.loads(
+            text, object_pairs_hook=unique, parse_constant=constant, parse_float=_real, parse_int=_whole
+        )
         if "\\u" in text:
             json.dumps(value, ensure_ascii=False).encode()  # half of a surrogate pair has no UTF-8
     except json.JSONDecodeError as error:
@@ -44,7 +59,8 @@ def parse_json(text: str, *, nan: bool = False) -> Any:
 def open_json(path: Path, remedy: str) -> Iterator[Any]:
     """Give the value in a file of a run to the block that takes it apart.
 
-    Raises CheckpointError, which ends in the `remedy`, where the file cannot be read or holds what the block does not expect.
+    Raises CheckpointError, which ends in the `remedy`, where the file cannot be read or holds what the block
+    does not expect.
     """
     try:
         yield parse_json(path.read_text("utf-8"))

@@ -1,7 +1,7 @@
 """Named tensors on disk: safetensors, written atomically, with a checksum and a finite flag for each tensor.
 
-`save` returns the entry that a manifest keeps; `load` checks the file against it, so a flipped bit is found before it is used.
-A sealed file is one that carries its own manifest.
+`save` returns the entry that a manifest keeps; `load` checks the file against it, so a flipped bit is found
+before it is used. A sealed file is one that carries its own manifest.
 """
 
 import json
@@ -28,19 +28,25 @@ def _checksum(tensor: Tensor) -> int:
 
 
 def save(path: Path, tensors: Mapping[str, Tensor], *, sealed: bool = False) -> dict[str, dict[str, Any]]:
-    """Write the tensors; the answer holds checksum and finiteness of each, and so does the file where it is `sealed`.
+    """Write the tensors; the answer holds checksum and finiteness of each, and so does the file where it is
+    `sealed`.
 
     Raises DataError, with what is needed and what is free, where the system refuses.
     """
     # Checksums are of the bytes that a reader will map: contiguous, on the CPU.
     plain = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
     entries = {
-        name: {"crc32": _checksum(t), "finite": bool(torch.isfinite(t).all()) if t.is_floating_point() else True}
+        name: {
+            "crc32": _checksum(t),
+            "finite": bool(torch.isfinite(t).all()) if t.is_floating_point() else True,
+        }
         for name, t in plain.items()
     }
     with atomic_path(path) as temporary:
         try:
-            safetensors.torch.save_file(plain, temporary, {_MANIFEST: json.dumps(entries)} if sealed else None)
+            safetensors.torch.save_file(
+                plain, temporary, {_MANIFEST: json.dumps(entries)} if sealed else None
+            )
         except SafetensorError as error:
             # safetensors wraps errors of the system in its own: their number says what the disk refused.
             match = _SYSTEM.search(str(error))
@@ -74,7 +80,9 @@ def load(path: Path, manifest: Mapping[str, Mapping[str, Any]]) -> dict[str, Ten
     for name, tensor in tensors.items():
         entry = dict(manifest[name]) if isinstance(manifest[name], Mapping) else {}
         if _checksum(tensor) != entry.get("crc32"):
-            raise CheckpointError(f"{path}: tensor {name} is damaged (checksum differs); use another checkpoint")
+            raise CheckpointError(
+                f"{path}: tensor {name} is damaged (checksum differs); use another checkpoint"
+            )
         if not entry.get("finite"):
             raise CheckpointError(f"{path}: tensor {name} was not finite when saved; use another checkpoint")
     return tensors

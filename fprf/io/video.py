@@ -1,4 +1,6 @@
-"""Frames to a film or to numbered pictures, one frame in memory at a time; to an animated picture, all of them."""
+"""Frames to a film or to numbered pictures, one frame in memory at a time; to an animated picture, all of
+them.
+"""
 
 import importlib
 from collections.abc import Iterable, Iterator, Sequence
@@ -45,18 +47,29 @@ def _alike(frames: Iterable[Picture], path: Path) -> Iterator[Picture]:
                 "render all views of a film at one size, or write a folder of pictures"
             )
         # 4:2:0 colour needs even sizes: the last row and column are repeated.
-        bottom, right = frame.shape[0] % 2, frame.shape[1] % 2
-        yield np.pad(checked(frame), ((0, bottom), (0, right), (0, 0)), mode="edge") if bottom or right else checked(frame)
+        bottom = frame.shape[0] % 2
+        right = frame.shape[1] % 2
+        yield (
+            np.pad(checked(frame), ((0, bottom), (0, right), (0, 0)), mode="edge")
+            if bottom or right
+            else checked(frame)
+        )
 
 
-def _with_av(av: "ModuleType", path: Path, frames: Iterator[Picture], size: tuple[int, int], fps: Fraction) -> None:
+def _with_av(
+    av: "ModuleType", path: Path, frames: Iterator[Picture], size: tuple[int, int], fps: Fraction
+) -> None:
     with av.open(str(path), "w", options={"movflags": "+faststart"}) as container:
         stream = container.add_stream("libx264", rate=fps, options={"crf": "17", "preset": "medium"})
         stream.width, stream.height = size
         stream.pix_fmt = "yuv420p"
-        # Players take untagged films of more than 576 lines for BT.709 and smaller ones for BT.601: say which it is.
+        # Players take untagged films of more than 576 lines for BT.709 and smaller ones for BT.601: say which
+        # it is.
         context = stream.codec_context
-        context.color_range, context.colorspace, context.color_primaries, context.color_trc = 1, 1, 1, 1
+        context.color_range = 1
+        context.colorspace = 1
+        context.color_primaries = 1
+        context.color_trc = 1
         for frame in frames:
             picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
             container.mux(stream.encode(picture.reformat(format="yuv420p", dst_colorspace="ITU709")))
@@ -64,14 +77,18 @@ def _with_av(av: "ModuleType", path: Path, frames: Iterator[Picture], size: tupl
 
 
 def write_video(path: Path, frames: Iterable[Picture], fps: float, *, h264: bool = True) -> Codec:
-    """Write an .mp4, whole or not at all: H.264 where PyAV is installed (extra `video`), MPEG-4 part 2 elsewhere.
+    """Write an .mp4, whole or not at all: H.264 where PyAV is installed (extra `video`), MPEG-4 part 2
+    elsewhere.
 
-    .gif (256 colours a frame, in steps of 10 ms), .webp and .apng (lossless) become animated pictures that start over.
-    Odd sizes gain a repeated row or column. Returns the codec that was used; browsers play all but "mp4v". `h264=False`
-    asks for the fallback. Raises UsageError for another ending, DataError for no frames or frames of several sizes.
+    .gif (256 colours a frame, in steps of 10 ms), .webp and .apng (lossless) become animated pictures that
+    start over. Odd sizes gain a repeated row or column. Returns the codec that was used; browsers play all
+    but "mp4v". `h264=False` asks for the fallback. Raises UsageError for another ending, DataError for no
+    frames or frames of several sizes.
     """
     if path.suffix.lower() not in FILMS:
-        raise UsageError(f"{path}: films end in {' '.join(FILMS)}; give such a name, or a folder for single pictures")
+        raise UsageError(
+            f"{path}: films end in {' '.join(FILMS)}; give such a name, or a folder for single pictures"
+        )
     if not 0 < fps <= MAX_FPS:
         raise UsageError(f"{path}: {fps} frames a second; must lie in (0, {MAX_FPS}]")
     rate = Fraction(fps).limit_denominator(1001)
@@ -93,7 +110,9 @@ def write_video(path: Path, frames: Iterable[Picture], fps: float, *, h264: bool
             return "h264"
         writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), float(rate), size)
         if not writer.isOpened():
-            raise DataError(f"{path}: no video encoder here; install one with pip install 'fprf[video]', or write a folder")
+            raise DataError(
+                f"{path}: no video encoder here; install one with pip install 'fprf[video]', or write a folder"
+            )
         count = 0
         try:
             for frame in chain([first], even):
@@ -113,7 +132,8 @@ def _animated(path: Path, frames: list[Picture], fps: float) -> Codec:
     kind, ending, options = _ANIMATIONS[path.suffix.lower()]
     film = cv2.Animation()
     film.frames = [cv2.cvtColor(frame, cv2.COLOR_RGB2BGR) for frame in frames]
-    # Each duration is a whole number of milliseconds, and of GIF's hundredths: rounded so that no error adds up.
+    # Each duration is a whole number of milliseconds, and of GIF's hundredths: rounded so that no error adds
+    # up.
     unit = 10 if kind == "gif" else 1
     ends = [round(1000 * (k + 1) / fps / unit) * unit for k in range(len(frames))]
     film.durations = [end - start for start, end in pairwise([0, *ends])]
@@ -130,17 +150,19 @@ _RECORD = ".render.json"
 def missing_frames(folder: Path, key: str, paths: Sequence[Path]) -> list[Path]:
     """Frames that are not there yet; all, where the folder was rendered from something else than `key` says.
 
-    The key is written down at once, with the names of the frames, so that what is rendered from now on counts, and can be told
-    from a stranger's files. Frames are whole or absent.
-    Raises DataError where the system refuses to write there.
+    The key is written down at once, with the names of the frames, so that what is rendered from now on
+    counts, and can be told from a stranger's files. Frames are whole or absent. Raises DataError where the
+    system refuses to write there.
     """
     # What the folder was rendered from, if that can be read, and the frames of it.
     record = folder / _RECORD
     try:
         content = parse_json(record.read_text("utf-8"))
-        known, old = content.get("key"), [Path(name).name for name in content.get("frames", [])]
+        known = content.get("key")
+        old = [Path(name).name for name in content.get("frames", [])]
     except (OSError, ValueError, AttributeError, TypeError):
-        known, old = None, []
+        known = None
+        old = []
     if known == key:
         return [path for path in paths if not path.is_file()]
     try:

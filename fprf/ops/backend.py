@@ -1,4 +1,6 @@
-"""Switches for a block of code: compiled kernels or plain torch, the reference everywhere; TF32. And float64 by device."""
+"""Switches for a block of code: compiled kernels or plain torch, the reference everywhere; TF32. And float64
+by device.
+"""
 
 import importlib.util
 from collections.abc import Iterator
@@ -24,7 +26,9 @@ def compiled_for(*tensors: Tensor) -> bool:
 
 @contextmanager
 def plain() -> Iterator[None]:
-    """The plain forms alone, in this thread and within this block: what kernels are measured and tested against."""
+    """The plain forms alone, in this thread and within this block: what kernels are measured and tested
+    against.
+    """
     before = _PLAIN.set(True)
     try:
         yield
@@ -34,7 +38,9 @@ def plain() -> Iterator[None]:
 
 @contextmanager
 def tf32(enabled: bool) -> Iterator[None]:
-    """Matrix products of float32 numbers on CUDA in TF32; a setting of the whole process, put back after the block."""
+    """Matrix products of float32 numbers on CUDA in TF32; a setting of the whole process, put back after the
+    block.
+    """
     if not enabled:
         yield
         return
@@ -48,10 +54,12 @@ def tf32(enabled: bool) -> Iterator[None]:
 
 @contextmanager
 def float32_convolutions(device: torch.device) -> Iterator[None]:
-    """Convolutions on CUDA in float32, not in TF32, torch's own choice; a setting of the process, put back after the block.
+    """Convolutions on CUDA in float32, not in TF32, torch's own choice; a setting of the process, put back
+    after the block.
 
-    TF32 shifts features by 6e-4 to 1e-3 of their spread, after which k-means may end elsewhere: a style moved by 0.17 of a
-    colour in [0, 1]. Under noise of 3e-4, 55 of 252 clusterings of references moved; under that of float32 (1e-6) none did.
+    TF32 shifts features by 6e-4 to 1e-3 of their spread, after which k-means may end elsewhere: a style moved
+    by 0.17 of a colour in [0, 1]. Under noise of 3e-4, 55 of 252 clusterings of references moved; under that
+    of float32 (1e-6) none did.
     """
     if device.type != "cuda":
         yield

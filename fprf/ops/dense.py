@@ -1,10 +1,11 @@
 """Small networks point by point: linear maps with ReLU between them.
 
-The torch form is the reference for every device and dtype. Where nobody learns, on the CPU in float32, a compiled kernel takes
-a block of points through all layers at once. Its sums run over the inputs in order, so that a point's outputs are bitwise the
-same in any batch.
+The torch form is the reference for every device and dtype. Where nobody learns, on the CPU in float32, a
+compiled kernel takes a block of points through all layers at once. Its sums run over the inputs in order, so
+that a point's outputs are bitwise the same in any batch.
 
-Part of the inputs may be shared by several points, as the direction of a ray is by its samples: given once, looked up by row.
+Part of the inputs may be shared by several points, as the direction of a ray is by its samples: given once,
+looked up by row.
 """
 
 # The checker takes compiled functions to have one argument.
@@ -23,7 +24,9 @@ Floats = np.ndarray[tuple[int], np.dtype[np.float32]]
 
 
 def usable(*tensors: Tensor) -> bool:
-    """Return whether kernels without gradients apply: float32 on the CPU, not empty, gradients disabled, numba installed."""
+    """Return whether kernels without gradients apply: float32 on the CPU, not empty, gradients disabled,
+    numba installed.
+    """
     return compiled_for(*tensors) and all(x.numel() > 0 for x in tensors) and not torch.is_grad_enabled()
 
 
@@ -43,8 +46,8 @@ def network(
 ) -> Annotated[Tensor, "N O"]:
     """x W^T + b layer after layer, with ReLU between them.
 
-    Weights are [outputs, inputs]. Point n has the inputs x[n] and behind them shared[row[n]]. Each layer of the kernel errs by
-    at most (I + 3) u (|x| |W|^T + |b|), u = 2^-24.
+    Weights are [outputs, inputs]. Point n has the inputs x[n] and behind them shared[row[n]]. Each layer of
+    the kernel errs by at most (I + 3) u (|x| |W|^T + |b|), u = 2^-24.
     """
     if not usable(x, *weights, *(bias for bias in biases if bias is not None)):
         if shared is not None and row is not None:
@@ -56,7 +59,11 @@ def network(
     from .simd import WIDE
 
     # Outputs are padded to whole vectors, which the next layer meets with zeros.
-    packed, shifts, widths, side, inputs = [], [], [], weights[0].new_empty(0), x.shape[1]
+    packed = []
+    shifts = []
+    widths = []
+    side = weights[0].new_empty(0)
+    inputs = x.shape[1]
     for k, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
         width = -(-len(weight) // WIDE) * WIDE
         if k == 0 and shared is not None:
@@ -65,7 +72,8 @@ def network(
         shifts.append(_fitted((weight.new_zeros(len(weight)) if bias is None else bias)[None], 1, width)[0])
         widths.append(width)
         inputs = width
-    rows, out = torch.empty(0, dtype=torch.int64) if row is None else row.contiguous(), torch.empty(len(x), len(weights[-1]))
+    rows = torch.empty(0, dtype=torch.int64) if row is None else row.contiguous()
+    out = torch.empty(len(x), len(weights[-1]))
     kernels.network(
         array(x), x.shape[1], array(torch.cat(packed)), array(torch.cat(shifts)), np.asarray(widths), array(side),
         rows.numpy(), out.view(-1).numpy(), out.shape[1],

@@ -1,14 +1,17 @@
-"""The compiled loops behind `dense`: small networks, a block of rows at a time, nothing between the layers leaves the cache.
+"""The compiled loops behind `dense`: small networks, a block of rows at a time, nothing between the layers
+leaves the cache.
 
-Arrays are flat, contiguous float32. Weights lie layer after layer as [inputs, width], biases as [width]; widths are whole
-vectors (padded with zeros), and the padding of one layer's outputs meets zero weights in the next.
+Arrays are flat, contiguous float32. Weights lie layer after layer as [inputs, width], biases as [width];
+widths are whole vectors (padded with zeros), and the padding of one layer's outputs meets zero weights in the
+next.
 
 A product is made of tiles, whose outputs are held in registers while the inputs stream by:
 
     out[r, :] = max(start[r, :] + sum_k x[r, k] w[k, :], floor)     r < ROWS[columns], : = columns vectors of WIDE
 
-Each output is one sum over k in order, whatever the tile: results do not depend on how a product is cut. Rows of x follow each
-other, `depth` numbers each; strides are w by k, the others by row; `_at` is the first number of each.
+Each output is one sum over k in order, whatever the tile: results do not depend on how a product is cut. Rows
+of x follow each other, `depth` numbers each; strides are w by k, the others by row; `_at` is the first number
+of each.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, call-arg"
@@ -47,7 +50,9 @@ def product(x, x_at, w, w_at, width, start, s_at, s_row, out, depth, floor):
     for c in range(0, width, 4 * WIDE):
         columns = min(4, (width - c) // WIDE)
         for r in range(0, BLOCK, ROWS[columns]):
-            i, s, o = x_at + r * depth, s_at + r * s_row + c, r * width + c
+            i = x_at + r * depth
+            s = s_at + r * s_row + c
+            o = r * width + c
             # The shape of a tile is a constant of the compiled code.
             if columns == 4:
                 multiply(x, i, w, w_at + c, width, start, s, s_row, out, o, depth, floor, 4)
@@ -67,24 +72,36 @@ def add_shift(bias, at, side, s_at, out, to):
 
 @numba.njit(inline="always")
 def _layers(source, at, depth, weights, biases, widths, side, row, first, rows, here, there, out, outputs):
-    """A block of rows of `source` through all layers, to rows `first` on of `out`; `source` may be `there`."""
+    """A block of rows of `source` through all layers, to rows `first` on of `out`; `source` may be
+    `there`.
+    """
     # Sums start from the biases, or from these and what is shared.
-    start, s_row = biases, 0
+    start = biases
+    s_row = 0
     if len(row) > 0:
-        width, start, s_row = widths[0], here, widths[0]
+        width = widths[0]
+        start = here
+        s_row = widths[0]
         for r in range(rows):
             for c in range(0, width, WIDE):
                 add_shift(biases, c, side, row[first + r] * width + c, here, r * width + c)
         here[rows * width : BLOCK * width] = np.float32(0)
-    w_at, b_at, layers = 0, 0, len(widths)
+    w_at = 0
+    b_at = 0
+    layers = len(widths)
     for layer in range(layers):
         width = widths[layer]
         floor = np.float32(0) if layer < layers - 1 else _LEAST
         # Sums that start from `here` may end there: a tile is read whole before it is written.
         goal = here if layer % 2 == 0 else there
         product(source, at, weights, w_at, width, start, b_at, s_row, goal, depth, floor)
-        w_at, b_at = w_at + depth * width, b_at + width
-        start, s_row, source, at, depth = biases, 0, goal, 0, width
+        w_at = w_at + depth * width
+        b_at = b_at + width
+        start = biases
+        s_row = 0
+        source = goal
+        at = 0
+        depth = width
     if depth == outputs:
         for i in range(0, rows * outputs, WIDE):
             store(out, first * outputs + i, load(source, i, WIDE))
@@ -100,16 +117,22 @@ def network(x, inputs, weights, biases, widths, side, row, out, outputs):
 
     `side` [rows, first width] is added before the first ReLU, row[n] of it to point n; both empty = nothing.
     """
-    count, broad = len(out) // outputs, inputs
+    count = len(out) // outputs
+    broad = inputs
     for width in widths:
         broad = max(broad, width)
     for task in numba.prange((count + BLOCK - 1) // BLOCK):
         first = task * BLOCK
         rows = min(BLOCK, count - first)
-        here, there = np.empty(BLOCK * broad, np.float32), np.empty(BLOCK * broad, np.float32)
-        source, at = x, first * inputs
+        here = np.empty(BLOCK * broad, np.float32)
+        there = np.empty(BLOCK * broad, np.float32)
+        source = x
+        at = first * inputs
         if rows < BLOCK:
-            source, at = there, 0
+            source = there
+            at = 0
             there[: rows * inputs] = x[first * inputs : (first + rows) * inputs]
             there[rows * inputs : BLOCK * inputs] = np.float32(0)
-        _layers(source, at, inputs, weights, biases, widths, side, row, first, rows, here, there, out, outputs)
+        _layers(
+            source, at, inputs, weights, biases, widths, side, row, first, rows, here, there, out, outputs
+        )

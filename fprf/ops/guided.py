@@ -1,18 +1,21 @@
-"""Edge-aware upsampling of feature maps: the colour guided filter (He et al. 2010) in the form of a few coefficients.
+"""Edge-aware upsampling of feature maps: the colour guided filter (He et al. 2010) in the form of a few
+coefficients.
 
-The filter's output is linear in the guide, F(p) = A(p) I(p) + b(p), where A and b are means over windows and so smooth:
-they are kept at a stride, as the cells whose bilinear interpolation is closest to them in least squares (half the error
-of area averages), and interpolated at the pixels that somebody asks for.
+The filter's output is linear in the guide, F(p) = A(p) I(p) + b(p), where A and b are means over windows and
+so smooth: they are kept at a stride, as the cells whose bilinear interpolation is closest to them in least
+squares (half the error of area averages), and interpolated at the pixels that somebody asks for.
 
-Letters: I guide [H W 3] sRGB in [0, 1]; f features [C h w], cell (i, j) covering its part of the whole image; p = f
-bilinearly upsampled to the guide (align_corners=False). Windows are squares of 2 radius + 1 pixels, cut at the border.
+Letters: I guide [H W 3] sRGB in [0, 1]; f features [C h w], cell (i, j) covering its part of the whole image;
+p = f bilinearly upsampled to the guide (align_corners=False). Windows are squares of 2 radius + 1 pixels, cut
+at the border.
 
-How it stays cheap: covariances always see every pixel of the guide, the features only at *nodes*. p is a sum of hat
-functions, p = sum_k f_k hat_k, so sum I p over a window = sum_k f_k (sum I hat_k), and the bracket has three channels, not
-C. Nodes are the feature cells, split by an odd factor (which represents p exactly) until a window is `fineness` nodes
-wide; windows are solved at centres as far apart. What is approximate is only the window's edge, soft by one node. With
-fineness = inf the nodes and centres are the pixels, and the filter is exact. Sums are small dense matrices per axis, not
-running sums: nothing accumulates. Guide statistics are float64, features are centred before they are multiplied.
+How it stays cheap: covariances always see every pixel of the guide, the features only at *nodes*. p is a sum
+of hat functions, p = sum_k f_k hat_k, so sum I p over a window = sum_k f_k (sum I hat_k), and the bracket has
+three channels, not C. Nodes are the feature cells, split by an odd factor (which represents p exactly) until
+a window is `fineness` nodes wide; windows are solved at centres as far apart. What is approximate is only the
+window's edge, soft by one node. With fineness = inf the nodes and centres are the pixels, and the filter is
+exact. Sums are small dense matrices per axis, not running sums: nothing accumulates. Guide statistics are
+float64, features are centred before they are multiplied.
 """
 
 import math
@@ -51,10 +54,11 @@ def coefficients(
     stride: int,
     fineness: float = FINENESS,
 ) -> Annotated[Tensor, "s t C 4"]:
-    """A (three numbers) and b of every channel, float32, in ceil(H / stride) x ceil(W / stride) equal cells of the image.
+    """A (three numbers) and b of every channel, float32, in ceil(H / stride) x ceil(W / stride) equal cells
+    of the image.
 
-    `radius` in pixels (>= 0), `eps` in squared colour units (>= 1e-6: below, float32 features no longer carry the answer).
-    Raises DataError for shapes that do not fit.
+    `radius` in pixels (>= 0), `eps` in squared colour units (>= 1e-6: below, float32 features no longer carry
+    the answer). Raises DataError for shapes that do not fit.
     """
     if features.ndim != 3 or guide.ndim != 3 or guide.shape[-1] != 3 or min(features.shape + guide.shape) < 1:
         raise DataError(
@@ -86,12 +90,17 @@ def coefficients(
     group = max(1, GROUP // (4 * moments[0].numel()))
     for first in range(0, channels, group):
         part = features[first : first + group].float()
-        result[:, :, first : first + group] = _solve(part, mean, inverse, moments, colour, operators).permute(2, 3, 1, 0)
+        result[:, :, first : first + group] = _solve(part, mean, inverse, moments, colour, operators).permute(
+            2, 3, 1, 0
+        )
     return result
 
 
 def apply(
-    coefs: Annotated[Tensor, "s t C 4"], pixel: Annotated[Tensor, "R 2"], rgb: Annotated[Tensor, "R 3"], size: tuple[int, int]
+    coefs: Annotated[Tensor, "s t C 4"],
+    pixel: Annotated[Tensor, "R 2"],
+    rgb: Annotated[Tensor, "R 3"],
+    size: tuple[int, int],
 ) -> Annotated[Tensor, "R C"]:
     """Features at pixel positions (x, y; centres at +0.5) of an image of `size` (height, width), float32."""
     cells = torch.tensor(coefs.shape[:2], device=pixel.device)
@@ -106,14 +115,17 @@ def apply(
 
 
 def _corners(pixel: Annotated[Tensor, "R 2"], cells: Tensor, size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows [R 2] and columns [R 2] of the four cells around each pixel, and their shares [R 4] in bilinear interpolation.
+    """Rows [R 2] and columns [R 2] of the four cells around each pixel, and their shares [R 4] in bilinear
+    interpolation.
 
-    `cells` are rows and columns, `size` height and width: [2], or [R 2] where they differ from pixel to pixel.
+    `cells` are rows and columns, `size` height and width: [2], or [R 2] where they differ from pixel to
+    pixel.
     """
     at = (pixel.float().flip(1) * (cells.float() / size.float()) - 0.5).clamp_min(0)
     at = torch.minimum(at, (cells - 1).float())
     low = torch.minimum(at.floor().long(), (cells - 2).clamp_min(0))
-    high, part = torch.minimum(low + 1, cells - 1), at - low
+    high = torch.minimum(low + 1, cells - 1)
+    part = at - low
     row, column = (torch.stack([low[:, axis], high[:, axis]], 1) for axis in (0, 1))
     y, x = (torch.stack([1 - part[:, axis], part[:, axis]], 1) for axis in (0, 1))
     return row, column, (y[:, :, None] * x[:, None, :]).flatten(1)
@@ -142,13 +154,16 @@ def apply_packed(
     *,
     grey: float,
 ) -> Annotated[Tensor, "R C"]:
-    """`apply` for pixels of several views at once, float32; all tensors on one device, `view` counts in `packed`.
+    """`apply` for pixels of several views at once, float32; all tensors on one device, `view` counts in
+    `packed`.
 
     Makes R x 16 x P numbers on the way. Sums are of float32 numbers whatever TF32 says.
     """
     cells = packed.cells[view]
     row, column, share = _corners(pixel, cells, packed.size[view])
-    index = (row[:, :, None] * cells[:, 1, None, None] + column[:, None, :]).flatten(1) + packed.start[view, None]
+    index = (row[:, :, None] * cells[:, 1, None, None] + column[:, None, :]).flatten(1) + packed.start[
+        view, None
+    ]
     colour = torch.cat([rgb.float() - grey, torch.ones_like(rgb[:, :1], dtype=torch.float32)], 1)
     mixed = (packed.coefs[index].float() * (share[:, :, None] * colour[:, None, :])[..., None]).sum((1, 2))
     return mixed[:, : packed.scale.shape[1]] * packed.scale[view] + packed.centre[view]
@@ -171,7 +186,9 @@ def upsample(
     for first in range(0, features.shape[0], group):
         part = coefs[:, :, first : first + group].permute(3, 2, 0, 1)
         dense = F.interpolate(part, size, mode="bilinear", align_corners=False)
-        result[..., first : first + group] = ((dense[:3] * colour[:, None]).sum(0) + dense[3]).permute(1, 2, 0)
+        result[..., first : first + group] = ((dense[:3] * colour[:, None]).sum(0) + dense[3]).permute(
+            1, 2, 0
+        )
     return result
 
 
@@ -179,10 +196,13 @@ def _solve(
     features: Tensor, mean: Tensor, inverse: Tensor, moments: Tensor, colour: Tensor, operators: list[Tensor]
 ) -> Annotated[Tensor, "4 C s t"]:
     """A and b of a group of channels."""
-    # cov(I, p) in every window; A = (cov(I, I) + eps)^-1 cov(I, p) and b = mean(p) - A mean(I) (He et al., Eq. 19 and 20).
+    # cov(I, p) in every window; A = (cov(I, I) + eps)^-1 cov(I, p) and b = mean(p) - A mean(I) (He et al.,
+    # Eq. 19 and 20).
     window_y, window_x, keep_y, keep_x = operators
     centre = features.mean((1, 2))[:, None, None]
-    nodes = F.interpolate((features - centre)[None], moments.shape[1:], mode="bilinear", align_corners=False)[0]
+    nodes = F.interpolate((features - centre)[None], moments.shape[1:], mode="bilinear", align_corners=False)[
+        0
+    ]
     sums = window_y @ ((moments[:, None] * nodes) @ window_x)
     covariance = sums[1:] - mean[:, None] * sums[0]
     slope = torch.stack([(inverse[i][:, None] * covariance).sum(0) for i in range(3)])
@@ -197,7 +217,8 @@ def _statistics(pixels: Tensor, y: _Axis, x: _Axis, eps: float) -> tuple[Tensor,
     first, second = torch.triu_indices(3, 3, device=pixels.device)
     stack = torch.cat([pixels, pixels[first] * pixels[second]])
     means = (y.window @ y.hat) @ (stack @ (x.window @ x.hat).T)
-    mean, square = means[:3], means[3:]
+    mean = means[:3]
+    square = means[3:]
     covariance = square.new_empty(3, 3, *square.shape[1:])
     covariance[first, second] = square - mean[first] * mean[second]
     covariance[second, first] = covariance[first, second]
@@ -215,7 +236,8 @@ def _axis(pixels: int, cells: int, radius: int, stride: int, fineness: float) ->
     stored = math.ceil(pixels / stride)
     centres = min(pixels, stored * math.ceil(pixels / (stored * spacing)))
 
-    # Windows around the centres as shares of the axis, in nodes and in centres; then the least-squares fit of the cells.
+    # Windows around the centres as shares of the axis, in nodes and in centres; then the least-squares fit of
+    # the cells.
     hat = _interpolation(nodes, pixels)
     middle = (torch.arange(centres).double() + 0.5) / centres
     reach = 0.5 * size / pixels
@@ -231,7 +253,9 @@ def _axis(pixels: int, cells: int, radius: int, stride: int, fineness: float) ->
 
 
 def _interpolation(cells: int, pixels: int) -> Annotated[Tensor, "cells pixels"]:
-    """Weight of each cell at each pixel: bilinear interpolation as `F.interpolate` with align_corners=False does it."""
+    """Weight of each cell at each pixel: bilinear interpolation as `F.interpolate` with align_corners=False
+    does it.
+    """
     at = ((torch.arange(pixels).double() + 0.5) * cells / pixels - 0.5).clamp(0, cells - 1)
     return (1 - (at - torch.arange(cells).double()[:, None]).abs()).clamp_min(0)
 

@@ -1,8 +1,9 @@
-"""Features at pixels from half-precision coefficients: `guided.apply`, compiled by numba on first use and cached.
+"""Features at pixels from half-precision coefficients: `guided.apply`, compiled by numba on first use and
+cached.
 
-Layout: one row a stored cell, four runs of P channels (A for red, green and blue, then b), as the bits of float16. P is C
-rounded up to whole vectors of NARROW.
-4096 pixels x 48 channels take 0.6 ms of one core where the coefficients are in its cache, 2.5 ms over 43 views that are not.
+Layout: one row a stored cell, four runs of P channels (A for red, green and blue, then b), as the bits of
+float16. P is C rounded up to whole vectors of NARROW. 4096 pixels x 48 channels take 0.6 ms of one core where
+the coefficients are in its cache, 2.5 ms over 43 views that are not.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg"
@@ -25,7 +26,9 @@ def _add_halves(total, at, address, weight):
 
 @numba.njit(inline="always")
 def _corner(position, cells):
-    """Lower cell, upper cell, share of the upper one; NaN falls on the lower border: no index may leave the table."""
+    """Lower cell, upper cell, share of the upper one; NaN falls on the lower border: no index may leave the
+    table.
+    """
     at = position - np.float32(0.5)
     at = min(at, np.float32(cells - 1)) if at > np.float32(0) else np.float32(0)
     low = int(at)
@@ -34,10 +37,11 @@ def _corner(position, cells):
 
 @cached_jit(parallel=True, nogil=True, fastmath={"contract"})
 def gather(slot, address, shape, scale, centre, run, pixel, rgb, out):
-    """out[i] [R C] = F = scale (A I + b) + centre at pixel[i] [R 2] with the colour I = rgb[i] [R 3] of the view slot[i].
+    """out[i] [R C] = F = scale (A I + b) + centre at pixel[i] [R 2] with the colour I = rgb[i] [R 3] of the
+    view slot[i].
 
-    Of V views: `address` of their coefficients [rows columns 4 P] and `shape` [V 4], which is rows, columns, height and width;
-    scale and centre [V C]; run = P.
+    Of V views: `address` of their coefficients [rows columns 4 P] and `shape` [V 4], which is rows, columns,
+    height and width; scale and centre [V C]; run = P.
     """
     channels = scale.shape[1]
     exponent = np.float32(2.0**112)
@@ -45,15 +49,22 @@ def gather(slot, address, shape, scale, centre, run, pixel, rgb, out):
         total = np.empty(run, dtype=np.float32)
         for i in range(task * PIXELS, min(len(slot), task * PIXELS + PIXELS)):
             view = slot[i]
-            rows, columns = shape[view, 0], shape[view, 1]
-            vertical, horizontal = np.float32(rows / shape[view, 2]), np.float32(columns / shape[view, 3])
+            rows = shape[view, 0]
+            columns = shape[view, 1]
+            vertical = np.float32(rows / shape[view, 2])
+            horizontal = np.float32(columns / shape[view, 3])
             # The four cells around the pixel.
             top, bottom, v = _corner(pixel[i, 1] * vertical, rows)
             left, right, u = _corner(pixel[i, 0] * horizontal, columns)
             total[:] = np.float32(0)
             for corner in range(4):
-                y, x = (bottom if corner & 2 else top), (right if corner & 1 else left)
-                share = (v if corner & 2 else np.float32(1) - v) * (u if corner & 1 else np.float32(1) - u) * exponent
+                y = bottom if corner & 2 else top
+                x = right if corner & 1 else left
+                share = (
+                    (v if corner & 2 else np.float32(1) - v)
+                    * (u if corner & 1 else np.float32(1) - u)
+                    * exponent
+                )
                 row = address[view] + (y * columns + x) * 4 * run * 2
                 for k in range(4):
                     weight = share * rgb[i, k] if k < 3 else share

@@ -1,4 +1,5 @@
-"""Spherical harmonics, and affine maps of the view-dependent colours that they express: harmonics in, harmonics out.
+"""Spherical harmonics, and affine maps of the view-dependent colours that they express: harmonics in,
+harmonics out.
 
     colour' = colour A + b,   0.5 + Y0 dc' = (0.5 + Y0 dc) A + b,   higher harmonics' = harmonics A
 
@@ -32,7 +33,8 @@ class Directions(NamedTuple):
 def spherical_harmonics(direction: Annotated[Tensor, "N 3"], degree: int) -> Annotated[Tensor, "N degree**2"]:
     """Values of the real spherical harmonics below a degree, 1 to 4, at unit directions.
 
-    In the order and with the signs of 3D Gaussian splatting files, where a colour is 0.5 + their sum with the coefficients.
+    In the order and with the signs of 3D Gaussian splatting files, where a colour is 0.5 + their sum with the
+    coefficients.
     """
     x, y, z = direction.unbind(-1)
     columns = [torch.full_like(x, 0.28209479177387814)]
@@ -60,12 +62,15 @@ def spherical_harmonics(direction: Annotated[Tensor, "N 3"], degree: int) -> Ann
 
 
 def as_drawn(harmonics: Annotated[Tensor, "N K 3"], directions: Directions) -> Annotated[Tensor, "N K 3"]:
-    """Harmonics of the colours that renderers show, which are cut at 0: a map would lift what was hidden below.
+    """Harmonics of the colours that renderers show, which are cut at 0: a map would lift what was hidden
+    below.
 
-    Where some direction is cut, the cut colours of all directions are fitted again by the first B harmonics, B <= K.
+    Where some direction is cut, the cut colours of all directions are fitted again by the first B harmonics,
+    B <= K.
     """
     count = len(directions.values)
-    # In no direction harmonics of degree l are further from 0 than their norm times sqrt((2 l + 1) / 4 pi) (addition theorem).
+    # In no direction harmonics of degree l are further from 0 than their norm times sqrt((2 l + 1) / 4 pi)
+    # (addition theorem).
     square = harmonics[:, :count].square()
     low = 0.5 + HARMONIC * harmonics[:, 0]
     for degree in range(1, math.isqrt(count)):
@@ -86,10 +91,11 @@ def recoloured(
     weight: Annotated[Tensor, "N"],
     directions: Directions,
 ) -> Annotated[Tensor, "N K 3"]:
-    """Harmonics as drawn, mapped by A = 1 + change[:, :3] and b = change[:, 3]; those of no weight stay, bit for bit.
+    """Harmonics as drawn, mapped by A = 1 + change[:, :3] and b = change[:, 3]; those of no weight stay, bit
+    for bit.
 
-    Mean colours stay below `MAX_COLOUR`, but for those that were above it. Within 60 u of the largest harmonic and change,
-    u = 2^-24.
+    Mean colours stay below `MAX_COLOUR`, but for those that were above it. Within 60 u of the largest
+    harmonic and change, u = 2^-24.
     """
     # All harmonics by A; the zeroth again, as colour A + b within its limit.
     drawn = as_drawn(harmonics, directions)

@@ -1,7 +1,8 @@
-"""L1 and SSIM between two images with the gradient, compiled: the loss of 3D Gaussian splatting in under a millisecond.
+"""L1 and SSIM between two images with the gradient, compiled: the loss of 3D Gaussian splatting in under a
+millisecond.
 
-Images are planes [3, H16, W16], flat, padded to multiples of LANES, with `slack(width)` numbers behind; SSIM is Wang's, in
-windows of 11 x 11 (Gaussian, sigma 1.5) that lie inside the image, over colours in [0, 1].
+Images are planes [3, H16, W16], flat, padded to multiples of LANES, with `slack(width)` numbers behind; SSIM
+is Wang's, in windows of 11 x 11 (Gaussian, sigma 1.5) that lie inside the image, over colours in [0, 1].
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg, var-annotated"
@@ -18,7 +19,8 @@ Floats = np.ndarray[Any, np.dtype[np.float32]]
 WINDOW = 11
 _weights = np.exp(-((np.arange(11.0) - 5) ** 2) / (2 * 1.5**2))
 _WEIGHTS = (_weights / _weights.sum()).tolist()
-_C1, _C2 = 0.01**2, 0.03**2
+_C1 = 0.01**2
+_C2 = 0.03**2
 _STRIP = 48
 """Rows that a thread takes at a time."""
 _jit = cached_jit(nogil=True, fastmath={"contract", "arcp", "nsz"})
@@ -60,7 +62,8 @@ def _blurred(counters, image, width, height, lines, out):
     padded = (width + LANES - 1) // LANES * LANES
     area = padded * ((height + LANES - 1) // LANES * LANES)
     down = height - WINDOW + 1
-    room, line = padded + 64, lines[take(counters, 1)]
+    room = padded + 64
+    line = lines[take(counters, 1)]
     while True:
         unit = take(counters, 0)
         if unit >= 3 * down:
@@ -73,7 +76,9 @@ def _blurred(counters, image, width, height, lines, out):
 
 
 def blurred(image: Floats, width: int, height: int) -> Floats:
-    """Windowed means of an image and of its squares, [2, planes]: the part of SSIM that a target has once for all."""
+    """Windowed means of an image and of its squares, [2, planes]: the part of SSIM that a target has once for
+    all.
+    """
     padded = (width + LANES - 1) // LANES * LANES
     out = np.zeros((2, 3 * padded * ((height + LANES - 1) // LANES * LANES) + 64), np.float32)
     if min(width, height) >= WINDOW:
@@ -93,13 +98,20 @@ def _down_both(image, target, at, padded, line, x, room):
 
 @traced
 def _similarity(line, x, room, blurred, at, beyond, across, scale, moves, d, layer):
-    """SSIM of the windows from x on; and what each one's mean of the image, of its square and of its product with the target
-    must move by, to moves."""
-    # Means, squares and the product in the windows: (2 m_a m_b + c1)(2 v_ab + c2) / ((m_a^2 + m_b^2 + c1)(v_a + v_b + c2)).
-    ma, aa, ab = _across(line, x), _across(line, room + x), _across(line, 2 * room + x)
-    mb, bb = load(blurred, at), load(blurred, beyond + at)
-    n1, n2 = 2 * ma * mb + _C1, 2 * (ab - ma * mb) + _C2
-    i1, i2 = 1 / (ma * ma + mb * mb + _C1), 1 / (aa - ma * ma + bb - mb * mb + _C2)
+    """SSIM of the windows from x on; and what each one's mean of the image, of its square and of its product
+    with the target must move by, to moves.
+    """
+    # Means, squares and the product in the windows: (2 m_a m_b + c1)(2 v_ab + c2) / ((m_a^2 + m_b^2 + c1)(v_a
+    # + v_b + c2)).
+    ma = _across(line, x)
+    aa = _across(line, room + x)
+    ab = _across(line, 2 * room + x)
+    mb = load(blurred, at)
+    bb = load(blurred, beyond + at)
+    n1 = 2 * ma * mb + _C1
+    n2 = 2 * (ab - ma * mb) + _C2
+    i1 = 1 / (ma * ma + mb * mb + _C1)
+    i2 = 1 / (aa - ma * ma + bb - mb * mb + _C2)
     both = i1 * i2
     s = n1 * n2 * both
     inside = where_greater(as_float(across) - as_float(x), lanes(s), splat(s, 1), 0)
@@ -117,7 +129,11 @@ def _up(moves, o, room, line, x):
 
 @traced
 def _gradient(image, target, at, line, x, room, grad):
-    value = _across(line, x) + 2 * load(image, at) * _across(line, room + x) + load(target, at) * _across(line, 2 * room + x)
+    value = (
+        _across(line, x)
+        + 2 * load(image, at) * _across(line, room + x)
+        + load(target, at) * _across(line, 2 * room + x)
+    )
     store(grad, at, value)
 
 
@@ -135,12 +151,15 @@ def _difference(image, target, at, width, x, slope, grad):
 def _loss(counters, image, target, target_blurred, width, height, share, rooms, grad, sums):
     padded = (width + LANES - 1) // LANES * LANES
     area = padded * ((height + LANES - 1) // LANES * LANES)
-    across, down = width - WINDOW + 1, height - WINDOW + 1
+    across = width - WINDOW + 1
+    down = height - WINDOW + 1
     similar = share > 0 and across > 0 and down > 0
     slope = (np.float32(1) - share) / np.float32(3 * width * height)
     scale = -share / np.float32(3 * max(across, 1) * max(down, 1))
-    room, memory = padded + 64, rooms[take(counters, 1)]
-    line, moves = memory[: 3 * room], memory[3 * room :]
+    room = padded + 64
+    memory = rooms[take(counters, 1)]
+    line = memory[: 3 * room]
+    moves = memory[3 * room :]
     layer = (_STRIP + WINDOW - 1) * room
     strips = (height + _STRIP - 1) // _STRIP
     while True:
@@ -149,7 +168,8 @@ def _loss(counters, image, target, target_blurred, width, height, share, rooms, 
             break
         first = unit % strips * _STRIP
         last = min(height, first + _STRIP)
-        alike, apart = 0.0, 0.0
+        alike = 0.0
+        apart = 0.0
         if similar:
             # SSIM of the windows, and what it moves. Windows that begin above the strip reach into it.
             for y in range(first - WINDOW + 1, last):
@@ -164,7 +184,17 @@ def _loss(counters, image, target, target_blurred, width, height, share, rooms, 
                     _down_both(image, target, at + x, padded, line, x, room)
                 for x in range(0, across, LANES):
                     similarity = _similarity(
-                        line, x, room, target_blurred, at + x, 3 * area + 64, across, scale, moves, d + x + WINDOW - 1, layer
+                        line,
+                        x,
+                        room,
+                        target_blurred,
+                        at + x,
+                        3 * area + 64,
+                        across,
+                        scale,
+                        moves,
+                        d + x + WINDOW - 1,
+                        layer,
                     )
                     if y >= first:
                         alike += total(similarity)
@@ -185,7 +215,8 @@ def _loss(counters, image, target, target_blurred, width, height, share, rooms, 
 def loss(
     image: Floats, target: Floats, target_blurred: Floats, width: int, height: int, share: float
 ) -> tuple[float, float, Floats]:
-    """Mean |image - target|, mean SSIM, and the gradient [planes] of (1 - share) L1 + share (1 - SSIM) in the image.
+    """Mean |image - target|, mean SSIM, and the gradient [planes] of (1 - share) L1 + share (1 - SSIM) in the
+    image.
 
     Where the image is smaller than a window, SSIM counts as 0 and only L1 has a gradient.
     """
@@ -193,7 +224,9 @@ def loss(
     grad = np.zeros(3 * padded * ((height + LANES - 1) // LANES * LANES) + 64, np.float32)
     rooms = np.zeros((numba.get_num_threads(), 3 * (padded + 64) * (_STRIP + WINDOW)), np.float32)
     sums = np.zeros((3 * -(-height // _STRIP), 2))
-    on_threads(_loss, image, target, target_blurred.reshape(-1), width, height, np.float32(share), rooms, grad, sums)
+    on_threads(
+        _loss, image, target, target_blurred.reshape(-1), width, height, np.float32(share), rooms, grad, sums
+    )
     windows = max(width - WINDOW + 1, 0) * max(height - WINDOW + 1, 0)
     apart, alike = sums.sum(0)
     return float(apart) / (3 * width * height), float(alike) / (3 * max(windows, 1)), grad

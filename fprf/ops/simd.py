@@ -1,14 +1,16 @@
 """Vectors of float32 in compiled kernels: of LANES, where nothing else is asked for.
 
-A function under `@traced` runs while a kernel that calls it is compiled: once, on placeholders whose operators emit LLVM code.
-Inside it loops and conditions on Python numbers unroll, and other traced functions are plain calls. A kernel passes it arrays
-(or `stack` memory), indices, constants, float32 numbers, vectors and tuples of vectors, and gets vectors or numbers back; numba
-infers no types within, which is most of what compilation costs. Left to itself the compiler keeps most of our inner loops
-scalar: it cannot prove that their arrays do not overlap.
+A function under `@traced` runs while a kernel that calls it is compiled: once, on placeholders whose
+operators emit LLVM code. Inside it loops and conditions on Python numbers unroll, and other traced functions
+are plain calls. A kernel passes it arrays (or `stack` memory), indices, constants, float32 numbers, vectors
+and tuples of vectors, and gets vectors or numbers back; numba infers no types within, which is most of what
+compilation costs. Left to itself the compiler keeps most of our inner loops scalar: it cannot prove that
+their arrays do not overlap.
 
-The instructions are plain LLVM code for any processor; narrower ones split a vector. Multiply and add may fuse and a division
-may become a product with the reciprocal, nothing else: NaN and infinity keep their meaning. Only `sums` and `total` add lanes,
-in pairs: no other result depends on the width of vectors, but for that fusion. A number among vectors counts in every lane.
+The instructions are plain LLVM code for any processor; narrower ones split a vector. Multiply and add may
+fuse and a division may become a product with the reciprocal, nothing else: NaN and infinity keep their
+meaning. Only `sums` and `total` add lanes, in pairs: no other result depends on the width of vectors, but for
+that fusion. A number among vectors counts in every lane.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg"
@@ -33,10 +35,14 @@ except RuntimeError:  # the features of some machines cannot be read
     WIDE = 8
 
 BLOCK = 48
-"""Points or rows that kernels take at a time: whole tiles of every shape, small enough for the first-level cache."""
+"""Points or rows that kernels take at a time: whole tiles of every shape, small enough for the first-level
+cache.
+"""
 
 _LINE = 64
-_FLOAT, _INT, _LONG = ir.FloatType(), ir.IntType(32), ir.IntType(64)
+_FLOAT = ir.FloatType()
+_INT = ir.IntType(32)
+_LONG = ir.IntType(64)
 _FUSE = ("contract", "arcp", "nsz")
 _ADD_ANYHOW = ("contract", "arcp", "nsz", "reassoc")
 
@@ -83,7 +89,8 @@ class _Placeholder:
     __array_ufunc__ = None  # operators with numpy's numbers are ours
 
     def __init__(self, build, value):
-        self.build, self.value = build, value
+        self.build = build
+        self.value = value
 
 
 def _of_integers(instruction):
@@ -104,8 +111,11 @@ def _of_vectors(instruction, *, swapped=False):
 class _Index(_Placeholder):
     """An integer: a place in an array."""
 
-    __add__, __sub__, __mul__ = _of_integers("add"), _of_integers("sub"), _of_integers("mul")
-    __radd__, __rmul__ = __add__, __mul__
+    __add__ = _of_integers("add")
+    __sub__ = _of_integers("sub")
+    __mul__ = _of_integers("mul")
+    __radd__ = __add__
+    __rmul__ = __mul__
 
 
 class _Array(_Placeholder):
@@ -133,10 +143,14 @@ class Vector(_Placeholder):
         """The LLVM value of a vector, or of a constant in every lane."""
         return other.value if isinstance(other, Vector) else _same(other, self.lanes)
 
-    __add__, __radd__ = _of_vectors("fadd"), _of_vectors("fadd", swapped=True)
-    __sub__, __rsub__ = _of_vectors("fsub"), _of_vectors("fsub", swapped=True)
-    __mul__, __rmul__ = _of_vectors("fmul"), _of_vectors("fmul", swapped=True)
-    __truediv__, __rtruediv__ = _of_vectors("fdiv"), _of_vectors("fdiv", swapped=True)
+    __add__ = _of_vectors("fadd")
+    __radd__ = _of_vectors("fadd", swapped=True)
+    __sub__ = _of_vectors("fsub")
+    __rsub__ = _of_vectors("fsub", swapped=True)
+    __mul__ = _of_vectors("fmul")
+    __rmul__ = _of_vectors("fmul", swapped=True)
+    __truediv__ = _of_vectors("fdiv")
+    __rtruediv__ = _of_vectors("fdiv", swapped=True)
 
     def __neg__(self):
         return -0.0 - self
@@ -152,15 +166,21 @@ def _wrapped(context, build, kind, value):
     if isinstance(kind, types.IntegerLiteral):
         return kind.literal_value
     if isinstance(kind, types.UniTuple):
-        return tuple(_wrapped(context, build, kind.dtype, build.extract_value(value, k)) for k in range(kind.count))
+        return tuple(
+            _wrapped(context, build, kind.dtype, build.extract_value(value, k)) for k in range(kind.count)
+        )
     if isinstance(kind, types.Array):
-        return _Array(build, value if context is None else context.make_array(kind)(context, build, value).data)
+        return _Array(
+            build, value if context is None else context.make_array(kind)(context, build, value).data
+        )
     if isinstance(kind, types.CPointer):
         return _Array(build, value)
     if isinstance(kind, types.Integer):
         return _Index(build, value if context is None else context.cast(build, value, kind, types.intp))
     if isinstance(kind, types.Float):
-        return _broadcast(build, value if context is None else context.cast(build, value, kind, types.float32))
+        return _broadcast(
+            build, value if context is None else context.cast(build, value, kind, types.float32)
+        )
     return Vector(build, value)
 
 
@@ -176,7 +196,9 @@ def _dry(kind):
 
 
 def traced(function):
-    """Let kernels call a function that runs while they are compiled. It stays what it is for other traced functions."""
+    """Let kernels call a function that runs while they are compiled. It stays what it is for other traced
+    functions.
+    """
     results: dict[Any, Any] = {}  # the kind of the result, by those of the arguments
 
     class Template(AbstractTemplate):
@@ -187,9 +209,13 @@ def traced(function):
             if args in results:
                 return signature(results[args], *args)
             # What comes back is seen in a trace whose code is thrown away.
-            body = ir.Function(ir.Module(), ir.FunctionType(ir.VoidType(), [_dry(kind) for kind in args]), "dry")
+            body = ir.Function(
+                ir.Module(), ir.FunctionType(ir.VoidType(), [_dry(kind) for kind in args]), "dry"
+            )
             build = ir.IRBuilder(body.append_basic_block())
-            result = function(*(_wrapped(None, build, kind, value) for kind, value in zip(args, body.args, strict=True)))
+            result = function(
+                *(_wrapped(None, build, kind, value) for kind, value in zip(args, body.args, strict=True))
+            )
             if result is None:
                 results[args] = types.void
             elif isinstance(result, tuple | list):
@@ -204,7 +230,9 @@ def traced(function):
 
     @lower_builtin(function, types.VarArg(types.Any))
     def lower(context, build, sig, args):
-        result = function(*(_wrapped(context, build, kind, value) for kind, value in zip(sig.args, args, strict=True)))
+        result = function(
+            *(_wrapped(context, build, kind, value) for kind, value in zip(sig.args, args, strict=True))
+        )
         if result is None:
             return context.get_dummy_value()
         if isinstance(result, tuple | list):
@@ -215,9 +243,12 @@ def traced(function):
 
 
 def _call(name, *args, flags=_FUSE):
-    """The LLVM value that an intrinsic makes of a vector, or of numbers and one: a vector, or a number by reduction."""
+    """The LLVM value that an intrinsic makes of a vector, or of numbers and one: a vector, or a number by
+    reduction.
+    """
     *numbers, vector = args
-    build, given = vector.build, [*numbers, vector.value]
+    build = vector.build
+    given = [*numbers, vector.value]
     kind = ir.FunctionType(_FLOAT if ".reduce." in name else vector.value.type, [each.type for each in given])
     function = cgutils.get_or_insert_function(build.module, kind, f"{name}.v{vector.lanes}f32")
     return build.call(function, given, fastmath=flags)
@@ -254,13 +285,14 @@ def load(array, at, lanes=LANES):
 def load_halves(address, lanes):
     """2^-112 of the float16 numbers whose bits lie at an address.
 
-    A half's exponent and mantissa, moved to a float's place, are 2^112 too small; subnormals come out right as well.
+    A half's exponent and mantissa, moved to a float's place, are 2^112 too small; subnormals come out right
+    as well.
     """
-    build, mask = address.build, lambda value: _same_int(value, lanes)
+    build = address.build
     halves = build.inttoptr(address.value, ir.VectorType(ir.IntType(16), lanes).as_pointer())
     half = build.zext(build.load(halves, align=2), _ints(lanes))
-    sign = build.shl(build.and_(half, mask(0x8000)), mask(16))
-    rest = build.shl(build.and_(half, mask(0x7FFF)), mask(13))
+    sign = build.shl(build.and_(half, _same_int(0x8000, lanes)), _same_int(16, lanes))
+    rest = build.shl(build.and_(half, _same_int(0x7FFF, lanes)), _same_int(13, lanes))
     return Vector(build, build.bitcast(build.or_(sign, rest), _floats(lanes)))
 
 
@@ -272,19 +304,28 @@ def store(array, at, value):
 
 
 def repeat(count, start, step, by=1):
-    """A loop of the compiled code: vectors = step(k, vectors) from `start` on, for k = 0, by, 2 by, ... below `count`."""
-    build, count = start[0].build, _long(count)
-    before, loop, after = build.block, build.append_basic_block("loop"), build.append_basic_block("after")
+    """A loop of the compiled code: vectors = step(k, vectors) from `start` on, for k = 0, by, 2 by, ... below
+    `count`.
+    """
+    build = start[0].build
+    count = _long(count)
+    before = build.block
+    loop = build.append_basic_block("loop")
+    after = build.append_basic_block("after")
     build.cbranch(build.icmp_signed(">", count, _long(0)), loop, after)
     build.position_at_end(loop)
-    k, held = build.phi(_LONG), [build.phi(each.value.type) for each in start]
+    k = build.phi(_LONG)
+    held = [build.phi(each.value.type) for each in start]
     found = step(_Index(build, k), [Vector(build, each) for each in held])
-    following, end = build.add(k, _long(by)), build.block
+    following = build.add(k, _long(by))
+    end = build.block
     build.cbranch(build.icmp_signed("<", following, count), loop, after)
     build.position_at_end(after)
     results = [build.phi(each.value.type) for each in start]
     firsts, lasts = ([each.value for each in vectors] for vectors in (start, found))
-    for phi, first, last in zip([k, *held, *results], [_long(0), *firsts * 2], [following, *lasts * 2], strict=True):
+    for phi, first, last in zip(
+        [k, *held, *results], [_long(0), *firsts * 2], [following, *lasts * 2], strict=True
+    ):
         phi.add_incoming(first, before)
         phi.add_incoming(last, end)
     return [Vector(build, each) for each in results]
@@ -307,7 +348,8 @@ def as_float(index):
 
 def _choose(comparison, x, y):
     like = x if isinstance(x, Vector) else y
-    x, y = like.same(x), like.same(y)
+    x = like.same(x)
+    y = like.same(y)
     return Vector(like.build, like.build.select(like.build.fcmp_ordered(comparison, x, y), x, y))
 
 
@@ -336,9 +378,12 @@ def _reduced(name, *start, flags=_FUSE):
     return traced(lambda x: _Float(x.build, _call(f"llvm.vector.reduce.{name}", *start, x, flags=flags)))
 
 
-square_root, absolute, floor = _lane_by_lane("sqrt"), _lane_by_lane("fabs"), _lane_by_lane("floor")
+square_root = _lane_by_lane("sqrt")
+absolute = _lane_by_lane("fabs")
+floor = _lane_by_lane("floor")
 """Of every lane; the floor is the largest whole number that is not above it."""
-least, largest = _reduced("fmin"), _reduced("fmax")
+least = _reduced("fmin")
+largest = _reduced("fmax")
 """Of all lanes, as a number."""
 total = _reduced("fadd", ir.Constant(_FLOAT, 0.0), flags=_ADD_ANYHOW)
 """The sum of the lanes."""
@@ -382,11 +427,15 @@ def transposed(rows):
 
 def swapped(blocks):
     """Four vectors of four quarters: the first quarters of all in one vector, and so on."""
-    swapped_lanes, quarter = [], LANES // 4
+    swapped_lanes = []
+    quarter = LANES // 4
     for k in range(4):
         pair = [k * quarter + lane + side * LANES for side in (0, 1) for lane in range(quarter)] * 2
-        low, high = _picked(*blocks[:2], pair), _picked(*blocks[2:], pair)
-        swapped_lanes.append(_picked(low, high, [lane if lane < LANES // 2 else lane + LANES for lane in range(LANES)]))
+        low = _picked(*blocks[:2], pair)
+        high = _picked(*blocks[2:], pair)
+        swapped_lanes.append(
+            _picked(low, high, [lane if lane < LANES // 2 else lane + LANES for lane in range(LANES)])
+        )
     return swapped_lanes
 
 
@@ -398,12 +447,17 @@ def added_in_fours(x):
 
 
 def sums(values):
-    """The sums of the lanes of each of at most LANES vectors, in the lanes of one; what is left over is undefined."""
-    vectors, fours = list(values), LANES // 4
+    """The sums of the lanes of each of at most LANES vectors, in the lanes of one; what is left over is
+    undefined.
+    """
+    vectors = list(values)
+    fours = LANES // 4
 
     def halve(low, high):
         """Add picked lanes of each pair of vectors: half as many vectors."""
-        pairs = [(vectors[k], vectors[k + 1] if k + 1 < len(vectors) else None) for k in range(0, len(vectors), 2)]
+        pairs = [
+            (vectors[k], vectors[k + 1] if k + 1 < len(vectors) else None) for k in range(0, len(vectors), 2)
+        ]
         return [_picked(x, y, low) + _picked(x, y, high) for x, y in pairs]
 
     def within_fours(*offsets):
@@ -413,11 +467,14 @@ def sums(values):
     vectors = halve(within_fours(0, 1, LANES, LANES + 1), within_fours(2, 3, LANES + 2, LANES + 3))
     left = fours
     while left > 1:
-        # Group g of a vector holds the partial sums of four of them; the groups of one vector are added in pairs.
+        # Group g of a vector holds the partial sums of four of them; the groups of one vector are added in
+        # pairs.
         low, high = (
-            [side * LANES + 4 * g + j for side in (0, 1) for g in range(first, fours, 2) for j in range(4)] for first in (0, 1)
+            [side * LANES + 4 * g + j for side in (0, 1) for g in range(first, fours, 2) for j in range(4)]
+            for first in (0, 1)
         )
-        vectors, left = halve(low, high), left // 2
+        vectors = halve(low, high)
+        left = left // 2
     assert len(vectors) == 1
     return vectors[0]
 
@@ -434,14 +491,18 @@ _ROUND = 1.5 * 2**23
 # 2^x on [-1/2, 1/2]: polynomials of least relative error, in the mean, at Chebyshev points.
 _POINTS = np.cos(np.pi * (np.arange(400) + 0.5) / 400) / 2
 _EXP2 = {
-    degree: np.linalg.lstsq(_POINTS[:, None] ** np.arange(degree + 1) / np.exp2(_POINTS)[:, None], np.ones(400), rcond=None)[0]
+    degree: np.linalg.lstsq(
+        _POINTS[:, None] ** np.arange(degree + 1) / np.exp2(_POINTS)[:, None], np.ones(400), rcond=None
+    )[0]
     for degree in (3, 5)
 }
 
 
 def exp2(x, degree=5):
     """2^x for |x| < 126; relative error 3e-7, or 1.1e-4 with degree 3."""
-    build, lanes, large = x.build, x.lanes, _same(_ROUND, x.lanes)
+    build = x.build
+    lanes = x.lanes
+    large = _same(_ROUND, x.lanes)
     # x = n + r with a whole n, the low bits of the sum, and |r| <= 1/2; these two must not be simplified.
     rounded = build.fadd(x.value, large)
     part = Vector(build, build.fsub(x.value, build.fsub(rounded, large)))
@@ -462,8 +523,10 @@ _LOG2 = (
 
 def log2(x):
     """log2 of a positive normal number; error 3e-7 of the larger of 1 and itself."""
-    build, lanes = x.build, x.lanes
-    bits, places = build.bitcast(x.value, _ints(lanes)), _same_int(23, lanes)
+    build = x.build
+    lanes = x.lanes
+    bits = build.bitcast(x.value, _ints(lanes))
+    places = _same_int(23, lanes)
     # x = 2^n (1 + m) with 1 + m from 2^-0.5 on: 0x3f3504f3 are the bits of the square root of one half.
     exponent = build.ashr(build.sub(bits, _same_int(0x3F3504F3, lanes)), places)
     part = Vector(build, build.bitcast(build.sub(bits, build.shl(exponent, places)), _floats(lanes))) - 1.0

@@ -1,11 +1,11 @@
 """Cache and threads of compiled kernels.
 
-Numba caches what it compiled under the text of a kernel's own file, but constants and traced functions of other files are
-compiled into it: after an update it would go on with the former ones. Here the text of all that kernels are made of counts:
-the files of `fprf/ops` without torch.
+Numba caches what it compiled under the text of a kernel's own file, but constants and traced functions of
+other files are compiled into it: after an update it would go on with the former ones. Here the text of all
+that kernels are made of counts: the files of `fprf/ops` without torch.
 
-Numba's own threads cost half of the compilation, and split work evenly, which pixels and Gaussians are not: here threads take
-what is to be done one by one.
+Numba's own threads cost half of the compilation, and split work evenly, which pixels and Gaussians are not:
+here threads take what is to be done one by one.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg"
@@ -34,15 +34,24 @@ def sources(folder: Path = Path(__file__).parent) -> str:
 
 
 def cached_jit(**options: Any) -> Callable[[Any], Any]:
-    """`numba.njit` with these options and a cache; numba looks for what it compiled by variables that a function encloses."""
+    """`numba.njit` with these options and a cache; numba looks for what it compiled by variables that a
+    function encloses.
+    """
 
     def compiled(function: Any) -> Any:
-        code, enclosed = function.__code__, function.__closure__ or ()
+        code = function.__code__
+        enclosed = function.__closure__ or ()
         code = code.replace(co_freevars=(*code.co_freevars, "sources"))
         dated = FunctionType(
-            code, function.__globals__, function.__name__, function.__defaults__, (*enclosed, CellType(sources()))
+            code,
+            function.__globals__,
+            function.__name__,
+            function.__defaults__,
+            (*enclosed, CellType(sources())),
         )
-        dated.__module__, dated.__qualname__, dated.__doc__ = function.__module__, function.__qualname__, function.__doc__
+        dated.__module__ = function.__module__
+        dated.__qualname__ = function.__qualname__
+        dated.__doc__ = function.__doc__
         return numba.njit(cache=True, **options)(dated)
 
     return compiled
@@ -72,9 +81,11 @@ if hasattr(os, "register_at_fork"):
 def on_threads(kernel: Callable[..., Any], *args: Any) -> list[Any]:
     """kernel(counters, *args) on each of `numba.get_num_threads()` threads; what each returned.
 
-    `counters` are two zeros (int64) for `take`: the first for what is to be done, the second for the number of a thread.
+    `counters` are two zeros (int64) for `take`: the first for what is to be done, the second for the number
+    of a thread.
     """
-    counters, others = np.zeros(2, np.int64), numba.get_num_threads() - 1
+    counters = np.zeros(2, np.int64)
+    others = numba.get_num_threads() - 1
     if others == 0:
         return [kernel(counters, *args)]
     running = [_pool(others).submit(kernel, counters, *args) for _ in range(others)]

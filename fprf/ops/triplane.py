@@ -1,15 +1,16 @@
-"""Tri-plane lookup (K-Planes): for every scale the product over three planes of a bilinear sample, scales side by side.
+"""Tri-plane lookup (K-Planes): for every scale the product over three planes of a bilinear sample, scales
+side by side.
 
-Conventions. Points lie in [-1, 1]^3; the outer nodes of a plane sit on -1 and 1, so neighbouring blocks that share an edge
-agree on it. A point outside takes the value at the border. Plane p spans the axes AXES[p]. All scales of all planes live
-in one table [rows, channels] of channel vectors: scale after scale, plane after plane, row v after row, node u after node.
-One table means one parameter, one optimiser state and one pass.
+Conventions. Points lie in [-1, 1]^3; the outer nodes of a plane sit on -1 and 1, so neighbouring blocks that
+share an edge agree on it. A point outside takes the value at the border. Plane p spans the axes AXES[p]. All
+scales of all planes live in one table [rows, channels] of channel vectors: scale after scale, plane after
+plane, row v after row, node u after node. One table means one parameter, one optimiser state and one pass.
 
-The torch form is the reference for every device and dtype; in float32 fused kernels take over: on the CPU `triplane_kernels`,
-compiled by numba on first use and cached, on CUDA `triplane_triton`, compiled by Triton. All keep coordinates and arithmetic
-in the dtype of the points, never half (half coordinates cost 3.5e-2 of the feature at 512 nodes). Gradients go to the table,
-and to points that ask for them (poses that are refined). A sample has a kink at each node: there its slope is that of the cell
-above.
+The torch form is the reference for every device and dtype; in float32 fused kernels take over: on the CPU
+`triplane_kernels`, compiled by numba on first use and cached, on CUDA `triplane_triton`, compiled by Triton.
+All keep coordinates and arithmetic in the dtype of the points, never half (half coordinates cost 3.5e-2 of
+the feature at 512 nodes). Gradients go to the table, and to points that ask for them (poses that are
+refined). A sample has a kink at each node: there its slope is that of the cell above.
 """
 
 # The checker takes compiled functions to have one argument.
@@ -32,8 +33,11 @@ AXES = ((0, 1), (0, 2), (1, 2))
 """Axes that each plane spans, along its rows first."""
 _LANES = 8
 """Channels of the kernels' vectors."""
-_SLICES, _SMALL = 4, 2**19
-"""Parts of the points whose gradients are summed apart, and numbers of a table below which that is worth the memory."""
+_SLICES = 4
+_SMALL = 2**19
+"""Parts of the points whose gradients are summed apart, and numbers of a table below which that is worth the
+memory.
+"""
 
 
 def rows(resolutions: Sequence[int]) -> int:
@@ -60,8 +64,10 @@ def lookup_reference(
         node = low.long()
         product: Tensor | None = None
         for plane, (a, b) in zip(planes, AXES, strict=True):
-            u, v = part[:, a, None], part[:, b, None]
-            i, j = node[:, b], node[:, a]
+            u = part[:, a, None]
+            v = part[:, b, None]
+            i = node[:, b]
+            j = node[:, a]
             value = (plane[i, j] * (1 - u) + plane[i, j + 1] * u) * (1 - v)
             value = value + (plane[i + 1, j] * (1 - u) + plane[i + 1, j + 1] * u) * v
             product = value if product is None else product * value
@@ -74,7 +80,8 @@ def variation_reference(table: Annotated[Tensor, "rows F"], resolutions: Sequenc
     """Mean squared difference of neighbouring nodes, summed over both directions and all scales: a scalar."""
     total = table.new_zeros(())
     for grid in split(table, resolutions):
-        across, down = grid[:, :, 1:] - grid[:, :, :-1], grid[:, 1:] - grid[:, :-1]
+        across = grid[:, :, 1:] - grid[:, :, :-1]
+        down = grid[:, 1:] - grid[:, :-1]
         total = total + across.square().mean() + down.square().mean()
     return total
 
@@ -87,7 +94,12 @@ def usable(points: Tensor, table: Tensor) -> bool:
 def triton_usable(points: Tensor, table: Tensor) -> bool:
     """Return whether Triton's kernels apply: float32 on one CUDA device for which it can compile."""
     device = points.device
-    if device.type != "cuda" or table.device != device or points.dtype != torch.float32 or table.dtype != torch.float32:
+    if (
+        device.type != "cuda"
+        or table.device != device
+        or points.dtype != torch.float32
+        or table.dtype != torch.float32
+    ):
         return False
     return compiled() and _compiles(device)
 
@@ -117,7 +129,9 @@ def _compiles(device: torch.device) -> bool:
 def lookup(
     points: Annotated[Tensor, "N 3"], table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]
 ) -> Annotated[Tensor, "N scales*F"]:
-    """The fastest form that this device and dtype have; equal to the reference within 4u (r |slope| + 3 |value|)."""
+    """The fastest form that this device and dtype have; equal to the reference within 4u (r |slope| + 3
+    |value|).
+    """
     if not (usable(points, table) or triton_usable(points, table)):
         return lookup_reference(points, table, resolutions)
     result: Tensor = _Lookup.apply(points.contiguous(), table, tuple(resolutions))  # type: ignore[no-untyped-call]
@@ -133,8 +147,10 @@ def variation(table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]) ->
 
 
 class _Lookup(torch.autograd.Function):
-    """On the CPU forward runs over points, and backward over (scale, group of channels): no two tasks write the same number, so
-    no locks, and the sum over points has one order: bitwise the same for any number of threads."""
+    """On the CPU forward runs over points, and backward over (scale, group of channels): no two tasks write
+    the same number, so no locks, and the sum over points has one order: bitwise the same for any number of
+    threads.
+    """
 
     @staticmethod
     def forward(ctx: Any, points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> Tensor:
@@ -163,7 +179,9 @@ class _Lookup(torch.autograd.Function):
                     value = lookup_reference(given, table.detach(), ctx.resolutions)
                 (to_points,) = torch.autograd.grad(value, given, grads[0])
             if ctx.needs_input_grad[1]:
-                to_table = triplane_triton.backward(points, table.detach().contiguous(), ctx.resolutions, grads[0])
+                to_table = triplane_triton.backward(
+                    points, table.detach().contiguous(), ctx.resolutions, grads[0]
+                )
             return to_points, to_table, None
         from . import triplane_kernels as kernels
 
@@ -172,8 +190,8 @@ class _Lookup(torch.autograd.Function):
             to_points = torch.empty(len(points), 3)
             kernels.point_slopes(*given, to_points.view(-1).numpy())
         if ctx.needs_input_grad[1]:
-            # A table of few scales gives few tasks, so a small one is summed up in parts. Sizes alone decide: the order of the
-            # sums must not depend on the machine.
+            # A table of few scales gives few tasks, so a small one is summed up in parts. Sizes alone decide:
+            # the order of the sums must not depend on the machine.
             slices = _SLICES if table.numel() <= _SMALL and grads[0].numel() > table.numel() else 1
             parts = torch.zeros(slices, *table.shape)
             kernels.backward(*given, slices, parts.view(-1).numpy())

@@ -1,4 +1,6 @@
-"""The compiled loops behind `triplane`. Conventions are those of `triplane`; arrays are flat, contiguous float32."""
+"""The compiled loops behind `triplane`. Conventions are those of `triplane`; arrays are flat, contiguous
+float32.
+"""
 
 # numba passes the typing context of an intrinsic by itself, which the checker cannot know: call-arg.
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, call-arg"
@@ -15,19 +17,23 @@ GROUP = 16
 """Channels of one backward task: a cache line of float32."""
 
 _jit = cached_jit(parallel=True, nogil=True)
-# Differences of neighbours may be summed in any order inside a row: the sum is a regulariser, kept in float64.
+# Differences of neighbours may be summed in any order inside a row: the sum is a regulariser, kept in
+# float64.
 _jit_sum = cached_jit(parallel=True, nogil=True, fastmath={"contract", "reassoc"})
 
 
 @numba.njit(inline="always")
 def _cells(points, first, count, size, start, channels, corner, part):
-    """For `count` <= BLOCK points: first number of the lower corner's vector in each plane, share of the next node per axis.
+    """For `count` <= BLOCK points: first number of the lower corner's vector in each plane, share of the next
+    node per axis.
 
-    Outside counts as the border; the comparison is written so that NaN falls on the lower one: an index must never leave the
-    table.
+    Outside counts as the border; the comparison is written so that NaN falls on the lower one: an index must
+    never leave the table.
     """
-    last, plane = np.float32(size - 1), size * size
-    half, top = np.float32(0.5) * last, np.float32(size - 2)
+    last = np.float32(size - 1)
+    plane = size * size
+    half = np.float32(0.5) * last
+    top = np.float32(size - 2)
     for axis in range(3):
         for n in range(count):
             at = (points[3 * (first + n) + axis] + np.float32(1)) * half
@@ -37,15 +43,17 @@ def _cells(points, first, count, size, start, channels, corner, part):
             corner[axis * BLOCK + n] = np.int64(low)
     # Rows of the table by plane: (0, 1), (0, 2), (1, 2).
     for n in range(count):
-        i, j, k = corner[n], corner[BLOCK + n], corner[2 * BLOCK + n]
+        i = corner[n]
+        j = corner[BLOCK + n]
+        k = corner[2 * BLOCK + n]
         corner[n] = (start + j * size + i) * channels
         corner[BLOCK + n] = (start + plane + k * size + i) * channels
         corner[2 * BLOCK + n] = (start + 2 * plane + k * size + j) * channels
 
 
-# The inner steps take several channels at a time: left to the compiler they are 3 times slower on 196 608 points, forward and
-# backward. Offsets are in numbers from the start of flat arrays; `step` and `stride` lead to the next node along the row and
-# to the next row; u, v, w are the shares of the next nodes.
+# The inner steps take several channels at a time: left to the compiler they are 3 times slower on 196 608
+# points, forward and backward. Offsets are in numbers from the start of flat arrays; `step` and `stride` lead
+# to the next node along the row and to the next row; u, v, w are the shares of the next nodes.
 
 
 def _samples(table, bases, step, stride, shares):
@@ -54,10 +62,14 @@ def _samples(table, bases, step, stride, shares):
     def mix(low, high, share):
         return low * (1 - share) + high * share
 
-    values, slopes = [], []
+    values = []
+    slopes = []
     for base, (across, down) in zip(bases, AXES, strict=True):
-        (a, b), (c, d) = ([load(table, at + k, shares[0].lanes) for k in (0, step)] for at in (base, base + stride))
-        upper, lower = mix(a, b, shares[across]), mix(c, d, shares[across])
+        (a, b), (c, d) = (
+            [load(table, at + k, shares[0].lanes) for k in (0, step)] for at in (base, base + stride)
+        )
+        upper = mix(a, b, shares[across])
+        lower = mix(c, d, shares[across])
         values.append(mix(upper, lower, shares[down]))
         slopes.append({across: mix(b - a, d - c, shares[down]), down: lower - upper})
     return values, slopes
@@ -72,7 +84,9 @@ def product_forward(table, out, a, b, c, o, step, stride, u, v, w, lanes):
 
 @traced
 def product_backward(table, grad, out, a, b, c, o, shift, step, stride, u, v, w, lanes):
-    """Add to out[shift:], at the corners of a, b and c, the gradient of `product_forward` for grad[o : o + lanes]."""
+    """Add to out[shift:], at the corners of a, b and c, the gradient of `product_forward` for grad[o : o +
+    lanes].
+    """
     shares = [narrow(share, lanes) for share in (u, v, w)]
     (x, y, z), _ = _samples(table, (a, b, c), step, stride, shares)
     g = load(grad, o, lanes)
@@ -85,11 +99,17 @@ def product_backward(table, grad, out, a, b, c, o, shift, step, stride, u, v, w,
 
 @traced
 def product_slopes(table, grad, sums, a, b, c, o, step, stride, u, v, w):
-    """Add to sums[0], [NARROW] and [2 NARROW] onwards grad[o :] times the slopes of `product_forward` along u, v and w."""
-    (x, y, z), slopes = _samples(table, (a, b, c), step, stride, [narrow(share, NARROW) for share in (u, v, w)])
+    """Add to sums[0], [NARROW] and [2 NARROW] onwards grad[o :] times the slopes of `product_forward` along
+    u, v and w.
+    """
+    (x, y, z), slopes = _samples(
+        table, (a, b, c), step, stride, [narrow(share, NARROW) for share in (u, v, w)]
+    )
     g = load(grad, o, NARROW)
     for axis in range(3):
-        first, second = (s[axis] * rest for s, rest in zip(slopes, (y * z, x * z, x * y), strict=True) if axis in s)
+        first, second = (
+            s[axis] * rest for s, rest in zip(slopes, (y * z, x * z, x * y), strict=True) if axis in s
+        )
         at = axis * NARROW
         store(sums, at, load(sums, at, NARROW) + g * (first + second))
 
@@ -102,16 +122,24 @@ def _features(points, first, count, table, channels, sizes, starts, corner, part
         size = sizes[scale]
         _cells(points, first, count, size, starts[scale], channels, corner, part)
         for n in range(count):
-            a, b, c = corner[n], corner[BLOCK + n], corner[2 * BLOCK + n]
-            u, v, w = part[n], part[BLOCK + n], part[2 * BLOCK + n]
+            a = corner[n]
+            b = corner[BLOCK + n]
+            c = corner[2 * BLOCK + n]
+            u = part[n]
+            v = part[BLOCK + n]
+            w = part[2 * BLOCK + n]
             o = to + (n * scales + scale) * channels
             # The number of channels at a time is a constant of the compiled code.
             if channels % WIDE == 0:
                 for s in range(0, channels, WIDE):
-                    product_forward(table, out, a + s, b + s, c + s, o + s, channels, size * channels, u, v, w, WIDE)
+                    product_forward(
+                        table, out, a + s, b + s, c + s, o + s, channels, size * channels, u, v, w, WIDE
+                    )
             else:
                 for s in range(0, channels, NARROW):
-                    product_forward(table, out, a + s, b + s, c + s, o + s, channels, size * channels, u, v, w, NARROW)
+                    product_forward(
+                        table, out, a + s, b + s, c + s, o + s, channels, size * channels, u, v, w, NARROW
+                    )
 
 
 @_jit
@@ -120,42 +148,94 @@ def forward(points, table, channels, sizes, starts, out):
     total = len(points) // 3
     for task in numba.prange((total + BLOCK - 1) // BLOCK):
         first = task * BLOCK
-        corner, part = np.empty(3 * BLOCK, np.int64), np.empty(3 * BLOCK, np.float32)
+        corner = np.empty(3 * BLOCK, np.int64)
+        part = np.empty(3 * BLOCK, np.float32)
         count = min(BLOCK, total - first)
         # In a function of its own: with these loops here the compiled ones are a tenth slower.
-        _features(points, first, count, table, channels, sizes, starts, corner, part, out, first * len(sizes) * channels)
+        _features(
+            points,
+            first,
+            count,
+            table,
+            channels,
+            sizes,
+            starts,
+            corner,
+            part,
+            out,
+            first * len(sizes) * channels,
+        )
 
 
 @_jit
 def backward(points, table, channels, sizes, starts, grad, slices, out):
-    """Add the table's gradient to `out` [slices ...]; a task per slice of the points, scale, channel group."""
-    scales, total = len(sizes), len(points) // 3
-    groups, blocks = (channels + GROUP - 1) // GROUP, (len(points) // 3 + BLOCK - 1) // BLOCK
+    """Add the table's gradient to `out` [slices ...]; a task per slice of the points, scale, channel
+    group.
+    """
+    scales = len(sizes)
+    total = len(points) // 3
+    groups = (channels + GROUP - 1) // GROUP
+    blocks = (len(points) // 3 + BLOCK - 1) // BLOCK
     for task in numba.prange(slices * scales * groups):
-        part_of, rest = task % slices, task // slices
-        scale, here = scales - 1 - rest // groups, rest % groups * GROUP
+        part_of = task % slices
+        rest = task // slices
+        scale = scales - 1 - rest // groups
+        here = rest % groups * GROUP
         wide = min(here + GROUP, channels) - here
-        size, mine = sizes[scale], part_of * len(table)
-        corner, part = np.empty(3 * BLOCK, np.int64), np.empty(3 * BLOCK, np.float32)
+        size = sizes[scale]
+        mine = part_of * len(table)
+        corner = np.empty(3 * BLOCK, np.int64)
+        part = np.empty(3 * BLOCK, np.float32)
         for block in range(part_of * blocks // slices, (part_of + 1) * blocks // slices):
             first = block * BLOCK
             count = min(BLOCK, total - first)
             _cells(points, first, count, size, starts[scale], channels, corner, part)
-            o, apart = (first * scales + scale) * channels + here, scales * channels
+            o = (first * scales + scale) * channels + here
+            apart = scales * channels
             for n in range(count):
-                a, b, c = corner[n] + here, corner[BLOCK + n] + here, corner[2 * BLOCK + n] + here
-                u, v, w = part[n], part[BLOCK + n], part[2 * BLOCK + n]
+                a = corner[n] + here
+                b = corner[BLOCK + n] + here
+                c = corner[2 * BLOCK + n] + here
+                u = part[n]
+                v = part[BLOCK + n]
+                w = part[2 * BLOCK + n]
                 if wide % WIDE == 0:
                     for s in range(0, wide, WIDE):
                         at = o + n * apart + s
                         product_backward(
-                            table, grad, out, a + s, b + s, c + s, at, mine, channels, size * channels, u, v, w, WIDE
+                            table,
+                            grad,
+                            out,
+                            a + s,
+                            b + s,
+                            c + s,
+                            at,
+                            mine,
+                            channels,
+                            size * channels,
+                            u,
+                            v,
+                            w,
+                            WIDE,
                         )
                 else:
                     for s in range(0, wide, NARROW):
                         at = o + n * apart + s
                         product_backward(
-                            table, grad, out, a + s, b + s, c + s, at, mine, channels, size * channels, u, v, w, NARROW
+                            table,
+                            grad,
+                            out,
+                            a + s,
+                            b + s,
+                            c + s,
+                            at,
+                            mine,
+                            channels,
+                            size * channels,
+                            u,
+                            v,
+                            w,
+                            NARROW,
                         )
 
 
@@ -163,27 +243,47 @@ def backward(points, table, channels, sizes, starts, grad, slices, out):
 def point_slopes(points, table, channels, sizes, starts, grad, out):
     """out [N 3] = gradient of the points, for the features' gradient grad [N scales*channels].
 
-    Along an axis on which a point lies outside of the planes, or nowhere, it is 0: there the border's value holds.
+    Along an axis on which a point lies outside of the planes, or nowhere, it is 0: there the border's value
+    holds.
     """
-    scales, total = len(sizes), len(points) // 3
+    scales = len(sizes)
+    total = len(points) // 3
     for task in numba.prange((total + BLOCK - 1) // BLOCK):
         first = task * BLOCK
-        corner, part = np.empty(3 * BLOCK, np.int64), np.empty(3 * BLOCK, np.float32)
+        corner = np.empty(3 * BLOCK, np.int64)
+        part = np.empty(3 * BLOCK, np.float32)
         sums = np.empty(3 * NARROW, np.float32)
         count = min(BLOCK, total - first)
         out[3 * first : 3 * (first + count)] = np.float32(0)
         for scale in range(scales):
             size = sizes[scale]
-            half, last = np.float32(0.5) * np.float32(size - 1), np.float32(size - 1)
+            half = np.float32(0.5) * np.float32(size - 1)
+            last = np.float32(size - 1)
             _cells(points, first, count, size, starts[scale], channels, corner, part)
-            o, apart = (first * scales + scale) * channels, scales * channels
+            o = (first * scales + scale) * channels
+            apart = scales * channels
             for n in range(count):
-                a, b, c = corner[n], corner[BLOCK + n], corner[2 * BLOCK + n]
-                u, v, w = part[n], part[BLOCK + n], part[2 * BLOCK + n]
+                a = corner[n]
+                b = corner[BLOCK + n]
+                c = corner[2 * BLOCK + n]
+                u = part[n]
+                v = part[BLOCK + n]
+                w = part[2 * BLOCK + n]
                 sums[:] = np.float32(0)
                 for s in range(0, channels, NARROW):
                     product_slopes(
-                        table, grad, sums, a + s, b + s, c + s, o + n * apart + s, channels, size * channels, u, v, w
+                        table,
+                        grad,
+                        sums,
+                        a + s,
+                        b + s,
+                        c + s,
+                        o + n * apart + s,
+                        channels,
+                        size * channels,
+                        u,
+                        v,
+                        w,
                     )
                 for axis in range(3):
                     at = (points[3 * (first + n) + axis] + np.float32(1)) * half
@@ -202,7 +302,8 @@ def variation(table, channels, sizes, starts):
         size = sizes[scale]
         part = 0.0
         for row in numba.prange(3 * size):
-            first, width = (starts[scale] + row * size) * channels, size * channels
+            first = (starts[scale] + row * size) * channels
+            width = size * channels
             line = 0.0
             for x in range(first, first + width - channels):
                 across = table[x + channels] - table[x]
@@ -218,13 +319,16 @@ def variation(table, channels, sizes, starts):
 
 @_jit
 def variation_gradient(table, channels, sizes, starts, scale, out):
-    """out = scale * d variation / d table: twice the differences to the four neighbours; a missing one is itself."""
+    """out = scale * d variation / d table: twice the differences to the four neighbours; a missing one is
+    itself.
+    """
     for s in range(len(sizes)):
         size = sizes[s]
         factor = np.float32(2.0 * scale / (3.0 * size * (size - 1) * channels))
         width = size * channels
         for row in numba.prange(3 * size):
-            v, first = row % size, (starts[s] + row * size) * channels
+            v = row % size
+            first = (starts[s] + row * size) * channels
             north = width if v > 0 else 0
             south = width if v < size - 1 else 0
             for u in range(size):

@@ -1,9 +1,12 @@
-"""Tri-planes on a CUDA device: one launch over all planes and scales, forward and backward. Conventions: `triplane`.
+"""Tri-planes on a CUDA device: one launch over all planes and scales, forward and backward. Conventions:
+`triplane`.
 
-Triton comes with torch for CUDA. A program takes BLOCK points through all scales and planes; LANES is the number of channels
-rounded up to a power of two. Resolutions are constants of the compiled code, so that strides and borders cost nothing.
+Triton comes with torch for CUDA. A program takes BLOCK points through all scales and planes; LANES is the
+number of channels rounded up to a power of two. Resolutions are constants of the compiled code, so that
+strides and borders cost nothing.
 
-Gradients are summed up by atomic additions, whose order differs from run to run: bits may differ, within rounding.
+Gradients are summed up by atomic additions, whose order differs from run to run: bits may differ, within
+rounding.
 """
 
 # triton has no types, and what is passed to device code is none of Python's.
@@ -42,7 +45,9 @@ def backward(
     return out
 
 
-def _launch(kernel: Any, points: Tensor, table: Tensor, out: Tensor, resolutions: Sequence[int], *more: Tensor) -> None:
+def _launch(
+    kernel: Any, points: Tensor, table: Tensor, out: Tensor, resolutions: Sequence[int], *more: Tensor
+) -> None:
     if len(points) > 0:
         lanes = 1 << (table.shape[1] - 1).bit_length()
         block = max(1, _TILE // lanes)
@@ -77,7 +82,8 @@ def _sample(table, row, c, mask, u, v, SIZE: tl.constexpr, CHANNELS: tl.constexp
 def _spread(out, row, c, mask, u, v, slope, SIZE: tl.constexpr, CHANNELS: tl.constexpr):
     """Add the gradient of a sample to its four rows. Others add to them at the same time, in any order."""
     corner = out + row[:, None] * CHANNELS + c[None, :]
-    low, high = slope * (1.0 - v), slope * v
+    low = slope * (1.0 - v)
+    high = slope * v
     tl.atomic_add(corner, low * (1.0 - u), mask=mask, sem="relaxed")
     tl.atomic_add(corner + CHANNELS, low * u, mask=mask, sem="relaxed")
     tl.atomic_add(corner + SIZE * CHANNELS, high * (1.0 - u), mask=mask, sem="relaxed")
@@ -90,13 +96,30 @@ def _rows(points, n, inside, START, SIZE: tl.constexpr):
     i, u = _nodes(points, n, inside, 0, SIZE)
     j, v = _nodes(points, n, inside, 1, SIZE)
     k, w = _nodes(points, n, inside, 2, SIZE)
-    return START + j * SIZE + i, START + SIZE * SIZE + k * SIZE + i, START + 2 * SIZE * SIZE + k * SIZE + j, u, v, w
+    return (
+        START + j * SIZE + i,
+        START + SIZE * SIZE + k * SIZE + i,
+        START + 2 * SIZE * SIZE + k * SIZE + j,
+        u,
+        v,
+        w,
+    )
 
 
 @triton.jit(do_not_specialize=["count"])
-def _forward(points, table, out, count, SIZES: tl.constexpr, CHANNELS: tl.constexpr, LANES: tl.constexpr, BLOCK: tl.constexpr):
+def _forward(
+    points,
+    table,
+    out,
+    count,
+    SIZES: tl.constexpr,
+    CHANNELS: tl.constexpr,
+    LANES: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
     """out [count scales CHANNELS] = products of the samples."""
-    n, c = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, LANES)
+    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    c = tl.arange(0, LANES)
     inside = n < count
     mask = inside[:, None] & (c < CHANNELS)[None, :]
     start = 0
@@ -115,12 +138,15 @@ def _backward(
     SIZES: tl.constexpr, CHANNELS: tl.constexpr, LANES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Add the table's gradient to out, for the gradient grad [count scales CHANNELS] of the products."""
-    n, c = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, LANES)
+    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    c = tl.arange(0, LANES)
     inside = n < count
     mask = inside[:, None] & (c < CHANNELS)[None, :]
     start = 0
     for scale in tl.static_range(len(SIZES)):
-        slope = tl.load(grad + (n[:, None] * len(SIZES) + scale) * CHANNELS + c[None, :], mask=mask, other=0.0)
+        slope = tl.load(
+            grad + (n[:, None] * len(SIZES) + scale) * CHANNELS + c[None, :], mask=mask, other=0.0
+        )
         first, second, third, u, v, w = _rows(points, n, inside, start, SIZES[scale])
         x = _sample(table, first, c, mask, u, v, SIZES[scale], CHANNELS)
         y = _sample(table, second, c, mask, u, w, SIZES[scale], CHANNELS)

@@ -1,10 +1,14 @@
-"""The page that shows a scene in 3D: one file (`fprf restyle --page`), or served with a scene behind it (`fprf view`).
+"""The page that shows a scene in 3D: one file (`fprf restyle --page`), or served with a scene behind it
+(`fprf view`).
 
-- What browsers run: `web/` (`splats.js` draws, `place.js` moves, `page.js` has the controls: every page has these,
-  `stage.html` and `page.css`; `page.html` is the file that one sends; `live.*`, `panel.html`, `start.js` are the served page).
+- What browsers run: `web/` (`splats.js` draws, `place.js` moves, `page.js` has the controls: every page has
+  these, `stage.html` and `page.css`; `page.html` is the file that one sends; `live.*`, `panel.html`,
+  `start.js` are the served page).
 - Gaussians as bytes: `pack.py`. The page as one file: `writer.py`.
-- Who may connect, and with what: `server.py`, `messages.py`. Photographs and files that come: `uploads.py`, `start.py`.
-- What is shown, as values: `state.py`. The scene that is open, its photographs and its training: `session.py`.
+- Who may connect, and with what: `server.py`, `messages.py`. Photographs and files that come: `uploads.py`,
+  `start.py`.
+- What is shown, as values: `state.py`. The scene that is open, its photographs and its training:
+  `session.py`.
 - Its styles, and what they show, drawn step by step: `drawing.py`, in the thread of `render_worker.py`.
 """
 

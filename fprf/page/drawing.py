@@ -1,11 +1,13 @@
-"""Looks on one scene, and their pictures and colours for clients: browsers draw Gaussians themselves, all else is drawn here.
+"""Looks on one scene, and their pictures and colours for clients: browsers draw Gaussians themselves, all
+else is drawn here.
 
-A moving camera must see something at once, a camera at rest everything: a new camera gets a small picture, then the
-whole one. What a client's last view holds is kept, so that a slider that is moved while the camera rests costs decoding alone.
+A moving camera must see something at once, a camera at rest everything: a new camera gets a small picture,
+then the whole one. What a client's last view holds is kept, so that a slider that is moved while the camera
+rests costs decoding alone.
 
-Films: keyframes that were set on the page become an mp4 in the run's folder. A film's folder holds what `fprf render` takes:
-`path.json` (a camera path), `keys.json` (styles by frame) and the styles with their photographs. The film is rendered from
-these very files, so the same command makes it again, at any size.
+Films: keyframes that were set on the page become an mp4 in the run's folder. A film's folder holds what `fprf
+render` takes: `path.json` (a camera path), `keys.json` (styles by frame) and the styles with their
+photographs. The film is rendered from these very files, so the same command makes it again, at any size.
 """
 
 import shutil
@@ -56,7 +58,8 @@ STRIP = 4096
 """Pixels of a step, or those of one row: after each one a newer request may take over."""
 _PREVIEW = 6
 """Factor by which the first picture of a new camera is smaller."""
-_MIN_CANVAS, _MAX_CANVAS = 8, 4096
+_MIN_CANVAS = 8
+_MAX_CANVAS = 4096
 """Longer sides of pictures, in pixels."""
 _NO_MATCH = 0.5
 """Grey of the map of matches without a style."""
@@ -67,9 +70,11 @@ _UNSURE = 0.45
 
 
 class Restyler:
-    """Looks as styles on one scene; runs on the render worker alone. Encoders are opened when they are first needed.
+    """Looks as styles on one scene; runs on the render worker alone. Encoders are opened when they are first
+    needed.
 
-    A photograph is encoded when it comes and clustered once for each number of clusters: a slider costs the stylizer alone.
+    A photograph is encoded when it comes and clustered once for each number of clusters: a slider costs the
+    stylizer alone.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -90,7 +95,8 @@ class Restyler:
 
     def reload(self, scene: Scene) -> SceneStyle | None:
         """Replace the scene, and with it its style; return the style from before, if there was one."""
-        self.scene, self._stale = scene, True
+        self.scene = scene
+        self._stale = True
         self._styles.clear()
         return None if self._encoders is None else self._encoders.scene_style
 
@@ -98,20 +104,31 @@ class Restyler:
         """Encode a photograph. Raises DataError for an unreadable one."""
         reference = encode_photograph(path, self.encoders, name=name)
         self._photographs += 1
-        return Photograph(self._photographs, name, path, shrink(load_image(path, upright=True), _THUMBNAIL), reference)
+        return Photograph(
+            self._photographs, name, path, shrink(load_image(path, upright=True), _THUMBNAIL), reference
+        )
 
     def styled(self, look: Look) -> Styled | None:
-        """The look on the scene; None for the scene as it is. Raises UsageError for rules that contradict each other."""
+        """The look on the scene; None for the scene as it is. Raises UsageError for rules that contradict
+        each other.
+        """
         if look.plain:
             return None
 
         def made() -> Styled:
-            # Each photograph is clustered once; a mix is their dictionaries side by side under the mix's weights.
+            # Each photograph is clustered once; a mix is their dictionaries side by side under the mix's
+            # weights.
             style = look.config()
-            clusters, blend, parts = style.clusters, style.blend, []
+            clusters = style.clusters
+            blend = style.blend
+            parts = []
             for photograph, _ in look.mix:
                 cluster = partial(
-                    build_dictionary, [photograph.reference], clusters=clusters, blend=blend, seed=self.encoders.seed
+                    build_dictionary,
+                    [photograph.reference],
+                    clusters=clusters,
+                    blend=blend,
+                    seed=self.encoders.seed,
                 )
                 parts.append(_recalled(self._dictionaries, (photograph, clusters, blend), cluster))
             dictionary = concatenate(parts, labels(style.references), [weight for _, weight in look.mix])
@@ -121,8 +138,12 @@ class Restyler:
 
     def retain(self, photographs: Collection[Photograph]) -> None:
         """Drop what is kept for any other photograph."""
-        self._dictionaries = {key: value for key, value in self._dictionaries.items() if key[0] in photographs}
-        self._styles = {look: value for look, value in self._styles.items() if {*dict(look.mix)} <= {*photographs}}
+        self._dictionaries = {
+            key: value for key, value in self._dictionaries.items() if key[0] in photographs
+        }
+        self._styles = {
+            look: value for look, value in self._styles.items() if {*dict(look.mix)} <= {*photographs}
+        }
 
     def restyle(self, look: Look) -> Restyle | None:
         """The look for a renderer."""
@@ -130,7 +151,9 @@ class Restyler:
         return None if styled is None else styled.restyle
 
     def region_at(self, cameras: Cameras, pixel: tuple[float, float]) -> int | None:
-        """The region at a pixel of the first camera, which lies within its view; None where there is nothing."""
+        """The region at a pixel of the first camera, which lies within its view; None where there is
+        nothing.
+        """
         # The region of the pixel's strongest membership, by the features that the ray sees.
         place = torch.tensor([pixel], dtype=torch.float64)
         share, opacity = memberships(self.scene, self.encoders.scene_style, cameras, 0, place)
@@ -139,12 +162,15 @@ class Restyler:
     def region_info(self, look: Look, region: int) -> RegionInfo:
         """Return the style that a region takes in a look."""
         # A region stands for its points: its key is matched as they are.
-        scene, styled = self.encoders.scene_style, self.styled(look)
+        scene = self.encoders.scene_style
+        styled = self.styled(look)
         taken: list[tuple[str, float]] = []
         if styled is not None:
             # What the region's key takes of each code, summed by photograph.
             attention = styled.restyle.match(scene.keys[region : region + 1].to(self.scene.device))[0].cpu()
-            shares = torch.zeros(len(styled.codes.names)).index_add_(0, styled.codes.reference, attention.float())
+            shares = torch.zeros(len(styled.codes.names)).index_add_(
+                0, styled.codes.reference, attention.float()
+            )
             names = [photograph.name for photograph, _ in look.mix]
             taken = sorted(zip(names, shares.tolist(), strict=True), key=lambda row: -row[1])
         return RegionInfo(region, float(scene.share[region]), tuple(taken))
@@ -174,7 +200,8 @@ def gaussian_colours(scene: SplatScene, packed: Packed, restyler: Restyler, show
     if shown.map == "none" and shown.region is None:
         return packed.colours(harmonics, rounds=2)
     # Maps are flat colours in the place of harmonics: what each Gaussian's features match.
-    features, solid = scene.found().features.float(), torch.ones(len(scene.gaussians))
+    features = scene.found().features.float()
+    solid = torch.ones(len(scene.gaussians))
     colours = 0.5 + HARMONIC * harmonics[:, 0]
 
     def match(restyle: Restyle) -> Tensor:
@@ -192,15 +219,20 @@ def _mapped(
     match: Callable[[Restyle], Annotated[Tensor, "N T"]],
     memberships: Callable[[], Annotated[Tensor, "N K"]],
 ) -> Annotated[Tensor, "N 3"]:
-    """Colours of a map of matches or regions in the place of those of the look, and one region lit up among them."""
+    """Colours of a map of matches or regions in the place of those of the look, and one region lit up among
+    them.
+    """
     if shown.map == "matches":
         if styled is None:
             colours = torch.full((len(opacity), 3), _NO_MATCH)
         else:
-            # Colours of the references, by what is taken of each code. The rest is what the look leaves as it is.
-            taken, codes = match(styled.restyle), styled.codes
+            # Colours of the references, by what is taken of each code. The rest is what the look leaves as it
+            # is.
+            taken = match(styled.restyle)
+            codes = styled.codes
             total = taken.sum(-1, keepdim=True)
-            attention, kept = taken / total.clamp_min(1e-10), (1 - total[:, 0]).clamp(0, 1)
+            attention = taken / total.clamp_min(1e-10)
+            kept = (1 - total[:, 0]).clamp(0, 1)
             picture = match_image(attention[None], codes.reference, codes.names, opacity[None], kept[None])[0]
             colours = torch.from_numpy(np.ascontiguousarray(picture)).float() / 255
     if shown.map != "regions" and shown.region is None:
@@ -229,9 +261,16 @@ class ScenePainter:
     """
 
     def __init__(
-        self, scene: Scene, restyler: Restyler, show: Callable[[Hashable, str, Picture, bool], None], longest: int
+        self,
+        scene: Scene,
+        restyler: Restyler,
+        show: Callable[[Hashable, str, Picture, bool], None],
+        longest: int,
     ) -> None:
-        self._scene, self._restyler, self._show, self._longest = scene, restyler, show, longest
+        self._scene = scene
+        self._restyler = restyler
+        self._show = show
+        self._longest = longest
         # Of each client's last view: its camera, and the strips of the whole picture.
         self._views: dict[Hashable, tuple[Camera, list[SceneView]]] = {}
 
@@ -278,7 +317,9 @@ class ScenePainter:
         def match(restyle: Restyle) -> Tensor:
             return strip.paint(restyle.match)
 
-        return _mapped(view.rgb.view(-1, 3), view.opacity.view(-1), shown, styled, match, memberships).view_as(view.rgb)
+        return _mapped(
+            view.rgb.view(-1, 3), view.opacity.view(-1), shown, styled, match, memberships
+        ).view_as(view.rgb)
 
 
 def _strips(scene: Scene, cameras: Cameras) -> Iterator[SceneView]:
@@ -291,7 +332,8 @@ def _strips(scene: Scene, cameras: Cameras) -> Iterator[SceneView]:
 
 
 def cameras_of(cameras: Sequence[Camera], size: tuple[int, int] | None = None, longest: int = 640) -> Cameras:
-    """Pinhole cameras of one size: `size`, or the shape of the first one's canvas, `longest` pixels at its longer side.
+    """Pinhole cameras of one size: `size`, or the shape of the first one's canvas, `longest` pixels at its
+    longer side.
 
     Each keeps its vertical angle. Raises UsageError for axes that are no rotation.
     """
@@ -299,10 +341,15 @@ def cameras_of(cameras: Sequence[Camera], size: tuple[int, int] | None = None, l
         width, height = cameras[0].size
         by = max(_MIN_CANVAS, min(longest, _MAX_CANVAS)) / max(width, height)
         size = (max(1, round(width * by)), max(1, round(height * by)))
-    poses, focal, centre = [], [], []
+    poses = []
+    focal = []
+    centre = []
     for camera in cameras:
         axes = torch.tensor(camera.axes, dtype=torch.float64)
-        if not torch.allclose(axes @ axes.T, torch.eye(3).double(), atol=1e-3) or float(torch.linalg.det(axes)) < 0:
+        if (
+            not torch.allclose(axes @ axes.T, torch.eye(3).double(), atol=1e-3)
+            or float(torch.linalg.det(axes)) < 0
+        ):
             raise UsageError("camera: its axes are no rotation")
         # Rows right, down, forward; a pose has columns right, up, back.
         turn = axes.T * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
@@ -316,7 +363,8 @@ def cameras_of(cameras: Sequence[Camera], size: tuple[int, int] | None = None, l
     return replace(ideal_cameras(torch.stack(poses), 1.0, size), focal=focals, centre=centres)
 
 
-FPS, FILM_SIDE = 24.0, 960
+FPS = 24.0
+FILM_SIDE = 960
 """Frames a second of a film, and its longest side in pixels."""
 _MAX_SECONDS = 600.0
 
@@ -343,8 +391,11 @@ def film_cameras(keys: Sequence[Key], seconds: float, side: int = FILM_SIDE) -> 
     return interpolate(cameras, torch.arange(len(keys)), film_gap(seconds) - 1)
 
 
-def write_film_files(folder: Path, keys: Sequence[Key], seconds: float, scene: Scene, side: int = FILM_SIDE) -> None:
-    """Write path.json, keys.json, and a folder a look with style.json and its photographs; the folder is made.
+def write_film_files(
+    folder: Path, keys: Sequence[Key], seconds: float, scene: Scene, side: int = FILM_SIDE
+) -> None:
+    """Write path.json, keys.json, and a folder a look with style.json and its photographs; the folder is
+    made.
 
     The path is in the capture's coordinates.
     """
@@ -370,7 +421,12 @@ def write_film_files(folder: Path, keys: Sequence[Key], seconds: float, scene: S
             looks[key.look] = path
         # A key without a look is the scene as captured.
         style = looks.get(key.look)
-        rows.append({"frame": i * film_gap(seconds), "style": None if style is None else str(style.relative_to(folder))})
+        rows.append(
+            {
+                "frame": i * film_gap(seconds),
+                "style": None if style is None else str(style.relative_to(folder)),
+            }
+        )
     write_json(folder / "keys.json", {"format": 1, "keyframes": rows})
 
 

@@ -21,7 +21,9 @@ Vector: TypeAlias = tuple[Number, Number, Number]
 Side: TypeAlias = Annotated[float, Meta(ge=1, le=8192)]
 Positive: TypeAlias = Annotated[float, Meta(gt=0, le=1e6)]
 
-Slider: TypeAlias = Literal["strength", "bold", "luminance", "clusters", "blend", "stylizer.temperature", "stylizer.smoothness"]
+Slider: TypeAlias = Literal[
+    "strength", "bold", "luminance", "clusters", "blend", "stylizer.temperature", "stylizer.smoothness"
+]
 """Fields of `StyleConfig` that the page shows, where its stylizer has them."""
 
 
@@ -41,7 +43,9 @@ class Message(Struct, tag=True, forbid_unknown_fields=True):
 
 
 class View(Message, tag="view"):
-    """A camera has moved, of a scene that is drawn here; with `captured` the scene as captured is shown beside the look."""
+    """A camera has moved, of a scene that is drawn here; with `captured` the scene as captured is shown
+    beside the look.
+    """
 
     camera: Camera
     captured: bool = False
@@ -150,7 +154,9 @@ _decoders: dict[Any, Any] = {kinds: msgspec.json.Decoder(kinds) for kinds in (An
 
 
 def read_message(text: str | bytes, kinds: Any = AnyMessage) -> Any:
-    """The message of a JSON text, of one of the `kinds`. Raises DataError unless the page could have sent it."""
+    """The message of a JSON text, of one of the `kinds`. Raises DataError unless the page could have sent
+    it.
+    """
     try:
         return _decoders[kinds].decode(text)
     except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:

@@ -1,6 +1,7 @@
 """Gaussians as the page draws them: 16 bytes for the shape of each, and 4 for its colours in each style.
 
-Letters: N Gaussians in Morton order, C chunks of 256 of them, K = (degree + 1)^2 harmonics a channel, of degree 2 at most.
+Letters: N Gaussians in Morton order, C chunks of 256 of them, K = (degree + 1)^2 harmonics a channel, of
+degree 2 at most.
 
 shape     N x 16 bytes: mean 3 x 16 bits and ln-scales 3 x 8 bits between the least and the most of the chunk, opacity 8 bits,
           quaternion 3 x 10 bits and 2 that say which component is left out, entry of the palette 16 bits
@@ -9,8 +10,9 @@ palette   E x (K - 1) x 4 signed bytes: harmonics above the constant one, b -> l
 colours   N x 4 bytes a style: mean colour between a least and a most, and which of the style's maps it takes
 maps      M x 9 floats a style: what becomes of the captured harmonics above the constant one, h' = h A
 
-A style changes colours by affine maps (`splats.restyle`), so its view dependence is that of the capture through one of at most
-256 matrices, and costs a byte. Compared with .sog, ranges by chunk keep 16 bits good for scenes of any extent.
+A style changes colours by affine maps (`splats.restyle`), so its view dependence is that of the capture
+through one of at most 256 matrices, and costs a byte. Compared with .sog, ranges by chunk keep 16 bits good
+for scenes of any extent.
 """
 
 import json
@@ -66,14 +68,16 @@ class Packed:
     """Magnitude of the palette's largest harmonic."""
 
     def colours(self, harmonics: Annotated[Tensor, "n K' 3"], rounds: int = 6) -> Colours:
-        """A style by the harmonics of all Gaussians that were given, in their order; harmonics that it lacks are 0.
+        """A style by the harmonics of all Gaussians that were given, in their order; harmonics that it lacks
+        are 0.
 
         `rounds` of fitting its maps: fewer for one that is shown at once, and soon replaced.
         """
         # Means between the least and the most of the style, 8 bits a channel.
         styled = harmonics[self.order, :_HARMONICS]
         mean = (0.5 + HARMONIC * styled[:, 0]).clamp(-1, 2).numpy()
-        low, high = mean.min(0), mean.max(0)
+        low = mean.min(0)
+        high = mean.max(0)
         rows = np.zeros((len(mean), 4), np.uint8)
         rows[:, :3] = steps((mean - low) / np.maximum(high - low, 1e-6), 255)
         # Harmonics above: none, as captured, or as captured through the map that fits best.
@@ -90,7 +94,8 @@ def pack(gaussians: Gaussians, entries: int = 4096) -> Packed:
     order = torch.from_numpy(spatial_order(gaussians.means.numpy()))
     gaussians = gaussians.select(order)
     count = len(gaussians)
-    means, log_scales = gaussians.means.numpy(), gaussians.log_scales.numpy().clip(-20, 20)
+    means = gaussians.means.numpy()
+    log_scales = gaussians.log_scales.numpy().clip(-20, 20)
     # A chunk holds neighbours, so that its own ranges make steps small where Gaussians lie close together.
     filled = np.minimum(np.arange(-(-count // CHUNK) * CHUNK), count - 1).reshape(-1, CHUNK)
     ranges = [(rows[filled].min(1), rows[filled].max(1)) for rows in (means, log_scales)]
@@ -99,7 +104,8 @@ def pack(gaussians: Gaussians, entries: int = 4096) -> Packed:
     for rows, (low, high), most in zip((means, log_scales), ranges, (65535, 255), strict=True):
         width = np.where(high > low, high - low, 1.0)
         parts.append(steps((rows - low[chunk]) / width[chunk], most))
-    # Words of 32 bits: two axes of the place; its third axis and the entry; the rotation; the size and the opacity.
+    # Words of 32 bits: two axes of the place; its third axis and the entry; the rotation; the size and the
+    # opacity.
     place, size = parts
     left_out, three = smallest_three(gaussians.quaternions.numpy())
     turn = steps(three / 2 + 0.5, 1023)
@@ -109,7 +115,9 @@ def pack(gaussians: Gaussians, entries: int = 4096) -> Packed:
     words[:, 0] = place[:, 0] | place[:, 1] << 16
     words[:, 1] = place[:, 2] | label << 16
     words[:, 2] = turn[:, 0] | turn[:, 1] << 10 | turn[:, 2] << 20 | left_out << 30
-    words[:, 3] = size[:, 0] | size[:, 1] << 8 | size[:, 2] << 16 | steps(gaussians.opacities.numpy(), 255) << 24
+    words[:, 3] = (
+        size[:, 0] | size[:, 1] << 8 | size[:, 2] << 16 | steps(gaussians.opacities.numpy(), 255) << 24
+    )
     chunks = np.concatenate([each for pair in ranges for each in pair], 1).astype(np.float32)
     return Packed(order, harmonics, words.view(np.uint8), chunks, palette, largest)
 
@@ -117,13 +125,17 @@ def pack(gaussians: Gaussians, entries: int = 4096) -> Packed:
 def _palette(
     rest: Annotated[Tensor, "N K-1 3"], entries: int
 ) -> tuple[Annotated[NDArray[np.int8], "E K-1 4"], NDArray[np.int64], float]:
-    """Entries, the one of each row, and the largest magnitude: k-means of k-means, or each row its own where there are few."""
-    count, coefficients = len(rest), rest.shape[1]
+    """Entries, the one of each row, and the largest magnitude: k-means of k-means, or each row its own where
+    there are few.
+    """
+    count = len(rest)
+    coefficients = rest.shape[1]
     if coefficients == 0:
         return np.zeros((0, 0, 4), np.int8), np.zeros(count, np.int64), 0.0
     rows = rest.flatten(1).float()
     if count <= entries:
-        book, label = rows, torch.arange(count)
+        book = rows
+        label = torch.arange(count)
     else:
         # Two levels: each row is compared with 2 sqrt(E) entries and not with E.
         side = math.isqrt(entries)
@@ -145,7 +157,9 @@ def _palette(
     return out, label.numpy(), largest
 
 
-def _clustered(rows: Annotated[Tensor, "N D"], count: int) -> tuple[Annotated[Tensor, "k D"], Annotated[Tensor, "N"]]:
+def _clustered(
+    rows: Annotated[Tensor, "N D"], count: int
+) -> tuple[Annotated[Tensor, "k D"], Annotated[Tensor, "N"]]:
     """At most `count` means of a sample of the rows (Lloyd's algorithm), and the nearest one of each row."""
     sample = rows[:: max(1, len(rows) // _SAMPLE)]
     book = sample[torch.linspace(0, len(sample) - 1, min(count, len(sample))).long()]
@@ -165,19 +179,25 @@ def _nearest(rows: Annotated[Tensor, "N D"], book: Annotated[Tensor, "E D"]) -> 
 
 
 def fit_maps(
-    before: Annotated[Tensor, "N K-1 3"], after: Annotated[Tensor, "N K-1 3"], rounds: int = 6, count: int = MAPS
+    before: Annotated[Tensor, "N K-1 3"],
+    after: Annotated[Tensor, "N K-1 3"],
+    rounds: int = 6,
+    count: int = MAPS,
 ) -> tuple[NDArray[np.uint8], Annotated[NDArray[np.float32], "M 9"]]:
-    """At most 256 matrices A, and for each row the one by which before A comes nearest to after, in least squares.
+    """At most 256 matrices A, and for each row the one by which before A comes nearest to after, in least
+    squares.
 
-    The error of a row is <G, A A^T> - 2 <H, A> + const with G = before^T before and H = before^T after: a product of 18
-    numbers, whatever K is.
+    The error of a row is <G, A A^T> - 2 <H, A> + const with G = before^T before and H = before^T after: a
+    product of 18 numbers, whatever K is.
     """
     grams = torch.einsum("nki,nkj->nij", before, before).flatten(1)
     crosses = torch.einsum("nki,nkj->nij", before, after).flatten(1)
     rows = torch.cat([grams, -2 * crosses], 1)
     # Start from the least-squares map of single rows, those of much view dependence first.
     weight = grams[:, [0, 4, 8]].sum(1)
-    some = weight.topk(min(len(weight), 64 * count)).indices[:: max(1, min(len(weight), 64 * count) // count)][: count - 1]
+    some = weight.topk(min(len(weight), 64 * count)).indices[
+        :: max(1, min(len(weight), 64 * count) // count)
+    ][: count - 1]
     ridge = 1e-2 * weight[some, None, None].clamp_min(1e-8) * torch.eye(3)
     maps = torch.linalg.solve(grams[some].view(-1, 3, 3) + ridge, crosses[some].view(-1, 3, 3) + ridge)
     maps = torch.cat([torch.eye(3)[None], maps])
@@ -222,6 +242,8 @@ def colour_header(colours: Colours) -> dict[str, Any]:
 
 
 def container(head: Mapping[str, Any], parts: Mapping[str, bytes]) -> bytes:
-    """One body of sections for HTTP: length of the JSON (4 bytes), JSON with each section's size, sections."""
+    """One body of sections for HTTP: length of the JSON (4 bytes), JSON with each section's size,
+    sections.
+    """
     text = json.dumps({**head, "sizes": {name: len(part) for name, part in parts.items()}}).encode()
     return len(text).to_bytes(4, "little") + text + b"".join(parts.values())

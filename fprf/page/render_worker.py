@@ -1,7 +1,8 @@
 """One thread for everything that touches the model, which it does step by step.
 
-Jobs are short and come first. Then clients take turns, a step each (a chunk of rays); what remains is for idle times. Newer
-work takes the place of older work of its name between two steps, so stale pictures never queue, however fast a camera moves.
+Jobs are short and come first. Then clients take turns, a step each (a chunk of rays); what remains is for
+idle times. Newer work takes the place of older work of its name between two steps, so stale pictures never
+queue, however fast a camera moves.
 """
 
 import contextlib
@@ -24,7 +25,8 @@ class RenderWorker:
     def __init__(self, on_error: Callable[[Exception], None]) -> None:
         self._on_error = on_error
         self._change = threading.Condition()
-        # Steps by their order and name, with what becomes of them; among those of the same order the first one is next.
+        # Steps by their order and name, with what becomes of them; among those of the same order the first
+        # one is next.
         self._work: dict[tuple[int, Hashable], tuple[Steps[Any], Future[Any]]] = {}
         self._dropped: list[Steps[Any]] = []
         self._closed = False
@@ -46,11 +48,15 @@ class RenderWorker:
         self._add((_IDLE, object()), steps).add_done_callback(self._report)
 
     def result(self, job: Callable[[], T]) -> T:
-        """Run a job from another thread and return its result. Raises what it raises, UsageError where the viewer ends."""
+        """Run a job from another thread and return its result. Raises what it raises, UsageError where the
+        viewer ends.
+        """
         return self._wait(self._add((_JOB, object()), _once(job)))
 
     def result_when_idle(self, steps: Steps[T]) -> T:
-        """Advance `steps` while no client waits, from another thread, and return their result. Raises as `result`."""
+        """Advance `steps` while no client waits, from another thread, and return their result. Raises as
+        `result`.
+        """
         return self._wait(self._add((_IDLE, object()), steps))
 
     def forget(self, client: Hashable) -> None:
@@ -79,7 +85,9 @@ class RenderWorker:
         return done
 
     def _drop(self, key: tuple[int, Hashable]) -> None:
-        """Take work out; its generator is closed by the thread that ran it, for it may be in the middle of a step."""
+        """Take work out; its generator is closed by the thread that ran it, for it may be in the middle of a
+        step.
+        """
         if (work := self._work.pop(key, None)) is not None:
             self._dropped.append(work[0])
             work[1].cancel()
@@ -120,7 +128,9 @@ class RenderWorker:
 
     def _report(self, done: "Future[Any]") -> None:
         if not done.cancelled() and isinstance(error := done.exception(), Exception):
-            with contextlib.suppress(Exception):  # reporting can fail too, as when the client has just disconnected
+            with contextlib.suppress(
+                Exception
+            ):  # reporting can fail too, as when the client has just disconnected
                 self._on_error(error)
 
     def _wait(self, done: "Future[T]") -> T:

@@ -1,7 +1,8 @@
 """The HTTP server of the viewer: who may connect, the page's requests, and its WebSocket of small messages.
 
-By default this machine alone may connect; from elsewhere a token is needed. A page of another site that is open in the same
-browser can send requests here, so Host must name this machine (DNS rebinding) and Origin must be our own page.
+By default this machine alone may connect; from elsewhere a token is needed. A page of another site that is
+open in the same browser can send requests here, so Host must name this machine (DNS rebinding) and Origin
+must be our own page.
 """
 
 import asyncio
@@ -44,7 +45,9 @@ _MIN_TOKEN = 16
 """Characters of a token that a user chooses."""
 _ANY_ADDRESS = ("0.0.0.0", "::")  # nosec B104  # recognised, never the default
 _TIMEOUT = 15.0
-"""Seconds for a request's head, for each further piece of a body, and for each piece of a response to be accepted."""
+"""Seconds for a request's head, for each further piece of a body, and for each piece of a response to be
+accepted.
+"""
 _MAX_HEAD = 16 << 10
 _CONNECTIONS = 64
 _PAGES = 24
@@ -82,7 +85,9 @@ class Access:
     """None = no token is needed."""
 
     def refusal(self, headers: Mapping[str, str], given: str | None = None) -> str | None:
-        """Return why a request is refused, or None. Header names are lower case; `given` is a token in the address."""
+        """Return why a request is refused, or None. Header names are lower case; `given` is a token in the
+        address.
+        """
         # A name that leads here by somebody else's DNS is not one of this machine (rebinding).
         name = headers.get("host", "")
         try:
@@ -91,7 +96,8 @@ class Access:
             host = ""
         if not name or (is_loopback(self.host) and not is_loopback(host)):
             return f"this viewer does not go by the name {name!r}; open it by the address that it printed"
-        # Browsers say whose page asks; programs that are no browser say nothing, and have the token alone to pass.
+        # Browsers say whose page asks; programs that are no browser say nothing, and have the token alone to
+        # pass.
         origin = headers.get("origin")
         if origin is not None and origin not in (f"http://{name}", f"https://{name}"):
             return "another site may not talk to this viewer"
@@ -106,15 +112,23 @@ class Access:
 
 
 def cookie_name(host: str) -> str:
-    """Name of the token's cookie under a Host header: with its port, since browsers send cookies to all ports of a host."""
+    """Name of the token's cookie under a Host header: with its port, since browsers send cookies to all ports
+    of a host.
+    """
     port = host.rpartition(":")[2]
     return f"fprf-token-{port if port.isdecimal() else 80}"
 
 
 def make_access(host: str, token: str | None) -> Access:
-    """Make a token where other machines can connect and none is given. Raises UsageError for one that is easily guessed."""
-    if token is not None and (len(token) < _MIN_TOKEN or not token.isascii() or not token.isprintable() or " " in token):
-        raise UsageError(f"--token: at least {_MIN_TOKEN} plain characters without spaces; leave it out and one is made")
+    """Make a token where other machines can connect and none is given. Raises UsageError for one that is
+    easily guessed.
+    """
+    if token is not None and (
+        len(token) < _MIN_TOKEN or not token.isascii() or not token.isprintable() or " " in token
+    ):
+        raise UsageError(
+            f"--token: at least {_MIN_TOKEN} plain characters without spaces; leave it out and one is made"
+        )
     if token is None and not is_loopback(host):
         token = secrets.token_urlsafe(24)
     return Access(host, token)
@@ -143,19 +157,23 @@ class _Protocol(H11Protocol):  # type: ignore[misc]  # uvicorn's types are not f
 
 
 class _GoneError(Exception):
-    """The client has gone or is too slow; no OSError, which is a fault of this machine that the client is told."""
+    """The client has gone or is too slow; no OSError, which is a fault of this machine that the client is
+    told.
+    """
 
 
 class Guard:
     """Middleware that answers nobody who may not ask, adds headers, and drops clients that do not read."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
-        self._app, self._access = app, access
+        self._app = app
+        self._access = access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Check a request or a WebSocket's handshake, and pass it on."""
         connection = HTTPConnection(scope)
-        given, refused = connection.query_params.get("token"), None
+        given = connection.query_params.get("token")
+        refused = None
         if any(len(connection.headers.getlist(name)) > 1 for name in ("host", "origin")):
             refused = (400, "the header host or origin comes twice")
         elif len(connection.query_params.multi_items()) > _MAX_FIELDS:
@@ -169,13 +187,16 @@ class Guard:
                 kept = [row for row in message["headers"] if row[0].decode().lower() not in _HEADERS]
                 message = {**message, "headers": [*kept, *added]}
             # A body goes in pieces, each of which the client must take in time.
-            body, start = message.get("body", b""), 0
+            body = message.get("body", b"")
+            start = 0
             try:
                 while len(body) - start > _PIECE:
                     piece = {"type": message["type"], "body": body[start : start + _PIECE], "more_body": True}
                     await asyncio.wait_for(send(piece), _TIMEOUT)
                     start += _PIECE
-                await asyncio.wait_for(send({**message, "body": body[start:]} if start else message), _TIMEOUT)
+                await asyncio.wait_for(
+                    send({**message, "body": body[start:]} if start else message), _TIMEOUT
+                )
             except OSError as error:
                 raise _GoneError from error
 
@@ -183,8 +204,8 @@ class Guard:
             if refused is not None:
                 await PlainTextResponse(f"{refused[1]}\n", refused[0])(scope, receive, patient)
             elif given is not None and scope["type"] == "http" and scope["method"] == "GET":
-                # Out of the address bar and its history. Lax: a link on another site opens the page too; what changes
-                # anything has an Origin, which is checked.
+                # Out of the address bar and its history. Lax: a link on another site opens the page too; what
+                # changes anything has an Origin, which is checked.
                 response = RedirectResponse(scope["path"], 303)
                 name = cookie_name(connection.headers.get("host", ""))
                 response.headers["set-cookie"] = f"{name}={given}; Path=/; HttpOnly; SameSite=Lax"
@@ -194,7 +215,9 @@ class Guard:
 
 
 class Client:
-    """A page's WebSocket: messages wait by their kind, a newer one takes the place of one that was not sent yet."""
+    """A page's WebSocket: messages wait by their kind, a newer one takes the place of one that was not sent
+    yet.
+    """
 
     def __init__(self) -> None:
         self._waiting: dict[str, str | bytes] = {}
@@ -213,14 +236,16 @@ class Client:
             self._news.clear()
             while self._waiting:
                 message = self._waiting.pop(next(iter(self._waiting)))
-                await (socket.send_bytes(message) if isinstance(message, bytes) else socket.send_text(message))
+                await (
+                    socket.send_bytes(message) if isinstance(message, bytes) else socket.send_text(message)
+                )
 
 
 class ViewerServer:
     """Listens in a thread of its own as soon as it is made; `port` 0 takes a free one. A context manager.
 
-    Shows that a scene is loading, a start page, or a scene. One request a connection; a client that breaks a rule loses its
-    connection and harms no other. Raises UsageError where the address cannot be listened on.
+    Shows that a scene is loading, a start page, or a scene. One request a connection; a client that breaks a
+    rule loses its connection and harms no other. Raises UsageError where the address cannot be listened on.
     """
 
     def __init__(self, access: Access, port: int) -> None:
@@ -233,15 +258,21 @@ class ViewerServer:
         self._uploads = asyncio.Semaphore(_UPLOADS)
         self._loop: asyncio.AbstractEventLoop | None = None
         try:
-            address = socket.getaddrinfo(access.host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+            address = socket.getaddrinfo(access.host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[
+                0
+            ]
             listener = socket.create_server(address[4][:2], family=address[0])
         except OSError as error:
             fault = f"--host {access.host} --port {port}: cannot listen there ({error.strerror}); choose another port"
             raise UsageError(fault) from error
         self.port: int = listener.getsockname()[1]
         # A mistake of the page's user, or what this machine cannot do, is a line in the answer.
-        wrong = dict.fromkeys((FprfError, OSError), lambda request, error: PlainTextResponse(_line(error), 400))
-        app = Starlette(routes=self._routes(), middleware=[Middleware(Guard, access=access)], exception_handlers=wrong)
+        wrong = dict.fromkeys(
+            (FprfError, OSError), lambda request, error: PlainTextResponse(_line(error), 400)
+        )
+        app = Starlette(
+            routes=self._routes(), middleware=[Middleware(Guard, access=access)], exception_handlers=wrong
+        )
         # Bounded connections, heads and messages; no proxy is believed, and nothing of a request is logged.
         config = uvicorn.Config(
             app,
@@ -261,7 +292,9 @@ class ViewerServer:
             h11_max_incomplete_event_size=_MAX_HEAD,
         )
         self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(target=self._server.run, args=([listener],), name="fprf-http", daemon=True)
+        self._thread = threading.Thread(
+            target=self._server.run, args=([listener],), name="fprf-http", daemon=True
+        )
         self._thread.start()
 
     def __enter__(self) -> "ViewerServer":
@@ -297,7 +330,8 @@ class ViewerServer:
         self.post(None, "said", {"type": "said", "text": text, "bad": False})
 
     def open(self, load: "Callable[[], Viewed]", *, warm: bool = True) -> "Session":
-        """Load a scene and show it in the place of what was shown, prepared for the first photograph if it is to be `warm`.
+        """Load a scene and show it in the place of what was shown, prepared for the first photograph if it is
+        to be `warm`.
 
         Raises what `load` raises, and DataError for an unreadable photograph.
         """
@@ -310,7 +344,9 @@ class ViewerServer:
             try:
                 session.upload(path.read_bytes(), path.name)
             except (DataError, OSError) as error:
-                why = error.strerror if isinstance(error, OSError) else str(error).removeprefix("photograph: ")
+                why = (
+                    error.strerror if isinstance(error, OSError) else str(error).removeprefix("photograph: ")
+                )
                 raise DataError(f"{path}: {why}") from error
         if warm:
             session.warm_up()
@@ -345,11 +381,15 @@ class ViewerServer:
 
     def _routes(self) -> list[BaseRoute]:
         # The stage of any page, with the panel of the served one.
-        stage = Template(read_asset("stage.html")).substitute(still="hidden", ratio="", facts=read_asset("panel.html"))
+        stage = Template(read_asset("stage.html")).substitute(
+            still="hidden", ratio="", facts=read_asset("panel.html")
+        )
         page = Template(read_asset("live.html")).substitute(stage=stage)
         return [
             Route("/", _asset("text/html", lambda: page)),
-            Route("/app.js", _asset("text/javascript", lambda: script("live.js", "start.js") + "\nlive();\n")),
+            Route(
+                "/app.js", _asset("text/javascript", lambda: script("live.js", "start.js") + "\nlive();\n")
+            ),
             Route("/app.css", _asset("text/css", lambda: read_asset("page.css") + read_asset("live.css"))),
             WebSocketRoute("/live", self._live),
             Route("/scene", self._scene),
@@ -368,7 +408,8 @@ class ViewerServer:
         await socket.accept()
         self._loop = asyncio.get_running_loop()
         # From here on it hears what is posted to all, beginning with what is shown now.
-        number, client = next(self._numbers), Client()
+        number = next(self._numbers)
+        client = Client()
         self._clients[number] = client
         for kind, message in self._hello():
             client.put(kind, json.dumps(message))
@@ -436,7 +477,8 @@ class ViewerServer:
         return FileResponse(path, filename=f"{self.session.viewed.name}-{name}")
 
     async def _photograph(self, request: Request) -> Response:
-        name, data = request.query_params.get("name", "photograph"), await self.body(request)
+        name = request.query_params.get("name", "photograph")
+        data = await self.body(request)
         photograph = await asyncio.to_thread(self.session.upload, data, name)
         return JSONResponse({"card": photograph.number, "name": photograph.name})
 
@@ -452,8 +494,14 @@ class ViewerServer:
         return JSONResponse(await asyncio.to_thread(self.start.handle, asked))
 
     async def _start_piece(self, request: Request) -> Response:
-        query, data = request.query_params, await self.body(request)
-        place = (query.get("scene", ""), query.get("name", ""), _integer(request, "at"), _integer(request, "size"))
+        query = request.query_params
+        data = await self.body(request)
+        place = (
+            query.get("scene", ""),
+            query.get("name", ""),
+            _integer(request, "at"),
+            _integer(request, "size"),
+        )
         await asyncio.to_thread(self.start.piece, *place, data)
         return JSONResponse({})
 
@@ -463,7 +511,9 @@ class ViewerServer:
         async with self._uploads:
             try:
                 async with asyncio.timeout(_TIMEOUT) as patience:
-                    size = int(request.headers.get("content-length", "0"))  # digits: the parser refuses others
+                    size = int(
+                        request.headers.get("content-length", "0")
+                    )  # digits: the parser refuses others
                     stream = request.stream()
                     while size <= _MAX_BODY:
                         if (piece := await anext(stream, None)) is None:
@@ -478,7 +528,9 @@ class ViewerServer:
 
 def _line(error: Exception) -> str:
     """The text of an error for the client; of an OSError its file and reason."""
-    return f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
+    return (
+        f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
+    )
 
 
 def _integer(request: Request, name: str) -> int:

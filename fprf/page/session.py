@@ -1,9 +1,10 @@
-"""The scene that is viewed: its state (`state.py`), its clients' requests, its photographs, films and training.
+"""The scene that is viewed: its state (`state.py`), its clients' requests, its photographs, films and
+training.
 
-Calls come from any thread. What touches the model runs on the render worker; clients learn of the results by messages, of which
-a newer one of the same kind takes the place of one that was not sent yet. The run folder is the only channel to a training: its
-newest checkpoint is shown, and as long as somebody looks the folder says so (`training.driver.watch`), for which training saves
-more often.
+Calls come from any thread. What touches the model runs on the render worker; clients learn of the results by
+messages, of which a newer one of the same kind takes the place of one that was not sent yet. The run folder
+is the only channel to a training: its newest checkpoint is shown, and as long as somebody looks the folder
+says so (`training.driver.watch`), for which training saves more often.
 """
 
 import secrets
@@ -69,7 +70,9 @@ class Viewed:
     step: int = 0
     """Step of the checkpoint that it was read from."""
     references: tuple[Path, ...] = ()
-    """Photographs that are on the shelf at the beginning; several are mixed, and those that come later join them."""
+    """Photographs that are on the shelf at the beginning; several are mixed, and those that come later join
+    them.
+    """
     pixels: int = 640
     """Longest side of the sharpest picture."""
 
@@ -84,7 +87,8 @@ class Session:
     """Use as a context manager, which ends its threads and processes."""
 
     def __init__(self, viewed: Viewed, post: Post) -> None:
-        self.viewed, self._post = viewed, post
+        self.viewed = viewed
+        self._post = post
         self._key = secrets.token_hex(8)
         """Tells pages that a server's scene is another one, also after the server was started anew."""
         self.restyler = Restyler(viewed.scene)
@@ -110,7 +114,8 @@ class Session:
 
     def _load(self) -> None:
         """Prepare what browsers are sent of Gaussians, or the painter of any other scene."""
-        scene, home = self.viewed.scene, self.viewed.home
+        scene = self.viewed.scene
+        home = self.viewed.home
         if isinstance(scene, SplatScene):
             # Shapes and captured colours go to browsers once.
             self.packed, head, parts = packed_scene(scene, [scene.gaussians.harmonics], home, level=1)
@@ -124,8 +129,15 @@ class Session:
 
     def hello(self) -> list[tuple[str, dict[str, Any]]]:
         """What a new client has to know."""
-        drawn_there, viewed = isinstance(self.viewed.scene, SplatScene), self.viewed
-        scene = {"type": "scene", "key": self._key, "name": viewed.name, "gaussians": drawn_there, "step": viewed.step}
+        drawn_there = isinstance(self.viewed.scene, SplatScene)
+        viewed = self.viewed
+        scene = {
+            "type": "scene",
+            "key": self._key,
+            "name": viewed.name,
+            "gaussians": drawn_there,
+            "step": viewed.step,
+        }
         coloured = [*self._colours.items()]  # the worker goes on changing them
         ready = [(f"colours {name}", _colours_message(name, version)) for name, (version, _) in coloured]
         training = [] if self._progress is None else [("training", self._progress)]
@@ -175,12 +187,14 @@ class Session:
         """Replace the state for all clients. Raises what `change` raises."""
         # Clients change the state one after the other, each what the one before it left.
         with self._lock:
-            before, self.state = self.state, change(self.state)
+            before = self.state
+            self.state = change(self.state)
             now = self.state
         if now.picked is not None and now.look != before.look:
             region = now.picked.region  # what it takes has changed
             self._worker.run("select", lambda: self._select(region))
-        # What is seen is drawn again only where it is another; names and lists of the page cost a message alone.
+        # What is seen is drawn again only where it is another; names and lists of the page cost a message
+        # alone.
         if now.shown != before.shown:
             self._refresh()
         if now != before:
@@ -193,7 +207,8 @@ class Session:
         def add() -> Photograph:
             photograph = self.restyler.encode(path, self.state.unused_name(shown_name(name)))
             self.apply(lambda state: state.added(photograph))
-            # Photographs that left the shelf and that no look needs go, with what was made of them: some 6 MB each.
+            # Photographs that left the shelf and that no look needs go, with what was made of them: some 6 MB
+            # each.
             used = self.state.in_use | frozenset(self.state.shelf)
             for gone in {*self._photographs, photograph} - used:
                 gone.path.unlink(missing_ok=True)
@@ -212,7 +227,9 @@ class Session:
             yield
             # A gradient in the place of a photograph: all that a drop runs is loaded and compiled by it.
             path = self.uploads.folder / "warm-up.png"
-            path.write_bytes(encode(np.linspace(0, 255, 96 * 128 * 3).reshape(96, 128, 3).astype(np.uint8), "png"))
+            path.write_bytes(
+                encode(np.linspace(0, 255, 96 * 128 * 3).reshape(96, 128, 3).astype(np.uint8), "png")
+            )
             photograph = self.restyler.encode(path, "warm-up")
             yield
             styled = self.restyler.styled(Look(style=self.viewed.style).mixed([(photograph, 1.0)]))
@@ -230,7 +247,8 @@ class Session:
             self.viewed = viewed
             before = self.restyler.reload(viewed.scene)
             self._load()
-            # Clients fetch shapes and colours anew: Gaussians of this state are others. What had colours is coloured again.
+            # Clients fetch shapes and colours anew: Gaussians of this state are others. What had colours is
+            # coloured again.
             coloured = [*self._colours]
             self._colours.clear()
             for kind, message in self.hello():
@@ -256,26 +274,37 @@ class Session:
         self._post(None, "training", self._progress)
 
     def colours(self, name: str) -> bytes:
-        """Colours of the present look or of a kept one, for a browser. Raises UsageError where there are none."""
+        """Colours of the present look or of a kept one, for a browser. Raises UsageError where there are
+        none.
+        """
         if (found := self._colours.get(name)) is None:
             raise UsageError(f"{name}: no such colours")
         return found[1]
 
     def gaussians(self) -> Path:
         """The Gaussians in the look of now, as a .ply file. Raises UsageError for a scene without any."""
-        viewed, scene = self.viewed, self.viewed.scene
+        viewed = self.viewed
+        scene = self.viewed.scene
         if not isinstance(scene, SplatScene):
             raise UsageError(f"{viewed.name}: no Gaussians; `fprf export` makes some of a field")
 
         def written() -> Path:
-            # Under a name of its own: another page may still be reading the one before, which its open file keeps.
+            # Under a name of its own: another page may still be reading the one before, which its open file
+            # keeps.
             for before in self.uploads.folder.glob("restyled-*.ply"):
                 before.unlink()
             path = self.uploads.folder / f"restyled-{next(self._version)}.ply"
             shown = scene.restyled(self.restyler.restyle(self.state.look)).shown
             # Of a capture all but the colours stays as it was in its file.
             if viewed.capture is None:
-                write_gaussians(path, shown, antialiased=scene.antialiased, views=scene.views, plain=True, origin=scene.origin)
+                write_gaussians(
+                    path,
+                    shown,
+                    antialiased=scene.antialiased,
+                    views=scene.views,
+                    plain=True,
+                    origin=scene.origin,
+                )
             else:
                 write_capture(path, viewed.capture, shown.harmonics)
             return path
@@ -305,7 +334,10 @@ class Session:
         assert isinstance(scene, SplatScene)
         colours = gaussian_colours(scene, self.packed, self.restyler, shown)
         version = next(self._version)
-        self._colours[name] = (version, container(colour_header(colours), {"rows": colour_section(colours, 1)}))
+        self._colours[name] = (
+            version,
+            container(colour_header(colours), {"rows": colour_section(colours, 1)}),
+        )
         self._post(None, f"colours {name}", _colours_message(name, version))
 
     def _select(self, region: int | None) -> None:
@@ -319,7 +351,8 @@ class Session:
                 raise UsageError("film: one is being made; wait for it")
             if self.viewed.root is None:
                 raise UsageError("this scene has no folder to put a film in")
-            films, scene = self.viewed.root / "films", self.viewed.scene
+            films = self.viewed.root / "films"
+            scene = self.viewed.scene
             folder = next(each for number in count(1) if not (each := films / f"{number:04d}").exists())
             write_film_files(folder, self.state.keys, seconds, scene)
             self.apply(lambda state: replace(state, film=(0, 1, None)))
@@ -360,11 +393,17 @@ _POLL = 0.5
 class TrainingFollower:
     """Keeps the scene that a server shows at the newest checkpoint of a run.
 
-    `load` opens the run, and `opened` is the session where it is open already; without, it is opened at the first checkpoint.
+    `load` opens the run, and `opened` is the session where it is open already; without, it is opened at the
+    first checkpoint.
     """
 
-    def __init__(self, server: "ViewerServer", root: Path, load: Callable[[], Viewed], opened: Session | None = None) -> None:
-        self._server, self._root, self._load, self.session = server, root, load, opened
+    def __init__(
+        self, server: "ViewerServer", root: Path, load: Callable[[], Viewed], opened: Session | None = None
+    ) -> None:
+        self._server = server
+        self._root = root
+        self._load = load
+        self.session = opened
         self._shown = -1 if opened is None else opened.viewed.step
 
     def run(self, ended: threading.Event) -> None:

@@ -1,8 +1,9 @@
-"""The start of `fprf view` without a run: photographs, a video or a capture come in, and become a scene that the viewer shows.
+"""The start of `fprf view` without a run: photographs, a video or a capture come in, and become a scene that
+the viewer shows.
 
-Poses and training are `fprf process` and `fprf train` in processes of their own; the page shows the lines that they print, and
-from the first checkpoint on the scene itself (`session.py`). A scene has one folder: its `files`, the `scene` with
-their poses, and the run folder `run`.
+Poses and training are `fprf process` and `fprf train` in processes of their own; the page shows the lines
+that they print, and from the first checkpoint on the scene itself (`session.py`). A scene has one folder: its
+`files`, the `scene` with their poses, and the run folder `run`.
 """
 
 import contextlib
@@ -29,7 +30,9 @@ if TYPE_CHECKING:
     from .session import Viewed
 
 METHOD = "fprf-splats"
-_FILES, _SCENE, _RUN = "files", "scene", "run"
+_FILES = "files"
+_SCENE = "scene"
+_RUN = "run"
 _LINES = 40
 """Lines of a process that are kept."""
 _RECENT = 12
@@ -62,10 +65,14 @@ class _Left(Exception):
 
 
 class Start:
-    """`output` holds a folder a scene; `load` opens a run folder or a capture under a name, for the `server` to show."""
+    """`output` holds a folder a scene; `load` opens a run folder or a capture under a name, for the `server`
+    to show.
+    """
 
     def __init__(self, output: Path, server: "ViewerServer", load: "Callable[[Path, str], Viewed]") -> None:
-        self._output, self._server, self._load = output.resolve(), server, load
+        self._output = output.resolve()
+        self._server = server
+        self._load = load
         self._uploads: dict[str, SceneFiles] = {}
         self._progress = Progress()
         self._lock = threading.Lock()
@@ -87,24 +94,30 @@ class Start:
         return {"type": "start", **asdict(progress), "output": str(self._output), "recent": recent}
 
     def handle(self, asked: StartRequest) -> dict[str, str]:
-        """Do what the page asks for. Raises UsageError or DataError where no scene can be made of what is named."""
+        """Do what the page asks for. Raises UsageError or DataError where no scene can be made of what is
+        named.
+        """
         match asked:
             case New():
                 name = self._unused(asked.name)
                 self._uploads[name] = SceneFiles(self._output / name / _FILES)
                 return {"scene": name}
             case Make():
-                # The folder came with the first file that was taken: none of those that were sent may have been.
+                # The folder came with the first file that was taken: none of those that were sent may have
+                # been.
                 folder = self._upload(asked.scene).folder
                 if not folder.is_dir():
-                    raise UsageError("none of these files can become a scene; give photographs, a video or a capture")
+                    raise UsageError(
+                        "none of these files can become a scene; give photographs, a video or a capture"
+                    )
                 self._begin(find_source(folder), asked.scene, asked.minutes)
             case Open():
                 # A file or folder of this machine, by its path as it is copied from elsewhere.
                 if not (text := asked.path.strip().strip("\"'")):
                     raise UsageError("name a run folder, a capture, a video or a folder of photographs")
                 path = Path(os.path.expanduser(text))  # as it is where there is no such user
-                source, whole = find_source(path), path.resolve()
+                source = find_source(path)
+                whole = path.resolve()
                 if source.kind == "run":
                     name = whole.parent.name if whole.name == _RUN else whole.name
                 else:
@@ -132,19 +145,25 @@ class Start:
         with self._lock:
             if self._busy:
                 name = self._progress.name  # none after `leave`, while what there is of it is saved
-                raise UsageError(f"{name} is being made; stop it first" if name else "a scene is being saved; try again")
+                raise UsageError(
+                    f"{name} is being made; stop it first" if name else "a scene is being saved; try again"
+                )
             # One scene is made at a time: training takes all cores.
             self._stopped = ""
             folder = self._output / name if source.kind != "run" else source.path
             self._progress = Progress(name=name, stage="opening", folder=str(folder))
-            self._thread = threading.Thread(target=self._make, args=(source, name, minutes), name="fprf-make", daemon=True)
+            self._thread = threading.Thread(
+                target=self._make, args=(source, name, minutes), name="fprf-make", daemon=True
+            )
             self._thread.start()
         self._server.post(None, "start", self.state())
 
     def _make(self, source: Source, name: str, minutes: float) -> None:
         """Find poses, train, and open the viewer, as far as the source needs it."""
-        root, path = self._output / name, source.path
-        # Each stage works on the folder that the one before made, and a source enters where it has what is needed.
+        root = self._output / name
+        path = source.path
+        # Each stage works on the folder that the one before made, and a source enters where it has what is
+        # needed.
         try:
             if source.kind in ("photographs", "video"):
                 self._set(stage="poses", what="looking at the photographs")
@@ -171,7 +190,8 @@ class Start:
         """Train a scene; from its first checkpoint on the viewer shows it."""
         from .session import TrainingFollower
 
-        load, ended = partial(self._load, run, name), threading.Event()
+        load = partial(self._load, run, name)
+        ended = threading.Event()
         follower = TrainingFollower(self._server, run, load)
         following = threading.Thread(target=follower.run, args=(ended,), name="fprf-follow", daemon=True)
         following.start()
@@ -187,11 +207,14 @@ class Start:
             self._server.open(load)
 
     def _call(self, args: Sequence[str]) -> None:
-        """Run a verb to its end. Raises DataError with what it says when it fails, `_Left` when it is to be left."""
+        """Run a verb to its end. Raises DataError with what it says when it fails, `_Left` when it is to be
+        left.
+        """
         if bool(self._stopped):  # not narrowed by mypy: another thread sets it
             raise _Left
         command = [sys.executable, "-m", "fprf", *args]
-        # A group of its own: an interrupt at the terminal is ours alone, and a second one would end it before it has saved.
+        # A group of its own: an interrupt at the terminal is ours alone, and a second one would end it before
+        # it has saved.
         with subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
@@ -210,12 +233,15 @@ class Start:
                     last = line.strip()
                     self._read(last)
         self._process = None
-        # An interrupted training has saved what there was, if there was anything; nothing else is worth going on with.
+        # An interrupted training has saved what there was, if there was anything; nothing else is worth going
+        # on with.
         saved = args[0] == "train" and newest_step(Path(args[args.index("--output") + 1])) >= 0
         if self._stopped == "leave" or (self._stopped and not saved):
             raise _Left
         if process.returncode and not self._stopped:
-            raise DataError(last.removeprefix("error: ") or f"fprf {args[0]} has ended with {process.returncode}")
+            raise DataError(
+                last.removeprefix("error: ") or f"fprf {args[0]} has ended with {process.returncode}"
+            )
 
     def _read(self, line: str) -> None:
         """Take a line that a process printed: progress as JSON, or a message."""
@@ -227,10 +253,15 @@ class Start:
             self._set(lines=(*self._progress.lines, line)[-_LINES:])
             return
         what = str(event["event"])
-        # Training tells its step and clock, other verbs how much of something is done; anything else is a line to read.
+        # Training tells its step and clock, other verbs how much of something is done; anything else is a
+        # line to read.
         if "step" in event:
             clock = f"{event['seconds_left'] // 60}:{event['seconds_left'] % 60:02d} left"
-            self._set(what=what, share=event["share"], detail=f"step {event['step']} · {event['psnr']:.1f} dB · {clock}")
+            self._set(
+                what=what,
+                share=event["share"],
+                detail=f"step {event['step']} · {event['psnr']:.1f} dB · {clock}",
+            )
         elif "total" in event:
             share = event["done"] / max(1, event["total"])
             self._set(what=what, share=share, detail=f"{event['done']} of {event['total']}")
@@ -266,14 +297,22 @@ class Start:
         plain = "".join(c if c.isalnum() or c in "-_" else "-" for c in last)[:40].strip("-") or "scene"
         # A number is added until no folder and no upload has the name.
         names = (plain if k == 1 else f"{plain}-{k}" for k in count(1))
-        return next(name for name in names if name not in self._uploads and not (self._output / name).exists())
+        return next(
+            name for name in names if name not in self._uploads and not (self._output / name).exists()
+        )
 
     def _recent(self) -> list[dict[str, str]]:
         """Scenes and runs on this machine, the newest first."""
         # Runs of the terminal lie in `runs`, that of the demo in its folder.
-        runs = [(path.parent, path.parent.name) for path in Path("runs").glob("*/config.json") if newest_step(path.parent) >= 0]
+        runs = [
+            (path.parent, path.parent.name)
+            for path in Path("runs").glob("*/config.json")
+            if newest_step(path.parent) >= 0
+        ]
         found = [*runs, (Path("demo/run"), "demo")]
-        for folder in self._output.glob("*/"):  # a scene's run, and its files where training has not come to its end
+        for folder in self._output.glob(
+            "*/"
+        ):  # a scene's run, and its files where training has not come to its end
             run, files, scene = (folder / part for part in (_RUN, _FILES, _SCENE))
             trained = newest_step(run) >= 0
             progress = training_progress(run) if trained else {"share": 0}

@@ -1,7 +1,8 @@
-"""State of the page as immutable values: looks, the shelf of photographs, keyframes; and the changes that messages make.
+"""State of the page as immutable values: looks, the shelf of photographs, keyframes; and the changes that
+messages make.
 
-A look says how a scene is coloured: `StyleConfig` holds what the sliders set, `Look.config` is the whole style in the terms of
-`style.json`.
+A look says how a scene is coloured: `StyleConfig` holds what the sliders set, `Look.config` is the whole
+style in the terms of `style.json`.
 """
 
 from collections.abc import Iterable, Sequence
@@ -78,7 +79,9 @@ class Look:
     def mixed(self, mix: Iterable[tuple[Photograph, float]]) -> "Look":
         """The look with other photographs; rules that name a photograph that is not among them go."""
         mix = tuple(mix)
-        rules = frozenset(rule for rule in self.rules if rule.photograph is None or rule.photograph in dict(mix))
+        rules = frozenset(
+            rule for rule in self.rules if rule.photograph is None or rule.photograph in dict(mix)
+        )
         return replace(self, mix=mix, rules=rules)
 
     def weighted(self, photograph: Photograph, weight: float, shelf: Iterable[Photograph]) -> "Look":
@@ -87,7 +90,8 @@ class Look:
         return self.mixed((each, weights[each]) for each in shelf if weights.get(each, 0.0) > 0)
 
     def ruled(self, region: int, action: RegionAction | None, photograph: Photograph | None = None) -> "Look":
-        """The look with a rule for a region; None removes its rules. Pinning and keeping replace the rules it had.
+        """The look with a rule for a region; None removes its rules. Pinning and keeping replace the rules it
+        had.
 
         A region for which every photograph would be forbidden loses its rules instead.
         """
@@ -106,11 +110,14 @@ class Look:
 
     def renumbered(self, regions: Sequence[int]) -> "Look":
         """The look with region r as regions[r]: regions were measured again."""
-        return replace(self, rules=frozenset(rule._replace(region=regions[rule.region]) for rule in self.rules))
+        return replace(
+            self, rules=frozenset(rule._replace(region=regions[rule.region]) for rule in self.rules)
+        )
 
     def config(self) -> StyleConfig:
         """The look as a style; references in the order of the mix."""
-        # REGION=REFERENCE, by the reference's place in the mix, as `--pin` and `--forbid` take them; `--keep` takes regions.
+        # REGION=REFERENCE, by the reference's place in the mix, as `--pin` and `--forbid` take them; `--keep`
+        # takes regions.
         place = {photograph: i for i, (photograph, _) in enumerate(self.mix)}
         texts: dict[str, list[str]] = {"pin": [], "forbid": [], "keep": []}
         for region, action, photograph in self.rules:
@@ -186,7 +193,9 @@ class State:
         return frozenset(photograph for look in self.looks for photograph, _ in look.mix)
 
     def renumbered(self, regions: Sequence[int]) -> "State":
-        """With region r as regions[r] in the rules of all looks; none is picked: regions were measured again."""
+        """With region r as regions[r] in the rules of all looks; none is picked: regions were measured
+        again.
+        """
         kept = tuple((name, look.renumbered(regions)) for name, look in self.kept)
         keys = tuple(key._replace(look=key.look.renumbered(regions)) for key in self.keys)
         return replace(self, look=self.look.renumbered(regions), kept=kept, keys=keys, picked=None)
@@ -201,14 +210,24 @@ class State:
     def unused_name(self, name: str) -> str:
         """The name, with a number where a photograph of the shelf has it already."""
         taken = {photograph.name for photograph in self.shelf}
-        return name if name not in taken else next(each for n in count(2) if (each := f"{name} ({n})") not in taken)
+        return (
+            name
+            if name not in taken
+            else next(each for n in count(2) if (each := f"{name} ({n})") not in taken)
+        )
 
     def added(self, photograph: Photograph) -> "State":
-        """With a new photograph on the shelf and in the look; the oldest one that no look needs makes room."""
+        """With a new photograph on the shelf and in the look; the oldest one that no look needs makes
+        room.
+        """
         shelf = (*self.shelf, photograph)
         together = self.together and self.look.mix
-        look = self.look.weighted(photograph, 1.0, shelf) if together else self.look.mixed([(photograph, 1.0)])
-        look = replace(look, style=replace(look.style, strength=look.style.strength or 1.0))  # else nothing is seen of it
+        look = (
+            self.look.weighted(photograph, 1.0, shelf) if together else self.look.mixed([(photograph, 1.0)])
+        )
+        look = replace(
+            look, style=replace(look.style, strength=look.style.strength or 1.0)
+        )  # else nothing is seen of it
         state = replace(self, shelf=shelf, look=look, picked=None)
         while len(state.shelf) > SHELF:
             spare = [each for each in state.shelf if each not in state.in_use] or [state.shelf[0]]
@@ -216,12 +235,16 @@ class State:
         return state
 
     def removed(self, photograph: Photograph) -> "State":
-        """Without a photograph on the shelf and in the look; looks that were kept, and keys of the film, keep it."""
+        """Without a photograph on the shelf and in the look; looks that were kept, and keys of the film, keep
+        it.
+        """
         shelf = tuple(each for each in self.shelf if each is not photograph)
         return replace(self, shelf=shelf, look=self.look.weighted(photograph, 0.0, shelf))
 
     def changed(self, message: messages.Change) -> "State":
-        """What a control of the page makes of the state. Raises UsageError or ConfigError for what is not possible."""
+        """What a control of the page makes of the state. Raises UsageError or ConfigError for what is not
+        possible.
+        """
         look = self.look
         match message:
             case messages.Set():
@@ -255,7 +278,8 @@ class State:
                 action = None if message.action == "free" else message.action
                 return replace(self, look=look.ruled(self.picked.region, action, named))
             case messages.Keep():
-                name, kept = " ".join(message.name.split())[:40], dict(self.kept)
+                name = " ".join(message.name.split())[:40]
+                kept = dict(self.kept)
                 if message.action == "restore" and name in kept:
                     return replace(self, look=kept[name])
                 if not name or name in (NOW, "Captured") or message.action == "restore":
@@ -271,7 +295,8 @@ class State:
                     raise UsageError(f"film: at most {_MAX_KEYS} keys; remove one first")
                 return replace(self, keys=(*self.keys, Key(message.camera, look)))
             case messages.Key():
-                keys, at = list(self.keys), message.at
+                keys = list(self.keys)
+                at = message.at
                 if not at < len(keys):
                     raise UsageError(f"film: key {at + 1} of {len(keys)}: there is none")
                 key = keys.pop(at)
@@ -281,7 +306,8 @@ class State:
 
     def described(self) -> dict[str, Any]:
         """The state as the page reads it."""
-        picked, weights = self.picked, dict(self.look.mix)
+        picked = self.picked
+        weights = dict(self.look.mix)
         hues = palette(len(weights)).mul(255).round().int().tolist() if self.map == "matches" else []
         colours = {each: "rgb({}, {}, {})".format(*hue) for each, hue in zip(weights, hues, strict=False)}
         region = None
@@ -296,7 +322,12 @@ class State:
         return {
             "type": "state",
             "shelf": [
-                {"card": each.number, "name": each.name, "weight": weights.get(each, 0.0), "colour": colours.get(each)}
+                {
+                    "card": each.number,
+                    "name": each.name,
+                    "weight": weights.get(each, 0.0),
+                    "colour": colours.get(each),
+                }
                 for each in self.shelf
             ],
             "look": _sliders(self.look.style),

@@ -1,11 +1,13 @@
 """Files that pages send: photographs for a scene that is open, and the files that a scene is made of.
 
-A photograph is checked by its first bytes, then decoded by a process of its own. The result is a PNG that we wrote ourselves,
-of bounded size, in a folder of ours under a name of ours. The decoder is started once and kept, since starting it takes longer
-than decoding. Its memory is limited; one that takes too long is replaced.
+A photograph is checked by its first bytes, then decoded by a process of its own. The result is a PNG that we
+wrote ourselves, of bounded size, in a folder of ours under a name of ours. The decoder is started once and
+kept, since starting it takes longer than decoding. Its memory is limited; one that takes too long is
+replaced.
 
-Files of a scene come in pieces. A piece is one request: the server's limits on bodies hold, and a file may be of any size. A
-file is checked by its first bytes before any of it is written, and has its name only when it is whole.
+Files of a scene come in pieces. A piece is one request: the server's limits on bodies hold, and a file may be
+of any size. A file is checked by its first bytes before any of it is written, and has its name only when it
+is whole.
 """
 
 import json
@@ -41,7 +43,9 @@ _NAME = 48
 
 
 def check_photograph(data: bytes, name: str = "photograph") -> None:
-    """Raise DataError for what is no photograph by its first bytes, or has too many. Its pixels are counted by the decoder."""
+    """Raise DataError for what is no photograph by its first bytes, or has too many. Its pixels are counted
+    by the decoder.
+    """
     if len(data) > MAX_BYTES:
         raise DataError(f"{name}: {len(data)} bytes; at most {MAX_BYTES} are taken: make it smaller")
     if not kind_of(data[:64]):
@@ -79,7 +83,8 @@ class Uploads:
         check_photograph(data)
         with self._lock:
             self._count += 1
-            source, target = self.folder / f"{self._count:04d}.part", self.folder / f"{self._count:04d}.png"
+            source = self.folder / f"{self._count:04d}.part"
+            target = self.folder / f"{self._count:04d}.png"
             source.write_bytes(data)
             try:
                 pipe = self._started()
@@ -109,7 +114,9 @@ class Uploads:
         """The pipe to the decoder, which is started where none runs."""
         if self._process is None or self._pipe is None or not self._process.is_alive():
             self._end()
-            context = multiprocessing.get_context("spawn")  # a fork would carry this process's threads and models
+            context = multiprocessing.get_context(
+                "spawn"
+            )  # a fork would carry this process's threads and models
             self._pipe, theirs = context.Pipe()
             self._process = context.Process(target=decode_photographs, args=(theirs,), daemon=True)
             self._process.start()
@@ -137,13 +144,17 @@ def limit_memory(room: int) -> None:
 
 
 def decode_photographs(pipe: Connection) -> None:
-    """Answer each [source, target] by what is wrong with it, empty once the target is written, until the pipe is closed."""
+    """Answer each [source, target] by what is wrong with it, empty once the target is written, until the pipe
+    is closed.
+    """
     import cv2
 
     from ..datamanagers.images import load_image
     from ..io.images import shrink
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt at the terminal is the viewer's, which ends this one
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # an interrupt at the terminal is the viewer's, which ends this one
     limit_memory(_MEMORY)  # what is imported does not count
     while True:
         try:
@@ -152,7 +163,9 @@ def decode_photographs(pipe: Connection) -> None:
             return
         try:
             small = shrink(load_image(Path(source), upright=True), MAX_SIDE)
-            Path(target).write_bytes(cv2.imencode(".png", cv2.cvtColor(small, cv2.COLOR_RGB2BGR))[1].tobytes())
+            Path(target).write_bytes(
+                cv2.imencode(".png", cv2.cvtColor(small, cv2.COLOR_RGB2BGR))[1].tobytes()
+            )
             said = ""
         except FprfError as fault:
             said = str(fault).removeprefix(f"{source}: ")  # the file's own name means nothing to the client
@@ -173,7 +186,8 @@ _MAX_SCENE_BYTES = 16 << 30
 """Of all files of a scene."""
 _ROOM = 1 << 30
 """Bytes of the disk that are left free."""
-_MAX_DEPTH, _MAX_PART = 6, 120
+_MAX_DEPTH = 6
+_MAX_PART = 120
 _TAIL = 4096
 """Bytes of the end of events.jsonl that hold its last line."""
 
@@ -195,7 +209,9 @@ def _kinds() -> str:
 
 def is_capture(path: Path) -> bool:
     """True for a path that is named like a capture of 3D Gaussians."""
-    return format_name(path) is not None or any((path / name).is_file() for name in ("meta.json", "lod-meta.json"))
+    return format_name(path) is not None or any(
+        (path / name).is_file() for name in ("meta.json", "lod-meta.json")
+    )
 
 
 def newest_step(run: Path) -> int:
@@ -205,7 +221,9 @@ def newest_step(run: Path) -> int:
 
 
 def training_progress(root: Path) -> dict[str, Any] | None:
-    """Progress of a run, by the last line of its events.jsonl: step, share, psnr, seconds left; None where it does not say."""
+    """Progress of a run, by the last line of its events.jsonl: step, share, psnr, seconds left; None where it
+    does not say.
+    """
     try:
         with (root / "events.jsonl").open("rb") as file:
             file.seek(max(0, file.seek(0, 2) - _TAIL))
@@ -214,13 +232,20 @@ def training_progress(root: Path) -> dict[str, Any] | None:
         last = next(line for line in reversed(lines) if "share" in line)
         # As long again for each share that is left, at the speed so far.
         left = last["seconds"] * (1 - last["share"]) / max(last["share"], 1e-3)
-        return {"step": int(last["step"]), "share": last["share"], "psnr": float(last["psnr"]), "seconds_left": round(left)}
+        return {
+            "step": int(last["step"]),
+            "share": last["share"],
+            "psnr": float(last["psnr"]),
+            "seconds_left": round(left),
+        }
     except (OSError, ValueError, KeyError, StopIteration):
         return None
 
 
 def find_source(path: Path) -> Source:
-    """Return the kind of a file or folder, by names alone. Raises DataError where no scene can be made of it."""
+    """Return the kind of a file or folder, by names alone. Raises DataError where no scene can be made of
+    it.
+    """
     if (path / "config.json").is_file():
         return Source("run", path)
     if is_capture(path):
@@ -262,7 +287,8 @@ def check_file(name: str, head: bytes, size: int) -> None:
     """Raise DataError for a file that no scene is made of, by its name, its first bytes and its size."""
     from ..splats.files.base import format_of
 
-    suffix, stem = Path(name).suffix.lower(), Path(name).stem
+    suffix = Path(name).suffix.lower()
+    stem = Path(name).stem
     if suffix in IMAGE_SUFFIXES:
         check_photograph(head, name)
         return
@@ -274,7 +300,9 @@ def check_file(name: str, head: bytes, size: int) -> None:
         ".npz": head.startswith(b"PK"),
         ".npy": head.startswith(b"\x93NUMPY"),
         ".json": head.lstrip()[:1] in (b"{", b"["),
-        **dict.fromkeys(VIDEO_SUFFIXES, head[4:8] in _ATOMS or head[8:11] == b"AVI" or head.startswith(b"\x1aE\xdf\xa3")),
+        **dict.fromkeys(
+            VIDEO_SUFFIXES, head[4:8] in _ATOMS or head[8:11] == b"AVI" or head.startswith(b"\x1aE\xdf\xa3")
+        ),
         **dict.fromkeys((".bin", ".txt") if stem in _MODEL else (), True),
     }
     if suffix not in whole:
@@ -294,12 +322,16 @@ class SceneFiles:
     def add(self, name: str, at: int, size: int, data: bytes) -> None:
         """Take the piece of a file of `size` bytes that begins at byte `at`; pieces come in their order.
 
-        Raises UsageError for a name that leads elsewhere and for a piece out of order, DataError for what is not taken.
+        Raises UsageError for a name that leads elsewhere and for a piece out of order, DataError for what is
+        not taken.
         """
         # The name leads to a place below the folder, by parts that are plain names on every system.
         parts = PurePosixPath(name).parts
         plain = all(
-            part.isprintable() and not part.startswith(".") and not {*part} & {*'\\:*?"<>|'} and len(part) <= _MAX_PART
+            part.isprintable()
+            and not part.startswith(".")
+            and not {*part} & {*'\\:*?"<>|'}
+            and len(part) <= _MAX_PART
             for part in parts
         )
         if not parts or not plain or name.startswith("/") or len(parts) > _MAX_DEPTH:
@@ -315,12 +347,15 @@ class SceneFiles:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 if shutil.disk_usage(path.parent).free < size + _ROOM:
                     raise DataError(f"{path.name}: the disk of {self.folder} is full; make room there")
-                self._files, self._bytes = self._files + 1, self._bytes + size
+                self._files = self._files + 1
+                self._bytes = self._bytes + size
                 part.unlink(missing_ok=True)
             # Pieces come in their order, so that a file's own size says how far it is.
             written = part.stat().st_size if part.is_file() else 0
             if written != at or at + len(data) > size or (at > 0 and not data):
-                raise UsageError(f"{path.name}: a piece at byte {at} of {size}, where {written} are there; send it again")
+                raise UsageError(
+                    f"{path.name}: a piece at byte {at} of {size}, where {written} are there; send it again"
+                )
             with part.open("ab") as file:
                 file.write(data)
             # It gets its name when it is whole, in one step.

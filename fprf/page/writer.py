@@ -30,7 +30,10 @@ from . import read_asset, script
 from .pack import Packed, colour_header, colour_section, header, pack, sections
 
 CAPTURED = "Captured"
-_STILL, _VIEW, _MAP, _REFERENCE = 800, 512, 320, 320
+_STILL = 800
+_VIEW = 512
+_MAP = 320
+_REFERENCE = 320
 """Longest sides in pixels: of pictures on the stage and below it, of match maps and references."""
 _CAMERAS = 48
 """Captured cameras that one can go to, at most."""
@@ -92,15 +95,17 @@ class Page:
 def write_page(path: Path, page: Page, *, megabytes: float | None = None) -> int:
     """Write the page to `path` (.html), whole or not at all; return how many Gaussians it shows.
 
-    With `megabytes` (2^20 bytes), Gaussians that show least are left out until the file is no larger. Raises DataError where
-    a page of hardly any Gaussian is larger, UsageError where two looks have one name.
+    With `megabytes` (2^20 bytes), Gaussians that show least are left out until the file is no larger. Raises
+    DataError where a page of hardly any Gaussian is larger, UsageError where two looks have one name.
     """
     text, count = page_html(page, megabytes=megabytes, path=path)
     write_text(path, text)
     return count
 
 
-def page_html(page: Page, *, megabytes: float | None = None, path: Path = Path("page.html")) -> tuple[str, int]:
+def page_html(
+    page: Page, *, megabytes: float | None = None, path: Path = Path("page.html")
+) -> tuple[str, int]:
     """The text of a page that lies at `path`, and how many Gaussians it shows. Raises as `write_page`."""
     names = [CAPTURED, *(style.name for style in page.styles)]
     if twice := [name for name in names if names.count(name) > 1]:
@@ -109,13 +114,19 @@ def page_html(page: Page, *, megabytes: float | None = None, path: Path = Path("
     fixed = _text(page, None, {})
     if (scene := page.scene) is None:
         return fixed, 0
-    harmonics = [scene.shown.harmonics, *(style.harmonics for style in page.styles if style.harmonics is not None)]
-    # Pack all, and while it is too large keep the share that would fit, of the Gaussians that weigh most in the views.
-    empty, kept = len(fixed.encode()), None
+    harmonics = [
+        scene.shown.harmonics,
+        *(style.harmonics for style in page.styles if style.harmonics is not None),
+    ]
+    # Pack all, and while it is too large keep the share that would fit, of the Gaussians that weigh most in
+    # the views.
+    empty = len(fixed.encode())
+    kept = None
     for _ in range(16):
         _, head, parts = packed_scene(scene, harmonics, page.start, kept)
         text = _text(page, head, parts)
-        size, count = len(text.encode()), int(head["count"])
+        size = len(text.encode())
+        count = int(head["count"])
         if room is None or size <= room:
             return text, count
         if room <= empty:
@@ -148,16 +159,18 @@ def packed_scene(
     kept: Annotated[Tensor, "n"] | None = None,
     level: int = 9,
 ) -> tuple[Packed, dict[str, Any], dict[str, bytes]]:
-    """Pack a scene's Gaussians, of those `kept`, in several colours, of which the first is captured; return the head and the
-    deflated sections that the page reads, too.
+    """Pack a scene's Gaussians, of those `kept`, in several colours, of which the first is captured; return
+    the head and the deflated sections that the page reads, too.
 
     The page begins at the camera `start`. `level` of deflating: 1 where somebody waits.
     """
     gaussians = scene.gaussians.recoloured(harmonics[0])
     if kept is not None:
-        gaussians, harmonics = gaussians.select(kept), [each[kept] for each in harmonics]
+        gaussians = gaussians.select(kept)
+        harmonics = [each[kept] for each in harmonics]
     packed = pack(gaussians)
-    parts, styles = sections(packed, level), []
+    parts = sections(packed, level)
+    styles = []
     for k, each in enumerate(harmonics):
         colours = packed.colours(each)
         styles.append(colour_header(colours))
@@ -168,13 +181,18 @@ def packed_scene(
 
 
 def about(cameras: Cameras, start: int, depth: Callable[[int], float]) -> dict[str, Any]:
-    """Cameras of a scene, that at `start` first, and where one may go; `depth` is the distance that a camera turns about."""
+    """Cameras of a scene, that at `start` first, and where one may go; `depth` is the distance that a camera
+    turns about.
+    """
     # Evenly chosen cameras in their order, rotated so that the one to start from comes first.
-    others = sorted({*torch.linspace(0, len(cameras) - 1, min(_CAMERAS, len(cameras))).round().long().tolist()})
+    others = sorted(
+        {*torch.linspace(0, len(cameras) - 1, min(_CAMERAS, len(cameras))).round().long().tolist()}
+    )
     chosen = [start, *(view for view in others if view > start), *(view for view in others if view < start)]
     depths = [depth(view) for view in chosen]
     up = torch.nn.functional.normalize(upwards(cameras).double(), dim=0)
-    # One may go beyond the outermost camera, and half as far again as what is looked at: then nothing is left to see.
+    # One may go beyond the outermost camera, and half as far again as what is looked at: then nothing is left
+    # to see.
     place = cameras.pose[:, :, 3].double()
     centre = place.mean(0)
     radius = _ROOM * float((place - centre).norm(dim=1).max()) + 0.5 * sorted(depths)[len(depths) // 2]
@@ -186,7 +204,9 @@ def about(cameras: Cameras, start: int, depth: Callable[[int], float]) -> dict[s
 
 
 def _camera(cameras: Cameras, view: int, depth: float) -> dict[str, Any]:
-    """A captured camera: world to camera by columns, fx fy cx cy, size, and the distance that it turns about."""
+    """A captured camera: world to camera by columns, fx fy cx cy, size, and the distance that it turns
+    about.
+    """
     camera = camera_of(cameras, view)
     intrinsics = camera.intrinsics
     return {
@@ -198,11 +218,17 @@ def _camera(cameras: Cameras, view: int, depth: float) -> dict[str, Any]:
 
 
 def _depth(scene: SplatScene, view: int) -> float:
-    """Distance along a camera's axis of the middle of what its picture shows: median of the Gaussians in it."""
+    """Distance along a camera's axis of the middle of what its picture shows: median of the Gaussians in
+    it.
+    """
     camera = camera_of(scene.views, view)
-    # 100 000 are enough for a median, evenly taken. Of the Gaussians whose centres lie in the middle two thirds of the picture.
+    # 100 000 are enough for a median, evenly taken. Of the Gaussians whose centres lie in the middle two
+    # thirds of the picture.
     means = scene.gaussians.means
-    at = means[:: max(1, len(means) // 100_000)].double() @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    at = (
+        means[:: max(1, len(means) // 100_000)].double() @ camera.world_to_camera[:3, :3].T
+        + camera.world_to_camera[:3, 3]
+    )
     depth = at[:, 2].clamp_min(1e-9)
     middle = camera.intrinsics[:2, 2] + at[:, :2] / depth[:, None] * camera.intrinsics.diagonal()[:2]
     size = torch.tensor([camera.width, camera.height]).double()
@@ -213,7 +239,8 @@ def _depth(scene: SplatScene, view: int) -> float:
 def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]) -> str:
     """The page; `head` None = without Gaussians."""
     names = [CAPTURED, *(style.name for style in page.styles)]
-    # With Gaussians one picture a style is enough: it stands in until the first frame, and where there is no WebGL 2.
+    # With Gaussians one picture a style is enough: it stands in until the first frame, and where there is no
+    # WebGL 2.
     most = 1 if page.scene is not None else len(page.views)
     pictures = [[view.original for view in page.views], *(style.stills for style in page.styles)]
     stills = [[data_uri(shrink(each, _STILL)) for each in row[:most]] for row in pictures]
@@ -246,7 +273,9 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
             ratio=f'style="--ratio:{width / height:.4f}"',
             facts=f'<dl class="facts">{rows}</dl>' if rows else "",
         ),
-        body="\n".join(f'<section id="{name.lower()}"><h2>{name}</h2>\n{part}\n</section>' for name, part in present),
+        body="\n".join(
+            f'<section id="{name.lower()}"><h2>{name}</h2>\n{part}\n</section>' for name, part in present
+        ),
         credits="\n".join(f"<p>{escape(line)}</p>" for line in page.credits),
         # "<" cannot end the script then, whatever a name holds.
         data=json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),
@@ -261,9 +290,8 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
 def _img(picture: Picture, side: int, alt: str) -> str:
     small = shrink(picture, side)
     height, width = small.shape[:2]
-    return (
-        f'<img src="{data_uri(small)}" alt="{escape(alt)}" width="{width}" height="{height}" decoding="async" loading="lazy">'
-    )
+    size = f'width="{width}" height="{height}"'
+    return f'<img src="{data_uri(small)}" alt="{escape(alt)}" {size} decoding="async" loading="lazy">'
 
 
 def _views(views: Sequence[PageView]) -> str:
@@ -274,20 +302,31 @@ def _views(views: Sequence[PageView]) -> str:
         for view in views
         if view.photograph is not None
     )
-    return (
-        f'<p class="lead">Photographs that training did not see, and beside them the scene.</p><div class="grid">{rows}</div>'
-    )
+    lead = "Photographs that training did not see, and beside them the scene."
+    return f'<p class="lead">{lead}</p><div class="grid">{rows}</div>'
 
 
 def _style(style: Style, views: Sequence[PageView], known: Mapping[str, Reference]) -> str:
-    """References of a style, with the colours of its match maps and with shares where there are any; the maps."""
+    """References of a style, with the colours of its match maps and with shares where there are any; the
+    maps.
+    """
     rows = []
     colours = to_uint8(palette(len(style.references))[None])[0] if style.references else []
     for place, name in enumerate(style.references):
-        chip = f'<i class="chip" style="background:rgb({",".join(map(str, colours[place]))})"></i>' if style.matches else ""
-        share = f'<data value="{style.shares[place]:.4f}">{style.shares[place]:.0%}</data>' if style.shares else ""
+        chip = (
+            f'<i class="chip" style="background:rgb({",".join(map(str, colours[place]))})"></i>'
+            if style.matches
+            else ""
+        )
+        share = (
+            f'<data value="{style.shares[place]:.4f}">{style.shares[place]:.0%}</data>'
+            if style.shares
+            else ""
+        )
         image = _img(known[name].image, _REFERENCE, f"Reference {name}")
-        rows.append(f"<figure>{image}<figcaption>{chip}<span>{escape(name)}</span>{share}</figcaption></figure>")
+        rows.append(
+            f"<figure>{image}<figcaption>{chip}<span>{escape(name)}</span>{share}</figcaption></figure>"
+        )
     maps = "".join(
         f"<figure>{_img(each, _MAP, view.name)}<figcaption>{escape(view.name)}</figcaption></figure>"
         for view, each in zip(views, style.matches, strict=False)

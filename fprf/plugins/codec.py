@@ -1,7 +1,7 @@
 """Configs to plain JSON and back, driven by the type hints.
 
-Nothing in a file is ever imported: a plug-in is named, and the name is looked up among the installed entry points. One
-that is not installed is kept as data (`Missing`) and fails only when it is built.
+Nothing in a file is ever imported: a plug-in is named, and the name is looked up among the installed entry
+points. One that is not installed is kept as data (`Missing`) and fails only when it is built.
 """
 
 import dataclasses
@@ -56,7 +56,9 @@ def to_json(config: object) -> Any:
 
 
 def leaves(config: object) -> dict[str, Any]:
-    """Every field of a config tree as JSON by its dotted path. A plug-in's path gives its name; without one there, null."""
+    """Every field of a config tree as JSON by its dotted path. A plug-in's path gives its name; without one
+    there, null.
+    """
     values: dict[str, Any] = {}
 
     def walk(tree: Any, path: str) -> None:
@@ -70,11 +72,14 @@ def leaves(config: object) -> dict[str, Any]:
     return values
 
 
-def from_json(data: Any, kind: type[T], *, packages: Mapping[str, str] | None = None, path: str = "config") -> T:
-    """The config of that type. Raises ConfigError naming the field by its dotted path, of which `path` is the start.
+def from_json(
+    data: Any, kind: type[T], *, packages: Mapping[str, str] | None = None, path: str = "config"
+) -> T:
+    """The config of that type. Raises ConfigError naming the field by its dotted path, of which `path` is the
+    start.
 
-    A key that is absent takes the code's default; an unknown one is refused. `packages` says by dotted path which
-    package each plug-in came from, for the message about a missing one.
+    A key that is absent takes the code's default; an unknown one is refused. `packages` says by dotted path
+    which package each plug-in came from, for the message about a missing one.
     """
     value: T = _read(data, kind, path, packages or {})
     return value
@@ -90,7 +95,9 @@ def _encode(value: Any, hint: Any, path: str) -> Any:
         hints = hints_of(type(value))
         names = [f.name for f in dataclasses.fields(value)]
         if kind and "type" in names:
-            raise ConfigError(f"{path}: {type(value).__name__} has a field `type`, which names the plug-in; rename it")
+            raise ConfigError(
+                f"{path}: {type(value).__name__} has a field `type`, which names the plug-in; rename it"
+            )
         return tag | {name: _encode(getattr(value, name), hints[name], f"{path}.{name}") for name in names}
     if isinstance(value, enum.Enum):
         return value.value
@@ -98,7 +105,10 @@ def _encode(value: Any, hint: Any, path: str) -> Any:
         return value.as_posix()
     if isinstance(value, tuple | list):
         hint = next((h for h in members(hint) if get_origin(h) in (tuple, list)), tuple[Any, ...])
-        return [_encode(v, h, f"{path}.{i}") for i, (v, h) in enumerate(zip(value, _items(hint, len(value)), strict=True))]
+        return [
+            _encode(v, h, f"{path}.{i}")
+            for i, (v, h) in enumerate(zip(value, _items(hint, len(value)), strict=True))
+        ]
     if isinstance(value, Mapping):
         hint = next((h for h in members(hint) if get_origin(h) is dict), dict[str, Any])
         return {str(k): _encode(v, get_args(hint)[1], f"{path}.{k}") for k, v in value.items()}
@@ -125,7 +135,8 @@ def _read(data: Any, hint: Any, path: str, packages: Mapping[str, str]) -> Any:
                 faults.append(str(fault).removeprefix(f"{path}: "))
         raise ConfigError(f"{path}: {', nor '.join(faults)}")
     hint = choices[0]
-    origin, args = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    args = get_args(hint)
     if is_slot(hint):
         # A plug-in is named; one that cannot be loaded is kept as data.
         fields = dict(_expect(data, dict, path))
@@ -135,9 +146,12 @@ def _read(data: Any, hint: Any, path: str, packages: Mapping[str, str]) -> Any:
         try:
             chosen = registry.load(hint.group, name, hint)
         except PluginError as reason:
-            slot, text = path.partition(".")[2], json.dumps(fields, allow_nan=False)
+            slot = path.partition(".")[2]
+            text = json.dumps(fields, allow_nan=False)
             package = packages.get(slot, "").removeprefix(f"{name} ")
-            return Missing(slot=slot, kind=hint.group, name=name, data=text, package=package, reason=str(reason))
+            return Missing(
+                slot=slot, kind=hint.group, name=name, data=text, package=package, reason=str(reason)
+            )
         return _read_fields(fields, chosen, path, packages)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return _read_fields(_expect(data, dict, path), hint, path, packages)
@@ -147,11 +161,15 @@ def _read(data: Any, hint: Any, path: str, packages: Mapping[str, str]) -> Any:
         hints = _items(hint, len(items))
         if len(items) != len(hints):
             raise ConfigError(f"{path}: expected {len(hints)} values, found {len(items)}")
-        return origin(_read(v, h, f"{path}.{i}", packages) for i, (v, h) in enumerate(zip(items, hints, strict=True)))
+        return origin(
+            _read(v, h, f"{path}.{i}", packages) for i, (v, h) in enumerate(zip(items, hints, strict=True))
+        )
     if origin is dict:
         return {k: _read(v, args[1], f"{path}.{k}", packages) for k, v in _expect(data, dict, path).items()}
     if origin is Literal or (isinstance(hint, type) and issubclass(hint, enum.Enum)):
-        allowed = {value: value for value in args} if origin is Literal else {each.value: each for each in hint}
+        allowed = (
+            {value: value for value in args} if origin is Literal else {each.value: each for each in hint}
+        )
         for value, meant in allowed.items():
             if type(value) is type(data) and value == data:  # True == 1
                 return meant

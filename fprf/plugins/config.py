@@ -18,8 +18,9 @@ class Need(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class PluginConfig:
-    """A config whose concrete type is an entry point. A field annotated with an abstract subclass (one that sets
-    `group`) is a *slot*: `--path.to.slot NAME` fills it, and the chosen config's own fields become flags.
+    """A config whose concrete type is an entry point. A field annotated with an abstract subclass (one that
+    sets `group`) is a *slot*: `--path.to.slot NAME` fills it, and the chosen config's own fields become
+    flags.
 
     Each kind declares its own `build(...)`, which imports the implementation: config modules import no torch.
     """
@@ -27,14 +28,20 @@ class PluginConfig:
     group: ClassVar[str]
 
     def needs(self) -> tuple[Need, ...]:
-        """Packages and files that `build` wants and that are not here, found without building or downloading anything.
+        """Packages and files that `build` wants and that are not here, found without building or downloading
+        anything.
 
-        `fprf train` shows the needs of all plug-ins at once, before any work, and `fprf doctor METHOD` beforehand; of a
-        format of files `fprf restyle` and `fprf export`. By default none. A slot's own plug-in is asked for itself.
+        `fprf train` shows the needs of all plug-ins at once, before any work, and `fprf doctor METHOD`
+        beforehand; of a format of files `fprf restyle` and `fprf export`. By default none. A slot's own
+        plug-in is asked for itself.
         """
         return ()
 
 
 def absent_file(path: Path | None) -> tuple[Need, ...]:
     """The need for a file of weights that is named and not there; none where no file is named."""
-    return () if path is None or path.is_file() else (Need(f"{path}: no such weights file", "name one that exists"),)
+    return (
+        ()
+        if path is None or path.is_file()
+        else (Need(f"{path}: no such weights file", "name one that exists"),)
+    )

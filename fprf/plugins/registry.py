@@ -1,4 +1,5 @@
-"""Names to objects through entry points. Listing reads metadata only; loading imports the one plug-in that is named.
+"""Names to objects through entry points. Listing reads metadata only; loading imports the one plug-in that is
+named.
 
 A broken, ambiguous or missing plug-in is an error only for whoever names it.
 """
@@ -37,7 +38,9 @@ def installed(group: str) -> Mapping[str, tuple[Entry, ...]]:
 
 
 def choices(group: str, kind: type = object) -> list[str]:
-    """Names of a group that may be of the kind: all but those known, without importing anything, to be of another."""
+    """Names of a group that may be of the kind: all but those known, without importing anything, to be of
+    another.
+    """
     names = []
     for name, entries in installed(group).items():
         known = _imported(entries[0].point) if len(entries) == 1 else None
@@ -52,17 +55,23 @@ def groups() -> tuple[str, ...]:
 
 
 def unreadable() -> tuple[str, ...]:
-    """Packages whose entry points cannot be read, each with the reason. They register nothing and hurt nobody else."""
+    """Packages whose entry points cannot be read, each with the reason. They register nothing and hurt nobody
+    else.
+    """
     return _scan()[1]
 
 
 def forget() -> None:
-    """Read the metadata anew at the next question, for example after a package was installed in this process."""
+    """Read the metadata anew at the next question, for example after a package was installed in this
+    process.
+    """
     _scan.cache_clear()
 
 
 def entry(group: str, name: str, kind: type = object) -> Entry:
-    """The one entry of that name. Raises PluginError where there is none or more than one; others of the kind are named."""
+    """The one entry of that name. Raises PluginError where there is none or more than one; others of the kind
+    are named.
+    """
     entries = installed(group).get(name, ())
     if not entries:
         others = choices(group, kind)
@@ -77,7 +86,8 @@ def entry(group: str, name: str, kind: type = object) -> Entry:
 
 
 def load_object(group: str, name: str, kind: type = object) -> object:
-    """Import the one plug-in of that name. Raises PluginError where it is missing, ambiguous or fails to import.
+    """Import the one plug-in of that name. Raises PluginError where it is missing, ambiguous or fails to
+    import.
 
     The kind, of which the object may yet not be, says which others that error names.
     """
@@ -138,7 +148,9 @@ def nearest(name: str, allowed: Mapping[str, object] | list[str]) -> str:
 
 
 def _imported(point: EntryPoint) -> object | None:
-    """The object of an entry point, from the modules that are imported already: a class may be re-exported."""
+    """The object of an entry point, from the modules that are imported already: a class may be
+    re-exported.
+    """
     # `package.module:Class.attribute`, of which the module may not be imported yet.
     module, _, attributes = point.value.partition(":")
     value: object | None = sys.modules.get(module.strip())
@@ -161,13 +173,16 @@ def _scan() -> tuple[Mapping[str, Mapping[str, tuple[Entry, ...]]], tuple[str, .
             # Of most packages this one file is read: metadata of hundreds would take a second to parse.
             if f"[{_PREFIX}" not in (distribution.read_text("entry_points.txt") or ""):
                 continue
-            name, points = distribution.name, list(distribution.entry_points)
-            spelling, package = re.sub(r"[-_.]+", "-", name).lower(), f"{name} {distribution.version}"
+            name = distribution.name
+            points = list(distribution.entry_points)
+            spelling = re.sub(r"[-_.]+", "-", name).lower()
+            package = f"{name} {distribution.version}"
             # Of several copies on sys.path the first one counts, be it one without entry points of ours.
             if spelling in seen or find_distribution(name).locate_file("") != distribution.locate_file(""):
                 continue
         except Exception as error:  # whatever a damaged file makes the reader raise: it may be about us
-            place, reason = distribution.locate_file(""), f"{type(error).__name__}: {error}"
+            place = distribution.locate_file("")
+            reason = f"{type(error).__name__}: {error}"
             complaints.append(f"{place}: a package's entry points cannot be read ({reason})")
             continue
         seen.add(spelling)
@@ -175,7 +190,9 @@ def _scan() -> tuple[Mapping[str, Mapping[str, tuple[Entry, ...]]], tuple[str, .
             if point.group.startswith(_PREFIX):
                 entries.setdefault(point.group, {}).setdefault(point.name, []).append(Entry(point, package))
     groups = {
-        group: MappingProxyType({name: tuple(sorted(names[name], key=lambda each: each.package)) for name in sorted(names)})
+        group: MappingProxyType(
+            {name: tuple(sorted(names[name], key=lambda each: each.package)) for name in sorted(names)}
+        )
         for group, names in entries.items()
     }
     return MappingProxyType(groups), tuple(complaints)

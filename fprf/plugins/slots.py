@@ -59,7 +59,8 @@ def slots(config: Any, prefix: str = "") -> Iterator[Slot]:
     """Every slot of a config tree, outer before inner, in the order of declaration."""
     hints = hints_of(type(config))
     for field in dataclasses.fields(config):
-        value, path = getattr(config, field.name), f"{prefix}{field.name}"
+        value = getattr(config, field.name)
+        path = f"{prefix}{field.name}"
         choices = members(hints[field.name])
         for kind in filter(is_slot, choices):
             yield Slot(path, kind, value, type(None) in choices)
@@ -77,7 +78,9 @@ def replace(config: C, path: str, value: object) -> C:
 
 
 def take_flag(args: Sequence[str], flag: str) -> tuple[str | None, list[str]]:
-    """Value of `--flag V` or `--flag=V` (the last one wins), and the other arguments. '-' and '_' are one letter."""
+    """Value of `--flag V` or `--flag=V` (the last one wins), and the other arguments. '-' and '_' are one
+    letter.
+    """
     value: str | None = None
     rest: list[str] = []
     # Flags of other slots and of fields are left for whoever knows them.
@@ -94,11 +97,13 @@ def take_flag(args: Sequence[str], flag: str) -> tuple[str | None, list[str]]:
 
 
 def resolve(config: C, args: Sequence[str]) -> tuple[C, list[str]]:
-    """Apply the slot flags among the arguments, outermost first, so that a chosen plug-in may bring slots of its own.
+    """Apply the slot flags among the arguments, outermost first, so that a chosen plug-in may bring slots of
+    its own.
 
     Naming the plug-in that is there keeps the values it has; another one starts from its own defaults.
     """
-    rest, seen = list(args), set[str]()
+    rest = list(args)
+    seen = set[str]()
     while todo := [slot for slot in slots(config) if slot.path not in seen]:
         slot = todo[0]
         seen.add(slot.path)

@@ -14,22 +14,33 @@ from ..io.atomic import write_bytes
 
 
 def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors (half precision widened to float32) and metadata. Raises WeightsError where the file is absent or damaged."""
+    """Tensors (half precision widened to float32) and metadata. Raises WeightsError where the file is absent
+    or damaged.
+    """
     if not path.is_file():
-        raise WeightsError(f"{path}: no such weights file; name an existing one or make it with `fprf pretrain`")
+        raise WeightsError(
+            f"{path}: no such weights file; name an existing one or make it with `fprf pretrain`"
+        )
     try:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             halves = (torch.float16, torch.bfloat16)
-            wide = {name: tensor.float() if tensor.dtype in halves else tensor for name, tensor in tensors.items()}
+            wide = {
+                name: tensor.float() if tensor.dtype in halves else tensor for name, tensor in tensors.items()
+            }
             return wide, dict(file.metadata() or {})
     except (SafetensorError, OSError) as error:
-        raise WeightsError(f"{path}: not a readable safetensors file ({error}); copy or download it again") from error
+        raise WeightsError(
+            f"{path}: not a readable safetensors file ({error}); copy or download it again"
+        ) from error
 
 
 def write_weights(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
     """Write all or nothing: a reader never meets half a file."""
-    write_bytes(path, save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, dict(metadata)))
+    write_bytes(
+        path,
+        save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, dict(metadata)),
+    )
 
 
 def tensors_hash(tensors: Mapping[str, Tensor]) -> str:
@@ -43,4 +54,5 @@ def tensors_hash(tensors: Mapping[str, Tensor]) -> str:
     return digest.hexdigest()[:12]
 
 
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)

@@ -45,7 +45,9 @@ class PretrainConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class PretrainDecoderConfig(PretrainConfig):
-    """D_VGG of the paper for one encoder: identity and, where asked for, the paper's content and style losses."""
+    """D_VGG of the paper for one encoder: identity and, where asked for, the paper's content and style
+    losses.
+    """
 
     encoder: EncoderConfig = BundledContentConfig()
     """The encoder whose features are to be decoded."""
@@ -58,14 +60,16 @@ class PretrainDecoderConfig(PretrainConfig):
     noise: float = 0.02
     """Gaussian noise on the features, in units of their standard deviation: makes the decoder smooth."""
     style: float = 0.0
-    """Weight of the style loss (paper, lambda_s) on AdaIN between photographs, beside the identity's squared error:
-    distance of VGG-19's means and deviations at relu1_1, relu2_1, relu3_1, relu4_1 (relu3_4 where the weights end before).
-    0 = not computed."""
+    """Weight of the style loss (paper, lambda_s) on AdaIN between photographs, beside the identity's squared
+    error: distance of VGG-19's means and deviations at relu1_1, relu2_1, relu3_1, relu4_1 (relu3_4 where the
+    weights end before). 0 = not computed.
+    """
     content: float = 0.0
     """Weight of the content loss (paper) on the same pictures, at relu2_1; 0 = not computed."""
     style_weights: Path | None = None
-    """VGG-19's weights for both losses. With a file the report measures them even where they do not count; none = the
-    download that the encoder `vgg19` uses."""
+    """VGG-19's weights for both losses. With a file the report measures them even where they do not count;
+    none = the download that the encoder `vgg19` uses.
+    """
     crops: int = 64
     """Photographs whose crops are restyled by one another; memory grows with them."""
     size: int = 96
@@ -73,8 +77,9 @@ class PretrainDecoderConfig(PretrainConfig):
     pairs: int = 2
     """Pairs of crops at a time."""
     every: int = 4
-    """Pairs are restyled in one step of so many, drawn by the seed, and then weigh as many times more: steps without them
-    take a fraction of the time."""
+    """Pairs are restyled in one step of so many, drawn by the seed, and then weigh as many times more: steps
+    without them take a fraction of the time.
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()

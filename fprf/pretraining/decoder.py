@@ -1,10 +1,11 @@
 """Train D_VGG: the colour of a photograph's pixel from its guided-filtered features, as scenes have them.
 
-Identity is what scenes are reconstructed by; the paper's content and style losses on restyled crops are added where they
-have a weight. AdaIN happens in the encoder's own space, on guided-filtered features as scenes have them. The content loss
-compares structure: relu2_1 of the decoded crop with AdaIN of the content's and the style's relu2_1. The style loss is that of
-AdaIN (Huang and Belongie 2017): means and standard deviations at relu1_1, relu2_1, relu3_1 and relu4_1, in units of each
-filter's own deviation. Weights that end before relu4_1 take relu3_4, the last layer before it.
+Identity is what scenes are reconstructed by; the paper's content and style losses on restyled crops are added
+where they have a weight. AdaIN happens in the encoder's own space, on guided-filtered features as scenes have
+them. The content loss compares structure: relu2_1 of the decoded crop with AdaIN of the content's and the
+style's relu2_1. The style loss is that of AdaIN (Huang and Belongie 2017): means and standard deviations at
+relu1_1, relu2_1, relu3_1 and relu4_1, in units of each filter's own deviation. Weights that end before
+relu4_1 take relu3_4, the last layer before it.
 """
 
 import math
@@ -33,11 +34,15 @@ Decode = Callable[[Annotated[Tensor, "N C"]], Annotated[Tensor, "N 3"]]
 CONTENT = 1
 """Index of the activations that the content loss compares: relu2_1, the paper's layer."""
 EPS = 1e-4
-"""Added to variances, which are in units of the filters' own: keeps the root's gradient finite where a filter is constant."""
+"""Added to variances, which are in units of the filters' own: keeps the root's gradient finite where a filter
+is constant.
+"""
 
 
 class StyleNetwork(nn.Module):
-    """VGG-19 that gradients pass through, frozen. `unit` divides the activations of each layer: 1 until measured."""
+    """VGG-19 that gradients pass through, frozen. `unit` divides the activations of each layer: 1 until
+    measured.
+    """
 
     def __init__(self, encoder: VggEncoder) -> None:
         super().__init__()
@@ -57,7 +62,9 @@ class StyleNetwork(nn.Module):
 
     @torch.no_grad()
     def measure(self, images: Sequence[Annotated[Tensor, "3 H W"]]) -> None:
-        """Take each filter's mean deviation over the images as its unit; filters that hardly fire are not blown up."""
+        """Take each filter's mean deviation over the images as its unit; filters that hardly fire are not
+        blown up.
+        """
         deviations = [[double(x[0]).std((1, 2), correction=0) for x in self(image[None])] for image in images]
         for layer, own_deviations in zip(self.layers, zip(*deviations, strict=True), strict=True):
             unit = self.get_buffer(f"unit_{layer}")
@@ -66,7 +73,9 @@ class StyleNetwork(nn.Module):
 
 
 def load_style_network(weights: Path | None) -> StyleNetwork:
-    """The network from a file of VGG-19's weights (None = the download that `vgg19` uses). Raises WeightsError."""
+    """The network from a file of VGG-19's weights (None = the download that `vgg19` uses). Raises
+    WeightsError.
+    """
     try:
         return StyleNetwork(build_vgg("relu4_1", weights=weights, normalise=True))
     except WeightsError:  # they may end before it
@@ -121,9 +130,11 @@ def prepare_crops(
     measure: bool,
     device: torch.device | None = None,
 ) -> Crops:
-    """One square of each photograph that is large enough on both sides (else as large as it gets). Draws by `seed`.
+    """One square of each photograph that is large enough on both sides (else as large as it gets). Draws by
+    `seed`.
 
-    `measure` sets the network's units from these crops. Encoder and network must be on `device`; None = the CPU.
+    `measure` sets the network's units from these crops. Encoder and network must be on `device`; None = the
+    CPU.
     """
     # Crops of one size, small enough for every photograph.
     loaded = [load_photo(path, longest).to(device) for path in photos]
@@ -133,14 +144,16 @@ def prepare_crops(
     images = [rgb.view(side, side, 3).permute(2, 0, 1) for _, rgb in made]
     if measure:
         network.measure(images)
-    # The content's structure is its normalised activations: they take the deviation of any style later (AdaIN).
+    # The content's structure is its normalised activations: they take the deviation of any style later
+    # (AdaIN).
     seen = [network(image[None]) for image in images]
     structure = []
     for each in seen:
         mean, std = (half[:, :, None, None] for half in style_statistics([each[CONTENT]])[0].chunk(2, 1))
         structure.append(((each[CONTENT] - mean) / std).half())
     statistics = [style_statistics(each) for each in seen]
-    # Moments of features in float64; the features themselves are kept in half precision, since there are many.
+    # Moments of features in float64; the features themselves are kept in half precision, since there are
+    # many.
     wide = [double(features) for features, _ in made]
     own = [(each.mean(0), each.var(0, correction=0)) for each in wide]
     return Crops(
@@ -161,9 +174,12 @@ def restyling_losses(
     style: Annotated[Tensor, "B"],
 ) -> tuple[Annotated[Tensor, ""], Annotated[Tensor, ""]]:
     """Content loss and style loss (paper, L_c and L_s) of crops `content` in the styles of crops `style`."""
-    # The paper's training pair: content features with the moments of the style, decoded to a picture (t, and g(t)).
+    # The paper's training pair: content features with the moments of the style, decoded to a picture (t, and
+    # g(t)).
     features = adain(
-        crops.features[content].float(), (crops.mean[content], crops.std[content]), (crops.mean[style], crops.std[style])
+        crops.features[content].float(),
+        (crops.mean[content], crops.std[content]),
+        (crops.mean[style], crops.std[style]),
     )
     colour = decode(features.flatten(0, 1)).view(len(content), crops.side, crops.side, 3)
     activations = network(colour.permute(0, 3, 1, 2))
@@ -194,13 +210,23 @@ def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[
         parts.append([each.cpu() for each in filtered_at(encoder, photo, pixels)])
     features, colours = (torch.cat(column) for column in zip(*parts, strict=True))
     mean = features.mean(0).to(device)
-    std = features.std(0, correction=0).clamp_min(1e-3 * float(features.std())).to(device)  # dead channels are not blown up
+    std = (
+        features.std(0, correction=0).clamp_min(1e-3 * float(features.std())).to(device)
+    )  # dead channels are not blown up
     say(f"{len(features)} pixels prepared")
     crops = None
     if network is not None:
-        chosen, seed = photos[: config.crops], config.seed + 2
+        chosen = photos[: config.crops]
+        seed = config.seed + 2
         crops = prepare_crops(
-            encoder, network, chosen, side=config.size, longest=LONGEST, seed=seed, measure=True, device=device
+            encoder,
+            network,
+            chosen,
+            side=config.size,
+            longest=LONGEST,
+            seed=seed,
+            measure=True,
+            device=device,
         )
     torch.manual_seed(config.seed)
     decoder = MlpDecoder(encoder.channels, config.hidden).to(device)
@@ -246,17 +272,29 @@ def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[
     report: Report = {"encoder": encoder.identity, "steps": steps, "learned_photos": len(photos)}
     report |= decoder_report(encoder, trained, held[:REPORT_PHOTOS], device)
     if network is not None:
-        chosen, seed = held[:REPORT_PHOTOS], config.seed + 3
+        chosen = held[:REPORT_PHOTOS]
+        seed = config.seed + 3
         others = prepare_crops(
-            encoder, network, chosen, side=config.size, longest=LONGEST, seed=seed, measure=False, device=device
+            encoder,
+            network,
+            chosen,
+            side=config.size,
+            longest=LONGEST,
+            seed=seed,
+            measure=False,
+            device=device,
         )
         report |= restyling_report(others, network, trained)
     return report
 
 
 @torch.no_grad()
-def decoder_report(encoder: Encoder, decoder: Decoder, photos: Sequence[Path], device: torch.device | None = None) -> Report:
-    """PSNR of decode(encode(photo)) over whole photographs: the mean of the photographs' own, and the worst."""
+def decoder_report(
+    encoder: Encoder, decoder: Decoder, photos: Sequence[Path], device: torch.device | None = None
+) -> Report:
+    """PSNR of decode(encode(photo)) over whole photographs: the mean of the photographs' own, and the
+    worst.
+    """
     psnr = []
     for path in photos:
         photo = load_photo(path, LONGEST).to(device)

@@ -1,6 +1,7 @@
 """Training of a network by any loss: Adam, one cosine to zero by time or steps, checkpoints.
 
-A batch is a function of (seed, step). The checkpoints lie in a folder beside the output until its weights are written.
+A batch is a function of (seed, step). The checkpoints lie in a folder beside the output until its weights are
+written.
 """
 
 import math
@@ -23,7 +24,8 @@ from .photos import find_photos
 
 WARM_UP = 0.02
 """Share of the run in which the rate rises."""
-_SAVED, _SPOKEN = 60.0, 15.0
+_SAVED = 60.0
+_SPOKEN = 15.0
 """Seconds between checkpoints, and between lines of progress."""
 
 
@@ -40,8 +42,12 @@ def training_folder(output: Path) -> Path:
 class NetworkLearner(Learner):
     """A network in training. `loss` draws its batch from the generator of a step."""
 
-    def __init__(self, network: nn.Module, loss: Callable[[torch.Generator], Tensor], config: PretrainConfig) -> None:
-        self.network, self.loss, self.config = network, loss, config
+    def __init__(
+        self, network: nn.Module, loss: Callable[[torch.Generator], Tensor], config: PretrainConfig
+    ) -> None:
+        self.network = network
+        self.loss = loss
+        self.config = config
         self.optimizer = torch.optim.Adam(network.parameters(), config.rate)
         self.value = torch.zeros(())
         self.skipped = self.failed = self.seen = 0
@@ -57,10 +63,12 @@ class NetworkLearner(Learner):
         value = self.loss(generator_of(self.config.seed, index))
         self.optimizer.zero_grad(set_to_none=True)
         value.backward()  # type: ignore[no-untyped-call]
-        self.value, self.seen = value.detach(), self.seen + self.config.batch
+        self.value = value.detach()
+        self.seen = self.seen + self.config.batch
         # A loss that is not finite changes nothing.
         finite = bool(torch.isfinite(self.value))
-        self.skipped, self.failed = self.skipped + (not finite), 0 if finite else self.failed + 1
+        self.skipped = self.skipped + (not finite)
+        self.failed = 0 if finite else self.failed + 1
         if finite:
             self.optimizer.step()
 
@@ -83,8 +91,9 @@ def train(
     output: Path,
     say: Callable[[str], None],
 ) -> int:
-    """Train in place until the budget is spent; the number of steps. A training of the same config and photographs goes on,
-    another is dropped. The caller holds `training_folder(output)`, and removes it when the weights are written.
+    """Train in place until the budget is spent; the number of steps. A training of the same config and
+    photographs goes on, another is dropped. The caller holds `training_folder(output)`, and removes it when
+    the weights are written.
 
     Raises as `training.driver.learn`.
     """

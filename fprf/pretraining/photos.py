@@ -1,4 +1,5 @@
-"""Photographs to learn from: found, split, cropped, shown in another light, and their guided-filtered features.
+"""Photographs to learn from: found, split, cropped, shown in another light, and their guided-filtered
+features.
 
 Every draw is a function of a generator.
 """
@@ -27,14 +28,20 @@ GUIDED = GuidedConfig()
 
 
 def find_photos(folders: Sequence[Path]) -> list[Path]:
-    """Every JPEG and PNG below the folders, in the order of a hash of their names: any prefix is a fair sample."""
+    """Every JPEG and PNG below the folders, in the order of a hash of their names: any prefix is a fair
+    sample.
+    """
     for folder in folders:
         if not folder.is_dir():
-            raise DataError(f"{folder}: no such folder of photographs; name existing ones with --images DIR ...")
+            raise DataError(
+                f"{folder}: no such folder of photographs; name existing ones with --images DIR ..."
+            )
     photos = [path for folder in folders for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES]
     if len(photos) < 2:
         listed = ", ".join(str(folder) for folder in folders) or "no folder"
-        raise DataError(f"{listed}: {len(photos)} photographs; at least 2 are needed: name more with --images DIR ...")
+        raise DataError(
+            f"{listed}: {len(photos)} photographs; at least 2 are needed: name more with --images DIR ..."
+        )
     return sorted(photos, key=lambda path: (hashlib.sha256(path.name.encode()).digest(), str(path)))
 
 
@@ -56,7 +63,9 @@ def load_photo(path: Path, longest: int | None = None) -> Annotated[Tensor, "H W
     return smaller.permute(1, 2, 0).contiguous()
 
 
-def random_pixels(photo: Annotated[Tensor, "H W 3"], count: int, generator: torch.Generator) -> Annotated[Tensor, "N 2"]:
+def random_pixels(
+    photo: Annotated[Tensor, "H W 3"], count: int, generator: torch.Generator
+) -> Annotated[Tensor, "N 2"]:
     """Row and column indices, int64, drawn with replacement."""
     height, width = photo.shape[:2]
     index = torch.randint(0, height * width, (count,), generator=generator)
@@ -94,7 +103,9 @@ def filtered_whole(encoder: Encoder, photo: Annotated[Tensor, "H W 3"]) -> Annot
     """Features at every pixel, row by row."""
     with float32_convolutions(photo.device):
         features: Tensor = encoder(photo.permute(2, 0, 1)[None])[0]
-    return upsample(features, photo, radius=_radius(photo), eps=GUIDED.eps, stride=GUIDED.stride).flatten(0, 1)
+    return upsample(features, photo, radius=_radius(photo), eps=GUIDED.eps, stride=GUIDED.stride).flatten(
+        0, 1
+    )
 
 
 def _radius(photo: Annotated[Tensor, "H W 3"]) -> int:

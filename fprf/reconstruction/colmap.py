@@ -1,10 +1,12 @@
-"""The steps of COLMAP, one process each. A step that was done from the same images and settings is not done again.
+"""The steps of COLMAP, one process each. A step that was done from the same images and settings is not done
+again.
 
 Features and matches go into a database as they are found: a step that was cut off goes on where it stood.
 
-Which images look alike is told before they are matched by one vector each (VLAD, Jégou et al., 2010), from a vocabulary of the
-scene's own features: descriptors are assigned to visual words, k-means centres of a sample of all; the differences to the
-centres are summed word by word, tamed by a square root and scaled to length 1, word by word and altogether.
+Which images look alike is told before they are matched by one vector each (VLAD, Jégou et al., 2010), from a
+vocabulary of the scene's own features: descriptors are assigned to visual words, k-means centres of a sample
+of all; the differences to the centres are summed word by word, tamed by a square root and scaled to length 1,
+word by word and altogether.
 """
 
 import contextlib
@@ -34,8 +36,11 @@ Descriptors = Annotated[NDArray[np.uint8], "N 128"]
 Words = Annotated[NDArray[np.float32], "W 128"]
 Reader = Callable[[int], Descriptors]
 
-_SAMPLE, _MOST = 40_000, 2000
-"""Descriptors that the words are made of, and evenly taken ones of an image that its vector is made of, at most."""
+_SAMPLE = 40_000
+_MOST = 2000
+"""Descriptors that the words are made of, and evenly taken ones of an image that its vector is made of, at
+most.
+"""
 _ROUNDS = 12
 """Rounds of k-means, at most."""
 _ALL_PAIRS = 120
@@ -65,7 +70,9 @@ def sequential_pairs(count: int, overlap: int) -> list[Pair]:
 
 
 def similar_pairs(vectors: Annotated[NDArray[np.float32], "V X"], nearest: int) -> list[Pair]:
-    """Each with those whose unit vectors are most like its own, by cosine; an image without a vector (all 0) with none."""
+    """Each with those whose unit vectors are most like its own, by cosine; an image without a vector (all 0)
+    with none.
+    """
     # Cosines, without those of images with themselves and of images that nothing is known of.
     likeness = vectors @ vectors.T
     empty = ~vectors.any(axis=1)
@@ -73,12 +80,19 @@ def similar_pairs(vectors: Annotated[NDArray[np.float32], "V X"], nearest: int) 
     np.fill_diagonal(likeness, -np.inf)
     count = min(nearest, max(0, len(vectors) - 1))
     best = np.argsort(-likeness, axis=1, kind="stable")[:, :count]
-    pairs = {(min(a, b), max(a, b)) for a, row in enumerate(best.tolist()) for b in row if np.isfinite(likeness[a, b])}
+    pairs = {
+        (min(a, b), max(a, b))
+        for a, row in enumerate(best.tolist())
+        for b in row
+        if np.isfinite(likeness[a, b])
+    }
     return sorted(pairs)
 
 
 def build_vocabulary(read: Reader, count: int, number: int, seed: int = 0) -> Words:
-    """`number` visual words, or fewer where there are fewer descriptors; `read(i)` gives those of image i of `count`."""
+    """`number` visual words, or fewer where there are fewer descriptors; `read(i)` gives those of image i of
+    `count`.
+    """
     # A sample of all descriptors, as many of each image.
     rng = np.random.default_rng(seed)
     each = max(1, _SAMPLE // max(1, count))
@@ -107,7 +121,8 @@ def vlad_vectors(read: Reader, count: int, vocabulary: Words) -> Annotated[NDArr
         some = features[:: -(-len(features) // _MOST) or 1].astype(np.float32)
         if not len(some) or not len(vocabulary):
             continue
-        # Differences to the nearest word, summed word by word, tamed, and scaled to length 1 word by word and altogether.
+        # Differences to the nearest word, summed word by word, tamed, and scaled to length 1 word by word and
+        # altogether.
         nearest = np.argmin(_distances(some, vocabulary), axis=1)
         sums = np.zeros_like(vocabulary)
         np.add.at(sums, nearest, some - vocabulary[nearest])
@@ -161,7 +176,8 @@ def find_features(place: SceneFolder, state: State, config: SfmConfig, progress:
 
 def find_matches(place: SceneFolder, state: State, config: SfmConfig, progress: Progress) -> str:
     """Matches of the pairs that `matching` says. Returns what it was decided to be."""
-    names, video = list(state.images), "frames" in state.done
+    names = list(state.images)
+    video = "frames" in state.done
     kind = config.matching
     if kind == "auto":
         kind = "exhaustive" if len(names) <= _ALL_PAIRS else "similar"
@@ -174,7 +190,8 @@ def find_matches(place: SceneFolder, state: State, config: SfmConfig, progress: 
     elif kind == "sequential":
         chosen = sequential_pairs(len(names), config.overlap)
     else:
-        # Neighbours by name help where things look alike everywhere; in a video they are neighbours for certain.
+        # Neighbours by name help where things look alike everywhere; in a video they are neighbours for
+        # certain.
         near = sequential_pairs(len(names), config.overlap if video else 2)
 
         def read(image: int) -> Descriptors:
@@ -191,8 +208,12 @@ def find_matches(place: SceneFolder, state: State, config: SfmConfig, progress: 
     return kind
 
 
-def find_poses(place: SceneFolder, state: State, config: SfmConfig, progress: Progress) -> list[dict[str, Any]]:
-    """The largest model in `sparse/0`; all of them described. Raises DataError where no two images fit together."""
+def find_poses(
+    place: SceneFolder, state: State, config: SfmConfig, progress: Progress
+) -> list[dict[str, Any]]:
+    """The largest model in `sparse/0`; all of them described. Raises DataError where no two images fit
+    together.
+    """
     key = step_key(state.done["matches"], "mapping")
     described = place.work / "models" / "models.json"
     if state.done.get("mapping") == key and (place.model / "images.bin").is_file() and described.is_file():
@@ -201,7 +222,9 @@ def find_poses(place: SceneFolder, state: State, config: SfmConfig, progress: Pr
 
     def registered() -> int:
         """Images with a pose so far: a line for each but the first."""
-        lines = [line for line in place.progress.read_text(encoding="utf-8").splitlines() if line.startswith("{")]
+        lines = [
+            line for line in place.progress.read_text(encoding="utf-8").splitlines() if line.startswith("{")
+        ]
         return len(lines) + 1 if lines else 0
 
     job = {"step": "mapping", "models": str(described.parent)}
@@ -226,10 +249,11 @@ def _run(
     total: int,
     progress: Progress,
 ) -> None:
-    """One step in its process, which is `count()` of `total` far. Raises UsageError where pycolmap is absent, DataError
-    where COLMAP fails.
+    """One step in its process, which is `count()` of `total` far. Raises UsageError where pycolmap is absent,
+    DataError where COLMAP fails.
     """
-    name, start = job["step"], time.perf_counter()
+    name = job["step"]
+    start = time.perf_counter()
     what = _TITLES[name]
     path = place.work / f"{name}.job.json"
     common = {
@@ -254,11 +278,17 @@ def _run(
     # Exit codes of the worker, in sentences.
     code = process.returncode
     if code == NO_PYCOLMAP:
-        raise UsageError("fprf process: pycolmap 4 or newer is needed; install it with: pip install 'pycolmap>=4'")
+        raise UsageError(
+            "fprf process: pycolmap 4 or newer is needed; install it with: pip install 'pycolmap>=4'"
+        )
     if code == NO_MODEL:
         # What the decoders lost comes first: it may be all that is wrong.
         unread = sorted(set(state.images) - set(MatchTables(place.database).features))
-        missed = f"COLMAP cannot decode {len(unread)} of {len(state.images)} images, for example {unread[0]}" if unread else ""
+        missed = (
+            f"COLMAP cannot decode {len(unread)} of {len(state.images)} images, for example {unread[0]}"
+            if unread
+            else ""
+        )
         lost = "; ".join(filter(None, [lost_files(state), missed]))
         rest = "no two of the other images fit together" if lost else "no two images fit together"
         raise DataError(
@@ -266,7 +296,11 @@ def _run(
             f"({place.log} has COLMAP's words)"
         )
     if code:
-        lines = [line for line in place.log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+        lines = [
+            line
+            for line in place.log.read_text(encoding="utf-8", errors="replace").splitlines()
+            if line.strip()
+        ]
         last = lines[-1].strip()[-200:] if lines else "nothing was said"
         raise DataError(f"{place.root}: COLMAP's {name} ended with {code}: {last}; {place.log} has the rest")
     progress(total, total, what)

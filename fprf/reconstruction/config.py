@@ -15,7 +15,9 @@ class SfmConfig:
     frames: int = 150
     """Sharp frames taken from a video, at most; images of a folder are all used."""
     blurred: float = 0.3
-    """A stretch of a video whose sharpest frame has less than this share of the sharpness around it gives none, in [0, 1)."""
+    """A stretch of a video whose sharpest frame has less than this share of the sharpness around it gives
+    none, in [0, 1).
+    """
     lens: Lens = "simple-radial"
     """Lens model that is fitted; wide-angle and action cameras want opencv or opencv-fisheye."""
     cameras: Literal["shared", "each"] = "shared"
@@ -25,9 +27,10 @@ class SfmConfig:
     side: int = 1600
     """Longest side in pixels at which features are sought; larger images are reduced for that."""
     matching: Literal["auto", "exhaustive", "sequential", "similar"] = "auto"
-    """exhaustive: all with all. sequential: in the order of names or time. similar: with those that look alike, by a
-    vocabulary of the scene's own features, and with their neighbours by name. auto: exhaustive for up to 120 images, else
-    similar, with sequential for videos."""
+    """exhaustive: all with all. sequential: in the order of names or time. similar: with those that look
+    alike, by a vocabulary of the scene's own features, and with their neighbours by name. auto: exhaustive
+    for up to 120 images, else similar, with sequential for videos.
+    """
     overlap: int = 10
     """Neighbours in order that an image is matched with, and 2, 4, 8, ... 2^overlap further on."""
     neighbours: int = 30

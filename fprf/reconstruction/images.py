@@ -1,7 +1,8 @@
-"""The images of a scene: copied from a folder, or taken from a video where it is sharp, with what their EXIF says of the lens.
+"""The images of a scene: copied from a folder, or taken from a video where it is sharp, with what their EXIF
+says of the lens.
 
-The sharpness of an image is the variance of its Laplacian on grey levels in [0, 255]: blur takes the fine edges first. It
-depends on what is shown, so frames are compared with their neighbours only.
+The sharpness of an image is the variance of its Laplacian on grey levels in [0, 255]: blur takes the fine
+edges first. It depends on what is shown, so frames are compared with their neighbours only.
 """
 
 import hashlib
@@ -33,7 +34,8 @@ _NEIGHBOURS = 2
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
 """Suffixes of videos, in lower case."""
-_FRAME, _QUALITY = "frame_{:06d}.jpg", 95
+_FRAME = "frame_{:06d}.jpg"
+_QUALITY = 95
 """File of a frame, and its quality as JPEG."""
 _FEWEST = 3
 """Images that a scene needs at least."""
@@ -50,7 +52,9 @@ def sharpness(image: Image) -> float:
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     scale = _SIDE / max(grey.shape)
     if scale < 1:
-        grey = np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        grey = np.asarray(
+            cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8
+        )
     return float(cv2.Laplacian(grey, cv2.CV_64F).var())
 
 
@@ -58,8 +62,9 @@ def choose_frames(scores: Sequence[float], count: int, least: float) -> tuple[li
     """The sharpest frame of each of `count` windows of equal length, and the other frames with the reason.
 
     The first of equally sharp frames is taken.
-    A window whose best frame has less than `least` times the median sharpness of the windows around it gives none: all of
-    it is blurred, as in a quick turn. `least` lies in [0, 1). With `count` frames or fewer every frame is a window.
+    A window whose best frame has less than `least` times the median sharpness of the windows around it gives
+    none: all of it is blurred, as in a quick turn. `least` lies in [0, 1). With `count` frames or fewer every
+    frame is a window.
     """
     # Windows of equal length, but for rounding, and the sharpest frame of each.
     windows = min(count, len(scores))
@@ -73,40 +78,58 @@ def choose_frames(scores: Sequence[float], count: int, least: float) -> tuple[li
     # The best frames of the windows around say how sharp images are there.
     chosen = []
     for k, top in enumerate(best):
-        around = [scores[best[j]] for j in range(max(0, k - _NEIGHBOURS), min(windows, k + _NEIGHBOURS + 1)) if j != k]
+        around = [
+            scores[best[j]]
+            for j in range(max(0, k - _NEIGHBOURS), min(windows, k + _NEIGHBOURS + 1))
+            if j != k
+        ]
         usual = float(np.median(around)) if around else 0.0
         if scores[top] < least * usual:
-            dropped[top] = f"blurred, like all frames around it (sharpness {scores[top]:.0f}, usual there is {usual:.0f})"
+            dropped[top] = (
+                f"blurred, like all frames around it (sharpness {scores[top]:.0f}, usual there is {usual:.0f})"
+            )
         else:
             chosen.append(top)
     return chosen, dict(sorted(dropped.items()))
 
 
-def save_frames(video: Path, frames: Sequence[int], place: SceneFolder, state: State, progress: Progress) -> None:
+def save_frames(
+    video: Path, frames: Sequence[int], place: SceneFolder, state: State, progress: Progress
+) -> None:
     """Write some of the frames, at least one, as JPEG (95)."""
-    wanted, last, done = set(frames), max(frames), 0
+    wanted = set(frames)
+    last = max(frames)
+    done = 0
     for index, (_, image) in enumerate(_frames(video, wanted)):
         if index in wanted:
-            coded, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+            coded, data = cv2.imencode(
+                ".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+            )
             assert coded
             _write_image(place, state, _FRAME.format(index), data.tobytes())
             done += 1
             progress(done, len(wanted), "writing frames")
         if index == last:
             return
-    raise DataError(f"{video}: frame {last} was there before and is not now; keep the video as it is while it is processed")
+    raise DataError(
+        f"{video}: frame {last} was there before and is not now; keep the video as it is while it is processed"
+    )
 
 
 def _frames(video: Path, wanted: set[int] | None = None) -> Iterator[tuple[int, Image]]:
-    """The number of frames that a video claims to have, with each of them; those that are not wanted come empty.
+    """The number of frames that a video claims to have, with each of them; those that are not wanted come
+    empty.
 
     Raises DataError where it cannot be opened.
     """
     reader = cv2.VideoCapture(str(video))
     try:
         if not reader.isOpened():
-            raise DataError(f"{video}: no video that can be opened; convert it to H.264 in an .mp4, or give a folder of images")
-        expected, index = max(0, int(reader.get(cv2.CAP_PROP_FRAME_COUNT))), 0
+            raise DataError(
+                f"{video}: no video that can be opened; convert it to H.264 in an .mp4, or give a folder of images"
+            )
+        expected = max(0, int(reader.get(cv2.CAP_PROP_FRAME_COUNT)))
+        index = 0
         while reader.grab():
             image = np.empty((0, 0, 3), dtype=np.uint8)
             if wanted is None or index in wanted:
@@ -131,19 +154,26 @@ class Lens(NamedTuple):
 
 
 def read_lens(path: Path) -> Lens:
-    """The lens of a photograph by its EXIF block; an empty one where that says nothing, or nothing that can be understood."""
+    """The lens of a photograph by its EXIF block; an empty one where that says nothing, or nothing that can
+    be understood.
+    """
     exif = _exif(path)
     try:
         inner = exif.get_ifd(IFD.Exif)
-        focal, focal_35 = float(inner.get(Tag.FocalLength, 0)), float(inner.get(Tag.FocalLengthIn35mmFilm, 0))
+        focal = float(inner.get(Tag.FocalLength, 0))
+        focal_35 = float(inner.get(Tag.FocalLengthIn35mmFilm, 0))
         model = str(exif.get(Tag.Model, "")).split("\0")[0].strip()
     except Exception:  # values of other types, and whatever Pillow raises over a damaged block
         return Lens()
-    return Lens(model, focal if 0 < focal < math.inf else 0.0, int(focal_35) if 0 < focal_35 < math.inf else 0)
+    return Lens(
+        model, focal if 0 < focal < math.inf else 0.0, int(focal_35) if 0 < focal_35 < math.inf else 0
+    )
 
 
 def _exif(path: Path) -> PIL.Image.Exif:
-    """The EXIF block of an image file; an empty one where there is none, it cannot be understood, or the file is none."""
+    """The EXIF block of an image file; an empty one where there is none, it cannot be understood, or the file
+    is none.
+    """
     try:
         with path.open("rb") as file:
             image = open_image(file, path)[1]
@@ -155,17 +185,23 @@ def _exif(path: Path) -> PIL.Image.Exif:
         return PIL.Image.Exif()
 
 
-def gather_images(source: Path, place: SceneFolder, state: State, config: SfmConfig, progress: Progress) -> None:
+def gather_images(
+    source: Path, place: SceneFolder, state: State, config: SfmConfig, progress: Progress
+) -> None:
     """Bring images into the folder, and describe them and what was dropped in `state`.
 
-    Raises UsageError for a source that is neither a folder of images nor a video, or not the one that the folder was
-    begun with; DataError for too few images.
+    Raises UsageError for a source that is neither a folder of images nor a video, or not the one that the
+    folder was begun with; DataError for too few images.
     """
     here = str(source.resolve())
     if state.source not in ("", here):
-        raise UsageError(f"--output {place.root}: was begun with {state.source}; go on with that, or name another folder")
+        raise UsageError(
+            f"--output {place.root}: was begun with {state.source}; go on with that, or name another folder"
+        )
     if source.resolve() == place.root.resolve():
-        raise UsageError(f"{source}: is the scene folder itself; give {place.images}, or name another --output")
+        raise UsageError(
+            f"{source}: is the scene folder itself; give {place.images}, or name another --output"
+        )
     if source.is_dir():
         gathered = _from_folder(source, place, state, progress)
     elif source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES:
@@ -177,20 +213,27 @@ def gather_images(source: Path, place: SceneFolder, state: State, config: SfmCon
         state.images = gathered
         why = lost_files(state) or "the video holds no more"
         if source.is_dir() and not state.dropped:
-            endings = sorted({path.suffix.lower() for path in source.rglob("*") if path.is_file() and path.suffix})
+            endings = sorted(
+                {path.suffix.lower() for path in source.rglob("*") if path.is_file() and path.suffix}
+            )
             there = f"it holds {' '.join(endings)} files" if endings else "it holds no files"
-            why = f"{there}, and what is read is {' '.join(sorted(IMAGE_SUFFIXES))}: convert the images to JPEG"
+            why = (
+                f"{there}, and what is read is {' '.join(sorted(IMAGE_SUFFIXES))}: convert the images to JPEG"
+            )
         raise DataError(f"{source}: {why}; {len(gathered)} usable images, at least {_FEWEST} are needed")
     # Images that are no longer used go, but never from the source itself.
     for name in set(state.images) - set(gathered):
         if place.images.resolve() != source.resolve():
             (place.images / name).unlink(missing_ok=True)
-    state.source, state.images = here, {name: gathered[name] for name in natural_order(gathered)}
+    state.source = here
+    state.images = {name: gathered[name] for name in natural_order(gathered)}
     state.save(place)
 
 
 def lost_files(state: State) -> str:
-    """The files of a folder that could not be decoded, in one clause; empty where all could be, and of a video."""
+    """The files of a folder that could not be decoded, in one clause; empty where all could be, and of a
+    video.
+    """
     if not state.dropped or "frames" in state.done:
         return ""
     # Files with the same reason are named together.
@@ -218,27 +261,40 @@ def natural_order(names: Iterable[str]) -> list[str]:
     return sorted(names, key=rank)
 
 
-def _from_folder(source: Path, place: SceneFolder, state: State, progress: Progress) -> dict[str, dict[str, Any]]:
-    """Every image below the folder that can be decoded, under its relative name without blanks and a leading #.
+def _from_folder(
+    source: Path, place: SceneFolder, state: State, progress: Progress
+) -> dict[str, dict[str, Any]]:
+    """Every image below the folder that can be decoded, under its relative name without blanks and a leading
+    #.
 
-    Formats that COLMAP does not read become JPEGs, whatever the name says: IMG_1.heic is IMG_1.heic.jpg in the scene. All
-    others are copied: COLMAP and `load_image` see the same pixels in them.
+    Formats that COLMAP does not read become JPEGs, whatever the name says: IMG_1.heic is IMG_1.heic.jpg in
+    the scene. All others are copied: COLMAP and `load_image` see the same pixels in them.
     """
-    # Images may lie in the scene already. A scene inside of the source is left out; hidden folders are those of other programs.
-    inplace, scene = place.images.resolve() == source.resolve(), place.root.resolve()
-    files = sorted(path for path in source.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
+    # Images may lie in the scene already. A scene inside of the source is left out; hidden folders are those
+    # of other programs.
+    inplace = place.images.resolve() == source.resolve()
+    scene = place.root.resolve()
+    files = sorted(
+        path for path in source.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()
+    )
     if source.resolve() in scene.parents:
         inner = source / scene.relative_to(source.resolve())
         files = [path for path in files if not path.is_relative_to(inner)]
-    files = [path for path in files if not any(part.startswith(".") for part in path.relative_to(source).parts)]
+    files = [
+        path for path in files if not any(part.startswith(".") for part in path.relative_to(source).parts)
+    ]
     entries: dict[str, dict[str, Any]] = {}
     state.dropped = {}
     for i, path in enumerate(files):
         progress(i, len(files), "reading images")
         given = path.relative_to(source).as_posix()
-        name = re.sub(r"\s|^#", "_", given)  # in COLMAP's lists of pairs a blank ends a name, and # begins a comment
+        name = re.sub(
+            r"\s|^#", "_", given
+        )  # in COLMAP's lists of pairs a blank ends a name, and # begins a comment
         if name in entries or (inplace and name != given):
-            raise UsageError(f"{path}: COLMAP takes no blanks or leading # in names; rename it so that none else is {name}")
+            raise UsageError(
+                f"{path}: COLMAP takes no blanks or leading # in names; rename it so that none else is {name}"
+            )
         # What was gathered before, and has not changed, is not read again.
         data = path.read_bytes()
         digest = hashlib.sha256(data).hexdigest()
@@ -252,7 +308,9 @@ def _from_folder(source: Path, place: SceneFolder, state: State, progress: Progr
             known = state.images.get(name, {})
             fresh = known.get("sha256") != digest or not (place.images / name).is_file()
             if foreign and inplace:
-                raise DataError(f"{path}: COLMAP reads no {kind}: name another --output, where JPEGs are made")
+                raise DataError(
+                    f"{path}: COLMAP reads no {kind}: name another --output, where JPEGs are made"
+                )
             if fresh and foreign:
                 _write_image(place, state, name, _jpeg(path))
             if fresh:
@@ -282,7 +340,9 @@ def _from_video(
         progress(len(scores), max(expected, len(scores) + 1), "looking for sharp frames")
         scores.append(sharpness(frame))
     if not scores:
-        raise DataError(f"{source}: no frame can be decoded; convert it to H.264 in an .mp4, or give a folder of images")
+        raise DataError(
+            f"{source}: no frame can be decoded; convert it to H.264 in an .mp4, or give a folder of images"
+        )
     progress(len(scores), len(scores), "looking for sharp frames")
     chosen, dropped = choose_frames(scores, config.frames, config.blurred)
     save_frames(source, chosen, place, state, progress)
@@ -296,19 +356,27 @@ def _from_video(
 
 
 def _write_image(place: SceneFolder, state: State, name: str, data: bytes) -> None:
-    """Write an image, whole or not at all. Raises UsageError where another picture lies that no earlier run has brought."""
+    """Write an image, whole or not at all. Raises UsageError where another picture lies that no earlier run
+    has brought.
+    """
     path = place.images / name
     there = path.read_bytes() if path.is_file() else None  # a run that was cut off left the same bytes
     if there is not None and there != data and name not in state.images:
-        raise UsageError(f"--output {place.root}: images/{name} is another picture; name a folder that is new or empty")
+        raise UsageError(
+            f"--output {place.root}: images/{name} is another picture; name a folder that is new or empty"
+        )
     if there != data:
         write_bytes(path, data)
 
 
 def _jpeg(path: Path) -> bytes:
-    """The image as JPEG, upright, with what the file says of its camera. Raises DataError where it cannot be decoded."""
+    """The image as JPEG, upright, with what the file says of its camera. Raises DataError where it cannot be
+    decoded.
+    """
     # The pixels are turned here, so that nothing may turn them again.
-    pixels, exif, data = load_image(path, upright=True), _exif(path), BytesIO()
+    pixels = load_image(path, upright=True)
+    exif = _exif(path)
+    data = BytesIO()
     exif.pop(Tag.Orientation, None)
     try:
         block = exif.tobytes()

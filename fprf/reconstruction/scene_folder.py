@@ -62,13 +62,17 @@ class State:
 
     @classmethod
     def load(cls, place: SceneFolder) -> "State":
-        """The state of a folder; a new one where nothing was done. Raises UsageError for a folder of something else."""
+        """The state of a folder; a new one where nothing was done. Raises UsageError for a folder of
+        something else.
+        """
         path = place.work / "state.json"
         # Only a folder that is new, or holds no more than images, is begun in.
         if not path.is_file():
             here = [entry.name for entry in place.root.iterdir()] if place.root.is_dir() else []
             if (place.root.exists() and not place.root.is_dir()) or set(here) - _IGNORED:
-                raise UsageError(f"--output {place.root}: holds something else; name a folder that is new or empty")
+                raise UsageError(
+                    f"--output {place.root}: holds something else; name a folder that is new or empty"
+                )
             return cls()
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
@@ -76,7 +80,9 @@ class State:
                 raise ValueError("written by another version")
             return cls(**content)
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise DataError(f"{path}: cannot be read ({error}); remove the folder {place.work} and start anew") from error
+            raise DataError(
+                f"{path}: cannot be read ({error}); remove the folder {place.work} and start anew"
+            ) from error
 
     def save(self, place: SceneFolder) -> None:
         """Write it."""
@@ -95,13 +101,17 @@ _LEAST = 15
 
 
 class MatchTables:
-    """Features and matches in a database, by image. Raises sqlite3.Error for what is no database of COLMAP's."""
+    """Features and matches in a database, by image. Raises sqlite3.Error for what is no database of
+    COLMAP's.
+    """
 
     def __init__(self, path: Path) -> None:
         with reading(path) as base:
             names = dict(base.execute("SELECT image_id, name FROM images"))
             features = dict(base.execute("SELECT image_id, rows FROM keypoints"))
-            pairs = base.execute("SELECT pair_id FROM two_view_geometries WHERE rows >= ?", (_LEAST,)).fetchall()
+            pairs = base.execute(
+                "SELECT pair_id FROM two_view_geometries WHERE rows >= ?", (_LEAST,)
+            ).fetchall()
         self.features: dict[str, int] = {name: features.get(number, 0) for number, name in names.items()}
         """Features of each image that COLMAP could decode."""
         fit = [divmod(pair, _MAX_IMAGES) for (pair,) in pairs]
@@ -128,23 +138,36 @@ def reading(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def report(
-    state: Mapping[str, Any], matching: str, matches: MatchTables, models: Sequence[Mapping[str, Any]], version: str
+    state: Mapping[str, Any],
+    matching: str,
+    matches: MatchTables,
+    models: Sequence[Mapping[str, Any]],
+    version: str,
 ) -> dict[str, Any]:
     """The content of process.json; `state` as a mapping, and COLMAP's models, the largest first.
 
-    Every image without a pose in the first of these is dropped: in the order of the steps, choosing, features, matching and
-    mapping, with the one where it was lost and the reason.
+    Every image without a pose in the first of these is dropped: in the order of the steps, choosing,
+    features, matching and mapping, with the one where it was lost and the reason.
     """
-    images, unused = state["images"], state["dropped"]
+    images = state["images"]
+    unused = state["dropped"]
     main = models[0] if models else {"images": [], "points": 0, "error_pixels": None, "track_length": None}
-    posed, size = set(main["images"]), [len(model["images"]) for model in models]
+    posed = set(main["images"])
+    size = [len(model["images"]) for model in models]
     part_of: dict[str, int] = {}  # the largest part that has it
     for number, model in enumerate(models, 1):
         part_of = dict.fromkeys(model["images"], number) | part_of
-    lost: dict[str, list[tuple[str, str]]] = {"choosing": [*unused.items()], "features": [], "matching": [], "mapping": []}
+    lost: dict[str, list[tuple[str, str]]] = {
+        "choosing": [*unused.items()],
+        "features": [],
+        "matching": [],
+        "mapping": [],
+    }
     # The first step that an image did not pass is where it was lost.
     for name in images:
-        features, partners, part = matches.features.get(name), matches.partners[name], part_of.get(name)
+        features = matches.features.get(name)
+        partners = matches.partners[name]
+        part = part_of.get(name)
         if name in posed:
             continue
         if features is None:
@@ -152,7 +175,9 @@ def report(
         elif not features:
             lost["features"].append((name, "nothing with texture in it"))
         elif not partners:
-            lost["matching"].append((name, f"{features} features, but it fits no other image; take views in between"))
+            lost["matching"].append(
+                (name, f"{features} features, but it fits no other image; take views in between")
+            )
         elif part is not None:
             apart = f"in part {part} ({size[part - 1]} images), apart from the rest; take views in between"
             lost["mapping"].append((name, apart))
@@ -170,6 +195,8 @@ def report(
         "matching": matching,
         "step_seconds": dict(state["seconds"]),
         "dropped": [
-            {"image": image, "step": step, "reason": reason} for step, drops in lost.items() for image, reason in drops
+            {"image": image, "step": step, "reason": reason}
+            for step, drops in lost.items()
+            for image, reason in drops
         ],
     }

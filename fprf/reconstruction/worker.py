@@ -1,9 +1,9 @@
 """`python -m fprf.reconstruction.worker JOB.json`: one step of COLMAP, in a process of its own.
 
-pycolmap brings libraries that clash with those of OpenCV and Pillow in one process, so nothing here imports these, numpy or
-torch, and nothing else in this package imports pycolmap. Progress goes to standard output as JSON lines, COLMAP's own words to
-standard error.
-Exit codes: 0 done, 3 pycolmap is absent or too old, 4 no reconstruction; anything else is COLMAP's failure.
+pycolmap brings libraries that clash with those of OpenCV and Pillow in one process, so nothing here imports
+these, numpy or torch, and nothing else in this package imports pycolmap. Progress goes to standard output as
+JSON lines, COLMAP's own words to standard error. Exit codes: 0 done, 3 pycolmap is absent or too old, 4 no
+reconstruction; anything else is COLMAP's failure.
 """
 
 import itertools
@@ -12,10 +12,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
-NO_PYCOLMAP, NO_MODEL = 3, 4
+NO_PYCOLMAP = 3
+NO_MODEL = 4
 _FIRST_ANGLES = 16.0, 2.0
-"""Degrees between the rays of the first pair, at least; COLMAP itself goes down to a quarter. Where all photographs face the
-same things from nearly one place (llff_flower: 34 within an arm's length) none has more than four."""
+"""Degrees between the rays of the first pair, at least; COLMAP itself goes down to a quarter. Where all
+photographs face the same things from nearly one place (llff_flower: 34 within an arm's length) none has more
+than four.
+"""
 
 
 def main(job: dict[str, Any]) -> int:
@@ -36,11 +39,13 @@ def main(job: dict[str, Any]) -> int:
 def _features(pycolmap: Any, job: dict[str, Any]) -> int:
     """Features of the images that have none yet; images of a group share a camera."""
     options = pycolmap.FeatureExtractionOptions()
-    options.max_image_size, options.num_threads = job["side"], job["threads"]
+    options.max_image_size = job["side"]
+    options.num_threads = job["threads"]
     options.sift.max_num_features = job["features"]
     for group in job["groups"]:
         # Images of the group without features; the camera is that of those that have some, or a new one (-1).
-        missing, camera = [], -1
+        missing = []
+        camera = -1
         with pycolmap.Database.open(job["database"]) as base:
             images = {image.name: image for image in base.read_all_images()}
             for name in group:
@@ -51,7 +56,8 @@ def _features(pycolmap: Any, job: dict[str, Any]) -> int:
         if not missing:
             continue
         reader = pycolmap.ImageReaderOptions()
-        reader.camera_model, reader.existing_camera_id = job["lens"], camera
+        reader.camera_model = job["lens"]
+        reader.existing_camera_id = camera
         pycolmap.extract_features(
             job["database"],
             job["images"],
@@ -84,7 +90,9 @@ def _matches(pycolmap: Any, job: dict[str, Any]) -> int:
 def _mapping(pycolmap: Any, job: dict[str, Any]) -> int:
     """Poses and points; every model is described in models.json, the largest one is written."""
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads, options.random_seed, options.min_model_size = job["threads"], job["seed"], 3
+    options.num_threads = job["threads"]
+    options.random_seed = job["seed"]
+    options.min_model_size = 3
     registered = itertools.count(1)
 
     def count() -> None:
@@ -97,7 +105,12 @@ def _mapping(pycolmap: Any, job: dict[str, Any]) -> int:
     for angle in _FIRST_ANGLES:
         options.mapper.init_min_tri_angle = angle
         mapped = pycolmap.incremental_mapping(
-            job["database"], job["images"], str(out), options, initial_image_pair_callback=count, next_image_callback=count
+            job["database"],
+            job["images"],
+            str(out),
+            options,
+            initial_image_pair_callback=count,
+            next_image_callback=count,
         )
         if mapped:
             break

@@ -1,10 +1,11 @@
 """Calibrated views and the rays through their pixels.
 
-World metres (or whatever unit the capture has), float64 throughout: the space that fields live in is recentred from it.
-Axes are OpenGL's: x right, y up, the camera looks along -z. Pixel centres lie at +0.5.
+World metres (or whatever unit the capture has), float64 throughout: the space that fields live in is
+recentred from it. Axes are OpenGL's: x right, y up, the camera looks along -z. Pixel centres lie at +0.5.
 
-Undistortion takes a dozen Newton steps a pixel; training asks for the same pixels over and over. Captures with one camera
-need one table (24 bytes a pixel). Above `LIMIT` bytes, for thousands of different lenses, rays are solved as they come.
+Undistortion takes a dozen Newton steps a pixel; training asks for the same pixels over and over. Captures
+with one camera need one table (24 bytes a pixel). Above `LIMIT` bytes, for thousands of different lenses,
+rays are solved as they come.
 """
 
 from collections.abc import Sequence
@@ -21,7 +22,9 @@ from .lens import PINHOLE, bend, lens_reach, unbend
 
 @dataclass(frozen=True)
 class Cameras:
-    """V views. `lens` is 0 pinhole, 1 OpenCV (k1..k4 radial, p1 p2 tangential), 2 fisheye (equidistant, k1..k4)."""
+    """V views. `lens` is 0 pinhole, 1 OpenCV (k1..k4 radial, p1 p2 tangential), 2 fisheye (equidistant,
+    k1..k4).
+    """
 
     pose: Annotated[Tensor, "V 3 4"]
     """Camera to world, float64."""
@@ -41,7 +44,9 @@ class Cameras:
 
     @cached_property
     def reach(self) -> Annotated[Tensor, "V"]:
-        """Limit up to which each lens maps one to one: radius at depth 1, or a fisheye's angle; infinite for a pinhole."""
+        """Limit up to which each lens maps one to one: radius at depth 1, or a fisheye's angle; infinite for
+        a pinhole.
+        """
         return lens_reach(self.distortion, self.lens)
 
     def select(self, index: Annotated[Tensor, "M"]) -> "Cameras":
@@ -68,11 +73,13 @@ class Cameras:
 
 
 def ideal_cameras(pose: Annotated[Tensor, "V 3 4"], focal: Tensor | float, size: tuple[int, int]) -> Cameras:
-    """Pinhole views of one size (width, height) without distortion, the principal point in the middle, pixels square.
+    """Pinhole views of one size (width, height) without distortion, the principal point in the middle, pixels
+    square.
 
     `focal` in pixels is one number, or one for each view.
     """
-    count, sides = len(pose), torch.tensor(size)
+    count = len(pose)
+    sides = torch.tensor(size)
     return Cameras(
         pose=pose,
         focal=torch.as_tensor(focal, dtype=torch.float64).reshape(-1, 1).expand(count, 2).clone(),
@@ -84,7 +91,9 @@ def ideal_cameras(pose: Annotated[Tensor, "V 3 4"], focal: Tensor | float, size:
 
 
 def pixel_grid(cameras: Cameras, view: int) -> Annotated[Tensor, "N 2"]:
-    """All N = H * W pixel centres of a view, row by row, float64: x in [0.5, W - 0.5], y in [0.5, H - 0.5]."""
+    """All N = H * W pixel centres of a view, row by row, float64: x in [0.5, W - 0.5], y in [0.5, H -
+    0.5].
+    """
     width, height = cameras.size[view].tolist()
     device = cameras.focal.device
     x = torch.arange(width, dtype=torch.float64, device=device) + 0.5
@@ -99,7 +108,8 @@ def _plane(cameras: Cameras, view: Tensor, pixel: Tensor) -> Tensor:
 def rays_through(
     cameras: Cameras, view: Annotated[Tensor, "R"], pixel: Annotated[Tensor, "R 2"]
 ) -> tuple[Annotated[Tensor, "R 3"], Annotated[Tensor, "R 3"]]:
-    """Origin and unit direction in the world, float64, of the rays through pixels of views; lenses may be mixed.
+    """Origin and unit direction in the world, float64, of the rays through pixels of views; lenses may be
+    mixed.
 
     A pixel that the lens maps nothing to gets the outermost direction on its side.
     """
@@ -118,8 +128,8 @@ def project(
 ) -> tuple[Annotated[Tensor, "R 2"], Annotated[Tensor, "R"]]:
     """Pixels, and depths along the view's axis, of world points in views, one view a point.
 
-    NaN pixels where the lens cannot see the point (behind it, or beyond its reach). Points that fall outside of the
-    image are not marked.
+    NaN pixels where the lens cannot see the point (behind it, or beyond its reach). Points that fall outside
+    of the image are not marked.
     """
     pose = cameras.pose[view]
     offset = points.to(pose) - pose[:, :, 3]
@@ -130,7 +140,9 @@ def project(
 
 
 def look_up(image: Annotated[Tensor, "H W C"], pixel: Annotated[Tensor, "N 2"]) -> Annotated[Tensor, "N C"]:
-    """Bilinear values at pixels, whose centres lie at +0.5, in their dtype; beside the image those of its border."""
+    """Bilinear values at pixels, whose centres lie at +0.5, in their dtype; beside the image those of its
+    border.
+    """
     place = 2 * pixel / pixel.new_tensor([image.shape[1], image.shape[0]]) - 1
     return F.grid_sample(
         image.to(place).permute(2, 0, 1)[None],
@@ -148,7 +160,8 @@ LIMIT = 256 * 2**20
 class PixelRays:
     """`rays_through` for pixels at their centres (+0.5), equal to it within float64 rounding.
 
-    Directions are kept for each kind of lens, up to `limit` bytes; those of pinholes beyond it are found without iteration.
+    Directions are kept for each kind of lens, up to `limit` bytes; those of pinholes beyond it are found
+    without iteration.
     """
 
     def __init__(self, cameras: Cameras, *, limit: int = LIMIT) -> None:
@@ -156,7 +169,14 @@ class PixelRays:
         self.pinholes = bool((cameras.lens == PINHOLE).all())
         # Views with one lens share a table: most captures have one camera.
         described = torch.cat(
-            [cameras.focal, cameras.centre, cameras.distortion, cameras.size.double(), cameras.lens[:, None].double()], -1
+            [
+                cameras.focal,
+                cameras.centre,
+                cameras.distortion,
+                cameras.size.double(),
+                cameras.lens[:, None].double(),
+            ],
+            -1,
         )
         kinds, self.kind = torch.unique(described, dim=0, return_inverse=True)
         first = torch.stack([(self.kind == k).nonzero()[0, 0] for k in range(len(kinds))])
@@ -164,11 +184,15 @@ class PixelRays:
         self.start = area.cumsum(0) - area
         self.table: Tensor | None = None
         if int(area.sum()) * 24 <= limit:
-            self.table = torch.cat([directions_of(intrinsics_of(cameras, int(view)), cameras.pose.device) for view in first])
+            self.table = torch.cat(
+                [directions_of(intrinsics_of(cameras, int(view)), cameras.pose.device) for view in first]
+            )
 
     @property
     def waits(self) -> bool:
-        """True where an accelerator would make the host wait: lenses beyond the limit are inverted by iteration."""
+        """True where an accelerator would make the host wait: lenses beyond the limit are inverted by
+        iteration.
+        """
         return self.table is None and not self.pinholes
 
     @property
@@ -178,7 +202,9 @@ class PixelRays:
 
     def to(self, device: torch.device) -> "PixelRays":
         """Move to a device."""
-        self.cameras, self.kind, self.start = self.cameras.to(device), self.kind.to(device), self.start.to(device)
+        self.cameras = self.cameras.to(device)
+        self.kind = self.kind.to(device)
+        self.start = self.start.to(device)
         self.table = None if self.table is None else self.table.to(device)
         return self
 
@@ -201,9 +227,11 @@ class PixelRays:
 def grid_rays(
     cameras: Cameras, view: int, device: torch.device | None = None
 ) -> tuple[Annotated[Tensor, "N 3"], Annotated[Tensor, "N 3"]]:
-    """`rays_through` all pixels of a view (`pixel_grid`), within float64 rounding; on a device, else where the cameras lie.
+    """`rays_through` all pixels of a view (`pixel_grid`), within float64 rounding; on a device, else where
+    the cameras lie.
 
-    The frames of a path, and mostly the views of a capture, look through one lens: the last two are remembered.
+    The frames of a path, and mostly the views of a capture, look through one lens: the last two are
+    remembered.
     """
     pose = cameras.pose[view].to(device)
     direction = directions_of(intrinsics_of(cameras, view), pose.device) @ pose[:, :3].T
@@ -223,12 +251,16 @@ class Intrinsics(NamedTuple):
         """One view with these intrinsics, at the origin, looking along -z."""
         still = torch.cat([torch.eye(3, dtype=torch.float64), torch.zeros(3, 1, dtype=torch.float64)], 1)
         focal, centre, distortion = (torch.tensor([x], dtype=torch.float64) for x in self[:3])
-        return Cameras(still[None], focal, centre, torch.tensor([self.size]), distortion, torch.tensor([self.lens]))
+        return Cameras(
+            still[None], focal, centre, torch.tensor([self.size]), distortion, torch.tensor([self.lens])
+        )
 
 
 def intrinsics_of(cameras: Cameras, view: int) -> Intrinsics:
     """Intrinsics of a view."""
-    focal, centre, distortion = (tuple(each[view].tolist()) for each in (cameras.focal, cameras.centre, cameras.distortion))
+    focal, centre, distortion = (
+        tuple(each[view].tolist()) for each in (cameras.focal, cameras.centre, cameras.distortion)
+    )
     return Intrinsics(focal, centre, distortion, tuple(cameras.size[view].tolist()), int(cameras.lens[view]))
 
 
@@ -241,30 +273,34 @@ def directions_of(intrinsics: Intrinsics, device: torch.device) -> Annotated[Ten
 
 
 def normals(cameras: Cameras, view: int, depth: Annotated[Tensor, "H W"]) -> Annotated[Tensor, "H W 3"]:
-    """Unit normals in world axes, facing the camera; 0 where depth is not positive and finite, or there is no neighbour.
+    """Unit normals in world axes, facing the camera; 0 where depth is not positive and finite, or there is no
+    neighbour.
 
-    `depth` is the distance along the unit ray. Of the two neighbours in each direction the nearer one in space counts, so
-    that an edge belongs to one of its sides.
+    `depth` is the distance along the unit ray. Of the two neighbours in each direction the nearer one in
+    space counts, so that an edge belongs to one of its sides.
     """
     origin, direction = grid_rays(cameras, view)
     height, width = depth.shape
     solid = torch.isfinite(depth) & (depth > 0)
     far = torch.where(solid, depth, torch.zeros_like(depth)).double()
     points = origin.view(height, width, 3) + direction.view(height, width, 3) * far[..., None]
-    # Steps follow the pixels' order, so that of what a camera sees they turn as its pixels do: the normal faces it. Where
-    # there is no step the product is 0, and stays so.
+    # Steps follow the pixels' order, so that of what a camera sees they turn as its pixels do: the normal
+    # faces it. Where there is no step the product is 0, and stays so.
     normal = torch.linalg.cross(_step(points, solid, 0), _step(points, solid, 1))
     return torch.nn.functional.normalize(normal, dim=-1, eps=1e-300).float()
 
 
 def _step(points: Tensor, solid: Tensor, axis: int) -> Tensor:
-    """Steps to each point's next one along an axis, or from the one before, whichever is shorter; 0 where there is none."""
+    """Steps to each point's next one along an axis, or from the one before, whichever is shorter; 0 where
+    there is none.
+    """
     count = points.shape[axis]
     both = (solid.narrow(axis, 1, count - 1) & solid.narrow(axis, 0, count - 1))[..., None]
     gaps = points.narrow(axis, 1, count - 1) - points.narrow(axis, 0, count - 1)
     gaps = torch.where(both, gaps, torch.full_like(gaps, torch.inf))
     edge = torch.full_like(points.narrow(axis, 0, 1), torch.inf)
-    ahead, behind = torch.cat([gaps, edge], axis), torch.cat([edge, gaps], axis)
+    ahead = torch.cat([gaps, edge], axis)
+    behind = torch.cat([edge, gaps], axis)
     shorter = ahead.norm(dim=-1, keepdim=True) <= behind.norm(dim=-1, keepdim=True)
     step = torch.where(shorter, ahead, behind)
     return torch.where(torch.isfinite(step), step, torch.zeros_like(step))

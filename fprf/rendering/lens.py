@@ -1,9 +1,10 @@
 """Lens models: between ideal and distorted coordinates on the image plane at depth 1, and their inverse.
 
-Letters: x y ideal, r = |(x, y)|, θ = angle to the axis; axes are OpenCV's here (x right, y down, z forward). A radial
-model is u(ρ) = ρ (1 + k1 ρ² + k2 ρ⁴ + k3 ρ⁶ + k4 ρ⁸), with ρ = r for OpenCV's lens and ρ = θ for the fisheye; OpenCV's
-adds tangential terms p1 p2. u grows only up to a *reach* ρ*: what lies beyond folds back onto the image, and pixels
-farther out than u(ρ*) see nothing. Everything is float64; the inverse is good to 1e-12 of the focal length.
+Letters: x y ideal, r = |(x, y)|, θ = angle to the axis; axes are OpenCV's here (x right, y down, z forward).
+A radial model is u(ρ) = ρ (1 + k1 ρ² + k2 ρ⁴ + k3 ρ⁶ + k4 ρ⁸), with ρ = r for OpenCV's lens and ρ = θ for the
+fisheye; OpenCV's adds tangential terms p1 p2. u grows only up to a *reach* ρ*: what lies beyond folds back
+onto the image, and pixels farther out than u(ρ*) see nothing. Everything is float64; the inverse is good to
+1e-12 of the focal length.
 """
 
 import math
@@ -12,7 +13,9 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-PINHOLE, OPENCV, FISHEYE = 0, 1, 2
+PINHOLE = 0
+OPENCV = 1
+FISHEYE = 2
 _TOLERANCE = 1e-14
 """Error of the inverse in focal lengths; pixels are some 1e3 to 1e4 times smaller, which leaves 1e-10 px."""
 _STEPS = 60
@@ -31,8 +34,8 @@ def _powers(k: Tensor, rho: Tensor) -> tuple[Tensor, Tensor]:
 def lens_reach(distortion: Annotated[Tensor, "V 6"], lens: Annotated[Tensor, "V"]) -> Annotated[Tensor, "V"]:
     """The largest ρ up to which u grows: infinite for a pinhole, at most π for a fisheye.
 
-    It is the smallest positive root of 1 + 3 k1 s + 5 k2 s² + 7 k3 s³ + 9 k4 s⁴, s = ρ². In z = 1/s that polynomial is
-    monic whatever the k are, so that its companion matrix always exists.
+    It is the smallest positive root of 1 + 3 k1 s + 5 k2 s² + 7 k3 s³ + 9 k4 s⁴, s = ρ². In z = 1/s that
+    polynomial is monic whatever the k are, so that its companion matrix always exists.
     """
     rows, inverse = torch.unique(distortion[:, :4], dim=0, return_inverse=True)
     companion = torch.zeros(len(rows), 4, 4, dtype=rows.dtype, device=rows.device)
@@ -48,7 +51,9 @@ def lens_reach(distortion: Annotated[Tensor, "V 6"], lens: Annotated[Tensor, "V"
 
 
 def _radial_inverse(k: Tensor, u: Tensor, reach: Tensor) -> Tensor:
-    """ρ in [0, reach] with u(ρ) = u, by Newton kept inside a bracket; `reach` itself where u lies beyond u(reach)."""
+    """ρ in [0, reach] with u(ρ) = u, by Newton kept inside a bracket; `reach` itself where u lies beyond
+    u(reach).
+    """
     low = torch.zeros_like(u)
     # Without a turning point u grows without bound: double until the bracket holds the root.
     high = torch.where(torch.isfinite(reach), reach, u.clamp_min(1e-3))
@@ -76,7 +81,8 @@ def _radial_inverse(k: Tensor, u: Tensor, reach: Tensor) -> Tensor:
 def _brown(distortion: Tensor, xy: Tensor) -> Tensor:
     """OpenCV's distortion of ideal points [R 2]."""
     x, y = xy.unbind(-1)
-    p1, p2 = distortion[:, 4], distortion[:, 5]
+    p1 = distortion[:, 4]
+    p2 = distortion[:, 5]
     rr = x * x + y * y
     share, _ = _powers(distortion[:, :4], rr.sqrt())
     xd = x * share + 2 * p1 * x * y + p2 * (rr + 2 * x * x)
@@ -85,7 +91,9 @@ def _brown(distortion: Tensor, xy: Tensor) -> Tensor:
 
 
 def _brown_newton(distortion: Tensor, xy: Tensor, target: Tensor, reach: Tensor) -> Tensor:
-    """Solve `_brown`(xy) = target by Newton steps that are halved until the residual shrinks; stop where none does."""
+    """Solve `_brown`(xy) = target by Newton steps that are halved until the residual shrinks; stop where none
+    does.
+    """
     solved = xy.clone()
     live = torch.arange(len(xy), device=xy.device)
     keep = torch.ones_like(live, dtype=torch.bool)
@@ -96,7 +104,11 @@ def _brown_newton(distortion: Tensor, xy: Tensor, target: Tensor, reach: Tensor)
         keep &= size > _TOLERANCE * (1 + target.norm(dim=-1))
         if not bool(keep.any()):
             break
-        live, xy, target, reach, distortion = live[keep], xy[keep], target[keep], reach[keep], distortion[keep]
+        live = live[keep]
+        xy = xy[keep]
+        target = target[keep]
+        reach = reach[keep]
+        distortion = distortion[keep]
         size = size[keep]
         # Far from the axis a whole step may overshoot the fold: halve it until the residual shrinks.
         trial = xy - _brown_step(distortion, xy, error[keep])
@@ -135,7 +147,9 @@ def bend(
     reach: Annotated[Tensor, "R"],
     points: Annotated[Tensor, "R 3"],
 ) -> Annotated[Tensor, "R 2"]:
-    """Image-plane coordinates, in focal lengths, of points in OpenCV's camera axes; NaN where none sees the point."""
+    """Image-plane coordinates, in focal lengths, of points in OpenCV's camera axes; NaN where none sees the
+    point.
+    """
     x, y, z = points.unbind(-1)
     radius = torch.hypot(x, y)
     ideal = points[:, :2] / torch.where(z > 0, z, math.nan)[:, None]
@@ -145,7 +159,10 @@ def bend(
     theta = torch.atan2(radius, z)
     share, _ = _powers(distortion[:, :4], theta)
     # On the axis the direction on the plane is open and the length 0.
-    round_ = points[:, :2] * (torch.where(theta <= reach, share * theta, math.nan) / radius.clamp_min(1e-300))[:, None]
+    round_ = (
+        points[:, :2]
+        * (torch.where(theta <= reach, share * theta, math.nan) / radius.clamp_min(1e-300))[:, None]
+    )
     bent = torch.where((lens == OPENCV)[:, None], _brown(distortion, flat), flat)
     return torch.where((lens == FISHEYE)[:, None], round_, bent)
 
@@ -165,7 +182,10 @@ def unbend(
     bent = lens != PINHOLE
     if bool(bent.any()):
         index = bent.nonzero()[:, 0]
-        distortion, lens, reach, plane = distortion[index], lens[index], reach[index], plane[index]
+        distortion = distortion[index]
+        lens = lens[index]
+        reach = reach[index]
+        plane = plane[index]
         # Radial terms keep the direction around the axis: one number a pixel is solved for.
         radius = plane.norm(dim=-1)
         rho = _radial_inverse(distortion[:, :4], radius, reach)

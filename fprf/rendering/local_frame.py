@@ -1,8 +1,8 @@
 """The local frame: coordinates about an origin near the scene, so that float32 holds them.
 
-world = local + origin, in float64, axes and unit the same. Projected metres (UTM) reach 6e6, Earth-centred ones too: there
-float32 steps by half a metre. The origin is 0 for scenes that lie near it, whole numbers for scenes of more than a unit, and
-always so short a binary number that taking it off loses nothing.
+world = local + origin, in float64, axes and unit the same. Projected metres (UTM) reach 6e6, Earth-centred
+ones too: there float32 steps by half a metre. The origin is 0 for scenes that lie near it, whole numbers for
+scenes of more than a unit, and always so short a binary number that taking it off loses nothing.
 
 Formats of float32 hold local coordinates, with a file beside them that says what to add (a "global shift"):
 NAME.offset.json for a file NAME, {"offset": [x, y, z]}.
@@ -26,7 +26,8 @@ _MOST = 1 << 16
 
 
 def local_origin(place: Annotated[Tensor, "N 3"], around: Annotated[Tensor, "P 3"] | None = None) -> Origin:
-    """Origin of places and of what is `around` them, to a power of two below their extent; 0 unless they lie far from 0.
+    """Origin of places and of what is `around` them, to a power of two below their extent; 0 unless they lie
+    far from 0.
 
     The extent is that of the places, or the distance that half of what is around keeps, if that is more.
     """
@@ -41,7 +42,9 @@ def local_origin(place: Annotated[Tensor, "N 3"], around: Annotated[Tensor, "P 3
 
 
 def extent_of(place: Annotated[Tensor, "N 3"]) -> tuple[Annotated[Tensor, "3"], float]:
-    """The median of places, and the distance from it that nine in ten keep; of finite ones, float64. 0 where there are none."""
+    """The median of places, and the distance from it that nine in ten keep; of finite ones, float64. 0 where
+    there are none.
+    """
     place = _some(place)
     if not len(place):
         return place.new_zeros(3), 0.0
@@ -56,7 +59,9 @@ def _some(place: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "M 3"]:
 
 
 def added_and_beside(origin: Origin, local: bool) -> tuple[Origin, Origin]:
-    """The offset that is added to local coordinates in a file of float64, and the one that its offset file says."""
+    """The offset that is added to local coordinates in a file of float64, and the one that its offset file
+    says.
+    """
     none = (0.0, 0.0, 0.0)
     return (none, origin) if local else (origin, none)
 
@@ -84,5 +89,7 @@ def read_offset(path: Path) -> Origin:
         if not all(map(math.isfinite, (x, y, z))):
             raise ValueError(f"{x} {y} {z}")
     except (OSError, ValueError, TypeError, KeyError) as error:
-        raise DataError(f'{file}: not {{"offset": [x, y, z]}} with three numbers ({error}); correct or remove it') from error
+        raise DataError(
+            f'{file}: not {{"offset": [x, y, z]}} with three numbers ({error}); correct or remove it'
+        ) from error
     return x, y, z

@@ -1,14 +1,15 @@
 """Camera paths through a captured scene, as `Cameras` without distortion, and Nerfstudio's files of cameras.
 
-World units and OpenGL axes as in `rendering.cameras`; float64. Every path stays where the training cameras were: a
-radiance field knows nothing of places that no camera has seen. A camera path that Nerfstudio's viewer exports is rendered
-here, and ours loads there:
+World units and OpenGL axes as in `rendering.cameras`; float64. Every path stays where the training cameras
+were: a radiance field knows nothing of places that no camera has seen. A camera path that Nerfstudio's viewer
+exports is rendered here, and ours loads there:
 
     {"camera_type": "perspective", "render_width": W, "render_height": H, "fps": F, "seconds": S,
-     "camera_path": [{"camera_to_world": [16 numbers, row by row], "fov": vertical degrees, "aspect": W / H}, ...]}
+     "camera_path": [{"camera_to_world": [16 numbers, row by row], "fov": vertical degrees, "aspect": W / H},
+     ...]}
 
-Poses are in the capture's own coordinates, whatever the scene's origin. Pixels are square and the principal point is the
-middle: the format can say nothing else.
+Poses are in the capture's own coordinates, whatever the scene's origin. Pixels are square and the principal
+point is the middle: the format can say nothing else.
 """
 
 import math
@@ -30,7 +31,8 @@ from .cameras import Cameras, ideal_cameras
 from .lens import FISHEYE, OPENCV, PINHOLE
 from .splines import catmull_rom, quaternions, rotations, slerp
 
-_TURNS, _SHRINKS = 2, 64
+_TURNS = 2
+_SHRINKS = 64
 """Of a spiral: its turns, and steps in which it shrinks until it stays near the cameras."""
 _MODELS = {FISHEYE: "OPENCV_FISHEYE", OPENCV: "OPENCV"}
 _STRAY = 1e-3
@@ -42,7 +44,8 @@ _Side = Annotated[float, Meta(ge=1, le=65536, multiple_of=1)]
 def look_at(
     position: Annotated[Tensor, "M 3"], target: Annotated[Tensor, "M 3"], up: Annotated[Tensor, "3"]
 ) -> Annotated[Tensor, "M 3 4"]:
-    """Poses at `position` that look at `target`, x level with respect to `up`. Rotations orthonormal to 1e-12.
+    """Poses at `position` that look at `target`, x level with respect to `up`. Rotations orthonormal to
+    1e-12.
 
     Where the line of sight runs along `up`, which then says nothing, another axis takes its place.
     """
@@ -54,21 +57,25 @@ def look_at(
 
 
 def pinhole(pose: Annotated[Tensor, "F 3 4"], *, width: int, height: int, fov: float) -> Cameras:
-    """Frames at `pose` with square pixels, the principal point in the middle and a vertical angle of `fov` degrees."""
+    """Frames at `pose` with square pixels, the principal point in the middle and a vertical angle of `fov`
+    degrees.
+    """
     return ideal_cameras(pose, height / 2 / math.tan(math.radians(fov) / 2), (width, height))
 
 
 def spiral(cameras: Cameras, frames: int) -> Cameras:
-    """A closed spiral of two turns about the most central captured camera, looking at where the optical axes meet.
+    """A closed spiral of two turns about the most central captured camera, looking at where the optical axes
+    meet.
 
-    The radii are the spread of the cameras along the central camera's axes, shrunk until no frame is farther from a
-    captured camera than captured cameras are from each other. Raises ConfigError.
+    The radii are the spread of the cameras along the central camera's axes, shrunk until no frame is farther
+    from a captured camera than captured cameras are from each other. Raises ConfigError.
     """
     at_least("frames", frames, 1)
     centres = cameras.pose[:, :, 3]
     apart = torch.cdist(centres, centres)
     middle = int(apart.sum(-1).argmin())
-    rotation, start = cameras.pose[middle, :, :3], centres[middle]
+    rotation = cameras.pose[middle, :, :3]
+    start = centres[middle]
     depth = _focus_depth(cameras, middle)
     spread = ((centres - start) @ rotation).abs().quantile(0.9, dim=0)
     # Beyond a third of the depth the view would swing by more than 18 degrees, or pass what it looks at.
@@ -87,14 +94,17 @@ def spiral(cameras: Cameras, frames: int) -> Cameras:
 
 
 def orbit(cameras: Cameras, frames: int) -> Cameras:
-    """Around the place that the cameras look at, in the distance and elevation that they have at each azimuth.
+    """Around the place that the cameras look at, in the distance and elevation that they have at each
+    azimuth.
 
-    A full circle where the cameras surround the place, else to and fro within the arc that they cover; closed in both
-    cases. The axis is the cameras' mean up, or for cameras that look straight down, against their view. Raises UsageError.
+    A full circle where the cameras surround the place, else to and fro within the arc that they cover; closed
+    in both cases. The axis is the cameras' mean up, or for cameras that look straight down, against their
+    view. Raises UsageError.
     """
     at_least("frames", frames, 1)
     pose = cameras.pose
-    centres, up = pose[:, :, 3], upwards(cameras)
+    centres = pose[:, :, 3]
+    up = upwards(cameras)
     if float(up.norm()) < 1e-6:
         raise UsageError("orbit: the cameras have no common up; choose the path 'interpolate' or 'dataset'")
     up = _unit(up)
@@ -119,27 +129,31 @@ def orbit(cameras: Cameras, frames: int) -> Cameras:
     else:
         arc = 2 * math.pi - float(gaps[widest])
         angle = first + arc * (1 - torch.cos(2 * math.pi * phase)) / 2
-    # Von Mises kernel, about 15 degrees wide; the maximum is taken out so that an empty azimuth takes the nearest camera.
+    # Von Mises kernel, about 15 degrees wide; the maximum is taken out so that an empty azimuth takes the
+    # nearest camera.
     closeness = 15 * torch.cos(angle[:, None] - azimuth)
     share = torch.softmax(closeness, dim=-1)
-    high, far = share @ elevation, share @ distance
+    high = share @ elevation
+    far = share @ distance
     level = angle.cos()[:, None] * east + angle.sin()[:, None] * north
     position = target + far[:, None] * (high.cos()[:, None] * level + high.sin()[:, None] * up)
     return _pinhole(look_at(position, target.expand_as(position), up), cameras, middle)
 
 
 def interpolate(cameras: Cameras, order: Annotated[Tensor, "M"], frames_between: int) -> Cameras:
-    """Through the views of `order`, with `frames_between` new ones in each gap: (M - 1) (frames_between + 1) + 1 frames.
+    """Through the views of `order`, with `frames_between` new ones in each gap: (M - 1) (frames_between + 1)
+    + 1 frames.
 
-    Positions follow a centripetal Catmull-Rom spline, which neither loops nor overshoots; rotations and intrinsics move
-    evenly (SLERP, linear). Every frame has the size of the first view. Raises ConfigError.
+    Positions follow a centripetal Catmull-Rom spline, which neither loops nor overshoots; rotations and
+    intrinsics move evenly (SLERP, linear). Every frame has the size of the first view. Raises ConfigError.
     """
     at_least("views", len(order), 1)
     # Intrinsics of all views in pixels of the first one: captures mix sizes.
     keys = cameras.select(order)
     keys = keys.resized(keys.size[:1].expand(len(keys), 2))
     frame = torch.arange((len(keys) - 1) * (frames_between + 1) + 1, device=keys.pose.device)
-    gap, u = frame // (frames_between + 1), (frame % (frames_between + 1)) / keys.pose.new_tensor(frames_between + 1)
+    gap = frame // (frames_between + 1)
+    u = (frame % (frames_between + 1)) / keys.pose.new_tensor(frames_between + 1)
     after = (gap + 1).clamp(max=len(keys) - 1)
     turn = quaternions(keys.pose[:, :, :3])
     # Rotations the short way round, positions along a spline that visits every key.
@@ -156,7 +170,9 @@ def interpolate(cameras: Cameras, order: Annotated[Tensor, "M"], frames_between:
 
 
 def tour(cameras: Cameras, indices: Annotated[Tensor, "M"]) -> Annotated[Tensor, "M"]:
-    """`indices` in an order fit for `interpolate`: from an outermost view always to the nearest one not yet visited."""
+    """`indices` in an order fit for `interpolate`: from an outermost view always to the nearest one not yet
+    visited.
+    """
     centres = cameras.pose[indices, :, 3]
     apart = torch.cdist(centres, centres)
     here = int(apart.sum(-1).argmax()) if len(indices) else 0
@@ -171,7 +187,12 @@ def tour(cameras: Cameras, indices: Annotated[Tensor, "M"]) -> Annotated[Tensor,
 def _pinhole(pose: Annotated[Tensor, "F 3 4"], cameras: Cameras, view: int) -> Cameras:
     """Frames at `pose` with the focal length and size of a captured view, without its distortion."""
     like = cameras.select(torch.full((len(pose),), view, device=pose.device))
-    return replace(like, pose=pose, distortion=torch.zeros_like(like.distortion), lens=torch.full_like(like.lens, PINHOLE))
+    return replace(
+        like,
+        pose=pose,
+        distortion=torch.zeros_like(like.distortion),
+        lens=torch.full_like(like.lens, PINHOLE),
+    )
 
 
 def _unit(vector: Tensor) -> Tensor:
@@ -186,11 +207,12 @@ def _least_axis(vector: Annotated[Tensor, "3"]) -> Annotated[Tensor, "3"]:
 def _meeting(pose: Annotated[Tensor, "V 3 4"]) -> Annotated[Tensor, "3"] | None:
     """The point closest to all optical axes, in front of the cameras; None where they do not meet, or hardly.
 
-    Of axes that all but agree in direction the closest point lies among the cameras themselves: most axes must pass it at
-    less than half of its distance.
+    Of axes that all but agree in direction the closest point lies among the cameras themselves: most axes
+    must pass it at less than half of its distance.
     """
     forward = -pose[:, :, 2]
-    # Least squares: the sum of squared distances to the axes has the normal matrix of projections across them.
+    # Least squares: the sum of squared distances to the axes has the normal matrix of projections across
+    # them.
     across = torch.eye(3, dtype=pose.dtype, device=pose.device) - forward[:, :, None] * forward[:, None, :]
     system = across.mean(dim=0)
     values = torch.linalg.eigvalsh(system)
@@ -210,20 +232,24 @@ def _focus_depth(cameras: Cameras, view: int) -> float:
     target = _meeting(cameras.pose)
     ahead = 0.0 if target is None else float((pose[:, 3] - target) @ pose[:, 2])
     spread = float((cameras.pose[:, :, 3] - pose[:, 3]).norm(dim=-1).max())
-    # Parallel axes show something far away compared with the baseline, as in any capture that can be reconstructed.
+    # Parallel axes show something far away compared with the baseline, as in any capture that can be
+    # reconstructed.
     return ahead if ahead > 0 else (4 * spread if spread > 0 else 1.0)
 
 
 MOTIONS = ("spiral", "orbit", "interpolate", "dataset")
 
 
-def make_path(cameras: Cameras, views: Sequence[int], motion: str, frames: int, origin: Origin = (0.0, 0.0, 0.0)) -> Cameras:
-    """Cameras of a motion, or of a camera-path JSON file, about the `origin` that the captured `cameras` have.
+def make_path(
+    cameras: Cameras, views: Sequence[int], motion: str, frames: int, origin: Origin = (0.0, 0.0, 0.0)
+) -> Cameras:
+    """Cameras of a motion, or of a camera-path JSON file, about the `origin` that the captured `cameras`
+    have.
 
-    `interpolate` and `dataset` go through `views` of the captured `cameras`, the latter with their own lenses. `frames` are
-    those of a spiral or orbit, and about those of an interpolation, which leaves out views where they are more; a file and the
-    captured views bring their own number.
-    Raises UsageError for what is neither, DataError for a file that is no camera path.
+    `interpolate` and `dataset` go through `views` of the captured `cameras`, the latter with their own
+    lenses. `frames` are those of a spiral or orbit, and about those of an interpolation, which leaves out
+    views where they are more; a file and the captured views bring their own number. Raises UsageError for
+    what is neither, DataError for a file that is no camera path.
     """
     chosen = torch.tensor(list(views), dtype=torch.int64)
     if motion == "dataset":
@@ -246,7 +272,9 @@ def make_path(cameras: Cameras, views: Sequence[int], motion: str, frames: int, 
 
 
 def upwards(cameras: Cameras) -> Annotated[Tensor, "3"]:
-    """The mean of the cameras' up, or, where they look straight down, against their view; world axes, not of unit length."""
+    """The mean of the cameras' up, or, where they look straight down, against their view; world axes, not of
+    unit length.
+    """
     up = cameras.pose[:, :, 1].mean(dim=0)
     return cameras.pose[:, :, 2].mean(dim=0) if float(up.norm()) < 0.3 else up
 
@@ -276,12 +304,18 @@ def read_camera_path(path: Path, origin: Origin = (0.0, 0.0, 0.0)) -> tuple[Came
     """
     try:
         content = msgspec.json.decode(path.read_bytes(), type=_CameraPath)
-        poses = [_orthonormal(f"$.camera_path[{k}]", frame.camera_to_world) for k, frame in enumerate(content.camera_path)]
+        poses = [
+            _orthonormal(f"$.camera_path[{k}]", frame.camera_to_world)
+            for k, frame in enumerate(content.camera_path)
+        ]
     except FileNotFoundError as error:
-        raise DataError(f"{path}: no such camera path; give spiral, interpolate, dataset or a JSON file") from error
+        raise DataError(
+            f"{path}: no such camera path; give spiral, interpolate, dataset or a JSON file"
+        ) from error
     except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError) as error:
         raise DataError(f"{path}: cannot be read ({error}); export the camera path again") from error
-    width, height = int(content.render_width), int(content.render_height)
+    width = int(content.render_width)
+    height = int(content.render_height)
     # Pixels are square: the vertical field of view decides both focal lengths.
     focals = [height / 2 / math.tan(math.radians(frame.fov) / 2) for frame in content.camera_path]
     frames = ideal_cameras(torch.stack(poses), torch.tensor(focals, dtype=torch.float64), (width, height))
@@ -297,7 +331,9 @@ def _orthonormal(where: str, matrix: _Matrix) -> Annotated[Tensor, "3 4"]:
     left, scales, right = torch.linalg.svd(pose[:, :3])
     turn = left @ right
     if float((scales - 1).abs().max()) > _STRAY or float(torch.linalg.det(turn)) < 0:
-        raise msgspec.ValidationError(f"Expected a rotation and a position, without scale or mirroring - at `{where}`")
+        raise msgspec.ValidationError(
+            f"Expected a rotation and a position, without scale or mirroring - at `{where}`"
+        )
     return torch.cat([turn, pose[:, 3:]], dim=1)
 
 
@@ -310,7 +346,8 @@ def write_camera_path(path: Path, cameras: Cameras, fps: float, origin: Origin =
         raise DataError(f"{path}: a camera path of no frames cannot be written")
     width, height = (int(side) for side in cameras.size[0])
     # Files are in the capture's coordinates, cameras about the local origin.
-    cameras, frames = cameras.shifted(origin), []
+    cameras = cameras.shifted(origin)
+    frames = []
     for view in range(len(cameras)):
         matrix = [*cameras.pose[view].flatten().tolist(), 0.0, 0.0, 0.0, 1.0]
         fov = math.degrees(2 * math.atan(float(cameras.size[view, 1]) / 2 / float(cameras.focal[view, 1])))
@@ -329,16 +366,23 @@ def write_camera_path(path: Path, cameras: Cameras, fps: float, origin: Origin =
     write_json(path, content)
 
 
-def transforms(cameras: Cameras, files: Sequence[str], *, train: Sequence[int], test: Sequence[int]) -> dict[str, Any]:
-    """transforms.json of V views whose images are `files`, relative to it. Intrinsics stand once if all views share them."""
+def transforms(
+    cameras: Cameras, files: Sequence[str], *, train: Sequence[int], test: Sequence[int]
+) -> dict[str, Any]:
+    """transforms.json of V views whose images are `files`, relative to it. Intrinsics stand once if all views
+    share them.
+    """
     lenses = []
     for view in range(len(cameras)):
         width, height = cameras.size[view].tolist()
-        (fx, fy), (cx, cy) = cameras.focal[view].tolist(), cameras.centre[view].tolist()
+        (fx, fy) = cameras.focal[view].tolist()
+        (cx, cy) = cameras.centre[view].tolist()
         lens = {"camera_model": _MODELS.get(int(cameras.lens[view]), "PINHOLE"), "w": width, "h": height}
         lens |= {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
         if bool(torch.any(cameras.distortion[view] != 0)):
-            lens |= dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), cameras.distortion[view].tolist(), strict=True))
+            lens |= dict(
+                zip(("k1", "k2", "k3", "k4", "p1", "p2"), cameras.distortion[view].tolist(), strict=True)
+            )
         lenses.append(lens)
     shared = all(lens == lenses[0] for lens in lenses)
     frames = []

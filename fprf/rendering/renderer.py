@@ -3,14 +3,16 @@
     sampler -> edges t -> density everywhere -> weights -> the heaviest samples of each ray
             -> content -> (stylizer) -> decoder -> composite
 
-Letters: R rays, S samples of a ray between E = S + 1 edges t, M samples that are kept of all R rays (packed, ray after ray),
-L latent, C content and D semantic channels. With densities s_i and steps d_i = t_i+1 - t_i (paper, Eq. 2; NeRF, Eq. 3)
+Letters: R rays, S samples of a ray between E = S + 1 edges t, M samples that are kept of all R rays (packed,
+ray after ray), L latent, C content and D semantic channels. With densities s_i and steps d_i = t_i+1 - t_i
+(paper, Eq. 2; NeRF, Eq. 3)
 
     w_i = T_i (1 - exp(-s_i d_i)),    T_i = exp(-sum_j<i s_j d_j),    value of a ray = sum_i w_i value_i + T_S background
 
-Only kept samples meet the content network, the semantic field, the stylizer and the decoder; what is left out weighs at most
-`budget` a ray, which bounds the error of colours in [0, 1]. In training on an accelerator every sample is kept and what is left
-out has weight 0: the host would have to wait for their number in each step.
+Only kept samples meet the content network, the semantic field, the stylizer and the decoder; what is left out
+weighs at most `budget` a ray, which bounds the error of colours in [0, 1]. In training on an accelerator
+every sample is kept and what is left out has weight 0: the host would have to wait for their number in each
+step.
 """
 
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -71,16 +73,21 @@ class March(NamedTuple):
 
 
 def march(
-    rays: Rays, parts: Parts, *, budget: float, step: int | None = None, generator: torch.Generator | None = None
+    rays: Rays,
+    parts: Parts,
+    *,
+    budget: float,
+    step: int | None = None,
+    generator: torch.Generator | None = None,
 ) -> March:
     """Sample rays, weigh the samples, and keep the heaviest. `step` is given in training alone."""
     # Where to look along each ray: edges t [R E] of S = E - 1 steps, placed by the sampler.
     space = parts.space
     sampled = parts.sampler(_detached(rays), space=space, step=step, generator=generator)
-    # A camera samples what is near it far more densely than any other camera does, and could explain its own image by a
-    # veil there. Scaling gradients by the square of the distance makes every piece of space count alike (Philip and
-    # Deschaintre 2023); beyond a few times the nearest distance that is no longer needed. In a box, and in normalised
-    # device coordinates, no camera stands amid the samples.
+    # A camera samples what is near it far more densely than any other camera does, and could explain its own
+    # image by a veil there. Scaling gradients by the square of the distance makes every piece of space count
+    # alike (Philip and Deschaintre 2023); beyond a few times the nearest distance that is no longer needed.
+    # In a box, and in normalised device coordinates, no camera stands amid the samples.
     scaled = step is not None and space.kind in ("contraction", "open")
     # Densities at the middle of each step, in the unit cube, where the fields live.
     middle = midpoints(sampled.t)
@@ -104,7 +111,9 @@ def march(
         ray = torch.arange(len(weights), device=weights.device)[:, None].expand(weights.shape).reshape(-1)
         heavy = torch.where(keep, weights, 0.0).view(-1)
         flat = None if scale is None else scale.view(-1)
-        kept = PackedSamples(ray, heavy, located, sample.latent, rays.view.index_select(0, ray), flat, whole=True)
+        kept = PackedSamples(
+            ray, heavy, located, sample.latent, rays.view.index_select(0, ray), flat, whole=True
+        )
         return March(sampled, weights, depth, opacity, transmittance, kept)
     # Elsewhere the kept ones alone, gathered.
     index = keep.view(-1).nonzero()[:, 0]
@@ -128,7 +137,9 @@ def _detached(rays: Rays) -> Rays:
 def march_features(
     rays: Rays, parts: Parts, *, budget: float, semantic: bool = True
 ) -> tuple[March, Annotated[Tensor, "M C"], Annotated[Tensor, "M D"] | None]:
-    """March rays, and evaluate content and, where they are asked for and exist, semantics at the kept samples."""
+    """March rays, and evaluate content and, where they are asked for and exist, semantics at the kept
+    samples.
+    """
     marched = march(rays, parts, budget=budget)
     kept = marched.kept
     content = parts.field.content(kept.latent, kept.view)
@@ -136,7 +147,10 @@ def march_features(
 
 
 def shade(
-    decoder: Decoder, content: Annotated[Tensor, "M C"], semantic: Annotated[Tensor, "M D"] | None, restyle: "Restyle | None"
+    decoder: Decoder,
+    content: Annotated[Tensor, "M C"],
+    semantic: Annotated[Tensor, "M D"] | None,
+    restyle: "Restyle | None",
 ) -> Annotated[Tensor, "M 3"]:
     """Colours of samples in a style (None = plain)."""
     if restyle is None or restyle.idle:
@@ -145,14 +159,18 @@ def shade(
     return restyle.colour(decoder, content, semantic if Want.SEMANTIC in restyle.needs else None)
 
 
-def composite(kept: PackedSamples, values: Annotated[Tensor, "M C"], rays: int) -> Annotated[Tensor, "rays C"]:
+def composite(
+    kept: PackedSamples, values: Annotated[Tensor, "M C"], rays: int
+) -> Annotated[Tensor, "rays C"]:
     """Weighted sum over the kept samples of each ray (paper, Eq. 2)."""
     if kept.whole and rays > 0:
         return (values * kept.weight[:, None]).view(rays, -1, values.shape[1]).sum(1)
     return values.new_zeros(rays, values.shape[1]).index_add(0, kept.ray, values * kept.weight[:, None])
 
 
-def composite_mean(kept: PackedSamples, values: Annotated[Tensor, "M C"], rays: int) -> Annotated[Tensor, "rays C"]:
+def composite_mean(
+    kept: PackedSamples, values: Annotated[Tensor, "M C"], rays: int
+) -> Annotated[Tensor, "rays C"]:
     """Mean over the kept samples of each ray, by their weights; 0 where a ray meets nothing."""
     mass = composite(kept, torch.ones_like(kept.weight)[:, None], rays)
     return composite(kept, values, rays) / mass.clamp_min(1e-10)
@@ -174,16 +192,18 @@ def render_rays(
 ) -> Rendered:
     """Render what is wanted. `step` is given in training alone.
 
-    Semantics are rendered with detached weights (the semantic loss never moves density), for the first `semantic_rays` rays
-    from their `semantic_samples` heaviest samples, whose weights are scaled up to the ray's opacity. Content features are
-    composited with detached weights too unless they may move density.
+    Semantics are rendered with detached weights (the semantic loss never moves density), for the first
+    `semantic_rays` rays from their `semantic_samples` heaviest samples, whose weights are scaled up to the
+    ray's opacity. Content features are composited with detached weights too unless they may move density.
     """
     # Geometry, which no style touches.
     marched = march(rays, parts, budget=budget, step=step, generator=generator)
-    kept, count = marched.kept, len(rays.near)
+    kept = marched.kept
+    count = len(rays.near)
     rgb = content = semantic = None
     if want & (Want.COLOUR | Want.CONTENT):
-        # Content features of the kept samples: composited as they are, or decoded to colours, after the style.
+        # Content features of the kept samples: composited as they are, or decoded to colours, after the
+        # style.
         features = parts.field.content(kept.latent, kept.view)
         if kept.gradient_scale is not None:
             features = scale_gradient(features, kept.gradient_scale[:, None])
@@ -199,14 +219,24 @@ def render_rays(
     if Want.SEMANTIC in want and parts.semantic is not None:
         # Semantics follow the geometry and never move it (paper, semantic field).
         semantic = _semantics(
-            marched, _detached(rays), parts, count if semantic_rays is None else semantic_rays, semantic_samples
+            marched,
+            _detached(rays),
+            parts,
+            count if semantic_rays is None else semantic_rays,
+            semantic_samples,
         )
     counts = {"rays": count, "samples": marched.weights.numel(), "kept": len(kept.ray)}
-    return Rendered(marched.depth, marched.opacity, rgb, content, semantic, marched.weights, marched.sampled, counts)
+    return Rendered(
+        marched.depth, marched.opacity, rgb, content, semantic, marched.weights, marched.sampled, counts
+    )
 
 
-def _semantics(marched: March, rays: Rays, parts: Parts, count: int, samples: int | None) -> Annotated[Tensor, "count D"]:
-    """Semantics of the first `count` rays, from their heaviest samples: most light comes from a few of them."""
+def _semantics(
+    marched: March, rays: Rays, parts: Parts, count: int, samples: int | None
+) -> Annotated[Tensor, "count D"]:
+    """Semantics of the first `count` rays, from their heaviest samples: most light comes from a few of
+    them.
+    """
     assert parts.semantic is not None
     weights = marched.weights[:count].detach()
     s = min(samples or weights.shape[1], weights.shape[1])
@@ -220,7 +250,9 @@ def _semantics(marched: March, rays: Rays, parts: Parts, count: int, samples: in
 
 
 def enlarged(small: View, size: list[int]) -> View:
-    """Resize a view to a width and height. Depths stay what they are: between near and far there is nothing."""
+    """Resize a view to a width and height. Depths stay what they are: between near and far there is
+    nothing.
+    """
     target = size[::-1]
     rgb = F.interpolate(small.rgb.permute(2, 0, 1)[None], target, mode="bicubic")[0].permute(1, 2, 0)
     depth = F.interpolate(small.depth[None, None], target, mode="nearest-exact")[0, 0]

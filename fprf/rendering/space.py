@@ -3,14 +3,16 @@
 Kinds, chosen from the cameras and points by `bounds.find_space`, never asked for:
 
     box          a bounded object: an affine map; rays are cut at the box
-    contraction  anything unbounded: recentred and scaled so that the part that matters lies in [-1, 1]^3, then
-                 x -> (2 - 1/m) x / m where m = max |x_i| > 1, and halved; distances are spaced evenly near, in disparity far
+    contraction  anything unbounded: recentred and scaled so that the part that matters lies in [-1, 1]^3,
+                 then x -> (2 - 1/m) x / m where m = max |x_i| > 1, and halved; distances are spaced evenly
+                 near, in disparity far
     ndc          forward-facing captures: normalised device coordinates of the mean camera (NeRF, appendix C)
     open         a scene cut into blocks: distances as in the contraction, points as they are (see `blocks.space`)
 
 World coordinates are recentred in float64 before anything is float32: at 4.5e6 m float32 steps are 0.5 m.
-Spacing maps s in [0, 1] to the ray parameter t. In the contraction g(t) = t/2 up to 1 and 1 - 1/(2t) beyond is linear in s;
-the far half works with the complement 1/(2t), which keeps its relative accuracy at any distance.
+Spacing maps s in [0, 1] to the ray parameter t. In the contraction g(t) = t/2 up to 1 and 1 - 1/(2t) beyond
+is linear in s; the far half works with the complement 1/(2t), which keeps its relative accuracy at any
+distance.
 """
 
 from dataclasses import dataclass, fields
@@ -26,7 +28,9 @@ Kind = Literal["box", "contraction", "ndc", "open"]
 
 
 def contract(x: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
-    """R^3 to [-1, 1]^3 by the largest coordinate; the identity, halved, inside [-1, 1]^3. Finite for any finite x."""
+    """R^3 to [-1, 1]^3 by the largest coordinate; the identity, halved, inside [-1, 1]^3. Finite for any
+    finite x.
+    """
     m = x.abs().amax(-1, keepdim=True).clamp_min(1)
     # x / m first: the product (2 - 1/m) x would overflow where x is near the largest float.
     return (1 - 0.5 / m) * (x / m)
@@ -38,7 +42,8 @@ def slab(
     """Ray parameters at which rays enter and leave a box; the first is the larger one where they miss it."""
     # A direction along a face: any crossing so far away that it decides nothing.
     safe = torch.where(direction.abs() < 1e-9, torch.full_like(direction, 1e-9), direction)
-    a, b = (low - origin) / safe, (high - origin) / safe
+    a = (low - origin) / safe
+    b = (high - origin) / safe
     return torch.minimum(a, b).amax(-1), torch.maximum(a, b).amin(-1)
 
 
@@ -68,7 +73,8 @@ class Space:
         """World rays (float64, unit directions) as float32 rays of this space."""
         o, d = self._recentred(origin, direction)
         if self.kind == "ndc":
-            # From the near plane (t = 0) to infinity (t = 1); a ray that looks backwards is bent to a grazing one.
+            # From the near plane (t = 0) to infinity (t = 1); a ray that looks backwards is bent to a grazing
+            # one.
             dz = d[:, 2].clamp(max=-1e-6)
             slopes = d[:, :2] / dz[:, None]
             start = o + (-(self.near + o[:, 2]) / dz)[:, None] * torch.cat([d[:, :2], dz[:, None]], -1)
@@ -76,8 +82,11 @@ class Space:
             x, y, z = start.unbind(-1)
             # NeRF, appendix C: the projection of the start, and its change along the ray.
             o = torch.stack([-fx * x / z, -fy * y / z, 1 + 2 * self.near / z], -1)
-            d = torch.stack([-fx * (slopes[:, 0] - x / z), -fy * (slopes[:, 1] - y / z), -2 * self.near / z], -1)
-            near, far = torch.zeros_like(o[:, 0]), torch.ones_like(o[:, 0])
+            d = torch.stack(
+                [-fx * (slopes[:, 0] - x / z), -fy * (slopes[:, 1] - y / z), -2 * self.near / z], -1
+            )
+            near = torch.zeros_like(o[:, 0])
+            far = torch.ones_like(o[:, 0])
         else:
             o = o * self.scale
             if self.kind == "box":
@@ -85,7 +94,8 @@ class Space:
                 near = near.clamp_min(self.near)
                 far = torch.maximum(far, near)  # a ray that misses the box gets an empty interval
             else:
-                near, far = torch.full_like(o[:, 0], self.near), torch.full_like(o[:, 0], self.far)
+                near = torch.full_like(o[:, 0], self.near)
+                far = torch.full_like(o[:, 0], self.far)
         return Rays(o.float(), d.float(), direction.float(), near.float(), far.float())
 
     def locate(self, x: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
@@ -94,21 +104,27 @@ class Space:
             return x
         if self.kind == "contraction":
             return contract(x)
-        low, high = self._constant("low", x), self._constant("high", x)
+        low = self._constant("low", x)
+        high = self._constant("high", x)
         return (x - low) * (2 / (high - low)) - 1
 
     def distance(
         self, s: Annotated[Tensor, "R E"], near: Annotated[Tensor, "R"], far: Annotated[Tensor, "R"]
     ) -> Annotated[Tensor, "R E"]:
         """Ray parameters t of edges s in [0, 1]; increasing, with the ends on near and far."""
-        n, f = near[:, None], far[:, None]
+        n = near[:, None]
+        f = far[:, None]
         if self.kind in ("box", "ndc"):
             return n + (f - n) * s
-        g_near, g_far = torch.where(n < 1, n / 2, 1 - 0.5 / n), torch.where(f < 1, f / 2, 1 - 0.5 / f)
-        c_near, c_far = torch.where(n < 1, 1 - n / 2, 0.5 / n), torch.where(f < 1, 1 - f / 2, 0.5 / f)
+        g_near = torch.where(n < 1, n / 2, 1 - 0.5 / n)
+        g_far = torch.where(f < 1, f / 2, 1 - 0.5 / f)
+        c_near = torch.where(n < 1, 1 - n / 2, 0.5 / n)
+        c_far = torch.where(f < 1, 1 - f / 2, 0.5 / f)
         # The far form starts from its far end: c_near + (c_far - c_near) s would cancel there.
-        g, c = g_near + (g_far - g_near) * s, c_far + (c_near - c_far) * (1 - s)
-        # Both round: the clamp keeps them in order where they meet, since a negative step would be a negative weight.
+        g = g_near + (g_far - g_near) * s
+        c = c_far + (c_near - c_far) * (1 - s)
+        # Both round: the clamp keeps them in order where they meet, since a negative step would be a negative
+        # weight.
         return torch.where(g < 0.5, 2 * g, 0.5 / c.clamp(max=0.5))
 
     def metric(
@@ -120,12 +136,16 @@ class Space:
         o, d = self._recentred(origin, direction)
         to_near = -(self.near + o[:, 2]) / d[:, 2]
         start = o[:, 2] + to_near * d[:, 2]
-        # NDC z = 1 + 2 near / z rises from -1; t is the share of the way to the far plane, so z = z0 / (1 - t).
+        # NDC z = 1 + 2 near / z rises from -1; t is the share of the way to the far plane, so z = z0 / (1 -
+        # t).
         z = start / (1 - t.to(o.dtype)).clamp_min(1e-9)
         return (to_near + (z - start) / d[:, 2]).to(t.dtype)
 
     def parameter(
-        self, origin: Annotated[Tensor, "R 3"], direction: Annotated[Tensor, "R 3"], distance: Annotated[Tensor, "R"]
+        self,
+        origin: Annotated[Tensor, "R 3"],
+        direction: Annotated[Tensor, "R 3"],
+        distance: Annotated[Tensor, "R"],
     ) -> Annotated[Tensor, "R"]:
         """The ray parameter t at a world distance along unit world rays: the inverse of `metric`."""
         if self.kind != "ndc":
@@ -143,7 +163,9 @@ class Space:
         return {}
 
     def _constant(self, name: str, like: Tensor) -> Tensor:
-        """A field as a tensor with the dtype and device of another one, copied once, not in each training step."""
+        """A field as a tensor with the dtype and device of another one, copied once, not in each training
+        step.
+        """
         key = (name, like.dtype, like.device)
         if key not in self._tensors:
             with torch.inference_mode(False):

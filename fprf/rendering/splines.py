@@ -1,4 +1,5 @@
-"""Smooth motion through key poses: quaternions (w x y z), SLERP and Catmull-Rom. All in the dtype of the input.
+"""Smooth motion through key poses: quaternions (w x y z), SLERP and Catmull-Rom. All in the dtype of the
+input.
 
 M keys · F frames. A frame lies in the gap between keys g and g + 1, at the place u in [0, 1) within it.
 """
@@ -51,7 +52,9 @@ def slerp(
     u = u[:, None]
     # torch.sinc is sin(πx) / (πx): sin(u a) / sin(a) stays finite at a = 0.
     whole = torch.sinc(angle / torch.pi)
-    return ((1 - u) * torch.sinc((1 - u) * angle / torch.pi) * start + u * torch.sinc(u * angle / torch.pi) * end) / whole
+    return (
+        (1 - u) * torch.sinc((1 - u) * angle / torch.pi) * start + u * torch.sinc(u * angle / torch.pi) * end
+    ) / whole
 
 
 def catmull_rom(
@@ -59,8 +62,9 @@ def catmull_rom(
 ) -> Annotated[Tensor, "F 3"]:
     """Through every key with a continuous velocity, each gap in the same time.
 
-    Directions at keys are those of the centripetal spline, whose knots are spaced by the root l of the distance: unlike
-    the uniform one it makes no loops (Yuksel et al. 2011). Speeds are those of the shorter gap, l_short · v with
+    Directions at keys are those of the centripetal spline, whose knots are spaced by the root l of the
+    distance: unlike the uniform one it makes no loops (Yuksel et al. 2011). Speeds are those of the shorter
+    gap, l_short · v with
     |v| <= 2 l_short, so that keys in a line are passed without turning back (Fritsch and Carlson 1980) and a key that
     comes twice is a rest. A missing neighbour at either end is the mirror image of the other one.
     """
@@ -71,7 +75,8 @@ def catmull_rom(
     root = chord.norm(dim=-1, keepdim=True).sqrt()
     # Where a root is 0 so is the shorter one, and with it the velocity, whatever the quotient.
     rate = chord / torch.where(root > 0, root, torch.ones_like(root))
-    left, right = root[:-1], root[1:]
+    left = root[:-1]
+    right = root[1:]
     both = left + right
     share = left / torch.where(both > 0, both, torch.ones_like(both))
     # Of the derivatives of the quadratic through three keys, the one at the middle key.

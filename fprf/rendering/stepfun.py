@@ -1,7 +1,8 @@
 """Step functions on sorted edges along rays.
 
-Conventions. `s` or `t` are edges [R E], E = S+1, not decreasing; `w` are the S weights between them, w >= 0, sum <= 1.
-`tau` is optical depth (density times length). Everything is float32 or better and independent for each ray.
+Conventions. `s` or `t` are edges [R E], E = S+1, not decreasing; `w` are the S weights between them, w >= 0,
+sum <= 1. `tau` is optical depth (density times length). Everything is float32 or better and independent for
+each ray.
 """
 
 from typing import Annotated, Any
@@ -13,8 +14,8 @@ from torch import Tensor
 class _Weights(torch.autograd.Function):
     """w_i = exp(-sum_{j<i} tau_j) (1 - exp(-tau_i)), with its gradient written out.
 
-    expm1 keeps thin media exact (1 - exp loses all of it at 1e-9), and its own autograd is wrong where the medium is
-    opaque. dL/dtau_i = T_{i+1} g_i - sum_{j>i} w_j g_j.
+    expm1 keeps thin media exact (1 - exp loses all of it at 1e-9), and its own autograd is wrong where the
+    medium is opaque. dL/dtau_i = T_{i+1} g_i - sum_{j>i} w_j g_j.
     """
 
     @staticmethod
@@ -35,13 +36,15 @@ class _Weights(torch.autograd.Function):
 
 
 def _before(x: Tensor) -> Tensor:
-    """Sum of all earlier entries. Taking an entry off the inclusive sum again would round by its own size: the fog in front
-    of a wall of optical depth 1e8 would be lost, and inf - inf is NaN.
+    """Sum of all earlier entries. Taking an entry off the inclusive sum again would round by its own size:
+    the fog in front of a wall of optical depth 1e8 would be lost, and inf - inf is NaN.
     """
     return torch.nn.functional.pad(x[..., :-1], (1, 0)).cumsum(-1)
 
 
-def transmittance_weights(density: Annotated[Tensor, "R S"], t: Annotated[Tensor, "R E"]) -> Annotated[Tensor, "R S"]:
+def transmittance_weights(
+    density: Annotated[Tensor, "R S"], t: Annotated[Tensor, "R E"]
+) -> Annotated[Tensor, "R S"]:
     """Rendering weights (paper, Eq. 2) of densities >= 0 between edges t; relative error <= 4u (1 + tau)."""
     weights: Tensor = _Weights.apply(density * (t[:, 1:] - t[:, :-1]))  # type: ignore[no-untyped-call]
     return weights
@@ -87,7 +90,8 @@ def resample(
 ) -> Annotated[Tensor, "R count+1"]:
     """Edges at even steps of the distribution w over s, shifted by one draw a ray (none: centred).
 
-    `padding` is the total probability spread evenly, so that rays of weight 0 stay defined and every place can be found.
+    `padding` is the total probability spread evenly, so that rays of weight 0 stay defined and every place
+    can be found.
     """
     w = w + padding / w.shape[1]
     cdf = w.cumsum(-1)
@@ -96,9 +100,12 @@ def resample(
     # Stratified: one even comb a ray through the inverse of the distribution, not independent draws.
     u = torch.linspace(0, 1 - step, count + 1, dtype=s.dtype, device=s.device) + shifts(s, generator) * step
     at = torch.searchsorted(cdf, u.contiguous(), right=True)
-    low, high = (at - 1).clamp(0, s.shape[1] - 1), at.clamp(0, s.shape[1] - 1)
-    c0, c1 = cdf.gather(1, low), cdf.gather(1, high)
-    s0, s1 = s.gather(1, low), s.gather(1, high)
+    low = (at - 1).clamp(0, s.shape[1] - 1)
+    high = at.clamp(0, s.shape[1] - 1)
+    c0 = cdf.gather(1, low)
+    c1 = cdf.gather(1, high)
+    s0 = s.gather(1, low)
+    s1 = s.gather(1, high)
     # A step without probability has c1 == c0; any place inside it is right, 1e-12 only avoids 0/0.
     return s0 + ((u - c0) / (c1 - c0).clamp_min(1e-12)).clamp(0, 1) * (s1 - s0)
 
@@ -113,7 +120,8 @@ def interlevel(
 
     Only the proposal learns from it.
     """
-    w, s = w.detach(), s.detach()
+    w = w.detach()
+    s = s.detach()
     total = torch.cat([torch.zeros_like(proposal_w[:, :1]), proposal_w.cumsum(-1)], -1)
     edges = proposal_s.contiguous()
     last = edges.shape[1] - 1
@@ -126,9 +134,12 @@ def interlevel(
 
 
 def distortion(s: Annotated[Tensor, "R E"], w: Annotated[Tensor, "R S"]) -> Tensor:
-    """Mean over rays of sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 (s_i+1 - s_i) / 3 (mip-NeRF 360, Eq. 15), in O(S)."""
+    """Mean over rays of sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 (s_i+1 - s_i) / 3 (mip-NeRF 360, Eq. 15), in
+    O(S).
+    """
     # Sorted middles: sums over pairs are prefix sums, since m_i >= m_j for all j < i.
-    middle, width = midpoints(s), s[:, 1:] - s[:, :-1]
+    middle = midpoints(s)
+    width = s[:, 1:] - s[:, :-1]
     before_w = w.cumsum(-1) - w
     before_m = (w * middle).cumsum(-1) - w * middle
     between = 2 * (w * (middle * before_w - before_m)).sum(-1)
@@ -143,7 +154,8 @@ def _mean(x: Tensor) -> Tensor:
 def keep_heaviest(w: Annotated[Tensor, "R S"], budget: float) -> Annotated[Tensor, "R S"]:
     """Mask of the fewest samples of each ray such that the weight left out is at most `budget`.
 
-    Colours lie in [0, 1], so leaving these out changes a pixel by at most the budget. Budget 0 drops exact zeros only.
+    Colours lie in [0, 1], so leaving these out changes a pixel by at most the budget. Budget 0 drops exact
+    zeros only.
     """
     if budget <= 0:
         return w > 0

@@ -2,9 +2,10 @@
 
 What is found out about a capture (views, semantics) is kept in a cache, by the content of its file.
 
-What a style needs to know is found from a sample of the Gaussians of all files together, so that all take the same maps of
-colours. A Gaussian that is not in the sample takes the features of those of the sample in the smallest cell around it that
-holds any. Then each file is read and written once; of the others nothing is in memory.
+What a style needs to know is found from a sample of the Gaussians of all files together, so that all take the
+same maps of colours. A Gaussian that is not in the sample takes the features of those of the sample in the
+smallest cell around it that holds any. Then each file is read and written once; of the others nothing is in
+memory.
 """
 
 import functools
@@ -45,21 +46,31 @@ _UP = (0.0, -1.0, 0.0)
 _CACHED = 24
 """Captures of which the cache keeps what was found out."""
 SAMPLE = 2_000_000
-"""Gaussians that are looked at, at most: what is in memory of captures of any size, beside the file at hand."""
-_FINEST, _LEVELS = 1024, 12
+"""Gaussians that are looked at, at most: what is in memory of captures of any size, beside the file at
+hand.
+"""
+_FINEST = 1024
+_LEVELS = 12
 """Cells along the longest side of the bulk at the finest level; levels, each of cells twice as wide."""
 _STRAY = 500.0
-"""Extents of the bulk from it, beyond which Gaussians do not say where cells begin: twice that fits into 2^20 finest ones."""
+"""Extents of the bulk from it, beyond which Gaussians do not say where cells begin: twice that fits into 2^20
+finest ones.
+"""
 _BLACK = 0.055
 """Added to sRGB, it is a power of linear light."""
-_VIEW, _SOLID = (480, 360), 0.95
+_VIEW = (480, 360)
+_SOLID = 0.95
 """Size of views in the place of photographs; opacity from which on their pixels count."""
 _REFERENCES = 16
 """Views of a capture that are references, at most."""
 _GAP = 0.1
 """Distance between captures that would overlap, as a share of their width, where they are put in a row."""
-_SHARED, _ENOUGH, _ALIKE = 24, 64, 0.4
-"""Cells that captures share, at least and enough, and correlation of their brightness there: then they are of one place."""
+_SHARED = 24
+_ENOUGH = 64
+_ALIKE = 0.4
+"""Cells that captures share, at least and enough, and correlation of their brightness there: then they are of
+one place.
+"""
 
 
 def look_at_capture(
@@ -70,16 +81,20 @@ def look_at_capture(
     progress: Callable[[int, int], None] = lambda done, total: None,
     camera: Cameras | None = None,
 ) -> SplatScene:
-    """Find views of Gaussians that are all finite, sizes included. What they show is found when it is first asked for.
+    """Find views of Gaussians that are all finite, sizes included. What they show is found when it is first
+    asked for.
 
-    `camera` is the view that the capture was made from, where it is known. Raises DataError where nothing can be seen.
+    `camera` is the view that the capture was made from, where it is known. Raises DataError where nothing can
+    be seen.
     """
     # Mistakes are told before views are sought, which takes seconds.
     up = torch.tensor(config.up or _UP)
     if not bool(up.isfinite().all() & (up.norm() > 0)):
         raise DataError(f"up {config.up}: no direction; give three numbers, not all 0")
     if float(gaussians.opacities.max()) < MIN_ALPHA:
-        raise DataError(f"all {len(gaussians)} Gaussians are transparent; nothing of the capture can be seen or restyled")
+        raise DataError(
+            f"all {len(gaussians)} Gaussians are transparent; nothing of the capture can be seen or restyled"
+        )
     cameras = find_views(
         gaussians,
         count=config.views,
@@ -92,17 +107,24 @@ def look_at_capture(
 
     def found() -> Semantics:
         near = clip_distance(gaussians)
-        return find_semantics(gaussians, antialiased, encoder, cameras, config.regions, near=near, progress=progress)
+        return find_semantics(
+            gaussians, antialiased, encoder, cameras, config.regions, near=near, progress=progress
+        )
 
     return _scene_of(gaussians, antialiased, cameras, functools.cache(found), encoder)
 
 
 def _scene_of(
-    gaussians: Gaussians, antialiased: bool, cameras: Cameras, found: Callable[[], Semantics], encoder: Encoder
+    gaussians: Gaussians,
+    antialiased: bool,
+    cameras: Cameras,
+    found: Callable[[], Semantics],
+    encoder: Encoder,
 ) -> SplatScene:
     """The scene of a capture; its views are numbered."""
     names = tuple(f"{view:02d}" for view in range(len(cameras)))
-    longest, near = int(cameras.size.amax()), clip_distance(gaussians)
+    longest = int(cameras.size.amax())
+    near = clip_distance(gaussians)
     return SplatScene(gaussians, antialiased, cameras, names, found, lambda: encoder, longest, near)
 
 
@@ -116,26 +138,35 @@ def open_capture(
 ) -> SplatScene:
     """A capture as a scene: its Gaussians that can be drawn, with views and features from the cache.
 
-    What points up is as `look` says, else as the file does. Where views and features are absent, views are found here, and
-    features, which are then stored, when they are first asked for. `cache` is the folder; by default the user's own.
+    What points up is as `look` says, else as the file does. Where views and features are absent, views are
+    found here, and features, which are then stored, when they are first asked for. `cache` is the folder; by
+    default the user's own.
     """
     look = replace(look, up=look.up or capture.up)
-    folder, encoder = cache or cache_folder() / "captures", look.semantic.encoder.build()
-    # What is found follows from the file, the encoder and how it is looked at. The first number counts the versions of it.
+    folder = cache or cache_folder() / "captures"
+    encoder = look.semantic.encoder.build()
+    # What is found follows from the file, the encoder and how it is looked at. The first number counts the
+    # versions of it.
     digest = hashlib.sha256(capture.data)
-    digest.update(f"10 {encoder.identity} {look.up} {look.inside} {look.views} {look.size} {look.regions}".encode())
+    digest.update(
+        f"10 {encoder.identity} {look.up} {look.inside} {look.views} {look.size} {look.regions}".encode()
+    )
     path = folder / f"{digest.hexdigest()[:32]}.safetensors"
-    gaussians, antialiased = capture.gaussians.drawable(), capture.antialiased
+    gaussians = capture.gaussians.drawable()
+    antialiased = capture.antialiased
     if path.is_file():
         try:
             tensors = load_sealed(path)
-            cameras, semantics = Cameras(**tensor_group(tensors, "camera")), load_semantics(tensors, len(gaussians))
+            cameras = Cameras(**tensor_group(tensors, "camera"))
+            semantics = load_semantics(tensors, len(gaussians))
         except (CheckpointError, TypeError) as error:
             say(f"looking again: {error}")
         else:
             with suppress(OSError):  # another process may just have removed it
                 os.utime(path)
-            return replace(_scene_of(gaussians, antialiased, cameras, lambda: semantics, encoder), origin=capture.origin)
+            return replace(
+                _scene_of(gaussians, antialiased, cameras, lambda: semantics, encoder), origin=capture.origin
+            )
     scene = look_at_capture(gaussians, antialiased, encoder, look, progress, capture.camera)
 
     def found() -> Semantics:
@@ -168,7 +199,8 @@ class Captures:
 
     def harmonics(self, index: int, capture: Capture, look: Restyle) -> Annotated[Tensor, "N K 3"]:
         """Harmonics in a look of all Gaussians of capture number `index` that can be drawn."""
-        gaussians, rows = capture.gaussians, self.rows[index]
+        gaussians = capture.gaussians
+        rows = self.rows[index]
         finite = gaussians.finite
         gaussians = gaussians if bool(finite.all()) else gaussians.select(finite)
         here = tuple(a - b for a, b in zip(capture.origin, self.scene.origin, strict=True))
@@ -196,14 +228,18 @@ def open_captures(
 ) -> Captures:
     """Read captures and see them as one scene; arguments as those of `open_capture`.
 
-    Of several captures each gives a like share of the sample. `first` is the first one, where it was read already. Raises
-    DataError where nothing can be seen.
+    Of several captures each gives a like share of the sample. `first` is the first one, where it was read
+    already. Raises DataError where nothing can be seen.
     """
     first = first or _read(paths[0], say)
     if len(paths) == 1 and len(first.gaussians) <= sample:
         scene = open_capture(first, look, cache=cache, progress=progress, say=say)
-        return Captures(scene, (slice(0, len(scene.gaussians)),), (torch.zeros(3),), first, len(first.gaussians))
-    parts, key, compensated = list[Gaussians](), hashlib.sha256(f"{sample} {len(paths)}".encode()), first.antialiased
+        return Captures(
+            scene, (slice(0, len(scene.gaussians)),), (torch.zeros(3),), first, len(first.gaussians)
+        )
+    parts = list[Gaussians]()
+    key = hashlib.sha256(f"{sample} {len(paths)}".encode())
+    compensated = first.antialiased
     count = 0
     for path in paths:
         capture = first if path == paths[0] else _read(path, say)
@@ -253,7 +289,9 @@ def sampled(gaussians: Gaussians, most: int) -> Gaussians:
 
 
 def _apart(parts: Sequence[Gaussians]) -> list[Annotated[Tensor, "3"]]:
-    """What takes captures apart, in a row along x, where some lie in one place; nothing where they are neighbours."""
+    """What takes captures apart, in a row along x, where some lie in one place; nothing where they are
+    neighbours.
+    """
     boxes = []
     for part in parts:
         # Stray Gaussians do not make neighbours of captures that are apart.
@@ -265,7 +303,8 @@ def _apart(parts: Sequence[Gaussians]) -> list[Annotated[Tensor, "3"]]:
             shared = (torch.minimum(high, other_high) - torch.maximum(low, other_low)).clamp_min(0)
             least = torch.minimum(high - low, other_high - other_low)
             overlap = overlap or bool((shared > 0.5 * least).all())
-    moves, at = [], 0.0
+    moves = []
+    at = 0.0
     for low, high in boxes:
         moves.append(torch.tensor([at - float(low[0]), 0.0, 0.0]) if overlap else torch.zeros(3))
         at += (1 + _GAP) * float(high[0] - low[0])
@@ -286,10 +325,12 @@ def _joined(parts: Sequence[Gaussians]) -> Gaussians:
 
 
 def neighbouring_light(captures: Captures, references: Sequence[Path]) -> Annotated[Tensor, "3"] | None:
-    """Gains of colours + 0.055 that take captures to the light of other captures which they overlap or border on.
+    """Gains of colours + 0.055 that take captures to the light of other captures which they overlap or border
+    on.
 
-    Found where both have Gaussians in one cell, so that what only one of them shows has no part in it: the median over cells.
-    None where they share too few cells, or where their colours in these have nothing in common: then they are not of one place.
+    Found where both have Gaussians in one cell, so that what only one of them shows has no part in it: the
+    median over cells. None where they share too few cells, or where their colours in these have nothing in
+    common: then they are not of one place.
     """
     own = captures.scene.gaussians
     means = own.means.clone()
@@ -300,11 +341,14 @@ def neighbouring_light(captures: Captures, references: Sequence[Path]) -> Annota
     shifts = [[a - b for a, b in zip(other.origin, captures.scene.origin, strict=True)] for other in others]
     theirs = torch.cat([part.means + torch.tensor(shift) for part, shift in zip(parts, shifts, strict=True)])
     places = torch.cat([means, theirs])
-    colours = (torch.cat([own.colours, *(part.colours for part in parts)]).double().clamp(0, 1) + _BLACK).log()
+    colours = (
+        torch.cat([own.colours, *(part.colours for part in parts)]).double().clamp(0, 1) + _BLACK
+    ).log()
     # What can be seen counts, by its opacity.
     weight = torch.cat([own.opacities, *(part.opacities for part in parts)]).double()
     low, edge = _grid(means)
-    gain, most = None, _SHARED - 1
+    gain = None
+    most = _SHARED - 1
     for level in range(_LEVELS - 2):
         cell = torch.unique(cells_of(places, low, edge * 2**level), return_inverse=True)[1]
         count = int(cell.max()) + 1
@@ -312,7 +356,9 @@ def neighbouring_light(captures: Captures, references: Sequence[Path]) -> Annota
         sides = []
         for rows in (slice(0, len(means)), slice(len(means), None)):
             share = torch.zeros(count).double().index_add_(0, cell[rows], weight[rows])
-            sums = torch.zeros(count, 3).double().index_add_(0, cell[rows], weight[rows, None] * colours[rows])
+            sums = (
+                torch.zeros(count, 3).double().index_add_(0, cell[rows], weight[rows, None] * colours[rows])
+            )
             sides.append((share, sums))
         both = (sides[0][0] > 0.5) & (sides[1][0] > 0.5)
         if int(both.sum()) <= most:
@@ -321,7 +367,8 @@ def neighbouring_light(captures: Captures, references: Sequence[Path]) -> Annota
         alike = torch.corrcoef(torch.stack([before.mean(1), after.mean(1)]))[0, 1]
         if not alike > _ALIKE:
             continue
-        gain, most = (after - before).median(0).values.exp(), int(both.sum())
+        gain = (after - before).median(0).values.exp()
+        most = int(both.sum())
         # The smaller the cells, the more alike are the things in them.
         if most >= _ENOUGH:
             break
@@ -329,40 +376,52 @@ def neighbouring_light(captures: Captures, references: Sequence[Path]) -> Annota
 
 
 def light_alone(styled: Styled, gain: Annotated[Tensor, "3"] | None = None) -> Styled:
-    """A style as its exposure and white balance alone: one gain a channel, in linear light, for the whole scene.
+    """A style as its exposure and white balance alone: one gain a channel, in linear light, for the whole
+    scene.
 
-    Without a known `gain` it takes the scene's mean colour, of logarithms, to that of the references: right where both are of
-    the same materials.
+    Without a known `gain` it takes the scene's mean colour, of logarithms, to that of the references: right
+    where both are of the same materials.
     """
-    style, dictionary, regions = styled.scene_style, styled.dictionary, len(styled.scene_style.keys)
+    style = styled.scene_style
+    dictionary = styled.dictionary
+    regions = len(styled.scene_style.keys)
     if dictionary.colour_mean is None:
         raise UsageError("--match-light: the style has no colours of photographs; name references")
     # sRGB is a power of linear light but for the black end: a gain is a factor of colours plus 0.055.
     sides = ((style.region_mean, style.share), (dictionary.colour_mean, code_odds(dictionary)))
     before, after = (
-        (share.double() / share.double().sum()) @ (colour.double().clamp(0, 1) + _BLACK).log() for colour, share in sides
+        (share.double() / share.double().sum()) @ (colour.double().clamp(0, 1) + _BLACK).log()
+        for colour, share in sides
     )
     gain = (after - before).exp() if gain is None else gain
     maps = ColourMaps(style, gain.diag().expand(regions, 3, 3), (_BLACK * (gain - 1)).expand(regions, 3), 1.0)
     return styled._replace(restyle=replace(styled.restyle, colours=maps, light=None, places=()))
 
 
-def reference_views(path: Path, look: LookConfig, folder: Path) -> tuple[tuple[Path, ...], tuple[Path, ...], tuple[float, ...]]:
-    """Write pictures of views of a capture or of a run into a folder: in the place of photographs, as references.
+def reference_views(
+    path: Path, look: LookConfig, folder: Path
+) -> tuple[tuple[Path, ...], tuple[Path, ...], tuple[float, ...]]:
+    """Write pictures of views of a capture or of a run into a folder: in the place of photographs, as
+    references.
 
-    Returns them, masks of what they show, and the shares of them that show anything. Raises DataError where none does.
+    Returns them, masks of what they show, and the shares of them that show anything. Raises DataError where
+    none does.
     """
     if (path / "config.json").is_file():
         scene: Scene = open_run(path, device="cpu").scene
     else:
-        capture, encoder = read_capture(path), look.semantic.encoder.build()
+        capture = read_capture(path)
+        encoder = look.semantic.encoder.build()
         gaussians = sampled(capture.gaussians.drawable(), SAMPLE)
-        # As many views as a capture that takes the style is looked at from: of one place both show alike shares.
+        # As many views as a capture that takes the style is looked at from: of one place both show alike
+        # shares.
         look = replace(look, size=_VIEW, up=look.up or capture.up)
         scene = look_at_capture(gaussians, capture.antialiased, encoder, look, camera=capture.camera)
     chosen = torch.linspace(0, len(scene.names) - 1, min(_REFERENCES, len(scene.names))).round().long()
     cameras = scene.cameras.select(chosen)
-    pictures, masks, weights = list[Path](), list[Path](), list[float]()
+    pictures = list[Path]()
+    masks = list[Path]()
+    weights = list[float]()
     for view in range(len(cameras)):
         shown = scene.render(cameras, view)
         solid = shown.opacity > _SOLID
@@ -378,7 +437,9 @@ def reference_views(path: Path, look: LookConfig, folder: Path) -> tuple[tuple[P
 
 
 def _grid(points: Annotated[Tensor, "N 3"]) -> tuple[Annotated[Tensor, "3"], float]:
-    """Lowest corner of the cells around points, and the edge of the finest. Strays are left out: the grid cannot reach both."""
+    """Lowest corner of the cells around points, and the edge of the finest. Strays are left out: the grid
+    cannot reach both.
+    """
     bulk = bulk_of(points.numpy())
     return points[torch.from_numpy(bulk.apart <= _STRAY)].amin(0), (bulk.side or 1.0) / _FINEST
 
@@ -388,7 +449,8 @@ class Neighbours:
 
     def __init__(self, points: Annotated[Tensor, "M 3"], features: Annotated[Tensor, "M D"]) -> None:
         self.low, self.edge = _grid(points)
-        self.fallback, self.levels = features.float().mean(0), []
+        self.fallback = features.float().mean(0)
+        self.levels = []
         for level in range(_LEVELS):
             keys, cell = torch.unique(cells_of(points, self.low, self.edge * 2**level), return_inverse=True)
             # A level has the means of its cells, by the sorted numbers of these.

@@ -1,8 +1,9 @@
-"""Scenes of Gaussians in cells, each a task of its own (`training.tasks`); how they are cut says `blocks.partition`.
+"""Scenes of Gaussians in cells, each a task of its own (`training.tasks`); how they are cut says
+`blocks.partition`.
 
-The whole scene is trained first, on photographs of half the size, for most of the schedule. Each cell goes on from there, with
-the poses that were refined there. It starts from Gaussians of the whole scene: those that its windows show explain what lies
-outside, and are dropped in the end.
+The whole scene is trained first, on photographs of half the size, for most of the schedule. Each cell goes on
+from there, with the poses that were refined there. It starts from Gaussians of the whole scene: those that
+its windows show explain what lies outside, and are dropped in the end.
 
     RUN/overview, RUN/cells/NN      the whole scene, and the cells (see `training.tasks`)
     RUN/checkpoints                 the union of all cells
@@ -52,17 +53,29 @@ Number = TypeVar("Number", bound=np.generic)
 _FORMAT = 6
 """Version of how a cell is trained: another one trains it anew."""
 _MOMENTS = "first", "second", "weight"
-_PIXELS, _SMALLEST = 16_000_000, 4
-"""Pixels of all photographs that the whole scene is trained on, at most; how far they are reduced before some are left out."""
+_PIXELS = 16_000_000
+_SMALLEST = 4
+"""Pixels of all photographs that the whole scene is trained on, at most; how far they are reduced before some
+are left out.
+"""
 _RATE = 0.5
-"""Factor of the learning rates in cells, whose windows are seen more often than the photographs of the whole scene."""
+"""Factor of the learning rates in cells, whose windows are seen more often than the photographs of the whole
+scene.
+"""
 _VISITS = 10
-"""Times that the whole scene sees each of them, at least, however few `steps` there are: cells do not make up for fewer."""
+"""Times that the whole scene sees each of them, at least, however few `steps` there are: cells do not make up
+for fewer.
+"""
 _DEVIATIONS = 3.0
 """A Gaussian is shown as far as so many standard deviations from its mean."""
-_RUN, _LOOKED, _COARSER, _WEIGHT = 256, 40, 4, 0.003
-"""Gaussians that are looked for together; windows that are drawn to see what they show, at most, evenly over all; the part of
-their size at which they are; the least that the weights of a Gaussian in all pixels of one sum to."""
+_RUN = 256
+_LOOKED = 40
+_COARSER = 4
+_WEIGHT = 0.003
+"""Gaussians that are looked for together; windows that are drawn to see what they show, at most, evenly over
+all; the part of their size at which they are; the least that the weights of a Gaussian in all pixels of one
+sum to.
+"""
 
 
 def folder_of(root: Path, cell: int) -> Path:
@@ -78,31 +91,53 @@ def load_cells(root: Path) -> list[Cell]:
 class Cells(Partition):
     """A scene that is ready to be trained cell by cell."""
 
-    def __init__(self, config: GaussiansConfig, scene: ParsedScene, saved: Facts | None, *, device: torch.device = CPU) -> None:
-        self.config, self.scene, self.device = config, scene, device
+    def __init__(
+        self, config: GaussiansConfig, scene: ParsedScene, saved: Facts | None, *, device: torch.device = CPU
+    ) -> None:
+        self.config = config
+        self.scene = scene
+        self.device = device
         self.compiling = [] if usable(device) else compile_beside((config.degree + 1) ** 2)
-        self._facts = saved or light_and_poses(config, scene, lambda view: load_images(scene, config.background, [view])[0])
+        self._facts = saved or light_and_poses(
+            config, scene, lambda view: load_images(scene, config.background, [view])[0]
+        )
 
     @property
     def facts(self) -> Facts:
         return self._facts
 
     def train(self, run: Run, display: Display, *, spent: float) -> None:
-        """Train the whole scene and all cells, those with the largest windows first, and unite them. Finished ones stay."""
-        config, size = self.config, self.scene.cameras.size
+        """Train the whole scene and all cells, those with the largest windows first, and unite them. Finished
+        ones stay.
+        """
+        config = self.config
+        size = self.scene.cameras.size
         for process in self.compiling:
             process.wait()
         cells = self.write(run)
         pixels = [sum(width * height for _, _, width, height in cell.windows.values()) for cell in cells]
         share = sum(pixels) / int(size[self.scene.train].prod(1).sum())
-        display.say(f"{len(cells)} cells, whose windows are {share:.2f} times the photographs{left_out(self.device)}")
+        display.say(
+            f"{len(cells)} cells, whose windows are {share:.2f} times the photographs{left_out(self.device)}"
+        )
         order = sorted(range(len(cells)), key=lambda cell: -pixels[cell])
         executor = config.executor.on(self.device.type if usable(self.device) else "cpu").build()
-        train_all(config, run, executor, open_cell, order, whole_share=config.overview, spent=spent, quiet=display.quiet)
+        train_all(
+            config,
+            run,
+            executor,
+            open_cell,
+            order,
+            whole_share=config.overview,
+            spent=spent,
+            quiet=display.quiet,
+        )
         display.say(f"{unite(run.root, cells)} Gaussians")
 
     def write(self, run: Run) -> list[Cell]:
-        """Cut the scene and write the cells. Those of another cut, which could be taken for these, are removed."""
+        """Cut the scene and write the cells. Those of another cut, which could be taken for these, are
+        removed.
+        """
         cells = bisect_sightings(self.scene, self.config.cells)
         if write_cells(run.root / "cells.json", cells):
             shutil.rmtree(run.root / "cells", ignore_errors=True)
@@ -110,7 +145,9 @@ class Cells(Partition):
 
 
 def load_overview(root: Path) -> checkpoint.Saved:
-    """The whole scene, mapped: of large ones a cell reads a part. Raises CheckpointError where it was not trained."""
+    """The whole scene, mapped: of large ones a cell reads a part. Raises CheckpointError where it was not
+    trained.
+    """
     folder = folder_of(root, WHOLE) / "checkpoints"
     saved, _ = checkpoint.load_latest(folder, verify=False)
     if saved is None:
@@ -131,7 +168,8 @@ class Overview(Part):
     """One of so many photographs is learnt from."""
 
     def build(self) -> GaussianLearner:
-        scene, facts = read_scene(self.config, self.facts), self.facts
+        scene = read_scene(self.config, self.facts)
+        facts = self.facts
         scene = replace(scene, train=scene.train[:: self.every])
         held = other_views(scene, scene.train.tolist()) if facts.exposure or facts.centres else ()
         return build(self.config, scene, replace(facts, held=held), device=device_of(self.config.device))
@@ -157,21 +195,27 @@ class CellPart(Part):
 
     def build(self) -> GaussianLearner:
         """Go on from the whole scene, at lower rates."""
-        config, cell, start = self.config, self.cell, self.start
-        # Photographs, from where the whole scene found its views, as far as the cell's windows reach. Lengths follow from the
-        # cell's own cameras: points of the whole scene say nothing about it.
+        config = self.config
+        cell = self.cell
+        start = self.start
+        # Photographs, from where the whole scene found its views, as far as the cell's windows reach. Lengths
+        # follow from the cell's own cameras: points of the whole scene say nothing about it.
         scene = replace(self.scene, cameras=refined(self.scene.cameras, start), points=None, seen=None)
         images, masks, skies = load_photographs(config, scene, list(cell.windows))
-        images, masks, skies = crop(cell, images), crop(cell, masks), crop(cell, skies)
+        images = crop(cell, images)
+        masks = crop(cell, masks)
+        skies = crop(cell, skies)
         # Gaussians of the whole scene that these show.
-        near, whole = float(start.model["near"]), from_tensors(start.model)
+        near = float(start.model["near"])
+        whole = from_tensors(start.model)
         own = scene_in_windows(scene, cell)
         shown = shown_in_windows(own.cameras, cell, whole, near)
         gaussians = whole.select(shown)
         # Only what lies inside and in the border becomes more: its share of all that may be added.
         around = int(cell.around(gaussians.means).sum())
         cap = len(gaussians) + round(max(config.most - len(whole), 0) * around / len(whole))
-        tones, device = overview_tones(self.facts, start), device_of(config.device)
+        tones = overview_tones(self.facts, start)
+        device = device_of(config.device)
         learner = GaussianLearner(
             replace(config, cap=cap, rate=_RATE * config.rate),
             make_levels(own, images, masks, near, skies, device=device),
@@ -198,10 +242,14 @@ class CellPart(Part):
 def open_cell(task: Task) -> Overview | CellPart:
     """The whole scene, or the cell, of a task.
 
-    Raises ConfigError where the images are not those of the run, CheckpointError where a cell's whole scene was not trained.
+    Raises ConfigError where the images are not those of the run, CheckpointError where a cell's whole scene
+    was not trained.
     """
-    root, number = Path(task.root), task.part
-    folder, facts, config = folder_of(root, number), Run(root).load_known().facts, Run(root).load_config()[0]
+    root = Path(task.root)
+    number = task.part
+    folder = folder_of(root, number)
+    facts = Run(root).load_known().facts
+    config = Run(root).load_config()[0]
     assert isinstance(config, GaussiansConfig)  # by its kind
     scene = read_scene(replace(config, data=Path(task.data)), facts)
     # Fields of the config that may change without training a part anew.
@@ -212,7 +260,9 @@ def open_cell(task: Task) -> Overview | CellPart:
             name="whole scene",
             folder=folder,
             # What is finished stays when a run is gone on with for more steps or minutes.
-            asked={"task": digest_of(config, free, scene, scene.train.tolist(), {"format": _FORMAT, "start": ""})},
+            asked={
+                "task": digest_of(config, free, scene, scene.train.tolist(), {"format": _FORMAT, "start": ""})
+            },
             schedule=Schedule(own.most_steps, task.minutes, config.checkpoint_minutes),
             config=own,
             facts=facts,
@@ -245,8 +295,10 @@ def overview_config(config: GaussiansConfig, scene: ParsedScene) -> tuple[Gaussi
 
     Of smaller images, then of fewer, where memory would not be bounded.
     """
-    # Memory is in proportion to the pixels: half the size, then a third, a quarter, and then every other photograph ...
-    pixels, factor = int(scene.cameras.size[scene.train].prod(1).sum()), 2
+    # Memory is in proportion to the pixels: half the size, then a third, a quarter, and then every other
+    # photograph ...
+    pixels = int(scene.cameras.size[scene.train].prod(1).sum())
+    factor = 2
     while factor < _SMALLEST and pixels > factor**2 * _PIXELS:
         factor += 1
     every = -(-pixels // (factor**2 * _PIXELS))
@@ -271,7 +323,8 @@ def scene_in_windows(scene: ParsedScene, cell: Cell) -> ParsedScene:
     """The scene that a cell sees: its windows are the training views."""
     views = torch.tensor(list(cell.windows), dtype=torch.int64)
     window = torch.tensor(list(cell.windows.values()), dtype=torch.int64)
-    centre, size = scene.cameras.centre.clone(), scene.cameras.size.clone()
+    centre = scene.cameras.centre.clone()
+    size = scene.cameras.size.clone()
     centre[views] -= window[:, :2]
     size[views] = window[:, 2:]
     return replace(scene, cameras=replace(scene.cameras, centre=centre, size=size), train=views)
@@ -286,18 +339,22 @@ def crop(cell: Cell, images: dict[int, NDArray[Number]]) -> dict[int, NDArray[Nu
     return cropped
 
 
-def shown_in_windows(cameras: Cameras, cell: Cell, gaussians: Gaussians, near: float) -> Annotated[Tensor, "N"]:
+def shown_in_windows(
+    cameras: Cameras, cell: Cell, gaussians: Gaussians, near: float
+) -> Annotated[Tensor, "N"]:
     """True for Gaussians that a window shows, and for all in the cell and its border.
 
-    `cameras` are those of `scene_in_windows`. What others hide, and what covers next to nothing, is not shown, so their number
-    does not grow with the scene.
+    `cameras` are those of `scene_in_windows`. What others hide, and what covers next to nothing, is not
+    shown, so their number does not grow with the scene.
     """
     visible = cell.around(gaussians.means)
-    # Runs [B R] of Gaussians near to each other, the last one repeated, with balls around what they show: most windows
-    # show few of them.
+    # Runs [B R] of Gaussians near to each other, the last one repeated, with balls around what they show:
+    # most windows show few of them.
     order = torch.from_numpy(curve_order(gaussians.means.double().numpy()))
     order = torch.nn.functional.pad(order[None], (0, -len(order) % _RUN), mode="replicate").view(-1, _RUN)
-    means, quaternions, log_scales = (x[order] for x in (gaussians.means, gaussians.quaternions, gaussians.log_scales))
+    means, quaternions, log_scales = (
+        x[order] for x in (gaussians.means, gaussians.quaternions, gaussians.log_scales)
+    )
     centre = (means.double().amin(1) + means.double().amax(1)) / 2
     reach = _DEVIATIONS * log_scales.amax(2).double().exp()
     radius = ((means.double() - centre[:, None]).norm(dim=2) + reach).amax(1)
@@ -331,29 +388,38 @@ def overview_tones(facts: Facts, start: checkpoint.Saved) -> Tones | None:
 def unite(root: Path, cells: Sequence[Cell]) -> int:
     """Write the union of all cells as the run's checkpoint; the number of its Gaussians.
 
-    Each view has the mean exposure of the cells that have a window of it. Raises CheckpointError where one is not finished.
+    Each view has the mean exposure of the cells that have a window of it. Raises CheckpointError where one is
+    not finished.
     """
     start = load_overview(root)
     # Exposures are averaged over cells as factors: of each view, those of the cells that have a window of it.
     tones = overview_tones(Run(root).load_known().facts, start)
     parts: list[tuple[Tensor, ...]] = []
-    step, seconds = start.step, start.seconds
-    gain, count = torch.zeros(0), torch.zeros(0)
+    step = start.step
+    seconds = start.seconds
+    gain = torch.zeros(0)
+    count = torch.zeros(0)
     if tones is not None:
-        gain, count = torch.zeros_like(tones.gains()), torch.zeros(len(tones.exposure), 1)
+        gain = torch.zeros_like(tones.gains())
+        count = torch.zeros(len(tones.exposure), 1)
     for number, cell in enumerate(cells):
         folder = folder_of(root, number)
         saved, _ = checkpoint.load_latest(folder / "checkpoints")
         if saved is None or read_done(folder) is None:
-            raise CheckpointError(f"{folder}: this cell is not finished; go on with `fprf train {root / 'config.json'}`")
+            raise CheckpointError(
+                f"{folder}: this cell is not finished; go on with `fprf train {root / 'config.json'}`"
+            )
         # What lies outside of the cell only explained what its windows show: its own cells know it better.
         gaussians = from_tensors(saved.model)
         parts.append(tuple(vars(gaussians.select(cell.holds(gaussians.means))).values()))
-        step, seconds = max(step, start.step + saved.step), seconds + saved.seconds
+        step = max(step, start.step + saved.step)
+        seconds = seconds + saved.seconds
         if tones is not None:
             used = list(cell.windows)
             own = tones.going_on(tuple(sorted(set(range(len(gain))) - set(used))))
-            own.load_state_dict({name: saved.optimizer[f"tones.{name}.value"].clone() for name in ("gain", "exponent")})
+            own.load_state_dict(
+                {name: saved.optimizer[f"tones.{name}.value"].clone() for name in ("gain", "exponent")}
+            )
             gain[used] += own.gains().detach()[used]
             count[used] += 1
     # Poses were refined in the whole scene alone.

@@ -1,4 +1,6 @@
-"""Configs of runs of 3D Gaussians and of views of a capture, and which files are captures by name. Imports no torch."""
+"""Configs of runs of 3D Gaussians and of views of a capture, and which files are captures by name. Imports no
+torch.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,13 +23,20 @@ if TYPE_CHECKING:
     from ..training.model import Facts
 
 CAPTURES = "fprf.captures"
-"""Entry points of file formats of Gaussians (`splats.files.base.CaptureFormat`), by the ending of their files."""
-_CAP, _PASSES, _STEPS, _NO_END = 60_000, 280, 10_000, 100_000
+"""Entry points of file formats of Gaussians (`splats.files.base.CaptureFormat`), by the ending of their
+files.
+"""
+_CAP = 60_000
+_PASSES = 280
+_STEPS = 10_000
+_NO_END = 100_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class GaussianSemanticsConfig:
-    """Semantics of Gaussians: features of rendered views, carried back to what they show. Nothing is trained for them."""
+    """Semantics of Gaussians: features of rendered views, carried back to what they show. Nothing is trained
+    for them.
+    """
 
     encoder: EncoderConfig = SEMANTICS
     """Encoder whose features find the fitting reference."""
@@ -38,7 +47,9 @@ class LookConfig:
     """Views of a capture, from which its regions and statistics are found."""
 
     up: tuple[float, float, float] | None = None
-    """Direction that points up in the capture's own axes; none = as the file says, else 0 -1 0: most captures have y down."""
+    """Direction that points up in the capture's own axes; none = as the file says, else 0 -1 0: most captures
+    have y down.
+    """
     inside: bool | None = None
     """Look from within, as in rooms and streets, or around an object; none = found out."""
     views: int = 32
@@ -65,40 +76,58 @@ class GaussiansConfig(RunConfig):
     open: ClassVar[tuple[str, ...]] = ("downscale", "cap", "passes")
 
     device: str = "auto"
-    """cpu, cuda, or auto. On CUDA they are trained where gsplat is installed (`pip install 'fprf[cuda]'`), else on the CPU."""
+    """cpu, cuda, or auto. On CUDA they are trained where gsplat is installed (`pip install 'fprf[cuda]'`),
+    else on the CPU.
+    """
     steps: int | None = None
     """Optimiser steps: one view each. none = 10 000, or with minutes as many as there is time for."""
     passes: int | None = None
-    """Passes over the training views at most, whatever `steps` and `minutes` say: more of them learn few photographs by heart.
-    Not in cells. none = 280, and more for photographs of more than 640 x 360 pixels."""
+    """Passes over the training views at most, whatever `steps` and `minutes` say: more of them learn few
+    photographs by heart. Not in cells. none = 280, and more for photographs of more than 640 x 360 pixels.
+    """
     parser: DataParserConfig | None = None
     """Format of the scene folder; none = recognised from what lies in it."""
     masks: bool = True
-    """Leave out, in training and metrics, what the capture's masks name (`masks/` beside the images, or `mask_path`)."""
+    """Leave out, in training and metrics, what the capture's masks name (`masks/` beside the images, or
+    `mask_path`).
+    """
     tones: bool | None = None
-    """Learn how bright and how coloured each view was taken, starting from its exposure; the scene is what they have in common.
-    none = where exposures differ, as the capture says or as its sparse points show."""
+    """Learn how bright and how coloured each view was taken, starting from its exposure; the scene is what
+    they have in common. none = where exposures differ, as the capture says or as its sparse points show.
+    """
     poses: float = 0.0
-    """Refine the cameras' poses with the scene: how far a view may move whenever it is seen, in radians and in distances that
-    views commonly see. It falls to a tenth. 0 = they are as the capture says, 0.002 suits poses that are off by some pixels."""
+    """Refine the cameras' poses with the scene: how far a view may move whenever it is seen, in radians and
+    in distances that views commonly see. It falls to a tenth. 0 = they are as the capture says, 0.002 suits
+    poses that are off by some pixels.
+    """
     initial: int = 40_000
-    """Gaussians at the start, at most: the reconstruction's points, else points matched between the posed views."""
+    """Gaussians at the start, at most: the reconstruction's points, else points matched between the posed
+    views.
+    """
     surroundings: int = 500
-    """Further Gaussians on a distant sphere at the start: they hold sky, and fill what no photograph shows. Only cells
-    split them. At most a tenth of `cap`; 0 = none."""
+    """Further Gaussians on a distant sphere at the start: they hold sky, and fill what no photograph shows.
+    Only cells split them. At most a tenth of `cap`; 0 = none.
+    """
     cap: int | None = None
-    """Gaussians at the end, at most; none = by the minutes and this machine's speed, and saved with the run."""
+    """Gaussians at the end, at most; none = by the minutes and this machine's speed, and saved with the
+    run.
+    """
     longest: int = 1600
-    """Longest side in pixels, at most, to which photographs are reduced where `downscale` is not given. Where the minutes are
-    too few for that size they are reduced further."""
+    """Longest side in pixels, at most, to which photographs are reduced where `downscale` is not given. Where
+    the minutes are too few for that size they are reduced further.
+    """
     pixels_per_gaussian: int = 20
-    """Pixels of all training views for each Gaussian, at least: few photographs get fewer Gaussians. Not in cells."""
+    """Pixels of all training views for each Gaussian, at least: few photographs get fewer Gaussians. Not in
+    cells.
+    """
     degree: int = 2
     """Degree of the harmonics of view-dependent colours, 0 to 3."""
     ssim: float = 0.2
     """Share of 1 - SSIM in the loss; the rest is the absolute error."""
     coarse: float = 0.6
-    """Share of training that sees the photographs reduced: at half their size, large ones at less in the first third of it."""
+    """Share of training that sees the photographs reduced: at half their size, large ones at less in the
+    first third of it.
+    """
     grow: float = 0.6
     """Share of training within which the number grows to `cap`."""
     relocate_every: int = 100
@@ -106,19 +135,25 @@ class GaussiansConfig(RunConfig):
     rate: float = 1.0
     """Factor of all learning rates."""
     cells: int = 1
-    """Parts of space that are trained apart, each with a part of the time and of the Gaussians; 1 = none. More need points of a
-    reconstruction."""
+    """Parts of space that are trained apart, each with a part of the time and of the Gaussians; 1 = none.
+    More need points of a reconstruction.
+    """
     overview: float = 0.9
-    """Share of steps and minutes in which the whole scene is trained at half the size before its cells go on from there."""
+    """Share of steps and minutes in which the whole scene is trained at half the size before its cells go on
+    from there.
+    """
     executor: ExecutorConfig = SerialConfig()
     """Executor that trains cells: one after the other, or several at a time."""
     semantic: GaussianSemanticsConfig = GaussianSemanticsConfig()
     """Semantics; another encoder needs no training anew."""
     regions: int = 24
-    """Semantic regions of the scene (with 16, 24, 32 of them 89, 91, 91 % of the town's pixels take from the right class)."""
+    """Semantic regions of the scene (with 16, 24, 32 of them 89, 91, 91 % of the town's pixels take from the
+    right class).
+    """
     semantic_size: int = 240
-    """Longest side in pixels, at most, of the views that semantics are found in and of references as they are encoded: at 240
-    the bundled encoder tells things apart best (docs/gaussians.md)."""
+    """Longest side in pixels, at most, of the views that semantics are found in and of references as they are
+    encoded: at 240 the bundled encoder tells things apart best (docs/gaussians.md).
+    """
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Colour behind everything, also where images have transparency."""
 
@@ -201,12 +236,16 @@ class GaussiansConfig(RunConfig):
 
 
 def endings() -> tuple[str, ...]:
-    """Endings of the files of installed formats, with their dot; an index of a folder (lod-meta.json) has none of its own."""
+    """Endings of the files of installed formats, with their dot; an index of a folder (lod-meta.json) has
+    none of its own.
+    """
     return tuple(f".{name}" for name in registry.installed(CAPTURES) if not name.endswith(".json"))
 
 
 def format_name(path: Path) -> str | None:
-    """The installed format that a file is of by its name; None where it is of none. A meta.json is that of a SOG folder."""
+    """The installed format that a file is of by its name; None where it is of none. A meta.json is that of a
+    SOG folder.
+    """
     name = path.name.lower()
     if name == "meta.json":
         return "sog"
@@ -216,7 +255,9 @@ def format_name(path: Path) -> str | None:
 
 
 def stem_of(path: Path) -> str:
-    """The name of a capture without the ending that says its format; of an index that of its folder, of a page its stem."""
+    """The name of a capture without the ending that says its format; of an index that of its folder, of a
+    page its stem.
+    """
     if path.is_dir():
         return path.resolve().name
     name = format_name(path)

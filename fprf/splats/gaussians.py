@@ -1,7 +1,7 @@
 """3D Gaussians with view-dependent colours (Kerbl et al. 2023), as every part of fprf passes them.
 
-World axes are the capture's own. Colour seen along a unit direction d = max(0, 0.5 + sum_k Y_k(d) harmonics_k), sRGB, with
-the real spherical harmonics Y of `ops.harmonics`.
+World axes are the capture's own. Colour seen along a unit direction d = max(0, 0.5 + sum_k Y_k(d)
+harmonics_k), sRGB, with the real spherical harmonics Y of `ops.harmonics`.
 """
 
 import math
@@ -20,9 +20,12 @@ from ..ops.rasterise.training import HARMONICS, LOG_SCALES, LOGIT, MEANS, QUATER
 
 COUNTS = (1, 4, 9, 16, 25)
 """Harmonics a channel, by degree."""
-_LARGEST, _WIDEST, _FLATTEST = 1e15, 88.0, -30.0
-"""Magnitude from which on nothing is drawn (`ops.rasterise.reference`); ln-scales: the largest whose size is finite in float32,
-and the smallest that drawing tells from 0."""
+_LARGEST = 1e15
+_WIDEST = 88.0
+_FLATTEST = -30.0
+"""Magnitude from which on nothing is drawn (`ops.rasterise.reference`); ln-scales: the largest whose size is
+finite in float32, and the smallest that drawing tells from 0.
+"""
 _SAMPLE = 100_000
 """Points, about, of which quantiles are taken."""
 
@@ -41,13 +44,24 @@ class Gaussians:
     harmonics: Annotated[Tensor, "N K 3"]
 
     def __post_init__(self) -> None:
-        n, k = len(self.means), self.harmonics.shape[1] if self.harmonics.ndim == 3 else 0
-        wanted = {"means": (n, 3), "quaternions": (n, 4), "log_scales": (n, 3), "logits": (n,), "harmonics": (n, k, 3)}
+        n = len(self.means)
+        k = self.harmonics.shape[1] if self.harmonics.ndim == 3 else 0
+        wanted = {
+            "means": (n, 3),
+            "quaternions": (n, 4),
+            "log_scales": (n, 3),
+            "logits": (n,),
+            "harmonics": (n, k, 3),
+        }
         for name, shape in wanted.items():
             if tuple(getattr(self, name).shape) != shape:
-                raise DataError(f"Gaussians: {name} of shape {tuple(getattr(self, name).shape)}; expected {shape}")
+                raise DataError(
+                    f"Gaussians: {name} of shape {tuple(getattr(self, name).shape)}; expected {shape}"
+                )
         if k not in COUNTS:
-            raise DataError(f"Gaussians: {k} harmonics a channel; there are 1, 4, 9, 16 or 25, for degrees 0 to 4")
+            raise DataError(
+                f"Gaussians: {k} harmonics a channel; there are 1, 4, 9, 16 or 25, for degrees 0 to 4"
+            )
 
     def __len__(self) -> int:
         return len(self.means)
@@ -69,15 +83,19 @@ class Gaussians:
 
     @property
     def rows(self) -> Annotated[Tensor, "N R"]:
-        """All parameters of a Gaussian in a row of R = 11 + 3 K, in the columns of `ops.rasterise.training`."""
+        """All parameters of a Gaussian in a row of R = 11 + 3 K, in the columns of
+        `ops.rasterise.training`.
+        """
         parts = (self.means, self.log_scales, self.quaternions, self.logits[:, None])
         return torch.cat([*parts, self.harmonics.flatten(1)], 1)
 
     @property
     def finite(self) -> Annotated[Tensor, "N"]:
-        """Gaussians that can be drawn, bool: with finite numbers below 1e15 and rotations of a length above 0.
+        """Gaussians that can be drawn, bool: with finite numbers below 1e15 and rotations of a length above
+        0.
 
-        Infinite logits are opacities 0 and 1, and ln-scales of -inf those of flat Gaussians: both can be drawn.
+        Infinite logits are opacities 0 and 1, and ln-scales of -inf those of flat Gaussians: both can be
+        drawn.
         """
         bounded, turned = self._sound()
         return bounded & turned
@@ -99,7 +117,9 @@ class Gaussians:
         return [f"{int(each.sum())} {what}" for what, each in counts.items() if bool(each.any())]
 
     def drawable(self) -> "Gaussians":
-        """The Gaussians that can be drawn, with finite ln-scales: flat ones get the smallest that makes a difference."""
+        """The Gaussians that can be drawn, with finite ln-scales: flat ones get the smallest that makes a
+        difference.
+        """
         finite = self.finite
         kept = self if bool(finite.all()) else self.select(finite)
         return replace(kept, log_scales=kept.log_scales.clamp_min(_FLATTEST))
@@ -113,7 +133,9 @@ class Gaussians:
         return Gaussians(*(part.to(device) for part in vars(self).values()))
 
     def select(self, index: Annotated[Tensor, "M"] | slice) -> "Gaussians":
-        """Some of the Gaussians, in the order of `index` (int64, or a mask of all); without a copy those of a slice."""
+        """Some of the Gaussians, in the order of `index` (int64, or a mask of all); without a copy those of a
+        slice.
+        """
         return Gaussians(*(part[index] for part in vars(self).values()))
 
 
@@ -128,7 +150,11 @@ class GaussianRows:
 
 
 def from_arrays(
-    means: NDArray[Any], quaternions: NDArray[Any], log_scales: NDArray[Any], logits: NDArray[Any], harmonics: NDArray[Any]
+    means: NDArray[Any],
+    quaternions: NDArray[Any],
+    log_scales: NDArray[Any],
+    logits: NDArray[Any],
+    harmonics: NDArray[Any],
 ) -> Gaussians:
     """Gaussians of arrays of any float type; what is beyond float32 becomes infinite."""
     parts = (means, quaternions, log_scales, logits, harmonics)
@@ -175,15 +201,20 @@ def bulk_of(points: Annotated[NDArray[Any], "N 3"]) -> Bulk:
     return Bulk(side, apart / (side or 1.0))
 
 
-def cells_of(places: Annotated[Tensor, "N 3"], low: Annotated[Tensor, "3"], edge: float) -> Annotated[Tensor, "N"]:
+def cells_of(
+    places: Annotated[Tensor, "N 3"], low: Annotated[Tensor, "3"], edge: float
+) -> Annotated[Tensor, "N"]:
     """Numbers of cells that begin at `low`; places far outside share those at the border."""
     cell: Tensor = ((places - low) / edge).clamp(-1, 2.0**20).long() + 1
     return (cell[:, 0] << 42) + (cell[:, 1] << 21) + cell[:, 2]
 
 
 def morton_order(cells: Annotated[NDArray[np.int64], "N 3"]) -> NDArray[np.int64]:
-    """Indices along a Morton curve (Z-order) of cells, 0 to 1023 a side: neighbours in space follow each other."""
-    # Bits of the three coordinates interleaved: each coordinate's are spread to every third place by doubling the gaps.
+    """Indices along a Morton curve (Z-order) of cells, 0 to 1023 a side: neighbours in space follow each
+    other.
+    """
+    # Bits of the three coordinates interleaved: each coordinate's are spread to every third place by doubling
+    # the gaps.
     code = np.zeros(len(cells), np.int64)
     for axis in range(3):
         v = cells[:, axis]

@@ -1,4 +1,6 @@
-"""Where Gaussians begin: at the reconstruction's points, else at points matched between posed views, else anywhere in view."""
+"""Where Gaussians begin: at the reconstruction's points, else at points matched between posed views, else
+anywhere in view.
+"""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -23,8 +25,13 @@ _ENOUGH = 100
 """Points that are worth starting from."""
 _WINDOW = 100
 """Points to either side on the curve among which the nearest are looked for."""
-_FEATURES, _NEIGHBOURS, _PIXELS, _ANGLE = 1500, 4, 1.5, math.radians(1.5)
-"""SIFT features of a view, views that it is matched with, largest error in pixels and least angle between the rays."""
+_FEATURES = 1500
+_NEIGHBOURS = 4
+_PIXELS = 1.5
+_ANGLE = math.radians(1.5)
+"""SIFT features of a view, views that it is matched with, largest error in pixels and least angle between the
+rays.
+"""
 
 _FAR = 10.0
 """Radius of the surroundings, in that of the cameras and of 95 % of the points."""
@@ -41,22 +48,29 @@ class Points(NamedTuple):
     colour: Annotated[NDArray[np.float32], "P 3"]
 
 
-def initial_points(scene: ParsedScene, images: Mapping[int, Image], count: int, rng: np.random.Generator) -> tuple[Points, str]:
+def initial_points(
+    scene: ParsedScene, images: Mapping[int, Image], count: int, rng: np.random.Generator
+) -> tuple[Points, str]:
     """At most `count` points, and where they are from; images as they lie, at the size of the cameras."""
     if scene.points is not None and len(scene.points) >= _ENOUGH:
         position = scene.points.double().numpy()
         position = position[np.isfinite(position).all(1)]
         position = position[np.sort(rng.permutation(len(position))[:count])]
-        return Points(position, _mean_colours(scene, images.__getitem__, position)[0]), "points of the reconstruction"
-    points, kind = _matched(scene, images), "points matched between views"
+        return Points(
+            position, _mean_colours(scene, images.__getitem__, position)[0]
+        ), "points of the reconstruction"
+    points = _matched(scene, images)
+    kind = "points matched between views"
     if len(points.position) < _ENOUGH:
-        points, kind = _scattered(scene, images, min(count, 10_000), rng), "random points"
+        points = _scattered(scene, images, min(count, 10_000), rng)
+        kind = "random points"
     chosen = np.sort(rng.permutation(len(points.position))[:count])
     return Points(points.position[chosen], points.colour[chosen]), kind
 
 
 def surroundings(scene: ParsedScene, images: Mapping[int, Image], points: Points, count: int) -> Points:
-    """`count` points spread evenly over a distant sphere, in the blurred colours of the photographs that show their directions.
+    """`count` points spread evenly over a distant sphere, in the blurred colours of the photographs that show
+    their directions.
 
     Where no view looks, the colours of the nearest seen directions go on.
     """
@@ -67,7 +81,8 @@ def surroundings(scene: ParsedScene, images: Mapping[int, Image], points: Points
     radius = max(np.linalg.norm(centres - centre, axis=1).max(), np.quantile(away, 0.95), _TINY)
     # Fibonacci's spiral: directions as evenly apart as can be.
     height = 1 - (2 * np.arange(count) + 1) / count
-    turn, level = np.arange(count) * math.pi * (3 - math.sqrt(5)), np.sqrt(1 - height**2)
+    turn = np.arange(count) * math.pi * (3 - math.sqrt(5))
+    level = np.sqrt(1 - height**2)
     direction = np.stack([level * np.cos(turn), level * np.sin(turn), height], 1)
     position = centre + _FAR * float(radius) * direction
 
@@ -75,7 +90,9 @@ def surroundings(scene: ParsedScene, images: Mapping[int, Image], points: Points
     def blurred(view: int) -> Image:
         tall, wide = images[view].shape[:2]
         shrink = _BLUR / min(tall, wide)
-        reduced = cv2.resize(images[view], (round(wide * shrink), round(tall * shrink)), interpolation=cv2.INTER_AREA)
+        reduced = cv2.resize(
+            images[view], (round(wide * shrink), round(tall * shrink)), interpolation=cv2.INTER_AREA
+        )
         return np.asarray(cv2.resize(reduced, (wide, tall), interpolation=cv2.INTER_LINEAR), np.uint8)
 
     colour, seen = _mean_colours(scene, blurred, position)
@@ -87,13 +104,17 @@ def surroundings(scene: ParsedScene, images: Mapping[int, Image], points: Points
 
 
 def spacing(position: Annotated[Doubles, "P 3"]) -> Annotated[Doubles, "P"]:
-    """Mean distance to the three nearest of the points around on a Morton curve; cut at that of all but 1 % of the points."""
+    """Mean distance to the three nearest of the points around on a Morton curve; cut at that of all but 1 %
+    of the points.
+    """
     count = len(position)
     if count < 4:
         return np.ones(count)
-    # Of each point the three least distances so far, to those that lie so many places apart on the curve, on either side.
+    # Of each point the three least distances so far, to those that lie so many places apart on the curve, on
+    # either side.
     order = curve_order(position)
-    sorted_, near = position[order], np.full((3, count), np.inf)
+    sorted_ = position[order]
+    near = np.full((3, count), np.inf)
     for step in range(1, min(_WINDOW, count - 1) + 1):
         apart = np.linalg.norm(sorted_[step:] - sorted_[:-step], axis=1)
         for part in (slice(step, None), slice(None, -step)):
@@ -108,23 +129,36 @@ def spacing(position: Annotated[Doubles, "P 3"]) -> Annotated[Doubles, "P"]:
 
 def curve_order(position: Annotated[NDArray[np.floating], "P 3"]) -> NDArray[np.int64]:
     """Indices along a Morton curve: what is near in space is then near in memory."""
-    low, high = np.percentile(position, 2, axis=0), np.percentile(position, 98, axis=0)
+    low = np.percentile(position, 2, axis=0)
+    high = np.percentile(position, 98, axis=0)
     cell = np.clip((position - low) / np.maximum(high - low, _TINY) * 1023, 0, 1023).astype(np.int64)
     return morton_order(cell)
 
 
-def projected(scene: ParsedScene, points: Annotated[Tensor, "P 3"]) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
-    """For each training view: its number, pixels and depths of points, and which of them it has in the picture."""
+def projected(
+    scene: ParsedScene, points: Annotated[Tensor, "P 3"]
+) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
+    """For each training view: its number, pixels and depths of points, and which of them it has in the
+    picture.
+    """
     for view in scene.train.tolist():
         pixel, depth = project(scene.cameras, torch.full((len(points),), view), points)
-        yield view, pixel, depth, (depth > 0) & (pixel >= 0).all(-1) & (pixel < scene.cameras.size[view]).all(-1)
+        yield (
+            view,
+            pixel,
+            depth,
+            (depth > 0) & (pixel >= 0).all(-1) & (pixel < scene.cameras.size[view]).all(-1),
+        )
 
 
 def _mean_colours(
     scene: ParsedScene, image: Callable[[int], Image], position: Doubles
 ) -> tuple[Annotated[NDArray[np.float32], "P 3"], Annotated[NDArray[np.bool_], "P"]]:
-    """Mean colours over the training views that have points in the picture, grey where none has; and where one has."""
-    total, count = np.zeros((len(position), 3)), np.zeros(len(position))
+    """Mean colours over the training views that have points in the picture, grey where none has; and where
+    one has.
+    """
+    total = np.zeros((len(position), 3))
+    count = np.zeros(len(position))
     for view, pixel, _, inside in projected(scene, torch.from_numpy(position)):
         x, y = pixel[inside].long().numpy().T
         total[inside.numpy()] += image(view)[y, x]
@@ -143,19 +177,29 @@ def _matched(scene: ParsedScene, images: Mapping[int, Image]) -> Points:
     places: dict[int, Doubles] = {}
     features: dict[int, NDArray[np.float32]] = {}
     for view in views:
-        keypoints, described = detector.detectAndCompute(cv2.cvtColor(pictures[view], cv2.COLOR_RGB2GRAY), None)
+        keypoints, described = detector.detectAndCompute(
+            cv2.cvtColor(pictures[view], cv2.COLOR_RGB2GRAY), None
+        )
         if described is None or len(keypoints) < 2:
             continue
         places[view] = np.array([each.pt for each in keypoints], np.float64) + 0.5
-        features[view] = np.sqrt(described / np.maximum(described.sum(1, keepdims=True), 1e-9)).astype(np.float32)  # RootSIFT
+        features[view] = np.sqrt(described / np.maximum(described.sum(1, keepdims=True), 1e-9)).astype(
+            np.float32
+        )  # RootSIFT
     # Each view is matched with the few that stand near and look the same way.
     centre = {v: scene.cameras.pose[v][:, 3].numpy() for v in views}
     axis = {v: -scene.cameras.pose[v][:, 2].numpy() for v in views}
     middle = np.mean([*centre.values()], axis=0)
     spread = max(float(np.mean([np.linalg.norm(c - middle) for c in centre.values()])), _TINY)
-    positions, colours, done = [np.zeros((0, 3))], [np.zeros((0, 3), np.float32)], set()
+    positions = [np.zeros((0, 3))]
+    colours = [np.zeros((0, 3), np.float32)]
+    done = set()
     for i in features:
-        apart = {j: np.linalg.norm(centre[j] - centre[i]) / spread + 2 * (1 - axis[i] @ axis[j]) for j in features if j != i}
+        apart = {
+            j: np.linalg.norm(centre[j] - centre[i]) / spread + 2 * (1 - axis[i] @ axis[j])
+            for j in features
+            if j != i
+        }
         for j in sorted(apart, key=lambda j: float(apart[j]))[:_NEIGHBOURS]:
             if (j, i) in done:
                 continue
@@ -165,7 +209,8 @@ def _matched(scene: ParsedScene, images: Mapping[int, Image]) -> Points:
                 continue
             # Points of both, in the colours of the first.
             rays = [(cameras[v].intrinsics @ cameras[v].world_to_camera[:3]).numpy() for v in (i, j)]
-            a, b = places[i][p], places[j][q]
+            a = places[i][p]
+            b = places[j][q]
             position = _triangulated(rays, (a, b), (centre[i], centre[j]))
             fine = np.isfinite(position).all(1)
             pixel = a[fine].astype(int)
@@ -176,12 +221,15 @@ def _matched(scene: ParsedScene, images: Mapping[int, Image]) -> Points:
     return Points(np.concatenate(positions), np.concatenate(colours))
 
 
-def _pairs(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _pairs(
+    first: NDArray[np.float32], second: NDArray[np.float32]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Mutual best matches whose second best is clearly worse (Lowe's ratio, 0.85)."""
     alike = first @ second.T
     rows = np.arange(len(first))
     # The two best matches of each; distances of unit vectors follow from their cosines.
-    backwards, best = alike.argmax(0), alike.argmax(1)
+    backwards = alike.argmax(0)
+    best = alike.argmax(1)
     likeness = alike[rows, best]
     alike[rows, best] = -np.inf
     near, next_ = (np.sqrt(np.maximum(2 - 2 * each, 0)) for each in (likeness, alike.max(1)))
@@ -189,8 +237,12 @@ def _pairs(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[NDA
     return rows[kept], best[kept]
 
 
-def _triangulated(rays: list[Doubles], pixels: tuple[Doubles, Doubles], centres: tuple[Doubles, Doubles]) -> Doubles:
-    """World points [M 3]; NaN where the error is too large, the point lies behind a view, or the rays are nearly parallel."""
+def _triangulated(
+    rays: list[Doubles], pixels: tuple[Doubles, Doubles], centres: tuple[Doubles, Doubles]
+) -> Doubles:
+    """World points [M 3]; NaN where the error is too large, the point lies behind a view, or the rays are
+    nearly parallel.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         homogeneous = cv2.triangulatePoints(rays[0], rays[1], pixels[0].T, pixels[1].T)
         position = (homogeneous[:3] / homogeneous[3]).T
@@ -198,15 +250,22 @@ def _triangulated(rays: list[Doubles], pixels: tuple[Doubles, Doubles], centres:
         good = np.isfinite(position).all(1)
         for matrix, pixel in zip(rays, pixels, strict=True):
             shown = position @ matrix[:, :3].T + matrix[:, 3]
-            good &= (shown[:, 2] > 0) & (np.linalg.norm(shown[:, :2] / shown[:, 2:] - pixel, axis=1) < _PIXELS)
+            good &= (shown[:, 2] > 0) & (
+                np.linalg.norm(shown[:, :2] / shown[:, 2:] - pixel, axis=1) < _PIXELS
+            )
         # ... and the angle between their rays says how far away they are.
-        u, v = position - centres[0], position - centres[1]
+        u = position - centres[0]
+        v = position - centres[1]
         cosine = (u * v).sum(1) / np.linalg.norm(u, axis=1) / np.linalg.norm(v, axis=1)
     return np.where((good & (cosine < math.cos(_ANGLE)))[:, None], position, np.nan)
 
 
-def _scattered(scene: ParsedScene, images: Mapping[int, Image], count: int, rng: np.random.Generator) -> Points:
-    """Points on random rays, their distances spread evenly over the logarithm: from a third to 30 times the cameras' spread."""
+def _scattered(
+    scene: ParsedScene, images: Mapping[int, Image], count: int, rng: np.random.Generator
+) -> Points:
+    """Points on random rays, their distances spread evenly over the logarithm: from a third to 30 times the
+    cameras' spread.
+    """
     # Random pixels of random views, and their colours.
     views = rng.choice(scene.train.numpy(), count)
     centre = scene.cameras.pose[:, :, 3].numpy()
@@ -219,4 +278,7 @@ def _scattered(scene: ParsedScene, images: Mapping[int, Image], count: int, rng:
     plane = (pixel - scene.cameras.centre[views].numpy()) / scene.cameras.focal[views].numpy()
     local = np.stack([plane[:, 0], -plane[:, 1], -np.ones(count)], 1) * depth[:, None]
     pose = scene.cameras.pose[views].numpy()
-    return Points(np.einsum("nij,nj->ni", pose[:, :, :3], local) + pose[:, :, 3], np.divide(colour, 255, dtype=np.float32))
+    return Points(
+        np.einsum("nij,nj->ni", pose[:, :, :3], local) + pose[:, :, 3],
+        np.divide(colour, 255, dtype=np.float32),
+    )

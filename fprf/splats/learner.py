@@ -4,12 +4,12 @@ A step renders a training view and moves what it shows against the gradient of
 
     L = (1 - ssim) mean |f * render - photograph| + ssim (1 - SSIM(f * render, photograph))        (Kerbl et al., Eq. 7)
 
-where f are the factors of the view's own exposure (`Tones`), 1 where none are learnt. Where views err, Gaussians are split, in
-the place of those that became transparent, and until there are as many as the config allows: the relocation of 3DGS-MCMC
-(Kheradmand et al. 2024) with the halves of Kerbl et al.
+where f are the factors of the view's own exposure (`Tones`), 1 where none are learnt. Where views err,
+Gaussians are split, in the place of those that became transparent, and until there are as many as the config
+allows: the relocation of 3DGS-MCMC (Kheradmand et al. 2024) with the halves of Kerbl et al.
 
-Shapes: N Gaussians, M of them that are split, V views, K = (degree + 1)^2 harmonics of a colour channel. A Gaussian is a row
-of R = 11 + 3 K float32 parameters, in the columns that `ops.rasterise.training` names:
+Shapes: N Gaussians, M of them that are split, V views, K = (degree + 1)^2 harmonics of a colour channel. A
+Gaussian is a row of R = 11 + 3 K float32 parameters, in the columns that `ops.rasterise.training` names:
 
     MEANS        3     in the world
     LOG_SCALES   3     natural logarithms of the standard deviations along the own axes
@@ -17,8 +17,8 @@ of R = 11 + 3 K float32 parameters, in the columns that `ops.rasterise.training`
     LOGIT        1     opacity = 1 / (1 + exp(-logit)), in (0, 1)
     HARMONICS    3 K   colour = 0.5 + sum_k Y_k(direction) h_k, sRGB; coefficient after coefficient, that of degree 0 first
 
-`share` in [0, 1) says how much of the schedule is over. Every draw is a function of (seed, step), so parameters, Adam's
-moments and the step are all the state there is.
+`share` in [0, 1) says how much of the schedule is over. Every draw is a function of (seed, step), so
+parameters, Adam's moments and the step are all the state there is.
 """
 
 import math
@@ -53,30 +53,55 @@ from .gaussians import Gaussians, from_arrays, from_rows, from_tensors, tensors_
 from .initial import Points, curve_order, spacing
 from .photographs import Level
 
-_START_OPACITY, _START_SCALE, _FAR_OPACITY = 0.3, 0.7, 0.9
-"""First Gaussians: opacity, standard deviation as a share of the distance to their neighbours, opacity far away."""
+_START_OPACITY = 0.3
+_START_SCALE = 0.7
+_FAR_OPACITY = 0.9
+"""First Gaussians: opacity, standard deviation as a share of the distance to their neighbours, opacity far
+away.
+"""
 _RATES = {"means": 2.5e-3, "scales": 0.08, "quats": 0.016, "opacities": 0.1, "sh0": 0.07, "shN": 0.01}
-"""Learning rates at the beginning, the means' in units of the scene scale. They fall to a fifth, the means' to a twentieth."""
-_DECAY, _DECAY_EVERY = 3e-3, 20
-"""Weight decay of the harmonics above degree 0, a step, and the steps between its uses; it falls as the rates do. From where no
-photograph looks they would become any colour, which a style that refits cut colours brings into view as specks."""
-_GAIN_RATE, _EXPONENT_RATE = 0.005, 2e-3
-"""Learning rates of the logarithms of a view's factors, whenever it is seen, and of the exponent. They fall to a tenth."""
+"""Learning rates at the beginning, the means' in units of the scene scale. They fall to a fifth, the means'
+to a twentieth.
+"""
+_DECAY = 3e-3
+_DECAY_EVERY = 20
+"""Weight decay of the harmonics above degree 0, a step, and the steps between its uses; it falls as the rates
+do. From where no photograph looks they would become any colour, which a style that refits cut colours brings
+into view as specks.
+"""
+_GAIN_RATE = 0.005
+_EXPONENT_RATE = 2e-3
+"""Learning rates of the logarithms of a view's factors, whenever it is seen, and of the exponent. They fall
+to a tenth.
+"""
 _NAMED = 3
 """Blurred photographs that are named, at most."""
-_SETTLE, _SORT_EVERY, _LAST = 200, 5, 0.85
-"""Steps before the first relocation; relocations between sorts; share of training after which nothing is moved any more."""
+_SETTLE = 200
+_SORT_EVERY = 5
+_LAST = 0.85
+"""Steps before the first relocation; relocations between sorts; share of training after which nothing is
+moved any more.
+"""
 _ERROR_VIEWS = 8
 """Views whose errors say where Gaussians are split."""
 _BLURRED_EVERY = 8
-"""Epochs of which one shows blurred views too. With 8 of 29 views moved by 7 to 13 pixels llff_flower comes to 28.6 dB if
-all are shown alike, 29.1 without the eight, and 29.2 so; had none moved, to 29.7 (benchmarks/results/blurred.json)."""
+"""Epochs of which one shows blurred views too. With 8 of 29 views moved by 7 to 13 pixels llff_flower comes
+to 28.6 dB if all are shown alike, 29.1 without the eight, and 29.2 so; had none moved, to 29.7
+(benchmarks/results/blurred.json).
+"""
 _DEAD = 0.005
 """Opacity below which a Gaussian is moved elsewhere."""
-_SKY, _SEEN = 0.7, 1.0
-"""Share of a Gaussian's weight in sky, and its least weight in pixels of these views, from which on it is moved."""
-_SPLIT_SIZE, _SPLIT_DISTANCE, _SPLIT_OPACITY = 0.6, 0.5, 0.85
-"""Halves: size and distance from the middle along the longest axis, as shares of its size; share of the opacity."""
+_SKY = 0.7
+_SEEN = 1.0
+"""Share of a Gaussian's weight in sky, and its least weight in pixels of these views, from which on it is
+moved.
+"""
+_SPLIT_SIZE = 0.6
+_SPLIT_DISTANCE = 0.5
+_SPLIT_OPACITY = 0.85
+"""Halves: size and distance from the middle along the longest axis, as shares of its size; share of the
+opacity.
+"""
 _SMOOTHING = 0.95
 """Decay of running means."""
 CPU = torch.device("cpu")
@@ -102,12 +127,13 @@ class Stage(NamedTuple):
 class GaussianLearner(SceneLearner):
     """Gaussians in training. `scene_scale` is the unit of the means' learning rate, in world units.
 
-    There is room for `room` of them. Only those whose means are `inside` are split or moved; None = all. After each step
-    `limit_widths` may cut the standard deviations; None = none is limited. Nothing nearer to a camera than `near` is drawn.
-    With `tones` each view's factors are learnt as well, with `poses` where each view was taken. `only` colours learns harmonics
-    alone, `only` poses neither Gaussians nor factors. `known` is what scene.json will hold, for learners of a run; `origin`
-    says where the first Gaussians come from. On a CUDA `device` they are drawn and moved there, where gsplat can; what is
-    decided every tenth step or more rarely (widths, splits) is decided on the CPU.
+    There is room for `room` of them. Only those whose means are `inside` are split or moved; None = all.
+    After each step `limit_widths` may cut the standard deviations; None = none is limited. Nothing nearer to
+    a camera than `near` is drawn. With `tones` each view's factors are learnt as well, with `poses` where
+    each view was taken. `only` colours learns harmonics alone, `only` poses neither Gaussians nor factors.
+    `known` is what scene.json will hold, for learners of a run; `origin` says where the first Gaussians come
+    from. On a CUDA `device` they are drawn and moved there, where gsplat can; what is decided every tenth
+    step or more rarely (widths, splits) is decided on the CPU.
     """
 
     def __init__(
@@ -128,16 +154,30 @@ class GaussianLearner(SceneLearner):
         origin: str = "",
         device: torch.device = CPU,
     ) -> None:
-        self.inside, self.limit_widths, self.near, self.known, self.origin = inside, limit_widths, near, known, origin
-        self.config, self.levels, self.scene_scale, self.stage = config, levels, scene_scale, stage or Stage()
+        self.inside = inside
+        self.limit_widths = limit_widths
+        self.near = near
+        self.known = known
+        self.origin = origin
+        self.config = config
+        self.levels = levels
+        self.scene_scale = scene_scale
+        self.stage = stage or Stage()
         self.bands = (config.degree + 1) ** 2
         self.model: Trainable = trainable(room, self.bands, device)
         self.asked = device
         self.begun = self.pixels = self.skipped = self.failed = 0
         self.means: dict[str, float] = {}
-        self.tones, self.poses, self.only = tones, poses, only
+        self.tones = tones
+        self.poses = poses
+        self.only = only
         self.corrections = {
-            f"{kind}.{name}": (each.detach(), torch.zeros_like(each), torch.zeros_like(each), torch.zeros(each.shape[:1]))
+            f"{kind}.{name}": (
+                each.detach(),
+                torch.zeros_like(each),
+                torch.zeros_like(each),
+                torch.zeros(each.shape[:1]),
+            )
             for kind, module in (("tones", tones), ("poses", poses))
             for name, each in (module.named_parameters() if module is not None else ())
         }
@@ -154,21 +194,29 @@ class GaussianLearner(SceneLearner):
         return self.known.facts
 
     def begin_at(self, points: Points, rng: np.random.Generator, surroundings: Points | None = None) -> None:
-        """Put a Gaussian at each point: as wide as the points lie apart, in any direction; those of surroundings are opaque."""
+        """Put a Gaussian at each point: as wide as the points lie apart, in any direction; those of
+        surroundings are opaque.
+        """
         # Neighbours in space follow each other, so that tiles find what they show close together.
         order = curve_order(points.position)
-        position, colour = points.position[order], points.colour[order]
-        size, opacity = spacing(position) * _START_SCALE, np.full(len(position), _START_OPACITY)
+        position = points.position[order]
+        colour = points.colour[order]
+        size = spacing(position) * _START_SCALE
+        opacity = np.full(len(position), _START_OPACITY)
         if surroundings is not None:
             far = surroundings.position
-            position, colour = np.concatenate([position, far]), np.concatenate([colour, surroundings.colour])
+            position = np.concatenate([position, far])
+            colour = np.concatenate([colour, surroundings.colour])
             size = np.concatenate([size, spacing(far) * _START_SCALE])
             opacity = np.concatenate([opacity, np.full(len(far), _FAR_OPACITY)])
         # The same colour from everywhere: c = 0.5 + Y_0 h_0.
         harmonics = np.zeros((len(position), self.bands, 3), np.float32)
         harmonics[:, 0] = (colour - 0.5) / HARMONIC
-        quaternions, log_scales = rng.normal(size=(4, len(position))).T, np.repeat(np.log(size)[:, None], 3, 1)
-        self.start_from(from_arrays(position, quaternions, log_scales, np.log(opacity / (1 - opacity)), harmonics))
+        quaternions = rng.normal(size=(4, len(position))).T
+        log_scales = np.repeat(np.log(size)[:, None], 3, 1)
+        self.start_from(
+            from_arrays(position, quaternions, log_scales, np.log(opacity / (1 - opacity)), harmonics)
+        )
 
     def start_from(self, gaussians: Gaussians) -> None:
         """Begin with Gaussians, of the config's degree, as they are."""
@@ -178,16 +226,22 @@ class GaussianLearner(SceneLearner):
     def step(self, index: int, share: float) -> None:
         """Learn from one view."""
         config = self.config
-        step, share = self.stage.before + index, self.stage.first + (self.stage.last - self.stage.first) * share
+        step = self.stage.before + index
+        share = self.stage.first + (self.stage.last - self.stage.first) * share
         # Coarse photographs first: half the size until `coarse`, a quarter until a third of that, and so on.
         level = self.levels[sum(share < config.coarse / 3**k for k in range(len(self.levels) - 1))]
         view = self._view(level, step)
         target = self._target(level, view)
-        # Render, compare, and move every Gaussian that the view shows; nothing moves where the loss is not finite.
-        rates, factors = self._learning_rates(share), self._factors(view)
-        measured = self.model.learn(target, background=config.background, ssim=config.ssim, rates=rates, factors=factors)
+        # Render, compare, and move every Gaussian that the view shows; nothing moves where the loss is not
+        # finite.
+        rates = self._learning_rates(share)
+        factors = self._factors(view)
+        measured = self.model.learn(
+            target, background=config.background, ssim=config.ssim, rates=rates, factors=factors
+        )
         if not math.isfinite(measured.l1 + measured.ssim):
-            self.skipped, self.failed = self.skipped + 1, self.failed + 1
+            self.skipped = self.skipped + 1
+            self.failed = self.failed + 1
             return
         self.failed = 0
         # Colours that no view shows fall back to their mean, and what grew too wide is cut.
@@ -196,7 +250,8 @@ class GaussianLearner(SceneLearner):
         if self.limit_widths is not None:
             self.limit_widths(self.model, step)
         self._correct_view(view, target, measured, share)
-        # Gaussians move to where views err, but not while the first ones settle, nor so late that nothing learns them.
+        # Gaussians move to where views err, but not while the first ones settle, nor so late that nothing
+        # learns them.
         due = (step + 1) % config.relocate_every == 0 and self.only is None
         if due and step >= _SETTLE and share < max(config.grow, _LAST):
             self._relocate_and_grow(step, level, share)
@@ -206,13 +261,18 @@ class GaussianLearner(SceneLearner):
             self.means[name] = _SMOOTHING * self.means.get(name, value) + (1 - _SMOOTHING) * value
 
     def _view(self, level: Level, step: int) -> int:
-        """The view of a step. Each epoch sees views once, in an order of its own: sharp ones, and all in every eighth."""
-        every, sharp = list(level), self._sharp(level)
+        """The view of a step. Each epoch sees views once, in an order of its own: sharp ones, and all in
+        every eighth.
+        """
+        every = list(level)
+        sharp = self._sharp(level)
         cycle, at = divmod(step, len(every) + (_BLURRED_EVERY - 1) * len(sharp))
-        epoch, turn = _BLURRED_EVERY * cycle, at
+        epoch = _BLURRED_EVERY * cycle
+        turn = at
         if at >= len(every):
             later, turn = divmod(at - len(every), len(sharp))
-            epoch, every = epoch + 1 + later, sharp
+            epoch = epoch + 1 + later
+            every = sharp
         return int(every[np.random.default_rng((self.config.seed, epoch)).permutation(len(every))[turn]])
 
     def _sharp(self, level: Level) -> list[int]:
@@ -248,45 +308,62 @@ class GaussianLearner(SceneLearner):
     def _correct_view(self, view: int, target: Target, measured: Learnt, share: float) -> None:
         """Move the exposure and the pose of a view by a step of Adam; their rates fall to a tenth.
 
-        Each view counts its own steps: with moments of all views together, one that is seen every thousandth step moved by the
-        root of a thousand times the rate, and far scenes got worse.
+        Each view counts its own steps: with moments of all views together, one that is seen every thousandth
+        step moved by the root of a thousand times the rate, and far scenes got worse.
         """
         if self.tones is not None and self.only != "poses":
-            # The factor is exp(gain + exponent * exposure): a slope by the exponent is that by the gain, times the exposure.
-            pull, rate = torch.from_numpy(measured.pull), self.config.rate * 0.1**share
+            # The factor is exp(gain + exponent * exposure): a slope by the exponent is that by the gain,
+            # times the exposure.
+            pull = torch.from_numpy(measured.pull)
+            rate = self.config.rate * 0.1**share
             _adam_step([each[view] for each in self.corrections["tones.gain"]], pull, _GAIN_RATE * rate)
             if self.tones.exponent.requires_grad:
                 slope = pull.sum() * self.tones.exposure[view]
                 _adam_step(self.corrections["tones.exponent"], slope, _EXPONENT_RATE * rate)
         if self.poses is not None:
-            # The gradient of a rotation vector is taken for that of a further turn: exact to first order in how far views turn.
+            # The gradient of a rotation vector is taken for that of a further turn: exact to first order in
+            # how far views turn.
             gradient = torch.from_numpy(measured.of_camera)
-            slope = torch.cat([torch.from_numpy(target.axes).T @ gradient[:3], self.poses.reach * gradient[3:]]).float()
-            _adam_step([each[view] for each in self.corrections["poses.offset"]], slope, self.config.poses * 0.1**share)
+            slope = torch.cat(
+                [torch.from_numpy(target.axes).T @ gradient[:3], self.poses.reach * gradient[3:]]
+            ).float()
+            _adam_step(
+                [each[view] for each in self.corrections["poses.offset"]],
+                slope,
+                self.config.poses * 0.1**share,
+            )
 
     def _relocate_and_grow(self, step: int, level: Level, share: float) -> None:
-        """Split Gaussians where views err: as many as became transparent, which move there, and as the number grows by."""
-        draw, model = np.random.default_rng((self.config.seed, step, 1)), self.model
-        # Of each Gaussian: the errors of some views, their sky, and all of their pixels, each times its weight there.
+        """Split Gaussians where views err: as many as became transparent, which move there, and as the number
+        grows by.
+        """
+        draw = np.random.default_rng((self.config.seed, step, 1))
+        model = self.model
+        # Of each Gaussian: the errors of some views, their sky, and all of their pixels, each times its
+        # weight there.
         sums = np.zeros((model.count, 3))
         for view in draw.permutation(self._sharp(level))[:_ERROR_VIEWS]:
             sums += model.errors(self._target(level, view), self.config.background, self._factors(view))
         error, sky, seen = sums.T
-        # The chance of a split: opacity times error, so that neither haze nor what is right already becomes more.
+        # The chance of a split: opacity times error, so that neither haze nor what is right already becomes
+        # more.
         opacity = 1 / (1 + np.exp(-model.read(LOGIT)[:, 0].astype(np.float64)))
         chance = np.nan_to_num(error * opacity)
-        # Used again elsewhere: what is transparent, and what shows almost only in the sky and so floats before it.
+        # Used again elsewhere: what is transparent, and what shows almost only in the sky and so floats
+        # before it.
         reusable = (opacity < _DEAD) | (sky > _SKY * np.maximum(seen, _SEEN))
         if self.inside is not None:
             inside = self.inside(torch.from_numpy(model.read(MEANS))).numpy()
-            chance, reusable = chance * inside, reusable & inside
+            chance = chance * inside
+            reusable = reusable & inside
         reused = np.flatnonzero(reusable)
         chance[reused] = 0
         # The number grows evenly on a logarithmic scale: begun (cap / begun)^(share / grow).
         cap = max(self.config.most, self.begun)
         wanted = int(self.begun * (cap / self.begun) ** min(1.0, share / self.config.grow))
         more = max(wanted - model.count, 0)
-        # One half stays in its place, the other takes that of one that is used again, or a new one at the end.
+        # One half stays in its place, the other takes that of one that is used again, or a new one at the
+        # end.
         many = min(len(reused) + more, int(np.count_nonzero(chance)))
         if many > 0:
             picked = draw.choice(model.count, many, replace=False, p=chance / chance.sum())
@@ -305,7 +382,9 @@ class GaussianLearner(SceneLearner):
         return from_rows(torch.from_numpy(self.model.read()))
 
     def state(self) -> State:
-        """Gaussians; Adam's moments and the weight in the second, exposures, poses, the number at the start."""
+        """Gaussians; Adam's moments and the weight in the second, exposures, poses, the number at the
+        start.
+        """
         first, second, weight = (torch.from_numpy(part) for part in self.model.moments())
         tensors = {"first": first, "second": second, "weight": weight, "begun": torch.tensor(self.begun)}
         for name, kept in self.corrections.items():
@@ -319,8 +398,10 @@ class GaussianLearner(SceneLearner):
 
         Checkpoints of before have no weights: their second moments are taken as they are.
         """
-        moments, rows = state.optimizer, from_tensors(state.model).rows.numpy()
-        self.begun, self.failed = int(moments["begun"]), 0
+        moments = state.optimizer
+        rows = from_tensors(state.model).rows.numpy()
+        self.begun = int(moments["begun"])
+        self.failed = 0
         weight = moments["weight"].numpy() if "weight" in moments else 1
         self.model.start(rows, moments["first"].numpy(), moments["second"].numpy(), weight)
         for name, kept in self.corrections.items():
@@ -331,8 +412,11 @@ class GaussianLearner(SceneLearner):
     def begin(self, run: Run) -> str:
         most = self.config.limited(len(self.levels[0]))
         passes = f"; at most {most} steps: {self.config.most_passes} passes over the photographs (--passes)"
-        names, dull = self.known.names if self.known is not None else (), sorted(self.levels[0].blurred)
-        few = ", ".join(Path(names[view]).name for view in dull[:_NAMED]) + (", ..." if len(dull) > _NAMED else "")
+        names = self.known.names if self.known is not None else ()
+        dull = sorted(self.levels[0].blurred)
+        few = ", ".join(Path(names[view]).name for view in dull[:_NAMED]) + (
+            ", ..." if len(dull) > _NAMED else ""
+        )
         blur = f"; blurred, and so shown rarely: {len(dull)} of {len(self.levels[0])} ({few})" if dull else ""
         light = ", tones" if self.tones is not None else ""
         where = "" if self.device == CPU else f", on {self.device} by gsplat"
@@ -351,7 +435,8 @@ def halves(
     rows: Annotated[Floats, "M R"], opacity: Annotated[NDArray[np.float64], "M"]
 ) -> tuple[Annotated[Floats, "M R"], Annotated[Floats, "M R"]]:
     """Split Gaussians in two along their longest axes: both are smaller, fainter and beside the middle."""
-    first, which = rows.copy(), np.arange(len(rows))
+    first = rows.copy()
+    which = np.arange(len(rows))
     longest = first[:, LOG_SCALES].argmax(1)
     size = first[which, LOG_SCALES.start + longest]
     # The longest axis in the world is a column of the rotation.
@@ -369,7 +454,9 @@ def halves(
 
 
 def _adam_step(kept: Sequence[Tensor], gradient: Tensor, rate: float) -> None:
-    """One step of Adam (Kingma and Ba 2015, Algorithm 1), in place, on a value, its two moments and the number of steps."""
+    """One step of Adam (Kingma and Ba 2015, Algorithm 1), in place, on a value, its two moments and the
+    number of steps.
+    """
     value, first, second, steps = kept
     steps += 1
     first.lerp_(gradient, 1 - 0.9)

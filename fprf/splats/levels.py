@@ -1,9 +1,10 @@
 """Levels of detail: chunks of Gaussians that are near to each other, each also as fewer and larger ones.
 
-A chunk is a box of a k-d tree. Its level k has a Gaussian for each 4^k along a Morton curve, with the mean, the covariance
-and the colour of their mixture by weight (opacity times area), and as much opacity times area as they have together (compare
-Kerbl et al. 2024, a hierarchical 3D Gaussian representation). A view takes of each chunk in its frustum the coarsest level in
-which what was merged lies within a given number of pixels; the others cost it nothing.
+A chunk is a box of a k-d tree. Its level k has a Gaussian for each 4^k along a Morton curve, with the mean,
+the covariance and the colour of their mixture by weight (opacity times area), and as much opacity times area
+as they have together (compare Kerbl et al. 2024, a hierarchical 3D Gaussian representation). A view takes of
+each chunk in its frustum the coarsest level in which what was merged lies within a given number of pixels;
+the others cost it nothing.
 """
 
 import io
@@ -27,13 +28,17 @@ from ..rendering.splines import quaternions, rotations
 from .gaussians import Gaussians, from_rows
 from .initial import curve_order
 
-_CHUNK, _GROUP, _LEVELS = 512, 4, 4
+_CHUNK = 512
+_GROUP = 4
+_LEVELS = 4
 """Gaussians of a chunk; those merged into one of the next level; levels, the finest included."""
 _DEVIATIONS = 3.0
 """How far a Gaussian reaches, in standard deviations."""
-_FARTHEST, _WIDENED = 3.5, 2.0
-"""Reach in standard deviations where nothing may be left out, at least sqrt(-2 log MIN_ALPHA) (`ops.rasterise`); pixels that
-drawing widens it by."""
+_FARTHEST = 3.5
+_WIDENED = 2.0
+"""Reach in standard deviations where nothing may be left out, at least sqrt(-2 log MIN_ALPHA)
+(`ops.rasterise`); pixels that drawing widens it by.
+"""
 _OPAQUE = 0.995
 _TAIL = 0.02
 """Share of the means at either end that does not say how long a chunk is."""
@@ -46,9 +51,12 @@ _PART = 1 << 17
 _KEPT = 1 << 28
 """Bytes of colours that a look keeps of chunks it has drawn."""
 _TABLES = "begin", "spread", "centre", "radius", "core"
-_FILE, _FORMAT, _LENGTH = "rows.bin", 2, 8
-"""File of a run's levels: rows, their order (int32), an .npz archive of the tables, the bytes of that archive as a number of
-this many bytes; all little endian."""
+_FILE = "rows.bin"
+_FORMAT = 2
+_LENGTH = 8
+"""File of a run's levels: rows, their order (int32), an .npz archive of the tables, the bytes of that archive
+as a number of this many bytes; all little endian.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +80,16 @@ class Levels:
     """The file that the rows lie in: of its pages none stays in memory."""
 
     def select(self, camera: Pinhole, pixels: float) -> Gaussians:
-        """Return the Gaussians that a camera sees, merged where they lie within `pixels`; 0 = nothing is merged."""
+        """Return the Gaussians that a camera sees, merged where they lie within `pixels`; 0 = nothing is
+        merged.
+        """
         return self.gather(*self.visible(camera, pixels))
 
     def visible(self, camera: Pinhole, pixels: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the chunks that a camera sees, in ascending order, and the level of each."""
         local, seen = in_view(camera, self.centre, self.radius)
-        fx, fy = float(camera.intrinsics[0, 0]), float(camera.intrinsics[1, 1])
+        fx = float(camera.intrinsics[0, 0])
+        fy = float(camera.intrinsics[1, 1])
         distance = np.maximum(np.linalg.norm(local, axis=1) - self.core, camera.near)
         fine = self.spread * max(fx, fy) <= pixels * distance[:, None]
         level = np.minimum.accumulate(fine, axis=1).sum(1) - 1
@@ -87,7 +98,8 @@ class Levels:
 
     def gather(self, chunks: NDArray[np.int64], level: NDArray[np.int64]) -> Gaussians:
         """Return the Gaussians of chunks, each at its level."""
-        first, last = self.begin[chunks, level], self.begin[chunks, level + 1]
+        first = self.begin[chunks, level]
+        last = self.begin[chunks, level + 1]
         parts = [self.rows[a:b] for a, b in zip(first, last, strict=True)] or [self.rows[:0]]
         nodes = np.concatenate(parts)
         if self.mapped is not None and hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
@@ -96,16 +108,20 @@ class Levels:
 
 
 class StyledLevels:
-    """Levels in other colours: those of a chunk are made when it is first drawn, and kept while there is room.
+    """Levels in other colours: those of a chunk are made when it is first drawn, and kept while there is
+    room.
 
     What is merged has the mean of the new colours of its Gaussians, as if the levels had been made of these.
     """
 
     def __init__(
-        self, levels: Levels, recolour: Callable[[Gaussians, Annotated[Tensor, "M"]], Annotated[Tensor, "M K 3"]]
+        self,
+        levels: Levels,
+        recolour: Callable[[Gaussians, Annotated[Tensor, "M"]], Annotated[Tensor, "M K 3"]],
     ) -> None:
         """`recolour` gives harmonics for Gaussians and their numbers in the scene."""
-        self._levels, self._recolour = levels, recolour
+        self._levels = levels
+        self._recolour = recolour
         self._colours: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
         self._bytes = 0
 
@@ -130,10 +146,13 @@ class StyledLevels:
 
     def _add(self, chunks: NDArray[np.int64], level: int) -> None:
         """Recolour the Gaussians of chunks and merge them up to a level."""
-        # New colours of the finest level; each coarser one has the means of the level before, by the weights of its Gaussians.
+        # New colours of the finest level; each coarser one has the means of the level before, by the weights
+        # of its Gaussians.
         levels = self._levels
         gaussians = levels.gather(chunks, np.zeros_like(chunks))
-        index = np.concatenate([levels.order[_CHUNK * chunk : _CHUNK * (chunk + 1)] for chunk in chunks]).astype(np.int64)
+        index = np.concatenate(
+            [levels.order[_CHUNK * chunk : _CHUNK * (chunk + 1)] for chunk in chunks]
+        ).astype(np.int64)
         harmonics = self._recolour(gaussians, torch.from_numpy(index))
         for k in range(level):
             if k:
@@ -146,7 +165,9 @@ class StyledLevels:
 
 
 def in_view(
-    camera: Pinhole, centre: Annotated[NDArray[np.float64], "B 3"], radius: Annotated[NDArray[np.float64], "B"]
+    camera: Pinhole,
+    centre: Annotated[NDArray[np.float64], "B 3"],
+    radius: Annotated[NDArray[np.float64], "B"],
 ) -> tuple[Annotated[NDArray[np.float64], "B 3"], Annotated[NDArray[np.bool_], "B"]]:
     """Centres of balls as the camera sees them, and whether it may see a part of each."""
     pose = camera.world_to_camera.double().numpy()
@@ -155,17 +176,25 @@ def in_view(
     x, y, z = local.T
     seen = z + radius > camera.near
     # Distance from the planes through the camera and the image's sides; normals point outwards.
-    for along, slope in ((-x, cx / fx), (x, (camera.width - cx) / fx), (-y, cy / fy), (y, (camera.height - cy) / fy)):
+    for along, slope in (
+        (-x, cx / fx),
+        (x, (camera.width - cx) / fx),
+        (-y, cy / fy),
+        (y, (camera.height - cy) / fy),
+    ):
         seen &= (along - slope * z) / math.hypot(1, slope) < radius
     return local, seen
 
 
 def seen_by(gaussians: Gaussians, camera: Pinhole) -> Annotated[Tensor, "M"]:
     """Numbers of the Gaussians that a camera may see."""
-    means, pose = gaussians.means.double().numpy(), camera.world_to_camera.double()
+    means = gaussians.means.double().numpy()
+    pose = camera.world_to_camera.double()
     away = np.linalg.norm(means + (pose[:3, :3].T @ pose[:3, 3]).numpy(), axis=1)
     widened = _WIDENED / float(min(camera.intrinsics[0, 0], camera.intrinsics[1, 1])) * away
-    _, seen = in_view(camera, means, _FARTHEST * gaussians.log_scales.double().amax(1).exp().numpy() + widened)
+    _, seen = in_view(
+        camera, means, _FARTHEST * gaussians.log_scales.double().amax(1).exp().numpy() + widened
+    )
     return torch.from_numpy(np.flatnonzero(seen))
 
 
@@ -183,12 +212,18 @@ def make_levels_of_detail(gaussians: Gaussians) -> Levels:
         fill = np.pad(before, (0, -len(before) % _GROUP)).reshape(-1, _GROUP).max(1)
         levels.append(merged)
         sizes.append(np.hypot(apart, fill))
-    # Of each chunk the rows of its levels, one after the other, and the balls around what it shows and around its means.
+    # Of each chunk the rows of its levels, one after the other, and the balls around what it shows and around
+    # its means.
     count = -(-len(order) // _CHUNK)
     width = [_CHUNK // _GROUP**k for k in range(_LEVELS)]
     tables = [level.rows.numpy() for level in levels]
-    parts, begin, spread = [], np.zeros((count, _LEVELS + 1), np.int64), np.zeros((count, _LEVELS))
-    centre, radius, core, at = np.zeros((count, 3)), np.zeros(count), np.zeros(count), 0
+    parts = []
+    begin = np.zeros((count, _LEVELS + 1), np.int64)
+    spread = np.zeros((count, _LEVELS))
+    centre = np.zeros((count, 3))
+    radius = np.zeros(count)
+    core = np.zeros(count)
+    at = 0
     reach = _DEVIATIONS * np.exp(levels[0].log_scales.double().amax(1).numpy())
     means = levels[0].means.double().numpy()
     for chunk in range(count):
@@ -202,32 +237,41 @@ def make_levels_of_detail(gaussians: Gaussians) -> Levels:
         own = slice(chunk * _CHUNK, (chunk + 1) * _CHUNK)
         centre[chunk] = np.median(means[own], axis=0)
         away = np.linalg.norm(means[own] - centre[chunk], axis=1)
-        radius[chunk], core[chunk] = (away + reach[own]).max(), np.quantile(away, _SPREAD)
+        radius[chunk] = (away + reach[own]).max()
+        core[chunk] = np.quantile(away, _SPREAD)
     return Levels(np.concatenate(parts), begin, spread, centre, radius, core, order.numpy().astype(np.int32))
 
 
 def write_levels(folder: Path, gaussians: Gaussians, key: str) -> None:
-    """Write levels of detail that `open_levels` maps, in bounded memory where the Gaussians are mapped from a file themselves.
+    """Write levels of detail that `open_levels` maps, in bounded memory where the Gaussians are mapped from a
+    file themselves.
 
-    Neighbours in memory should be neighbours in space, as the cells of a union are. All lies in one file, which is replaced as
-    a whole. Raises DataError where the system refuses.
+    Neighbours in memory should be neighbours in space, as the cells of a union are. All lies in one file,
+    which is replaced as a whole. Raises DataError where the system refuses.
     """
     columns: list[tuple[NDArray[Any], ...]] = []
     orders: list[NDArray[np.int32]] = []
     written = 0
     with atomic_path(folder / _FILE) as temporary, temporary.open("wb") as file:
         for first in range(0, len(gaussians), _PART):
-            levels = make_levels_of_detail(gaussians.select(torch.arange(first, min(first + _PART, len(gaussians)))))
+            levels = make_levels_of_detail(
+                gaussians.select(torch.arange(first, min(first + _PART, len(gaussians))))
+            )
             file.write(levels.rows.tobytes())
             columns.append((levels.begin + written, levels.spread, levels.centre, levels.radius, levels.core))
             orders.append(levels.order + np.int32(first))
             written += len(levels.rows)
         for order in orders:
             file.write(order.tobytes())
-        parts = dict(zip(_TABLES, (np.concatenate(column) for column in zip(*columns, strict=True)), strict=True))
+        parts = dict(
+            zip(_TABLES, (np.concatenate(column) for column in zip(*columns, strict=True)), strict=True)
+        )
         tables = io.BytesIO()
-        width, count = np.array(levels.rows.shape[1]), np.array(len(gaussians))
-        np.savez(tables, allow_pickle=False, key=np.array(f"{_FORMAT} {key}"), width=width, count=count, **parts)
+        width = np.array(levels.rows.shape[1])
+        count = np.array(len(gaussians))
+        np.savez(
+            tables, allow_pickle=False, key=np.array(f"{_FORMAT} {key}"), width=width, count=count, **parts
+        )
         file.write(tables.getvalue() + len(tables.getvalue()).to_bytes(_LENGTH, "little"))
 
 
@@ -253,8 +297,12 @@ def open_levels(folder: Path, key: str) -> Levels | None:
     return Levels(rows=rows, **parts, order=order, mapped=mapped)
 
 
-def _chunks(position: Annotated[NDArray[np.float64], "N 3"], index: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Indices in chunks, all but the last one full: halved across the longest side, then along a Morton curve."""
+def _chunks(
+    position: Annotated[NDArray[np.float64], "N 3"], index: NDArray[np.int64]
+) -> list[NDArray[np.int64]]:
+    """Indices in chunks, all but the last one full: halved across the longest side, then along a Morton
+    curve.
+    """
     if len(index) <= _CHUNK:
         return [index[curve_order(position[index])]] if len(index) else []
     own = position[index]
@@ -264,8 +312,12 @@ def _chunks(position: Annotated[NDArray[np.float64], "N 3"], index: NDArray[np.i
     return _chunks(position, index[order[:half]]) + _chunks(position, index[order[half:]])
 
 
-def _shares(gaussians: Gaussians) -> tuple[Annotated[Tensor, "M*4"], Annotated[Tensor, "M 4 1"], Annotated[Tensor, "M 4 1"]]:
-    """Numbers of the Gaussians that are merged, `_GROUP` by `_GROUP`, their shares of what they become, and their weights."""
+def _shares(
+    gaussians: Gaussians,
+) -> tuple[Annotated[Tensor, "M*4"], Annotated[Tensor, "M 4 1"], Annotated[Tensor, "M 4 1"]]:
+    """Numbers of the Gaussians that are merged, `_GROUP` by `_GROUP`, their shares of what they become, and
+    their weights.
+    """
     missing = -len(gaussians) % _GROUP
     index = torch.arange(len(gaussians) + missing).clamp_max(len(gaussians) - 1)
     areas = gaussians.log_scales.double().exp().topk(2, dim=1).values.prod(1)

@@ -28,11 +28,15 @@ from .photographs import load_photographs, make_levels
 from .scene import SplatScene
 from .semantics import Semantics, find_semantics, load_semantics, semantics_tensors
 
-_FIT_RATE, _FIT_STEPS = 2e-3, 120
-"""Rate of poses (`GaussiansConfig.poses`) and steps of each view, where poses of views are fitted to a finished scene."""
+_FIT_RATE = 2e-3
+_FIT_STEPS = 120
+"""Rate of poses (`GaussiansConfig.poses`) and steps of each view, where poses of views are fitted to a
+finished scene.
+"""
 _VIEWS = 32
 """Training views that semantics are found in, at most."""
-_LEVELS, _MANY = "levels", 400_000
+_LEVELS = "levels"
+_MANY = 400_000
 """Folder of a run; Gaussians from which on levels of detail are kept there and mapped, not made in memory."""
 
 
@@ -44,28 +48,38 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
     assert isinstance(config, GaussiansConfig)  # by its kind
     if quality.max_memory:
         raise UsageError("--max-memory: is for runs of fields; leave it out")
-    root, preset = run.root, None if quality.quality is None else PRESETS[quality.quality]
+    root = run.root
+    preset = None if quality.quality is None else PRESETS[quality.quality]
     merged = None if preset is None else preset.merged
     # Levels of detail were written from what was verified.
     key = "" if merged is None else checkpoint.digest(run.checkpoints)
-    saved, _ = checkpoint.load_latest(run.checkpoints, verify=not key or open_levels(root / _LEVELS, key) is None)
+    saved, _ = checkpoint.load_latest(
+        run.checkpoints, verify=not key or open_levels(root / _LEVELS, key) is None
+    )
     if saved is None:
-        raise CheckpointError(f"{root}: no checkpoint yet; go on with `fprf train {root / 'config.json'} --output {root}`")
-    # The scene as training left it: its cameras where they were put, in the light that all views have in common.
-    captured, gaussians = run.load_known(), from_tensors(saved.model)
+        raise CheckpointError(
+            f"{root}: no checkpoint yet; go on with `fprf train {root / 'config.json'} --output {root}`"
+        )
+    # The scene as training left it: its cameras where they were put, in the light that all views have in
+    # common.
+    captured = run.load_known()
+    gaussians = from_tensors(saved.model)
     known = replace(captured, cameras=refined(captured.cameras, saved))
     tones = tones_of(known.facts)
     if tones is not None:
         kept = {name: saved.optimizer[f"tones.{name}.value"] for name, _ in tones.named_parameters()}
         tones.load_state_dict(kept, strict=False)
         tones.requires_grad_(False)
-    near, training = float(saved.model.get("near", torch.tensor(0.01))), in_training(root)
+    near = float(saved.model.get("near", torch.tensor(0.01)))
+    training = in_training(root)
     # What a training has learnt so far is looked at quickly, in few, small views, and not kept.
     count, side = (_VIEWS // 4, config.semantic_size // 2) if training else (_VIEWS, config.semantic_size)
     encoder = functools.cache(config.semantic.encoder.build)
 
     def found() -> Semantics:
-        """Semantics from the run folder; found anew, and kept, where those are of another step, encoder or setting."""
+        """Semantics from the run folder; found anew, and kept, where those are of another step, encoder or
+        setting.
+        """
         wanted = {"step": saved.step, "regions": config.regions, "semantic_size": config.semantic_size}
         if not training and (root / "style.safetensors").is_file():
             tensors = run.load_tensors("style")
@@ -74,7 +88,9 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
                 if kept.encoder == encoder().identity:
                     return kept
         every = torch.tensor(known.train)
-        views = known.cameras.select(every[torch.linspace(0, len(every) - 1, min(count, len(every))).round().long()])
+        views = known.cameras.select(
+            every[torch.linspace(0, len(every) - 1, min(count, len(every))).round().long()]
+        )
         views = views.scaled(max(1.0, float(views.size.amax()) / side))
         semantics = find_semantics(gaussians, True, encoder(), views, config.regions, near=near)
         if not training:
@@ -85,10 +101,14 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
     resolution = preset.resolution if preset is not None else 1.0
 
     def fit(scene: ParsedScene, views: Sequence[int]) -> Annotated[Tensor, "V 6"]:
-        return fit_poses(config, replace(scene, cameras=known.cameras), known.facts, gaussians, near, tones, views)
+        return fit_poses(
+            config, replace(scene, cameras=known.cameras), known.facts, gaussians, near, tones, views
+        )
 
     def levels() -> Levels:
-        """Levels of detail; those of many Gaussians lie in a file, written where there is none of this checkpoint."""
+        """Levels of detail; those of many Gaussians lie in a file, written where there is none of this
+        checkpoint.
+        """
         if len(gaussians) < _MANY:
             return make_levels_of_detail(gaussians)
         if open_levels(root / _LEVELS, key) is None:
@@ -134,7 +154,8 @@ def fit_poses(
     tones: Tones | None,
     views: Sequence[int],
 ) -> Annotated[Tensor, "V 6"]:
-    """Turns (radians) and shifts (world units), float64, that bring renders of some views nearest to their photographs.
+    """Turns (radians) and shifts (world units), float64, that bring renders of some views nearest to their
+    photographs.
 
     Gaussians stay as they are; the other views' moves are 0.
     """
@@ -142,7 +163,9 @@ def fit_poses(
     scene = replace(scene, train=torch.tensor(views))
     images, masks, _ = load_photographs(config, scene, list(views))
     others = tuple(sorted(set(range(len(scene.paths))) - set(views)))
-    poses = Poses(scene.cameras.pose[:, :, 3], others, reach=reach_of(scene, facts.space), pace=1.0, still=True)
+    poses = Poses(
+        scene.cameras.pose[:, :, 3], others, reach=reach_of(scene, facts.space), pace=1.0, still=True
+    )
     levels = make_levels(scene, images, masks, near)
     # A learner of poses alone: the Gaussians are drawn as they are, in the light of each view.
     config = replace(config, poses=_FIT_RATE, degree=gaussians.degree)

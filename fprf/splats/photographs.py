@@ -1,7 +1,9 @@
-"""Photographs as the rasteriser sees the world: through a pinhole, with what lies beyond a lens's picture left out.
+"""Photographs as the rasteriser sees the world: through a pinhole, with what lies beyond a lens's picture
+left out.
 
-Shapes: views of H W pixels, pinholes of h w, which cover what their lenses show. Images are [H W 3], 8 bits, sRGB; masks [H W];
-pixel centres lie at +0.5. Camera axes of the rasteriser are OpenCV's (x right, y down, z forward), those of `Cameras` OpenGL's.
+Shapes: views of H W pixels, pinholes of h w, which cover what their lenses show. Images are [H W 3], 8 bits,
+sRGB; masks [H W]; pixel centres lie at +0.5. Camera axes of the rasteriser are OpenCV's (x right, y down, z
+forward), those of `Cameras` OpenGL's.
 """
 
 from collections import OrderedDict
@@ -24,7 +26,15 @@ from ..ops.photometric import WINDOW
 from ..ops.rasterise.gsplat import target_on, usable
 from ..ops.rasterise.rendering import Pinhole
 from ..ops.rasterise.training import Floats, Target, target_of
-from ..rendering.cameras import Cameras, Intrinsics, directions_of, intrinsics_of, pixel_grid, project, rays_through
+from ..rendering.cameras import (
+    Cameras,
+    Intrinsics,
+    directions_of,
+    intrinsics_of,
+    pixel_grid,
+    project,
+    rays_through,
+)
 from .config import GaussiansConfig
 
 Masks = dict[int, NDArray[np.bool_]]
@@ -32,10 +42,14 @@ Masks = dict[int, NDArray[np.bool_]]
 _WIDEST = 4.0
 """Tangent of the widest angle that a pinhole shows: 76 degrees."""
 _SHARPEST = cv2.INTER_LANCZOS4
-"""Out of its lens and back into it a photograph of 135 x 240 pixels comes with 43 dB; by cubic interpolation with 40."""
-_KEPT, _KEPT_THERE = 1 << 31, 0.3
-"""Bytes of photographs in the rasteriser's layout, some ten times as large as 8-bit pixels, that are kept between steps; share
-of a CUDA device's free memory that they may take there."""
+"""Out of its lens and back into it a photograph of 135 x 240 pixels comes with 43 dB; by cubic interpolation
+with 40.
+"""
+_KEPT = 1 << 31
+_KEPT_THERE = 0.3
+"""Bytes of photographs in the rasteriser's layout, some ten times as large as 8-bit pixels, that are kept
+between steps; share of a CUDA device's free memory that they may take there.
+"""
 _DULL = 0.5
 """Share of the usual ratio below which a photograph counts as blurred."""
 _BESIDE = 8
@@ -69,7 +83,8 @@ class _Kept(OrderedDict[tuple[int, int], Target]):
 
     def __init__(self, room: int) -> None:
         super().__init__()
-        self.room, self.bytes = room, 0
+        self.room = room
+        self.bytes = 0
 
     def add(self, key: tuple[int, int], target: Target) -> None:
         """Keep a target; where there is no room, those go that were used longest ago."""
@@ -83,9 +98,18 @@ class _Scaled(Level):
     """Views at 1/2^k of their size, brought into the rasteriser's layout when a step asks for them."""
 
     def __init__(
-        self, views: Mapping[int, _View], k: int, kept: _Kept, blurred: frozenset[int], make: Callable[..., Target]
+        self,
+        views: Mapping[int, _View],
+        k: int,
+        kept: _Kept,
+        blurred: frozenset[int],
+        make: Callable[..., Target],
     ) -> None:
-        self.views, self.k, self.kept, self.blurred, self.make = views, k, kept, blurred, make
+        self.views = views
+        self.k = k
+        self.kept = kept
+        self.blurred = blurred
+        self.make = make
 
     def __iter__(self) -> Iterator[int]:
         return iter(self.views)
@@ -101,18 +125,27 @@ class _Scaled(Level):
             return self.kept[key]
         camera, image, valid, sky = self.views[view]
         size = max(1, camera.width >> self.k), max(1, camera.height >> self.k)
-        shrink = torch.tensor([[size[0] / camera.width], [size[1] / camera.height], [1.0]], dtype=torch.float64)
+        shrink = torch.tensor(
+            [[size[0] / camera.width], [size[1] / camera.height], [1.0]], dtype=torch.float64
+        )
         small = camera._replace(intrinsics=camera.intrinsics * shrink, width=size[0], height=size[1])
-        # Each size is reduced from the full one, so that errors do not add up; the camera shrinks with the image.
+        # Each size is reduced from the full one, so that errors do not add up; the camera shrinks with the
+        # image.
         colours: Floats = np.divide(image, 255, dtype=np.float32)
-        reduced: Floats = np.asarray(cv2.resize(colours, size, interpolation=cv2.INTER_AREA), np.float32) if self.k else colours
+        reduced: Floats = (
+            np.asarray(cv2.resize(colours, size, interpolation=cv2.INTER_AREA), np.float32)
+            if self.k
+            else colours
+        )
         target = self.make(small, reduced, _resized(valid, size), _resized(sky, size))
         self.kept.add(key, target)
         return target
 
 
 def _bytes(target: Target) -> int:
-    return sum(part.nbytes for part in (*target, *(target.there or ())) if isinstance(part, np.ndarray | Tensor))
+    return sum(
+        part.nbytes for part in (*target, *(target.there or ())) if isinstance(part, np.ndarray | Tensor)
+    )
 
 
 def camera_of(cameras: Cameras, view: int, near: float = 0.01) -> Pinhole:
@@ -122,11 +155,16 @@ def camera_of(cameras: Cameras, view: int, near: float = 0.01) -> Pinhole:
     turn = (pose[:, :3] * torch.tensor([1.0, -1.0, -1.0], dtype=pose.dtype)).T
     world_to_camera = torch.eye(4, dtype=torch.float64)
     world_to_camera[:3, :3], world_to_camera[:3, 3] = turn, -turn @ pose[:, 3]
-    return Pinhole(_intrinsics(cameras.focal[view], cameras.centre[view]), world_to_camera, width, height, near)
+    return Pinhole(
+        _intrinsics(cameras.focal[view], cameras.centre[view]), world_to_camera, width, height, near
+    )
 
 
-def undistorted(cameras: Cameras, view: int, image: Image, camera: Pinhole) -> tuple[Image, NDArray[np.bool_] | None]:
-    """Return the image of a pinhole camera at a view's place, and the part of it that the view shows; None = everywhere.
+def undistorted(
+    cameras: Cameras, view: int, image: Image, camera: Pinhole
+) -> tuple[Image, NDArray[np.bool_] | None]:
+    """Return the image of a pinhole camera at a view's place, and the part of it that the view shows; None =
+    everywhere.
 
     The image is returned as it is where the view is a pinhole, which `camera` is then taken to be.
     """
@@ -141,12 +179,14 @@ def undistorted(cameras: Cameras, view: int, image: Image, camera: Pinhole) -> t
 def _places(
     lens: Intrinsics, pinhole: tuple[float, ...], width: int, height: int
 ) -> tuple[Annotated[Floats, "h w"], Annotated[Floats, "h w"], Annotated[NDArray[np.bool_], "h w"]]:
-    """Where a lens shows the pixels of a pinhole with an intrinsic matrix, as `cv2.remap` takes it, and which of them it shows.
+    """Where a lens shows the pixels of a pinhole with an intrinsic matrix, as `cv2.remap` takes it, and which
+    of them it shows.
 
     Most views of a capture look through one lens.
     """
     # Rays through the pixels of the pinhole, from OpenCV's axes to OpenGL's.
-    x, y = torch.arange(width).double() + 0.5, torch.arange(height).double() + 0.5
+    x = torch.arange(width).double() + 0.5
+    y = torch.arange(height).double() + 0.5
     grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).view(-1, 2)
     matrix = torch.tensor(pinhole, dtype=torch.float64).view(3, 3)
     local = (grid - matrix[:2, 2]) / matrix.diagonal()[:2]
@@ -154,7 +194,9 @@ def _places(
     # Where the lens maps them; what falls beyond the outermost pixel centres would only repeat the edge.
     pixel, _ = project(lens.camera(), torch.zeros(len(points), dtype=torch.int64), points)
     place = pixel.view(height, width, 2).numpy()
-    inside = np.isfinite(place).all(-1) & (place >= 0.5).all(-1) & (place <= np.array(lens.size) - 0.5).all(-1)
+    inside = (
+        np.isfinite(place).all(-1) & (place >= 0.5).all(-1) & (place <= np.array(lens.size) - 0.5).all(-1)
+    )
     where = (np.nan_to_num(place, nan=-1e6) - 0.5).astype(np.float32)
     return np.ascontiguousarray(where[..., 0]), np.ascontiguousarray(where[..., 1]), inside
 
@@ -166,13 +208,16 @@ def covering(cameras: Cameras, view: int, near: float) -> Pinhole:
         return plain
     reached = _outermost(intrinsics_of(cameras, view)) * cameras.focal[view]
     # The pinhole keeps the focal length, and has a border of two pixels to interpolate in.
-    low, high = reached.amin(0).floor() - 2, reached.amax(0).ceil() + 2
+    low = reached.amin(0).floor() - 2
+    high = reached.amax(0).ceil() + 2
     wide, tall = (high - low).int().tolist()
     return plain._replace(intrinsics=_intrinsics(cameras.focal[view], -low), width=wide, height=tall)
 
 
 def cover(cameras: Cameras, view: int, near: float) -> tuple[Pinhole, Annotated[Tensor, "H W 2"] | None]:
-    """`covering`, and where each of the view's pixels lies in its image; None where the view is a pinhole itself."""
+    """`covering`, and where each of the view's pixels lies in its image; None where the view is a pinhole
+    itself.
+    """
     camera = covering(cameras, view, near)
     if int(cameras.lens[view]) == 0:
         return camera, None
@@ -184,14 +229,17 @@ def cover(cameras: Cameras, view: int, near: float) -> tuple[Pinhole, Annotated[
 @lru_cache(maxsize=2)
 def _outermost(lens: Intrinsics) -> Annotated[Tensor, "N 2"]:
     """Tangents of the rays through a lens's outermost pixels."""
-    camera, (width, height) = lens.camera(), lens.size
+    camera = lens.camera()
+    (width, height) = lens.size
     grid = pixel_grid(camera, 0).view(height, width, 2)
     border = torch.cat([grid[0], grid[-1], grid[:, 0], grid[:, -1]])
     return _tangents(rays_through(camera, torch.zeros(len(border), dtype=torch.int64), border)[1])
 
 
 def _tangents(direction: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 2"]:
-    """Tangents, in OpenCV's axes, of rays in OpenGL's: what lies behind the camera is put at the widest angle."""
+    """Tangents, in OpenCV's axes, of rays in OpenGL's: what lies behind the camera is put at the widest
+    angle.
+    """
     ahead = (-direction[:, 2]).clamp_min(1e-9)
     return torch.stack([direction[:, 0] / ahead, -direction[:, 1] / ahead], -1).clamp(-_WIDEST, _WIDEST)
 
@@ -206,13 +254,21 @@ def distorted(
     return torch.from_numpy(np.atleast_3d(sampled))
 
 
-def load_photographs(config: GaussiansConfig, scene: ParsedScene, views: list[int]) -> tuple[dict[int, Image], Masks, Masks]:
-    """Images of views, then the masks that say where they count, and those that say where they show sky, of views with one."""
+def load_photographs(
+    config: GaussiansConfig, scene: ParsedScene, views: list[int]
+) -> tuple[dict[int, Image], Masks, Masks]:
+    """Images of views, then the masks that say where they count, and those that say where they show sky, of
+    views with one.
+    """
     images = dict(zip(views, load_images(scene, config.background, views), strict=True))
 
     def load_masks(paths: tuple[Path | None, ...]) -> Masks:
         named = {view: paths[view] for view in views} if paths and config.masks else {}
-        return {view: load_mask(path, images[view].shape[1::-1]) for view, path in named.items() if path is not None}
+        return {
+            view: load_mask(path, images[view].shape[1::-1])
+            for view, path in named.items()
+            if path is not None
+        }
 
     # Without surroundings nothing could show the sky but what floats before it.
     return images, load_masks(scene.masks), load_masks(scene.sky_masks if config.surroundings else ())
@@ -227,15 +283,18 @@ def make_levels(
     *,
     device: torch.device | None = None,
 ) -> list[Level]:
-    """The training views at their own size, at half of it and so on, until the longer side has less than 240 pixels.
+    """The training views at their own size, at half of it and so on, until the longer side has less than 240
+    pixels.
 
-    A view counts where its mask, if it has one, is true; where that in `skies` is true it shows sky. They are made for the CPU,
-    or for a CUDA `device` on which gsplat trains.
+    A view counts where its mask, if it has one, is true; where that in `skies` is true it shows sky. They are
+    made for the CPU, or for a CUDA `device` on which gsplat trains.
     """
     cameras = {view: covering(scene.cameras, view, near) for view in scene.train.tolist()}
     longest = max(max(each.width, each.height) for each in cameras.values())
     shortest = min(min(each.width, each.height) for each in cameras.values())
-    count = max(2, min((longest // 120).bit_length(), (shortest // WINDOW).bit_length()))  # SSIM needs its window
+    count = max(
+        2, min((longest // 120).bit_length(), (shortest // WINDOW).bit_length())
+    )  # SSIM needs its window
     pixels: dict[int, _View] = {}
 
     def straightened(masks: Masks, view: int) -> NDArray[np.bool_] | None:
@@ -247,32 +306,40 @@ def make_levels(
     for view, camera in cameras.items():
         # The photograph and its masks without their lens: what lies beyond the lens's picture does not count.
         image, valid = undistorted(scene.cameras, view, images[view], camera)
-        mask, sky = straightened(masks, view), straightened(skies or {}, view)
-        pixels[view] = _View(camera, image, mask if valid is None else valid if mask is None else valid & mask, sky)
+        mask = straightened(masks, view)
+        sky = straightened(skies or {}, view)
+        pixels[view] = _View(
+            camera, image, mask if valid is None else valid if mask is None else valid & mask, sky
+        )
     blurred = blurred_views(scene.cameras, {view: images[view] for view in cameras}, count)
     if device is None or not usable(device):
-        kept, make = _Kept(_KEPT), target_of
+        kept = _Kept(_KEPT)
+        make = target_of
     else:
-        kept, make = _Kept(int(_KEPT_THERE * (free_memory(device) or 0))), partial(target_on, device)
+        kept = _Kept(int(_KEPT_THERE * (free_memory(device) or 0)))
+        make = partial(target_on, device)
     return [_Scaled(pixels, k, kept, blurred[k], make) for k in range(count)]
 
 
 def detail(image: Image, scales: int) -> Annotated[NDArray[np.float64], "K"]:
-    """Sharpness of an RGB image [H W 3] at scales k < K = `scales`; NaN where nothing is to be seen, and where it is too small.
+    """Sharpness of an RGB image [H W 3] at scales k < K = `scales`; NaN where nothing is to be seen, and
+    where it is too small.
 
     Blur takes the finest detail of a photograph and leaves the coarse. So their ratio,
 
         r_k = var(Laplacian at 1/2^k of the size) / var(Laplacian at 1/2^(k + 2)),
 
-    says how sharp it is at a scale, whatever it shows: of eight photographs of llff_flower that were moved by 7 to 13 pixels it
-    falls to 0.23 to 0.32 of what is usual, of the sharp ones none below 0.79.
+    says how sharp it is at a scale, whatever it shows: of eight photographs of llff_flower that were moved by
+    7 to 13 pixels it falls to 0.23 to 0.32 of what is usual, of the sharp ones none below 0.79.
     """
     # A pyramid of halved sizes: the variance of the Laplacian at each is the detail that is left there.
     grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY).astype(np.float32)
     energy = np.full(scales + _APART, np.nan)
     for k in range(scales + _APART):
         if k:
-            grey = np.asarray(cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.float32)
+            grey = np.asarray(
+                cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.float32
+            )
         if min(grey.shape) < _SMALLEST:
             break
         energy[k] = cv2.Laplacian(grey, cv2.CV_32F).var(dtype=np.float64)
@@ -286,8 +353,9 @@ def detail(image: Image, scales: int) -> Annotated[NDArray[np.float64], "K"]:
 def blurred_views(cameras: Cameras, images: Mapping[int, Image], scales: int) -> tuple[frozenset[int], ...]:
     """Views, of those with an image, that are blurred at each scale: at their size, at half of it and so on.
 
-    `cameras` are of all views; images [H W 3] are 8 bits, sRGB. What is usual is the median of photographs taken near by in the
-    same direction, so a softer camera is compared with itself, and nothing counts as blurred where all is.
+    `cameras` are of all views; images [H W 3] are 8 bits, sRGB. What is usual is the median of photographs
+    taken near by in the same direction, so a softer camera is compared with itself, and nothing counts as
+    blurred where all is.
     """
     views = list(images)
     if len(views) < _FEWEST:
@@ -296,7 +364,8 @@ def blurred_views(cameras: Cameras, images: Mapping[int, Image], scales: int) ->
         ratio = np.stack(list(pool.map(lambda view: detail(images[view], scales), views)))
     # Near by means places in units of how far the cameras stand apart, and directions in radians.
     pose = cameras.pose[torch.tensor(views)].double()
-    place, ahead = pose[:, :, 3], -pose[:, :, 2]
+    place = pose[:, :, 3]
+    ahead = -pose[:, :, 2]
     spread = float((place - place.mean(0)).norm(dim=1).mean()) or 1.0
     blurred: list[set[int]] = [set() for _ in range(scales)]
     for row, view in enumerate(views):

@@ -1,9 +1,9 @@
 """A style on a scene of Gaussians: harmonics in, harmonics out.
 
-An affine map of colours is exact on harmonics, from every direction (`ops.harmonics`). Stylizers whose config says `colours`
-carry the colours of each region over as a whole, and nothing else: content features and a decoder would add nothing, since
-single Gaussians have colours that no photograph has. Others move the colours in the place of features. Luminance is kept as
-an affine map too.
+An affine map of colours is exact on harmonics, from every direction (`ops.harmonics`). Stylizers whose config
+says `colours` carry the colours of each region over as a whole, and nothing else: content features and a
+decoder would add nothing, since single Gaussians have colours that no photograph has. Others move the colours
+in the place of features. Luminance is kept as an affine map too.
 """
 
 import math
@@ -44,7 +44,10 @@ class Colours(Encoder):
 
 @torch.inference_mode()
 def restyled_harmonics(
-    before: Annotated[Tensor, "N K 3"], means: Annotated[Tensor, "N 3"], semantic: Annotated[Tensor, "N D"], look: Restyle
+    before: Annotated[Tensor, "N K 3"],
+    means: Annotated[Tensor, "N 3"],
+    semantic: Annotated[Tensor, "N D"],
+    look: Restyle,
 ) -> Annotated[Tensor, "N K 3"]:
     """Harmonics of Gaussians in a look. Those that it leaves alone (strength 0) stay, bit for bit."""
     if look.idle:
@@ -54,19 +57,23 @@ def restyled_harmonics(
     directions = all_around(before.shape[1])
     for start in range(0, len(before), _ROWS):
         rows = slice(start, start + _ROWS)
-        # The change against the identity, A and below it b of each Gaussian (c' = c + c A + b), and how strongly the look acts.
+        # The change against the identity, A and below it b of each Gaussian (c' = c + c A + b), and how
+        # strongly the look acts.
         features = semantic[rows].to(means)
-        change, weight = features.new_zeros(len(features), 4, 3), features.new_zeros(len(features))
+        change = features.new_zeros(len(features), 4, 3)
+        weight = features.new_zeros(len(features))
         for part in look.parts:
             if part.share == 0 or part.strength == 0:
                 continue
             regions = features.new_ones(len(features), 1) if part.regions is None else part.regions(features)
-            acts, added = part.share * part.strength * regions, _added(part, features)
+            acts = part.share * part.strength * regions
+            added = _added(part, features)
             for place, other in part.places:  # a later place lies over those before it
                 inside = place_weight(place, means[rows])[:, None]
                 if bool(inside.any()):
                     added = torch.lerp(added, _added(other, features), inside[..., None])
-            change, weight = change + acts[..., None] * added, weight + acts[:, 0]
+            change = change + acts[..., None] * added
+            weight = weight + acts[:, 0]
         if kept > 0:  # what the map adds to luma is taken back from all channels alike
             change = change - kept * luma(change)
         out[rows] = recoloured(before[rows], change, weight, directions)
@@ -77,7 +84,8 @@ def restyled_harmonics(
 def all_around(bands: int) -> Directions:
     """Directions all around, for that many bands; no more than those of degree 3."""
     at = torch.arange(_DIRECTIONS) + 0.5
-    height, turn = 1 - 2 * at / _DIRECTIONS, at * (math.pi * (5**0.5 - 1))
+    height = 1 - 2 * at / _DIRECTIONS
+    turn = at * (math.pi * (5**0.5 - 1))
     flat = (1 - height.square()).sqrt()
     around = torch.stack([flat * turn.cos(), flat * turn.sin(), height], 1)
     values = spherical_harmonics(around, math.isqrt(min(bands, 16)))
@@ -85,7 +93,9 @@ def all_around(bands: int) -> Directions:
 
 
 def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N 4 3"]:
-    """A and b of one part at full strength: what its stylizer and colours paint, and the light that falls on it."""
+    """A and b of one part at full strength: what its stylizer and colours paint, and the light that falls on
+    it.
+    """
     # Light and paint are of one scene, and so are the regions that they ask about.
     belongs = None if part.light is None else part.light.membership(semantic)
     if part.colours is not None:
@@ -95,7 +105,9 @@ def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tenso
     else:
         # An affine stylizer is known by what it makes of black and of each channel alone.
         black = part.stylizer(semantic.new_zeros(len(semantic), 3), semantic)
-        rows = [part.stylizer(axis.expand(len(semantic), 3), semantic) - black - axis for axis in torch.eye(3)]
+        rows = [
+            part.stylizer(axis.expand(len(semantic), 3), semantic) - black - axis for axis in torch.eye(3)
+        ]
         painted = part.features * torch.stack([*rows, black], 1)
     if part.light is None:
         return painted

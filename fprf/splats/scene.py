@@ -1,7 +1,9 @@
-"""Scenes of Gaussians: of a capture that is looked at, or of a run; all that verbs, styles and viewers need of them.
+"""Scenes of Gaussians: of a capture that is looked at, or of a run; all that verbs, styles and viewers need
+of them.
 
-The content of such a scene is its colour: a look changes harmonics (`restyle`), by the semantics of its Gaussians
-(`semantics`), and views are drawn by the rasteriser, through a pinhole that covers what a lens shows (`photographs`).
+The content of such a scene is its colour: a look changes harmonics (`restyle`), by the semantics of its
+Gaussians (`semantics`), and views are drawn by the rasteriser, through a pinhole that covers what a lens
+shows (`photographs`).
 """
 
 from collections.abc import Callable, Sequence
@@ -31,7 +33,8 @@ from .semantics import Semantics
 from .views import SeenMeans, draw, seen_means
 
 CPU = torch.device("cpu")
-_ROWS, _CHANNELS = 1 << 14, 128
+_ROWS = 1 << 14
+_CHANNELS = 128
 """Gaussians whose values are found, and channels that are drawn, at a time: bounds the memory."""
 
 
@@ -49,7 +52,9 @@ class SplatScene(Scene):
     encoder: Callable[[], Encoder]
     """The encoder of these semantics, for references: built when first needed."""
     longest: int
-    """Longest side in pixels of the views that semantics were found in; references are encoded at that size."""
+    """Longest side in pixels of the views that semantics were found in; references are encoded at that
+    size.
+    """
     near: float = 0.01
     """Nothing is drawn nearer to a camera, along z."""
     background: tuple[float, float, float] = (0.5, 0.5, 0.5)
@@ -60,7 +65,9 @@ class SplatScene(Scene):
     tone: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Factors of rendered colours, applied last."""
     merged: float | None = None
-    """Pixels within which Gaussians are drawn as one, and those out of view not at all; None = all are drawn."""
+    """Pixels within which Gaussians are drawn as one, and those out of view not at all; None = all are
+    drawn.
+    """
     levels: Callable[[], Levels] | None = None
     """Levels of detail of the Gaussians as captured, for scenes that are drawn merged."""
     origin: Origin = (0.0, 0.0, 0.0)
@@ -97,7 +104,9 @@ class SplatScene(Scene):
 
     @property
     def drawn_on(self) -> torch.device:
-        """Device that views are drawn on: what was asked for, or the CPU. The first call may wait until gsplat is compiled."""
+        """Device that views are drawn on: what was asked for, or the CPU. The first call may wait until
+        gsplat is compiled.
+        """
         return self.asked if usable(self.asked) else CPU
 
     @cached_property
@@ -111,7 +120,9 @@ class SplatScene(Scene):
         if self.look is None:
             return gaussians
         features = self.found().features[rows]
-        return gaussians.recoloured(restyled_harmonics(gaussians.harmonics, gaussians.means, features, self.look))
+        return gaussians.recoloured(
+            restyled_harmonics(gaussians.harmonics, gaussians.means, features, self.look)
+        )
 
     def gaussian_rows(self) -> GaussianRows:
         """All Gaussians in the scene's look, to be read in parts."""
@@ -121,7 +132,8 @@ class SplatScene(Scene):
     def _detail(self) -> Levels | StyledLevels:
         """Levels of detail in the scene's look."""
         assert self.levels is not None  # by `merged`
-        levels, look = self.levels(), self.look
+        levels = self.levels()
+        look = self.look
         if look is None:
             return levels
         features = self.found().features
@@ -146,9 +158,13 @@ class SplatScene(Scene):
             return enlarged(self.render(small, 0, resolution=1.0), cameras.size[view].tolist())
         # A lens is drawn through a pinhole that covers it, and brought to its pixels in the end.
         camera, place = cover(cameras, view, self.near)
-        shown = self._there if self.merged is None else self._detail.select(camera, self.merged).to(self.drawn_on)
+        shown = (
+            self._there if self.merged is None else self._detail.select(camera, self.merged).to(self.drawn_on)
+        )
         drawn = draw(shown, camera, antialiased=self.antialiased, background=self.background)
-        colour, along, opacity = drawn.image.cpu(), drawn.depth.cpu(), drawn.opacity.cpu()
+        colour = drawn.image.cpu()
+        along = drawn.depth.cpu()
+        opacity = drawn.opacity.cpu()
         # Depths are along z; those of a view along its rays, whose lengths are these where z is 1.
         inverse = camera.intrinsics.inverse().float()
         x = (torch.arange(camera.width) + 0.5) * inverse[0, 0] + inverse[0, 2]
@@ -156,7 +172,8 @@ class SplatScene(Scene):
         depth = along * (x.square() + y.square()[:, None] + 1).sqrt()
         shape = torch.stack([depth, opacity], -1)
         if place is not None:
-            colour, shape = distorted(colour, place), distorted(shape, place, linear=True)
+            colour = distorted(colour, place)
+            shape = distorted(shape, place, linear=True)
         return View((colour * torch.tensor(self.tone)).clamp(0, 1), shape[..., 0], shape[..., 1], 1.0)
 
     @torch.inference_mode()
@@ -171,15 +188,18 @@ class SplatScene(Scene):
     ) -> tuple[Annotated[Tensor, "R X"], Annotated[Tensor, "R"]]:
         """Values of the Gaussians, drawn."""
         camera, place = cover(cameras, view, self.near)
-        features, means = self.found().features[:, : None if semantic else 0], self.gaussians.means
+        features = self.found().features[:, : None if semantic else 0]
+        means = self.gaussians.means
         # A pixel of a lens takes the nearest one of the pinhole.
         x, y = pixel.long().unbind(1)
         if place is not None:
             x, y = place[y, x].long().unbind(1)
         at = y.clamp(0, camera.height - 1) * camera.width + x.clamp(0, camera.width - 1)
-        # Match maps have a channel for each style code: values are found for some Gaussians at a time, and some channels drawn.
+        # Match maps have a channel for each style code: values are found for some Gaussians at a time, and
+        # some channels drawn.
         channels = values(features[:1].float(), means[:1]).shape[1]
-        shown, out = torch.empty(len(means), channels), torch.empty(len(at), channels)
+        shown = torch.empty(len(means), channels)
+        out = torch.empty(len(at), channels)
         for start in range(0, len(means), _ROWS):
             rows = slice(start, start + _ROWS)
             shown[rows] = values(features[rows].float(), means[rows])
@@ -204,7 +224,11 @@ class SplatScene(Scene):
         self, captured: ParsedScene, views: Sequence[int], progress: Callable[[int, int, str], None]
     ) -> Annotated[Tensor, "V 6"]:
         progress(0, 1, "fitting poses")
-        return super().fit_poses(captured, views, progress) if self.poses is None else self.poses(captured, views)
+        return (
+            super().fit_poses(captured, views, progress)
+            if self.poses is None
+            else self.poses(captured, views)
+        )
 
     @property
     def counts(self) -> dict[str, int]:
@@ -228,7 +252,9 @@ class SplatScene(Scene):
         return self.found().style, self.found().basis
 
     def encoders(self) -> Encoders:
-        """Colours in the place of content, and the semantic encoder. Raises WeightsError where weights are missing."""
+        """Colours in the place of content, and the semantic encoder. Raises WeightsError where weights are
+        missing.
+        """
         found = self.found()
         return Encoders(Colours(), self.encoder(), found.basis, found.style, longest=self.longest)
 

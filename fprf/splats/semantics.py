@@ -1,12 +1,14 @@
-"""Semantics of Gaussians, found by looking at them: features of rendered views, carried back to what they show.
+"""Semantics of Gaussians, found by looking at them: features of rendered views, carried back to what they
+show.
 
-Views are encoded as photographs are; a guided filter brings the features to their pixels, and each Gaussian takes the mean of
-the pixels that it shows in, by its weights there. The *content* of such a scene is its colour, as drawn: a style is then an
-affine map of colours, which acts on harmonics exactly. Statistics are those of pixels: Gaussians themselves have less contrast
-(deviation 0.13 against 0.17 on a plant), since what is seen is a mix of many.
+Views are encoded as photographs are; a guided filter brings the features to their pixels, and each Gaussian
+takes the mean of the pixels that it shows in, by its weights there. The *content* of such a scene is its
+colour, as drawn: a style is then an affine map of colours, which acts on harmonics exactly. Statistics are
+those of pixels: Gaussians themselves have less contrast (deviation 0.13 against 0.17 on a plant), since what
+is seen is a mix of many.
 
-Shapes: N Gaussians, V views of H W pixels and h w cells of the encoder's, C channels of the encoder, D principal components of
-them that are kept, K regions. Layers are channels last; colours in [0, 1].
+Shapes: N Gaussians, V views of H W pixels and h w cells of the encoder's, C channels of the encoder, D
+principal components of them that are kept, K regions. Layers are channels last; colours in [0, 1].
 """
 
 import contextvars
@@ -37,7 +39,9 @@ from .photographs import camera_of
 from .views import OUTLYING, draw
 
 _CHANNELS = 31
-"""Principal components of the semantics that are kept; with the weight they are carried back in four vectors of eight."""
+"""Principal components of the semantics that are kept; with the weight they are carried back in four vectors
+of eight.
+"""
 _SOLID = 0.5
 """Pixels and cells less opaque than this say nothing about the scene."""
 _TRUST = 4.0
@@ -48,9 +52,12 @@ _COARSER = 2
 """Features, which are smooth, are filtered and carried back at the views' resolution divided by this."""
 _TOGETHER = 8
 """Components of the features that are spread at a time: of all Gaussians there are copies of so many."""
-_NEIGHBOURS, _NEIGHBOURHOODS, _EDGE = 1.0, 8, 0.02
-"""Pixels that the nearest neighbourhood counts for, half of it for each that is twice as wide; how many; the edge of the
-nearest one, as a share of the spread of the positions."""
+_NEIGHBOURS = 1.0
+_NEIGHBOURHOODS = 8
+_EDGE = 0.02
+"""Pixels that the nearest neighbourhood counts for, half of it for each that is twice as wide; how many; the
+edge of the nearest one, as a share of the spread of the positions.
+"""
 _VIEWS_AT_ONCE = 4
 """Views that are looked at at the same time, at most: each takes the memory of what it draws."""
 _Result = TypeVar("_Result")
@@ -91,7 +98,8 @@ def find_semantics(
 
     Raises DataError where nothing is opaque enough to be seen.
     """
-    count, total = len(cameras), 2 * len(cameras)
+    count = len(cameras)
+    total = 2 * len(cameras)
 
     # 1. Draw the views and encode them; the encoder leaves out what is transparent.
     def encoded(view: int) -> _Picture:
@@ -100,7 +108,8 @@ def find_semantics(
         maps = encoder.cutout(drawn.image.permute(2, 0, 1)[None], drawn.opacity[None])[0].float()
         return _Picture(drawn.image, drawn.opacity, maps)
 
-    pictures, solid = [], []
+    pictures = []
+    solid = []
     for view, picture in enumerate(_in_threads(encoded, count)):
         progress(view, total)
         pictures.append(picture)
@@ -109,17 +118,22 @@ def find_semantics(
     if not any(len(each) for each in solid):
         raise DataError("nothing in the capture is opaque enough to be seen; it cannot be restyled")
 
-    # 2. Bring the principal components of the encoder's cells to pixels, by the guided filter that photographs pass. Its window
-    # is a share of the root of the area: one of the shorter side of an upright view hardly covers two of the encoder's cells,
-    # and a fir before the sky was half sky.
-    basis, guided, reduced = fit_basis(torch.cat(solid), _CHANNELS), GuidedConfig(), cameras.scaled(_COARSER)
+    # 2. Bring the principal components of the encoder's cells to pixels, by the guided filter that
+    #    photographs pass. Its window
+    # is a share of the root of the area: one of the shorter side of an upright view hardly covers two of the
+    # encoder's cells, and a fir before the sky was half sky.
+    basis = fit_basis(torch.cat(solid), _CHANNELS)
+    guided = GuidedConfig()
+    reduced = cameras.scaled(_COARSER)
 
     every = max(1, sum(picture.opacity.numel() for picture in pictures) // (_SAMPLES * _COARSER**2))
 
     def carried(view: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
-        """Numbers of the Gaussians that the view shows, sums of features and of weights over their pixels [M D+1], and samples.
+        """Numbers of the Gaussians that the view shows, sums of features and of weights over their pixels [M
+        D+1], and samples.
 
-        Samples are colours, features and opacities of some pixels, and colours and features of both ends of pairs [P 2 3+D].
+        Samples are colours, features and opacities of some pixels, and colours and features of both ends of
+        pairs [P 2 3+D].
         """
         image, opacity, maps = pictures[view]
         width, height = reduced.size[view].tolist()
@@ -130,7 +144,9 @@ def find_semantics(
         radius = round(guided.radius * math.sqrt(width * height))
         fine = upsample(low, filled, radius=radius, eps=guided.eps, stride=guided.stride)
         # Colours are those of single pixels of the whole picture: averages would have less contrast.
-        colour, seen = (each[::_COARSER, ::_COARSER][:height, :width].flatten(0, 1) for each in (image, opacity))
+        colour, seen = (
+            each[::_COARSER, ::_COARSER][:height, :width].flatten(0, 1) for each in (image, opacity)
+        )
         at = (seen[::every] > _SOLID).nonzero()[:, 0] * every
         sample = (colour[at] / seen[at, None]).clamp(0, 1), fine.flatten(0, 1)[at], seen[at]
         # Neighbours along rows: where both are solid, with their colours without what is behind them.
@@ -139,15 +155,23 @@ def find_semantics(
         shown = torch.cat([(coarse[..., :3] / coarse[..., 3:].clamp_min(_SOLID)).clamp(0, 1), fine], 2)
         ends = torch.stack([shown[:, :-1].flatten(0, 1)[pair], shown[:, 1:].flatten(0, 1)[pair]], 1)
         # Each Gaussian that the camera may see takes the sum over its pixels, by its weights there.
-        camera, trust = camera_of(reduced, view, near), coarse[..., 3:] ** _TRUST
+        camera = camera_of(reduced, view, near)
+        trust = coarse[..., 3:] ** _TRUST
         index = seen_by(gaussians, camera)
-        shape = (gaussians.means[index], gaussians.quaternions[index], gaussians.log_scales[index], gaussians.logits[index])
+        shape = (
+            gaussians.means[index],
+            gaussians.quaternions[index],
+            gaussians.log_scales[index],
+            gaussians.logits[index],
+        )
         lifted = lift(*shape, camera, torch.cat([fine * trust, trust], 2), antialiased=antialiased)
         return index, lifted, sample, ends
 
     dim = basis.matrix.shape[1]
-    sums, weights = torch.zeros(len(gaussians), dim), torch.zeros(len(gaussians))
-    samples, pairs = [], []
+    sums = torch.zeros(len(gaussians), dim)
+    weights = torch.zeros(len(gaussians))
+    samples = []
+    pairs = []
     for view, (index, lifted, sample, ends) in enumerate(_in_threads(carried, count)):
         progress(count + view, total)
         sums.index_add_(0, index, lifted[:, :dim])
@@ -172,8 +196,8 @@ def find_semantics(
 def _in_threads(function: Callable[[int], _Result], count: int) -> Iterator[_Result]:
     """function(0), function(1), ... function(count - 1) in order: several at a time, each on one thread.
 
-    For views. The operations on one are too short to be shared between threads, which would wait for each other most of the
-    time. At most one more is under way than there are threads, so memory is bounded.
+    For views. The operations on one are too short to be shared between threads, which would wait for each
+    other most of the time. At most one more is under way than there are threads, so memory is bounded.
     """
     before = torch.get_num_threads()
     threads = min(before, _VIEWS_AT_ONCE)
@@ -204,19 +228,28 @@ def _in_threads(function: Callable[[int], _Result], count: int) -> Iterator[_Res
 
 
 def _spread(
-    points: Annotated[Tensor, "N 3"], sums: Annotated[Tensor, "N D"], mass: Annotated[Tensor, "N"], none: Annotated[Tensor, "D"]
+    points: Annotated[Tensor, "N 3"],
+    sums: Annotated[Tensor, "N D"],
+    mass: Annotated[Tensor, "N"],
+    none: Annotated[Tensor, "D"],
 ) -> Annotated[Tensor, "N D"]:
-    """Means at points, drawn to those of ever larger neighbourhoods, which decide where little was seen: half precision.
+    """Means at points, drawn to those of ever larger neighbourhoods, which decide where little was seen: half
+    precision.
 
     A point far from whatever was seen takes `none`.
     """
-    trust, levels = mass.clone(), []
-    # Neither stray Gaussians nor the distance from the origin decide how large neighbourhoods are, nor where they begin.
+    trust = mass.clone()
+    levels = []
+    # Neither stray Gaussians nor the distance from the origin decide how large neighbourhoods are, nor where
+    # they begin.
     near = points[torch.from_numpy(bulk_of(points.numpy()).apart <= OUTLYING)].double()
     edge = _EDGE * float(near.var(0, correction=0).mean().sqrt())
-    # Each level divides space into boxes twice as wide; a box counts for at most so many pixels, however much was seen there.
+    # Each level divides space into boxes twice as wide; a box counts for at most so many pixels, however much
+    # was seen there.
     for level in range(_NEIGHBOURHOODS):
-        box = torch.unique(cells_of(points, near.amin(0), max(edge * 2**level, 1e-30)), return_inverse=True)[1]
+        box = torch.unique(cells_of(points, near.amin(0), max(edge * 2**level, 1e-30)), return_inverse=True)[
+            1
+        ]
         weight = sums.new_zeros(int(box.max()) + 1).index_add_(0, box, mass)
         share = weight.clamp_max(_NEIGHBOURS * 0.5**level) / weight.clamp_min(1e-12)
         trust += (weight * share)[box]
@@ -228,19 +261,29 @@ def _spread(
         mean = part.clone()
         for box, share in levels:
             mean += (sums.new_zeros(len(share), len(some)).index_add_(0, box, part) * share[:, None])[box]
-        out[:, some] = torch.where(trust[:, None] > 1e-6, mean / trust.clamp_min(1e-12)[:, None], none[some]).half()
+        out[:, some] = torch.where(
+            trust[:, None] > 1e-6, mean / trust.clamp_min(1e-12)[:, None], none[some]
+        ).half()
     return out
 
 
 def semantics_tensors(found: Semantics) -> dict[str, Tensor]:
     """Return semantics for a file of tensors."""
     parts = {"style": style_tensors(found.style), "basis": found.basis.tensors()}
-    named = {f"{group}.{name}": tensor for group, tensors in parts.items() for name, tensor in tensors.items()}
-    return {**named, "semantic": found.features, "encoder": torch.tensor([*found.encoder.encode()], dtype=torch.uint8)}
+    named = {
+        f"{group}.{name}": tensor for group, tensors in parts.items() for name, tensor in tensors.items()
+    }
+    return {
+        **named,
+        "semantic": found.features,
+        "encoder": torch.tensor([*found.encoder.encode()], dtype=torch.uint8),
+    }
 
 
 def load_semantics(tensors: dict[str, Tensor], count: int) -> Semantics:
-    """Read the tensors of `semantics_tensors`. Raises CheckpointError where they are not of as many Gaussians."""
+    """Read the tensors of `semantics_tensors`. Raises CheckpointError where they are not of as many
+    Gaussians.
+    """
     features = tensors.get("semantic", torch.zeros(0, 0))
     try:
         basis = Basis.from_tensors(tensor_group(tensors, "basis"))
@@ -248,7 +291,9 @@ def load_semantics(tensors: dict[str, Tensor], count: int) -> Semantics:
     except (KeyError, ValueError, DataError) as error:
         raise CheckpointError(f"what is known of a capture is incomplete ({error})") from error
     if features.shape != (count, basis.matrix.shape[1]):
-        raise CheckpointError(f"what is known of a capture has features {tuple(features.shape)}; it is of another one")
+        raise CheckpointError(
+            f"what is known of a capture has features {tuple(features.shape)}; it is of another one"
+        )
     return Semantics(style_from(tensor_group(tensors, "style")), basis, features.half(), encoder)
 
 

@@ -1,7 +1,8 @@
 """Build a `GaussianLearner` from photographs: their levels of size, first points, limits of widths.
 
-Shapes: N Gaussians, P points, V views, M training views. World axes and units are the capture's own, relative to its origin.
-Lengths that are needed before anything is learnt follow from the cameras and the sparse points:
+Shapes: N Gaussians, P points, V views, M training views. World axes and units are the capture's own, relative
+to its origin. Lengths that are needed before anything is learnt follow from the cameras and the sparse
+points:
 
     scene scale    how far the cameras stand apart; the means' learning rate is in proportion to it
     near           distance along z below which nothing is drawn
@@ -31,19 +32,31 @@ from .photographs import load_photographs, make_levels
 
 _SURROUNDINGS = 10
 """Gaussians, at most, for one of the surroundings."""
-_SPHERE_WIDTH, _INSIDE_SPHERE = 0.2, 0.5
-"""Greatest width of the surroundings, and distance from the middle up to which Gaussians are none of them: in radii."""
-_WIDTH, _WIDTH_IN_CELLS = 0.5, 0.25
+_SPHERE_WIDTH = 0.2
+_INSIDE_SPHERE = 0.5
+"""Greatest width of the surroundings, and distance from the middle up to which Gaussians are none of them: in
+radii.
+"""
+_WIDTH = 0.5
+_WIDTH_IN_CELLS = 0.25
 """Greatest width of all others in distances to the nearest camera; in scenes of cells."""
-_EVERY, _EVERY_IN_CELLS, _SPHERE_EVERY = 20, 100, 10
+_EVERY = 20
+_EVERY_IN_CELLS = 100
+_SPHERE_EVERY = 10
 """Steps between cuts of widths; in scenes of cells; of the surroundings."""
-_TOGETHER, _PAIRS = 256, 1 << 16
-"""Gaussians whose distances to cameras are taken together, at least, and pairs of both, where cameras are few."""
-_NEAR_POINTS, _NEAR_DEPTHS = 4000, 10_000_000
+_TOGETHER = 256
+_PAIRS = 1 << 16
+"""Gaussians whose distances to cameras are taken together, at least, and pairs of both, where cameras are
+few.
+"""
+_NEAR_POINTS = 4000
+_NEAR_DEPTHS = 10_000_000
 """Points, and depths of them in all views, that say how near to a camera things are, at most."""
-_NEAR, _NEAR_UNSEEN = 0.25, 1e-3
-"""The near plane as a share of the distance that all but 1 % of the points in view have; of the scene scale, where no view has
-any point."""
+_NEAR = 0.25
+_NEAR_UNSEEN = 1e-3
+"""The near plane as a share of the distance that all but 1 % of the points in view have; of the scene scale,
+where no view has any point.
+"""
 
 
 def build(
@@ -54,9 +67,12 @@ def build(
     *,
     device: torch.device = CPU,
 ) -> GaussianLearner:
-    """Load photographs, find the first points, and put a Gaussian at each; arguments as of `RunConfig.build`."""
+    """Load photographs, find the first points, and put a Gaussian at each; arguments as of
+    `RunConfig.build`.
+    """
     compiling = [] if usable(device) else compile_beside((config.degree + 1) ** 2)  # while images are read
-    # Few photographs get few Gaussians, which they would else learn by heart; cells bound theirs by the whole scene.
+    # Few photographs get few Gaussians, which they would else learn by heart; cells bound theirs by the whole
+    # scene.
     if config.cells == 1:
         pixels = int(scene.cameras.size[scene.train].prod(1).sum())
         cap = max(1, min(config.most, pixels // config.pixels_per_gaussian))
@@ -68,7 +84,8 @@ def build(
     draw = np.random.default_rng((config.seed, 0))
     points, origin = initial_points(scene, images, config.initial, draw)
     # ... and on a sphere around everything, which stays coarse: only what it encloses is split.
-    far, sphere = None, None
+    far = None
+    sphere = None
     if config.surroundings:
         far = surroundings(scene, images, points, config.surroundings)
         centre = torch.from_numpy(far.position.mean(0)).float()
@@ -97,7 +114,9 @@ def build(
 
 
 def light_and_poses(config: GaussiansConfig, scene: ParsedScene, image: Callable[[int], Image]) -> Facts:
-    """Facts of a scene with exposures and places of the views, where these are learnt; `image(view)` is a training view."""
+    """Facts of a scene with exposures and places of the views, where these are learnt; `image(view)` is a
+    training view.
+    """
     exposure = exposure_of(config.tones, scene, lambda view: torch.from_numpy(image(view)).float() / 255)
     return facts_of(scene, config.background, exposure=exposure, poses=config.poses > 0)
 
@@ -114,11 +133,15 @@ class _Sphere(NamedTuple):
         return apart < _INSIDE_SPHERE * self.radius
 
 
-def limit_widths(scene: ParsedScene, near: float, *, cells: bool, sphere: _Sphere | None = None) -> LimitWidths:
-    """Keep Gaussians narrower than a share of the distance to the nearest training camera, and the surroundings thin.
+def limit_widths(
+    scene: ParsedScene, near: float, *, cells: bool, sphere: _Sphere | None = None
+) -> LimitWidths:
+    """Keep Gaussians narrower than a share of the distance to the nearest training camera, and the
+    surroundings thin.
 
-    What reaches a camera is drawn before the whole scene as haze, and mixes the semantics of everything. Of thousands of
-    photographs each is seen rarely, so scenes of cells have a lower limit. Nothing nearer than `near` is drawn.
+    What reaches a camera is drawn before the whole scene as haze, and mixes the semantics of everything. Of
+    thousands of photographs each is seen rarely, so scenes of cells have a lower limit. Nothing nearer than
+    `near` is drawn.
     """
     centres = scene.cameras.pose[scene.train][:, :, 3].float().contiguous()
     share, every = (_WIDTH_IN_CELLS, _EVERY_IN_CELLS) if cells else (_WIDTH, _EVERY)
@@ -126,7 +149,8 @@ def limit_widths(scene: ParsedScene, near: float, *, cells: bool, sphere: _Spher
     def nearest_camera(points: Annotated[Tensor, "P 3"]) -> Annotated[Tensor, "P"]:
         # Points lie within a ball, so the camera nearest to one of them is among those nearest to its centre.
         middle = (points.amin(0) + points.amax(0)) / 2
-        radius, apart = (points - middle).norm(dim=1).amax(), (centres - middle).norm(dim=1)
+        radius = (points - middle).norm(dim=1).amax()
+        apart = (centres - middle).norm(dim=1)
         some = centres[apart <= 1.001 * (apart.amin() + 2 * radius)]
         return torch.cdist(points, some, compute_mode="donot_use_mm_for_euclid_dist").amin(1)
 
@@ -135,8 +159,11 @@ def limit_widths(scene: ParsedScene, near: float, *, cells: bool, sphere: _Spher
         if sphere is not None and step % _SPHERE_EVERY == 0:
             apart = gaussians.read(MEANS) - sphere.centre.numpy()
             far = np.flatnonzero(np.einsum("nk,nk->n", apart, apart) >= (_INSIDE_SPHERE * sphere.radius) ** 2)
-            gaussians.limit_scales(np.full(len(far), math.log(_SPHERE_WIDTH * sphere.radius), np.float32), far)
-        # What is narrower than the share of `near` is narrow enough everywhere that it is drawn: distances cost time.
+            gaussians.limit_scales(
+                np.full(len(far), math.log(_SPHERE_WIDTH * sphere.radius), np.float32), far
+            )
+        # What is narrower than the share of `near` is narrow enough everywhere that it is drawn: distances
+        # cost time.
         if step % every == 0:
             wide = np.flatnonzero(gaussians.read(LOG_SCALES).max(1) > math.log(share * near))
             if len(wide):
@@ -151,8 +178,8 @@ def limit_widths(scene: ParsedScene, near: float, *, cells: bool, sphere: _Spher
 def scene_scale(scene: ParsedScene) -> float:
     """Unit of the means' learning rate: the radius of the training cameras' positions.
 
-    At most the distance at which views commonly see points, where the capture knows: steps in proportion to the radius of a
-    district scatter what its views show.
+    At most the distance at which views commonly see points, where the capture knows: steps in proportion to
+    the radius of a district scatter what its views show.
     """
     around = scene.cameras.pose[scene.train][:, :, 3]
     radius = 1.1 * float((around - around.mean(0)).norm(dim=1).max()) or 1.0
@@ -161,7 +188,8 @@ def scene_scale(scene: ParsedScene) -> float:
 
 
 def find_near(scene: ParsedScene, points: Points) -> float:
-    """Near plane: a quarter of the depth that 99 % of the points exceed, so that haze right before a lens is not drawn.
+    """Near plane: a quarter of the depth that 99 % of the points exceed, so that haze right before a lens is
+    not drawn.
 
     Of some of the points and depths, evenly spread; where no view has any, a thousandth of the scene scale.
     """

@@ -1,13 +1,14 @@
-"""Cameras for a capture that came without any: around an object, or inside what surrounds them (rooms, streets, gardens).
+"""Cameras for a capture that came without any: around an object, or inside what surrounds them (rooms,
+streets, gardens).
 
-Where photographs were taken from tells the size of the Gaussians: training makes them about as large as pixels, so that their
-size grows with the distance from the cameras. Where one place explains the sizes plainly better than none, cameras stand
-around it and look at what lies about it, whatever points up.
+Where photographs were taken from tells the size of the Gaussians: training makes them about as large as
+pixels, so that their size grows with the distance from the cameras. Where one place explains the sizes
+plainly better than none, cameras stand around it and look at what lies about it, whatever points up.
 
-Objects are seen from rings at several heights and distances. Where a capture was made from within, cameras stand in free
-places and look around: there most directions end on something, as they do in a hollow object, but what lies far out is made
-of larger Gaussians, or reaches far beyond the rest. Either way the better views are kept: filled, and with nothing close
-before the camera.
+Objects are seen from rings at several heights and distances. Where a capture was made from within, cameras
+stand in free places and look around: there most directions end on something, as they do in a hollow object,
+but what lies far out is made of larger Gaussians, or reaches far beyond the rest. Either way the better views
+are kept: filled, and with nothing close before the camera.
 """
 
 import math
@@ -33,42 +34,62 @@ _DISTANCES = (1.2, 1.7)
 """Distances of the rings; at 1 the object just fits into the view."""
 OUTLYING = 128.0
 """Extents of the bulk from it, beyond which Gaussians are stray."""
-_FOV, _WIDE = 45.0, 70.0
+_FOV = 45.0
+_WIDE = 70.0
 """Vertical angles of views around and inside, in degrees."""
 _PROBE = 8
 """Candidates are judged on pictures reduced by this."""
 _CELLS = 24
 """Cells a side of the grid in which free places are looked for."""
-_FREE, _PLACES, _TURNS = 0.02, 12, 8
-"""Opacity of a free cell, as a share of that of all occupied ones in the mean; places tried; directions looked in at each."""
+_FREE = 0.02
+_PLACES = 12
+_TURNS = 8
+"""Opacity of a free cell, as a share of that of all occupied ones in the mean; places tried; directions
+looked in at each.
+"""
 _PROBED = 30_000
 """Gaussians, those of most opacity times area, of which candidates are drawn."""
 _ENCLOSED = 0.8
-"""Opacity of the surroundings, seen from the better places, from which on a capture is looked at from within."""
-_COARSE, _TAIL = 2.5, 6.0
-"""Size of the outer fifth of the Gaussians relative to the inner half, and distance of the outermost thousandth relative to the
-median, from which on a capture is taken for one from within. Eight captures of objects have at most 1.8 and 3.7."""
-_SIZED, _SIZED_WITHIN, _SAMPLE = 0.8, 0.9, 1500
-"""Median deviation of the logarithms of size over distance from the place that explains sizes best, relative to that of the
-sizes alone, below which the photographs were taken about there, and where the capture is from within; Gaussians that are
-asked. Eight captures of objects have 0.89 or more."""
+"""Opacity of the surroundings, seen from the better places, from which on a capture is looked at from
+within.
+"""
+_COARSE = 2.5
+_TAIL = 6.0
+"""Size of the outer fifth of the Gaussians relative to the inner half, and distance of the outermost
+thousandth relative to the median, from which on a capture is taken for one from within. Eight captures of
+objects have at most 1.8 and 3.7.
+"""
+_SIZED = 0.8
+_SIZED_WITHIN = 0.9
+_SAMPLE = 1500
+"""Median deviation of the logarithms of size over distance from the place that explains sizes best, relative
+to that of the sizes alone, below which the photographs were taken about there, and where the capture is from
+within; Gaussians that are asked. Eight captures of objects have 0.89 or more.
+"""
 _GRIDS = ((17, 3.0), (9, 0.375))
 """Places tried along an axis, and how far out in half spans of the capture: all over, then about the best."""
 _AROUND = (0.08, 0.2)
 """Distances of the cameras from that place, relative to the median distance of what they see."""
 _BACK = (0.0, 0.25)
 """Distances behind that place, against the mean direction of what is seen, in the same unit."""
-_TARGETS, _NARROW = 12, 55.0
+_TARGETS = 12
+_NARROW = 55.0
 """Directions looked in from there, and the vertical angle in degrees."""
-_CLOSE, _BLUR = 0.15, 3.0
-"""Share of the median distance within which things are in the way; logarithm of the size in angle, relative to the median one
-as seen from the place, at which Gaussians are as bad as none."""
+_CLOSE = 0.15
+_BLUR = 3.0
+"""Share of the median distance within which things are in the way; logarithm of the size in angle, relative
+to the median one as seen from the place, at which Gaussians are as bad as none.
+"""
 _NEAR = 3.0
 """What a pixel with something close before the camera costs, in filled ones."""
-_MEAN_VIEWS, _UNSEEN = 32, 1e-4
+_MEAN_VIEWS = 32
+_UNSEEN = 1e-4
 """Views that means are taken from, at most; weight, in pixels, of those that do not show a Gaussian."""
-_CLIP, _CLIPPED = 0.01, (1e-4, 2e-2)
-"""Distance from a camera from which on a capture is drawn, and its bounds as shares of the capture's extent."""
+_CLIP = 0.01
+_CLIPPED = (1e-4, 2e-2)
+"""Distance from a camera from which on a capture is drawn, and its bounds as shares of the capture's
+extent.
+"""
 
 
 def draw(
@@ -80,7 +101,13 @@ def draw(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Rasterised:
     """A view of Gaussians; harmonics above degree 3, which files may hold, are not drawn."""
-    parts = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits, gaussians.harmonics[:, :16])
+    parts = (
+        gaussians.means,
+        gaussians.quaternions,
+        gaussians.log_scales,
+        gaussians.logits,
+        gaussians.harmonics[:, :16],
+    )
     behind = torch.tensor(background, device=gaussians.means.device)
     return rasterise(*parts, camera, features=features, background=behind, antialiased=antialiased)
 
@@ -92,8 +119,9 @@ def clip_distance(gaussians: Gaussians) -> float:
 
 
 class SeenMeans(NamedTuple):
-    """Means over the views that show each Gaussian: what comes nearest to them where a renderer knows one colour a Gaussian and
-    no compensation of opacities (Mip-Splatting), as in browsers and .splat files."""
+    """Means over the views that show each Gaussian: what comes nearest to them where a renderer knows one
+    colour a Gaussian and no compensation of opacities (Mip-Splatting), as in browsers and .splat files.
+    """
 
     functions: Annotated[Tensor, "N K"]
     """Means of the functions of the harmonics, at most those of degree 3."""
@@ -107,7 +135,9 @@ class SeenMeans(NamedTuple):
 
     def gaussians(self, gaussians: Gaussians) -> Gaussians:
         """The Gaussians with mean colours, which may leave [0, 1], and opacities."""
-        mean = 0.5 + torch.einsum("nk,nkc->nc", self.functions, gaussians.harmonics[:, : self.functions.shape[1]])
+        mean = 0.5 + torch.einsum(
+            "nk,nkc->nc", self.functions, gaussians.harmonics[:, : self.functions.shape[1]]
+        )
         return self.plain(gaussians.recoloured((mean - 0.5)[:, None] / HARMONIC))
 
 
@@ -115,14 +145,15 @@ class SeenMeans(NamedTuple):
 def seen_means(gaussians: Gaussians, cameras: Cameras, *, antialiased: bool) -> SeenMeans:
     """Means of what views show of each Gaussian, by its weights in their pixels.
 
-    The mean over all directions is another colour where photographs are from one side. What no view shows takes the mean
-    over all of them; what is not finite keeps its constant harmonic.
+    The mean over all directions is another colour where photographs are from one side. What no view shows
+    takes the mean over all of them; what is not finite keeps its constant harmonic.
     """
     bands = min(gaussians.degree, 3) + 1
     shape = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)
     functions, opacities, weights = (torch.zeros(len(gaussians), n) for n in (bands**2, 1, 1))
     near = clip_distance(gaussians)
-    # Sums over views, each by the Gaussian's weight in its pixels; what none shows weighs the same in all of them.
+    # Sums over views, each by the Gaussian's weight in its pixels; what none shows weighs the same in all of
+    # them.
     for view in torch.linspace(0, len(cameras) - 1, min(_MEAN_VIEWS, len(cameras))).round().long().tolist():
         camera = covering(cameras, view, near)
         direction = torch.nn.functional.normalize(gaussians.means - cameras.pose[view, :, 3].float(), dim=1)
@@ -151,16 +182,18 @@ def find_views(
 ) -> Cameras:
     """At most `count` views of `size` (width, height), the nearer ones around an object first.
 
-    `inside` says whether cameras stand within the capture; None = found out. Where the `camera` is known that the capture was
-    made from, it is the first view, and the others stand about it. Gaussians very far from the others play no part. Raises
-    DataError where nothing can be seen from anywhere.
+    `inside` says whether cameras stand within the capture; None = found out. Where the `camera` is known that
+    the capture was made from, it is the first view, and the others stand about it. Gaussians very far from
+    the others play no part. Raises DataError where nothing can be seen from anywhere.
     """
     near = torch.from_numpy(bulk_of(gaussians.means.numpy()).apart <= OUTLYING)
     gaussians = gaussians if bool(near.all()) else gaussians.select(near)
     search = _Search(gaussians, size, up.double() / up.double().norm(), antialiased)
     within = search.made_from_within() if inside is None else inside
-    # About where sizes say that photographs were taken; else within what surrounds a free place; else around the object.
-    chosen, others = None, count - (camera is not None)
+    # About where sizes say that photographs were taken; else within what surrounds a free place; else around
+    # the object.
+    chosen = None
+    others = count - (camera is not None)
     if inside is not False:
         place = None if camera is None else camera.pose[0, :, 3].double()
         chosen = search.around_place(others, _SIZED_WITHIN if within else _SIZED, place)
@@ -172,22 +205,35 @@ def find_views(
         chosen = cameras.select(best[worth[best] > 0])
     if camera is None:
         if not len(chosen):
-            raise DataError("no view shows anything of the capture; give the axis that points up (--up), or clean the file")
+            raise DataError(
+                "no view shows anything of the capture; give the axis that points up (--up), or clean the file"
+            )
         return chosen
     # On the grid of the others, so that all of its picture lies within.
     share = float((torch.tensor(size) / camera.size[0]).min())
     centre = torch.tensor(size) / 2 + share * (camera.centre - camera.size / 2)
     first = replace(camera.resized(torch.tensor([size])), focal=camera.focal * share, centre=centre)
-    return Cameras(*(torch.cat([getattr(each, field.name) for each in (first, chosen)]) for field in fields(Cameras)))
+    return Cameras(
+        *(torch.cat([getattr(each, field.name) for each in (first, chosen)]) for field in fields(Cameras))
+    )
 
 
 class _Search:
-    """Candidates for views of `size` (width, height) of a capture, and what they are worth; `up` has length 1, float64."""
+    """Candidates for views of `size` (width, height) of a capture, and what they are worth; `up` has length
+    1, float64.
+    """
 
-    def __init__(self, gaussians: Gaussians, size: tuple[int, int], up: Annotated[Tensor, "3"], antialiased: bool) -> None:
-        self.gaussians, self.size, self.up, self.antialiased = gaussians, size, up, antialiased
+    def __init__(
+        self, gaussians: Gaussians, size: tuple[int, int], up: Annotated[Tensor, "3"], antialiased: bool
+    ) -> None:
+        self.gaussians = gaussians
+        self.size = size
+        self.up = up
+        self.antialiased = antialiased
         opacity = gaussians.opacities
-        self.ends = torch.stack([_quantiles(axis, opacity, (0.02, 0.98)) for axis in gaussians.means.T]).double()
+        self.ends = torch.stack(
+            [_quantiles(axis, opacity, (0.02, 0.98)) for axis in gaussians.means.T]
+        ).double()
         """Lowest and highest corner [3 2] of the box that most opacity lies in."""
         self.coarse = gaussians
         """Gaussians that show most: candidates are judged on pictures of these."""
@@ -216,14 +262,18 @@ class _Search:
         return bool(coarser.exp() >= _COARSE) or bool(away[last] >= _TAIL * away[half])
 
     def around_place(self, count: int, sized: float, known: Annotated[Tensor, "3"] | None) -> Cameras | None:
-        """Views from about where the photographs were taken, if known; None where sizes do not tell as well as `sized`."""
-        # The place from which the sizes of some solid Gaussians are most alike in angle, and that usual angle.
+        """Views from about where the photographs were taken, if known; None where sizes do not tell as well
+        as `sized`.
+        """
+        # The place from which the sizes of some solid Gaussians are most alike in angle, and that usual
+        # angle.
         gaussians = self.gaussians
         solid = (gaussians.opacities > 0.2).nonzero()[:, 0]
         if len(solid) < 100:
             return None
         some = solid[:: max(1, len(solid) // _SAMPLE)]
-        points, extent = gaussians.means.double(), gaussians.log_scales.double().topk(2, dim=1).values.mean(1)
+        points = gaussians.means.double()
+        extent = gaussians.log_scales.double().topk(2, dim=1).values.mean(1)
         place, share = _size_centre(points[some], extent[some], self.ends) if known is None else (known, 0.0)
         if share > sized:
             return None
@@ -244,11 +294,16 @@ class _Search:
         offsets = middle * torch.cat([back, *(far * ring for far in _AROUND)])
         eye = (place + offsets).repeat_interleave(_TARGETS, 0)
         cameras = self.looking(eye, (place + middle * ahead[picked]).repeat(len(offsets), 1), _NARROW)
-        # Their worth on small pictures of those that show most there: how much is filled, less what is close or looks blurred.
+        # Their worth on small pictures of those that show most there: how much is filled, less what is close
+        # or looks blurred.
         seen = 2 * (extent - torch.linalg.vector_norm(points - place, dim=1).clamp_min(0.05 * middle).log())
         shown = (seen + gaussians.opacities.log()).topk(min(_PROBED, len(seen))).indices
-        coarse, points, extent = gaussians.select(shown), points[shown].float(), extent[shown].float()
-        small, worth, near = cameras.scaled(_PROBE), torch.zeros(len(cameras)), clip_distance(gaussians)
+        coarse = gaussians.select(shown)
+        points = points[shown].float()
+        extent = extent[shown].float()
+        small = cameras.scaled(_PROBE)
+        worth = torch.zeros(len(cameras))
+        near = clip_distance(gaussians)
         for view in range(len(small)):
             apart = torch.linalg.vector_norm(points - eye[view].float(), dim=1).clamp_min(1e-9)
             blurred = ((extent - apart.log() - usual) / _BLUR).clamp(0, 1)[:, None]
@@ -260,10 +315,16 @@ class _Search:
         return cameras.select((worth - 0.05 * rank).topk(min(count, len(worth))).indices.sort().values)
 
     def from_free_places(self, enclosed: float) -> tuple[Cameras, Annotated[Tensor, "V"]] | None:
-        """Views in all directions from free places that are enclosed, with their worth; None where few are."""
-        # Opacity in each cell of a grid; a cell is free where neither it nor a neighbour holds more than next to nothing.
-        gaussians, up, ends = self.gaussians, self.up, self.ends
-        low, span = ends[:, 0], (ends[:, 1] - ends[:, 0]).clamp_min(1e-9)
+        """Views in all directions from free places that are enclosed, with their worth; None where few
+        are.
+        """
+        # Opacity in each cell of a grid; a cell is free where neither it nor a neighbour holds more than next
+        # to nothing.
+        gaussians = self.gaussians
+        up = self.up
+        ends = self.ends
+        low = ends[:, 0]
+        span = (ends[:, 1] - ends[:, 0]).clamp_min(1e-9)
         at = ((gaussians.means.double() - low) / span * _CELLS).floor().long()
         kept = ((at >= 0) & (at < _CELLS)).all(1)
         flat = at[kept] @ torch.tensor([_CELLS * _CELLS, _CELLS, 1])
@@ -273,7 +334,8 @@ class _Search:
         # Not at the box's faces, and not in the upper third, where nobody holds a camera.
         clear[[0, 1, -2, -1]] = clear[:, [0, 1, -2, -1]] = clear[:, :, [0, 1, -2, -1]] = False
         places = low + (clear.nonzero().double() + 0.5) / _CELLS * span
-        bottom, top = (ends * up[:, None]).amin(1).sum(), (ends * up[:, None]).amax(1).sum()
+        bottom = (ends * up[:, None]).amin(1).sum()
+        top = (ends * up[:, None]).amax(1).sum()
         places = places[places @ up <= bottom + 0.67 * (top - bottom)]
         if not len(places):
             return None
@@ -285,11 +347,15 @@ class _Search:
             picked.append(nearest)
             apart = apart.minimum((places - places[nearest]).norm(dim=1))
         places = places[picked]
-        # Of the directions half overlap enough to tell: a place is enclosed where something fills the view in most of them.
-        eye, ahead = places.repeat_interleave(_TURNS, 0), _around(up, _TURNS) - 0.1 * up
+        # Of the directions half overlap enough to tell: a place is enclosed where something fills the view in
+        # most of them.
+        eye = places.repeat_interleave(_TURNS, 0)
+        ahead = _around(up, _TURNS) - 0.1 * up
         cameras = self.looking(eye, eye + ahead.repeat(len(places), 1), _WIDE)
         every = torch.arange(0, len(cameras), 2)
-        near = torch.full((len(cameras),), 0.05 * float(self.coarse.means.double().var(0, correction=0).sum().sqrt()))
+        near = torch.full(
+            (len(cameras),), 0.05 * float(self.coarse.means.double().var(0, correction=0).sum().sqrt())
+        )
         _, filled = self.probed(cameras.select(every), near[every])
         share = filled.view(len(places), _TURNS // 2).mean(1)
         if float(share.quantile(0.75)) < enclosed:
@@ -300,10 +366,13 @@ class _Search:
 
     def rings(self, count: int) -> tuple[Cameras, Annotated[Tensor, "V"]]:
         """Views around the middle, more than are needed, with their worth."""
-        centre, opacities = self.ends.mean(1), self.gaussians.opacities
+        centre = self.ends.mean(1)
+        opacities = self.gaussians.opacities
         away = torch.linalg.vector_norm(self.gaussians.means.double() - centre, dim=1)
         # Where all are at one place, their own size is that of the object.
-        away = away.clamp_min(float(_quantiles(self.gaussians.log_scales.amax(1).exp(), opacities, (0.5,))[0]))
+        away = away.clamp_min(
+            float(_quantiles(self.gaussians.log_scales.amax(1).exp(), opacities, (0.5,))[0])
+        )
         reach = float(_quantiles(away.float(), opacities, (0.95,))[0]) / math.sin(math.radians(_FOV / 2))
         # Rings of cameras, each turned against the one before, so that none stands behind another.
         rings = [(math.radians(height), far) for far in _DISTANCES for height in _LIFTS]
@@ -316,9 +385,15 @@ class _Search:
         cameras = self.looking(eye, centre.expand_as(eye), _FOV)
         return cameras, self.probed(cameras, 0.3 * torch.linalg.vector_norm(eye - centre, dim=1))[0]
 
-    def probed(self, cameras: Cameras, near: Annotated[Tensor, "V"]) -> tuple[Annotated[Tensor, "V"], Annotated[Tensor, "V"]]:
-        """Worth of views, how much of a small picture is filled less what is nearer than `near`, and the former alone."""
-        small, worth, filled = cameras.scaled(_PROBE), torch.zeros(len(cameras)), torch.zeros(len(cameras))
+    def probed(
+        self, cameras: Cameras, near: Annotated[Tensor, "V"]
+    ) -> tuple[Annotated[Tensor, "V"], Annotated[Tensor, "V"]]:
+        """Worth of views, how much of a small picture is filled less what is nearer than `near`, and the
+        former alone.
+        """
+        small = cameras.scaled(_PROBE)
+        worth = torch.zeros(len(cameras))
+        filled = torch.zeros(len(cameras))
         clip = clip_distance(self.coarse)
         for view in range(len(small)):
             drawn = draw(self.coarse, camera_of(small, view, clip), antialiased=self.antialiased)
@@ -331,8 +406,11 @@ class _Search:
 def _size_centre(
     points: Annotated[Tensor, "N 3"], extent: Annotated[Tensor, "N"], ends: Tensor
 ) -> tuple[Annotated[Tensor, "3"], float]:
-    """The place from which sizes (logarithms) are most alike in angle, and how much more alike than the sizes themselves."""
-    place, half = ends.mean(1), float((ends[:, 1] - ends[:, 0]).max()) / 2
+    """The place from which sizes (logarithms) are most alike in angle, and how much more alike than the sizes
+    themselves.
+    """
+    place = ends.mean(1)
+    half = float((ends[:, 1] - ends[:, 0]).max()) / 2
     spread = deviation = float((extent - extent.median()).abs().median())
     middle = points.mean(0)  # taken off: float32 tells distances in captures far from the origin
     for count, reach in _GRIDS:
@@ -345,14 +423,17 @@ def _size_centre(
             left = extent.float() - apart.log()
             each.append((left - left.median(1, keepdim=True).values).abs().median(1).values)
         deviations = torch.cat(each)
-        place, deviation = tried[int(deviations.argmin())], float(deviations.min())
+        place = tried[int(deviations.argmin())]
+        deviation = float(deviations.min())
     return place, deviation / max(spread, 1e-9)
 
 
 def _around(up: Annotated[Tensor, "3"], count: int, begin: float = 0.0) -> Annotated[Tensor, "count 3"]:
     """Directions across `up`, spread evenly, turned by `begin` of the angle between them."""
     # An orthonormal basis whose first axis is `up`, from the two axes of the world that are least along it.
-    basis = torch.linalg.qr(torch.cat([up[:, None], torch.eye(3, dtype=up.dtype)[:, up.abs().argsort()[:2]]], 1))[0]
+    basis = torch.linalg.qr(
+        torch.cat([up[:, None], torch.eye(3, dtype=up.dtype)[:, up.abs().argsort()[:2]]], 1)
+    )[0]
     turn = (torch.arange(count, dtype=torch.float64) + begin) * (2 * math.pi / count)
     ring: Tensor = turn.cos()[:, None] * basis[:, 1] + turn.sin()[:, None] * basis[:, 2]
     return ring

@@ -1,9 +1,10 @@
-"""Everything that makes a style, as one config: the flags of `fprf stylize` and the content of a `style.json`. No torch.
+"""Everything that makes a style, as one config: the flags of `fprf stylize` and the content of a
+`style.json`. No torch.
 
-What users say of regions is `REGION`, `REGION=REFERENCE` or `REGION=NUMBER`. A region is named by its number, by its name in a
-style file, by a pixel of a view (`VIEW:X,Y`) or by a mask over one (`VIEW:MASK.png`), and in pins on Gaussians by a place
-(`parse_place`); a reference by its file or by its number, from 0 in the order given. What each text means is found out on a
-scene (`style.regions`); here is only the grammar.
+What users say of regions is `REGION`, `REGION=REFERENCE` or `REGION=NUMBER`. A region is named by its number,
+by its name in a style file, by a pixel of a view (`VIEW:X,Y`) or by a mask over one (`VIEW:MASK.png`), and in
+pins on Gaussians by a place (`parse_place`); a reference by its file or by its number, from 0 in the order
+given. What each text means is found out on a scene (`style.regions`); here is only the grammar.
 """
 
 import math
@@ -45,11 +46,14 @@ class Place(NamedTuple):
 
     def about(self, origin: "Origin") -> "Place":
         """Move the place into the local frame of an origin."""
-        return self._replace(points=tuple(tuple(x - of for x, of in zip(each, origin, strict=True)) for each in self.points))
+        return self._replace(
+            points=tuple(tuple(x - of for x, of in zip(each, origin, strict=True)) for each in self.points)
+        )
 
 
 def parse_place(field: str, text: str) -> Place | None:
-    """Parse `box:X,Y,Z:X,Y,Z[:BORDER]`, `path:X,Y,Z:X,Y,Z[...]:WIDTH[,BORDER]` or `everywhere`; None for another region.
+    """Parse `box:X,Y,Z:X,Y,Z[:BORDER]`, `path:X,Y,Z:X,Y,Z[...]:WIDTH[,BORDER]` or `everywhere`; None for
+    another region.
 
     Raises ConfigError naming the field.
     """
@@ -64,9 +68,12 @@ def parse_place(field: str, text: str) -> Place | None:
         numbers = []
     # Corners have three numbers each; what follows them are the sizes.
     count = next((k for k, each in enumerate(numbers) if len(each) != 3), len(numbers))
-    points, sizes = numbers[:count], numbers[count:]
+    points = numbers[:count]
+    sizes = numbers[count:]
     size = sizes[0] if len(sizes) == 1 else ()
-    given = all(0 <= value < math.inf for value in size) and not any(math.isnan(x) for point in points for x in point)
+    given = all(0 <= value < math.inf for value in size) and not any(
+        math.isnan(x) for point in points for x in point
+    )
     if kind == "box" and given and len(points) == 2 and len(sizes) <= 1 and len(size) == len(sizes):
         low, high = (tuple(map(choose, *points)) for choose in (min, max))
         return Place((low, high), None, *(size or (0.0,)))
@@ -82,7 +89,9 @@ def parse_region_value(field: str, text: str) -> RegionValue:
     """`REGION=VALUE`, at the last equals sign. Raises ConfigError naming the field."""
     region, equals, value = text.rpartition("=")
     if not (equals and region and value):
-        raise ConfigError(f"{field}: {text!r} is not REGION=VALUE; write for example 3=autumn.jpg or IMG_0012:120,80=0")
+        raise ConfigError(
+            f"{field}: {text!r} is not REGION=VALUE; write for example 3=autumn.jpg or IMG_0012:120,80=0"
+        )
     return RegionValue(region, value)
 
 
@@ -98,19 +107,25 @@ def parse_strength(field: str, text: str) -> tuple[str, float]:
 
 
 def parse_pixel(text: str) -> tuple[float, float] | None:
-    """`X,Y`, x to the right and y down in pixels of the rendered view; None for something else, such as the name of a mask."""
+    """`X,Y`, x to the right and y down in pixels of the rendered view; None for something else, such as the
+    name of a mask.
+    """
     match = _PIXEL.fullmatch(text)
     return (float(match[1]), float(match[2])) if match else None
 
 
 def labels(paths: Sequence[Path]) -> tuple[str, ...]:
-    """Name each reference, all different: by its file, with folders before it or a number behind where files agree."""
+    """Name each reference, all different: by its file, with folders before it or a number behind where files
+    agree.
+    """
     for folders in range(3):
         names = ["/".join([*(f.name for f in p.parents[:folders][::-1] if f.name), p.name]) for p in paths]
         if len(set(names)) == len(names):
             return tuple(names)
     plain = [p.name for p in paths]
-    return tuple(f"{name} ({plain[:i].count(name) + 1})" if name in plain[:i] else name for i, name in enumerate(plain))
+    return tuple(
+        f"{name} ({plain[:i].count(name) + 1})" if name in plain[:i] else name for i, name in enumerate(plain)
+    )
 
 
 def find_reference(text: str, paths: Sequence[Path]) -> int:
@@ -126,7 +141,9 @@ def find_reference(text: str, paths: Sequence[Path]) -> int:
         if len(matches) == 1:
             return matches[0]
         if matches:
-            raise UsageError(f"reference {text!r}: {len(matches)} references are called so; use the number, from 0")
+            raise UsageError(
+                f"reference {text!r}: {len(matches)} references are called so; use the number, from 0"
+            )
     given = ", ".join(f"{i} {name}" for i, name in enumerate(names))
     raise UsageError(f"reference {text!r}: no such reference; there are {given}")
 
@@ -144,7 +161,9 @@ class StyleConfig:
     weights: tuple[float, ...] = ()
     """Weight of each reference, in their order, above 0; none = all alike."""
     masks: tuple[Path, ...] = ()
-    """A picture for each reference, in their order: only what is white there makes style codes; `none` = all of it."""
+    """A picture for each reference, in their order: only what is white there makes style codes; `none` = all
+    of it.
+    """
     stylizer: StylizerConfig = RegionToneConfig()
     """Method that moves the scene's features."""
     clusters: int = 20
@@ -154,13 +173,18 @@ class StyleConfig:
     strength: float = 1.0
     """0 leaves the scene bit for bit as it is, 1 is the full style."""
     luminance: float = 0.0
-    """Share of the scene's own luminance that is kept, in [0, 1]; at 1 the references give their tints alone."""
+    """Share of the scene's own luminance that is kept, in [0, 1]; at 1 the references give their tints
+    alone.
+    """
     bold: float = 0.5
-    """How far things are painted that the references do not surely show, in [0, 1]: 0 = everything takes light alone, 0.5 = as
-    far as the match is sure, 1 = everything is painted. Counts where `stylizer.light` is true."""
+    """How far things are painted that the references do not surely show, in [0, 1]: 0 = everything takes
+    light alone, 0.5 = as far as the match is sure, 1 = everything is painted. Counts where `stylizer.light`
+    is true.
+    """
     pin: tuple[str, ...] = ()
-    """REGION=REFERENCE: the region takes its style from this reference (from any of them, if pinned to several).
-    For Gaussians REGION may be a place; a later place lies over those before it."""
+    """REGION=REFERENCE: the region takes its style from this reference (from any of them, if pinned to
+    several). For Gaussians REGION may be a place; a later place lies over those before it.
+    """
     forbid: tuple[str, ...] = ()
     """REGION=REFERENCE: the region takes nothing from this reference."""
     keep: tuple[str, ...] = ()
@@ -168,7 +192,9 @@ class StyleConfig:
     region_strength: tuple[str, ...] = ()
     """REGION=STRENGTH in [0, 1]: how strongly the region is restyled, times the overall strength."""
     keep_below: float | None = None
-    """Regions whose best score is lower stay as they are, unless pinned; a score is a cosine, in [-1, 1]. none = no limit."""
+    """Regions whose best score is lower stay as they are, unless pinned; a score is a cosine, in [-1, 1].
+    none = no limit.
+    """
     between: Path | None = None
     """Another style file: the result lies between this style and that one, feature by feature."""
     at: float = 0.5
@@ -192,17 +218,23 @@ class StyleConfig:
         for name in ("weights", "masks"):
             given = len(getattr(self, name))
             if given and self.references and given != len(self.references):
-                raise ConfigError(f"{name}: {given} {name} for {len(self.references)} references; give one each, or none")
+                raise ConfigError(
+                    f"{name}: {given} {name} for {len(self.references)} references; give one each, or none"
+                )
 
 
 C = TypeVar("C", bound=StyleConfig)
 
 PRESETS: Mapping[str, Mapping[str, float]] = MappingProxyType(
     {
-        "gentle": MappingProxyType({"strength": 0.9, "luminance": 0.2, "blend": 0.2, "stylizer.smoothness": 128.0}),
+        "gentle": MappingProxyType(
+            {"strength": 0.9, "luminance": 0.2, "blend": 0.2, "stylizer.smoothness": 128.0}
+        ),
     }
 )
-"""Values by dotted field of `StyleConfig`. `gentle`: safe on photographs, still clearly in the style (docs/styles.md)."""
+"""Values by dotted field of `StyleConfig`. `gentle`: safe on photographs, still clearly in the style
+(docs/styles.md).
+"""
 
 
 def with_preset(config: C, name: str) -> C:
@@ -211,7 +243,9 @@ def with_preset(config: C, name: str) -> C:
     Raises UsageError for an unknown name.
     """
     if name not in PRESETS:
-        raise UsageError(f"preset {name!r}: no such preset{nearest(name, list(PRESETS))}; there is {', '.join(PRESETS)}")
+        raise UsageError(
+            f"preset {name!r}: no such preset{nearest(name, list(PRESETS))}; there is {', '.join(PRESETS)}"
+        )
     for path, value in PRESETS[name].items():
         slot, _, field = path.rpartition(".")
         if hasattr(getattr(config, slot) if slot else config, field):

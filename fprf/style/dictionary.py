@@ -1,12 +1,14 @@
-"""The style dictionary (paper, section on semantic matching): reference photographs to pixel samples, samples to style codes.
+"""The style dictionary (paper, section on semantic matching): reference photographs to pixel samples, samples
+to style codes.
 
-Letters: N pixel samples of a photograph, C content channels, D semantic channels in the scene's basis, T style codes of all
-references, K regions of the scene. Colours are sRGB in [0, 1].
+Letters: N pixel samples of a photograph, C content channels, D semantic channels in the scene's basis, T
+style codes of all references, K regions of the scene. Colours are sRGB in [0, 1].
 
-Content and semantics of a photograph pass the same guided filter as the scene's training targets, at its own pixels, so that
-a reference's statistics are in kind with the scene's. What moves them is the size that the encoder sees (VGG relu2_1: the
-deviations change by 4 to 12 % from 512 to 384 pixels a side), so photographs are encoded at the scene's own. What doesn't is
-how many pixels are looked at: every third and coarser filter cells change them by 0.6 % at most, and cost a fifth.
+Content and semantics of a photograph pass the same guided filter as the scene's training targets, at its own
+pixels, so that a reference's statistics are in kind with the scene's. What moves them is the size that the
+encoder sees (VGG relu2_1: the deviations change by 4 to 12 % from 512 to 384 pixels a side), so photographs
+are encoded at the scene's own. What doesn't is how many pixels are looked at: every third and coarser filter
+cells change them by 0.6 % at most, and cost a fifth.
 """
 
 import hashlib
@@ -36,8 +38,9 @@ if TYPE_CHECKING:
     from .scene_style import SceneStyle
 
 BLEND = 0.1
-"""Share of the whole image's (or scene's) statistics in each local code. The paper has none, its released code 0.3, which
-ends further from the truth where that is known (docs/evidence)."""
+"""Share of the whole image's (or scene's) statistics in each local code. The paper has none, its released
+code 0.3, which ends further from the truth where that is known (docs/evidence).
+"""
 
 CLUSTERS = 20
 """Local codes a reference: with ten, as the paper suggests, trees and houses share some (docs/evidence)."""
@@ -91,28 +94,33 @@ class Reference(NamedTuple):
     colour: Annotated[Tensor, "N 3"] | None = None
     """The samples' own colours, sRGB in [0, 1]; None where nobody will ask."""
     beyond: Annotated[Tensor, "N"] | None = None
-    """Squared length that semantics lose by projection on the scene's basis (`Basis.beyond`): large for what the scene does
-    not show. None = 0."""
+    """Squared length that semantics lose by projection on the scene's basis (`Basis.beyond`): large for what
+    the scene does not show. None = 0.
+    """
 
 
 @torch.inference_mode()
 def encode_photograph(path: Path, encoders: Encoders, *, name: str, mask: Path | None = None) -> Reference:
     """Encode one photograph to samples in the scene's terms: D is 0 without a semantic encoder or basis.
 
-    Of a photograph with a `mask`, a picture of the same shape, only what is white there is sampled; the encoders see all of
-    it. Raises DataError where a file is no readable image, or a mask does not fit.
+    Of a photograph with a `mask`, a picture of the same shape, only what is white there is sampled; the
+    encoders see all of it. Raises DataError where a file is no readable image, or a mask does not fit.
     """
     photo = load_image(path, upright=True)
-    # Reduced to the size of the scene's views where the shape allows, and enlarged only where an encoder could not take it.
+    # Reduced to the size of the scene's views where the shape allows, and enlarged only where an encoder
+    # could not take it.
     height, width = photo.shape[:2]
     scale = min(1.0, max(encoders.longest, _SHORTEST_LONG_SIDE) / max(height, width))
-    width, height = max(_SHORTEST, round(width * scale)), max(_SHORTEST, round(height * scale))
+    width = max(_SHORTEST, round(width * scale))
+    height = max(_SHORTEST, round(height * scale))
     reduced = np.asarray(cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
     image = torch.from_numpy(reduced).to(encoders.device).float() / 255
     # Sample a regular grid of pixels; of a mask every n-th pixel, so that a small one is looked at closely.
     if mask is None:
         step = max(1, round((height * width / _SAMPLES) ** 0.5))
-        y, x = torch.meshgrid(torch.arange(step // 2, height, step), torch.arange(step // 2, width, step), indexing="ij")
+        y, x = torch.meshgrid(
+            torch.arange(step // 2, height, step), torch.arange(step // 2, width, step), indexing="ij"
+        )
         pixel = torch.stack([x.flatten(), y.flatten()], 1)
     else:
         pixel = _read_mask(mask, path, photo, (width, height)).nonzero().flip(1)
@@ -128,9 +136,15 @@ def encode_photograph(path: Path, encoders: Encoders, *, name: str, mask: Path |
 
 
 def semantic_samples(
-    image: Annotated[Tensor, "H W 3"], pixel: Annotated[Tensor, "N 2"], encoder: Encoder, basis: "Basis", guided: GuidedConfig
+    image: Annotated[Tensor, "H W 3"],
+    pixel: Annotated[Tensor, "N 2"],
+    encoder: Encoder,
+    basis: "Basis",
+    guided: GuidedConfig,
 ) -> tuple[Annotated[Tensor, "N D"], Annotated[Tensor, "N"]]:
-    """Sample filtered semantics at pixels (x, y, int64) in a scene's basis, and what lies beyond it (`Basis.beyond`)."""
+    """Sample filtered semantics at pixels (x, y, int64) in a scene's basis, and what lies beyond it
+    (`Basis.beyond`).
+    """
     maps = _encode(encoder, image)
     cells = maps.flatten(1).T
     low = basis.project(cells)
@@ -147,7 +161,10 @@ def _encode(encoder: Encoder, image: Annotated[Tensor, "H W 3"]) -> Annotated[Te
 
 
 def _filtered(
-    maps: Annotated[Tensor, "C h w"], image: Annotated[Tensor, "H W 3"], pixel: Annotated[Tensor, "N 2"], guided: GuidedConfig
+    maps: Annotated[Tensor, "C h w"],
+    image: Annotated[Tensor, "H W 3"],
+    pixel: Annotated[Tensor, "N 2"],
+    guided: GuidedConfig,
 ) -> Annotated[Tensor, "N C"]:
     """Apply the guided filter at pixels (x, y, int64)."""
     height, width = image.shape[:2]
@@ -158,18 +175,25 @@ def _filtered(
 
 
 def _read_mask(path: Path, photo_path: Path, photo: Image, size: tuple[int, int]) -> Annotated[Tensor, "H W"]:
-    """Read a mask at a size (width, height), bool: what is at least half covered, else whatever is covered at all."""
+    """Read a mask at a size (width, height), bool: what is at least half covered, else whatever is covered at
+    all.
+    """
     white = load_mask(path, upright=True)
-    (height, width), (own_height, own_width) = white.shape, photo.shape[:2]
+    (height, width) = white.shape
+    (own_height, own_width) = photo.shape[:2]
     if abs(width * own_height - height * own_width) > 0.5 * (width + height + own_width + own_height):
         raise DataError(
             f"{path}: a mask of {width}x{height} pixels does not fit {photo_path.name} of {own_width}x{own_height}; "
             "draw it on the photograph itself"
         )
-    cover = torch.from_numpy(np.asarray(cv2.resize(white.astype(np.float32), size, interpolation=cv2.INTER_AREA)))
+    cover = torch.from_numpy(
+        np.asarray(cv2.resize(white.astype(np.float32), size, interpolation=cv2.INTER_AREA))
+    )
     selected = cover >= 0.5 if bool((cover >= 0.5).any()) else cover > 0
     if not bool(selected.any()):
-        raise DataError(f"{path}: the mask selects no pixel of {photo_path.name}; paint white what makes the style")
+        raise DataError(
+            f"{path}: the mask selects no pixel of {photo_path.name}; paint white what makes the style"
+        )
     return selected
 
 
@@ -192,14 +216,18 @@ class StyleDictionary(NamedTuple):
     blend: float = 0.0
     """Share of the whole reference's statistics that is in each code; `whole_style` takes it out again."""
     colour_mean: Annotated[Tensor, "T 3"] | None = None
-    """Mean colour of each code's pixels, blended as `mean` is; None where a reference came without colours."""
+    """Mean colour of each code's pixels, blended as `mean` is; None where a reference came without
+    colours.
+    """
     colour_covariance: Annotated[Tensor, "T 3 3"] | None = None
     beyond: Annotated[Tensor, "T"] | None = None
     """Mean squared length of each code's semantics outside of the scene's basis; None = 0."""
     allowed: Annotated[Tensor, "K references"] | None = None
     """On one scene: which references each of its regions may take from, bool; None = all. Not saved."""
     origin: Annotated[Tensor, "D"] | None = None
-    """The encoder's zero, projected on the scene's semantic basis; None = 0. Not saved: it follows from the basis."""
+    """The encoder's zero, projected on the scene's semantic basis; None = 0. Not saved: it follows from the
+    basis.
+    """
 
 
 def build_dictionary(
@@ -209,12 +237,13 @@ def build_dictionary(
     blend: float = BLEND,
     seed: int = 0,
 ) -> StyleDictionary:
-    """Cluster each reference by its semantics; a code is the mean and covariance of the content inside, float32.
+    """Cluster each reference by its semantics; a code is the mean and covariance of the content inside,
+    float32.
 
-    A code takes `blend` of its whole image's statistics, and more the further its members fall short of 32. The
-    order of the references plays no part: they are sorted by what they hold. Statistics are computed on the samples' device;
-    the tables, a few kB, are on the CPU, where stylizers are built. Raises DataError for no references, and for values
-    that are not finite.
+    A code takes `blend` of its whole image's statistics, and more the further its members fall short of 32.
+    The order of the references plays no part: they are sorted by what they hold. Statistics are computed on
+    the samples' device; the tables, a few kB, are on the CPU, where stylizers are built. Raises DataError for
+    no references, and for values that are not finite.
     """
     at_least("clusters", clusters, 1)
     between("blend", blend, 0.0, 1.0)
@@ -226,7 +255,9 @@ def build_dictionary(
                 f"{r.name}: {len(r.content)} samples of content, {len(r.semantic)} of semantics; as many of both, at least 1"
             )
         if not bool(r.content.isfinite().all() & r.semantic.isfinite().all()):
-            raise DataError(f"{r.name}: a feature is not finite; the image or the encoder's weights are damaged")
+            raise DataError(
+                f"{r.name}: a feature is not finite; the image or the encoder's weights are damaged"
+            )
 
     def content_hash(r: Reference) -> str:
         digest = hashlib.sha256()
@@ -241,10 +272,14 @@ def build_dictionary(
     return concatenate(parts, [r.name for r in ordered], [r.weight for r in ordered])
 
 
-def concatenate(parts: Sequence[StyleDictionary], names: Sequence[str], weights: Sequence[float]) -> StyleDictionary:
+def concatenate(
+    parts: Sequence[StyleDictionary], names: Sequence[str], weights: Sequence[float]
+) -> StyleDictionary:
     """Join dictionaries of one reference each, under new names and weights."""
     counts = torch.tensor([len(part.keys) for part in parts])
-    fields = [name for name in (*_TABLES, *_OPTIONAL) if all(getattr(part, name) is not None for part in parts)]
+    fields = [
+        name for name in (*_TABLES, *_OPTIONAL) if all(getattr(part, name) is not None for part in parts)
+    ]
     tables = {name: torch.cat([getattr(part, name) for part in parts]) for name in fields}
     tables["weight"] = torch.tensor(weights, dtype=torch.float32).repeat_interleave(counts)
     reference = torch.arange(len(parts)).repeat_interleave(counts)
@@ -254,16 +289,19 @@ def concatenate(parts: Sequence[StyleDictionary], names: Sequence[str], weights:
 def _codes_of(r: Reference, clusters: int, blend: float, seed: int) -> StyleDictionary:
     """Build the codes of one reference, float32, those of colours where it has some."""
     # Local codes are clusters of the semantics; without semantics there is one.
-    label, keys = r.semantic.new_zeros(len(r.semantic), dtype=torch.int64), r.semantic[:1].float()
+    label = r.semantic.new_zeros(len(r.semantic), dtype=torch.int64)
+    keys = r.semantic[:1].float()
     if r.semantic.shape[1] > 0:
         keys, label = kmeans(r.semantic, clusters, seed=seed)
-    # Codes with few members say little: the fewer, the more of the whole image they take. `whole_share` [T] is that: `blend`
-    # for codes of _FEW_MEMBERS or more, rising to 1 for a code without any.
+    # Codes with few members say little: the fewer, the more of the whole image they take. `whole_share` [T]
+    # is that: `blend` for codes of _FEW_MEMBERS or more, rising to 1 for a code without any.
     member = double(torch.nn.functional.one_hot(label, len(keys)))
     share = member.sum(0) / len(label)
     whole_share = 1 - (1 - blend) * (share * len(label) / _FEW_MEMBERS).clamp_max(1.0)
 
-    def statistics(features: Annotated[Tensor, "N C"]) -> tuple[Annotated[Tensor, "T C"], Annotated[Tensor, "T C C"]]:
+    def statistics(
+        features: Annotated[Tensor, "N C"],
+    ) -> tuple[Annotated[Tensor, "T C"], Annotated[Tensor, "T C C"]]:
         """Mean M and covariance Sigma of each code (paper, Eq. 6), blended with those of the whole image."""
         whole = moments(features, features.new_ones(len(features)))
         mean, covariances, _ = group_moments(features, member)
@@ -293,22 +331,27 @@ def blend_codes(
 ) -> tuple[Annotated[Tensor, "T C"], Annotated[Tensor, "T C C"]]:
     """Local statistics x (1 - blend) + whole x blend, code by code (released code, `blending_ratio`)."""
     whole = blend[:, None]
-    return (1 - whole) * mean + whole * whole_mean, (1 - whole[..., None]) * covariances + whole[..., None] * whole_covariance
+    return (1 - whole) * mean + whole * whole_mean, (1 - whole[..., None]) * covariances + whole[
+        ..., None
+    ] * whole_covariance
 
 
 def whole_style(d: StyleDictionary) -> tuple[Annotated[Tensor, "C"], Annotated[Tensor, "C C"]]:
     """Mean and covariance of all pixels of all references by user weight, float64: what global AdaIN aims at.
 
-    Blending draws the codes' means together and thereby takes b (1 - b) of the scatter between them out of the total
-    covariance, for blend b; it is given back, reference by reference, so that clusters and blend don't matter here (but
-    for clusters of less than 32 members, which hold too few pixels to show).
+    Blending draws the codes' means together and thereby takes b (1 - b) of the scatter between them out of
+    the total covariance, for blend b; it is given back, reference by reference, so that clusters and blend
+    don't matter here (but for clusters of less than 32 members, which hold too few pixels to show).
     """
-    means, covariances, weights = [], [], []
+    means = []
+    covariances = []
+    weights = []
     for i in range(len(d.names)):
         own = d.reference == i
         mean, total = mix(d.mean[own], d.covariance[own], d.share[own])
         if d.blend < 1:
-            # The blended means scatter (1 - b)^2 as much as the true ones, of whose scatter b (1 - b) is missing in the total.
+            # The blended means scatter (1 - b)^2 as much as the true ones, of whose scatter b (1 - b) is
+            # missing in the total.
             share = double(d.share[own])
             apart = (double(d.mean[own]) - mean) * (share / share.sum()).sqrt()[:, None]
             total = total + d.blend / (1 - d.blend) * apart.T @ apart
@@ -324,8 +367,12 @@ def code_odds(d: StyleDictionary) -> Annotated[Tensor, "T"]:
     return odds / odds.sum()
 
 
-def choose(d: StyleDictionary, references: Annotated[Tensor, "references"]) -> tuple[StyleDictionary, Annotated[Tensor, "T"]]:
-    """Select some of the references (bool, at least one); return their dictionary, and which of the codes these are (bool)."""
+def choose(
+    d: StyleDictionary, references: Annotated[Tensor, "references"]
+) -> tuple[StyleDictionary, Annotated[Tensor, "T"]]:
+    """Select some of the references (bool, at least one); return their dictionary, and which of the codes
+    these are (bool).
+    """
     # References that stay are numbered anew, from 0.
     codes = references[d.reference]
     renumbered = references.cumsum(0) - 1
@@ -339,7 +386,9 @@ def choose(d: StyleDictionary, references: Annotated[Tensor, "references"]) -> t
 
 
 def save_dictionary(path: Path, d: StyleDictionary) -> None:
-    """Write the dictionary as safetensors, for people and other programs; a crash leaves the old file or the new one."""
+    """Write the dictionary as safetensors, for people and other programs; a crash leaves the old file or the
+    new one.
+    """
     fields = [name for name in (*_TABLES, "reference", *_OPTIONAL) if getattr(d, name) is not None]
     tensors = {name: getattr(d, name).detach().cpu().contiguous() for name in fields}
     write_bytes(path, save(tensors, metadata={"names": json.dumps(d.names), "blend": repr(d.blend)}))

@@ -5,15 +5,15 @@
     {"format": 1, "style": {the fields of StyleConfig}, "sha256": {path: hash}, "semantic_encoder": identity,
      "regions": {name: [key in the encoder's own channels]}, "made": what a run measured}
 
-Only "format" and "style" must be there. Paths are relative to the file, or absolute. A region that the style names is found
-on another scene by its key, since numbers mean something on one scene alone.
+Only "format" and "style" must be there. Paths are relative to the file, or absolute. A region that the style
+names is found on another scene by its key, since numbers mean something on one scene alone.
 
 `keys.json` says which frame has which style; between two of them one fades into the other.
 
     {"format": 1, "keyframes": [{"frame": 0, "style": "day/style.json"}, {"frame": 48, "style": null}]}
 
-Paths are relative to the file, or absolute; null is the scene as it is. The fade is a smoothstep, so it starts and ends without
-a jerk; before the first key and after the last, their styles hold.
+Paths are relative to the file, or absolute; null is the scene as it is. The fade is a smoothstep, so it
+starts and ends without a jerk; before the first key and after the last, their styles hold.
 """
 
 import hashlib
@@ -61,17 +61,30 @@ def read_style(path: Path, *, centred: bool = True) -> StyleFile:
     """
     whole = read_json(path, "a style.json, as `fprf stylize` writes it")
     try:
-        if not isinstance(whole, dict) or whole.get("format") != _FORMAT or not isinstance(whole.get("style"), dict):
-            raise ConfigError(f'expected an object with "format": {_FORMAT} and "style", as `fprf stylize` writes it')
+        if (
+            not isinstance(whole, dict)
+            or whole.get("format") != _FORMAT
+            or not isinstance(whole.get("style"), dict)
+        ):
+            raise ConfigError(
+                f'expected an object with "format": {_FORMAT} and "style", as `fprf stylize` writes it'
+            )
         for key in whole:
             if key not in _KEYS:  # a typing error would otherwise go unnoticed
-                raise ConfigError(f"unknown key {key!r}{nearest(key, list(_KEYS))} (allowed: {', '.join(_KEYS)})")
+                raise ConfigError(
+                    f"unknown key {key!r}{nearest(key, list(_KEYS))} (allowed: {', '.join(_KEYS)})"
+                )
         fields = whole["style"]
         if "fprf" in whole and "bold" not in fields:  # saved before there was light: all was painted
             fields = {**fields, "bold": 1.0}
         stylizer = fields.get("stylizer", {})
-        if isinstance(stylizer, dict) and stylizer.get("similarity") == "cosine":  # once a choice, now how it is always done
-            fields = {**fields, "stylizer": {name: value for name, value in stylizer.items() if name != "similarity"}}
+        if (
+            isinstance(stylizer, dict) and stylizer.get("similarity") == "cosine"
+        ):  # once a choice, now how it is always done
+            fields = {
+                **fields,
+                "stylizer": {name: value for name, value in stylizer.items() if name != "similarity"},
+            }
         style = from_json(fields, StyleConfig, packages=from_json(whole.get("plugins", {}), dict[str, str]))
         if "centred" not in stylizer and hasattr(style.stylizer, "centred"):
             style = slots.replace(style, "stylizer.centred", centred)
@@ -80,7 +93,9 @@ def read_style(path: Path, *, centred: bool = True) -> StyleFile:
         encoder = from_json(whole.get("semantic_encoder", ""), str)
         for name in regions:
             if name.isdigit() or not name or ":" in name or "=" in name:
-                raise ConfigError(f"regions: {name!r} is no name; a name is no number and holds neither ':' nor '='")
+                raise ConfigError(
+                    f"regions: {name!r} is no name; a name is no number and holds neither ':' nor '='"
+                )
     except ConfigError as fault:
         raise ConfigError(f"{path}: {fault}") from fault
     return StyleFile(
@@ -92,7 +107,9 @@ def read_style(path: Path, *, centred: bool = True) -> StyleFile:
 
 
 def write_style(path: Path, file: StyleFile, made: Mapping[str, Any] | None = None) -> None:
-    """Write the style with the hashes of its photographs as they are now; `made` is kept beside it for people to read."""
+    """Write the style with the hashes of its photographs as they are now; `made` is kept beside it for people
+    to read.
+    """
     # Paths go relative, so that the folder can be moved; hashes tell when a photograph changes.
     style = file.style
     masks = [p for p in style.masks if p != NO_MASK]
@@ -109,7 +126,9 @@ def write_style(path: Path, file: StyleFile, made: Mapping[str, Any] | None = No
 
 
 def check_photographs(path: Path, file: StyleFile) -> None:
-    """Raise DataError where a photograph or mask of a style file is not the one that the style was saved with."""
+    """Raise DataError where a photograph or mask of a style file is not the one that the style was saved
+    with.
+    """
     for photo in (*file.style.references, *file.style.masks):
         then = file.sha256.get(photo)
         if then is not None and photo.is_file() and (now := _hash(photo)) != then:
@@ -123,27 +142,38 @@ def check_photographs(path: Path, file: StyleFile) -> None:
 def with_folders(style: S, report: Callable[[str], None] = warnings.warn) -> S:
     """The style with the images of each folder in the folder's place, all with its weight.
 
-    Images of folders that cannot be read are left out, and `report` is given the reason. Raises DataError for a folder
-    without a readable image, ConfigError for a mask over a folder.
+    Images of folders that cannot be read are left out, and `report` is given the reason. Raises DataError for
+    a folder without a readable image, ConfigError for a mask over a folder.
     """
     folders = {path for path in style.references if path.is_dir() and not is_scene(path)}
     if not folders:
         return style
     from ..datamanagers.images import photographs
 
-    # Of folders each image once, and none that is also named itself: that has a weight, and may have masks, of its own.
-    count, known = len(style.references), set(style.references)
+    # Of folders each image once, and none that is also named itself: that has a weight, and may have masks,
+    # of its own.
+    count = len(style.references)
+    known = set(style.references)
     rows: list[tuple[Path, float, Path]] = []
     for path, weight, mask in zip(
         style.references, style.weights or (1.0,) * count, style.masks or (NO_MASK,) * count, strict=True
     ):
         if path in folders and mask != NO_MASK:
-            raise ConfigError(f"masks: {mask} is for one photograph, {path} is a folder; write none, or name the photographs")
-        files = [file for file in photographs([path], report) if file not in known] if path in folders else [path]
+            raise ConfigError(
+                f"masks: {mask} is for one photograph, {path} is a folder; write none, or name the photographs"
+            )
+        files = (
+            [file for file in photographs([path], report) if file not in known] if path in folders else [path]
+        )
         known |= {*files}
         rows += [(file, weight, mask) for file in files]
     references, weights, masks = zip(*rows, strict=True)
-    return replace(style, references=references, weights=weights if style.weights else (), masks=masks if style.masks else ())
+    return replace(
+        style,
+        references=references,
+        weights=weights if style.weights else (),
+        masks=masks if style.masks else (),
+    )
 
 
 def _with_paths(style: StyleConfig, change: Callable[[Path], Path]) -> StyleConfig:
@@ -163,8 +193,11 @@ def _resolved(file: Path, path: Path) -> Path:
 
 
 def _portable(file: Path, path: Path) -> Path:
-    """Make a path relative to a file in whose folder or below it lies, so that both can be moved; else absolute."""
-    here, there = Path(os.path.abspath(file.parent)), Path(os.path.abspath(path))
+    """Make a path relative to a file in whose folder or below it lies, so that both can be moved; else
+    absolute.
+    """
+    here = Path(os.path.abspath(file.parent))
+    there = Path(os.path.abspath(path))
     return there.relative_to(here) if there.is_relative_to(here) else there
 
 
@@ -172,7 +205,9 @@ def _hash(path: Path) -> str:
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
+        raise DataError(
+            f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -188,10 +223,18 @@ class Keyframe:
 
 def read_keyframes(path: Path) -> tuple[Keyframe, ...]:
     """The keys of a file, by frame. Raises ConfigError naming the file and the key."""
-    whole = read_json(path, 'a keyframe file: {"format": 1, "keyframes": [{"frame": 0, "style": "style.json"}]}')
+    whole = read_json(
+        path, 'a keyframe file: {"format": 1, "keyframes": [{"frame": 0, "style": "style.json"}]}'
+    )
     try:
-        if not isinstance(whole, dict) or whole.keys() != {"format", "keyframes"} or whole["format"] != _FORMAT:
-            raise ConfigError(f'expected an object with "format": {_FORMAT} and "keyframes", and nothing else')
+        if (
+            not isinstance(whole, dict)
+            or whole.keys() != {"format", "keyframes"}
+            or whole["format"] != _FORMAT
+        ):
+            raise ConfigError(
+                f'expected an object with "format": {_FORMAT} and "keyframes", and nothing else'
+            )
         keys = from_json(whole["keyframes"], list[Keyframe], path="keyframes")
         if not keys or len({key.frame for key in keys}) < len(keys):
             raise ConfigError("keyframes: at least one is needed, and no two at one frame")
@@ -203,7 +246,9 @@ def read_keyframes(path: Path) -> tuple[Keyframe, ...]:
 
 
 def fade(frames: Sequence[int], at: int) -> tuple[int, int, float]:
-    """Find the keys before and after a frame, as places in `frames` (sorted), and how far it is between them, in [0, 1]."""
+    """Find the keys before and after a frame, as places in `frames` (sorted), and how far it is between them,
+    in [0, 1].
+    """
     after = next((i for i, frame in enumerate(frames) if frame > at), len(frames))
     if after == 0 or after == len(frames):
         only = min(after, len(frames) - 1)

@@ -1,28 +1,32 @@
 """Light where a match is not sure: what the references do not show keeps its material and takes their light.
 
-Letters: N points, D semantic channels, T style codes, K regions of the scene. Colours are sRGB in [0, 1], rows: c' = c A + b. A
-region k with mean m_k takes
+Letters: N points, D semantic channels, T style codes, K regions of the scene. Colours are sRGB in [0, 1],
+rows: c' = c A + b. A region k with mean m_k takes
 
     light_k(c)  =  (e_k m_k + q_k (c - m_k)) S,        S = (s I + (1 - s) L) diag(g)
 
-with its exposure e_k and contrast q_k, and the saturation s and white balance g of the references; L takes colours to the grey
-of their luma. A gain of light is a product, in linear light and, but for the black end, in sRGB.
+with its exposure e_k and contrast q_k, and the saturation s and white balance g of the references; L takes
+colours to the grey of their luma. A gain of light is a product, in linear light and, but for the black end,
+in sRGB.
 
-- Exposure: the median change of log luma over the things of the scene, each counted as far as it is sure of its match, drawn
-  to no change. A night is dark for what it does not show, too; how dark is known within limits.
-  The sky is a source of light and no thing; it changes more than what it lights, so smooth regions follow their match.
-- White balance: the cast that all codes of the references share (`shared`), less that of the scene, drawn to none likewise. A
-  sunset is warm in sky, road and tree: that is light. A meadow with a blue sky and a red barn shares nothing: that is material.
+- Exposure: the median change of log luma over the things of the scene, each counted as far as it is sure of
+  its match, drawn to no change. A night is dark for what it does not show, too; how dark is known within
+  limits. The sky is a source of light and no thing; it changes more than what it lights, so smooth regions
+  follow their match.
+- White balance: the cast that all codes of the references share (`shared`), less that of the scene, drawn to
+  none likewise. A sunset is warm in sky, road and tree: that is light. A meadow with a blue sky and a red
+  barn shares nothing: that is material.
 
-A point of confidence p takes p paint(c) + (1 - p) light(c) + 4 p (1 - p) u_k. On the way from blue to yellow lies green: u_k
-takes it out of the middle where both are opposite along red and blue.
+A point of confidence p takes p paint(c) + (1 - p) light(c) + 4 p (1 - p) u_k. On the way from blue to yellow
+lies green: u_k takes it out of the middle where both are opposite along red and blue.
 
-Confidence has two factors. One is a ramp over the likeness of a point and its region to the codes that they take, in spreads
-of the cosines between the scene's own regions: encoders differ in these as they do in the scores of unlike things. The other
-asks the scene itself, where both sides come from the same pictures (`unrivalled`): a code that another, unlike region of the
-scene resembles more belongs to that region's kind. Where the references lack trees, trees take the road's code, which the road
-claims. Both are set on painted pairs of photographs (`benchmarks/semantic_matching.py`): confidence is about the rate at which
-matches are right where a right one is as likely as none.
+Confidence has two factors. One is a ramp over the likeness of a point and its region to the codes that they
+take, in spreads of the cosines between the scene's own regions: encoders differ in these as they do in the
+scores of unlike things. The other asks the scene itself, where both sides come from the same pictures
+(`unrivalled`): a code that another, unlike region of the scene resembles more belongs to that region's kind.
+Where the references lack trees, trees take the road's code, which the road claims. Both are set on painted
+pairs of photographs (`benchmarks/semantic_matching.py`): confidence is about the rate at which matches are
+right where a right one is as likely as none.
 """
 
 from typing import TYPE_CHECKING, Annotated
@@ -39,7 +43,9 @@ if TYPE_CHECKING:
     from ..plugins.stylizers.config import StylizerConfig
 
 SURE = 0.9
-"""Likeness, in spreads of the scene's own regions, from which on a match counts wholly; at 0 it counts nothing."""
+"""Likeness, in spreads of the scene's own regions, from which on a match counts wholly; at 0 it counts
+nothing.
+"""
 UNRIVALLED = 0.9
 """Lowe's ratio from which on a claim has no rival: below lies the noise between regions of one kind."""
 _RIVALLED = 0.8
@@ -47,10 +53,14 @@ _RIVALLED = 0.8
 _NEAREST = 0.05
 """Share of a reference's pixels that a score is the mean of: less may be the rim of something else."""
 APPLIED = 0.6
-"""Share of the estimated exposure of things and of the cast that is applied: both are drawn to no change, since a few matches
-know the light of another place within limits."""
-_SMOOTH, _ROUGH = 0.12, 0.25
-"""Deviations of luma, relative to it, up to which a region is a source of light, and from which on it is a thing."""
+"""Share of the estimated exposure of things and of the cast that is applied: both are drawn to no change,
+since a few matches know the light of another place within limits.
+"""
+_SMOOTH = 0.12
+_ROUGH = 0.25
+"""Deviations of luma, relative to it, up to which a region is a source of light, and from which on it is a
+thing.
+"""
 _BLACK = 0.02
 """Added to colours before ratios are taken: five 8-bit steps, below which no ratio is known."""
 _WHITE = 0.95
@@ -58,15 +68,21 @@ _WHITE = 0.95
 _EXPOSURE = (0.05, 2.5)
 """Least and largest gain of light."""
 _SATURATION = (0.35, 1.1)
-"""Least and largest gain of saturation: black and white takes colour away, a neon street adds little to a wall."""
+"""Least and largest gain of saturation: black and white takes colour away, a neon street adds little to a
+wall.
+"""
 _SKY_SATURATION = 0.7
-"""Gain of saturation of sources of light besides: what they show is light, no material, and an overcast sky is never wrong."""
+"""Gain of saturation of sources of light besides: what they show is light, no material, and an overcast sky
+is never wrong.
+"""
 _CAST = 0.36
 """Largest cast along an axis, in logarithms of sRGB."""
 _BRIGHT = 0.15
 """Luma below which colours count less for the cast: what is nearly black has none."""
 _LEAST_VOTE = 0.1
-"""Vote of an unsure region on the exposure, beside 1 of a sure one: a scene of nothing but these has an exposure, too."""
+"""Vote of an unsure region on the exposure, beside 1 of a sure one: a scene of nothing but these has an
+exposure, too.
+"""
 _AXES = ((0.5**0.5, 0.0, -(0.5**0.5)), (-(6**-0.5), (2 / 3) ** 0.5, -(6**-0.5)))
 """Red against blue, green against magenta; of unit length, at right angles to grey and to each other."""
 _LUMA = (0.2126, 0.7152, 0.0722)
@@ -105,7 +121,9 @@ class Light(nn.Module):
         allowed: Annotated[Tensor, "K references"],
     ) -> None:
         super().__init__()
-        self.membership, self.bold, self._spread = Membership(scene.keys, scene.semantic_mean), bold, _spread(scene)
+        self.membership = Membership(scene.keys, scene.semantic_mean)
+        self.bold = bold
+        self._spread = _spread(scene)
         self._restricted = not bool(allowed.all())
         self.register_buffer("maps", (maps - torch.eye(4, 3).to(maps)).float())
         self.register_buffer("between", between.float())
@@ -123,9 +141,11 @@ class Light(nn.Module):
     ) -> Annotated[Tensor, "N 1"]:
         """How sure points are of their match, in [0, 1].
 
-        Likeness is that of a point to its nearest codes and that of its regions to those that they take, half each.
+        Likeness is that of a point to its nearest codes and that of its regions to those that they take, half
+        each.
         """
-        belongs, points = self._belongs(semantic, belongs), semantic.to(self.keys)
+        belongs = self._belongs(semantic, belongs)
+        points = semantic.to(self.keys)
         # The most like of all references, each by the mean cosine with its nearest codes.
         own = points.new_full((len(points),), -1.0)
         for i, middle in enumerate(self.middles):
@@ -133,7 +153,8 @@ class Light(nn.Module):
             near = cosines(points, self.keys[codes], self.beyond[codes], self.membership.centre, middle)
             if self._restricted:  # of references that are forbidden to their regions, points know nothing
                 near = near - 2 * (belongs @ self.forbidden[:, i, None])
-            # From the nearest code on, until a twentieth of the reference's pixels is full; the last one counts in part.
+            # From the nearest code on, until a twentieth of the reference's pixels is full; the last one
+            # counts in part.
             near, order = near.sort(1, descending=True)
             size = (self.share[codes] / self.share[codes].sum())[order]
             taken = (_NEAREST - (size.cumsum(1) - size)).clamp_min(0).minimum(size)
@@ -156,7 +177,8 @@ class Light(nn.Module):
         belongs: Annotated[Tensor, "N K"] | None = None,
     ) -> Annotated[Tensor, "N 4 3"]:
         """What is added to colours beside the paint: A and below it b of each point, c' = c + c A + b."""
-        # A and b of the regions, mixed by membership, as far as points are not painted; u is largest half-way.
+        # A and b of the regions, mixed by membership, as far as points are not painted; u is largest
+        # half-way.
         belongs = self._belongs(semantic, belongs)
         lit = (belongs @ self.maps.flatten(1)).view(-1, 4, 3) * (1 - paint)[..., None]
         lit[:, 3] += 4 * paint * (1 - paint) * (belongs @ self.between)
@@ -187,35 +209,47 @@ def light_of(
     bold: float,
     allowed: Annotated[Tensor, "K references"] | None = None,
 ) -> Light | None:
-    """The light of references on a scene; None where all is painted (`bold` 1), or nothing tells regions or colours apart.
+    """The light of references on a scene; None where all is painted (`bold` 1), or nothing tells regions or
+    colours apart.
 
-    The stylizer of `config` matches codes and regions; `colours` are mean and covariance of the regions' own colours. A region
-    that may not take from all references is lit as if there were only those that it may take from.
+    The stylizer of `config` matches codes and regions; `colours` are mean and covariance of the regions' own
+    colours. A region that may not take from all references is lit as if there were only those that it may
+    take from.
     """
     if bold == 1 or len(scene.share) == 1 or dictionary.colour_mean is None:
         return None
     count = len(scene.share)
     every = torch.ones(count, len(dictionary.names), dtype=torch.bool) if allowed is None else allowed.cpu()
     mean, covariance = (double(part).cpu() for part in colours)
-    likeness, claim = mean.new_zeros(count), mean.new_zeros(count)
-    maps, between = mean.new_zeros(count, 4, 3), torch.zeros_like(mean)
+    likeness = mean.new_zeros(count)
+    claim = mean.new_zeros(count)
+    maps = mean.new_zeros(count, 4, 3)
+    between = torch.zeros_like(mean)
     # Cosine of each region with each code, float64: each reference is seen from its own middle.
-    own, keys, centre = double(scene.keys).cpu(), double(dictionary.keys).cpu(), double(scene.semantic_mean).cpu()
-    beyond, cosine = double(_beyond(dictionary)).cpu(), mean.new_zeros(count, len(dictionary.keys))
+    own = double(scene.keys).cpu()
+    keys = double(dictionary.keys).cpu()
+    centre = double(scene.semantic_mean).cpu()
+    beyond = double(_beyond(dictionary)).cpu()
+    cosine = mean.new_zeros(count, len(dictionary.keys))
     for i, middle in enumerate(double(_middles(scene, dictionary)).cpu()):
         codes = (dictionary.reference == i).nonzero().squeeze(1)
         cosine[:, codes] = cosines(own, keys[codes], beyond[codes], centre, middle)
     for row in sorted({tuple(row) for row in every.tolist()}):
         # All regions are matched with one choice of references; those that made it take their rows.
         chosen = torch.tensor(row)
-        (part, codes), rows = choose(dictionary, chosen), (every == chosen).all(1)
+        (part, codes) = choose(dictionary, chosen)
+        rows = (every == chosen).all(1)
         table = double(config.build(dictionary=part, scene=scene).region_match(scene.keys)).cpu()
-        # Likeness is the mean cosine with the codes that a region takes, in spreads of the scene's own regions.
-        alike, alone = (table * cosine[:, codes]).sum(1) / _spread(scene), unrivalled(scene, part, table)
-        likeness[rows], claim[rows] = alike[rows], alone[rows]
+        # Likeness is the mean cosine with the codes that a region takes, in spreads of the scene's own
+        # regions.
+        alike = (table * cosine[:, codes]).sum(1) / _spread(scene)
+        alone = unrivalled(scene, part, table)
+        likeness[rows] = alike[rows]
+        claim[rows] = alone[rows]
         sure = (alike / SURE).clamp(0, 1) * alone
         lit, added = light_maps(mean, covariance, double(scene.share), table, part, sure)
-        maps[rows], between[rows] = lit[rows], added[rows]
+        maps[rows] = lit[rows]
+        between[rows] = added[rows]
     return Light(scene, dictionary, maps, between, bold, likeness, claim, every)
 
 
@@ -228,8 +262,9 @@ def cosines(
 ) -> Annotated[Tensor, "N T"]:
     """The lesser of the cosines seen from the scene's mean and from the middle between scene and reference.
 
-    In a room all of a meadow lies in one direction from the mean, and from the middle all of the room does. What codes have
-    `beyond` the basis of the scene (squared length) is at right angles to all that the scene has.
+    In a room all of a meadow lies in one direction from the mean, and from the middle all of the room does.
+    What codes have `beyond` the basis of the scene (squared length) is at right angles to all that the scene
+    has.
     """
 
     def seen(at: Tensor) -> Tensor:
@@ -254,16 +289,20 @@ def _middles(scene: SceneStyle, dictionary: StyleDictionary) -> Annotated[Tensor
     return torch.stack(rows)
 
 
-def unrivalled(scene: SceneStyle, dictionary: StyleDictionary, table: Annotated[Tensor, "K T"]) -> Annotated[Tensor, "K"]:
+def unrivalled(
+    scene: SceneStyle, dictionary: StyleDictionary, table: Annotated[Tensor, "K T"]
+) -> Annotated[Tensor, "K"]:
     """How little other, unlike regions claim the codes that each region takes, in [0, 1], float64.
 
-    With the squared distance d of directions from the scene's mean, a region k takes code t against its strongest rival l by
+    With the squared distance d of directions from the scene's mean, a region k takes code t against its
+    strongest rival l by
 
         min over l of   r + (1 - r) max(0, cos(k, l))^4,      r = min(1, d(l, t) / d(k, t))
 
-    r is Lowe's ratio of distances (IJCV 2004, section 7.1), with rivals of the scene in the place of rival codes; a rival that
-    is like the region takes nothing from it, since what it claims is of its kind. Cosines between regions know no gap between
-    two sets of pictures: codes come back to the scene (cycle consistency).
+    r is Lowe's ratio of distances (IJCV 2004, section 7.1), with rivals of the scene in the place of rival
+    codes; a rival that is like the region takes nothing from it, since what it claims is of its kind. Cosines
+    between regions know no gap between two sets of pictures: codes come back to the scene (cycle
+    consistency).
     """
     # d, r and cos(k, l) of the formula; the least over rivals counts.
     units = unit(double(scene.keys), double(scene.semantic_mean))
@@ -284,42 +323,57 @@ def light_maps(
     dictionary: StyleDictionary,
     sure: Annotated[Tensor, "K"],
 ) -> tuple[Annotated[Tensor, "K 4 3"], Annotated[Tensor, "K 3"]]:
-    """The affine map of each region by the references' light (A, below it b), and u, float64; see the top of the file."""
+    """The affine map of each region by the references' light (A, below it b), and u, float64; see the top of
+    the file.
+    """
     assert dictionary.colour_mean is not None
-    codes, odds = double(dictionary.colour_mean), code_odds(dictionary)
-    painted, own, grey = table @ codes, luma(mean)[:, 0], luma(torch.eye(3, dtype=torch.float64))
+    codes = double(dictionary.colour_mean)
+    odds = code_odds(dictionary)
+    painted = table @ codes
+    own = luma(mean)[:, 0]
+    grey = luma(torch.eye(3, dtype=torch.float64))
     # Smooth regions are sources of light, as the sky is; rough ones are things.
     deviation = torch.einsum("kij,ix,jx->k", covariance, grey, grey).clamp_min(0).sqrt()
     source = ((_ROUGH - deviation / (own + _BLACK)) / (_ROUGH - _SMOOTH)).clamp(0, 1)
     vote = share * (1 - source)
-    vote = share if float(vote.sum()) < 1e-3 * float(share.sum()) else vote  # of a scene of nothing but sky, all
-    # Exposure e, from the logarithms of luma: things take the median of their changes, sources the change of their match.
+    vote = (
+        share if float(vote.sum()) < 1e-3 * float(share.sum()) else vote
+    )  # of a scene of nothing but sky, all
+    # Exposure e, from the logarithms of luma: things take the median of their changes, sources the change of
+    # their match.
     change = (luma(painted)[:, 0] + _BLACK).log() - (own + _BLACK).log()
     thing = torch.full_like(change, APPLIED * _quantile(change, vote * (sure + _LEAST_VOTE), 0.5))
     gain = torch.lerp(thing, change, source).exp().clamp(*_EXPOSURE)
     # What is nearly white already, as a marble statue is, cannot become brighter without losing its shape.
     gain = gain.minimum((_WHITE / (own + deviation)).clamp_min(1.0))
-    # White balance g, from the logarithms of colours: the cast of the references less that of the scene, axis by axis.
+    # White balance g, from the logarithms of colours: the cast of the references less that of the scene, axis
+    # by axis.
     axes = torch.tensor(_AXES, dtype=torch.float64)
     here, there = ((part.clamp_min(0) + _BLACK).log() @ axes.T for part in (mean, codes))
     bright = odds * (luma(codes)[:, 0] / _BRIGHT).clamp(0.05, 1)
     cast = []
     for a in range(len(axes)):
         common = shared(there[:, a], bright)
-        # Where the references share nothing, what the scene shares may be its material: a plant is yellowish throughout.
+        # Where the references share nothing, what the scene shares may be its material: a plant is yellowish
+        # throughout.
         cast.append(common - shared(here[:, a], share) if common else 0.0)
     balance = (APPLIED * torch.tensor(cast, dtype=torch.float64).clamp(-_CAST, _CAST) @ axes).exp()
     # Saturation s of the references against the scene's, and S = (s I + (1 - s) L) diag(g).
     saturation = (_saturation(codes, odds) / _saturation(mean, share)).clamp(*_SATURATION)
-    saturation = (saturation * torch.lerp(torch.ones_like(source), source.new_tensor(_SKY_SATURATION), source))[:, None, None]
+    saturation = (
+        saturation * torch.lerp(torch.ones_like(source), source.new_tensor(_SKY_SATURATION), source)
+    )[:, None, None]
     towards = (saturation * torch.eye(3).to(grey) + (1 - saturation) * grey.expand(3, 3)) * balance
     # Contrast q: two deviations above the mean stay below white, with at least a third of the contrast.
-    contrast = gain.minimum(((1 - gain * own) / (2 * deviation).clamp_min(_BLACK)).clamp_min(gain.clamp_max(1) / 3))
+    contrast = gain.minimum(
+        ((1 - gain * own) / (2 * deviation).clamp_min(_BLACK)).clamp_min(gain.clamp_max(1) / 3)
+    )
     bias = torch.einsum("kc,kcd->kd", (gain - contrast)[:, None] * mean, towards)
-    # u takes green and magenta out of the middle of the lit and the painted mean, as far as these are opposite along red
-    # and blue.
+    # u takes green and magenta out of the middle of the lit and the painted mean, as far as these are
+    # opposite along red and blue.
     lit_mean = torch.einsum("kc,kcd->kd", gain[:, None] * mean, towards)
-    (red, green), (other_red, other_green) = (lit_mean @ axes.T).unbind(1), (painted @ axes.T).unbind(1)
+    (red, green) = (lit_mean @ axes.T).unbind(1)
+    (other_red, other_green) = (painted @ axes.T).unbind(1)
     opposite = (-red * other_red / red.square().maximum(other_red.square()).clamp_min(1e-12)).clamp(0, 1)
     between = (-opposite * (green + other_green) / 2)[:, None] * axes[1]
     return torch.cat([contrast[:, None, None] * towards, bias[:, None]], 1), between
@@ -327,7 +381,8 @@ def light_maps(
 
 def shared(value: Annotated[Tensor, "N"], weight: Annotated[Tensor, "N"]) -> float:
     """What four fifths of the weight have at least, with its sign; 0 where signs differ."""
-    low, high = _quantile(value, weight, 0.2), _quantile(value, weight, 0.8)
+    low = _quantile(value, weight, 0.2)
+    high = _quantile(value, weight, 0.8)
     return low if low > 0 else high if high < 0 else 0.0
 
 
@@ -340,7 +395,9 @@ def _quantile(value: Tensor, weight: Tensor, at: float) -> float:
 def _saturation(colour: Annotated[Tensor, "N 3"], weight: Annotated[Tensor, "N"]) -> Tensor:
     """Median distance of colours from grey, relative to their luma; never 0."""
     grey = luma(colour)
-    return torch.tensor(_quantile((colour - grey).abs().amax(1) / (grey[:, 0] + _BLACK), weight, 0.5) + _BLACK)
+    return torch.tensor(
+        _quantile((colour - grey).abs().amax(1) / (grey[:, 0] + _BLACK), weight, 0.5) + _BLACK
+    )
 
 
 def _spread(scene: SceneStyle) -> float:

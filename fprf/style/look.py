@@ -1,20 +1,22 @@
-"""The look of a scene in a style: features to styled features, then colours, strengths and luminance, point by point.
+"""The look of a scene in a style: features to styled features, then colours, strengths and luminance, point
+by point.
 
-Letters: N points, C content channels, D semantic channels, K regions of the scene, T style codes. Colours are sRGB in [0, 1].
-Strengths, shares and luminances lie in [0, 1]; strengths are one number or one a point.
+Letters: N points, C content channels, D semantic channels, K regions of the scene, T style codes. Colours are
+sRGB in [0, 1]. Strengths, shares and luminances lie in [0, 1]; strengths are one number or one a point.
 
-A look is one stylizer with its strengths, or a mix of several: features, strengths and luminances are mixed linearly at every
-point, so that a style fades into another without either's edges showing.
+A look is one stylizer with its strengths, or a mix of several: features, strengths and luminances are mixed
+linearly at every point, so that a style fades into another without either's edges showing.
 
-Colours behind the decoder. A decoder is not linear, and styled features lie off what it has seen: their statistics may be those
-of the references while the colours are not. So colours get a map of their own, region by region,
+Colours behind the decoder. A decoder is not linear, and styled features lie off what it has seen: their
+statistics may be those of the references while the colours are not. So colours get a map of their own, region
+by region,
 
     c'  =  c + sum_k a_k(point) ((c - m_k) A_k + n_k - c)
 
-where m_k and S_k are mean and covariance of the colours that region k has after the decoder, n_k and T_k those of pixels of the
-photographs in the codes that it matches, and A_k S_k A_k = T_k is the optimal transport of three channels. Colours after the
-decoder are those of draws from the region's Gaussian of features: a trained scene knows that and needs no images. A point's
-colour still depends on the point alone.
+where m_k and S_k are mean and covariance of the colours that region k has after the decoder, n_k and T_k
+those of pixels of the photographs in the codes that it matches, and A_k S_k A_k = T_k is the optimal
+transport of three channels. Colours after the decoder are those of draws from the region's Gaussian of
+features: a trained scene knows that and needs no images. A point's colour still depends on the point alone.
 """
 
 from dataclasses import dataclass, replace
@@ -41,21 +43,26 @@ _DRAWS = 512
 _GAIN = 3.0
 """No direction of colour is amplified more: a flat region's noise must stay unseen."""
 _QUIET = 2e-4
-"""Variance added on both sides: a deviation of four 8-bit steps, below which colours have no shape worth carrying over."""
+"""Variance added on both sides: a deviation of four 8-bit steps, below which colours have no shape worth
+carrying over.
+"""
 
 
 def keep_luminance(
     styled: Annotated[Tensor, "N 3"], own: Annotated[Tensor, "N 3"], share: float | Annotated[Tensor, "N 1"]
 ) -> Annotated[Tensor, "N 3"]:
-    """Styled colours whose luma is moved towards the scene's own by `share`: 0 changes nothing, 1 gives luma(own).
+    """Styled colours whose luma is moved towards the scene's own by `share`: 0 changes nothing, 1 gives
+    luma(own).
 
-    All in [0, 1]. A colour that would leave that range fades towards grey just as far as it must, which leaves its luma. Points
-    are treated, not pixels: luma is linear, so both would agree but for what leaves the range, and there a point's colour must
-    stay in [0, 1] (which bounds the renderer's error) and be the same from every view.
+    All in [0, 1]. A colour that would leave that range fades towards grey just as far as it must, which
+    leaves its luma. Points are treated, not pixels: luma is linear, so both would agree but for what leaves
+    the range, and there a point's colour must stay in [0, 1] (which bounds the renderer's error) and be the
+    same from every view.
     """
     before = luma(styled)
     shift = share * (luma(own) - before)
-    moved, level = styled + shift, before + shift
+    moved = styled + shift
+    level = before + shift
     # Fade the tint, the distance from the grey of the same luma, until the colour fits.
     tint = moved - level
     room = torch.where(tint > 0, 1 - level, level)
@@ -71,7 +78,8 @@ def place_weight(place: Place, points: Annotated[Tensor, "N 3"]) -> Annotated[Te
         away = torch.maximum(corners[0] - points, points - corners[1]).clamp_min(0).norm(dim=1)
     else:
         # The nearest point of each piece of the path, and of these the nearest.
-        first, along = corners[:-1], corners[1:] - corners[:-1]
+        first = corners[:-1]
+        along = corners[1:] - corners[:-1]
         local = points[:, None] - first
         share = (local * along).sum(2) / along.square().sum(1).clamp_min(torch.finfo(points.dtype).tiny)
         nearest = local - share.clamp(0, 1)[..., None] * along
@@ -91,7 +99,11 @@ class ColourMaps(nn.Module):
     bias: Annotated[Tensor, "K 3"]
 
     def __init__(
-        self, scene: SceneStyle, matrix: Annotated[Tensor, "K 3 3"], bias: Annotated[Tensor, "K 3"], share: float
+        self,
+        scene: SceneStyle,
+        matrix: Annotated[Tensor, "K 3 3"],
+        bias: Annotated[Tensor, "K 3"],
+        share: float,
     ) -> None:
         super().__init__()
         self.membership = Membership(scene.keys, scene.semantic_mean)
@@ -131,11 +143,12 @@ def colour_maps(
     share: float = 1.0,
     smoothing: Annotated[Tensor, "K K"] | None = None,
 ) -> ColourMaps | None:
-    """The maps of a stylizer whose change of features counts `features`; None where nothing is to be carried over.
+    """The maps of a stylizer whose change of features counts `features`; None where nothing is to be carried
+    over.
 
-    `share`, in [0, 1], is how much of the way colours go. Regions and codes are matched by the stylizer itself; `smoothing`
-    (`region_smoothing`) is what it smooths its matches by. A dictionary without the colours of its photographs (that of the
-    scene itself) carries nothing over.
+    `share`, in [0, 1], is how much of the way colours go. Regions and codes are matched by the stylizer
+    itself; `smoothing` (`region_smoothing`) is what it smooths its matches by. A dictionary without the
+    colours of its photographs (that of the scene itself) carries nothing over.
     """
     if share == 0 or dictionary.colour_mean is None or dictionary.colour_covariance is None:
         return None
@@ -144,7 +157,10 @@ def colour_maps(
     whole = mix(mean, covariances, scene.share)
     mean, covariances = blend_codes(mean, covariances, *whole, mean.new_full((len(mean),), dictionary.blend))
     if smoothing is not None:
-        mean, covariances = smoothing.to(mean) @ mean, torch.einsum("kl,lij->kij", smoothing.to(mean), covariances)
+        mean, covariances = (
+            smoothing.to(mean) @ mean,
+            torch.einsum("kl,lij->kij", smoothing.to(mean), covariances),
+        )
     device = next(stylizer.buffers(), scene.mean).device
     table = double(stylizer.region_match(scene.keys.to(device))).to(mean)
     return ColourMaps(scene, *carried_colours(mean, covariances, table, dictionary), share)
@@ -159,17 +175,19 @@ def region_maps(
 ) -> ColourMaps | None:
     """The maps of scenes whose content is colour (there is no decoder); None where the config asks for none.
 
-    The colours of each region are carried over to those of the codes that it takes; `allowed` as of `regional`.
+    The colours of each region are carried over to those of the codes that it takes; `allowed` as of
+    `regional`.
     """
     if config.colours <= 0:
         return None
-    # Matched with itself as with the photographs, the scene keeps its colours. Where a region may not take from all, the scene
-    # stands in the place of each, so that both sides are smoothed over the same regions.
+    # Matched with itself as with the photographs, the scene keeps its colours. Where a region may not take
+    # from all, the scene stands in the place of each, so that both sides are smoothed over the same regions.
     names = ("scene",) if bool(allowed.all()) else dictionary.names
     mine = concatenate([own_style(scene, dictionary.blend)] * len(names), names, [1.0] * len(names))
     mine = mine._replace(origin=dictionary.origin)
     table = double(regional(mine, scene, allowed, config).region_match(scene.keys))
-    mean, covariances = table @ double(mine.mean), torch.einsum("kt,tij->kij", table, double(mine.covariance))
+    mean = table @ double(mine.mean)
+    covariances = torch.einsum("kt,tij->kij", table, double(mine.covariance))
     taken = double(stylizer.region_match(scene.keys))
     return ColourMaps(scene, *carried_colours(mean, covariances, taken, dictionary), config.colours)
 
@@ -180,16 +198,19 @@ def carried_colours(
     table: Annotated[Tensor, "K T"],
     dictionary: StyleDictionary,
 ) -> tuple[Annotated[Tensor, "K 3 3"], Annotated[Tensor, "K 3"]]:
-    """A and b of each region, float64, c' = c A + b: from the colours that it has to those of the codes that it takes.
+    """A and b of each region, float64, c' = c A + b: from the colours that it has to those of the codes that
+    it takes.
 
     `table` holds the shares of the codes, and the dictionary the colours of its photographs.
     """
     assert dictionary.colour_mean is not None and dictionary.colour_covariance is not None
-    there, spread = double(dictionary.colour_mean).to(mean), double(dictionary.colour_covariance).to(mean)
+    there = double(dictionary.colour_mean).to(mean)
+    spread = double(dictionary.colour_covariance).to(mean)
     if len(mean) == 1:  # an undivided scene takes its codes together, with what lies between them
         target, wide = (part[None] for part in mix(there, spread, table[0]))
     else:
-        target, wide = table @ there, torch.einsum("kt,tij->kij", table, spread)
+        target = table @ there
+        wide = torch.einsum("kt,tij->kij", table, spread)
     floor = _QUIET * torch.eye(3).to(mean)
     matrix = monge(covariances + floor, wide + floor, gain=_GAIN)
     return matrix, target - torch.einsum("kc,kcd->kd", mean, matrix)
@@ -199,16 +220,20 @@ def carried_colours(
 def decoded_colours(
     stylizer: Stylizer, scene: SceneStyle, decoder: Decoder | None, *, features: float
 ) -> tuple[Annotated[Tensor, "K 3"], Annotated[Tensor, "K 3 3"]]:
-    """Mean and covariance of each region's colours, float64, after a share of the stylizer's change, and the decoder.
+    """Mean and covariance of each region's colours, float64, after a share of the stylizer's change, and the
+    decoder.
 
     Without a decoder they are those of the content, unchanged.
     """
     if decoder is None:
         return double(scene.region_mean), double(scene.region_covariance)
     device = next(stylizer.buffers(), scene.mean).device
-    draw = torch.randn(_DRAWS // 2, scene.mean.numel(), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    draw = torch.randn(
+        _DRAWS // 2, scene.mean.numel(), generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     draw = torch.cat([draw, -draw])  # in pairs: the features' mean is met exactly
-    means, covariances = [], []
+    means = []
+    covariances = []
     for k in range(len(scene.share)):
         # Points of the region's Gaussian of features, all with the semantics of its key.
         root = symmetric_root(double(scene.region_covariance[k])).cpu()
@@ -222,13 +247,18 @@ def decoded_colours(
 
 
 def regional(
-    dictionary: StyleDictionary, scene: SceneStyle, allowed: Annotated[Tensor, "K references"], config: "StylizerConfig"
+    dictionary: StyleDictionary,
+    scene: SceneStyle,
+    allowed: Annotated[Tensor, "K references"],
+    config: "StylizerConfig",
 ) -> Stylizer:
-    """Build the stylizer that heeds which references each region may take from; that of all of them where none is excluded.
+    """Build the stylizer that heeds which references each region may take from; that of all of them where
+    none is excluded.
 
-    A region that is pinned to a reference looks as it would if that were the only one, whatever the stylizer, and by its own
-    matching. Stylizers that are made of regions heed the choice themselves, at no cost. No other needs to know of it: each
-    choice gets a stylizer of its own, and a point takes of each as much as it belongs to its regions.
+    A region that is pinned to a reference looks as it would if that were the only one, whatever the stylizer,
+    and by its own matching. Stylizers that are made of regions heed the choice themselves, at no cost. No
+    other needs to know of it: each choice gets a stylizer of its own, and a point takes of each as much as it
+    belongs to its regions.
     """
     if bool(allowed.all()):
         return config.build(dictionary=dictionary, scene=scene)
@@ -266,7 +296,9 @@ class RegionStylizer(Stylizer):
     def needs(self) -> Want:
         return self._stylizer(0).needs if self.alone else Want.CONTENT | Want.SEMANTIC
 
-    def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
+    def forward(
+        self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
+    ) -> Annotated[Tensor, "N C"]:
         """Each point by the stylizers of its regions; the others are not called for it."""
         if self.alone:
             only: Tensor = self._stylizer(0)(content, semantic)
@@ -277,7 +309,9 @@ class RegionStylizer(Stylizer):
         # Points outside of a stylizer's regions are not computed by it.
         for p, column in enumerate(share.T.contiguous()):
             inside = column.nonzero().squeeze(1)
-            styled: Tensor = self._stylizer(p)(content.index_select(0, inside), semantic.index_select(0, inside))
+            styled: Tensor = self._stylizer(p)(
+                content.index_select(0, inside), semantic.index_select(0, inside)
+            )
             out.index_add_(0, inside, styled * column.index_select(0, inside)[:, None])
         return out
 
@@ -310,12 +344,15 @@ class Restyle:
     luminance: float = 0.0
     """Share of the scene's own luminance that is kept."""
     light: Light | None = None
-    """What points take, as far as they are not sure of their match, instead of all that the stylizer and `colours` do; None =
-    all are sure."""
+    """What points take, as far as they are not sure of their match, instead of all that the stylizer and
+    `colours` do; None = all are sure.
+    """
     share: float = 1.0
     """Its part of the mix; those of all parts sum to 1."""
     places: tuple[tuple[Place, "Restyle"], ...] = ()
-    """Stylizers and colours of places, for Gaussians alone, each over those before it; of these no other field counts."""
+    """Stylizers and colours of places, for Gaussians alone, each over those before it; of these no other
+    field counts.
+    """
     others: tuple["Restyle", ...] = ()
     """The other parts of the mix, which have none themselves."""
 
@@ -363,9 +400,10 @@ class Restyle:
     ) -> Annotated[Tensor, "N 3"]:
         """Colours of points in this look, in [0, 1]."""
         parts = [part for part in self.parts if part.share > 0]
-        # Features: each part's stylizer, by its strength and by how sure points are of their match. Membership, once known to
-        # the stylizer (`belongs`), serves regions, colours and light.
-        styled, active = [], []
+        # Features: each part's stylizer, by its strength and by how sure points are of their match.
+        # Membership, once known to the stylizer (`belongs`), serves regions, colours and light.
+        styled = []
+        active = []
         for part in parts:
             if part.strength == 0:
                 styled.append(content)
@@ -376,21 +414,27 @@ class Restyle:
                 # Without semantics there is one region, and nothing to look up.
                 weight: Tensor = part.regions(content[:, :0] if semantic is None else semantic, belongs)
                 strength = strength * weight
-            painted, paint = strength, None
+            painted = strength
+            paint = None
             if part.light is not None:
                 assert semantic is not None, "Want.SEMANTIC was asked for"
                 paint = part.light.paint(semantic, belongs)
                 painted = strength * paint.to(content)
             # At 0 the scene's own features, at 1 the styled ones, both bit for bit.
             share = part.features * painted
-            styled.append(torch.lerp(content, moved, share.to(content) if isinstance(share, Tensor) else share))
+            styled.append(
+                torch.lerp(content, moved, share.to(content) if isinstance(share, Tensor) else share)
+            )
             active.append((part, belongs, strength, painted, paint))
         # Mix the parts by their shares; one alone is left as it is, bit for bit.
-        mixed, luminance = styled[0], parts[0].luminance
+        mixed = styled[0]
+        luminance = parts[0].luminance
         if len(parts) > 1:
-            mixed, luminance = torch.zeros_like(mixed), 0.0
+            mixed = torch.zeros_like(mixed)
+            luminance = 0.0
             for part, features in zip(parts, styled, strict=True):
-                mixed, luminance = mixed + part.share * features, luminance + part.share * part.luminance
+                mixed = mixed + part.share * features
+                luminance = luminance + part.share * part.luminance
         colour: Tensor = decoder(mixed)
         lit = any(paint is not None for *_, paint in active)
         own = decoder(content) if luminance > 0 or lit else colour
@@ -408,10 +452,11 @@ class Restyle:
     def match(
         self, semantic: Annotated[Tensor, "N D"], points: Annotated[Tensor, "N 3"] | None = None
     ) -> Annotated[Tensor, "N T"]:
-        """Share that each point takes of each style code, those of all parts one after the other; rows sum to 1 at most.
+        """Share that each point takes of each style code, those of all parts one after the other; rows sum to
+        1 at most.
 
-        What is missing to 1 is what regions keep; the overall strength does not count. Without `points` (world units) neither
-        do places.
+        What is missing to 1 is what regions keep; the overall strength does not count. Without `points`
+        (world units) neither do places.
         """
         # A place lies over what is below it; what regions keep is taken from all alike.
         taken = []
@@ -419,7 +464,9 @@ class Restyle:
             own = part.stylizer.match(semantic)
             if points is not None:
                 for place, other in part.places:
-                    own = torch.lerp(own, other.stylizer.match(semantic), place_weight(place, points)[:, None])
+                    own = torch.lerp(
+                        own, other.stylizer.match(semantic), place_weight(place, points)[:, None]
+                    )
             taken.append(part.share * (own if part.regions is None else own * part.regions(semantic)))
         return torch.cat(taken, 1)
 

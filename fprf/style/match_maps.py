@@ -1,7 +1,8 @@
-"""Matches before any colour is rendered: references and style codes that each pixel takes, and a list of a scene's regions.
+"""Matches before any colour is rendered: references and style codes that each pixel takes, and a list of a
+scene's regions.
 
-The list shows where each region is seen best, how large it is, and what it takes from the references. Letters: H x W pixels of
-a view, T style codes, K regions.
+The list shows where each region is seen best, how large it is, and what it takes from the references.
+Letters: H x W pixels of a view, T style codes, K regions.
 """
 
 import math
@@ -25,7 +26,8 @@ _LISTED = 0.005
 """Codes that less than this share of a view takes are not listed."""
 _VIEWS = 24
 """Views that are looked through for where each region is largest, evenly over all."""
-_COARSE, _FINE = 32, 160
+_COARSE = 32
+_FINE = 160
 """Longest side of the views that are looked through, and of the thumbnails."""
 
 
@@ -39,7 +41,9 @@ class MatchMap(NamedTuple):
     region: Annotated[Tensor, "H W K"]
     """Share of each region of the scene."""
     confidence: Annotated[Tensor, "H W"]
-    """How sure what lies there is of its match, in [0, 1]: what is not takes light alone. 1 where all is painted."""
+    """How sure what lies there is of its match, in [0, 1]: what is not takes light alone. 1 where all is
+    painted.
+    """
     opacity: Annotated[Tensor, "H W"]
 
     @property
@@ -61,11 +65,17 @@ class MatchMap(NamedTuple):
 
 @torch.inference_mode()
 def match_map(scene: Scene, styled: Styled, view: int, cameras: Cameras | None = None) -> MatchMap:
-    """Matches of one of the scene's scene_style views, or of `cameras`: geometry and semantics alone are computed."""
-    cameras, scene_style, look = scene.cameras if cameras is None else cameras, styled.scene_style, styled.restyle
+    """Matches of one of the scene's scene_style views, or of `cameras`: geometry and semantics alone are
+    computed.
+    """
+    cameras = scene.cameras if cameras is None else cameras
+    scene_style = styled.scene_style
+    look = styled.restyle
     device = scene.device
     belongs = Membership(scene_style.keys, scene_style.semantic_mean).to(device)
-    centre, units, codes = scene_style.semantic_mean.to(device), styled.codes.units.to(device), len(styled.codes.reference)
+    centre = scene_style.semantic_mean.to(device)
+    units = styled.codes.units.to(device)
+    codes = len(styled.codes.reference)
 
     def values(semantic: Tensor, points: Tensor | None) -> Tensor:
         # The score is weighted by what is taken, so that its composite is the mean over that.
@@ -82,7 +92,8 @@ def match_map(scene: Scene, styled: Styled, view: int, cameras: Cameras | None =
     shares = shares.view(height, width, -1)
     taken = shares[..., :codes]
     score = shares[..., codes] / taken.sum(-1).clamp_min(1e-10)
-    confidence, region = shares[..., codes + 1].clamp(0, 1), shares[..., codes + 2 :]
+    confidence = shares[..., codes + 1].clamp(0, 1)
+    region = shares[..., codes + 2 :]
     return MatchMap(taken, score.clamp(-1, 1), region, confidence, opacity.view(height, width))
 
 
@@ -103,26 +114,40 @@ def match_pictures(matched: MatchMap, codes: Codes) -> dict[str, Picture]:
 
 
 def summarize(matched: MatchMap, codes: Codes) -> dict[str, Any]:
-    """Use of the references and their codes, and its certainty, over the pixels of a view by their opacity."""
+    """Use of the references and their codes, and its certainty, over the pixels of a view by their
+    opacity.
+    """
     # Pixels count by their opacity; certainty is that of what is styled at all.
-    each, kept = matched.opacity.double(), matched.kept
+    each = matched.opacity.double()
+    kept = matched.kept
     total = float(each.sum()) or 1.0
     weight = each * (1 - kept)
     styled = float(weight.sum()) or 1.0
-    of_code, of_region = weighted_sum(matched.taken, each) / total, weighted_sum(matched.region, each) / total
+    of_code = weighted_sum(matched.taken, each) / total
+    of_region = weighted_sum(matched.region, each) / total
     # Codes are numbered within their reference, and listed from the most used on.
     listed = []
     for t in of_code.argsort(descending=True).tolist():
         if float(of_code[t]) >= _LISTED:
             cluster = int((codes.reference[:t] == codes.reference[t]).sum())
-            listed.append({"reference": codes.names[int(codes.reference[t])], "cluster": cluster, "share": float(of_code[t])})
+            listed.append(
+                {
+                    "reference": codes.names[int(codes.reference[t])],
+                    "cluster": cluster,
+                    "share": float(of_code[t]),
+                }
+            )
     return {
         **match_summary(matched.attention, codes.reference, codes.names, weight),
         "score": float((matched.score * weight).sum()) / styled,
         "confidence": float((matched.confidence * weight).sum()) / styled,
         "kept_share": float((kept * each).sum()) / total,
         "codes": listed,
-        "regions": [{"region": k, "share": float(share)} for k, share in enumerate(of_region) if float(share) >= _LISTED],
+        "regions": [
+            {"region": k, "share": float(share)}
+            for k, share in enumerate(of_region)
+            if float(share) >= _LISTED
+        ],
     }
 
 
@@ -163,7 +188,8 @@ class ExplainedRegion(NamedTuple):
 @torch.inference_mode()
 def explain(regions: Regions, styled: Styled | None = None) -> list[ExplainedRegion]:
     """All regions in their order, with what they take where there is a style."""
-    scene, style = regions.scene, regions.scene_style
+    scene = regions.scene
+    style = regions.scene_style
     # Views evenly over all are looked through, coarsely, for where each region is largest.
     looked = sorted({round(i * (len(scene.names) - 1) / max(1, _VIEWS - 1)) for i in range(_VIEWS)})
     mass = []
@@ -179,21 +205,34 @@ def explain(regions: Regions, styled: Styled | None = None) -> list[ExplainedReg
         seen[view] = picture, share * opacity[..., None]
     rows = []
     for k, view in enumerate(best):
-        picture, share = seen[view][0], seen[view][1][..., k]
-        # Blurred membership is highest in the middle; a pixel that belongs to the region itself comes before one beside it.
-        own, reach = share.cpu().numpy(), 2 * (max(share.shape) // 12) + 1
+        picture = seen[view][0]
+        share = seen[view][1][..., k]
+        # Blurred membership is highest in the middle; a pixel that belongs to the region itself comes before
+        # one beside it.
+        own = share.cpu().numpy()
+        reach = 2 * (max(share.shape) // 12) + 1
         smooth = cv2.blur(own, (reach, reach), borderType=cv2.BORDER_CONSTANT)
         y, x = np.unravel_index(int(np.argmax(smooth * (own > 0.5) + 1e-3 * smooth)), smooth.shape)
-        (width, height), (tall, wide) = scene.cameras.size[view].tolist(), share.shape
+        (width, height) = scene.cameras.size[view].tolist()
+        (tall, wide) = share.shape
         pixel = int((x + 0.5) * width / wide), int((y + 0.5) * height / tall)
-        rows.append(ExplainedRegion(k, float(style.share[k]), scene.names[view], pixel, highlight(picture, share)))
+        rows.append(
+            ExplainedRegion(k, float(style.share[k]), scene.names[view], pixel, highlight(picture, share))
+        )
     if styled is None:
         return rows
-    keys, reference, controls = style.keys.to(scene.device), styled.dictionary.reference, styled.controls
-    attention, sure = styled.restyle.stylizer.match(keys).cpu().double(), styled.restyle.confidence(keys).cpu()
+    keys = style.keys.to(scene.device)
+    reference = styled.dictionary.reference
+    controls = styled.controls
+    attention = styled.restyle.stylizer.match(keys).cpu().double()
+    sure = styled.restyle.confidence(keys).cpu()
     for k, row in enumerate(rows):
         taken = [
-            ReferenceShare(name, float(attention[k][reference == i].sum()), float(controls.score[k][reference == i].max()))
+            ReferenceShare(
+                name,
+                float(attention[k][reference == i].sum()),
+                float(controls.score[k][reference == i].max()),
+            )
             for i, name in enumerate(styled.dictionary.names)
         ]
         rows[k] = row._replace(
@@ -208,7 +247,12 @@ def explain(regions: Regions, styled: Styled | None = None) -> list[ExplainedReg
 
 def region_row(region: ExplainedRegion) -> dict[str, Any]:
     """A region for JSON."""
-    row: dict[str, Any] = {"region": region.number, "share": region.share, "view": region.view, "pixel": list(region.pixel)}
+    row: dict[str, Any] = {
+        "region": region.number,
+        "share": region.share,
+        "view": region.view,
+        "pixel": list(region.pixel),
+    }
     if region.taken:
         row |= {
             "references": [taken._asdict() for taken in region.taken],
@@ -222,7 +266,10 @@ def region_row(region: ExplainedRegion) -> dict[str, Any]:
 
 def region_tile(region: ExplainedRegion, names: tuple[str, ...]) -> Tile:
     """A region for a sheet; `names` are the references in the order of their colours."""
-    lines = [f"{region.number}: {region.share:.1%} of the scene", f"{region.view}:{region.pixel[0]},{region.pixel[1]}"]
+    lines = [
+        f"{region.number}: {region.share:.1%} of the scene",
+        f"{region.view}:{region.pixel[0]},{region.pixel[1]}",
+    ]
     if not region.taken:
         return Tile(region.picture, tuple(lines))
     best = region.taken[0]

@@ -1,7 +1,9 @@
-"""What a style asks of single regions of a scene: which regions its texts mean, and what each of them may take.
+"""What a style asks of single regions of a scene: which regions its texts mean, and what each of them may
+take.
 
-Letters: K regions of the scene, T style codes. A region is named by its number, by its name in a style file, by a pixel of a
-view (`VIEW:X,Y`) or by a mask over one (`VIEW:MASK.png`); the grammar is that of `style.config`.
+Letters: K regions of the scene, T style codes. A region is named by its number, by its name in a style file,
+by a pixel of a view (`VIEW:X,Y`) or by a mask over one (`VIEW:MASK.png`); the grammar is that of
+`style.config`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +21,16 @@ from ..datamanagers.images import load_mask
 from ..errors import UsageError
 from ..interfaces import Scene
 from ..rendering.cameras import Cameras, pixel_grid
-from .config import Place, StyleConfig, find_reference, labels, parse_pixel, parse_place, parse_region_value, parse_strength
+from .config import (
+    Place,
+    StyleConfig,
+    find_reference,
+    labels,
+    parse_pixel,
+    parse_place,
+    parse_region_value,
+    parse_strength,
+)
 from .dictionary import StyleDictionary
 from .files import RegionKey, StyleFile
 from .matching import scores, unit
@@ -28,8 +39,9 @@ from .scene_style import Membership, SceneStyle
 ALIKE = 0.5
 """Least cosine of a region with a key from elsewhere: below, the scene has no such region.
 
-Between the embedded towns in all lights and a photographed street, right matches lay from 0.53 to 0.98 (bundled semantic
-encoder, 8 regions a scene); of the regions of scenes with nothing in common 9 in 10 lay below.
+Between the embedded towns in all lights and a photographed street, right matches lay from 0.53 to 0.98
+(bundled semantic encoder, 8 regions a scene); of the regions of scenes with nothing in common 9 in 10 lay
+below.
 """
 
 _SIDE = 128
@@ -68,18 +80,22 @@ class RegionMatch(NamedTuple):
 
 
 def key_of(regions: Regions, number: int) -> RegionKey:
-    """The semantics of a region in the encoder's own channels, to six digits: what it can be found by on another scene."""
+    """The semantics of a region in the encoder's own channels, to six digits: what it can be found by on
+    another scene.
+    """
     if regions.basis is None:
         return ()
     return tuple(float(f"{x:.6g}") for x in regions.basis.lift(regions.scene_style.keys[number]).tolist())
 
 
 def find_regions(regions: Regions, text: str) -> list[RegionMatch]:
-    """Find the regions that a text means: one, those that a mask covers, or those like a region of the style file, if any are.
+    """Find the regions that a text means: one, those that a mask covers, or those like a region of the style
+    file, if any are.
 
     Raises UsageError for what names nothing on this scene, DataError for an unreadable mask.
     """
-    count, names = len(regions.scene_style.share), regions.scene.names
+    count = len(regions.scene_style.share)
+    names = regions.scene.names
     if text.isascii() and text.isdigit():
         if int(text) >= count:
             raise UsageError(f"region {text}: regions go from 0 to {count - 1}; --explain lists them")
@@ -101,29 +117,38 @@ def find_regions(regions: Regions, text: str) -> list[RegionMatch]:
         x, y = pixel
         width, height = regions.scene.cameras.size[view].tolist()
         if not (0 <= x < width and 0 <= y < height):
-            raise UsageError(f"{text}: outside of the view; x goes from 0 to {width - 1}, y from 0 to {height - 1}")
+            raise UsageError(
+                f"{text}: outside of the view; x goes from 0 to {width - 1}, y from 0 to {height - 1}"
+            )
         centre = torch.tensor([[int(x) + 0.5, int(y) + 0.5]], dtype=torch.float64)
         share, opacity = memberships(regions.scene, regions.scene_style, regions.scene.cameras, view, centre)
         if float(opacity[0]) < _SOLID:
             raise UsageError(f"{text}: there is nothing at that pixel; choose another")
         found = {int(share[0].argmax())}
     else:
-        # Regions of which the mask covers more than half of what the view shows, and the one that fills most of the mask: by
-        # their mass in the view and under the mask, on a small copy of both.
+        # Regions of which the mask covers more than half of what the view shows, and the one that fills most
+        # of the mask: by their mass in the view and under the mask, on a small copy of both.
         share, opacity = membership_view(regions, view, _SIDE)
         painted = load_mask(Path(rest), upright=True).astype(np.float32)
-        white = torch.from_numpy(np.asarray(cv2.resize(painted, opacity.shape[::-1], interpolation=cv2.INTER_AREA)))
+        white = torch.from_numpy(
+            np.asarray(cv2.resize(painted, opacity.shape[::-1], interpolation=cv2.INTER_AREA))
+        )
         mass = (share * opacity[..., None]).flatten(0, 1)
-        inside, total = white.flatten() @ mass, mass.sum(0)
+        inside = white.flatten() @ mass
+        total = mass.sum(0)
         if float(inside.sum()) < _SOLID:
-            raise UsageError(f"{rest}: the mask selects nothing of view {names[view]}; paint white what counts")
+            raise UsageError(
+                f"{rest}: the mask selects nothing of view {names[view]}; paint white what counts"
+            )
         mostly = (inside / total.clamp_min(1e-10) > 0.5) & (inside >= 1)
         found = {int(inside.argmax()), *mostly.nonzero().flatten().tolist()}
     return [RegionMatch(k, str(k)) for k in sorted(found)]
 
 
 def _alike(regions: Regions, name: str) -> list[RegionMatch]:
-    """Find the regions that, of all that the style file knows, are most like the one of that name, and really like it."""
+    """Find the regions that, of all that the style file knows, are most like the one of that name, and really
+    like it.
+    """
     style = regions.scene_style
     if regions.basis is None or not regions.keys_fit:
         raise UsageError(
@@ -143,13 +168,21 @@ def _alike(regions: Regions, name: str) -> list[RegionMatch]:
 def memberships(
     scene: Scene, style: SceneStyle, cameras: Cameras, view: int, pixel: Annotated[Tensor, "N 2"]
 ) -> tuple[Annotated[Tensor, "N K"], Annotated[Tensor, "N"]]:
-    """Share of what pixels (centres) see that belongs to each region of a scene's style, and their opacity."""
+    """Share of what pixels (centres) see that belongs to each region of a scene's style, and their
+    opacity.
+    """
     belongs = Membership(style.keys, style.semantic_mean).to(scene.device)
-    return scene.paint(cameras, view, pixel, lambda features, points: belongs(features), semantic=belongs.divided)
+    return scene.paint(
+        cameras, view, pixel, lambda features, points: belongs(features), semantic=belongs.divided
+    )
 
 
-def membership_view(regions: Regions, view: int, size: int) -> tuple[Annotated[Tensor, "H W K"], Annotated[Tensor, "H W"]]:
-    """Share of each pixel that belongs to each region, and its opacity, with the longest side at most `size` pixels."""
+def membership_view(
+    regions: Regions, view: int, size: int
+) -> tuple[Annotated[Tensor, "H W K"], Annotated[Tensor, "H W"]]:
+    """Share of each pixel that belongs to each region, and its opacity, with the longest side at most `size`
+    pixels.
+    """
     cameras = shrunk(regions.scene.cameras, view, size)
     share, opacity = memberships(regions.scene, regions.scene_style, cameras, 0, pixel_grid(cameras, 0))
     width, height = (int(v) for v in cameras.size[0])
@@ -170,7 +203,9 @@ class RegionControls(NamedTuple):
     strength: Annotated[Tensor, "K"]
     """Strength of the style; 0 = kept."""
     score: Annotated[Tensor, "K T"]
-    """Cosine of the region with each style code, both from the scene's mean, in [-1, 1]; 0 without semantics."""
+    """Cosine of the region with each style code, both from the scene's mean, in [-1, 1]; 0 without
+    semantics.
+    """
     saved: StyleFile
     """The style with every region named in terms that hold on other scenes."""
     regions: Regions
@@ -181,7 +216,9 @@ class RegionControls(NamedTuple):
 
 
 def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleConfig) -> RegionControls:
-    """Find every region and reference that the style names. Raises UsageError for those that are not there, or contradict."""
+    """Find every region and reference that the style names. Raises UsageError for those that are not there,
+    or contradict.
+    """
     names = _StyleNames(regions, dictionary, style.references)
     # What the style asks for, in numbers of regions and references. Pins of places are kept apart.
     pin_texts = [parse_region_value("pin", text) for text in style.pin]
@@ -191,7 +228,8 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
     kept = [match for text in style.keep for match in names.find(text)]
     parsed = [parse_strength("region_strength", text) for text in style.region_strength]
     strengths = [(match, value) for text, value in parsed for match in names.find(text)]
-    # A pinned region takes from the references that it is pinned to alone, every other one from all that are not forbidden.
+    # A pinned region takes from the references that it is pinned to alone, every other one from all that are
+    # not forbidden.
     allowed = torch.ones(len(regions.scene_style.share), len(dictionary.names), dtype=torch.bool)
     pinned = {match.number for match, _ in pins}
     allowed[sorted(pinned)] = False
@@ -203,10 +241,12 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
         raise UsageError(f"region {k}: every reference is forbidden; allow one, or keep the region as it is")
     for match in kept:
         if match.number in pinned or match.number in {f.number for f, _ in strengths}:
-            raise UsageError(f"region {match.name}: is to be kept, and to be pinned or restyled in part; leave out one of both")
-    # Scores say whether the references show such a thing at all, so both sides are seen from the scene's mean. Matching, which
-    # only has to choose, centres each side on its own: there a rose's petals are as far from its leaves as the sky from the
-    # road, and something would always fit.
+            raise UsageError(
+                f"region {match.name}: is to be kept, and to be pinned or restyled in part; leave out one of both"
+            )
+    # Scores say whether the references show such a thing at all, so both sides are seen from the scene's
+    # mean. Matching, which only has to choose, centres each side on its own: there a rose's petals are as far
+    # from its leaves as the sky from the road, and something would always fit.
     centre = regions.scene_style.semantic_mean
     score = scores(unit(regions.scene_style.keys, centre), unit(dictionary.keys, centre))
     strength = torch.ones(len(allowed))
@@ -218,7 +258,11 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
         poor = (best < style.keep_below).nonzero().flatten().tolist()
         strength[[k for k in poor if k not in pinned]] = 0.0
         if poor and not bool(strength.any()):
-            scored = "a scene of one region has no scores" if len(score) == 1 else f"the best score is {float(best.max()):.2f}"
+            scored = (
+                "a scene of one region has no scores"
+                if len(score) == 1
+                else f"the best score is {float(best.max()):.2f}"
+            )
             names.notes.append(f"keep_below {style.keep_below:g}: every region stays as it is; {scored}")
     # Places: what regions may take of these references; all of them where that is none.
     references_of: dict[str, set[int]] = {}
@@ -236,25 +280,39 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
         style,
         pin=(
             *(f"{names.region(f)}={names.reference(i)}" for f, i in pins),
-            *(f"{text}={names.reference(i)}" for text, chosen in references_of.items() for i in sorted(chosen)),
+            *(
+                f"{text}={names.reference(i)}"
+                for text, chosen in references_of.items()
+                for i in sorted(chosen)
+            ),
         ),
         forbid=tuple(f"{names.region(f)}={names.reference(i)}" for f, i in bans),
         keep=tuple(names.region(f) for f in kept),
         region_strength=tuple(f"{names.region(f)}={value:g}" for f, value in strengths),
     )
     file = StyleFile(saved, names.keys, regions.scene.semantic_encoder)
-    return RegionControls(allowed, strength, score, file, regions, tuple(dict.fromkeys(names.notes)), tuple(places))
+    return RegionControls(
+        allowed, strength, score, file, regions, tuple(dict.fromkeys(names.notes)), tuple(places)
+    )
 
 
 class _StyleNames:
-    """Finds regions and references by what a style calls them, and collects the keys and notes that belong to them."""
+    """Finds regions and references by what a style calls them, and collects the keys and notes that belong to
+    them.
+    """
 
     def __init__(self, regions: Regions, dictionary: StyleDictionary, references: Sequence[Path]) -> None:
-        self.regions, self.references = regions, references
+        self.regions = regions
+        self.references = references
         self.labels = labels(references)
         self.order = [dictionary.names.index(label) for label in self.labels]
-        # All regions, not only those that are named: on another scene each must find its like among all of them.
-        every = {f"region{k}": key_of(regions, k) for k in range(len(regions.scene_style.share)) if regions.basis is not None}
+        # All regions, not only those that are named: on another scene each must find its like among all of
+        # them.
+        every = {
+            f"region{k}": key_of(regions, k)
+            for k in range(len(regions.scene_style.share))
+            if regions.basis is not None
+        }
         self.keys = dict(regions.keys) if regions.keys_fit else every
         self.notes: list[str] = []
 
@@ -262,15 +320,23 @@ class _StyleNames:
         """Find the regions that a text means, and note what is not obvious about them."""
         matches = find_regions(self.regions, text)
         if not matches:
-            self.notes.append(f"region {text!r} of the style: no region here is most like it, so it is left out")
+            self.notes.append(
+                f"region {text!r} of the style: no region here is most like it, so it is left out"
+            )
         for each in matches:
             if each.name in self.regions.keys:
-                self.notes.append(f"region {text!r} of the style is region {each.number} here (cosine {each.alike:.2f})")
+                self.notes.append(
+                    f"region {text!r} of the style is region {each.number} here (cosine {each.alike:.2f})"
+                )
         return matches
 
     def find_pairs(self, texts: Sequence[tuple[str, str]]) -> list[tuple[RegionMatch, int]]:
         """Find regions and references of REGION=REFERENCE; a mask may mean several regions."""
-        return [(match, find_reference(value, self.references)) for region, value in texts for match in self.find(region)]
+        return [
+            (match, find_reference(value, self.references))
+            for region, value in texts
+            for match in self.find(region)
+        ]
 
     def reference(self, number: int) -> str:
         """A reference as a style file names it, wherever its photographs are moved to."""
@@ -281,7 +347,8 @@ class _StyleNames:
         """Name of a region in a style file, which holds its key under that name."""
         if region.name in self.regions.keys or not self.keys:
             return region.name
-        key, name = key_of(self.regions, region.number), f"region{region.number}"
+        key = key_of(self.regions, region.number)
+        name = f"region{region.number}"
         same_key = [other for other, its in self.keys.items() if its == key]
         if same_key:
             return same_key[0]

@@ -1,4 +1,6 @@
-"""References to a style on a scene: the feed-forward step, a second or less a photograph, and what holds for single regions."""
+"""References to a style on a scene: the feed-forward step, a second or less a photograph, and what holds for
+single regions.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -22,7 +24,9 @@ from .scene_style import RegionWeight, SceneStyle
 
 
 class Codes(NamedTuple):
-    """The style codes that points can take, of one style or of two that are mixed: what match maps speak of."""
+    """The style codes that points can take, of one style or of two that are mixed: what match maps speak
+    of.
+    """
 
     reference: Annotated[Tensor, "T"]
     names: tuple[str, ...]
@@ -48,23 +52,29 @@ def apply_style(
     trail: tuple[Path, ...] = (),
     encoded: dict[tuple[Path, Path], Reference] | None = None,
 ) -> Styled:
-    """Build the dictionary of a style's references and its stylizer on the scene; mix in the style that it goes towards.
+    """Build the dictionary of a style's references and its stylizer on the scene; mix in the style that it
+    goes towards.
 
-    `trail` are the style files that led here. `encoded` keeps photographs with their masks for further styles. Raises
-    UsageError for no references and for regions that the scene does not have, DataError for unreadable photographs,
-    WeightsError where the encoders are not the scene's.
+    `trail` are the style files that led here. `encoded` keeps photographs with their masks for further
+    styles. Raises UsageError for no references and for regions that the scene does not have, DataError for
+    unreadable photographs, WeightsError where the encoders are not the scene's.
     """
     style = with_folders(file.style)
     if not style.references:
-        raise UsageError("--references: at least one photograph is needed, for example --references autumn.jpg night.jpg")
+        raise UsageError(
+            "--references: at least one photograph is needed, for example --references autumn.jpg night.jpg"
+        )
     # Photographs are encoded once, whatever name, weight or style they are used under.
     encoders = scene.encoders() if encoders is None else encoders
     encoded = {} if encoded is None else encoded
     references = []
     for i, (path, name) in enumerate(zip(style.references, labels(style.references), strict=True)):
-        mask, weight = style.masks[i] if style.masks else NO_MASK, style.weights[i] if style.weights else 1.0
+        mask = style.masks[i] if style.masks else NO_MASK
+        weight = style.weights[i] if style.weights else 1.0
         if (path, mask) not in encoded:
-            encoded[path, mask] = encode_photograph(path, encoders, name=name, mask=None if mask == NO_MASK else mask)
+            encoded[path, mask] = encode_photograph(
+                path, encoders, name=name, mask=None if mask == NO_MASK else mask
+            )
         references.append(encoded[path, mask]._replace(name=name, weight=weight))
     dictionary = build_dictionary(references, clusters=style.clusters, blend=style.blend, seed=encoders.seed)
     styled = apply_dictionary(scene, file._replace(style=style), encoders, dictionary)
@@ -80,26 +90,40 @@ def apply_style(
 
 
 @torch.inference_mode()
-def apply_dictionary(scene: Scene, file: StyleFile, encoders: Encoders, dictionary: StyleDictionary) -> Styled:
+def apply_dictionary(
+    scene: Scene, file: StyleFile, encoders: Encoders, dictionary: StyleDictionary
+) -> Styled:
     """Build the look of a style whose dictionary is built already. `between` is not heeded.
 
-    The dictionary's names are the labels of the style's references. Raises UsageError for regions that the scene does not have.
+    The dictionary's names are the labels of the style's references. Raises UsageError for regions that the
+    scene does not have.
     """
-    style, scene_style, basis = file.style, encoders.scene_style, encoders.basis
+    style = file.style
+    scene_style = encoders.scene_style
+    basis = encoders.basis
     # Cosines that are not centred start from the encoder's zero, which the basis knows.
     if basis is not None:
         dictionary = dictionary._replace(origin=basis.origin().to(dictionary.keys))
-    controls = region_controls(Regions(scene, scene_style, basis, file.regions, file.semantic_encoder), dictionary, style)
+    controls = region_controls(
+        Regions(scene, scene_style, basis, file.regions, file.semantic_encoder), dictionary, style
+    )
     if controls.places and scene.decoder is not None:
-        raise UsageError("--pin: places are for Gaussians; for a run of fields pin regions, such as --pin 3=autumn.jpg")
-    config, device = style.stylizer, scene.device
+        raise UsageError(
+            "--pin: places are for Gaussians; for a run of fields pin regions, such as --pin 3=autumn.jpg"
+        )
+    config = style.stylizer
+    device = scene.device
     partly = bool((controls.strength != 1).any())
     weight = RegionWeight(scene_style, controls.strength[:, None]).to(device) if partly else None
 
     def look(allowed: Annotated[Tensor, "K references"]) -> Restyle:
-        """The look of one choice of references: stylizer, colours behind the decoder, and light where matches are not sure."""
+        """The look of one choice of references: stylizer, colours behind the decoder, and light where matches
+        are not sure.
+        """
         stylizer = regional(dictionary, scene_style, allowed, config)
-        check_stylizer(config, stylizer, dictionary, scene_style, affine=scene.decoder is None and config.colours <= 0)
+        check_stylizer(
+            config, stylizer, dictionary, scene_style, affine=scene.decoder is None and config.colours <= 0
+        )
         stylizer = stylizer.to(device)
         if scene.decoder is None:
             colours = region_maps(stylizer, dictionary, scene_style, config, allowed)
@@ -116,7 +140,9 @@ def apply_dictionary(scene: Scene, file: StyleFile, encoders: Encoders, dictiona
         light = None
         if config.light and style.bold < 1:
             colours_before = decoded_colours(stylizer, scene_style, scene.decoder, features=0.0)
-            light = light_of(scene_style, dictionary, config, colours_before, bold=style.bold, allowed=allowed)
+            light = light_of(
+                scene_style, dictionary, config, colours_before, bold=style.bold, allowed=allowed
+            )
         return Restyle(
             stylizer,
             strength=style.strength,
@@ -161,7 +187,8 @@ def keyed_looks(scene: Scene, keys: Sequence[Keyframe]) -> Callable[[int], Resty
 
     def look(at: int) -> Restyle | None:
         before, after, way = fade(frames, at)
-        first, second = looks[keys[before].style], looks[keys[after].style]
+        first = looks[keys[before].style]
+        second = looks[keys[after].style]
         if way == 0 or second is first:
             return first
         if first is None:

@@ -1,7 +1,8 @@
-"""Style of a trained scene: one set of content statistics, its semantic regions, and which points belong to them.
+"""Style of a trained scene: one set of content statistics, its semantic regions, and which points belong to
+them.
 
-Letters: N points, C content channels, D semantic channels, K regions, P pairs of neighbouring pixels. Statistics are sums in
-float64 and kept in float32; memberships are in [0, 1], and those of a point sum to 1.
+Letters: N points, C content channels, D semantic channels, K regions, P pairs of neighbouring pixels.
+Statistics are sums in float64 and kept in float32; memberships are in [0, 1], and those of a point sum to 1.
 """
 
 from collections.abc import Mapping
@@ -18,15 +19,19 @@ from .statistics import Moments, covariance, group_moments, kmeans
 from .statistics import moments as moments_of
 
 _SOFTNESS = 0.3
-"""Temperature of points belonging to regions, relative to the spread of the scores: fixed with the scene, since the
-regions' statistics are taken with it."""
+"""Temperature of points belonging to regions, relative to the spread of the scores: fixed with the scene,
+since the regions' statistics are taken with it.
+"""
 
 _FAINT = 0.01
-"""Memberships below this share of the largest are dropped: a point then belongs to two or three regions and the others
-cost nothing. What jumps there is below an 8-bit step."""
+"""Memberships below this share of the largest are dropped: a point then belongs to two or three regions and
+the others cost nothing. What jumps there is below an 8-bit step.
+"""
 
 _ALIKE = 0.05
-"""Difference of colours in [0, 1] at which two neighbouring pixels count 0.6 as one surface; at three times that, 0.01."""
+"""Difference of colours in [0, 1] at which two neighbouring pixels count 0.6 as one surface; at three times
+that, 0.01.
+"""
 
 
 class SceneStyle(NamedTuple):
@@ -47,7 +52,9 @@ class SceneStyle(NamedTuple):
     semantic_mean: Annotated[Tensor, "D"]
     """Mean semantic feature of the scene: the centre for cosine matching."""
     contacts: Annotated[Tensor, "K K"]
-    """Contact of each two regions without an edge of colour between them (`region_contacts`); 0 where not measured."""
+    """Contact of each two regions without an edge of colour between them (`region_contacts`); 0 where not
+    measured.
+    """
 
 
 def scene_style(
@@ -60,24 +67,26 @@ def scene_style(
 ) -> SceneStyle:
     """The scene's style from weighted points, float32.
 
-    Regions are k-means clusters of the semantics; their statistics are taken over the same soft `Membership` by which the
-    region stylizers assign points. Contacts are left at 0. Its tables, a few kB, are on the CPU, where stylizers are built,
-    whatever the device of the points. `moments` are those of the whole scene, where a longer pass has them already. Raises
-    DataError for no weight, NumericsError for values that are not finite.
+    Regions are k-means clusters of the semantics; their statistics are taken over the same soft `Membership`
+    by which the region stylizers assign points. Contacts are left at 0. Its tables, a few kB, are on the CPU,
+    where stylizers are built, whatever the device of the points. `moments` are those of the whole scene,
+    where a longer pass has them already. Raises DataError for no weight, NumericsError for values that are
+    not finite.
     """
     if not bool(weights.any()):
         raise DataError("scene statistics: no point has weight; the scene renders empty, train it for longer")
     whole = moments_of(content, weights) if moments is None else moments
     # Points that render nothing say nothing, whatever they hold.
     keep = weights > 0
-    content, weights = content[keep], weights[keep]
+    content = content[keep]
+    weights = weights[keep]
     semantic = content.new_zeros(len(content), 0) if semantic is None else semantic[keep]
     keys = semantic.new_zeros(1, 0)
     if semantic.shape[1] > 0:
         keys = kmeans(semantic, regions, seed=seed, weights=weights).centres
     middle = (double(weights) @ double(semantic) / double(weights).sum()).to(semantic)
-    # K-means compares distances and membership compares directions, so a cluster may win no point. Memberships are taken again
-    # without it, as the stylizers will: no region has statistics of nothing.
+    # K-means compares distances and membership compares directions, so a cluster may win no point.
+    # Memberships are taken again without it, as the stylizers will: no region has statistics of nothing.
     while True:
         belongs = Membership(keys, middle)(semantic)
         used = belongs.sum(0) > 0
@@ -92,7 +101,8 @@ def scene_style(
 
 
 class Membership(nn.Module):
-    """Membership of points in regions by keys: attention without the faintest shares, on the device of the module.
+    """Membership of points in regions by keys: attention without the faintest shares, on the device of the
+    module.
 
     Directions are taken from a centre: the mean of the scene's semantics.
     """
@@ -153,7 +163,9 @@ class RegionWeight(nn.Module):
     def forward(
         self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
     ) -> Annotated[Tensor, "N X"]:
-        """The values, mixed by membership (`belongs`, where it is known): exactly 0 where all of a point's regions have 0."""
+        """The values, mixed by membership (`belongs`, where it is known): exactly 0 where all of a point's
+        regions have 0.
+        """
         share: Tensor = self.membership(semantic) if belongs is None else belongs
         return share.to(self.values) @ self.values
 
@@ -161,14 +173,16 @@ class RegionWeight(nn.Module):
 def region_contacts(
     scene: SceneStyle, semantic: Annotated[Tensor, "P 2 D"], colour: Annotated[Tensor, "P 2 3"]
 ) -> Annotated[Tensor, "K K"]:
-    """Membership that passes from one region to another between P pairs of neighbouring pixels without an edge of colour.
+    """Membership that passes from one region to another between P pairs of neighbouring pixels without an
+    edge of colour.
 
-    Mean over the pairs of -d_k d_l, with d the difference of both ends' memberships, where that is above 0; pairs whose colours
-    differ count less. Symmetric, at least 0, with 0 on the diagonal.
+    Mean over the pairs of -d_k d_l, with d the difference of both ends' memberships, where that is above 0;
+    pairs whose colours differ count less. Symmetric, at least 0, with 0 on the diagonal.
     """
     belongs = Membership(scene.keys, scene.semantic_mean)
     ends = [double(belongs(part.contiguous())) for part in semantic.unbind(1)]
-    # What one region loses between the ends of a pair, another gains; across an edge of colour it counts little.
+    # What one region loses between the ends of a pair, another gains; across an edge of colour it counts
+    # little.
     change = ends[0] - ends[1]
     even = torch.exp(-double(colour[:, 0] - colour[:, 1]).abs().amax(1).square() / (2 * _ALIKE**2))
     passed = -(change * even[:, None]).T @ change / max(1, len(change))
@@ -178,11 +192,13 @@ def region_contacts(
 def region_smoothing(
     scene: SceneStyle, smoothness: float, allowed: Annotated[Tensor, "K references"] | None = None
 ) -> Annotated[Tensor, "K K"]:
-    """Matrix that makes regions alike that meet without an edge of colour: H, float64, rows sum to 1; the identity for 0.
+    """Matrix that makes regions alike that meet without an edge of colour: H, float64, rows sum to 1; the
+    identity for 0.
 
-    For values v of the regions, x = H v minimises sum_k s_k |x_k - v_k|^2 + smoothness sum_(k<l) c_kl |x_k - x_l|^2, with
-    shares s and contacts c: the second sum is what x changes by between neighbouring pixels of one colour. The mean over the
-    scene stays, s H = s. Regions that may not take from the same references (`allowed`) do not take from each other.
+    For values v of the regions, x = H v minimises sum_k s_k |x_k - v_k|^2 + smoothness sum_(k<l) c_kl |x_k -
+    x_l|^2, with shares s and contacts c: the second sum is what x changes by between neighbouring pixels of
+    one colour. The mean over the scene stays, s H = s. Regions that may not take from the same references
+    (`allowed`) do not take from each other.
     """
     unity = torch.eye(len(scene.share), dtype=torch.float64)
     if smoothness == 0:
@@ -200,7 +216,9 @@ def region_smoothing(
 def own_style(scene: SceneStyle, blend: float = BLEND) -> StyleDictionary:
     """The scene as its own only reference, blended as references are: the dictionary that changes nothing."""
     at = scene.share.new_full((len(scene.share),), blend)
-    mean, covariances = blend_codes(scene.region_mean, scene.region_covariance, scene.mean, scene.covariance, at)
+    mean, covariances = blend_codes(
+        scene.region_mean, scene.region_covariance, scene.mean, scene.covariance, at
+    )
     return StyleDictionary(
         keys=scene.keys,
         mean=mean,
@@ -238,11 +256,15 @@ def from_tensors(tensors: Mapping[str, Tensor]) -> SceneStyle:
         raise CheckpointError(f"scene statistics: {', '.join(missing)} missing; compute the statistics again")
     scene = SceneStyle(**{name: tensors[name] for name in SceneStyle._fields})
     # A checkpoint may be somebody else's: every table must fit the others.
-    c, k, d = scene.mean.numel(), scene.share.numel(), scene.semantic_mean.numel()
+    c = scene.mean.numel()
+    k = scene.share.numel()
+    d = scene.semantic_mean.numel()
     shapes = ((c,), (c, c), (k, d), (k, c), (k, c, c), (k,), (d,), (k, k))
     for name, t, shape in zip(SceneStyle._fields, scene, shapes, strict=True):
         if tuple(t.shape) != shape:
-            raise CheckpointError(f"scene statistics: {name} is {tuple(t.shape)}, expected {shape}; compute them again")
+            raise CheckpointError(
+                f"scene statistics: {name} is {tuple(t.shape)}, expected {shape}; compute them again"
+            )
         if not bool(t.isfinite().all()):
             raise CheckpointError(f"scene statistics: {name} is not finite; compute the statistics again")
     return scene

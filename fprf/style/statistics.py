@@ -2,15 +2,18 @@
 
 Letters: N rows, C channels, K groups, T codes, k clusters. Sums run in float64 on centred data.
 
-Moments merge exactly (Chan): any order and partition gives the same within 1e-12. Scatter is the weighted sum of outer products
-about the mean; covariance = scatter / weight (not Bessel-corrected: weights are rendering weights, not counts).
+Moments merge exactly (Chan): any order and partition gives the same within 1e-12. Scatter is the weighted sum
+of outer products about the mean; covariance = scatter / weight (not Bessel-corrected: weights are rendering
+weights, not counts).
 
-Optimal transport (Monge), c content, s style: T = Cs^1/2 (Cs^1/2 Cc Cs^1/2)^-1/2 Cs^1/2 is the one symmetric positive map with
-T Cc T = Cs: of all linear maps that give the style's covariance it moves the features least. Computed by one singular value
-decomposition, Cs^1/2 Cc^1/2 = U S V^T, so that T = Cs^1/2 U S^-1 U^T Cs^1/2: S has the square root of the condition of the
-product under the inverse root above, which would lose half of the digits.
+Optimal transport (Monge), c content, s style: T = Cs^1/2 (Cs^1/2 Cc Cs^1/2)^-1/2 Cs^1/2 is the one symmetric
+positive map with T Cc T = Cs: of all linear maps that give the style's covariance it moves the features
+least. Computed by one singular value decomposition, Cs^1/2 Cc^1/2 = U S V^T, so that T = Cs^1/2 U S^-1 U^T
+Cs^1/2: S has the square root of the condition of the product under the inverse root above, which would lose
+half of the digits.
 
-K-means cannot fail: seeded k-means++, empty clusters dropped, a cap on the steps. Distances after centring stay exact where
+K-means cannot fail: seeded k-means++, empty clusters dropped, a cap on the steps. Distances after centring
+stay exact where
 |x| is large and the spread small (|x|^2 - 2xc + |c|^2 misassigns 67 % of the points at norm 1000, spread 1). Float64 costs as
 little as float32 here: the products are [N D] x [D k] with small k.
 """
@@ -27,7 +30,9 @@ _CHUNK = 16384
 """Rows centred at a time: bounds the float64 copies of large inputs."""
 
 _FLOOR = 0.01
-"""A channel deviates by at least this share of the median channel: noise of dead channels must not become style."""
+"""A channel deviates by at least this share of the median channel: noise of dead channels must not become
+style.
+"""
 
 _RESOLUTION = 1e-6
 """A deviation below this share of the mean is float32 rounding."""
@@ -54,18 +59,24 @@ def moments(features: Annotated[Tensor, "N C"], weights: Annotated[Tensor, "N"])
     """
     total = empty(features.shape[1], device=float64_device(features.device))
     for start in range(0, len(features), _CHUNK):
-        rows, mass = features[start : start + _CHUNK], double(weights[start : start + _CHUNK])
+        rows = features[start : start + _CHUNK]
+        mass = double(weights[start : start + _CHUNK])
         if not bool((mass >= 0).all() & mass.isfinite().all()):
-            raise NumericsError("statistics: a weight is negative or not finite; weights must be finite and at least 0")
+            raise NumericsError(
+                "statistics: a weight is negative or not finite; weights must be finite and at least 0"
+            )
         # Rows of weight 0 leave before they are looked at: they may hold anything.
         counted = mass > 0
         if not bool(counted.any()):
             continue
         if not bool(counted.all()):
-            rows, mass = rows[counted.to(rows.device)], mass[counted]
+            rows = rows[counted.to(rows.device)]
+            mass = mass[counted]
         rows = double(rows)
         if not bool(rows.isfinite().all()):
-            raise NumericsError("statistics: a content feature is not finite; check the field or encoder that made it")
+            raise NumericsError(
+                "statistics: a content feature is not finite; check the field or encoder that made it"
+            )
         # Mean and scatter of this chunk.
         weight = mass.sum()
         mean = mass @ rows / weight
@@ -78,7 +89,9 @@ def moments(features: Annotated[Tensor, "N C"], weights: Annotated[Tensor, "N"])
 
 
 def merge(a: Moments, b: Moments) -> Moments:
-    """Moments of both inputs together (Chan, Golub, LeVeque 1979). Commutative and associative within 1e-12."""
+    """Moments of both inputs together (Chan, Golub, LeVeque 1979). Commutative and associative within
+    1e-12.
+    """
     # The mean moves by b's share of the way; the scatter gains what the means lie apart.
     weight = a.weight + b.weight
     share = b.weight / torch.where(weight > 0, weight, 1.0)
@@ -99,8 +112,8 @@ def group_moments(
 ) -> tuple[Annotated[Tensor, "K C"], Annotated[Tensor, "K C C"], Annotated[Tensor, "K"]]:
     """Mean, covariance and share of the weight of each (soft) group, float64.
 
-    Membership is the weight >= 0 of each row in each group; only rows that belong to a group are visited for it, so
-    sharp memberships cost one group. An empty group has the mean and covariance of nothing: zero.
+    Membership is the weight >= 0 of each row in each group; only rows that belong to a group are visited for
+    it, so sharp memberships cost one group. An empty group has the mean and covariance of nothing: zero.
     """
     groups = [
         moments(features[inside.to(features.device)], membership[inside, k])
@@ -109,14 +122,22 @@ def group_moments(
     # Shares of all weight; where there is none at all they are 0, not NaN.
     weight = torch.stack([g.weight for g in groups])
     mean = torch.stack([g.mean for g in groups])
-    return mean, torch.stack([covariance(g) for g in groups]), weight / weight.sum().clamp_min(torch.finfo().tiny)
+    return (
+        mean,
+        torch.stack([covariance(g) for g in groups]),
+        weight / weight.sum().clamp_min(torch.finfo().tiny),
+    )
 
 
 def mix(
     mean: Annotated[Tensor, "T C"], covariances: Annotated[Tensor, "T C C"], share: Annotated[Tensor, "T"]
 ) -> tuple[Annotated[Tensor, "C"], Annotated[Tensor, "C C"]]:
-    """Mean and covariance of groups taken together, by the law of total covariance. Shares need not sum to 1."""
-    mean, covariances, share = double(mean), double(covariances), double(share)
+    """Mean and covariance of groups taken together, by the law of total covariance. Shares need not sum to
+    1.
+    """
+    mean = double(mean)
+    covariances = double(covariances)
+    share = double(share)
     # The scatter within groups, and that of their means about the mean of all.
     share = share / share.sum()
     whole = share @ mean
@@ -124,8 +145,11 @@ def mix(
     return whole, torch.einsum("t,tij->ij", share, covariances) + apart.T @ apart
 
 
-def deviation(mean: Annotated[Tensor, "... C"], variance: Annotated[Tensor, "... C"]) -> Annotated[Tensor, "... C"]:
-    """Standard deviation per channel, never below 1 % of the median channel's nor below float32 rounding of the means.
+def deviation(
+    mean: Annotated[Tensor, "... C"], variance: Annotated[Tensor, "... C"]
+) -> Annotated[Tensor, "... C"]:
+    """Standard deviation per channel, never below 1 % of the median channel's nor below float32 rounding of
+    the means.
 
     The floor is relative, so it biases no live channel, whatever the encoder's scale; always above 0.
     """
@@ -136,7 +160,9 @@ def deviation(mean: Annotated[Tensor, "... C"], variance: Annotated[Tensor, "...
 
 
 _RIDGE = 1e-4
-"""Variance added in every direction, as a share of the mean variance: 1 % of the deviation, as AdaIN's floor."""
+"""Variance added in every direction, as a share of the mean variance: 1 % of the deviation, as AdaIN's
+floor.
+"""
 
 
 def symmetric_root(c: Annotated[Tensor, "... C C"]) -> Annotated[Tensor, "... C C"]:
@@ -151,10 +177,11 @@ def monge(
 ) -> Annotated[Tensor, "... C C"]:
     """Symmetric T [C C], float64, with T content T = style, for covariances of any rank, 0 among them.
 
-    Both sides get the same relative ridge, so equal covariances give the identity; eigenvalues of T above `gain` (>= 1)
-    are capped, which is where it stops matching the style exactly.
+    Both sides get the same relative ridge, so equal covariances give the identity; eigenvalues of T above
+    `gain` (>= 1) are capped, which is where it stops matching the style exactly.
     """
-    # T by one singular value decomposition (see the top of the file), as a product that is symmetric up to rounding.
+    # T by one singular value decomposition (see the top of the file), as a product that is symmetric up to
+    # rounding.
     style_root = symmetric_root(_with_ridge(double(style)))
     left, value, _ = torch.linalg.svd(style_root @ symmetric_root(_with_ridge(double(content))))
     half = style_root @ (left / value.clamp_min(torch.finfo(value.dtype).tiny).sqrt()[..., None, :])
@@ -176,10 +203,15 @@ _ROWS = 20_480
 """Rows worth clustering: more do not move the centroids, and cost more than half a second."""
 
 _FEW = 4096
-"""Rows on which Lloyd's steps start: neighbouring pixels are alike; they find the same clusters at a quarter of the cost."""
+"""Rows on which Lloyd's steps start: neighbouring pixels are alike; they find the same clusters at a quarter
+of the cost.
+"""
 
-_ITERATIONS, _REFINED = 40, 4
-"""Lloyd steps at most on few rows (photographs settle in 10 to 40, pure noise never does), and on all of them after that."""
+_ITERATIONS = 40
+_REFINED = 4
+"""Lloyd steps at most on few rows (photographs settle in 10 to 40, pure noise never does), and on all of them
+after that.
+"""
 
 
 class Clusters(NamedTuple):
@@ -191,13 +223,15 @@ class Clusters(NamedTuple):
     """int64 cluster of each point."""
 
 
-def kmeans(x: Annotated[Tensor, "N D"], k: int, *, seed: int, weights: Annotated[Tensor, "N"] | None = None) -> Clusters:
+def kmeans(
+    x: Annotated[Tensor, "N D"], k: int, *, seed: int, weights: Annotated[Tensor, "N"] | None = None
+) -> Clusters:
     """Cluster rows, the same for the same input and seed. No rows give no clusters; equal rows give one.
 
-    Of more than 20 480 rows a random sample is clustered, and the others join the nearest centres; of more than 4096 a random
-    sample decides where the steps on all of them start.
-    Weights >= 0 count a row several times, or not at all; if all are 0 they are taken as equal. Raises NumericsError
-    for values that are not finite.
+    Of more than 20 480 rows a random sample is clustered, and the others join the nearest centres; of more
+    than 4096 a random sample decides where the steps on all of them start. Weights >= 0 count a row several
+    times, or not at all; if all are 0 they are taken as equal. Raises NumericsError for values that are not
+    finite.
     """
     points = double(x)
     mass = points.new_ones(len(points)) if weights is None else double(weights)
@@ -213,7 +247,8 @@ def kmeans(x: Annotated[Tensor, "N D"], k: int, *, seed: int, weights: Annotated
     generator = torch.Generator().manual_seed(seed)
     # Sample, and begin on a sample of the sample: seeding and most of the steps see few rows.
     some = _sample(mass, _ROWS, generator)
-    rows, row_mass = points[some], mass[some]
+    rows = points[some]
+    row_mass = mass[some]
     few = _sample(row_mass, _FEW, generator)
     centres = _seed(rows[few], row_mass[few], k, generator)
     centres, label = _lloyd(rows[few], row_mass[few], centres, _ITERATIONS)
@@ -234,7 +269,9 @@ def _sample(mass: Tensor, rows: int, generator: torch.Generator) -> Tensor | sli
 
 
 def _lloyd(points: Tensor, mass: Tensor, centres: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-    """Take Lloyd's steps until no label changes, `steps` at most; return centres and labels of centred points."""
+    """Take Lloyd's steps until no label changes, `steps` at most; return centres and labels of centred
+    points.
+    """
     label = _nearest(points, centres)
     for _ in range(steps):
         centres, label = _means(points, mass, label, len(centres))
@@ -246,9 +283,12 @@ def _lloyd(points: Tensor, mass: Tensor, centres: Tensor, steps: int) -> tuple[T
 
 
 def _seed(points: Tensor, mass: Tensor, k: int, generator: torch.Generator) -> Tensor:
-    """Draw centres by weight x squared distance to the nearest so far (k-means++); fewer if points run out."""
+    """Draw centres by weight x squared distance to the nearest so far (k-means++); fewer if points run
+    out.
+    """
     centres: list[Tensor] = []
-    odds, distance = mass, torch.full_like(mass, torch.inf)
+    odds = mass
+    distance = torch.full_like(mass, torch.inf)
     # One number a centre, drawn on the CPU: the same on every device.
     for draw in torch.rand(k, generator=generator, dtype=torch.float64).to(points.device):
         # Rounding of the sum cannot land on odds of 0.
@@ -269,9 +309,13 @@ def _nearest(points: Tensor, centres: Tensor) -> Tensor:
 
 
 def _means(points: Tensor, mass: Tensor, label: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """Return means of the clusters that have weight, and labels among those; weightless points go to the nearest of them."""
+    """Return means of the clusters that have weight, and labels among those; weightless points go to the
+    nearest of them.
+    """
     # A product with one-hot rows, not index_add: the sum is the same in every run on every device.
-    member = torch.zeros(k, len(points), dtype=points.dtype, device=points.device).scatter_(0, label[None], mass[None])
+    member = torch.zeros(k, len(points), dtype=points.dtype, device=points.device).scatter_(
+        0, label[None], mass[None]
+    )
     total = member.sum(1)
     alive = total > 0
     centres = (member @ points)[alive] / total[alive][:, None]

@@ -20,7 +20,9 @@ from ..types import Batch, Rays, Site
 
 
 def uniform(*shape: int, seed: int) -> Tensor:
-    """Uniform draws in [0, 1]. Every call in this package has a seed of its own, so that swapped arguments are seen."""
+    """Uniform draws in [0, 1]. Every call in this package has a seed of its own, so that swapped arguments
+    are seen.
+    """
     return torch.rand(shape, generator=torch.Generator().manual_seed(seed))
 
 
@@ -38,7 +40,8 @@ def points(count: int) -> Annotated[Tensor, "N 3"]:
 def rays(count: int) -> Rays:
     """Rays from outside the unit cube through it."""
     direction = torch.nn.functional.normalize(normal(count, 3, seed=2), dim=1)
-    near, far = torch.full((count,), 0.5), torch.full((count,), 3.5)
+    near = torch.full((count,), 0.5)
+    far = torch.full((count,), 3.5)
     return Rays(origin=-2 * direction, direction=direction, view=direction, near=near, far=far)
 
 
@@ -70,7 +73,8 @@ def capture(folder: Path) -> ParsedScene:
         distortion=torch.zeros(len(sizes), 6, dtype=torch.float64),
         lens=torch.zeros(len(sizes), dtype=torch.int64),
     )
-    train, test = torch.tensor([0, 2, 3, 4]), torch.tensor([1])
+    train = torch.tensor([0, 2, 3, 4])
+    test = torch.tensor([1])
     return ParsedScene(name="noise", paths=tuple(paths), cameras=cameras, train=train, test=test, alpha=False)
 
 
@@ -83,8 +87,11 @@ def parts() -> Parts:
 
 def batch(count: int) -> Batch:
     """Targets of `rays` for `parts`; semantics of the first half."""
-    view, pixel = torch.zeros(count, dtype=torch.int64), torch.full((count, 2), 0.5)
-    return Batch(view, pixel, uniform(count, 3, seed=17), normal(count, 7, seed=3), normal(count // 2, 5, seed=4))
+    view = torch.zeros(count, dtype=torch.int64)
+    pixel = torch.full((count, 2), 0.5)
+    return Batch(
+        view, pixel, uniform(count, 3, seed=17), normal(count, 7, seed=3), normal(count // 2, 5, seed=4)
+    )
 
 
 class _Sigmoid(Decoder):

@@ -1,7 +1,7 @@
 """Contracts of plug-ins, as functions that a plug-in's own tests call: `check_encoder(MyConfig())`.
 
-Each builds the plug-in from its config, as the program does, and raises AssertionError with one sentence on the first
-breach. They take a second or so on a CPU and need no data but what is passed to them.
+Each builds the plug-in from its config, as the program does, and raises AssertionError with one sentence on
+the first breach. They take a second or so on a CPU and need no data but what is passed to them.
 """
 
 # A plug-in is asked whether it is of an abstract kind.
@@ -70,33 +70,50 @@ Kind = TypeVar("Kind")
 
 
 def check_config(config: PluginConfig) -> None:
-    """A frozen dataclass that its defaults build, that compares by value, and that JSON carries there and back."""
+    """A frozen dataclass that its defaults build, that compares by value, and that JSON carries there and
+    back.
+    """
     kind = type(config)
     parameters = getattr(kind, "__dataclass_params__", None)
-    require(parameters is not None and parameters.frozen, f"{kind.__name__}: must be a dataclass(frozen=True, kw_only=True)")
+    require(
+        parameters is not None and parameters.frozen,
+        f"{kind.__name__}: must be a dataclass(frozen=True, kw_only=True)",
+    )
     require(kind() == kind(), f"{kind.__name__}: two with the same values must be equal")
     require(from_json(to_json(config), kind) == config, f"{kind.__name__}: must survive JSON unchanged")
     for field in dataclasses.fields(kind):
-        require(field.name not in ("type", "build", "needs"), f"{kind.__name__}: a field must not be called {field.name!r}")
+        require(
+            field.name not in ("type", "build", "needs"),
+            f"{kind.__name__}: a field must not be called {field.name!r}",
+        )
         require(field.kw_only is True, f"{kind.__name__}.{field.name}: fields must be keyword-only")
     require(
-        all(type(need) is Need for need in config.needs()), f"{kind.__name__}: needs() must give Need, as often as it is asked"
+        all(type(need) is Need for need in config.needs()),
+        f"{kind.__name__}: needs() must give Need, as often as it is asked",
     )
 
 
-def _built(config: PluginConfig, kind: type[Kind], build: Callable[[], object], *, again: bool = True) -> tuple[Kind, str]:
-    """The plug-in of a config that keeps to the rules of configs, and the name that sentences about it begin with.
+def _built(
+    config: PluginConfig, kind: type[Kind], build: Callable[[], object], *, again: bool = True
+) -> tuple[Kind, str]:
+    """The plug-in of a config that keeps to the rules of configs, and the name that sentences about it begin
+    with.
 
     `again` builds it twice, to see that its parameters come from the seed.
     """
     check_config(config)
-    made, name = build(), type(config).__name__
-    require(isinstance(made, kind), f"{name}: build() gives {type(made).__name__}, not an fprf.interfaces.{kind.__name__}")
+    made = build()
+    name = type(config).__name__
+    require(
+        isinstance(made, kind),
+        f"{name}: build() gives {type(made).__name__}, not an fprf.interfaces.{kind.__name__}",
+    )
     assert isinstance(made, kind)
     module: object = made
     other = build() if again and isinstance(module, nn.Module) else None
     if isinstance(module, nn.Module) and isinstance(other, nn.Module):
-        mine, theirs = module.state_dict(), other.state_dict()
+        mine = module.state_dict()
+        theirs = other.state_dict()
         equal = mine.keys() == theirs.keys() and all(torch.equal(mine[key], theirs[key]) for key in mine)
         require(equal, f"{name}: its parameters must be drawn from the seed alone")
     return made, name
@@ -106,23 +123,43 @@ def check_encoder(config: EncoderConfig) -> None:
     """Any size, any batch, frozen, deterministic, finite, and with an identity that is the same each time."""
     encoder, name = _built(config, Encoder, config.build, again=False)
     require(not encoder.training, f"{name}: must be in evaluation mode")
-    require(not any(p.requires_grad for p in encoder.parameters()), f"{name}: its parameters must not want gradients")
-    require(config.build().identity == encoder.identity, f"{name}: identity must be the same for the same config")
+    require(
+        not any(p.requires_grad for p in encoder.parameters()),
+        f"{name}: its parameters must not want gradients",
+    )
+    require(
+        config.build().identity == encoder.identity, f"{name}: identity must be the same for the same config"
+    )
     # Sizes that strides divide, and some that they do not; both ways round.
     for height, width in ((64, 96), (49, 37), (96, 64)):
         image = cases.uniform(2, 3, height, width, seed=18)
         features = encoder(image)
         tensor(features, (2, encoder.channels, None, None), f"{name} of {height} x {width} pixels")
         h, w = features.shape[2:]
-        require(1 <= h <= height and 1 <= w <= width, f"{name}: {h} x {w} features of {height} x {width} pixels")
+        require(
+            1 <= h <= height and 1 <= w <= width, f"{name}: {h} x {w} features of {height} x {width} pixels"
+        )
         skew = (w / width) / (h / height)
-        require(0.4 < skew < 2.5, f"{name}: {h} x {w} features do not keep the aspect of {height} x {width} pixels")
+        require(
+            0.4 < skew < 2.5,
+            f"{name}: {h} x {w} features do not keep the aspect of {height} x {width} pixels",
+        )
         require(not features.requires_grad, f"{name}: features must not carry gradients to the weights")
         same(encoder(image), features, 0.0, f"{name}: must be deterministic")
-        same(encoder(image[1:]), features[1:], 1e-3, f"{name}: an image's features must not depend on its batch")
+        same(
+            encoder(image[1:]),
+            features[1:],
+            1e-3,
+            f"{name}: an image's features must not depend on its batch",
+        )
         # Half of it cut out, and all of it.
         opaque = torch.ones(2, height, width)
-        same(encoder.cutout(image, opaque), features, 1e-3, f"{name}: what is opaque must have the features of the image")
+        same(
+            encoder.cutout(image, opaque),
+            features,
+            1e-3,
+            f"{name}: what is opaque must have the features of the image",
+        )
         for opacity in ((torch.arange(width) < width // 2).float() * opaque, 0 * opaque):
             shown = encoder.cutout(image * opacity[:, None], opacity)
             tensor(shown, tuple(features.shape), f"{name} of a picture that is transparent in places")
@@ -131,7 +168,11 @@ def check_encoder(config: EncoderConfig) -> None:
         features = encoder(cases.uniform(1, 3, height, width, seed=19))
         tensor(features, (1, encoder.channels, None, None), f"{name} of {height} x {width} pixels")
     for level in (0.0, 1.0):
-        tensor(encoder(torch.full((1, 3, 40, 40), level)), (1, encoder.channels, None, None), f"{name} of a flat image")
+        tensor(
+            encoder(torch.full((1, 3, 40, 40), level)),
+            (1, encoder.channels, None, None),
+            f"{name} of a flat image",
+        )
     # In float64 a tensor that it makes for itself shows, if it does not follow the inputs.
     image = cases.uniform(1, 3, 40, 40, seed=20).double()
     encoder.double()
@@ -151,16 +192,19 @@ def check_decoder(config: DecoderConfig, *, encoder: str, channels: int) -> None
 
 
 def check_stylizer(config: StylizerConfig) -> None:
-    """Point by point, finite, honest about what it needs; its matches are shares of the style codes; affine in content unless
-    the config carries colours over."""
+    """Point by point, finite, honest about what it needs; its matches are shares of the style codes; affine
+    in content unless the config carries colours over.
+    """
     name = type(config).__name__
 
     def check(codes: int, regions: int, dims: int) -> None:
-        dictionary, scene = cases.dictionary(codes, 8, dims), cases.scene(regions, 8, dims)
+        dictionary = cases.dictionary(codes, 8, dims)
+        scene = cases.scene(regions, 8, dims)
         stylizer = _built(config, Stylizer, lambda: config.build(dictionary=dictionary, scene=scene))[0]
         check_needs(stylizer, f"{name}: needs")
         # Features on which nothing was fitted; semantics only where it says that it reads them.
-        content, semantic = cases.normal(11, 8, seed=22), cases.normal(11, dims, seed=13)
+        content = cases.normal(11, 8, seed=22)
+        semantic = cases.normal(11, dims, seed=13)
         given = semantic if Want.SEMANTIC in stylizer.needs else None
         styled = stylizer(content, given)
         tensor(styled, (11, 8), name)
@@ -184,11 +228,17 @@ def check_stylizer(config: StylizerConfig) -> None:
         check(codes, regions, dims)
     if config.handles_allowed_references:
         # Two references, of which every region may take from the first alone.
-        both = cases.dictionary(4, 8, 4)._replace(reference=torch.tensor([0, 0, 1, 1]), names=("one", "other"))
+        both = cases.dictionary(4, 8, 4)._replace(
+            reference=torch.tensor([0, 0, 1, 1]), names=("one", "other")
+        )
         pinned = both._replace(allowed=torch.tensor([[True, False]] * 3))
-        match = config.build(dictionary=pinned, scene=cases.scene(3, 8, 4)).match(cases.normal(11, 4, seed=23))
+        match = config.build(dictionary=pinned, scene=cases.scene(3, 8, 4)).match(
+            cases.normal(11, 4, seed=23)
+        )
         taken = bool(match[:, 2:].any())
-        require(not taken, f"{name}: handles_allowed_references is true, but codes that are not allowed are taken")
+        require(
+            not taken, f"{name}: handles_allowed_references is true, but codes that are not allowed are taken"
+        )
 
 
 def check_sampler(config: SamplerConfig) -> None:
@@ -197,26 +247,42 @@ def check_sampler(config: SamplerConfig) -> None:
 
     def sample(rays: Rays, seed: int | None) -> Sampled:
         generator = None if seed is None else torch.Generator().manual_seed(seed)
-        found: Sampled = sampler(rays, space=cases.space(), step=None if seed is None else 10, generator=generator)
+        found: Sampled = sampler(
+            rays, space=cases.space(), step=None if seed is None else 10, generator=generator
+        )
         return found
 
     # Views sample without a generator, training with one; a chunk may hold any number of rays.
     for count in (6, 1, 0):
         rays = cases.rays(count)
         for seed in (None, 3):
-            sampled, again = sample(rays, seed), sample(rays, seed)
-            require(sampled.t.shape[0] == count and sampled.t.shape[1] >= 2, f"{name}: t must be [R E], E = samples + 1")
+            sampled = sample(rays, seed)
+            again = sample(rays, seed)
+            require(
+                sampled.t.shape[0] == count and sampled.t.shape[1] >= 2,
+                f"{name}: t must be [R E], E = samples + 1",
+            )
             tensor(sampled.s, tuple(sampled.t.shape), f"{name}: s")
             tensor(sampled.t, tuple(sampled.s.shape), f"{name}: t")
-            same(again.t, sampled.t, 0.0, f"{name}: must be a function of the rays, the step and the generator")
+            same(
+                again.t, sampled.t, 0.0, f"{name}: must be a function of the rays, the step and the generator"
+            )
             # Weights are of the steps between edges: one that is out of order would be negative.
-            for edges, low, high in ((sampled.s, torch.zeros(count), torch.ones(count)), (sampled.t, rays.near, rays.far)):
+            for edges, low, high in (
+                (sampled.s, torch.zeros(count), torch.ones(count)),
+                (sampled.t, rays.near, rays.far),
+            ):
                 require(bool((edges.diff(dim=1) >= 0).all()), f"{name}: edges must be sorted")
                 slack = 1e-4 * (high - low)[:, None]
                 inside = (edges >= low[:, None] - slack) & (edges <= high[:, None] + slack)
                 require(bool(inside.all()), f"{name}: edges must lie between near and far")
             for level in sampled.levels:
-                tensor(level.weights, (count, level.s.shape[1] - 1), f"{name}: weights of a proposal level", low=0.0)
+                tensor(
+                    level.weights,
+                    (count, level.s.shape[1] - 1),
+                    f"{name}: weights of a proposal level",
+                    low=0.0,
+                )
     sampler.double()
     penalties(sampler, name)
     rays = Rays(*(x.double() for x in cases.rays(6)))
@@ -225,9 +291,12 @@ def check_sampler(config: SamplerConfig) -> None:
 
 
 def check_content_field(config: ContentFieldConfig) -> None:
-    """Density at least 0, content of so many channels, a function of its seed, trainable in every parameter."""
+    """Density at least 0, content of so many channels, a function of its seed, trainable in every
+    parameter.
+    """
     field, name = _built(config, ContentField, lambda: config.build(channels=7, seed=0))
-    points, view = cases.points(13), nn.functional.normalize(cases.normal(13, 3, seed=14), dim=1)
+    points = cases.points(13)
+    view = nn.functional.normalize(cases.normal(13, 3, seed=14), dim=1)
     # Density everywhere, content only of some points, by their latents: the parts that the renderer asks for.
     sample = field.density(points)
     tensor(sample.density, (13,), f"{name}: density", low=0.0)
@@ -240,7 +309,8 @@ def check_content_field(config: ContentFieldConfig) -> None:
     trainable(field, sample.density.sum() + content.square().sum(), name)
     field.double()
     penalties(field, name)
-    points, view = points.double(), view.double()
+    points = points.double()
+    view = view.double()
     latent = field.density(points).latent
     follows(lambda: field.density(points).density, points, f"{name}: density")
     follows(lambda: field.content(latent, view), points, f"{name}: content")
@@ -265,45 +335,76 @@ def check_layout(config: LayoutConfig) -> None:
     layout, name = _built(config, BlockLayout, config.build)
     # A capture with a reconstruction, few views without one, and a single view.
     for site in (cases.site(40, 200), cases.site(3, 0), cases.site(1, 0)):
-        cells, again = layout.cut(site), layout.cut(site)
+        cells = layout.cut(site)
+        again = layout.cut(site)
         require(len(cells) > 0, f"{name}: at least one block is needed")
         for cell, other in zip(cells, again, strict=True):
             shapes = {tuple(each.shape) for each in (cell.low, cell.high, cell.border)}
             require(shapes == {(3,)}, f"{name}: low, high and border must be [3], found {shapes}")
-            require(bool((cell.low < cell.high).all()), f"{name}: a cell's lowest corner must lie below its highest")
+            require(
+                bool((cell.low < cell.high).all()),
+                f"{name}: a cell's lowest corner must lie below its highest",
+            )
             require(torch.equal(cell.border, cells[0].border), f"{name}: all cells must have the same border")
             same = torch.equal(cell.low, other.low) and torch.equal(cell.high, other.high)
             require(same, f"{name}: must be deterministic")
-        require(bool((cells[0].border > 0).all()) or len(cells) == 1, f"{name}: blocks need a border above 0 to blend in")
+        require(
+            bool((cells[0].border > 0).all()) or len(cells) == 1,
+            f"{name}: blocks need a border above 0 to blend in",
+        )
         # Blocks and surroundings together must explain every place, also far outside.
         weight = routing.shares(4 * cases.points(64), cells).float()
         shares(weight, (64, len(cells) + 1), f"{name}: weights of cells and surroundings")
 
 
 def check_parser(config: DataParserConfig, data: Path) -> None:
-    """A scene of `data`, a folder of that format: rigid poses, cameras that fit the paths, disjoint splits."""
+    """A scene of `data`, a folder of that format: rigid poses, cameras that fit the paths, disjoint
+    splits.
+    """
     parser, name = _built(config, DataParser, config.build)
     scene, *smaller = (parser.parse(data, downscale) for downscale in (1, 2, 2.5))
-    count, cameras = len(scene.paths), scene.cameras
+    count = len(scene.paths)
+    cameras = scene.cameras
     require(count > 0 and len(cameras) == count, f"{name}: {count} paths but {len(cameras)} cameras")
-    require(cameras.pose.dtype == torch.float64 and tuple(cameras.pose.shape) == (count, 3, 4), f"{name}: pose [V 3 4] fp64")
-    # Poses are rotations and positions: a scale or a mirroring would go unnoticed until the renders are wrong.
+    require(
+        cameras.pose.dtype == torch.float64 and tuple(cameras.pose.shape) == (count, 3, 4),
+        f"{name}: pose [V 3 4] fp64",
+    )
+    # Poses are rotations and positions: a scale or a mirroring would go unnoticed until the renders are
+    # wrong.
     turn = cameras.pose[:, :, :3]
     rigid = close(turn @ turn.mT, torch.eye(3).double().expand(count, 3, 3), 1e-3)
-    require(rigid and bool((torch.linalg.det(turn) > 0).all()), f"{name}: poses must be rotations, right-handed")
-    require(bool((cameras.focal > 0).all() and (cameras.size > 0).all()), f"{name}: focal lengths and sizes must be above 0")
+    require(
+        rigid and bool((torch.linalg.det(turn) > 0).all()), f"{name}: poses must be rotations, right-handed"
+    )
+    require(
+        bool((cameras.focal > 0).all() and (cameras.size > 0).all()),
+        f"{name}: focal lengths and sizes must be above 0",
+    )
     # Held-out views must not be learnt from, and the same folder must give the same numbers each time.
     views = torch.cat([scene.train, scene.test])
     require(len(set(views.tolist())) == len(views), f"{name}: a view must not be in train and test")
-    require(len(scene.train) > 0 and 0 <= int(views.min()) <= int(views.max()) < count, f"{name}: splits must index views")
+    require(
+        len(scene.train) > 0 and 0 <= int(views.min()) <= int(views.max()) < count,
+        f"{name}: splits must index views",
+    )
     for downscale, other in zip((2, 2.5), smaller, strict=True):
         fits = bool((other.cameras.size - scene.cameras.size / downscale).abs().max() <= 1)
         require(fits, f"{name}: downscale={downscale} must divide the size by it")
-    require(parser.parse(data, 1).paths == scene.paths, f"{name}: the order of the views must be the same each time")
+    require(
+        parser.parse(data, 1).paths == scene.paths,
+        f"{name}: the order of the views must be the same each time",
+    )
     # Recognition looks at every folder that a user names: it must not claim what it cannot read.
     known = config.recognises(data)
-    require(known is None or 0 < known.confidence <= 1, f"{name}: its confidence must lie in (0, 1], or None be given")
-    require(config.recognises(data / "no-such-folder") is None, f"{name}: must not recognise a folder that is absent")
+    require(
+        known is None or 0 < known.confidence <= 1,
+        f"{name}: its confidence must lie in (0, 1], or None be given",
+    )
+    require(
+        config.recognises(data / "no-such-folder") is None,
+        f"{name}: must not recognise a folder that is absent",
+    )
     require(config.recognises(scene.paths[0]) is None, f"{name}: must not recognise an image as a folder")
     try:
         parser.parse(data / "no-such-folder", 1)
@@ -313,32 +414,54 @@ def check_parser(config: DataParserConfig, data: Path) -> None:
 
 
 def check_data_manager(config: DataManagerConfig) -> None:
-    """Batches that are a function of (seed, step), of training views alone, with the colours and features of their pixels."""
+    """Batches that are a function of (seed, step), of training views alone, with the colours and features of
+    their pixels.
+    """
     check_config(config)
-    name, encoder = type(config).__name__, RandomConfig(channels=5, stride=3).build()
+    name = type(config).__name__
+    encoder = RandomConfig(channels=5, stride=3).build()
     with tempfile.TemporaryDirectory() as folder:
         scene = cases.capture(Path(folder))
 
         def build(seed: int = 0, *, features: bool = True) -> DataManager:
             given = encoder if features else None
-            return config.build(scene=scene, content=given, semantic=given, dim=3, cache=Path(folder, "cache"), seed=seed)
+            return config.build(
+                scene=scene, content=given, semantic=given, dim=3, cache=Path(folder, "cache"), seed=seed
+            )
 
-        manager, again, plain = build(), build(), build(features=False)
-        require(isinstance(manager, DataManager), f"{name}: build() gives {type(manager).__name__}, not a DataManager")
+        manager = build()
+        again = build()
+        plain = build(features=False)
+        require(
+            isinstance(manager, DataManager),
+            f"{name}: build() gives {type(manager).__name__}, not a DataManager",
+        )
         # A resumed run draws the batches of the one that was interrupted.
-        batch, later = manager.batch(3), manager.batch(4)
+        batch = manager.batch(3)
+        later = manager.batch(4)
         for other in (manager, again, manager.to(torch.device("cpu"), room=0)):
             for mine, theirs in zip(other.batch(3), batch, strict=True):
-                equal = mine is theirs is None or (mine is not None and theirs is not None and torch.equal(mine, theirs))
+                equal = mine is theirs is None or (
+                    mine is not None and theirs is not None and torch.equal(mine, theirs)
+                )
                 require(equal, f"{name}: a batch must be a function of the seed and the step")
         count = len(batch.rgb)
         require(config.batch_rays() == count, f"{name}: batch_rays() must be the rays of a batch, {count}")
         require(not torch.equal(batch.pixel, later.pixel), f"{name}: another step must bring other pixels")
-        require(not torch.equal(batch.pixel, build(1).batch(3).pixel), f"{name}: another seed must bring other pixels")
+        require(
+            not torch.equal(batch.pixel, build(1).batch(3).pixel),
+            f"{name}: another seed must bring other pixels",
+        )
         tensor(batch.pixel, (count, 2), f"{name}: pixel")
         tensor(batch.rgb, (count, 3), f"{name}: rgb")
-        require(batch.view.dtype == torch.int64 and batch.view.shape == (count,), f"{name}: view must be int64 [R]")
-        require(bool(torch.isin(batch.view, scene.train).all()), f"{name}: batches must be of training views alone")
+        require(
+            batch.view.dtype == torch.int64 and batch.view.shape == (count,),
+            f"{name}: view must be int64 [R]",
+        )
+        require(
+            bool(torch.isin(batch.view, scene.train).all()),
+            f"{name}: batches must be of training views alone",
+        )
         # Colours and pixels belong together: each is looked up in the view that it names.
         corner = batch.pixel - 0.5
         inside = (corner == corner.floor()) & (corner >= 0) & (corner < scene.cameras.size[batch.view])
@@ -346,14 +469,25 @@ def check_data_manager(config: DataManagerConfig) -> None:
         images = [manager.image(view) for view in range(len(scene.paths))]
         for image, (width, height) in zip(images, scene.cameras.size.tolist(), strict=True):
             tensor(image, (height, width, 3), f"{name}: image", low=0.0, high=1.0)
-        shown = torch.stack([images[v][y, x] for v, (x, y) in zip(batch.view.tolist(), corner.long().tolist(), strict=True)])
+        shown = torch.stack(
+            [images[v][y, x] for v, (x, y) in zip(batch.view.tolist(), corner.long().tolist(), strict=True)]
+        )
         same(batch.rgb, shown, 1e-6, f"{name}: rgb must be the colour of the pixel, as image() gives it")
         # Stores say what units and how many channels the fields are built with.
-        content, semantic = manager.content_store, manager.semantic_store
-        require(content is not None and semantic is not None, f"{name}: must have stores where encoders are given")
+        content = manager.content_store
+        semantic = manager.semantic_store
+        require(
+            content is not None and semantic is not None, f"{name}: must have stores where encoders are given"
+        )
         assert content is not None and semantic is not None
-        require((content.channels, semantic.channels) == (5, 3), f"{name}: stores must have the encoder's channels, and `dim`")
-        require(batch.content is not None and batch.semantic is not None, f"{name}: batches must bring what stores hold")
+        require(
+            (content.channels, semantic.channels) == (5, 3),
+            f"{name}: stores must have the encoder's channels, and `dim`",
+        )
+        require(
+            batch.content is not None and batch.semantic is not None,
+            f"{name}: batches must bring what stores hold",
+        )
         assert batch.content is not None and batch.semantic is not None
         tensor(batch.content, (count, 5), f"{name}: content")
         tensor(batch.semantic, (None, 3), f"{name}: semantic")
@@ -365,12 +499,20 @@ def check_data_manager(config: DataManagerConfig) -> None:
 
 
 def check_loss_term(config: LossTermConfig) -> None:
-    """A finite scalar with a gradient, a function of render, batch, step and generator, which reads no number of the device."""
+    """A finite scalar with a gradient, a function of render, batch, step and generator, which reads no number
+    of the device.
+    """
     term, name = _built(config, LossTerm, config.build)
     require(isinstance(term.needs, Want), f"{name}: needs must be a Want")
-    parts, count = cases.parts(), 6
+    parts = cases.parts()
+    count = 6
     rendered = render_rays(
-        cases.rays(count), parts, want=Want.DENSITY | term.needs, budget=0.0, step=10, semantic_rays=count // 2
+        cases.rays(count),
+        parts,
+        want=Want.DENSITY | term.needs,
+        budget=0.0,
+        step=10,
+        semantic_rays=count // 2,
     )
     assert rendered.weights is not None
     bare = cases.batch(count)._replace(content=None, semantic=None)
@@ -384,7 +526,12 @@ def check_loss_term(config: LossTermConfig) -> None:
             with Unread(name):
                 loss = value(render, batch, seed)
             tensor(loss, (), f"{name}: the term")
-            same(value(render, batch, seed), loss, 0.0, f"{name}: must be a function of its inputs and the generator")
+            same(
+                value(render, batch, seed),
+                loss,
+                0.0,
+                f"{name}: must be a function of its inputs and the generator",
+            )
     loss = value(rendered, cases.batch(count))
     require(loss.requires_grad, f"{name}: no gradient goes through the term")
     for gradient in torch.autograd.grad(
@@ -393,19 +540,28 @@ def check_loss_term(config: LossTermConfig) -> None:
         require(gradient is None or bool(gradient.isfinite().all()), f"{name}: its gradient is not finite")
     # At the beginning rays may meet nothing, or a wall at once: no term may divide by what is not there.
     nothing = torch.zeros_like(rendered.weights)
-    for weights, kind in ((nothing, "that meet nothing"), (nothing.index_fill(1, torch.tensor([2]), 1.0), "that end at once")):
+    for weights, kind in (
+        (nothing, "that meet nothing"),
+        (nothing.index_fill(1, torch.tensor([2]), 1.0), "that end at once"),
+    ):
         weights.requires_grad_()
         loss = value(rendered._replace(weights=weights, opacity=weights.detach().sum(1)), cases.batch(count))
         tensor(loss, (), f"{name} of rays {kind}")
         moved = torch.autograd.grad(loss, weights, allow_unused=True)[0] if loss.requires_grad else None
-        require(moved is None or bool(moved.isfinite().all()), f"{name}: its gradient for rays {kind} is not finite")
+        require(
+            moved is None or bool(moved.isfinite().all()),
+            f"{name}: its gradient for rays {kind} is not finite",
+        )
     follows(lambda: value(rendered, cases.batch(count)), rendered.weights, name)
 
 
 def check_executor(config: ExecutorConfig) -> None:
     """Results in the order of the tasks; an error reaches the caller."""
     executor, name = _built(config, Executor, config.build)
-    require(executor.map(math.factorial, [5, 0, 3]) == [120, 1, 6], f"{name}: results must be in the order of the tasks")
+    require(
+        executor.map(math.factorial, [5, 0, 3]) == [120, 1, 6],
+        f"{name}: results must be in the order of the tasks",
+    )
     require(executor.map(math.factorial, []) == [], f"{name}: no tasks, no results")
     try:
         executor.map(math.factorial, [1, -1])
@@ -415,7 +571,8 @@ def check_executor(config: ExecutorConfig) -> None:
 
 
 def check_capture_format(form: "CaptureFormat") -> None:
-    """A format reads what it writes: as many Gaussians of the same places and colours; recolouring changes nothing else.
+    """A format reads what it writes: as many Gaussians of the same places and colours; recolouring changes
+    nothing else.
 
     Damaged files end in DataError.
     """
@@ -424,7 +581,8 @@ def check_capture_format(form: "CaptureFormat") -> None:
     from ..splats.gaussians import Gaussians
 
     check_config(form)
-    name, path = type(form).__name__, Path("capture")
+    name = type(form).__name__
+    path = Path("capture")
     if not (form.reads and form.writes):
         try:
             form.read(path, b"")
@@ -441,9 +599,12 @@ def check_capture_format(form: "CaptureFormat") -> None:
     data = b"".join(form.pack(made, form.view_dependent, (0.0, 0.0, 0.0)))
     require(form.recognises(data[:64], len(data)), f"{name}.recognises: must be True of a file that it wrote")
     read = form.read(path, data)
-    found, apart = read.gaussians, torch.cdist(made.means, read.gaussians.means)
+    found = read.gaussians
+    apart = torch.cdist(made.means, read.gaussians.means)
     require(len(found) == len(made), f"{name}: {len(found)} Gaussians come back of {len(made)}")
-    require(read.antialiased == form.view_dependent, f"{name}: whether opacities are compensated must come back")
+    require(
+        read.antialiased == form.view_dependent, f"{name}: whether opacities are compensated must come back"
+    )
     order = apart.argmin(1)
     same(found.means[order], made.means, 0.02, f"{name}: positions must come back")
     same(found.colours[order], made.colours, 0.05, f"{name}: colours must come back")
@@ -453,7 +614,9 @@ def check_capture_format(form: "CaptureFormat") -> None:
     new = torch.where(torch.from_numpy(changed)[:, None, None], 0.5 * found.harmonics, found.harmonics)
     again = form.read(path, b"".join(read.recolour(new.numpy(), changed))).gaussians
     for part in ("means", "quaternions", "log_scales", "logits"):
-        same(getattr(again, part), getattr(found, part), 0.0, f"{name}.recolour: {part} must stay as they are")
+        same(
+            getattr(again, part), getattr(found, part), 0.0, f"{name}.recolour: {part} must stay as they are"
+        )
     same(again.colours, 0.5 + HARMONIC * new[:, 0], 0.05, f"{name}.recolour: the new colours must be there")
     # Files are cut short by full disks and broken downloads.
     for wrong in (b"", data[: len(data) // 2]):
@@ -461,4 +624,7 @@ def check_capture_format(form: "CaptureFormat") -> None:
             shorter = len(form.read(path, wrong).gaussians)
         except DataError:
             continue
-        require(0 < shorter < len(made), f"{name}: a file that is cut off must raise DataError, or hold fewer Gaussians")
+        require(
+            0 < shorter < len(made),
+            f"{name}: a file that is cut off must raise DataError, or hold fewer Gaussians",
+        )

@@ -1,8 +1,9 @@
-"""Requirements that say in one sentence what was found where, as AssertionError, and the checks of the program's own.
+"""Requirements that say in one sentence what was found where, as AssertionError, and the checks of the
+program's own.
 
-Contracts (`testing.contracts`) are made of them. The first outputs of plug-ins are checked while a model or a style is built: a
-breach is told with the plug-in's name, as PluginError, not met later as a strange image. A handful of points cost
-milliseconds, and nothing afterwards.
+Contracts (`testing.contracts`) are made of them. The first outputs of plug-ins are checked while a model or a
+style is built: a breach is told with the plug-in's name, as PluginError, not met later as a strange image. A
+handful of points cost milliseconds, and nothing afterwards.
 """
 
 import math
@@ -41,13 +42,23 @@ def require(condition: bool, breach: str) -> None:
 
 
 def tensor(
-    value: Tensor, shape: tuple[int | None, ...], what: str, low: float = -math.inf, high: float = math.inf, slack: float = 0.0
+    value: Tensor,
+    shape: tuple[int | None, ...],
+    what: str,
+    low: float = -math.inf,
+    high: float = math.inf,
+    slack: float = 0.0,
 ) -> None:
-    """Require a finite float32 tensor on the CPU of that shape, of which None stands for any size, from low to high."""
+    """Require a finite float32 tensor on the CPU of that shape, of which None stands for any size, from low
+    to high.
+    """
     wanted = f"float32 [{' '.join('any' if size is None else str(size) for size in shape)}] on cpu"
     require(isinstance(value, Tensor), f"{what}: expected {wanted}, found {type(value).__name__}")
-    found, sizes = kind_of(value), tuple(value.shape)
-    fits = len(sizes) == len(shape) and all(want in (None, size) for want, size in zip(shape, sizes, strict=True))
+    found = kind_of(value)
+    sizes = tuple(value.shape)
+    fits = len(sizes) == len(shape) and all(
+        want in (None, size) for want, size in zip(shape, sizes, strict=True)
+    )
     right = fits and value.dtype == torch.float32 and value.device.type == "cpu"
     require(right, f"{what}: expected {wanted}, found {found}")
     bad = int((~value.isfinite()).sum())
@@ -92,20 +103,25 @@ def pointwise(function: Callable[[Tensor], Tensor], points: Tensor, name: str) -
 
 
 def follows(call: Callable[[], Tensor], like: Tensor, name: str) -> None:
-    """Require that the result of a call, and tensors that it makes, take device and dtype from its inputs, like `like`.
+    """Require that the result of a call, and tensors that it makes, take device and dtype from its inputs,
+    like `like`.
 
-    Called with float64 on the CPU, while new tensors that name no device are put elsewhere: those cannot be computed with.
+    Called with float64 on the CPU, while new tensors that name no device are put elsewhere: those cannot be
+    computed with.
     """
     # Results first: then a tensor made without a device, which would land elsewhere on an accelerator.
     plain = call()
-    kind_found, kind = f"{plain.dtype} on {plain.device}", f"{like.dtype} on {like.device}"
+    kind_found = f"{plain.dtype} on {plain.device}"
+    kind = f"{like.dtype} on {like.device}"
     require(kind_found == kind, f"{name}: expected {kind} for inputs of that kind, found {kind_found}")
     try:
         with torch.device("meta"):
             again = call()
     except (RuntimeError, TypeError, ValueError) as fault:
         line = " ".join(str(fault).split())
-        raise AssertionError(f"{name}: makes a tensor that is not on the device of its inputs ({line})") from fault
+        raise AssertionError(
+            f"{name}: makes a tensor that is not on the device of its inputs ({line})"
+        ) from fault
     whole = again.device == plain.device and torch.equal(again, plain)
     require(whole, f"{name}: makes a tensor that is not on the device of its inputs")
 
@@ -131,7 +147,9 @@ def trainable(module: nn.Module, loss: Tensor, name: str) -> None:
 
 
 class Unread(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Raise AssertionError where the host would wait for the device: `.item()`, `bool`, `nonzero`, a boolean index."""
+    """Raise AssertionError where the host would wait for the device: `.item()`, `bool`, `nonzero`, a boolean
+    index.
+    """
 
     def __init__(self, name: str) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
@@ -142,9 +160,19 @@ class Unread(TorchDispatchMode):  # type: ignore[no-untyped-call]
     ) -> Any:
         """Look at one operator."""
         aten = torch.ops.aten
-        mask = func is aten.index.Tensor and any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1])
-        waits = func.overloadpacket in (aten._local_scalar_dense, aten.nonzero, aten.equal, aten.masked_select)
-        require(not (mask or waits), f"{self.name}: reads numbers of the device in a step ({func.overloadpacket.__name__})")
+        mask = func is aten.index.Tensor and any(
+            i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1]
+        )
+        waits = func.overloadpacket in (
+            aten._local_scalar_dense,
+            aten.nonzero,
+            aten.equal,
+            aten.masked_select,
+        )
+        require(
+            not (mask or waits),
+            f"{self.name}: reads numbers of the device in a step ({func.overloadpacket.__name__})",
+        )
         return func(*args, **(kwargs or {}))
 
 
@@ -158,7 +186,10 @@ def asked(what: str, function: Callable[[Tensor], Answer], given: Tensor) -> Ans
     except Exception as error:
         line = (str(error).splitlines() or [""])[0][:200]
         raise AssertionError(f"{what}: expected an answer, found {type(error).__name__}: {line}") from error
-    require(torch.equal(before, given), f"{what}: expected an input that is left alone, found an input that was written to")
+    require(
+        torch.equal(before, given),
+        f"{what}: expected an input that is left alone, found an input that was written to",
+    )
     return answer
 
 
@@ -173,12 +204,16 @@ def naming_plugin(config: PluginConfig) -> Iterator[None]:
             who = f"{config.group}: {name!r} ({registry.entry(config.group, name).origin})"
         except PluginError:  # of a test, or of a script
             who = f"{type(config).__module__}:{type(config).__qualname__}"
-        raise PluginError(f"{who}: {breach}; mend or uninstall that package, or choose another plug-in") from breach
+        raise PluginError(
+            f"{who}: {breach}; mend or uninstall that package, or choose another plug-in"
+        ) from breach
 
 
 @torch.no_grad()
 def check_parts(config: "TrainConfig", parts: "Parts", channels: int, dim: int) -> None:
-    """Fields, decoder and sampler of a model on the CPU, at some points of the unit cube. Raises PluginError."""
+    """Fields, decoder and sampler of a model on the CPU, at some points of the unit cube. Raises
+    PluginError.
+    """
     points = 0.9 * torch.sin(torch.arange(3.0 * POINTS).view(POINTS, 3))
     view = torch.nn.functional.normalize(points + 2, dim=1)
     # Each part is fed what the one before it returned, as in a render, so the first breach names its maker.
@@ -189,7 +224,9 @@ def check_parts(config: "TrainConfig", parts: "Parts", channels: int, dim: int) 
         features = asked("content", lambda some: parts.field.content(sample.latent, some), view)
         tensor(features, (POINTS, channels), "content")
     with naming_plugin(config.content.decoder):
-        tensor(asked("colours", parts.decoder, features), (POINTS, 3), "colours", low=0.0, high=1.0, slack=_SLACK)
+        tensor(
+            asked("colours", parts.decoder, features), (POINTS, 3), "colours", low=0.0, high=1.0, slack=_SLACK
+        )
     if parts.semantic is not None:
         with naming_plugin(config.semantic.field):
             tensor(asked("semantics", parts.semantic, points), (POINTS, dim), "semantics")
@@ -197,31 +234,46 @@ def check_parts(config: "TrainConfig", parts: "Parts", channels: int, dim: int) 
     near, far = (0.0, 1.0) if parts.space.kind == "ndc" else (parts.space.near, parts.space.far)
     rays = Rays(torch.zeros(POINTS, 3), view, view, torch.full((POINTS,), near), torch.full((POINTS,), far))
     with naming_plugin(config.sampler):
-        sampler, space = parts.sampler, parts.space
+        sampler = parts.sampler
+        space = parts.space
         sampled = asked(
-            "edges", lambda origin: sampler(rays._replace(origin=origin), space=space, step=None, generator=None), rays.origin
+            "edges",
+            lambda origin: sampler(rays._replace(origin=origin), space=space, step=None, generator=None),
+            rays.origin,
         )
         count = sampled.t.shape[-1] if isinstance(sampled.t, Tensor) and sampled.t.ndim else 0
         for name, edges in (("edges s", sampled.s), ("edges t", sampled.t)):
             tensor(edges, (POINTS, count), name)
             rising = count >= 2 and bool((edges.diff(dim=1) >= 0).all())
-            require(rising, f"{name}: expected at least two, not decreasing along a ray, found {count}, of which some decrease")
+            require(
+                rising,
+                f"{name}: expected at least two, not decreasing along a ray, found {count}, of which some decrease",
+            )
 
 
 @torch.no_grad()
 def check_stylizer(
-    config: StylizerConfig, stylizer: Stylizer, dictionary: "StyleDictionary", scene: "SceneStyle", *, affine: bool = False
+    config: StylizerConfig,
+    stylizer: Stylizer,
+    dictionary: "StyleDictionary",
+    scene: "SceneStyle",
+    *,
+    affine: bool = False,
 ) -> None:
     """A stylizer on the CPU, at some points about the scene's mean. Raises PluginError.
 
-    `affine` says that the scene's content is its colours, which are known by what becomes of black and of each channel.
+    `affine` says that the scene's content is its colours, which are known by what becomes of black and of
+    each channel.
     """
 
     def spread(middle: Tensor) -> Tensor:
         channels = middle.numel()
-        return middle.float().cpu() + 0.1 * torch.cos(torch.arange(float(POINTS * channels)).view(POINTS, channels))
+        return middle.float().cpu() + 0.1 * torch.cos(
+            torch.arange(float(POINTS * channels)).view(POINTS, channels)
+        )
 
-    content, semantic = spread(scene.mean), spread(scene.semantic_mean)
+    content = spread(scene.mean)
+    semantic = spread(scene.semantic_mean)
     with naming_plugin(config):
         check_needs(stylizer, "needs")
         given = semantic if Want.SEMANTIC in stylizer.needs else None
@@ -234,7 +286,8 @@ def check_stylizer(
 
 def check_needs(stylizer: Stylizer, what: str) -> None:
     """Require that a stylizer needs content, with semantics or without."""
-    needs, allowed = stylizer.needs, (Want.CONTENT, Want.CONTENT | Want.SEMANTIC)
+    needs = stylizer.needs
+    allowed = (Want.CONTENT, Want.CONTENT | Want.SEMANTIC)
     require(needs in allowed, f"{what}: expected Want.CONTENT, with Want.SEMANTIC or without, found {needs}")
 
 
@@ -243,11 +296,16 @@ def check_affine(stylizer: Stylizer, content: Tensor, semantic: Tensor | None, w
     other = content.flip(0) + 0.1
     between = torch.lerp(stylizer(content, semantic), stylizer(other, semantic), 0.3)
     straight = close(stylizer(torch.lerp(content, other, 0.3), semantic), between, 1e-3)
-    require(straight, f"{what}: expected an affine map of content, or `colours` above 0 in the config, found a bent one")
+    require(
+        straight,
+        f"{what}: expected an affine map of content, or `colours` above 0 in the config, found a bent one",
+    )
 
 
 def check_term(config: LossTermConfig, term: Tensor, like: Tensor) -> None:
-    """Raise PluginError unless a training term is a scalar of the kind of another tensor. Reads no number of it."""
+    """Raise PluginError unless a training term is a scalar of the kind of another tensor. Reads no number of
+    it.
+    """
     expected = kind_of(like.new_empty(()))
     with naming_plugin(config):
         require(isinstance(term, Tensor), f"the term: expected {expected}, found {type(term).__name__}")

@@ -1,12 +1,14 @@
 """A scene of fields in blocks: cut, trained block by block, and put together again for rendering.
 
-The surroundings are trained first, on everything: a coarse scene. A block is trained inside of a copy of them, which goes on
-learning with it and is then dropped: so each ray is whole while a block learns its part, and what the block cannot explain
-does not end up as a veil in it. The block itself starts as what they have learnt of its place (`blocks.fields.inherit`): a
-street of four blocks came out 1.9 dB better after 200 steps each than from seeded planes.
+The surroundings are trained first, on everything: a coarse scene. A block is trained inside of a copy of
+them, which goes on learning with it and is then dropped: so each ray is whole while a block learns its part,
+and what the block cannot explain does not end up as a veil in it. The block itself starts as what they have
+learnt of its place (`blocks.fields.inherit`): a street of four blocks came out 1.9 dB better after 200 steps
+each than from seeded planes.
 
-One semantic basis, one unit of each loss and one cache of features, which are mapped from their files, serve all blocks. While
-features are made, the pixels of all training views lie in a mapped file as well, three bytes each.
+One semantic basis, one unit of each loss and one cache of features, which are mapped from their files, serve
+all blocks. While features are made, the pixels of all training views lie in a mapped file as well, three
+bytes each.
 
     RUN/blocks.json                      the partition
     RUN/blocks/NN/rays.safetensors       the views and tiles that a block learns from
@@ -23,7 +25,15 @@ from typing import Annotated, Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..blocks.fields import BlockedField, BlockedSampler, BlockedSemantic, Member, Members, ResidentMembers, inherit
+from ..blocks.fields import (
+    BlockedField,
+    BlockedSampler,
+    BlockedSemantic,
+    Member,
+    Members,
+    ResidentMembers,
+    inherit,
+)
 from ..blocks.partition import Plan, pixel_mask, read_cells, write_cells
 from ..blocks.routing import BlendRouter, InsetRouter, Router, chart_of, surroundings_of, to_single
 from ..config import FREE_IN_BLOCKS, TrainConfig, fields_only
@@ -64,7 +74,12 @@ class Built(NamedTuple):
 
     def kept(self) -> dict[str, nn.Module]:
         """Parts that stay when a block is finished, by their names in its file."""
-        parts = {"member": self.member, "decoder": self.model.decoder, "tones": self.model.tones, "poses": self.model.poses}
+        parts = {
+            "member": self.member,
+            "decoder": self.model.decoder,
+            "tones": self.model.tones,
+            "poses": self.model.poses,
+        }
         return {kind: part for kind, part in parts.items() if part is not None}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
@@ -99,16 +114,21 @@ def assemble(
 
 
 def surroundings(config: TrainConfig, facts: Facts, cells: Sequence[Cell]) -> Built:
-    """The coarse scene that everything starts from. Raises PluginError where a part breaks its contract at once."""
+    """The coarse scene that everything starts from. Raises PluginError where a part breaks its contract at
+    once.
+    """
     decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
     member = Member(surroundings_of(cells), *build_fields(config, facts))
-    tones, poses = tones_of(facts), poses_of(facts, config.poses)
+    tones = tones_of(facts)
+    poses = poses_of(facts, config.poses)
     model = assemble(config, facts, ResidentMembers([member]), to_single, decoder, tones, poses)
     check_parts(config, model.parts, facts.channels, facts.dim)
     return Built(model, member)
 
 
-def block_in_surroundings(config: TrainConfig, facts: Facts, cell: Cell, around: Built, views: Annotated[Tensor, "M"]) -> Built:
+def block_in_surroundings(
+    config: TrainConfig, facts: Facts, cell: Cell, around: Built, views: Annotated[Tensor, "M"]
+) -> Built:
     """A block inside of a copy of its surroundings; decoder and tones are theirs, as they learnt them.
 
     Poses start as theirs too, and are refined further from the `views` that the block learns from.
@@ -117,9 +137,11 @@ def block_in_surroundings(config: TrainConfig, facts: Facts, cell: Cell, around:
     member = Member(chart, *build_fields(config, facts))
     # What the surroundings have learnt of this place is not learnt again.
     inherit(member, around.member)
-    # Decoder and tones stay as they are, so that all blocks mean the same by a colour; the surroundings go on learning.
+    # Decoder and tones stay as they are, so that all blocks mean the same by a colour; the surroundings go on
+    # learning.
     decoder = copy.deepcopy(around.model.decoder).requires_grad_(False)
-    tones, poses = copy.deepcopy(around.model.tones), around.model.poses
+    tones = copy.deepcopy(around.model.tones)
+    poses = around.model.poses
     if tones is not None:
         tones.requires_grad_(False)
     if poses is not None:
@@ -130,7 +152,9 @@ def block_in_surroundings(config: TrainConfig, facts: Facts, cell: Cell, around:
 
 
 def load_finished(folder: Path, *, verify: bool = True) -> tuple[Done, dict[str, Tensor]]:
-    """A finished block; its tensors are memory-mapped, and verifying reads them all. Raises CheckpointError."""
+    """A finished block; its tensors are memory-mapped, and verifying reads them all. Raises
+    CheckpointError.
+    """
     done = read_done(folder)
     if done is None:
         again = f"fprf train {folder.parent.parent / 'config.json'}"
@@ -140,11 +164,15 @@ def load_finished(folder: Path, *, verify: bool = True) -> tuple[Done, dict[str,
 
 
 def restore(module: nn.Module, kind: str, tensors: dict[str, Tensor]) -> None:
-    """Give a `member`, `decoder`, `tones` or `poses` its tensors of a finished block: mapped from the file, not copied."""
+    """Give a `member`, `decoder`, `tones` or `poses` its tensors of a finished block: mapped from the file,
+    not copied.
+    """
     own = {name.removeprefix(f"{kind}."): t for name, t in tensors.items() if name.startswith(f"{kind}.")}
     wrong = misfit(module, own)
     if wrong is not None:
-        raise CheckpointError(f"block: {kind} {wrong} does not fit the config; it was changed since the block was trained")
+        raise CheckpointError(
+            f"block: {kind} {wrong} does not fit the config; it was changed since the block was trained"
+        )
     module.load_state_dict(own, assign=True)
 
 
@@ -154,8 +182,12 @@ class BlockCache(Members):
     At most `limit` bytes of them stay, one at least.
     """
 
-    def __init__(self, root: Path, cells: Sequence[Cell], around: Member, *, device: torch.device, limit: int | None) -> None:
-        self.root, self.cells, self.device = root, cells, device
+    def __init__(
+        self, root: Path, cells: Sequence[Cell], around: Member, *, device: torch.device, limit: int | None
+    ) -> None:
+        self.root = root
+        self.cells = cells
+        self.device = device
         self.held = (around,)
         self.verified: set[int] = set()
         self._here: OrderedDict[int, Member] = OrderedDict()
@@ -168,7 +200,9 @@ class BlockCache(Members):
         return tuple(self._here)
 
     def member(self, number: int) -> Member:
-        """A block by its number; the surroundings come after the last one. Raises CheckpointError for a missing block."""
+        """A block by its number; the surroundings come after the last one. Raises CheckpointError for a
+        missing block.
+        """
         if number == len(self.cells):
             return self.held[0]
         if number in self._here:
@@ -189,9 +223,11 @@ class BlockCache(Members):
 def load_blocked(
     root: Path, config: TrainConfig, facts: Facts, device: torch.device, max_memory: float | None
 ) -> tuple[Model, int, float]:
-    """The blended model of a run's blocks, the steps of the one trained least, and the seconds of all together.
+    """The blended model of a run's blocks, the steps of the one trained least, and the seconds of all
+    together.
 
-    Blocks are fetched as they are met; at most `max_memory` MiB of them stay. Raises CheckpointError where one is missing.
+    Blocks are fetched as they are met; at most `max_memory` MiB of them stay. Raises CheckpointError where
+    one is missing.
     """
     # The surroundings stay in memory, with the decoder, tones and poses that all blocks have in common.
     cells = load_blocks(root)
@@ -201,17 +237,28 @@ def load_blocked(
     # Blocks are fetched when a ray meets them.
     limit = None if max_memory is None else int(max_memory * _MIB)
     cache = BlockCache(root, cells, around.member.to(device), device=device, limit=limit)
-    model = assemble(config, facts, cache, BlendRouter(cells), around.model.decoder, around.model.tones, around.model.poses)
+    model = assemble(
+        config, facts, cache, BlendRouter(cells), around.model.decoder, around.model.tones, around.model.poses
+    )
     model.requires_grad_(False)
     done = [load_finished(folder_of(root, block), verify=False)[0] for block in range(len(cells))]
-    return model.to(device).eval(), min(each.step for each in done), whole.seconds + sum(each.seconds for each in done)
+    return (
+        model.to(device).eval(),
+        min(each.step for each in done),
+        whole.seconds + sum(each.seconds for each in done),
+    )
 
 
 class Blocks(Partition):
     """A scene that is ready to be trained block by block."""
 
-    def __init__(self, config: TrainConfig, scene: ParsedScene, plan: Plan, facts: Facts, basis: Basis | None) -> None:
-        self.config, self.scene, self.plan, self.basis = config, scene, plan, basis
+    def __init__(
+        self, config: TrainConfig, scene: ParsedScene, plan: Plan, facts: Facts, basis: Basis | None
+    ) -> None:
+        self.config = config
+        self.scene = scene
+        self.plan = plan
+        self.basis = basis
         self._facts = facts
 
     @property
@@ -220,20 +267,32 @@ class Blocks(Partition):
 
     def train(self, run: Run, display: Display, *, spent: float) -> None:
         """The surroundings, the blocks, largest first, and the style of the whole. Finished ones stay."""
-        config, scene = self.config, self.scene
+        config = self.config
+        scene = self.scene
         self.write(run)
         display.say(f"{len(self.plan.cells)} blocks and their surroundings")
         executor = config.executor.on(device_of(config.device).type).build()
         order = self.plan.rays.argsort(descending=True).tolist()
-        train_all(config, run, executor, open_block, order, whole_share=SHARE, spent=spent, quiet=display.quiet)
-        finish(run, display, config, load_blocked(run.root, config, self.facts, device_of(config.device), None)[0], scene)
+        train_all(
+            config, run, executor, open_block, order, whole_share=SHARE, spent=spent, quiet=display.quiet
+        )
+        finish(
+            run,
+            display,
+            config,
+            load_blocked(run.root, config, self.facts, device_of(config.device), None)[0],
+            scene,
+        )
 
     def write(self, run: Run) -> None:
-        """Write all that tasks read. Blocks that were trained as what another number is now are moved there."""
+        """Write all that tasks read. Blocks that were trained as what another number is now are moved
+        there.
+        """
         plan = self.plan
         if self.basis is not None:
             run.save_tensors("basis", self.basis.tensors())
-        # The views that see a block, and the tiles of them whose rays meet it; the surroundings learn from everything.
+        # The views that see a block, and the tiles of them whose rays meet it; the surroundings learn from
+        # everything.
         rays = {}
         for block in (WHOLE, *range(len(plan.cells))):
             views = plan.views if block == WHOLE else plan.views_of(block)
@@ -243,7 +302,10 @@ class Blocks(Partition):
         folder = folder_of(run.root, 0).parent
         if any(task_of(part) for part in folder.glob("*")):  # digests read all images
             blocks = range(len(plan.cells))
-            asked = {z: block_task(self.config, self.facts, self.scene, plan.cells, z, rays[z])["task"] for z in blocks}
+            asked = {
+                z: block_task(self.config, self.facts, self.scene, plan.cells, z, rays[z])["task"]
+                for z in blocks
+            }
             renumber(folder, asked)
         for block, own in rays.items():
             folder_of(run.root, block).mkdir(parents=True, exist_ok=True)
@@ -252,21 +314,34 @@ class Blocks(Partition):
 
 
 def block_task(
-    config: TrainConfig, facts: Facts, scene: ParsedScene, cells: Sequence[Cell], block: int, rays: dict[str, Tensor]
+    config: TrainConfig,
+    facts: Facts,
+    scene: ParsedScene,
+    cells: Sequence[Cell],
+    block: int,
+    rays: dict[str, Tensor],
 ) -> dict[str, Any]:
     """The task of a block, and how long it is trained (`Part.asked`). `rays` is its rays.safetensors.
 
-    A block is decided by its bounds and rays, its images, and the config but for what may change, not by its surroundings:
-    they are only its frame.
+    A block is decided by its bounds and rays, its images, and the config but for what may change, not by its
+    surroundings: they are only its frame.
     """
     # What the surroundings span follows from all blocks together, not from how they are cut.
     chart = surroundings_of(cells) if block == WHOLE else chart_of(cells[block])
-    views, space = rays["views"].tolist(), facts.space
+    views = rays["views"].tolist()
+    space = facts.space
     parts = {
         "bounds": [chart.low.tolist(), chart.high.tolist(), torch.eye(3).tolist()],
         "space": [space.centre, space.rotation, space.scale, space.near, space.far],
         "views": views,
-        "facts": [facts.channels, facts.dim, facts.content_encoder, facts.semantic_encoder, facts.background, facts.exposure],
+        "facts": [
+            facts.channels,
+            facts.dim,
+            facts.content_encoder,
+            facts.semantic_encoder,
+            facts.background,
+            facts.exposure,
+        ],
     }
     # Tiles count as bytes: another layout around a block leaves its rays, and so its task, as they are.
     task = digest_of(config, FREE_IN_BLOCKS, scene, views, parts, rays["seen"].numpy().tobytes())
@@ -285,17 +360,28 @@ class Block(Part):
     rays: dict[str, Tensor]
 
     def build(self) -> FieldLearner:
-        """A block inside of its finished surroundings, on its own views and pixels; features are in the cache."""
-        config, facts, scene, lead = self.config, self.facts, replace(self.scene, train=self.rays["views"]), 0
+        """A block inside of its finished surroundings, on its own views and pixels; features are in the
+        cache.
+        """
+        config = self.config
+        facts = self.facts
+        scene = replace(self.scene, train=self.rays["views"])
+        lead = 0
         built = surroundings(config, facts, load_blocks(self.run.root))
         if self.block != WHOLE:
             done, tensors = load_finished(folder_of(self.run.root, WHOLE))
-            built.restore({name: tensor.clone() for name, tensor in tensors.items()})  # training writes to them
+            built.restore(
+                {name: tensor.clone() for name, tensor in tensors.items()}
+            )  # training writes to them
             built.member.requires_grad_(True)
-            built = block_in_surroundings(config, facts, load_blocks(self.run.root)[self.block], built, self.rays["views"])
+            built = block_in_surroundings(
+                config, facts, load_blocks(self.run.root)[self.block], built, self.rays["views"]
+            )
             # Its sampler goes on where that of the surroundings stopped.
             lead = done.step
-            config = replace(config, optimizer=replace(config.optimizer, warm_up=min(config.optimizer.warm_up, WARM_UP)))
+            config = replace(
+                config, optimizer=replace(config.optimizer, warm_up=min(config.optimizer.warm_up, WARM_UP))
+            )
         # Its pixels are those of the tiles that meet it; the basis of the semantics is the whole scene's.
         slots = {view: slot for slot, view in enumerate(self.rays["views"].tolist())}
 
@@ -304,27 +390,41 @@ class Block(Part):
             return pixel_mask(self.rays["seen"][slots[view]].bool(), (width, height))
 
         basis = Basis.from_tensors(self.run.load_tensors("basis")) if facts.dim else None
-        prepared = prepare(config, scene, facts, space=facts.space, basis=basis, seen=seen)._replace(facts=facts)
+        prepared = prepare(config, scene, facts, space=facts.space, basis=basis, seen=seen)._replace(
+            facts=facts
+        )
         return FieldLearner(config, prepared, device_of(config.device), built.model, lead=lead)
 
     def keep(self, learner: Learner) -> dict[str, Any]:
         """Write the block's fields, and what was learnt with them."""
-        assert isinstance(learner, FieldLearner) and isinstance(learner.model.field, BlockedField)  # it is that of `build`
+        assert isinstance(learner, FieldLearner) and isinstance(
+            learner.model.field, BlockedField
+        )  # it is that of `build`
         built = Built(learner.model, learner.model.field.members.held[0])
-        tensors = {f"{kind}.{name}": t for kind, part in built.kept().items() for name, t in part.state_dict().items()}
+        tensors = {
+            f"{kind}.{name}": t
+            for kind, part in built.kept().items()
+            for name, t in part.state_dict().items()
+        }
         return tensorfiles.save(self.folder / FILE, tensors)
 
 
 def open_block(task: Task) -> Block:
     """The block of a task. Raises ConfigError where the images are not those of the run."""
-    root, block = Path(task.root), task.part
+    root = Path(task.root)
+    block = task.part
     # All but its number and its share of the time is read from the run folder.
-    run, folder = Run(root), folder_of(root, block)
-    config, facts = fields_only(run.load_config()[0], root), run.load_known().facts
+    run = Run(root)
+    folder = folder_of(root, block)
+    config = fields_only(run.load_config()[0], root)
+    facts = run.load_known().facts
     # A worker may see the scene at another path; views are numbers, so it must be the same scene.
-    scene, rays = read_scene(replace(config, data=Path(task.data)), facts), tensorfiles.read(folder / RAYS)
+    scene = read_scene(replace(config, data=Path(task.data)), facts)
+    rays = tensorfiles.read(folder / RAYS)
     if len(rays["views"]) and int(rays["views"].max()) >= len(scene.paths):
-        raise ConfigError(f"{folder}: its views are not those of {scene.name}; train with the scene that the run was cut from")
+        raise ConfigError(
+            f"{folder}: its views are not those of {scene.name}; train with the scene that the run was cut from"
+        )
     return Block(
         name="surroundings" if block == WHOLE else f"block {block:02d}",
         folder=folder,

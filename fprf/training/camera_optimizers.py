@@ -1,13 +1,15 @@
 """Corrections of the captured poses: a turn and a shift a view, learnt with the scene.
 
-Conventions. A move is [turn, shift]: a rotation vector in world axes about the camera's own centre (radians), and the centre's
-shift in units of `reach`, the distance that views commonly see. So one step of the optimiser moves a pixel about as far by
-either. A scene can be shifted, turned and scaled with all its cameras without any image changing: these seven directions (to
-first order, about the mean of the cameras that are learnt from) are taken out of every move, so the scene stays where the
-capture put it. Views that are held out never move.
+Conventions. A move is [turn, shift]: a rotation vector in world axes about the camera's own centre (radians),
+and the centre's shift in units of `reach`, the distance that views commonly see. So one step of the optimiser
+moves a pixel about as far by either. A scene can be shifted, turned and scaled with all its cameras without
+any image changing: these seven directions (to first order, about the mean of the cameras that are learnt
+from) are taken out of every move, so the scene stays where the capture put it. Views that are held out never
+move.
 
-The surroundings of a scene of blocks find the moves of all views. Each block starts from those and goes on with its own views,
-without those seven directions of its own, so neighbours stay together; rendering uses what the surroundings found.
+The surroundings of a scene of blocks find the moves of all views. Each block starts from those and goes on
+with its own views, without those seven directions of its own, so neighbours stay together; rendering uses
+what the surroundings found.
 """
 
 from dataclasses import replace
@@ -33,17 +35,24 @@ class Poses(nn.Module):
     gauge: Tensor
 
     def __init__(
-        self, centres: Annotated[Tensor, "V 3"], held: tuple[int, ...], *, reach: float, pace: float, still: bool = False
+        self,
+        centres: Annotated[Tensor, "V 3"],
+        held: tuple[int, ...],
+        *,
+        reach: float,
+        pace: float,
+        still: bool = False,
     ) -> None:
-        """`centres` are the cameras' in the world; `held` are views that are not learnt from. One unit of the parameters is
-        `pace` radians, or reaches: how fast poses are learnt beside everything else. Where the scene is `still`, nothing is
-        taken out of the moves.
+        """`centres` are the cameras' in the world; `held` are views that are not learnt from. One unit of the
+        parameters is `pace` radians, or reaches: how fast poses are learnt beside everything else. Where the
+        scene is `still`, nothing is taken out of the moves.
         """
         super().__init__()
         views = len(centres)
         learned = torch.ones(views, dtype=torch.bool)
         learned[list(held)] = False
-        self.reach, self.pace = reach, pace
+        self.reach = reach
+        self.pace = pace
         self.offset = nn.Parameter(torch.zeros(views, 6))
         self.register_buffer("known", torch.zeros(views, 6))
         self.register_buffer("learned", learned.nonzero()[:, 0], persistent=False)
@@ -59,7 +68,10 @@ class Poses(nn.Module):
         return moves
 
     def forward(
-        self, view: Annotated[Tensor, "R"], origin: Annotated[Tensor, "R 3"], direction: Annotated[Tensor, "R 3"]
+        self,
+        view: Annotated[Tensor, "R"],
+        origin: Annotated[Tensor, "R 3"],
+        direction: Annotated[Tensor, "R 3"],
     ) -> tuple[Annotated[Tensor, "R 3"], Annotated[Tensor, "R 3"]]:
         """World rays (float64, unit directions) of the views as they are now."""
         # To the device first, since MPS has no float64.
@@ -74,7 +86,9 @@ class Poses(nn.Module):
     @torch.no_grad()
     def moved_by(self) -> Annotated[Tensor, "V 6"]:
         """Turn (radians) and shift (world units) of each view, float64, on the CPU."""
-        return self.moves().cpu().double() * torch.tensor([1.0, 1, 1, self.reach, self.reach, self.reach], dtype=torch.float64)
+        return self.moves().cpu().double() * torch.tensor(
+            [1.0, 1, 1, self.reach, self.reach, self.reach], dtype=torch.float64
+        )
 
     def going_on(self, centres: Annotated[Tensor, "V 3"], held: tuple[int, ...]) -> "Poses":
         """Poses that start as these are now, and learn from other views."""
@@ -98,21 +112,29 @@ def rotated(x: Annotated[Tensor, "N 3"], turn: Annotated[Tensor, "N 3"]) -> Anno
     across = torch.linalg.cross(turn, x)
     # (1 - cos a) / a^2 by the half angle: 1 - cos would cancel.
     half = torch.sin(angle / 2) / (angle / 2)
-    turned: Tensor = x + torch.sin(angle) / angle * across + 0.5 * half.square() * torch.linalg.cross(turn, across)
+    turned: Tensor = (
+        x + torch.sin(angle) / angle * across + 0.5 * half.square() * torch.linalg.cross(turn, across)
+    )
     return turned
 
 
 def rays_of_moving_cameras(rays: Rays) -> Rays:
-    """Rays whose origin and direction alone lead gradients: samples are placed, and looks shaded, as if poses were fixed."""
+    """Rays whose origin and direction alone lead gradients: samples are placed, and looks shaded, as if poses
+    were fixed.
+    """
     return Rays(rays.origin, rays.direction, rays.view.detach(), rays.near.detach(), rays.far.detach())
 
 
 def _gauge(centres: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "6M G"]:
     """An orthonormal basis, G <= 7, of the moves that shift, turn or scale all cameras as one."""
     place = centres - centres.mean(0) if len(centres) else centres
-    none, axes = torch.zeros_like(place), torch.eye(3, dtype=place.dtype)
+    none = torch.zeros_like(place)
+    axes = torch.eye(3, dtype=place.dtype)
     columns = [torch.cat([none, axis.expand_as(place)], -1) for axis in axes]
-    columns += [torch.cat([axis.expand_as(place), torch.linalg.cross(axis.expand_as(place), place)], -1) for axis in axes]
+    columns += [
+        torch.cat([axis.expand_as(place), torch.linalg.cross(axis.expand_as(place), place)], -1)
+        for axis in axes
+    ]
     columns.append(torch.cat([none, place], -1))
     matrix = torch.stack([column.reshape(-1) for column in columns], -1)
     if not matrix.numel():
@@ -144,7 +166,9 @@ class Tones(nn.Module):
         self.register_buffer("known", torch.zeros(views, 3), persistent=False)
 
     def gains(self) -> Annotated[Tensor, "V 3"]:
-        """Logarithms of what exposures do not say. The mean over the views that are learnt from does not change."""
+        """Logarithms of what exposures do not say. The mean over the views that are learnt from does not
+        change.
+        """
         centre = (self.gain * self.learned).sum(0) / self.learned.sum().clamp_min(1)
         gains: Tensor = self.known + (self.gain - centre) * self.learned
         return gains
@@ -152,7 +176,9 @@ class Tones(nn.Module):
     def forward(self, view: Annotated[Tensor, "R"]) -> Annotated[Tensor, "R 3"]:
         """Factors of views; of one that was never learnt from, what its exposure alone says."""
         at = view.to(self.gain.device)
-        return torch.exp(self.gains().index_select(0, at) + self.exponent * self.exposure.index_select(0, at)[:, None])
+        return torch.exp(
+            self.gains().index_select(0, at) + self.exponent * self.exposure.index_select(0, at)[:, None]
+        )
 
     def going_on(self, held: tuple[int, ...]) -> "Tones":
         """Tones that start as these are now, and learn from other views; the exponent stays."""

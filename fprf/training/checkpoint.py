@@ -1,7 +1,7 @@
 """Checkpoints: `checkpoints/step-N/` with model, optimiser and a manifest that is written last.
 
-A folder without a valid manifest was cut short and does not count. The two newest are kept. All draws are functions of
-(seed, step), so parameters, moments and the step are all there is to save.
+A folder without a valid manifest was cut short and does not count. The two newest are kept. All draws are
+functions of (seed, step), so parameters, moments and the step are all there is to save.
 """
 
 import json
@@ -54,8 +54,11 @@ def steps(root: Path) -> list[int]:
     return sorted(numbers)
 
 
-def write(root: Path, model: Mapping[str, Tensor], optimizer: Mapping[str, Tensor], *, step: int, seconds: float) -> Path:
-    """Write the checkpoint of a step, then drop all but the newest two; later ones are of a past that was gone back from.
+def write(
+    root: Path, model: Mapping[str, Tensor], optimizer: Mapping[str, Tensor], *, step: int, seconds: float
+) -> Path:
+    """Write the checkpoint of a step, then drop all but the newest two; later ones are of a past that was
+    gone back from.
 
     Raises DataError where the system refuses; what was there before is then there still.
     """
@@ -75,12 +78,16 @@ def write(root: Path, model: Mapping[str, Tensor], optimizer: Mapping[str, Tenso
     written = steps(root)
     for old in [s for s in written if s <= step][:-KEEP] + [s for s in written if s > step]:
         (_folder(root, old) / "manifest.json").unlink()
-        shutil.rmtree(_folder(root, old), ignore_errors=True)  # files that somebody has open stay; `tidy` removes them later
+        shutil.rmtree(
+            _folder(root, old), ignore_errors=True
+        )  # files that somebody has open stay; `tidy` removes them later
     return folder
 
 
 def tidy(root: Path) -> None:
-    """Remove what was cut short: folders without a manifest, unfinished files. Only where nobody else writes."""
+    """Remove what was cut short: folders without a manifest, unfinished files. Only where nobody else
+    writes.
+    """
     complete = {_folder(root, step) for step in steps(root)}
     for folder in root.glob("step-*"):
         if folder in complete:
@@ -90,11 +97,15 @@ def tidy(root: Path) -> None:
 
 
 def load(root: Path, step: int, *, verify: bool = True) -> Saved:
-    """One checkpoint. Its tensors are mapped from files: only to `verify` them they are read. Raises CheckpointError."""
-    folder, manifest = _folder(root, step), _read(root, step)
+    """One checkpoint. Its tensors are mapped from files: only to `verify` them they are read. Raises
+    CheckpointError.
+    """
+    folder = _folder(root, step)
+    manifest = _read(root, step)
     files = {name: (folder / f"{name}.safetensors", entries) for name, entries in manifest.files.items()}
     model, optimizer = (
-        tensorfiles.load(*files[name]) if verify else tensorfiles.read(files[name][0]) for name in ("model", "optimizer")
+        tensorfiles.load(*files[name]) if verify else tensorfiles.read(files[name][0])
+        for name in ("model", "optimizer")
     )
     return Saved(step, manifest.seconds, model, optimizer)
 
@@ -123,7 +134,8 @@ def _read(root: Path, step: int) -> _Manifest:
     with open_json(_folder(root, step) / "manifest.json", "use another checkpoint") as manifest:
         if manifest.pop("crc32", None) not in (None, checksum := _checksum(manifest)):
             raise ValueError("its checksum differs")
-        at, seconds = int(manifest["step"]), float(manifest["seconds"])
+        at = int(manifest["step"])
+        seconds = float(manifest["seconds"])
         files = {name: dict(manifest["files"][name]) for name in ("model", "optimizer")}
         if at != step or not math.isfinite(seconds):
             raise ValueError(f"it speaks of step {at} after {seconds} s")
@@ -131,7 +143,9 @@ def _read(root: Path, step: int) -> _Manifest:
 
 
 def load_latest(root: Path, *, verify: bool = True) -> tuple[Saved | None, list[str]]:
-    """The newest intact checkpoint, and a line for every newer one that was damaged. Raises where all are damaged."""
+    """The newest intact checkpoint, and a line for every newer one that was damaged. Raises where all are
+    damaged.
+    """
     # From the newest backwards, since a disk that failed has mostly failed at the last one.
     damaged: list[str] = []
     for step in reversed(steps(root)):
@@ -145,7 +159,9 @@ def load_latest(root: Path, *, verify: bool = True) -> tuple[Saved | None, list[
 
 
 def misfit(module: nn.Module, tensors: Mapping[str, Tensor]) -> str | None:
-    """Name of a tensor that is absent, of another shape, or not the module's; None where all are those of its state."""
+    """Name of a tensor that is absent, of another shape, or not the module's; None where all are those of its
+    state.
+    """
     own = module.state_dict()
     wrong = [name for name in own if name not in tensors or own[name].shape != tensors[name].shape]
     wrong += [name for name in tensors if name not in own]
@@ -169,7 +185,9 @@ def restore(state: State, model: nn.Module, optimizer: torch.optim.Optimizer | N
 
 
 def moments_of(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """The tensors of an optimiser by the number of their parameter and their own name, as `restore` reads them."""
+    """The tensors of an optimiser by the number of their parameter and their own name, as `restore` reads
+    them.
+    """
     return {
         f"{index}.{key}": value
         for index, values in optimizer.state_dict()["state"].items()

@@ -1,6 +1,7 @@
 """Compare a device with the CPU on a tiny scene of seeded numbers: no files, no network, a few seconds.
 
-The expected values are computed by plain torch on the CPU, so on the CPU its compiled kernels are compared with them.
+The expected values are computed by plain torch on the CPU, so on the CPU its compiled kernels are compared
+with them.
 """
 
 import math
@@ -57,7 +58,8 @@ def compare(device: torch.device) -> list[Outcome]:
     computed = _computed(device)
     outcomes = []
     for what, allowed in _ALLOWED.items():
-        away, like = double(computed[what].cpu()) - double(expected[what]), double(expected[what])
+        away = double(computed[what].cpu()) - double(expected[what])
+        like = double(expected[what])
         error = float(away.abs().max() if what in ("render", "restyle") else away.norm() / like.norm())
         outcomes.append(Outcome(what, math.inf if math.isnan(error) else error, allowed))
     return outcomes
@@ -90,16 +92,21 @@ def _computed(device: torch.device) -> dict[str, Tensor]:
     config = TrainConfig(
         sampler=ProposalConfig(samples=(16,), final=8, resolutions=(8,)),
         content=ContentConfig(
-            encoder=BundledContentConfig(), field=PlanesConfig(resolutions=(8, 16), channels=8, hidden=32, layers=1)
+            encoder=BundledContentConfig(),
+            field=PlanesConfig(resolutions=(8, 16), channels=8, hidden=32, layers=1),
         ),
-        semantic=SemanticConfig(field=SemanticPlanesConfig(resolutions=(8,), channels=8, hidden=16, layers=1), dim=_DIM),
+        semantic=SemanticConfig(
+            field=SemanticPlanesConfig(resolutions=(8,), channels=8, hidden=16, layers=1), dim=_DIM
+        ),
         render=RenderConfig(budget=0.0),
     )
     axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     space = Space(kind="contraction", centre=(0.0, 0.0, 0.0), rotation=axes, scale=1.0, near=0.1, far=100.0)
     facts = Facts(space=space, channels=encoder.channels, dim=_DIM, content_encoder=encoder.identity)
     model = build_model(config, facts).to(device)
-    place, target, up = (torch.tensor([x], dtype=torch.float64) for x in ((0.0, -0.4, 0.1), (0.1, 0.5, 0.0), (0.0, 0.0, 1.0)))
+    place, target, up = (
+        torch.tensor([x], dtype=torch.float64) for x in ((0.0, -0.4, 0.1), (0.1, 0.5, 0.0), (0.0, 0.0, 1.0))
+    )
     cameras = pinhole(look_at(place, target, up[0]), width=32, height=24, fov=60.0)
     # Features of a picture, a step of training, and the view as it is and in the picture's style.
     encoder = encoder.to(device)
@@ -120,10 +127,16 @@ def _gradients(model: Model, cameras: Cameras, image: Annotated[Tensor, "3 H W"]
     learned = model.learned()
     gradients: list[Tensor] = []
     for _ in range(2):
-        out = render_rays(rays, model.parts, want=Want.COLOUR | Want.CONTENT | Want.SEMANTIC, budget=0.0, step=0)
+        out = render_rays(
+            rays, model.parts, want=Want.COLOUR | Want.CONTENT | Want.SEMANTIC, budget=0.0, step=0
+        )
         assert out.rgb is not None and out.content is not None and out.semantic is not None
         target = torch.nn.functional.interpolate(image[None], (24, 32))[0].flatten(1).T
-        loss = (out.rgb - target).square().mean() + (out.content - 0.1).square().mean() + (out.semantic - 0.1).square().mean()
+        loss = (
+            (out.rgb - target).square().mean()
+            + (out.content - 0.1).square().mean()
+            + (out.semantic - 0.1).square().mean()
+        )
         gradients = list(torch.autograd.grad(loss, learned, allow_unused=True, materialize_grads=True))
         # A plain step, so that the second gradient depends on the first one.
         with torch.no_grad():
@@ -134,16 +147,24 @@ def _gradients(model: Model, cameras: Cameras, image: Annotated[Tensor, "3 H W"]
 
 @torch.no_grad()
 def _restyle(model: Model, features: Annotated[Tensor, "N C"], image: Annotated[Tensor, "3 H W"]) -> Restyle:
-    """The style of the picture for points with its features, scaled and shifted; both have a few distinct classes."""
+    """The style of the picture for points with its features, scaled and shifted; both have a few distinct
+    classes.
+    """
     kinds = torch.arange(len(features), device=features.device) % _KINDS
-    semantic = torch.nn.functional.one_hot(kinds, _DIM).float() + 0.05 * _uniform(len(features), _DIM).to(features)
+    semantic = torch.nn.functional.one_hot(kinds, _DIM).float() + 0.05 * _uniform(len(features), _DIM).to(
+        features
+    )
     colour = torch.nn.functional.interpolate(image[None], (24, 32), mode="area")[0].flatten(1).T
     dictionary = build_dictionary([Reference("picture", features, semantic, colour=colour)], clusters=_KINDS)
     scene = scene_style(0.5 * features + 0.2, semantic, torch.ones_like(features[:, 0]), None, _KINDS, 0)
     chosen = RegionToneConfig()
     stylizer = chosen.build(dictionary=dictionary, scene=scene).to(features.device)
-    colours = colour_maps(stylizer, dictionary, scene, model.decoder, features=chosen.features, share=chosen.colours)
-    return Restyle(stylizer, features=chosen.features, colours=None if colours is None else colours.to(features.device))
+    colours = colour_maps(
+        stylizer, dictionary, scene, model.decoder, features=chosen.features, share=chosen.colours
+    )
+    return Restyle(
+        stylizer, features=chosen.features, colours=None if colours is None else colours.to(features.device)
+    )
 
 
 def _uniform(*shape: int) -> Tensor:

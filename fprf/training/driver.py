@@ -1,11 +1,12 @@
 """Training of any kind of scene, from a config to a run folder.
 
-`train` owns the folder: its lock, config, hashes of the images, facts, and what is resumed. `learn` owns the loop: schedule,
-checkpoints, reports, interrupts, steps that are not finite, memory. What is learnt, and how, belongs to the learner
-(`interfaces.Learner`) that the config builds.
+`train` owns the folder: its lock, config, hashes of the images, facts, and what is resumed. `learn` owns the
+loop: schedule, checkpoints, reports, interrupts, steps that are not finite, memory. What is learnt, and how,
+belongs to the learner (`interfaces.Learner`) that the config builds.
 
-The run folder is the only channel to whoever watches: they read its newest checkpoint and the end of events.jsonl. `watch` asks
-for checkpoints more often while somebody looks; nothing else that they do reaches training.
+The run folder is the only channel to whoever watches: they read its newest checkpoint and the end of
+events.jsonl. `watch` asks for checkpoints more often while somebody looks; nothing else that they do reaches
+training.
 """
 
 import math
@@ -37,12 +38,17 @@ from .run import Run, check_images, image_hashes, lock_folder, save_image_hashes
 REPORT_SECONDS = 0.5
 """Time between reports."""
 PATIENCE = 3
-"""Steps in a row that are not finite after which a run goes back to its last checkpoint: it will not recover by itself."""
+"""Steps in a row that are not finite after which a run goes back to its last checkpoint: it will not recover
+by itself.
+"""
 WATCHED = ".watched"
 """File of a run folder that whoever looks at a training touches every second."""
-_WATCH_SECONDS, _SAVING_SHARE, _MIN_PAUSE = 5.0, 0.05, 2.0
-"""Age up to which that file says that somebody looks; the share of the time that checkpoints may then take, and the least
-seconds between them."""
+_WATCH_SECONDS = 5.0
+_SAVING_SHARE = 0.05
+_MIN_PAUSE = 2.0
+"""Age up to which that file says that somebody looks; the share of the time that checkpoints may then take,
+and the least seconds between them.
+"""
 _SMALL = 96
 """Pixels of an image's shorter side below which a `--downscale` that was asked for is probably a mistake."""
 _SHOWN = 4
@@ -90,14 +96,16 @@ class Report(NamedTuple):
 
 
 def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images: bool = False) -> Path:
-    """Train a scene to the end and return its run folder; an existing run there is resumed if its config and images fit.
+    """Train a scene to the end and return its run folder; an existing run there is resumed if its config and
+    images fit.
 
-    With `changed_images` they may be others than those that the run was begun with. Raises UsageError where packages,
-    weights or the scene are missing, DataError where another process is training there.
+    With `changed_images` they may be others than those that the run was begun with. Raises UsageError where
+    packages, weights or the scene are missing, DataError where another process is training there.
     """
     start = time.perf_counter()
     output = config.output or default_output(config, method)
-    config, run = replace(config, output=output), Run(output)
+    config = replace(config, output=output)
+    run = Run(output)
     # What is missing is said before there is a folder.
     with Display(quiet=quiet) as display:
         _check_needs(config, method, display)
@@ -134,8 +142,11 @@ def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images
             display.say(shown + learner.begin(run))
             learn(learner, run, schedule_of(config, len(scene.train)), reporter(display, run), spent=spent)
             learner.finish(run, display)
-        quoted, seconds = shlex.quote(str(output)), time.perf_counter() - start
-        display.say(f"done after {seconds:.0f} s: fprf stylize {quoted} --references PHOTO.jpg, fprf eval {quoted}")
+        quoted = shlex.quote(str(output))
+        seconds = time.perf_counter() - start
+        display.say(
+            f"done after {seconds:.0f} s: fprf stylize {quoted} --references PHOTO.jpg, fprf eval {quoted}"
+        )
     return output
 
 
@@ -146,21 +157,29 @@ def default_output(config: RunConfig, method: str) -> Path:
 
 
 def learn(
-    learner: Learner, run: Run | None, schedule: Schedule, report: Callable[[Report], None], *, spent: float = 0.0
+    learner: Learner,
+    run: Run | None,
+    schedule: Schedule,
+    report: Callable[[Report], None],
+    *,
+    spent: float = 0.0,
 ) -> tuple[int, float]:
-    """Take steps, going on from the newest checkpoint of the run, until the schedule is over; `spent` seconds count as used.
+    """Take steps, going on from the newest checkpoint of the run, until the schedule is over; `spent` seconds
+    count as used.
 
     Returns how many steps are made, and the seconds of training, those of earlier starts included.
 
-    Without a `run` nothing is saved. An interrupt saves first, then goes on upwards. Steps that are not finite change nothing
-    and are logged; PATIENCE of them in a row lead back to the last checkpoint: on CUDA with the next report. Raises
-    NumericsError where there is none, or where that was of no use, OutOfMemoryError where a step finds too little memory.
+    Without a `run` nothing is saved. An interrupt saves first, then goes on upwards. Steps that are not
+    finite change nothing and are logged; PATIENCE of them in a row lead back to the last checkpoint: on CUDA
+    with the next report. Raises NumericsError where there is none, or where that was of no use,
+    OutOfMemoryError where a step finds too little memory.
     """
     # All draws are functions of (seed, step): a resumed training is bit for bit the one that never stopped.
     saved = None if run is None else _resume(learner, run)
     step, seconds_before = (saved.step, saved.seconds) if saved is not None else (0, spent)
     # `step` steps are made, `clock` seconds used.
-    first, clock = step, seconds_before
+    first = step
+    clock = seconds_before
     went_back = -1  # the step that faults led back to last
     begun = last_report = last_saved = time.perf_counter()
     pause = longest = 60 * schedule.checkpoint_minutes
@@ -190,9 +209,15 @@ def learn(
                 learner.step(step, share)
                 now = time.perf_counter()
                 due = now - last_report > REPORT_SECONDS
-                # An accelerator works ahead of the host, which waits for it only twice a second and at the end.
-                if due or learner.device.type == "cpu" or schedule.share(step + 1, seconds_before + now - begun) >= 1:
-                    # The only place where the host waits; faults of all steps since the last look come with it.
+                # An accelerator works ahead of the host, which waits for it only twice a second and at the
+                # end.
+                if (
+                    due
+                    or learner.device.type == "cpu"
+                    or schedule.share(step + 1, seconds_before + now - begun) >= 1
+                ):
+                    # The only place where the host waits; faults of all steps since the last look come with
+                    # it.
                     figures = learner.figures()
                     if figures.fault and run is not None:
                         run.log({"step": step, "skipped": figures.fault})
@@ -200,7 +225,8 @@ def learn(
                         went_back = step = _go_back(learner, run, figures, step, went_back)
                         continue
                 # The clock goes on from that of earlier starts, so that a time limit holds for all of them.
-                step, clock = step + 1, seconds_before + now - begun
+                step = step + 1
+                clock = seconds_before + now - begun
                 if due and figures is not None:
                     last_report = now
                     report(measured(figures, schedule.share(step, clock)))
@@ -247,7 +273,9 @@ def _resume(learner: Learner, run: Run) -> checkpoint.Saved | None:
 
 
 def _go_back(learner: Learner, run: Run | None, figures: Figures, step: int, before: int) -> int:
-    """Load the newest checkpoint and return its step; a second time to the same one (`before`) would change nothing."""
+    """Load the newest checkpoint and return its step; a second time to the same one (`before`) would change
+    nothing.
+    """
     why = f"step {step}: {figures.fault or 'the loss'} is not finite for {PATIENCE} steps in a row"
     remedy = "lower the learning rate, or check the images"
     saved = None if run is None else checkpoint.load_latest(run.checkpoints)[0]
@@ -261,7 +289,9 @@ def _go_back(learner: Learner, run: Run | None, figures: Figures, step: int, bef
 
 
 def watch(root: Path) -> None:
-    """Tell the training in a run folder, if there is one, that somebody looks: to be called every second while they do."""
+    """Tell the training in a run folder, if there is one, that somebody looks: to be called every second
+    while they do.
+    """
     with suppress(OSError):  # a run on a read-only disk is not being trained
         (root / WATCHED).touch()
 
@@ -275,8 +305,10 @@ def is_watched(root: Path) -> bool:
 
 
 class _SignalHandler:
-    """SIGINT and SIGTERM held back inside the block, and as before after it. Python lets only the main thread set
-    handlers; in any other this changes nothing. A handler that was not set from Python stays: it could not be set again."""
+    """SIGINT and SIGTERM held back inside the block, and as before after it. Python lets only the main thread
+    set handlers; in any other this changes nothing. A handler that was not set from Python stays: it could
+    not be set again.
+    """
 
     def __init__(self) -> None:
         self.asked = False
@@ -289,7 +321,11 @@ class _SignalHandler:
         if threading.current_thread() is threading.main_thread():
             # Windows has SIGBREAK for a process group of its own.
             held = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGBREAK", signal.SIGTERM)}
-            self.before = {number: signal.signal(number, self.note) for number in held if signal.getsignal(number) is not None}
+            self.before = {
+                number: signal.signal(number, self.note)
+                for number in held
+                if signal.getsignal(number) is not None
+            }
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -305,13 +341,16 @@ class _SignalHandler:
 
 
 def reporter(display: Display, run: Run, name: str = "training") -> Callable[[Report], None]:
-    """Progress of what is trained in a folder: for the display, and every few seconds a line of its events.jsonl."""
+    """Progress of what is trained in a folder: for the display, and every few seconds a line of its
+    events.jsonl.
+    """
     last = -LINE_SECONDS
 
     def report(event: Report) -> None:
         nonlocal last
         display.training(event, name)
-        # events.jsonl grows by a line every few seconds, whatever the pace of reports; the last one always counts.
+        # events.jsonl grows by a line every few seconds, whatever the pace of reports; the last one always
+        # counts.
         now = time.perf_counter()
         if now - last < LINE_SECONDS and event.share < 1:
             return
@@ -333,13 +372,17 @@ def reporter(display: Display, run: Run, name: str = "training") -> Callable[[Re
 
 
 def _check_needs(config: RunConfig, method: str, display: Display) -> None:
-    """Raise UsageError where something is missing that nothing downloads, after showing all that is missing."""
+    """Raise UsageError where something is missing that nothing downloads, after showing all that is
+    missing.
+    """
     needs = config.needs()
     if config.data is not None and all(need.downloaded for need in needs):
         return  # where the scene cannot be read its parser says so
     # Something is: then whether some parser reads the scene folder is told as well, before it is mended.
     if config.data is None:
-        needs.insert(0, Need("no scene is named", "give --data FOLDER, or --data garden for the embedded scene"))
+        needs.insert(
+            0, Need("no scene is named", "give --data FOLDER, or --data garden for the embedded scene")
+        )
     elif config.scene_parser is None:
         try:
             recognise(config.data)
@@ -348,7 +391,9 @@ def _check_needs(config: RunConfig, method: str, display: Display) -> None:
     if len(needs) > 1:
         for need in needs:
             display.say(f"missing: {need.what}: {need.remedy}")
-        raise UsageError(f"fprf train {method}: {len(needs)} things are missing; `fprf doctor {method}` looks again")
+        raise UsageError(
+            f"fprf train {method}: {len(needs)} things are missing; `fprf doctor {method}` looks again"
+        )
     raise UsageError(f"fprf train {method}: {needs[0].what}: {needs[0].remedy}")
 
 
@@ -371,27 +416,46 @@ def _sized(run: Run, config: RunConfig, display: Display) -> RunConfig:
         config = planned(config, scene)
         sizes = scene.cameras.scaled(config.downscale or 1).size
         width, height = sizes[scene.train[0] if len(scene.train) else 0].tolist()
-        ends = f"{config.minutes:g} minutes" if config.minutes is not None else f"{config.limited(len(scene.train)):,} steps"
-        reduced = f" (1/{config.downscale:.3g}; --downscale 1 keeps them whole)" if config.downscale != 1 else ""
-        display.say(f"plan: {len(scene.train)} views at {width}x{height}{reduced}{config.described()}, {ends}")
+        ends = (
+            f"{config.minutes:g} minutes"
+            if config.minutes is not None
+            else f"{config.limited(len(scene.train)):,} steps"
+        )
+        reduced = (
+            f" (1/{config.downscale:.3g}; --downscale 1 keeps them whole)" if config.downscale != 1 else ""
+        )
+        display.say(
+            f"plan: {len(scene.train)} views at {width}x{height}{reduced}{config.described()}, {ends}"
+        )
     return config
 
 
 def _check_same(run: Run, config: RunConfig) -> None:
-    """Raise UsageError where a folder holds a run with another config; only what `changeable` names may differ."""
+    """Raise UsageError where a folder holds a run with another config; only what `changeable` names may
+    differ.
+    """
     if not run.exists:
         return
     old, _ = run.load_config()
     # What the run itself left open was never decided there.
     free = (*config.changeable(old), *(name for name in config.open if getattr(old, name, None) is None))
     # Whole branches of the config may be free: what is compared are its leaves, by their paths.
-    mine, theirs = leaves(config), leaves(old)
-    changed = [path for path in theirs | mine if path.partition(".")[0] not in free and mine.get(path) != theirs.get(path)]
+    mine = leaves(config)
+    theirs = leaves(old)
+    changed = [
+        path
+        for path in theirs | mine
+        if path.partition(".")[0] not in free and mine.get(path) != theirs.get(path)
+    ]
     if changed:
-        shown = [f"{name} {theirs.get(name, '-')} ({mine.get(name, '-')} is asked)" for name in changed[:_SHOWN]]
+        shown = [
+            f"{name} {theirs.get(name, '-')} ({mine.get(name, '-')} is asked)" for name in changed[:_SHOWN]
+        ]
         more = f" and {len(changed) - _SHOWN} others" if len(changed) > _SHOWN else ""
         # The first free name after this one, so that the line can be copied.
-        other = next(path for k in range(2, 1000) if not (path := run.root.with_name(f"{run.root.name}-{k}")).exists())
+        other = next(
+            path for k in range(2, 1000) if not (path := run.root.with_name(f"{run.root.name}-{k}")).exists()
+        )
         raise UsageError(
             f"{run.root}: holds a run with {', '.join(shown)}{more}; go on with it by its own values, or begin another with "
             f"--output {shlex.quote(str(other))}"

@@ -1,8 +1,8 @@
 """Fields in training: one batch of rays a step, Adam, and the paper's losses.
 
-Batches and draws are functions of (seed, step), so a resumed run goes on as if never stopped. On CUDA the host waits for the
-device only where figures are asked for: losses and faults stay on the device until then. Batches are drawn there where their
-data fit, otherwise copied one step ahead.
+Batches and draws are functions of (seed, step), so a resumed run goes on as if never stopped. On CUDA the
+host waits for the device only where figures are asked for: losses and faults stay on the device until then.
+Batches are drawn there where their data fit, otherwise copied one step ahead.
 
 Letters: R rays of a batch, S samples of a ray.
 """
@@ -47,16 +47,18 @@ FAINT_SECOND = 1e-36
 LARGEST = 1.8e19
 """Norm of a gradient that Adam can square in float32 (3.4e38)."""
 _FEW_STEPS = 600
-"""Fewer are too few to judge by: a garden of ten views shows streaks on held-out ones after 350, at 19.8 dB on the training
-views; flower and fox are at 22.9 and 27.1 dB on held-out views after 754 and 775."""
+"""Fewer are too few to judge by: a garden of ten views shows streaks on held-out ones after 350, at 19.8 dB
+on the training views; flower and fox are at 22.9 and 27.1 dB on held-out views after 754 and 775.
+"""
 
 
 class FieldLearner(SceneLearner):
-    """Fields in training: their model, its optimiser, and what lives between steps but is not saved: running means.
+    """Fields in training: their model, its optimiser, and what lives between steps but is not saved: running
+    means.
 
-    `model` is one at its start, where it is not simply that of the config: a block in its surroundings, whose sampler was
-    trained for `lead` steps before. The parts of a step carry names (`fprf.batch` ...) that a profiler sees; without one they
-    cost microseconds.
+    `model` is one at its start, where it is not simply that of the config: a block in its surroundings, whose
+    sampler was trained for `lead` steps before. The parts of a step carry names (`fprf.batch` ...) that a
+    profiler sees; without one they cost microseconds.
     """
 
     def __init__(
@@ -68,11 +70,16 @@ class FieldLearner(SceneLearner):
         *,
         lead: int = 0,
     ) -> None:
-        self.config, self.prepared, self._device, self.lead = config, prepared, device, lead
+        self.config = config
+        self.prepared = prepared
+        self._device = device
+        self.lead = lead
         self.model = (build_model(config, prepared.facts) if model is None else model).to(device)
         adam = config.optimizer
         betas = 0.9, adam.beta2
-        self.optimizer = torch.optim.Adam(self.model.learned(), lr=adam.rate, betas=betas, eps=adam.eps, fused=True)
+        self.optimizer = torch.optim.Adam(
+            self.model.learned(), lr=adam.rate, betas=betas, eps=adam.eps, fused=True
+        )
         self.tf32 = config.precision == "tf32" and device.type == "cuda"
         # A mistake in the config is told before features are moved and steps are taken.
         check_penalties(config.loss, self.model)
@@ -84,7 +91,9 @@ class FieldLearner(SceneLearner):
             self.manager = prepared.manager.to(device, room=int(config.device_memory * (free or 0)))
         self.batches = Batches(self.manager, device)
         self.through = PixelRays(prepared.scene.cameras)
-        if device.type != "mps" and not self.through.waits:  # MPS has no float64: rays are made on the CPU, as those that wait
+        if (
+            device.type != "mps" and not self.through.waits
+        ):  # MPS has no float64: rays are made on the CPU, as those that wait
             self.through.to(device)
         self.background = background_of(prepared.facts, device)
         self.statistics = StepStatistics(device)
@@ -104,11 +113,16 @@ class FieldLearner(SceneLearner):
             self._step(index, share)
 
     def _step(self, step: int, share: float) -> None:
-        # The pixels of the step, and the rays through them: where poses are refined, of the cameras as they are now.
+        # The pixels of the step, and the rays through them: where poses are refined, of the cameras as they
+        # are now.
         with record_function("fprf.batch"):
             drawn = self.batches(step)
-            here = drawn._replace(pixel=drawn.pixel.float()) if self.device.type == "mps" else drawn  # which has no float64
-            batch = Batch._make(x if x is None else x.to(self.device, non_blocking=self.device.type == "cuda") for x in here)
+            here = (
+                drawn._replace(pixel=drawn.pixel.float()) if self.device.type == "mps" else drawn
+            )  # which has no float64
+            batch = Batch._make(
+                x if x is None else x.to(self.device, non_blocking=self.device.type == "cuda") for x in here
+            )
             rays, ends = self._rays(drawn if self.through.device.type == "cpu" else batch)
         for group in self.optimizer.param_groups:
             group["lr"] = rate(self.config.optimizer, step, share)
@@ -150,8 +164,8 @@ class FieldLearner(SceneLearner):
         unfit = (~(torch.isfinite(loss.detach()) & (norm < LARGEST))).float()
         with record_function("fprf.optimizer"):
             if self.device.type == "cuda":
-                # The host runs ahead and does not know: the optimiser then changes neither parameters, moments nor its count of
-                # steps, as with torch's GradScaler.
+                # The host runs ahead and does not know: the optimiser then changes neither parameters,
+                # moments nor its count of steps, as with torch's GradScaler.
                 self.optimizer.found_inf = unfit  # type: ignore[attr-defined]
                 self.optimizer.step()
             elif not bool(unfit):
@@ -163,8 +177,11 @@ class FieldLearner(SceneLearner):
         self.rays += len(batch.rgb)
 
     def figures(self) -> Figures:
-        """Running means, corrected for their start; a term that comes every few steps counts when it comes."""
-        before, (means, self.skipped, failed, names) = self.skipped, self.statistics.read()
+        """Running means, corrected for their start; a term that comes every few steps counts when it
+        comes.
+        """
+        before = self.skipped
+        (means, self.skipped, failed, names) = self.statistics.read()
         fault = (names or "the loss or a gradient") if self.skipped > before else ""
         return Figures(means, self.rays, self.skipped, failed, fault, means.pop("kept", 0.0))
 
@@ -189,7 +206,8 @@ class FieldLearner(SceneLearner):
     def _rays(self, batch: Batch) -> tuple[Rays, Tensor | None]:
         """The rays of a batch, and their parameters at its known distances."""
         # Rays are made in float64 in the world, then moved to the space of the field.
-        there, space = self.through.device, self.model.space
+        there = self.through.device
+        space = self.model.space
         origin, direction = self.through(batch.view.to(there), batch.pixel.to(there))
         ends = None
         if batch.distance is not None:
@@ -202,11 +220,16 @@ class FieldLearner(SceneLearner):
 
 
 class Batches:
-    """Batches of a data manager. For an accelerator those in host memory are drawn one step ahead by a thread."""
+    """Batches of a data manager. For an accelerator those in host memory are drawn one step ahead by a
+    thread.
+    """
 
     def __init__(self, manager: DataManager, device: torch.device) -> None:
-        self.manager, self.device = manager, device
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="fprf-batches")  # it starts with its first task
+        self.manager = manager
+        self.device = device
+        self._thread = ThreadPoolExecutor(
+            1, thread_name_prefix="fprf-batches"
+        )  # it starts with its first task
         self._next: tuple[int, Future[Batch]] | None = None
 
     def __call__(self, step: int) -> Batch:
@@ -237,22 +260,28 @@ def rate(config: OptimizerConfig, step: int, share: float) -> float:
 
 
 class StepStatistics:
-    """Running means of named scalars, and counts of those that were not finite, kept on their device until they are read."""
+    """Running means of named scalars, and counts of those that were not finite, kept on their device until
+    they are read.
+    """
 
     def __init__(self, device: torch.device) -> None:
         self.names: list[str] = []
         # A row each: sums of values, sums of weights, how often not finite. MPS has no float64.
-        self.rows = torch.zeros(3, 0, dtype=torch.float32 if device.type == "mps" else torch.float64, device=device)
+        self.rows = torch.zeros(
+            3, 0, dtype=torch.float32 if device.type == "mps" else torch.float64, device=device
+        )
         self.none = torch.full((), torch.nan, device=device)
-        self.skipped, self.failed = torch.zeros((), device=device), torch.zeros((), device=device)
+        self.skipped = torch.zeros((), device=device)
+        self.failed = torch.zeros((), device=device)
         self._present: dict[tuple[str, ...], Tensor] = {}
 
     @torch.no_grad()
     def add(self, values: Mapping[str, Tensor], unfit: Tensor) -> None:
-        """One step's scalars. A name that is absent, or not finite, leaves its mean as it is; `unfit` is 1 where the step was
-        skipped, else 0.
+        """One step's scalars. A name that is absent, or not finite, leaves its mean as it is; `unfit` is 1
+        where the step was skipped, else 0.
         """
-        self.skipped, self.failed = self.skipped + unfit, (self.failed + 1) * unfit
+        self.skipped = self.skipped + unfit
+        self.failed = (self.failed + 1) * unfit
         new = [name for name in values if name not in self.names]
         if new:
             self.names += new
@@ -271,9 +300,11 @@ class StepStatistics:
         self.rows = torch.cat([torch.where(fit, means, self.rows[:2]), bad[None]])
 
     def read(self) -> tuple[dict[str, float], int, int, str]:
-        """Means, steps skipped so far, the last ones in a row, and names of terms that were not finite since the last call.
+        """Means, steps skipped so far, the last ones in a row, and names of terms that were not finite since
+        the last call.
 
-        Means are corrected for their start, without names that never had a finite number. The host waits for the device once.
+        Means are corrected for their start, without names that never had a finite number. The host waits for
+        the device once.
         """
         counts = torch.stack([self.skipped, self.failed]).to(self.rows.dtype)
         *numbers, skipped, failed = torch.cat([self.rows.flatten(), counts]).tolist()
@@ -281,14 +312,22 @@ class StepStatistics:
         # Both sums began at 0: their quotient is the mean over what was seen.
         value, weight, bad = (numbers[k * len(self.names) : (k + 1) * len(self.names)] for k in range(3))
         means = {name: v / w for name, v, w in zip(self.names, value, weight, strict=True) if w > 0}
-        return means, int(skipped), int(failed), ", ".join(name for name, b in zip(self.names, bad, strict=True) if b > 0)
+        return (
+            means,
+            int(skipped),
+            int(failed),
+            ", ".join(name for name, b in zip(self.names, bad, strict=True) if b > 0),
+        )
 
 
 @torch.no_grad()
 def clear_denormals(optimizer: torch.optim.Optimizer) -> None:
-    """Set moments of Adam that are, or would soon be, denormal to zero; the parameters' next step is the same without them."""
+    """Set moments of Adam that are, or would soon be, denormal to zero; the parameters' next step is the same
+    without them.
+    """
     for state in optimizer.state.values():
-        first, second = state.get("exp_avg"), state.get("exp_avg_sq")
+        first = state.get("exp_avg")
+        second = state.get("exp_avg_sq")
         if first is not None and second is not None:
             torch.hardshrink(first, FAINT_FIRST, out=first)
             torch.threshold_(second, FAINT_SECOND, 0.0)
@@ -302,9 +341,15 @@ def finish(run: Run, display: Display, config: TrainConfig, model: Model, scene:
 
 
 def training_summary(run: Run, config: TrainConfig, scene: ParsedScene) -> str:
-    """One line on what a training reached, by its events.jsonl or those of its blocks, and the command that raises it."""
+    """One line on what a training reached, by its events.jsonl or those of its blocks, and the command that
+    raises it.
+    """
     try:
-        trained = [history for history in read_history(run.root) if history.values.get("psnr", [None])[-1] is not None]
+        trained = [
+            history
+            for history in read_history(run.root)
+            if history.values.get("psnr", [None])[-1] is not None
+        ]
     except CheckpointError:
         trained = []
     if not trained:
@@ -320,9 +365,17 @@ def training_summary(run: Run, config: TrainConfig, scene: ParsedScene) -> str:
     # The next try is advised in the unit that ended this one.
     timed = config.minutes is not None and steps < config.steps
     again = f"fprf train {shlex.quote(str(run.root / 'config.json'))}"
-    longer = f"--minutes {2 * (config.minutes or 0):g}" if timed else f"--steps {max(2 * config.steps, _FEW_STEPS)}"
+    longer = (
+        f"--minutes {2 * (config.minutes or 0):g}"
+        if timed
+        else f"--steps {max(2 * config.steps, _FEW_STEPS)}"
+    )
     if steps < _FEW_STEPS:
         return f"warning: too few steps to judge the scene by: {reached}; go on: {again} {longer}"
     size = config.downscale or 1
-    finer = f"; for more detail: --downscale {max(size - 1, 1):g} and another --output" if size > 1 and passes > PASSES else ""
+    finer = (
+        f"; for more detail: --downscale {max(size - 1, 1):g} and another --output"
+        if size > 1 and passes > PASSES
+        else ""
+    )
     return f"{reached}; to raise it: {again} {longer}{finer}"

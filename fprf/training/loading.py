@@ -29,9 +29,13 @@ from .style_pass import measure_style
 from .views import CachedView, cache_view, fit_pose, paint_pixels, render_view
 
 SCENES = "fprf.scenes"
-"""Entry points by the `kind` of configs: functions `(run, config, device, quality) -> LoadedRun` that open their runs."""
+"""Entry points by the `kind` of configs: functions `(run, config, device, quality) -> LoadedRun` that open
+their runs.
+"""
 _FEW_RAYS = 2**14
-"""Rays that the style of a run in training is measured with: 0.2 s instead of seconds, and it changes soon."""
+"""Rays that the style of a run in training is measured with: 0.2 s instead of seconds, and it changes
+soon.
+"""
 S = TypeVar("S", bound=Scene, covariant=True)
 
 
@@ -85,7 +89,9 @@ class Trained(Scene):
         return self.known.facts.semantic_encoder
 
     def render(self, cameras: Cameras, view: int, *, resolution: float | None = None) -> View:
-        config = self.config.render if resolution is None else replace(self.config.render, resolution=resolution)
+        config = (
+            self.config.render if resolution is None else replace(self.config.render, resolution=resolution)
+        )
         return render_view(self.model, self.known.facts, cameras, view, config, self.look)
 
     def paint(
@@ -108,19 +114,24 @@ class Trained(Scene):
             return self
         # Of a view that was held out, what its exposure says.
         red, green, blue = self.model.tones(torch.tensor([view]))[0].tolist()
-        return replace(self, config=replace(self.config, render=replace(self.config.render, tone=(red, green, blue))))
+        return replace(
+            self, config=replace(self.config, render=replace(self.config.render, tone=(red, green, blue)))
+        )
 
     def fit_poses(
         self, captured: ParsedScene, views: Sequence[int], progress: Callable[[int, int, str], None]
     ) -> Annotated[Tensor, "V 6"]:
-        facts, moves = self.known.facts, torch.zeros(len(self.names), 6, dtype=torch.float64)
+        facts = self.known.facts
+        moves = torch.zeros(len(self.names), 6, dtype=torch.float64)
         # Shifts are counted in what views commonly see, as in training, where poses are learnt.
         reach = facts.reach if facts.centres else reach_of(captured, facts.space)
         for done, view in enumerate(views):
             progress(done, len(views), "fitting poses")
             truth, where = self.known.photograph(captured, view, masks=self.config.masked)
             budget = self.config.render.budget
-            moves[view] = fit_pose(self.model, facts, self.cameras, view, truth, where, reach=reach, budget=budget)
+            moves[view] = fit_pose(
+                self.model, facts, self.cameras, view, truth, where, reach=reach, budget=budget
+            )
         progress(len(views), len(views), "fitting poses")
         return moves
 
@@ -138,40 +149,58 @@ class Trained(Scene):
             # What changes soon need not be measured exactly.
             few = replace(self.config.statistics, rays=min(_FEW_RAYS, self.config.statistics.rays))
             style = measure_style(
-                replace(self.config, statistics=few), self.model, self.known.cameras, torch.tensor(self.known.train)
+                replace(self.config, statistics=few),
+                self.model,
+                self.known.cameras,
+                torch.tensor(self.known.train),
             )
-            return style, None if style.keys.shape[1] == 0 else Basis.from_tensors(self.run.load_tensors("basis"))
+            return style, None if style.keys.shape[1] == 0 else Basis.from_tensors(
+                self.run.load_tensors("basis")
+            )
         return load_style(self.run)
 
     @torch.inference_mode()
     def encoders(self) -> Encoders:
-        """The encoders that the scene was trained with. Raises WeightsError where those at hand are others."""
-        (style, basis), config, facts = self.measured(), self.config, self.known.facts
+        """The encoders that the scene was trained with. Raises WeightsError where those at hand are
+        others.
+        """
+        (style, basis) = self.measured()
+        config = self.config
+        facts = self.known.facts
         content, semantic = build_encoders(config, semantic=basis is not None)
         # Features of another encoder would mean something else: references and scene must speak of the same.
-        trained_with = ("content", content, facts.content_encoder), ("semantic", semantic, facts.semantic_encoder)
+        trained_with = (
+            ("content", content, facts.content_encoder),
+            ("semantic", semantic, facts.semantic_encoder),
+        )
         for name, encoder, known in trained_with:
             if encoder is not None and encoder.identity != known:
                 raise WeightsError(
                     f"{name} encoder: the scene was trained with {known}, this is {encoder.identity}; "
                     "use the same weights, or train the scene again"
                 )
-        device, longest = self.device, int(self.cameras.size.amax())
+        device = self.device
+        longest = int(self.cameras.size.amax())
         moved = None if semantic is None else semantic.to(device)
-        return Encoders(content.to(device), moved, basis, style, device, longest, config.datamanager.guided, config.seed)
+        return Encoders(
+            content.to(device), moved, basis, style, device, longest, config.datamanager.guided, config.seed
+        )
 
 
 def open_run(root: Path, device: str = "auto", quality: QualityConfig | None = None) -> LoadedRun[Scene]:
-    """A run of any kind, by the function that the entry-point group `fprf.scenes` names for the kind of its config.
+    """A run of any kind, by the function that the entry-point group `fprf.scenes` names for the kind of its
+    config.
 
-    Of a run in training it is the newest checkpoint. Raises CheckpointError with what is missing, UsageError for qualities
-    that the kind does not know, PluginError where the kind is not installed.
+    Of a run in training it is the newest checkpoint. Raises CheckpointError with what is missing, UsageError
+    for qualities that the kind does not know, PluginError where the kind is not installed.
     """
     run = Run(root)
     config = run.load_config()[0]
     opened = load_object(SCENES, config.kind)
     if not callable(opened):
-        raise PluginError(f"{SCENES}: {config.kind!r} ({entry(SCENES, config.kind).origin}) is no function; mend that package")
+        raise PluginError(
+            f"{SCENES}: {config.kind!r} ({entry(SCENES, config.kind).origin}) is no function; mend that package"
+        )
     loaded: LoadedRun[Scene] = opened(run, config, device, QualityConfig() if quality is None else quality)
     return loaded
 
@@ -183,7 +212,8 @@ def open_fields(run: Run, config: RunConfig, device: str, quality: QualityConfig
 
 
 def load_run(root: Path, device: str = "auto", max_memory: float | None = None) -> Trained:
-    """Rebuild a run's model from its folder alone. Raises CheckpointError with what is missing and what to do.
+    """Rebuild a run's model from its folder alone. Raises CheckpointError with what is missing and what to
+    do.
 
     Blocks of a large scene are fetched as they are met; at most `max_memory` MiB of them stay (one at least).
     """
@@ -197,11 +227,17 @@ def load_run(root: Path, device: str = "auto", max_memory: float | None = None) 
     else:
         saved, _ = checkpoint.load_latest(run.checkpoints)
         if saved is None:
-            raise CheckpointError(f"{root}: no checkpoint yet; go on with `fprf train {root / 'config.json'} --output {root}`")
-        model, step, seconds = build_model(config, known.facts), saved.step, saved.seconds
+            raise CheckpointError(
+                f"{root}: no checkpoint yet; go on with `fprf train {root / 'config.json'} --output {root}`"
+            )
+        model = build_model(config, known.facts)
+        step = saved.step
+        seconds = saved.seconds
         checkpoint.restore(saved.state, model, None)
         model = model.requires_grad_(False).to(device_of(device)).eval()
-    return Trained(run, config, method, replace(known, cameras=model.refined(known.cameras)), model, step, seconds)
+    return Trained(
+        run, config, method, replace(known, cameras=model.refined(known.cameras)), model, step, seconds
+    )
 
 
 def load_style(run: Run) -> tuple[SceneStyle, Basis | None]:

@@ -20,7 +20,9 @@ from ..types import Batch, Rendered, Want
 from .model import Facts, Model
 
 FADE = 0.01
-"""Share of `loss.depth` that is left at the end: points say where things are, pixels what they look like in detail."""
+"""Share of `loss.depth` that is left at the end: points say where things are, pixels what they look like in
+detail.
+"""
 SHELL = 4.0
 """Sky lies at least so many space units away: times what views commonly see, or the scene's inner radius."""
 NEARBY = 0.04
@@ -33,7 +35,9 @@ def extra_term(config: LossConfig) -> LossTerm | None:
 
 
 def check_penalties(config: LossConfig, model: Model) -> None:
-    """Raise ConfigError where a weight is given to an unknown penalty, PluginError where a penalty has the name of a term."""
+    """Raise ConfigError where a weight is given to an unknown penalty, PluginError where a penalty has the
+    name of a term.
+    """
     # The two of the planes have fields of their own in the config, and need not be named.
     names = model.penalty_names
     for name, _ in config.penalties:
@@ -44,7 +48,9 @@ def check_penalties(config: LossConfig, model: Model) -> None:
                 f"(penalties that can be named: {', '.join(known) or 'none'})"
             )
     for name in sorted(names & _weights(config).keys()):
-        raise PluginError(f"a penalty of a field or a sampler is called {name!r}, the name of a loss term; rename it there")
+        raise PluginError(
+            f"a penalty of a field or a sampler is called {name!r}, the name of a loss term; rename it there"
+        )
 
 
 def wanted(config: LossConfig, batch: Batch, extra: LossTerm | None = None) -> Want:
@@ -71,11 +77,12 @@ def terms(
     extra: LossTerm | None = None,
     generator: torch.Generator | None = None,
 ) -> dict[str, Tensor]:
-    """Each term by name, unweighted. Feature terms are in units of the targets' spread, so one weight fits any encoder.
+    """Each term by name, unweighted. Feature terms are in units of the targets' spread, so one weight fits
+    any encoder.
 
-    `ends` are the ray parameters at `batch.distance` (`Space.parameter`). Penalties run over every parameter of the planes,
-    whatever the batch: they are computed every `penalty_every` steps. `extra` is the term of `extra_term`; it draws from the
-    generator.
+    `ends` are the ray parameters at `batch.distance` (`Space.parameter`). Penalties run over every parameter
+    of the planes, whatever the batch: they are computed every `penalty_every` steps. `extra` is the term of
+    `extra_term`; it draws from the generator.
     """
     result: dict[str, Tensor] = {}
     # Reconstruction (paper, Eq. 3 and 4): what was rendered against pixels and their features.
@@ -85,8 +92,10 @@ def terms(
         result["content"] = F.mse_loss(rendered.content, batch.content) / facts.content_scale**2
     if config.semantic > 0 and rendered.semantic is not None and batch.semantic is not None:
         result["semantic"] = F.l1_loss(rendered.semantic, batch.semantic) / facts.semantic_scale
-    # Geometry: proposals bound the weights, weights gather (Mip-NeRF 360, Eq. 13 and 15), end at known points, leave the sky.
-    sampled, weights = rendered.sampled, rendered.weights
+    # Geometry: proposals bound the weights, weights gather (Mip-NeRF 360, Eq. 13 and 15), end at known
+    # points, leave the sky.
+    sampled = rendered.sampled
+    weights = rendered.weights
     assert sampled is not None and weights is not None
     if config.interlevel > 0 and sampled.levels:
         parts = [interlevel(sampled.s, weights, level.s, level.weights) for level in sampled.levels]
@@ -103,23 +112,33 @@ def terms(
         result["extra"] = extra(rendered, batch, model.parts, step=step, generator=generator)
         check_term(config.extra, result["extra"], rendered.opacity)
     # Regularisers of all parameters cost as much as a batch, and need not follow every one.
-    if step % config.penalty_every == 0 and any(_penalty_weight(config, name) > 0 for name in model.penalty_names):
-        result |= {name: value for name, value in model.penalties().items() if _penalty_weight(config, name) > 0}
+    if step % config.penalty_every == 0 and any(
+        _penalty_weight(config, name) > 0 for name in model.penalty_names
+    ):
+        result |= {
+            name: value for name, value in model.penalties().items() if _penalty_weight(config, name) > 0
+        }
     return result
 
 
 def ending(
-    t: Annotated[Tensor, "R E"], weights: Annotated[Tensor, "R S"], ends: Annotated[Tensor, "R"], *, ndc: bool = False
+    t: Annotated[Tensor, "R E"],
+    weights: Annotated[Tensor, "R S"],
+    ends: Annotated[Tensor, "R"],
+    *,
+    ndc: bool = False,
 ) -> Tensor:
     """Distance of rays from ending at their known ray parameters (NaN = unknown); 0 where none is known.
 
-    (1 - weight within NEARBY of the distance)^2 + (weight before)^2, the mean over those rays: both within [0, 1].
+    (1 - weight within NEARBY of the distance)^2 + (weight before)^2, the mean over those rays: both within
+    [0, 1].
     """
     known = torch.isfinite(ends)
     ends = torch.where(known, ends, 0.5)
     # In NDC 1 - t is in proportion to 1 / depth.
     low, high = (1 - (1 - ends) / near if ndc else ends * near for near in (1 - NEARBY, 1 + NEARBY))
-    start, stop = t[:, :-1], t[:, 1:]
+    start = t[:, :-1]
+    stop = t[:, 1:]
     # Weight before the point would hide it; what lies behind it is not known.
     before = stop <= low[:, None]
     # An interval that reaches into the range counts: far from the camera intervals are wider than the range.
@@ -129,7 +148,11 @@ def ending(
 
 
 def emptiness(
-    t: Annotated[Tensor, "R E"], weights: Annotated[Tensor, "R S"], sky: Annotated[Tensor, "R"], *, within: float
+    t: Annotated[Tensor, "R E"],
+    weights: Annotated[Tensor, "R S"],
+    sky: Annotated[Tensor, "R"],
+    *,
+    within: float,
 ) -> Tensor:
     """Opacity that rays into the sky meet before `within` (space units); 0 where there are none.
 
@@ -151,7 +174,10 @@ def total(config: LossConfig, parts: dict[str, Tensor], share: float = 0.0) -> T
     # A penalty that is computed in one step of so many weighs as many times more.
     every = config.penalty_every
     return torch.stack(
-        [(weights[name] if name in weights else _penalty_weight(config, name) * every) * value for name, value in parts.items()]
+        [
+            (weights[name] if name in weights else _penalty_weight(config, name) * every) * value
+            for name, value in parts.items()
+        ]
     ).sum()
 
 

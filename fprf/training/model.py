@@ -1,4 +1,6 @@
-"""A scene's networks together, built from a config and what was found out about the scene. No data, no losses, no files."""
+"""A scene's networks together, built from a config and what was found out about the scene. No data, no
+losses, no files.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,16 +26,20 @@ from .camera_optimizers import Poses, Tones
 def build_decoder(config: TrainConfig, *, encoder: str, channels: int) -> Decoder:
     """The decoder of the content encoder, by the encoder's identity.
 
-    Raises WeightsError where there is none or it belongs to another encoder, with the line that makes the right one.
+    Raises WeightsError where there is none or it belongs to another encoder, with the line that makes the
+    right one.
     """
     try:
         return config.content.decoder.build(encoder=encoder, channels=channels, seed=config.seed + 3)
     except WeightsError as error:
         line = pretrain_line(config.content.encoder)
-        raise WeightsError(f"{error}; `{line}` makes its decoder, --content.decoder.weights FILE names it") from error
+        raise WeightsError(
+            f"{error}; `{line}` makes its decoder, --content.decoder.weights FILE names it"
+        ) from error
 
 
-_MOST_CHANNELS, _FARTHEST = 2**16, 1e30
+_MOST_CHANNELS = 2**16
+_FARTHEST = 1e30
 """Bounds of what a spoilt file may ask for: memory, and distances that float32 holds."""
 
 
@@ -57,7 +63,9 @@ class Facts:
     background: tuple[float, float, float] | None = None
     """Colour behind everything, if anything can be seen through."""
     exposure: tuple[float, ...] = ()
-    """Logarithm of each view's exposure over their mean (see `prepare.exposure_of`); empty where tones are not learnt."""
+    """Logarithm of each view's exposure over their mean (see `prepare.exposure_of`); empty where tones are
+    not learnt.
+    """
     held: tuple[int, ...] = ()
     """Views that neither tones nor poses are learnt from."""
     centres: tuple[tuple[float, float, float], ...] = ()
@@ -147,7 +155,8 @@ def build_fields(config: TrainConfig, facts: Facts) -> tuple[Sampler, ContentFie
 def build_model(config: TrainConfig, facts: Facts) -> Model:
     """The model at its seeded start.
 
-    Raises WeightsError where no decoder fits the content encoder, PluginError where a part breaks its contract at once.
+    Raises WeightsError where no decoder fits the content encoder, PluginError where a part breaks its
+    contract at once.
     """
     decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
     parts = Parts(facts.space, *build_fields(config, facts), decoder)

@@ -37,7 +37,9 @@ def cache_folder() -> Path:
 
 
 def device_of(name: str) -> torch.device:
-    """`auto` is CUDA, then MPS, then the CPU. Raises PluginError for a device that torch does not know here."""
+    """`auto` is CUDA, then MPS, then the CPU. Raises PluginError for a device that torch does not know
+    here.
+    """
     if name == "auto":
         if torch.cuda.is_available():
             return torch.device("cuda", torch.cuda.current_device())
@@ -46,12 +48,17 @@ def device_of(name: str) -> torch.device:
         return torch.empty(0, device=name).device
     except (RuntimeError, AssertionError) as e:
         known = ", ".join(["auto", "cpu", *(f"cuda:{k}" for k in range(torch.cuda.device_count()))])
-        ray = "; a worker of Ray counts the GPUs that it was given from 0: take cuda" if name.startswith("cuda:") else ""
+        ray = (
+            "; a worker of Ray counts the GPUs that it was given from 0: take cuda"
+            if name.startswith("cuda:")
+            else ""
+        )
         raise PluginError(f"device: {name!r} is not available here; there is {known}{ray}") from e
 
 
 def planned(config: RunConfig, whole: ParsedScene | None = None) -> RunConfig:
-    """The config with what it leaves open decided, the size of its images first, by its scene at its own size.
+    """The config with what it leaves open decided, the size of its images first, by its scene at its own
+    size.
 
     That is read where it is not given. Raises as `read_scene`.
     """
@@ -74,8 +81,11 @@ def read_scene(config: RunConfig, saved: Facts | None = None) -> ParsedScene:
 
 
 def build_encoders(config: TrainConfig, *, semantic: bool = True) -> tuple[Encoder, Encoder | None]:
-    """The encoders of content and, where wanted and chosen, of semantics. Raises WeightsError with what either lacks."""
-    built, missing = list[Encoder | None](), list[str]()
+    """The encoders of content and, where wanted and chosen, of semantics. Raises WeightsError with what
+    either lacks.
+    """
+    built = list[Encoder | None]()
+    missing = list[str]()
     for each in (config.content.encoder, config.semantic.encoder if semantic else None):
         try:
             built.append(None if each is None else each.build())
@@ -100,13 +110,16 @@ def prepare(
 ) -> Prepared:
     """Everything of a scene of fields but the model, in a space that is found where none is given.
 
-    Arguments as of `RunConfig.build` and `DataManagerConfig.build`. Raises WeightsError where an encoder or a decoder lacks
-    its weights.
+    Arguments as of `RunConfig.build` and `DataManagerConfig.build`. Raises WeightsError where an encoder or a
+    decoder lacks its weights.
     """
     device = device_of(config.device)
     content, semantic = build_encoders(config)
-    content, semantic = content.to(device), None if semantic is None else semantic.to(device)
-    build_decoder(config, encoder=content.identity, channels=content.channels)  # refused now, not after all the features
+    content = content.to(device)
+    semantic = None if semantic is None else semantic.to(device)
+    build_decoder(
+        config, encoder=content.identity, channels=content.channels
+    )  # refused now, not after all the features
     background = config.render.background or (WHITE if scene.alpha else None)
     # Decodes all images and extracts their features, or finds both in the cache.
     manager = config.datamanager.build(
@@ -124,7 +137,8 @@ def prepare(
     exposure = exposure_of(config.tones, scene, manager.image, saved)
     facts = facts_of(scene, background, space=space, exposure=exposure, poses=config.poses > 0)
     # Scales are the spread of the targets: losses in their units weigh the same with any encoder.
-    contents, semantics = manager.content_store, manager.semantic_store
+    contents = manager.content_store
+    semantics = manager.semantic_store
     facts = replace(
         facts,
         channels=content.channels,
@@ -145,7 +159,9 @@ def facts_of(
     exposure: tuple[float, ...] = (),
     poses: bool = False,
 ) -> Facts:
-    """Facts of a scene without fields; `space` is found where none is given, `poses` says whether cameras are refined."""
+    """Facts of a scene without fields; `space` is found where none is given, `poses` says whether cameras are
+    refined.
+    """
     space = find_space(scene) if space is None else space
     # Corrections of views that nothing is learnt from stay at none.
     others = tuple(sorted(set(range(len(scene.paths))) - set(scene.train.tolist())))
@@ -154,14 +170,19 @@ def facts_of(
         background=background,
         exposure=exposure,
         held=others if exposure or poses else (),
-        centres=tuple((float(x), float(y), float(z)) for x, y, z in scene.cameras.pose[:, :, 3]) if poses else (),
+        centres=tuple((float(x), float(y), float(z)) for x, y, z in scene.cameras.pose[:, :, 3])
+        if poses
+        else (),
         reach=reach_of(scene, space) if poses else 1.0,
         origin=scene.origin,
     )
 
 
 def exposure_of(
-    tones: bool | None, scene: ParsedScene, image: Callable[[int], Annotated[Tensor, "H W 3"]], saved: Facts | None = None
+    tones: bool | None,
+    scene: ParsedScene,
+    image: Callable[[int], Annotated[Tensor, "H W 3"]],
+    saved: Facts | None = None,
 ) -> tuple[float, ...]:
     """Logarithm of each view's exposure over their geometric mean; empty where tones are not learnt.
 

@@ -1,7 +1,8 @@
 """Presets of rendering time: settings that change without training again. Imports no torch at first.
 
-Only the resolution is worth a knob (`python -m benchmarks pareto`, on fox): 1.5 times the samples along rays took 1.5 times the
-time for 0.1 dB, half of them cost 3.6 dB; error budgets of 0 to 1/256 differ by 17 % of the time and 0.01 dB.
+Only the resolution is worth a knob (`python -m benchmarks pareto`, on fox): 1.5 times the samples along rays
+took 1.5 times the time for 0.1 dB, half of them cost 3.6 dB; error budgets of 0 to 1/256 differ by 17 % of
+the time and 0.01 dB.
 """
 
 from dataclasses import dataclass, replace
@@ -41,13 +42,17 @@ class QualityConfig:
     quality: Name | None = None
     """draft, standard or best; none = as the run's own config says."""
     resolution: float | None = None
-    """Share of an image's width and height that is rendered, in (0, 1]; the rest is interpolated; none = what the quality
-    says."""
+    """Share of an image's width and height that is rendered, in (0, 1]; the rest is interpolated; none = what
+    the quality says.
+    """
     max_memory: float | None = None
-    """MiB that blocks of a large scene may take together; the least recently used make room. none = all stay."""
+    """MiB that blocks of a large scene may take together; the least recently used make room. none = all
+    stay.
+    """
     tone: str | None = None
-    """Training view in whose light to show the scene, by name or number; none = the light that all views have in common. For
-    runs with learnt `tones`."""
+    """Training view in whose light to show the scene, by name or number; none = the light that all views have
+    in common. For runs with learnt `tones`.
+    """
 
     def __post_init__(self) -> None:
         if self.max_memory is not None:
@@ -58,7 +63,9 @@ class QualityConfig:
 
 
 def at_quality(trained: "Trained", quality: QualityConfig) -> "Trained":
-    """The run with other limits; the same one where nothing is asked. Raises UsageError where it has no such tone."""
+    """The run with other limits; the same one where nothing is asked. Raises UsageError where it has no such
+    tone.
+    """
     render = trained.config.render
     # A resolution that is asked for goes before that of the preset.
     if quality.resolution is not None:
@@ -71,14 +78,20 @@ def at_quality(trained: "Trained", quality: QualityConfig) -> "Trained":
 
 
 def tone_of(tones: "Tones | None", known: "Known", text: str) -> tuple[float, float, float]:
-    """Factors of a training view, by name, or by number where no name is alike. Raises UsageError for others."""
+    """Factors of a training view, by name, or by number where no name is alike. Raises UsageError for
+    others.
+    """
     if tones is None:
-        raise UsageError("tone: this run has learnt no tones; train it with --tones true, or leave --tone out")
+        raise UsageError(
+            "tone: this run has learnt no tones; train it with --tones true, or leave --tone out"
+        )
     # Names of views may be numbers themselves: a name comes before a number.
     view = known.names.index(text) if text in known.names else int(text) if text.isdecimal() else -1
     if view not in known.train:
         few = ", ".join(known.names[k] for k in known.train[:3])
-        raise UsageError(f"tone: {text!r} is no training view; the {len(known.train)} are {few} ..., or their numbers")
+        raise UsageError(
+            f"tone: {text!r} is no training view; the {len(known.train)} are {few} ..., or their numbers"
+        )
     from torch import tensor
 
     red, green, blue = tones(tensor([view]))[0].tolist()

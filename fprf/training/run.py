@@ -9,7 +9,8 @@
     metrics.json        written by `fprf eval`
     checkpoints/        see `training.checkpoint`
 
-It can be moved and shared: it holds no absolute path that matters and needs neither images nor encoders to render.
+It can be moved and shared: it holds no absolute path that matters and needs neither images nor encoders to
+render.
 """
 
 import dataclasses
@@ -67,7 +68,9 @@ class Known:
         """Views of `train`, `test` or `all`; `some`: at most 8 training views, spread evenly."""
         count = min(_SHOWN, len(self.train))
         some = tuple(self.train[k * len(self.train) // count] for k in range(count))
-        return {"some": some, "train": self.train, "test": self.test, "all": tuple(range(len(self.names)))}[name]
+        return {"some": some, "train": self.train, "test": self.test, "all": tuple(range(len(self.names)))}[
+            name
+        ]
 
     def views(self, split: str, names: Sequence[str] = ()) -> list[int]:
         """Views by name, or those of a split where none is named.
@@ -77,7 +80,9 @@ class Known:
         held = list(self.names)
         for name in names:
             if name not in held:
-                raise UsageError(f"--views {name}: no such view in the run{nearest(name, held)} ({held[0]} … {held[-1]})")
+                raise UsageError(
+                    f"--views {name}: no such view in the run{nearest(name, held)} ({held[0]} … {held[-1]})"
+                )
         views = [held.index(name) for name in names] or list(self.split(split))
         if not views:
             raise UsageError(f"--split {split}: the run holds no such views; choose another split")
@@ -86,9 +91,14 @@ class Known:
     def photograph(
         self, captured: ParsedScene, view: int, *, masks: bool
     ) -> tuple[Annotated[Tensor, "H W 3"], Annotated[Tensor, "H W"] | None]:
-        """The image of a view at the size of its camera, in [0, 1], and where it counts by the masks; None = everywhere."""
+        """The image of a view at the size of its camera, in [0, 1], and where it counts by the masks; None =
+        everywhere.
+        """
         width, height = self.cameras.size[view].tolist()
-        image = torch.from_numpy(load_image(captured.paths[view], (width, height), self.facts.background)).float() / 255
+        image = (
+            torch.from_numpy(load_image(captured.paths[view], (width, height), self.facts.background)).float()
+            / 255
+        )
         mask = captured.masks[view] if captured.masks and masks else None
         return image, None if mask is None else torch.from_numpy(load_mask(mask, (width, height)))
 
@@ -116,7 +126,9 @@ class Run:
     def load_config(self) -> tuple[RunConfig, str]:
         """Config and method name. Raises CheckpointError where this is no run folder."""
         if not self.exists:
-            raise CheckpointError(f"{self.root}: no config.json here, so it is no run folder; `fprf train` makes one")
+            raise CheckpointError(
+                f"{self.root}: no config.json here, so it is no run folder; `fprf train` makes one"
+            )
         return load_config(self.root / "config.json")
 
     def save_known(self, scene: ParsedScene, data: Path | None, facts: Facts) -> None:
@@ -128,7 +140,9 @@ class Run:
 
     def load_known(self) -> Known:
         """Read scene.json. Raises CheckpointError."""
-        with open_json(self.root / "scene.json", "train the scene again, or use the fprf that wrote it") as document:
+        with open_json(
+            self.root / "scene.json", "train the scene again, or use the fprf that wrote it"
+        ) as document:
             if document["format"] != FORMAT:
                 raise ValueError(f"format {document['format']!r}, this fprf reads {FORMAT}")
             names = from_json(document["names"], tuple[str, ...], path="names")
@@ -139,7 +153,9 @@ class Run:
             cameras = {}
             # Shapes are those of the numbers of names, whatever the file says.
             for key, shape in _CAMERA.items():
-                numbers = torch.tensor(document["cameras"][key], dtype=torch.int64 if key in _INTEGERS else torch.float64)
+                numbers = torch.tensor(
+                    document["cameras"][key], dtype=torch.int64 if key in _INTEGERS else torch.float64
+                )
                 cameras[key] = numbers.reshape(len(names), *shape)
             return Known(
                 name=from_json(document["name"], str, path="name"),
@@ -160,10 +176,14 @@ class Run:
         tensorfiles.save(self.root / f"{name}.safetensors", tensors, sealed=True)
 
     def load_tensors(self, name: str) -> dict[str, Tensor]:
-        """Read NAME.safetensors. Raises CheckpointError where training did not get that far, or the file is damaged."""
+        """Read NAME.safetensors. Raises CheckpointError where training did not get that far, or the file is
+        damaged.
+        """
         path = self.root / f"{name}.safetensors"
         if not path.is_file():
-            raise CheckpointError(f"{path}: not written yet; finish training with `fprf train {self.root}/config.json`")
+            raise CheckpointError(
+                f"{path}: not written yet; finish training with `fprf train {self.root}/config.json`"
+            )
         return tensorfiles.load_sealed(path)
 
     def log(self, event: dict[str, Any]) -> None:
@@ -188,7 +208,9 @@ def known_of(scene: ParsedScene, data: Path | None, facts: Facts) -> Known:
 
 
 def view_names(paths: Sequence[Path]) -> list[str]:
-    """The stems of images; where two agree (a folder per camera), with one or two folders above, else a number, before them."""
+    """The stems of images; where two agree (a folder per camera), with one or two folders above, else a
+    number, before them.
+    """
     # As few folders as tell all images apart: names are shown and typed.
     for folders in range(3):
         names = ["-".join([*(f.name for f in p.parents[:folders][::-1]), p.stem]) for p in paths]
@@ -210,7 +232,8 @@ _NOTE = 200
 def lock_folder(folder: Path) -> Iterator[None]:
     """Hold a folder for the length of the block; it is made if need be, and removed again if it stays empty.
 
-    Raises DataError where another process holds it, naming that, and where nothing can be written: before any work is done.
+    Raises DataError where another process holds it, naming that, and where nothing can be written: before any
+    work is done.
     """
     # The holder before may remove the file between opening and locking it: then a new one is opened.
     while (handle := _locked(folder)) is None:
@@ -284,7 +307,9 @@ def image_hashes(scene: ParsedScene) -> dict[str, str]:
             with path.open("rb") as file:
                 return hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:
-            raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
+            raise DataError(
+                f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
+            ) from error
 
     # Hashing waits for the disk, so files are read side by side.
     with ThreadPoolExecutor() as pool:
@@ -297,8 +322,8 @@ def save_image_hashes(root: Path, hashes: Mapping[str, str]) -> None:
 
 
 def check_images(root: Path, scene: ParsedScene, hashes: Mapping[str, str]) -> None:
-    """Raise UsageError where images differ from those that the run in a folder was begun with; no run, or one of before
-    there was a list, has none.
+    """Raise UsageError where images differ from those that the run in a folder was begun with; no run, or one
+    of before there was a list, has none.
     """
     path = root / IMAGES
     if not path.exists():
@@ -307,7 +332,9 @@ def check_images(root: Path, scene: ParsedScene, hashes: Mapping[str, str]) -> N
         before = from_json(document["images"], dict[str, str], path="images")
     # By name, not by order: an image that was added moves all numbers behind it.
     files = dict(zip(view_names(scene.paths), scene.paths, strict=True))
-    changed = [f"{files[name]} is another" for name in hashes if name in before and before[name] != hashes[name]]
+    changed = [
+        f"{files[name]} is another" for name in hashes if name in before and before[name] != hashes[name]
+    ]
     changed += [f"{files[name]} is new" for name in hashes if name not in before]
     changed += [f"{name} is gone" for name in before if name not in hashes]
     if changed:
@@ -333,17 +360,25 @@ class History(NamedTuple):
 
 
 def read_history(run: Path) -> list[History]:
-    """The histories of a run and of its parts: blocks, or the overview and cells; those without any line are left out.
+    """The histories of a run and of its parts: blocks, or the overview and cells; those without any line are
+    left out.
 
-    Where a run was resumed from an earlier step, the later steps of the first try are dropped. Raises CheckpointError
-    where there is no line at all.
+    Where a run was resumed from an earlier step, the later steps of the first try are dropped. Raises
+    CheckpointError where there is no line at all.
     """
     parts = ("overview", "blocks/*", "cells/*")
-    files = [run / "events.jsonl", *(file for part in parts for file in sorted(run.glob(f"{part}/events.jsonl")))]
-    histories = [_history("" if file.parent == run else file.parent.name, file) for file in files if file.is_file()]
+    files = [
+        run / "events.jsonl",
+        *(file for part in parts for file in sorted(run.glob(f"{part}/events.jsonl"))),
+    ]
+    histories = [
+        _history("" if file.parent == run else file.parent.name, file) for file in files if file.is_file()
+    ]
     histories = [history for history in histories if history.step]
     if not histories:
-        raise CheckpointError(f"{run}: no events.jsonl with a line of training; `fprf train` writes it as it goes")
+        raise CheckpointError(
+            f"{run}: no events.jsonl with a line of training; `fprf train` writes it as it goes"
+        )
     return histories
 
 
@@ -367,14 +402,19 @@ def _history(name: str, file: Path) -> History:
         else:
             notes.append(", ".join(f"{key.replace('_', ' ')}: {value}" for key, value in event.items()))
     # Losses stand beside the other figures of their line; what a line does not say is None.
-    flat = [{**event, **(event["losses"] if isinstance(event.get("losses"), dict) else {})} for event in lines]
+    flat = [
+        {**event, **(event["losses"] if isinstance(event.get("losses"), dict) else {})} for event in lines
+    ]
     known = dict.fromkeys(key for event in flat for key in event if key not in ("step", "seconds", "losses"))
     values = {key: [_number(event.get(key)) for event in flat] for key in known}
     return History(name, [e["step"] for e in lines], [float(e["seconds"]) for e in lines], values, notes)
 
 
-_LARGEST, _LAST = 3.4e38, 2**63
-"""Bounds of figures (training computes in float32) and of steps: with those beyond, sums and charts would overflow."""
+_LARGEST = 3.4e38
+_LAST = 2**63
+"""Bounds of figures (training computes in float32) and of steps: with those beyond, sums and charts would
+overflow.
+"""
 
 
 def _number(value: object) -> float | None:

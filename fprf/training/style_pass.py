@@ -1,8 +1,10 @@
 """One exact pass over the trained scene: the statistics and regions that every style builds on.
-A second one over pairs of neighbouring pixels tells which regions meet without an edge of colour between them.
+A second one over pairs of neighbouring pixels tells which regions meet without an edge of colour between
+them.
 
-Features are those of the very samples that the renderer keeps, weighted by their rendering weights, on a fixed lattice of
-pixels over all training views; moments are merged in float64, so neither order nor chunk size matters.
+Features are those of the very samples that the renderer keeps, weighted by their rendering weights, on a
+fixed lattice of pixels over all training views; moments are merged in float64, so neither order nor chunk
+size matters.
 """
 
 from typing import Annotated
@@ -44,7 +46,9 @@ def lattice(cameras: Cameras, views: Annotated[Tensor, "V"], rays: int) -> tuple
 
 
 def neighbours(cameras: Cameras, views: Annotated[Tensor, "V"], pairs: int) -> tuple[Tensor, Tensor]:
-    """View [P] and pixels [P 2 2] of about so many pairs on the lattice: one step to the right or down, inside of the image."""
+    """View [P] and pixels [P 2 2] of about so many pairs on the lattice: one step to the right or down,
+    inside of the image.
+    """
     view, pixel = lattice(cameras, views, pairs)
     size = cameras.size[view]
     step = (size.amin(1) // _REACH).clamp_min(1)[:, None] * F.one_hot(torch.arange(len(view)) % 2, 2)
@@ -55,12 +59,15 @@ def neighbours(cameras: Cameras, views: Annotated[Tensor, "V"], pairs: int) -> t
 
 
 @torch.inference_mode()
-def measure_style(config: TrainConfig, model: Model, cameras: Cameras, views: Annotated[Tensor, "V"]) -> SceneStyle:
+def measure_style(
+    config: TrainConfig, model: Model, cameras: Cameras, views: Annotated[Tensor, "V"]
+) -> SceneStyle:
     """Content statistics over the training views and the scene's semantic regions, on the CPU.
 
     `cameras` are the capture's; the model's own poses, if it has any, are taken into account here.
     """
-    # Rays on a lattice over all training views, chunk by chunk; moments are merged, so that chunks do not matter.
+    # Rays on a lattice over all training views, chunk by chunk; moments are merged, so that chunks do not
+    # matter.
     cameras = model.refined(cameras)
     device = model.device
     view, pixel = lattice(cameras, views, config.statistics.rays)
@@ -77,7 +84,9 @@ def measure_style(config: TrainConfig, model: Model, cameras: Cameras, views: An
         semantic = model.semantic(kept.point[::every]).cpu() if model.semantic is not None else None
         return own, content[::every].cpu(), kept.weight[::every].cpu(), semantic
 
-    contents, weights, semantics = [], [], []
+    contents = []
+    weights = []
+    semantics = []
     for own, content, weight, semantic in in_parts(len(view), config.render.chunk, part_of):
         whole = own if whole is None else merge(whole, own)
         contents.append(content)
@@ -102,16 +111,20 @@ def _contacts(
     config: TrainConfig, model: Model, cameras: Cameras, views: Annotated[Tensor, "V"], scene: SceneStyle
 ) -> Annotated[Tensor, "K K"]:
     """How much regions touch without an edge of colour between them, from pairs of rendered pixels."""
-    # Two pixels a pair, rendered one after the other: colour to look for an edge, semantics to know the regions.
+    # Two pixels a pair, rendered one after the other: colour to look for an edge, semantics to know the
+    # regions.
     view, pixel = neighbours(cameras, views, max(1, config.statistics.rays // _PAIRS))
-    view, pixel = view.repeat_interleave(2), pixel.flatten(0, 1)
+    view = view.repeat_interleave(2)
+    pixel = pixel.flatten(0, 1)
 
     def part_of(part: slice) -> Annotated[Tensor, "R 3+D"]:
         rays = model.space.rays(*rays_through(cameras, view[part], pixel[part]))
         rays = type(rays)(*(x.to(model.device) for x in rays))
         marched, content, semantic = march_features(rays, model.parts, budget=config.render.budget)
         assert semantic is not None  # else there is one region
-        return composite_mean(marched.kept, torch.cat([model.decoder(content), semantic], 1), len(rays.near)).cpu()
+        return composite_mean(
+            marched.kept, torch.cat([model.decoder(content), semantic], 1), len(rays.near)
+        ).cpu()
 
     shown = torch.cat(list(in_parts(len(view), config.render.chunk, part_of)))
     shown = shown.view(-1, 2, shown.shape[1])

@@ -1,4 +1,5 @@
-"""Parts of a scene as tasks: blocks of fields and cells of Gaussians, each killed, moved or trained again without the others.
+"""Parts of a scene as tasks: blocks of fields and cells of Gaussians, each killed, moved or trained again
+without the others.
 
 The whole scene is trained first, coarsely; each part goes on from there, on any machine, in any order.
 
@@ -36,13 +37,17 @@ from .run import Run, lock_folder
 
 WHOLE = -1
 """The number of the whole scene among the parts."""
-_TASK, _DONE, _FORMAT = "task.json", "done.json", 1
+_TASK = "task.json"
+_DONE = "done.json"
+_FORMAT = 1
 _MOVING = "moving-"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """Message to a worker; the rest lies in the run folder. Small, so that it can be sent to other machines."""
+    """Message to a worker; the rest lies in the run folder. Small, so that it can be sent to other
+    machines.
+    """
 
     root: str
     """Run folder."""
@@ -78,7 +83,9 @@ class Part(ABC):
     """Name in messages."""
     folder: Path
     asked: dict[str, Any]
-    """`task`, the digest of what it is trained as, and how long it is to be trained: it is finished where done.json says so."""
+    """`task`, the digest of what it is trained as, and how long it is to be trained: it is finished where
+    done.json says so.
+    """
     schedule: Schedule
 
     @abstractmethod
@@ -97,7 +104,8 @@ class Part(ABC):
 def train_part(part: Part, report: Callable[[Report], None]) -> bool:
     """Train a part to its end, from its newest checkpoint; False where it was finished already.
 
-    A folder that was trained as something else is started anew. Raises DataError where another process trains there.
+    A folder that was trained as something else is started anew. Raises DataError where another process trains
+    there.
     """
     with lock_folder(part.folder):
         # Whoever runs a task again, on whichever machine, finds out here that nothing is left to do.
@@ -133,20 +141,26 @@ def train_all(
 ) -> None:
     """Train the whole scene, then its parts in the given order; what is finished stays.
 
-    The whole scene may take a share of the minutes that are left of a limit when `spent` seconds are over, each part as much
-    of the rest as the others.
+    The whole scene may take a share of the minutes that are left of a limit when `spent` seconds are over,
+    each part as much of the rest as the others.
     """
     # Tasks name folders absolutely: a worker may run elsewhere, on a disk that both see.
-    begun, folder = time.perf_counter() - spent, config.data or Path()
-    root, data = str(run.root.resolve()), str(folder.resolve() if folder.exists() else folder)  # `town` is no folder
+    begun = time.perf_counter() - spent
+    folder = config.data or Path()
+    # `town` is no folder
+    root = str(run.root.resolve())
+    data = str(folder.resolve() if folder.exists() else folder)
     for parts, share in (([WHOLE], whole_share), (order, 1 / len(order))):
-        # What is left is looked at again after the whole scene: where that ended early the parts have its time, too.
+        # What is left is looked at again after the whole scene: where that ended early the parts have its
+        # time, too.
         minutes = None
         if config.minutes is not None:
             left = config.minutes - (time.perf_counter() - begun) / 60
             minutes = share * max(left, 0.05 * config.minutes)
         work = partial(run_task, open_part=open_part)  # which other processes can be sent
-        executor.map(work, [Task(root=root, data=data, part=part, minutes=minutes, quiet=quiet) for part in parts])
+        executor.map(
+            work, [Task(root=root, data=data, part=part, minutes=minutes, quiet=quiet) for part in parts]
+        )
 
 
 def digest_of(
@@ -157,7 +171,9 @@ def digest_of(
     parts: Mapping[str, Any],
     content: bytes = b"",
 ) -> str:
-    """Digest of what a part is trained as: the config but for fields that are `free`, its views, and whatever else decides."""
+    """Digest of what a part is trained as: the config but for fields that are `free`, its views, and whatever
+    else decides.
+    """
     # Cameras as floats in full; images as checksums of their files.
     tree = to_json(config)
     assert isinstance(tree, dict)
@@ -165,14 +181,18 @@ def digest_of(
         "config": {name: value for name, value in tree.items() if name not in free},
         "cameras": [getattr(scene.cameras, of.name)[views].tolist() for of in fields(scene.cameras)],
     }
-    digest = hashlib.sha256(json.dumps(document | dict(parts), sort_keys=True, default=str).encode() + content)
+    digest = hashlib.sha256(
+        json.dumps(document | dict(parts), sort_keys=True, default=str).encode() + content
+    )
     for view in views:
         digest.update(zlib.crc32(scene.paths[view].read_bytes()).to_bytes(4, "little"))
     return digest.hexdigest()[:32]
 
 
 def task_of(folder: Path) -> str | None:
-    """The digest of the task that a part was begun as; None where task.json is absent or damaged, which counts as not begun."""
+    """The digest of the task that a part was begun as; None where task.json is absent or damaged, which
+    counts as not begun.
+    """
     try:
         with open_json(folder / _TASK, "") as document:
             return from_json(document["task"], str, path="task")
@@ -209,7 +229,8 @@ def renumber(folder: Path, asked: Mapping[int, str]) -> None:
     tasks = {mark.parent: task_of(mark.parent) for mark in sorted(folder.glob(f"*/{_TASK}"))}
     known = {part: task for part, task in tasks.items() if task is not None}
     targets = {number: folder / f"{number:02d}" for number in asked}
-    # Those that are where they belong stay; of the others each number takes the first that was begun as what it is asked for.
+    # Those that are where they belong stay; of the others each number takes the first that was begun as what
+    # it is asked for.
     moves: dict[int, Path] = {}
     for number, task in asked.items():
         if known.get(targets[number]) == task:

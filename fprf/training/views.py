@@ -13,7 +13,16 @@ from ..interfaces import Decoder, SceneView, Values
 from ..memory import chunk_size, in_parts
 from ..ops.backend import float64_device
 from ..rendering.cameras import Cameras, PixelRays, grid_rays, rays_through
-from ..rendering.renderer import PackedSamples, composite, composite_mean, enlarged, march, march_features, render_rays, shade
+from ..rendering.renderer import (
+    PackedSamples,
+    composite,
+    composite_mean,
+    enlarged,
+    march,
+    march_features,
+    render_rays,
+    shade,
+)
 from ..style.look import Restyle
 from ..types import Rays, View, Want
 from .camera_optimizers import rays_of_moving_cameras, rotated
@@ -23,7 +32,8 @@ from .model import Facts, Model, background_of
 def view_rays(
     model: Model, cameras: Cameras, view: int, pixel: Annotated[Tensor, "R 2"] | None = None
 ) -> tuple[Rays, Annotated[Tensor, "R 3"], Annotated[Tensor, "R 3"]]:
-    """Rays through some pixels of a view, or all, on the model's device; their origins and directions in the world.
+    """Rays through some pixels of a view, or all, on the model's device; their origins and directions in the
+    world.
 
     The latter are float64: on the CPU where the device has none.
     """
@@ -32,7 +42,9 @@ def view_rays(
     if pixel is None:
         origin, direction = grid_rays(cameras, view, wide)
     else:
-        origin, direction = (x.to(wide) for x in rays_through(cameras, torch.full((len(pixel),), view), pixel))
+        origin, direction = (
+            x.to(wide) for x in rays_through(cameras, torch.full((len(pixel),), view), pixel)
+        )
     return Rays(*(x.to(device) for x in model.space.rays(origin, direction))), origin, direction
 
 
@@ -63,7 +75,10 @@ class ViewChunk:
     @torch.inference_mode()
     def colour(self, decoder: Decoder, restyle: Restyle | None) -> Annotated[Tensor, "R 3"]:
         """Colours of its pixels in a style, or as they are, in [0, 1]."""
-        rgb = composite(self.kept, shade(decoder, self.content, self.semantic, restyle), self.rays) + self.behind
+        rgb = (
+            composite(self.kept, shade(decoder, self.content, self.semantic, restyle), self.rays)
+            + self.behind
+        )
         return (rgb if self.tone == (1.0, 1.0, 1.0) else rgb * rgb.new_tensor(self.tone)).clamp(0, 1)
 
     @torch.inference_mode()
@@ -85,30 +100,48 @@ def view_chunks(
 
     def rendered(here: slice) -> ViewChunk:
         chunk = Rays(*(x[here] for x in rays))
-        marched, content, semantics = march_features(chunk, model.parts, budget=config.budget, semantic=semantic)
+        marched, content, semantics = march_features(
+            chunk, model.parts, budget=config.budget, semantic=semantic
+        )
         kept = marched.kept
         behind = 0.0 if background is None else marched.transmittance[:, None] * background
         # Points and latents have done their part, and would be most of what is held.
-        bare = kept._replace(point=kept.point[:, :0].clone(), latent=kept.latent[:, :0].clone(), view=kept.view[:, :0].clone())
+        bare = kept._replace(
+            point=kept.point[:, :0].clone(), latent=kept.latent[:, :0].clone(), view=kept.view[:, :0].clone()
+        )
         # Depths along the world's ray, whatever space the field lives in.
-        metric = model.space.metric(origin[here], direction[here], marched.depth.to(origin.device)).to(chunk.near.device)
-        samples, tone = marched.weights.numel(), config.tone or (1.0, 1.0, 1.0)
-        return ViewChunk(bare, content, semantics, behind, len(chunk.near), metric, marched.opacity, samples, tone)
+        metric = model.space.metric(origin[here], direction[here], marched.depth.to(origin.device)).to(
+            chunk.near.device
+        )
+        samples = marched.weights.numel()
+        tone = config.tone or (1.0, 1.0, 1.0)
+        return ViewChunk(
+            bare, content, semantics, behind, len(chunk.near), metric, marched.opacity, samples, tone
+        )
 
     yield from in_parts(len(rays.near), chunk_size(config.chunk, rays.near.device), rendered)
 
 
 @torch.inference_mode()
-def _view_of(chunks: Iterable[ViewChunk], decoder: Decoder, restyle: Restyle | None, size: tuple[int, int]) -> View:
+def _view_of(
+    chunks: Iterable[ViewChunk], decoder: Decoder, restyle: Restyle | None, size: tuple[int, int]
+) -> View:
     """The chunks of a view of (height, width) pixels in a style, still on their device."""
-    rgb, depth, opacity, kept, samples = [], [], [], 0, 0
+    rgb = []
+    depth = []
+    opacity = []
+    kept = 0
+    samples = 0
     for chunk in chunks:
         rgb.append(chunk.colour(decoder, restyle))
         depth.append(chunk.depth)
         opacity.append(chunk.opacity)
-        kept, samples = kept + len(chunk.kept.ray), samples + chunk.samples
+        kept = kept + len(chunk.kept.ray)
+        samples = samples + chunk.samples
     share = kept / max(1, samples)
-    return View(torch.cat(rgb).view(*size, 3), torch.cat(depth).view(size), torch.cat(opacity).view(size), share)
+    return View(
+        torch.cat(rgb).view(*size, 3), torch.cat(depth).view(size), torch.cat(opacity).view(size), share
+    )
 
 
 def _on_host(view: View) -> View:
@@ -116,12 +149,19 @@ def _on_host(view: View) -> View:
     if view.rgb.device.type == "cpu":
         return view
     flat = torch.cat([each.reshape(-1) for each in (view.rgb, view.depth, view.opacity)]).cpu()
-    rgb, depth, opacity = torch.split_with_sizes(flat, [view.rgb.numel(), view.depth.numel(), view.opacity.numel()])
+    rgb, depth, opacity = torch.split_with_sizes(
+        flat, [view.rgb.numel(), view.depth.numel(), view.opacity.numel()]
+    )
     return View(rgb.view_as(view.rgb), depth.view_as(view.depth), opacity.view_as(view.opacity), view.kept)
 
 
 def render_view(
-    model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig, restyle: Restyle | None = None
+    model: Model,
+    facts: Facts,
+    cameras: Cameras,
+    view: int,
+    config: RenderConfig,
+    restyle: Restyle | None = None,
 ) -> View:
     """Colour and depth of one view in a style, or as captured, in chunks of rays and in one copy to the host.
 
@@ -129,7 +169,8 @@ def render_view(
     """
     whole = cameras.size[view].tolist()
     if config.resolution < 1:
-        cameras, view = cameras.select(torch.tensor([view])).scaled(1 / config.resolution), 0
+        cameras = cameras.select(torch.tensor([view])).scaled(1 / config.resolution)
+        view = 0
     width, height = cameras.size[view].tolist()
     # Semantics are evaluated only where the style tells places apart by them.
     semantic = restyle is not None and not restyle.idle and Want.SEMANTIC in restyle.needs
@@ -153,8 +194,12 @@ class CachedView(SceneView):
     @torch.inference_mode()
     def paint(self, values: Values) -> Annotated[Tensor, "N X"]:
         # Where the scene has no semantics all points are alike: features without channels.
-        semantics = [chunk.content[:, :0] if chunk.semantic is None else chunk.semantic for chunk in self.chunks]
-        return torch.cat([chunk.mean(values(at, None)).cpu() for chunk, at in zip(self.chunks, semantics, strict=True)])
+        semantics = [
+            chunk.content[:, :0] if chunk.semantic is None else chunk.semantic for chunk in self.chunks
+        ]
+        return torch.cat(
+            [chunk.mean(values(at, None)).cpu() for chunk, at in zip(self.chunks, semantics, strict=True)]
+        )
 
     @property
     def bytes(self) -> int:
@@ -180,8 +225,8 @@ def paint_pixels(
 ) -> tuple[Annotated[Tensor, "R X"], Annotated[Tensor, "R"]]:
     """Means over what each pixel sees of anything that follows from semantics, and the opacity; on the CPU.
 
-    Pixels that see nothing get 0. `values` is given features without channels where the scene has no semantics or
-    `semantic` is false. Neither content nor colour is computed.
+    Pixels that see nothing get 0. `values` is given features without channels where the scene has no
+    semantics or `semantic` is false. Neither content nor colour is computed.
     """
     # Geometry and semantics alone; content, the widest network, is not needed.
     rays, _, _ = view_rays(model, cameras, view, pixel)
@@ -189,18 +234,24 @@ def paint_pixels(
     def paint(here: slice) -> tuple[Tensor, Tensor]:
         chunk = Rays(*(x[here] for x in rays))
         marched = march(chunk, model.parts, budget=config.budget)
-        kept, field = marched.kept, model.semantic if semantic else None
+        kept = marched.kept
+        field = model.semantic if semantic else None
         painted = values(kept.point[:, :0] if field is None else field(kept.point), None)
         return composite_mean(kept, painted, len(chunk.near)), marched.opacity
 
-    painted, opacity = zip(*in_parts(len(rays.near), chunk_size(config.chunk, rays.near.device), paint), strict=True)
+    painted, opacity = zip(
+        *in_parts(len(rays.near), chunk_size(config.chunk, rays.near.device), paint), strict=True
+    )
     return torch.cat(painted).cpu(), torch.cat(opacity).cpu()
 
 
 FIT_STEPS = 120
 """Steps of Adam that fit the pose of a view."""
-_FIT_RAYS, _FIT_RATE = 512, 2e-3
-"""Pixels of such a step; radians, and distances that views commonly see, of the first one, falling along a cosine to none."""
+_FIT_RAYS = 512
+_FIT_RATE = 2e-3
+"""Pixels of such a step; radians, and distances that views commonly see, of the first one, falling along a
+cosine to none.
+"""
 
 
 def fit_pose(
@@ -214,16 +265,21 @@ def fit_pose(
     reach: float,
     budget: float,
 ) -> Annotated[Tensor, "6"]:
-    """Turn and shift (world units), float64, that bring the render of a view nearest to its image, `where` that counts.
+    """Turn and shift (world units), float64, that bring the render of a view nearest to its image, `where`
+    that counts.
 
-    Where training refines poses the scene moves with the training views, and a held-out view stays where the capture says: its
-    pose is fitted to its own image (BARF, section 4), six numbers a view. The scene is not changed.
+    Where training refines poses the scene moves with the training views, and a held-out view stays where the
+    capture says: its pose is fitted to its own image (BARF, section 4), six numbers a view. The scene is not
+    changed.
     """
-    device, tones = model.device, model.tones
-    through, background = PixelRays(cameras.select(torch.tensor([view]))), background_of(facts, device)
+    device = model.device
+    tones = model.tones
+    through = PixelRays(cameras.select(torch.tensor([view])))
+    background = background_of(facts, device)
     # Photographs are compared as the view took them: a held-out view by what its exposure says.
     factor = torch.ones(3) if tones is None else tones(torch.tensor([view]))[0].detach().cpu()
-    pixels, generator = truth.reshape(-1, 3), torch.Generator().manual_seed(view)
+    pixels = truth.reshape(-1, 3)
+    generator = torch.Generator().manual_seed(view)
     used = None if where is None or not bool(where.any()) else where.reshape(-1).nonzero()[:, 0]
     move = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     optimizer = torch.optim.Adam([move], lr=_FIT_RATE, betas=(0.9, 0.95))
@@ -234,7 +290,8 @@ def fit_pose(
         at = at if used is None else used[at]
         pixel = torch.stack([at % truth.shape[1], at // truth.shape[1]], -1) + 0.5
         origin, direction = through(torch.zeros_like(at), pixel)
-        # Only the move has a gradient: samples are placed as if the pose were fixed (see `rays_of_moving_cameras`).
+        # Only the move has a gradient: samples are placed as if the pose were fixed (see
+        # `rays_of_moving_cameras`).
         turned = rotated(direction, move[:3].expand_as(direction))
         rays = rays_of_moving_cameras(model.space.rays(origin + reach * move[3:], turned))
         rays = Rays(*(x.to(device) for x in rays))

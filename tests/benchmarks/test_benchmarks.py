@@ -1,4 +1,6 @@
-"""The list of benchmarks, each the whole way and small, what the larger ones say of the tiny run; `benchmarks/gpu.sh`."""
+"""The list of benchmarks, each the whole way and small, what the larger ones say of the tiny run;
+`benchmarks/gpu.sh`.
+"""
 
 import importlib.util
 import json
@@ -38,8 +40,14 @@ def test_every_benchmark_is_listed_and_says_what_it_needs(
     monkeypatch.setitem(BENCHMARKS, "fuzz_guided", absent)
     assert main(["fuzz_guided", "--minutes", "1"]) == 2
     needs, error = capsys.readouterr().err.splitlines()
-    assert needs.startswith("fuzz_guided needs the package atheris") and "no_such_package not installed" in error
-    assert main([]) == 2 and main(["--help"]) == 0 and all(f"  {name} " in capsys.readouterr().out for name in ("paper",))
+    assert (
+        needs.startswith("fuzz_guided needs the package atheris") and "no_such_package not installed" in error
+    )
+    assert (
+        main([]) == 2
+        and main(["--help"]) == 0
+        and all(f"  {name} " in capsys.readouterr().out for name in ("paper",))
+    )
     assert main(["papers"]) == 2 and capsys.readouterr().err.startswith("error: papers: no such benchmark")
 
 
@@ -52,7 +60,9 @@ def test_every_benchmark_is_listed_and_says_what_it_needs(
         ("restyle --frames 7", "--frames"),
     ],
 )
-def test_a_mistake_is_one_line(line: str, told: str, world: World, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_mistake_is_one_line(
+    line: str, told: str, world: World, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(line.replace("RUN", str(world.run)).split()) == 2
     lines = [each for each in capsys.readouterr().err.splitlines() if not each.startswith("{")]
     assert len(lines) == 2 and " needs " in lines[0], "needs are said first"
@@ -76,10 +86,28 @@ def test_a_peer_s_frames_are_judged_by_all_that_can_be_known(
 ) -> None:
     """The town at night as a peer's restyling of the town by day: exact, and nothing is missing."""
     write_town(tmp_path / "night", seed=0, palette="night", views=10, width=32, height=24)
-    frames, plain = str(tmp_path / "night" / "images"), str(world.town / "images")
-    page, output = tmp_path / "page.md", tmp_path / "peer.json"
-    words = ["--cameras", str(world.town / "transforms.json"), "--plain", plain, "--depth", str(world.town / "depth")]
-    words += ["--truth", frames, "--references", str(world.references[0]), "--page", str(page), "--output", str(output)]
+    frames = str(tmp_path / "night" / "images")
+    plain = str(world.town / "images")
+    page = tmp_path / "page.md"
+    output = tmp_path / "peer.json"
+    words = [
+        "--cameras",
+        str(world.town / "transforms.json"),
+        "--plain",
+        plain,
+        "--depth",
+        str(world.town / "depth"),
+    ]
+    words += [
+        "--truth",
+        frames,
+        "--references",
+        str(world.references[0]),
+        "--page",
+        str(page),
+        "--output",
+        str(output),
+    ]
     assert main(["peer", frames, *words, "--device", "cpu"]) == 0
     document = json.loads(output.read_text())
     assert document["frames"] == 10 and document["size"] == [32, 24] and document["missing"] == {}
@@ -103,7 +131,8 @@ def test_the_truth_is_the_town_itself(world: World) -> None:
     photographs = [world.prepared.manager.image(view) for view in held_out[:2]]
     for rendered, taken in zip(true_views(stage, "day"), photographs, strict=True):
         assert psnr(rendered, taken) > 60
-    night, day = true_views(stage, "night"), true_views(stage, "day")
+    night = true_views(stage, "night")
+    day = true_views(stage, "day")
     assert float(night[0].mean()) < 0.5 * float(day[0].mean())
 
 
@@ -112,8 +141,11 @@ UNMATCHED = {PLAIN, *GLOBAL, MATCHED, BOUND}
 METHODS = {*UNMATCHED, FLAT, *STYLIZERS, "nearest-code"}
 
 
-def test_every_method_is_in_the_table(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    page, sheet = tmp_path / "docs/page.md", tmp_path / "docs/sheets/all.png"
+def test_every_method_is_in_the_table(
+    world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "docs/page.md"
+    sheet = tmp_path / "docs/sheets/all.png"
     files = ["--output", str(tmp_path / "a.json"), "--page", str(page), "--sheet", str(sheet)]
     assert main(["restyle", str(world.run), *SMALL, *files]) == 0
     document = json.loads((tmp_path / "a.json").read_text())
@@ -138,13 +170,16 @@ def test_every_method_is_in_the_table(world: World, tmp_path: Path, capsys: pyte
 
 def test_exact_is_double_and_every_way_comes_near_it(world: World) -> None:
     trained = world.load()
-    known, model = trained.known, trained.model
+    known = trained.known
+    model = trained.model
     rays = view_rays(model, known.cameras, 1)
     for stylizer in (None, RegionOtConfig(), LocalAdainConfig()):
         look = (
             None
             if stylizer is None
-            else apply_style(trained, StyleFile(StyleConfig(references=world.references, stylizer=stylizer))).restyle
+            else apply_style(
+                trained, StyleFile(StyleConfig(references=world.references, stylizer=stylizer))
+            ).restyle
         )
         truth = exact(model, known.facts, rays, look)
         assert truth.dtype == torch.float64 and truth.shape == (24 * 32, 3)
@@ -193,24 +228,43 @@ if "eval" in words:
 if "speed" in words:
     shutil.copy(os.environ["RESULTS"] + "/speed_fox.json", words[words.index("--output") + 1])
 """
-METRICS = {"method": "fprf", "scene": "flower", "train_seconds": 179.0, "train_steps": 9000, "views": 5, "psnr": 26.5}
+METRICS = {
+    "method": "fprf",
+    "scene": "flower",
+    "train_seconds": 179.0,
+    "train_steps": 9000,
+    "views": 5,
+    "psnr": 26.5,
+}
 
 
 def script(folder: Path, *words: str, fails: str = "nothing") -> tuple[int, list[list[str]]]:
-    """Exit status and commands of the script with an interpreter that runs none of them; its folder is kept."""
+    """Exit status and commands of the script with an interpreter that runs none of them; its folder is
+    kept.
+    """
     folder.mkdir(exist_ok=True)
     stand_in = folder / "python"
     stand_in.write_text(INTERPRETER.replace("PYTHON", sys.executable, 1))
     stand_in.chmod(0o755)
     (folder / "metrics.json").write_text(json.dumps(METRICS))
-    environment = {**os.environ, "PYTHON": str(stand_in), "KEPT": str(folder), "RESULTS": str(RESULTS), "FAILS": fails}
+    environment = {
+        **os.environ,
+        "PYTHON": str(stand_in),
+        "KEPT": str(folder),
+        "RESULTS": str(RESULTS),
+        "FAILS": fails,
+    }
     command = ["bash", str(ROOT / "benchmarks" / "gpu.sh"), *words]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=folder, timeout=100)
     asked = folder / "commands"
-    return done.returncode, [line.split("\t") for line in asked.read_text().splitlines()] if asked.is_file() else []
+    return done.returncode, [
+        line.split("\t") for line in asked.read_text().splitlines()
+    ] if asked.is_file() else []
 
 
-def test_a_failed_step_is_reported_and_the_others_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_step_is_reported_and_the_others_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     code, commands = script(tmp_path / "run", "--dry", fails="speed")
     assert code == 1, "what gpu_rows.py says"
     kinds = ["pytest", "train", "eval", "speed"]

@@ -60,7 +60,8 @@ def picture(height: int = 24, width: int = 30, seed: int = 0) -> torch.Tensor:
 @given(st.integers(0, 1000), st.integers(11, 20), st.integers(11, 20))
 def test_structure_is_the_written_out_one(seed: int, height: int, width: int) -> None:
     """SSIM's second factor of luminances with one mean and deviation."""
-    a, b = picture(height, width, seed), picture(height, width, seed + 1)
+    a = picture(height, width, seed)
+    b = picture(height, width, seed + 1)
     b = 0.5 * a + 0.5 * b
     greys = [image.double().numpy() @ np.array([[0.2126], [0.7152], [0.0722]]) for image in (a, b)]
     alike = [0.25 * (grey - grey.mean()) / grey.std() for grey in greys]
@@ -70,15 +71,23 @@ def test_structure_is_the_written_out_one(seed: int, height: int, width: int) ->
 def statistics(seed: int, channels: int = 4) -> RegionStatistics:
     draw = np.random.default_rng(seed)
     root = draw.normal(size=(channels, channels))
-    return RegionStatistics(100, torch.from_numpy(draw.normal(size=channels)), torch.from_numpy(root @ root.T))
+    return RegionStatistics(
+        100, torch.from_numpy(draw.normal(size=channels)), torch.from_numpy(root @ root.T)
+    )
 
 
 @given(st.integers(0, 1000), st.integers(1, 6))
 def test_the_full_distance_is_frechets(seed: int, channels: int) -> None:
-    a, b = statistics(seed, channels), statistics(seed + 1, channels)
+    a = statistics(seed, channels)
+    b = statistics(seed + 1, channels)
     product = np.linalg.eigvals(a.covariance.numpy() @ b.covariance.numpy())
     cross = np.sqrt(np.maximum(product.real, 0)).sum()
-    square = np.square((a.mean - b.mean).numpy()).sum() + np.trace(a.covariance) + np.trace(b.covariance) - 2 * cross
+    square = (
+        np.square((a.mean - b.mean).numpy()).sum()
+        + np.trace(a.covariance)
+        + np.trace(b.covariance)
+        - 2 * cross
+    )
     assert gaussian_distance(a, b, full=True) == pytest.approx(math.sqrt(max(0, float(square))), abs=1e-5)
     assert gaussian_distance(a, b, full=True) == pytest.approx(gaussian_distance(b, a, full=True), abs=1e-6)
     assert gaussian_distance(a, a, full=True) < 1e-5
@@ -87,14 +96,17 @@ def test_the_full_distance_is_frechets(seed: int, channels: int) -> None:
 def rate_oracle(a: np.ndarray, b: np.ndarray, la: np.ndarray, lb: np.ndarray, regions: list[int]) -> float:
     """Cell by cell, in float64."""
     centre = np.concatenate([a, b]).mean(0)
-    a, b = a - centre, b - centre
+    a = a - centre
+    b = b - centre
     hits: dict[int, list[bool]] = {r: [] for r in regions}
     for x, label in zip(a, la, strict=True):
         if label not in regions:
             continue
         best = {}
         for r in regions:
-            like = sorted((x @ y / np.linalg.norm(x) / np.linalg.norm(y) for y in b[lb == r]), reverse=True)[:3]
+            like = sorted((x @ y / np.linalg.norm(x) / np.linalg.norm(y) for y in b[lb == r]), reverse=True)[
+                :3
+            ]
             best[r] = sum(like) / len(like)
         hits[label].append(max(best, key=lambda r: best[r]) == label)
     return float(np.mean([np.mean(hits[r]) for r in regions]))
@@ -115,7 +127,9 @@ def colours(count: int, seed: int, low: float = 0.3, high: float = 0.7) -> Tenso
     return low + (high - low) * torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
 
 
-FILM_WIDTH, FILM_HEIGHT, FILM_FRAMES = 96, 72, 8
+FILM_WIDTH = 96
+FILM_HEIGHT = 72
+FILM_FRAMES = 8
 
 
 @pytest.fixture(scope="module")
@@ -134,8 +148,11 @@ def depths(path: Cameras) -> list[Tensor]:
 
 @pytest.fixture(scope="module")
 def day(path: Cameras) -> list[Tensor]:
-    town, look = build_town(0), palette("day")
-    return [torch.from_numpy(render(town, town_view(path, i), look).rgb).float() / 255 for i in range(FILM_FRAMES)]
+    town = build_town(0)
+    look = palette("day")
+    return [
+        torch.from_numpy(render(town, town_view(path, i), look).rgb).float() / 255 for i in range(FILM_FRAMES)
+    ]
 
 
 def spoilt(frame: Tensor, k: int, fault: str, size: float) -> Tensor:
@@ -158,13 +175,20 @@ def test_the_render_itself_scores_zero(day: list[Tensor], depths: list[Tensor], 
     found = steadiness(day, day, depths, path)
     assert found.score == 0 and found.sharpness == 1
     assert found.short == found.plain_short and found.long == found.plain_long
-    assert found.plain_short is not None and found.plain_short < 0.05, "true depth warps a true picture onto the next"
+    assert found.plain_short is not None and found.plain_short < 0.05, (
+        "true depth warps a true picture onto the next"
+    )
     assert found.valid_share > 0.4
 
 
 @pytest.mark.parametrize(
     ("fault", "sizes"),
-    [("flicker", (0.01, 0.03, 0.09)), ("drift", (0.02, 0.06, 0.15)), ("blur", (0.5, 1, 2)), ("noise", (0.02, 0.05, 0.1))],
+    [
+        ("flicker", (0.01, 0.03, 0.09)),
+        ("drift", (0.02, 0.06, 0.15)),
+        ("blur", (0.5, 1, 2)),
+        ("noise", (0.02, 0.05, 0.1)),
+    ],
 )
 def test_faults_rank_by_their_size(
     fault: str, sizes: tuple[float, ...], day: list[Tensor], depths: list[Tensor], path: Cameras
@@ -176,8 +200,11 @@ def test_faults_rank_by_their_size(
 
 def test_a_camera_at_rest_compares_pixel_with_pixel() -> None:
     """Brighter by 0.01 with every frame: neighbours differ by that, frames 7 apart by seven times as much."""
-    images, depths = [torch.full((12, 12, 3), 0.2 + 0.01 * t) for t in range(9)], [torch.full((12, 12), 2.0)] * 9
-    still = pinhole(torch.eye(4, dtype=torch.float64)[None, :3].repeat(9, 1, 1), width=12, height=12, fov=53.0)
+    images = [torch.full((12, 12, 3), 0.2 + 0.01 * t) for t in range(9)]
+    depths = [torch.full((12, 12), 2.0)] * 9
+    still = pinhole(
+        torch.eye(4, dtype=torch.float64)[None, :3].repeat(9, 1, 1), width=12, height=12, fov=53.0
+    )
     found = published(images, depths, still)
     assert found["short"]["rmse"] == pytest.approx(0.01, rel=1e-4) and found["short"]["pairs"] == 8
     assert found["short"]["e_warp"] == pytest.approx(1e-4, rel=1e-4)

@@ -25,7 +25,8 @@ TOWN = build_town(0)
 def slow_enter(shape, o, d):
     """Entry distance of one ray in plain floats, inf where it misses."""
     if isinstance(shape, Polyhedron):
-        start, stop = -math.inf, math.inf
+        start = -math.inf
+        stop = math.inf
         for n, offset in zip(shape.normals, shape.offsets, strict=True):
             room = offset - sum(float(n[i]) * o[i] for i in range(3))
             slope = sum(float(n[i]) * d[i] for i in range(3))
@@ -38,13 +39,15 @@ def slow_enter(shape, o, d):
                 stop = min(stop, room / slope)
         return start if 1e-4 < start <= stop else math.inf
     if isinstance(shape, Ellipsoid):
-        p, q = ([(v[i] - w[i]) / shape.radii[i] for i in range(3)] for v, w in ((o, shape.centre), (d, (0, 0, 0))))
-    else:
         p, q = (
-            [(v[i] - w[i]) / shape.radius for i in range(2) for v, w in ((o, shape.centre),)],
-            [d[i] / shape.radius for i in range(2)],
+            [(v[i] - w[i]) / shape.radii[i] for i in range(3)] for v, w in ((o, shape.centre), (d, (0, 0, 0)))
         )
-    a, b, c = sum(v * v for v in q), 2 * sum(v * w for v, w in zip(p, q, strict=True)), sum(v * v for v in p) - 1
+    else:
+        p = [(v[i] - w[i]) / shape.radius for i in range(2) for v, w in ((o, shape.centre),)]
+        q = [d[i] / shape.radius for i in range(2)]
+    a = sum(v * v for v in q)
+    b = 2 * sum(v * w for v, w in zip(p, q, strict=True))
+    c = sum(v * v for v in p) - 1
     if b * b - 4 * a * c <= 0:
         return math.inf
     t = (-b - math.sqrt(b * b - 4 * a * c)) / (2 * a)
@@ -54,12 +57,14 @@ def slow_enter(shape, o, d):
 
 
 def test_depth_and_face_are_those_of_a_plain_loop():
-    town, rng = build_town(3), np.random.default_rng(3)
+    town = build_town(3)
+    rng = np.random.default_rng(3)
     for view in walk(seed=3, views=5, width=40, height=30):
         d = np.stack(directions(view, 1), -1)
         distance, face = cast(town, view, directions(view, 1), 1)
         for row, column in zip(rng.integers(0, 30, 24), rng.integers(0, 40, 24), strict=True):
-            place, way = view.pose[:, 3].tolist(), d[row, column].tolist()
+            place = view.pose[:, 3].tolist()
+            way = d[row, column].tolist()
             ground = -place[2] / way[2] if way[2] < 0 else math.inf
             slow = min(ground, *(slow_enter(shape, place, way) for shape in town.shapes))
             assert distance[row, column] == pytest.approx(slow, rel=1e-10)
@@ -67,7 +72,8 @@ def test_depth_and_face_are_those_of_a_plain_loop():
         # Every ray meets its flat face from outside, on its plane and within its extent.
         flat = (face > 0) & ~town.faces.curve[face].any(-1)
         u, v, origin = (part[face[flat]] for part in (town.faces.u, town.faces.v, town.faces.origin))
-        normal, at = np.cross(u, v), view.pose[:, 3] + distance[flat][:, None] * d[flat] - origin
+        normal = np.cross(u, v)
+        at = view.pose[:, 3] + distance[flat][:, None] * d[flat] - origin
         assert flat.sum() > 100 and ((normal * d[flat]).sum(1) < 0).all()
         assert np.abs((at * normal).sum(1)).max() < 1e-9
         within = np.stack([(at * u).sum(1), (at * v).sum(1)], 1)
@@ -90,7 +96,8 @@ def test_shadows_are_those_of_a_plain_loop():
 def test_views_agree_on_colours():
     """What two cameras both see has the same colour in both, up to the pixels' footprints."""
     big = walk(seed=0, views=40, width=120, height=90)
-    a, b = big[2], big[3]
+    a = big[2]
+    b = big[3]
     one, two = (colours(TOWN, view, palette("day"), 1) for view in (a, b))
     points, seen = world(a, geometry(TOWN, a)[0])
     row, column, distance = project(b, points)
@@ -102,7 +109,8 @@ def test_views_agree_on_colours():
 
 
 def test_the_pictures_that_encoders_are_measured_on_are_the_towns():
-    town, views = build_town(0), walk(seed=0, views=len(PALETTES), width=160, height=128)
+    town = build_town(0)
+    views = walk(seed=0, views=len(PALETTES), width=160, height=128)
     pictures = [render(town, view, look).rgb for view, look in zip(views, PALETTES.values(), strict=True)]
     assert np.array_equal((street() * 255).round().byte().permute(0, 2, 3, 1).numpy(), np.stack(pictures))
 
@@ -131,7 +139,8 @@ def project(view, points):
         x = view.focal * local[:, 0] / -local[:, 2] + view.width / 2
         y = -view.focal * local[:, 1] / -local[:, 2] + view.height / 2
         inside = (local[:, 2] < -0.05) & (x >= 0) & (y >= 0) & (x < view.width) & (y < view.height)
-        row, column = np.where(inside, np.floor(y), -1).astype(int), np.where(inside, np.floor(x), -1).astype(int)
+        row = np.where(inside, np.floor(y), -1).astype(int)
+        column = np.where(inside, np.floor(x), -1).astype(int)
     return row, column, np.linalg.norm(off, axis=1)
 
 
@@ -154,7 +163,8 @@ def cache(tmp_path, monkeypatch):
 
 
 def test_files_are_the_pictures(folder):
-    town, views = build_town(2), walk(seed=2, views=9, width=24, height=18)
+    town = build_town(2)
+    views = walk(seed=2, views=9, width=24, height=18)
     for k in (0, 7):
         shot = render(town, views[k], palette("autumn"))
         assert np.array_equal(cv2.imread(str(folder / f"images/{k:04d}.png"))[..., ::-1], shot.rgb)
@@ -165,7 +175,8 @@ def test_files_are_the_pictures(folder):
 
 def test_points_lie_on_surfaces(folder):
     with np.load(folder / "points.npz") as stored:
-        xyz, rgb = stored["xyz"], stored["rgb"]
+        xyz = stored["xyz"]
+        rgb = stored["rgb"]
     assert xyz.shape == rgb.shape and len(xyz) > 7 * 100 and xyz[:, 2].min() > -0.01
     assert (xyz.dtype, rgb.dtype) == (np.float32, np.uint8)
     row, column, distance = project(walk(seed=2, views=9, width=24, height=18)[1], xyz[: write._POINTS])

@@ -43,7 +43,10 @@ def street(length: float = 100.0, views: int = 40, walls: int = 4000) -> ParsedS
     position = torch.stack([x, 0.2 * torch.sin(x), torch.full_like(x, 2.0)], 1)
     ahead = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64).expand(views, 3)
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    points = torch.rand(walls, 3, dtype=torch.float64, generator=draw) * torch.tensor([length + 30, 2.0, 8.0]).double()
+    points = (
+        torch.rand(walls, 3, dtype=torch.float64, generator=draw)
+        * torch.tensor([length + 30, 2.0, 8.0]).double()
+    )
     points[:, 1] = torch.where(points[:, 1] > 1, 6.0, -6.0)
     return scene_of(cameras_at(position, ahead, up), points)
 
@@ -56,7 +59,10 @@ def drone(side: float = 90.0, rows: int = 7, height: float = 30.0, points: int =
     position = torch.stack([x.flatten(), y.flatten(), torch.full((rows * rows,), height).double()], 1)
     ahead = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64).expand(len(position), 3)
     north = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
-    ground = torch.rand(points, 3, dtype=torch.float64, generator=draw) * torch.tensor([side + 20, side + 20, 4.0]).double()
+    ground = (
+        torch.rand(points, 3, dtype=torch.float64, generator=draw)
+        * torch.tensor([side + 20, side + 20, 4.0]).double()
+    )
     ground[:, :2] -= 10
     return scene_of(cameras_at(position, ahead, north), ground)
 

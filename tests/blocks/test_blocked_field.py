@@ -1,4 +1,6 @@
-"""Fields of blocks against a plain loop, seams, gradients; routers and weights: a partition of unity, continuous, local."""
+"""Fields of blocks against a plain loop, seams, gradients; routers and weights: a partition of unity,
+continuous, local.
+"""
 
 import math
 from collections.abc import Sequence
@@ -11,15 +13,34 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from fprf.blocks.fields import BlockedField, BlockedSampler, BlockedSemantic, Member, ResidentMembers, emission, inherit
-from fprf.blocks.routing import BlendRouter, Chart, Group, InsetRouter, chart_of, shares, surroundings_of, to_single, window
+from fprf.blocks.fields import (
+    BlockedField,
+    BlockedSampler,
+    BlockedSemantic,
+    Member,
+    ResidentMembers,
+    emission,
+    inherit,
+)
+from fprf.blocks.routing import (
+    BlendRouter,
+    Chart,
+    Group,
+    InsetRouter,
+    chart_of,
+    shares,
+    surroundings_of,
+    to_single,
+    window,
+)
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.fields.planes import Planes
 from fprf.plugins.samplers.config import ProposalConfig
 from fprf.rendering.space import Space
 from fprf.types import Cell, Rays
 
-CHANNELS, DIMS = 5, 4
+CHANNELS = 5
+DIMS = 4
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 SPACE = Space("open", (0.0, 0.0, 0.0), EYE, 1.0, 0.05, 1e3)
 
@@ -31,7 +52,9 @@ def member(chart: Chart, seed: int, resolutions: tuple[int, int] = (4, 8)) -> Me
     field = PlanesConfig(resolutions=resolutions, channels=8, hidden=16, layers=1)
     semantic = SemanticPlanesConfig(resolutions=resolutions[:1], channels=8, hidden=16, layers=1)
     sampler = replace(SAMPLER, resolutions=resolutions).build(seed=seed)
-    return Member(chart, sampler, field.build(channels=CHANNELS, seed=seed), semantic.build(channels=DIMS, seed=seed))
+    return Member(
+        chart, sampler, field.build(channels=CHANNELS, seed=seed), semantic.build(channels=DIMS, seed=seed)
+    )
 
 
 def members(cells: list[Cell], spread: float = 3.0) -> list[Member]:
@@ -54,12 +77,18 @@ class Counting(ResidentMembers):
         return super().member(number)
 
 
-def plain(cells: list[Cell], parts: Sequence[Member], points: Tensor, view: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def plain(
+    cells: list[Cell], parts: Sequence[Member], points: Tensor, view: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """Density, content and semantics by a loop over points and members."""
     weight = shares(points.double(), cells)
-    densities, contents, semantics = [], [], []
+    densities = []
+    contents = []
+    semantics = []
     for p, v, w in zip(points, view, weight, strict=True):
-        sigma, content, semantic = [], [], []
+        sigma = []
+        content = []
+        semantic = []
         for member in parts:
             at = member.chart.locate(p[None])
             sample = member.field.density(at)
@@ -80,8 +109,10 @@ def test_against_a_loop() -> None:
     parts = members(cells)
     points = points_around(cells, 150)
     view = torch.nn.functional.normalize(torch.randn(150, 3), dim=1)
-    held, router = ResidentMembers(parts), BlendRouter(cells)
-    field, semantic = BlockedField(held, router), BlockedSemantic(held, router)
+    held = ResidentMembers(parts)
+    router = BlendRouter(cells)
+    field = BlockedField(held, router)
+    semantic = BlockedSemantic(held, router)
     sample = field.density(points)
     density, content, semantics = plain(cells, parts, points, view)
     assert torch.allclose(sample.density.double(), density, rtol=3e-5, atol=0)
@@ -94,7 +125,8 @@ def test_only_the_blocks_that_points_meet_are_asked() -> None:
     cells = row(6)
     counting = Counting(members(cells))
     counting.asked = set()
-    field, semantic = BlockedField(counting, BlendRouter(cells)), BlockedSemantic(counting, BlendRouter(cells))
+    field = BlockedField(counting, BlendRouter(cells))
+    semantic = BlockedSemantic(counting, BlendRouter(cells))
     points = torch.tensor([[3.0, 0.0, 0.7], [3.9, 0.1, 0.7]])
     field.content(field.density(points).latent, torch.eye(3)[:2])
     semantic(points)
@@ -127,7 +159,8 @@ def test_an_inset_block_learns_inside_and_its_surroundings_outside() -> None:
         features = field.content(sample.latent, view)
         (sample.density[chosen].sum() + features[chosen].sum()).backward()
         touched = [
-            sum(float(p.grad.abs().sum()) for p in m.field.parameters() if p.grad is not None) for m in field.members.held
+            sum(float(p.grad.abs().sum()) for p in m.field.parameters() if p.grad is not None)
+            for m in field.members.held
         ]
         assert touched[learns] > 0 and touched[rests] == 0
 
@@ -176,7 +209,9 @@ def smooth(part: nn.Module) -> None:
                 at = torch.linspace(-1, 1, r)
                 for _ in range(3):
                     a, b = torch.rand(2, module.table.shape[1], generator=draw)
-                    tables.append((0.4 + 0.1 * a * at[:, None, None] + 0.1 * b * at[None, :, None]).reshape(r * r, -1))
+                    tables.append(
+                        (0.4 + 0.1 * a * at[:, None, None] + 0.1 * b * at[None, :, None]).reshape(r * r, -1)
+                    )
             with torch.no_grad():
                 module.table.copy_(torch.cat(tables))
 
@@ -184,14 +219,16 @@ def smooth(part: nn.Module) -> None:
 @pytest.mark.parametrize("block", [0, 1])
 def test_a_block_says_what_its_surroundings_say(block: int) -> None:
     cells = row(3, 0.2)
-    around, own = member(surroundings_of(cells), 0, (9, 17)), member(chart_of(cells[block]), 7, (9, 17))
+    around = member(surroundings_of(cells), 0, (9, 17))
+    own = member(chart_of(cells[block]), 7, (9, 17))
     smooth(around)
     inherit(own, around)
     points = points_around(cells, 2000)
     # Within the bounds of all blocks the contraction is linear, and so are these planes: nothing is lost.
     inner = points[around.chart.inside(points) & own.chart.inside(points)]
     assert len(inner) > 100
-    mine, theirs = own.field.density(own.chart.locate(inner)), around.field.density(around.chart.locate(inner))
+    mine = own.field.density(own.chart.locate(inner))
+    theirs = around.field.density(around.chart.locate(inner))
     torch.testing.assert_close(mine.density, theirs.density, rtol=2e-3, atol=1e-5)
     view = torch.nn.functional.normalize(torch.randn(len(inner), 3), dim=-1)
     torch.testing.assert_close(
@@ -199,13 +236,20 @@ def test_a_block_says_what_its_surroundings_say(block: int) -> None:
     )
     assert own.semantic is not None and around.semantic is not None
     torch.testing.assert_close(
-        own.semantic(own.chart.locate(inner)), around.semantic(around.chart.locate(inner)), rtol=1e-3, atol=1e-3
+        own.semantic(own.chart.locate(inner)),
+        around.semantic(around.chart.locate(inner)),
+        rtol=1e-3,
+        atol=1e-3,
     )
     first, second = (each.sampler.fields[0](each.chart.locate(inner)) for each in (own, around))
     torch.testing.assert_close(first, second, rtol=2e-3, atol=1e-5)
 
 
-UNEVEN = [cell((0, 0, 0), (2, 3, 1), 0.25), cell((2, 0, 0), (5, 1, 1), 0.25), cell((2, 1, 0), (5, 3, 1), 0.25)]
+UNEVEN = [
+    cell((0, 0, 0), (2, 3, 1), 0.25),
+    cell((2, 0, 0), (5, 1, 1), 0.25),
+    cell((2, 1, 0), (5, 3, 1), 0.25),
+]
 """As bisection leaves them: a face of one is shared by two."""
 
 
@@ -225,7 +269,8 @@ def test_blending_is_what_the_windows_say(cells: list[Cell], seed: int) -> None:
     points = points_around(cells, 400, seed)
     groups = BlendRouter(cells)(points)
     assert sorted(torch.cat([g.at for g in groups]).tolist()) == list(range(400)), "each point in one group"
-    found, wanted = dense(groups, 400, len(cells) + 1), shares(points, cells).double()
+    found = dense(groups, 400, len(cells) + 1)
+    wanted = shares(points, cells).double()
     # What is left out is slight, and float32 windows round by 1e-6 or so of a margin.
     assert float((found - wanted).abs().max()) < 1e-5
     assert torch.allclose(found.sum(1), torch.ones(400).double(), atol=1e-6)
@@ -245,17 +290,25 @@ def test_surroundings_hold_everything_and_blocks_fill_their_inner_half() -> None
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 3), st.integers(1, 3), st.floats(0.01, 0.5), st.integers(0, 2**31 - 1))
-def test_weights_sum_to_one_and_need_no_scaling_in_a_grid(columns: int, rows: int, border: float, seed: int) -> None:
+def test_weights_sum_to_one_and_need_no_scaling_in_a_grid(
+    columns: int, rows: int, border: float, seed: int
+) -> None:
     cells = grid(columns, rows, border)
     draw = torch.Generator().manual_seed(seed)
-    points = torch.rand(200, 3, dtype=torch.float64, generator=draw) * torch.tensor([columns + 2.0, rows + 2.0, 3.0]) - 1
+    points = (
+        torch.rand(200, 3, dtype=torch.float64, generator=draw)
+        * torch.tensor([columns + 2.0, rows + 2.0, 3.0])
+        - 1
+    )
     weight = shares(points, cells)
     assert weight.shape == (200, columns * rows + 1) and bool((weight >= 0).all())
     assert torch.allclose(weight.sum(1), torch.ones(200, dtype=torch.float64), atol=1e-12)
     bare = torch.stack([window(points, each) for each in cells], 1).sum(1)
     assert bool((bare <= 1 + 1e-12).all()), "windows of cells that share faces never sum to more than 1"
     inside = (points > 2 * border).all(1) & (points < torch.tensor([columns, rows, 1.0]) - 2 * border).all(1)
-    assert torch.allclose(bare[inside], torch.ones(int(inside.sum())).double(), atol=1e-12), "no surroundings inside"
+    assert torch.allclose(bare[inside], torch.ones(int(inside.sum())).double(), atol=1e-12), (
+        "no surroundings inside"
+    )
 
 
 @pytest.mark.parametrize("cells", [grid(3, 2), UNEVEN], ids=["grid", "uneven"])
@@ -263,7 +316,9 @@ def test_weights_change_no_faster_than_the_borders_allow(cells: list[Cell]) -> N
     """Steepest slope of a smoothstep over two borders is 3 / (4 b) an axis; scaling at most doubles it."""
     draw = torch.Generator().manual_seed(3)
     start = torch.rand(4000, 3, dtype=torch.float64, generator=draw) * 6 - 2.5
-    step = torch.nn.functional.normalize(torch.randn(4000, 3, dtype=torch.float64, generator=draw), dim=1) * 1e-3
+    step = (
+        torch.nn.functional.normalize(torch.randn(4000, 3, dtype=torch.float64, generator=draw), dim=1) * 1e-3
+    )
     jump = (shares(start + step, cells) - shares(start, cells)).abs().amax(1)
     assert float(jump.max()) <= 1e-3 * math.sqrt(3) * 2 * 0.75 / float(cells[0].border[0]) + 1e-12
     assert float(jump.max()) > 0, "the test crosses a border"

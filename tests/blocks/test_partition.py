@@ -1,4 +1,6 @@
-"""Partitions of both kinds: blocks hold what cameras see and fit their budget, cells of Gaussians cover all of space."""
+"""Partitions of both kinds: blocks hold what cameras see and fit their budget, cells of Gaussians cover all
+of space.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +11,16 @@ from block_scenes import drone, street
 from torch import Tensor
 
 from fprf.blocks.config import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig
-from fprf.blocks.partition import bisect_sightings, bounds, make_plan, open_space, pixel_mask, read_cells, site_of, write_cells
+from fprf.blocks.partition import (
+    bisect_sightings,
+    bounds,
+    make_plan,
+    open_space,
+    pixel_mask,
+    read_cells,
+    site_of,
+    write_cells,
+)
 from fprf.blocks.routing import shares
 from fprf.datamanagers.scene import ParsedScene, find_sightings
 from fprf.errors import CheckpointError, ConfigError
@@ -21,7 +32,8 @@ def site(scene: ParsedScene) -> Site:
     return site_of(scene, open_space(scene, find_sightings(scene)))
 
 
-DRONE, STREET = site(drone()), site(street())
+DRONE = site(drone())
+STREET = site(street())
 
 
 def holding(cells: list[Cell], points: Tensor) -> Tensor:
@@ -43,7 +55,9 @@ def holding(cells: list[Cell], points: Tensor) -> Tensor:
     ],
     ids=str,
 )
-def test_cameras_stand_in_blocks_and_next_to_nothing_is_left_to_the_surroundings(layout: LayoutConfig, here: Site) -> None:
+def test_cameras_stand_in_blocks_and_next_to_nothing_is_left_to_the_surroundings(
+    layout: LayoutConfig, here: Site
+) -> None:
     cells = layout.build().cut(here)
     assert bool(holding(cells, here.position).all())
     low, high = bounds(here)
@@ -75,7 +89,8 @@ def test_adaptive_blocks_fit_the_budget_or_cannot_be_split(budget: int) -> None:
     low, high = bounds(DRONE)
     inside = DRONE.points[((DRONE.points >= low) & (DRONE.points <= high)).all(1)][:, :2]
     for cell in cells:
-        first, last = cell.low[:2], cell.high[:2]
+        first = cell.low[:2]
+        last = cell.high[:2]
         cameras = ((DRONE.position[:, :2] >= first) & (DRONE.position[:, :2] < last)).all(1)
         points = ((inside >= first) & (inside < last)).all(1)
         load = 0.5 * float(DRONE.rays[cameras].sum()) + 0.5 * total * float(points.double().mean())
@@ -107,7 +122,9 @@ def cells(scene: ParsedScene) -> list[Cell]:
     return bisect_sightings(scene, COUNT)
 
 
-def test_cells_cover_space_once_and_have_equally_many_sightings(scene: ParsedScene, cells: list[Cell]) -> None:
+def test_cells_cover_space_once_and_have_equally_many_sightings(
+    scene: ParsedScene, cells: list[Cell]
+) -> None:
     draw = torch.Generator().manual_seed(0)
     points = 1e3 * torch.randn(1000, 3, generator=draw, dtype=torch.float64) ** 3
     assert torch.stack([cell.holds(points) for cell in cells]).sum(0).eq(1).all()
@@ -128,7 +145,9 @@ def test_windows_show_their_points_through_their_cameras(scene: ParsedScene, cel
         inside = torch.zeros_like(mine)
         for view, (left, top, width, height) in cell.windows.items():
             x, y = sightings.pixel.unbind(1)
-            inside |= (sightings.view == view) & (x >= left) & (x < left + width) & (y >= top) & (y < top + height)
+            inside |= (
+                (sightings.view == view) & (x >= left) & (x < left + width) & (y >= top) & (y < top + height)
+            )
         assert inside[mine].double().mean() > 0.9  # outliers and views with few points are left out
 
 
@@ -153,7 +172,11 @@ def test_a_partition_comes_back_from_its_file(tmp_path: Path, kind: str) -> None
     assert not write_cells(file, cells) and not write_cells(file, cells)
     assert [*map(repr, read_cells(file))] == [*map(repr, cells)]
     assert write_cells(file, cells[:1]), "it held another one"
-    for text in ("", '{"format": 2, "boxes": {}}', '{"format": 1, "boxes": {"low": [1], "high": [1], "turn": [1]}}'):
+    for text in (
+        "",
+        '{"format": 2, "boxes": {}}',
+        '{"format": 1, "boxes": {"low": [1], "high": [1], "turn": [1]}}',
+    ):
         file.write_text(text)
         with pytest.raises(CheckpointError):
             read_cells(file)

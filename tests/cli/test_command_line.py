@@ -146,7 +146,9 @@ def test_a_config_with_a_missing_plugin_needs_another_choice(tmp_path: Path) -> 
     whole["config"]["semantic"]["encoder"] = {"type": "gone", "tile": 3}
     path.write_text(json.dumps(whole))
     config, _ = load_config(path)
-    with pytest.raises(PluginError, match=r"semantic\.encoder: .*no plug-in 'gone'.*--semantic\.encoder NAME"):
+    with pytest.raises(
+        PluginError, match=r"semantic\.encoder: .*no plug-in 'gone'.*--semantic\.encoder NAME"
+    ):
         parse(config, [], prog="x", description="")
     chosen = parse(config, ["--semantic.encoder", "bundled-semantic"], prog="x", description="")
     assert chosen == replace(fprf_lite(), "semantic.encoder", BundledSemanticConfig())
@@ -199,7 +201,11 @@ def test_arguments_and_exit_code_pass_through(monkeypatch: pytest.MonkeyPatch) -
     ],
 )
 def test_how_a_verb_ends(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: BaseException, code: int, said: str | None
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    error: BaseException,
+    code: int,
+    said: str | None,
 ) -> None:
     _verb(monkeypatch, Mock(side_effect=error))
     assert cli.main(["doctor"]) == code
@@ -235,13 +241,19 @@ def test_a_reader_that_leaves_is_met_with_silence() -> None:
     read, write = os.pipe()
     os.close(read)
     ended = subprocess.run(
-        [sys.executable, "-m", "fprf", "--help"], stdout=write, stderr=subprocess.PIPE, timeout=60, check=False
+        [sys.executable, "-m", "fprf", "--help"],
+        stdout=write,
+        stderr=subprocess.PIPE,
+        timeout=60,
+        check=False,
     )
     os.close(write)
     assert (ended.returncode, ended.stderr) == (141, b"")
 
 
-def test_built_ins_are_listed_and_load(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_built_ins_are_listed_and_load(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("COLUMNS", "140")
     assert run([]) == 0
     text = capsys.readouterr().out
@@ -257,11 +269,21 @@ MINE = ENCODER.format(name="N") + "\nthing = NConfig"
     ("group", "name", "source", "shown"),
     [
         ("fprf.encoders", "x", "import not_there", "ModuleNotFoundError"),
-        ("fprf.encoders", "x", "from fprf.blocks.config import SingleConfig as thing", "is SingleConfig, not a EncoderConfig"),
+        (
+            "fprf.encoders",
+            "x",
+            "from fprf.blocks.config import SingleConfig as thing",
+            "is SingleConfig, not a EncoderConfig",
+        ),
         ("fprf.encoders", "none", MINE, "can never be chosen"),
         ("fprf.encoders", "x", MINE.replace("int = 224", "int"), "no defaults"),
         ("fprf.encoders", "vgg19", MINE, "several packages provide 'vgg19'"),
-        ("fprf.commands", "train", "from fprf.cli.config import CommandConfig as thing", "is never called: fprf has a verb"),
+        (
+            "fprf.commands",
+            "train",
+            "from fprf.cli.config import CommandConfig as thing",
+            "is never called: fprf has a verb",
+        ),
         ("fprf.methods", "x", "def thing(): return None", "gives NoneType, not a RunConfig"),
     ],
 )
@@ -307,7 +329,9 @@ def counting(packages: Packages) -> Packages:
     return packages
 
 
-def test_it_is_parsed_and_called_like_a_built_in_one(counting: Packages, capsys: pytest.CaptureFixture[str]) -> None:
+def test_it_is_parsed_and_called_like_a_built_in_one(
+    counting: Packages, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = counting.root / "some"
     folder.mkdir()
     (folder / "a").touch()
@@ -315,7 +339,10 @@ def test_it_is_parsed_and_called_like_a_built_in_one(counting: Packages, capsys:
     assert capsys.readouterr().out == "4 ProposalConfig\n"
     assert cli.main(["count", str(folder / "b")]) == 2
     assert capsys.readouterr().err == f"error: {folder / 'b'}: no such folder\n"
-    assert cli.main(["count", str(folder), "--stp", "2"]) == 2 and "did you mean --step?" in capsys.readouterr().err
+    assert (
+        cli.main(["count", str(folder), "--stp", "2"]) == 2
+        and "did you mean --step?" in capsys.readouterr().err
+    )
     assert cli.main(["count", "--help"]) == 0
     shown = capsys.readouterr().out
     assert "usage: fprf count" in shown and "Count the files of a folder." in shown and "--step INT" in shown
@@ -330,6 +357,8 @@ def test_a_broken_verb_harms_only_its_callers(counting: Packages, capsys: pytest
     assert cli.main(["--help"]) == 0
     assert "of acme-twice-1 1 and acme-twice-2 1" in capsys.readouterr().out
     assert cli.main(["bad"]) == 2
-    assert "'bad' (acme_bad5:C from acme-bad 1) failed to import: ZeroDivisionError" in capsys.readouterr().err
+    assert (
+        "'bad' (acme_bad5:C from acme-bad 1) failed to import: ZeroDivisionError" in capsys.readouterr().err
+    )
     assert cli.main(["twice"]) == 2 and "several packages provide 'twice'" in capsys.readouterr().err
     assert cli.main(["plugins", "--help"]) == 0, "ours wins"

@@ -29,7 +29,9 @@ def _by_name(findings: Iterator[Finding]) -> dict[str, Finding]:
 
 def test_scene_folders(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     found = _by_name(scene_folder(world.town))
-    assert found["format"].found == "transforms" and found["views"].found == "10 of 32 x 24 pixels, pinhole lens"
+    assert (
+        found["format"].found == "transforms" and found["views"].found == "10 of 32 x 24 pixels, pinhole lens"
+    )
     assert found["next"].found == f"fprf train --data {world.town}"
     assert run([str(world.town)]) == 0 and "32 x 24" in capsys.readouterr().out
 
@@ -44,15 +46,21 @@ def m():
 """A method with an encoder of the hub."""
 
 
-def test_a_method_says_what_it_needs(packages: Packages, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_method_says_what_it_needs(
+    packages: Packages, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert run(["fprf-lite"]) == run(["fprf"]) == 0, "what they need ships"
     packages.install("acme-m", {"fprf.methods": {"acme-m": "acme_methods:m"}}, code={"acme_methods": METHOD})
     assert run(["acme-m"]) == 1
     package, model = (finding for finding in method_needs("acme-m") if finding.what == "needs")
-    assert "transformers" in package.found and package.remedy.startswith("pip install") and not package.optional
-    assert model.remedy == "hf download facebook/dino-vits8" and model.optional, "it is downloaded where there is a network"
+    assert (
+        "transformers" in package.found and package.remedy.startswith("pip install") and not package.optional
+    )
+    assert model.remedy == "hf download facebook/dino-vits8" and model.optional, (
+        "it is downloaded where there is a network"
+    )
     snapshot = tmp_path / "models--facebook--dino-vits8" / "snapshots" / "1"
     snapshot.mkdir(parents=True)
     (snapshot / "config.json").touch()
@@ -115,7 +123,9 @@ def test_a_planted_fault_is_found(what: str, monkeypatch: pytest.MonkeyPatch) ->
     assert what in wrong and "encoder" not in wrong
 
 
-def test_a_wrong_kernel_of_the_cpu_is_found(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_kernel_of_the_cpu_is_found(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(dense, "array", lambda x, real=dense.array: real(1.05 * x))
     assert cli.main(["doctor", "--device", "cpu"]) == 1
     said = [line for line in capsys.readouterr().out.splitlines() if "self-test" in line]
@@ -136,9 +146,13 @@ VIEWS = 12
 
 
 def write_scene(folder: Path, points: tuple[float, ...] = (0, 0, 0)) -> Path:
-    """Views in a row before a wall of coloured points, as transforms.json with points.npz and with pictures of a texture."""
+    """Views in a row before a wall of coloured points, as transforms.json with points.npz and with pictures
+    of a texture.
+    """
     draw = np.random.default_rng(0)
-    texture = cv2.resize(draw.integers(40, 216, (48, 160, 3), dtype=np.uint8), None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+    texture = cv2.resize(
+        draw.integers(40, 216, (48, 160, 3), dtype=np.uint8), None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC
+    )
     frames = []
     (folder / "images").mkdir(parents=True)
     for k in range(VIEWS):
@@ -171,7 +185,10 @@ def test_what_was_left_out_is_told(tmp_path: Path) -> None:
 
 def test_points_that_no_view_sees_are_told(tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "s", points=(0, 0, 50))
-    assert "0 of 10" in _by_name(scene_folder(folder))["points"].found and _by_name(scene_folder(folder))["points"].optional
+    assert (
+        "0 of 10" in _by_name(scene_folder(folder))["points"].found
+        and _by_name(scene_folder(folder))["points"].optional
+    )
     (folder / "points.npz").unlink()
     assert _by_name(scene_folder(folder))["points"].found.startswith("none")
 
@@ -192,4 +209,7 @@ def test_damaged_images_are_named(tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "s")
     data = (folder / "images/06.png").read_bytes()
     (folder / "images/06.png").write_bytes(data[: len(data) // 2])
-    assert "06.png" in _by_name(scene_folder(folder))["images"].found and not _by_name(scene_folder(folder))["images"].optional
+    assert (
+        "06.png" in _by_name(scene_folder(folder))["images"].found
+        and not _by_name(scene_folder(folder))["images"].optional
+    )

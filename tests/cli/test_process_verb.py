@@ -1,4 +1,6 @@
-"""`fprf process` over a fake pycolmap (tests/reconstruction/fake) that records its calls; test_colmap has the real one."""
+"""`fprf process` over a fake pycolmap (tests/reconstruction/fake) that records its calls; test_colmap has the
+real one.
+"""
 
 import json
 import os
@@ -24,7 +26,9 @@ FAKE = Path(__file__).parents[1] / "reconstruction" / "fake"
 @pytest.fixture
 def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.syspath_prepend(str(FAKE))
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(FAKE), *filter(None, [os.environ.get("PYTHONPATH")])]))
+    monkeypatch.setenv(
+        "PYTHONPATH", os.pathsep.join([str(FAKE), *filter(None, [os.environ.get("PYTHONPATH")])])
+    )
     (tmp_path / "in").mkdir()
     for k in range(5):
         add(tmp_path / "in", k)
@@ -59,7 +63,11 @@ def test_images_become_a_scene(photos: Path, capsys: pytest.CaptureFixture[str])
     scene = parse_scene(photos.parent / "scene", 1, None)
     assert [path.name for path in scene.paths] == [f"{k}.png" for k in range(5)]
     assert scene.cameras.pose[:, 0, 3].tolist() == [1, 2, 3, 4, 5]
-    assert calls(photos) == ["features SIMPLE_RADIAL 1600 0.png 1.png 2.png 3.png 4.png", "matches 10", "mapping"]
+    assert calls(photos) == [
+        "features SIMPLE_RADIAL 1600 0.png 1.png 2.png 3.png 4.png",
+        "matches 10",
+        "mapping",
+    ]
     out = capsys.readouterr().out
     assert "5 of 5 images have a pose; 50 points, 0.50 pixels off; exhaustive matching" in out
     train, stylize = (shlex.split(line)[1:] for line in out.splitlines()[-2:])
@@ -78,7 +86,9 @@ def test_what_is_done_is_not_done_again(photos: Path) -> None:
     assert calls(photos) == [] and before == {p: p.stat().st_mtime_ns for p in before}
     add(photos, 5)
     assert process(photos) == 0
-    assert calls(photos) == ["features SIMPLE_RADIAL 1600 5.png", "matches 15", "mapping"], "the others keep theirs"
+    assert calls(photos) == ["features SIMPLE_RADIAL 1600 5.png", "matches 15", "mapping"], (
+        "the others keep theirs"
+    )
     assert process(photos, "--matching", "sequential", "--overlap", "1") == 0
     assert calls(photos) == ["matches 9", "mapping"]
     assert process(photos, "--matching", "sequential", "--overlap", "1", "--lens", "opencv") == 0
@@ -86,7 +96,9 @@ def test_what_is_done_is_not_done_again(photos: Path) -> None:
 
 
 @pytest.mark.parametrize("step", ["features", "matches", "mapping"])
-def test_a_step_that_breaks_off_goes_on_where_it_stood(photos: Path, step: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_step_that_breaks_off_goes_on_where_it_stood(
+    photos: Path, step: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert process(photos, plan={"fail": step}) == 2
     error = capsys.readouterr().err.splitlines()[-1]
     assert error.startswith("error: ") and "log.txt" in error
@@ -127,7 +139,9 @@ def test_photographs_from_nearly_one_place_find_their_poses_too(photos: Path) ->
     assert calls(photos)[-2:] == ["mapping", "mapping"] and report(photos)["images"]["posed"] == 5
 
 
-def test_nothing_fits_together_and_what_the_decoder_lost_is_told(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nothing_fits_together_and_what_the_decoder_lost_is_told(
+    photos: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (photos / "empty [1].jpg").write_bytes(b"")
     assert process(photos, plan={"nothing": True}) == 2
     told = capsys.readouterr().err
@@ -150,7 +164,13 @@ def test_a_missing_or_an_old_pycolmap_is_refused(
 
 def test_the_worker_never_meets_opencv(photos: Path) -> None:
     code = "import sys, fprf.reconstruction.worker; print({'cv2', 'numpy', 'torch', 'PIL', 'pycolmap'} & {*sys.modules})"
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True
+    )
     assert ended.stdout.strip() == "set()"
-    sources = [path for path in Path(cli.__file__).parents[1].rglob("*.py") if "import pycolmap" in path.read_text("utf-8")]
+    sources = [
+        path
+        for path in Path(cli.__file__).parents[1].rglob("*.py")
+        if "import pycolmap" in path.read_text("utf-8")
+    ]
     assert [path.name for path in sources] == ["worker.py"]

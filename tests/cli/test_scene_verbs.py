@@ -52,7 +52,9 @@ def test_captured_views_keep_their_names_and_are_those_of_eval(run: Path, tmp_pa
 
 
 def test_a_gif_is_a_file(run: Path, world: World, tmp_path: Path) -> None:
-    render(run, tmp_path / "a.gif", "--path", "spiral", "--frames", "2", "--references", str(world.references[0]))
+    render(
+        run, tmp_path / "a.gif", "--path", "spiral", "--frames", "2", "--references", str(world.references[0])
+    )
     assert (tmp_path / "a.gif").read_bytes().startswith(b"GIF89a") and len(list(tmp_path.iterdir())) == 2
 
 
@@ -68,7 +70,9 @@ def test_several_looks_and_channels_lie_beside_each_other(run: Path, world: Worl
         assert np.array_equal(whole[:, :32], one)
 
 
-def test_frames_that_are_there_are_not_made_again(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frames_that_are_there_are_not_made_again(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "frames"
     whole = render(run, out, *ORBIT, "4")
     stamps = {path.name: path.stat().st_mtime_ns for path in out.glob("*.png")}
@@ -84,7 +88,9 @@ def test_frames_that_are_there_are_not_made_again(run: Path, tmp_path: Path, cap
     assert not any(np.array_equal(whole[name], picture) for name, picture in others.items())
 
 
-def test_an_interrupted_film_goes_on(run: Path, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_film_goes_on(
+    run: Path, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     film = tmp_path / "x.mp4"
     args = ["render", str(run), *ORBIT, "4", "--output", str(film)]
     write = Mock(wraps=images.write_image, side_effect=[DEFAULT, DEFAULT, KeyboardInterrupt])
@@ -118,7 +124,9 @@ def views(page: str) -> list[str]:
     return re.findall(r"<figcaption>([^<]*)</figcaption>", maps)
 
 
-def test_a_folder_of_photographs_becomes_a_page(run: Path, world: World, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_of_photographs_becomes_a_page(
+    run: Path, world: World, capsys: pytest.CaptureFixture[str]
+) -> None:
     photos = run.parent / "photos"
     photos.mkdir()
     for path in world.references:
@@ -156,7 +164,9 @@ def test_style_files_are_styles_of_the_page(run: Path, world: World) -> None:
     page = gallery(run, "--references", str(captured), "--views", "0000")
     assert [style["name"] for style in data_of(page)["styles"]] == ["Captured", "Captured (1)"]
     page = gallery(run, "--references", references[0], "--between", str(style), "--views", "0000")
-    assert [style["name"] for style in data_of(page)["styles"]] == ["Captured", "dusk"], "on the way to another style"
+    assert [style["name"] for style in data_of(page)["styles"]] == ["Captured", "dusk"], (
+        "on the way to another style"
+    )
 
 
 KEYS = {
@@ -184,7 +194,9 @@ def test_data_that_has_moved(run: Path, world: World, tmp_path: Path) -> None:
     assert not (run / "renders").exists()
 
 
-def test_each_photograph_is_judged_at_its_own_size_up_to_a_limit(run: Path, world: World, tmp_path: Path) -> None:
+def test_each_photograph_is_judged_at_its_own_size_up_to_a_limit(
+    run: Path, world: World, tmp_path: Path
+) -> None:
     town = shutil.copytree(world.town, tmp_path / "town")
     manifest = town / "transforms.json"
     document = json.loads(manifest.read_text())
@@ -204,7 +216,9 @@ def read(folder: Path) -> dict[str, list[tuple[int, float, float]]]:
     reader = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     events = reader.EventAccumulator(str(folder))
     events.Reload()
-    return {tag: [(e.step, e.wall_time, e.value) for e in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
+    return {
+        tag: [(e.step, e.wall_time, e.value) for e in events.Scalars(tag)] for tag in events.Tags()["scalars"]
+    }
 
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
@@ -217,7 +231,11 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"training", "02"}
     assert len(list(tmp_path.glob("*/events.out*"))) == 2 and (tmp_path / "training" / "mine.jpg").exists()
     found = read(tmp_path / "training")
-    assert found == {"psnr": [(10, 1.5, 12.0)], "colour": [(10, 1.5, 0.5), (20, 3.0, 0.25)]} == read(tmp_path / "02")
+    assert (
+        found
+        == {"psnr": [(10, 1.5, 12.0)], "colour": [(10, 1.5, 0.5), (20, 3.0, 0.25)]}
+        == read(tmp_path / "02")
+    )
 
 
 GARDEN = Path(str(files("fprf") / "garden"))
@@ -233,13 +251,25 @@ def test_the_demo_from_nothing_to_a_page(
     assert cli.main(args) == 0
     styles = ["all-together.ply", "autumn.ply", "night.ply", "sunset.ply", "winter.ply"]
     assert {p.name for p in out.iterdir()} >= {"run", "metrics.json", "garden.html", *styles}
-    plain, *others = [read_capture(out / name).gaussians for name in ("night.ply", "autumn.ply", "winter.ply")]
-    assert all(torch.equal(plain.means, each.means) and not torch.equal(plain.harmonics, each.harmonics) for each in others)
+    plain, *others = [
+        read_capture(out / name).gaussians for name in ("night.ply", "autumn.ply", "winter.ply")
+    ]
+    assert all(
+        torch.equal(plain.means, each.means) and not torch.equal(plain.harmonics, each.harmonics)
+        for each in others
+    )
     metrics = json.loads((out / "metrics.json").read_text())
-    assert (metrics["method"], metrics["scene"], metrics["views"], metrics["train_steps"]) == ("fprf-splats", "garden", 4, 10)
+    assert (metrics["method"], metrics["scene"], metrics["views"], metrics["train_steps"]) == (
+        "fprf-splats",
+        "garden",
+        4,
+        10,
+    )
     assert metrics["total_seconds"] > metrics["new_style_seconds"] > 0
     page = (out / "garden.html").read_text()
-    assert "CC BY 4.0" in page and not re.findall(r"""(?:src|href)=["'](?!data:|#)""", page), "it loads nothing"
+    assert "CC BY 4.0" in page and not re.findall(r"""(?:src|href)=["'](?!data:|#)""", page), (
+        "it loads nothing"
+    )
     assert f"open {out / 'garden.html'}" in capsys.readouterr().out
 
 
@@ -265,7 +295,8 @@ def export(world: World, *args: str) -> int:
 def test_cameras_with_pictures_are_a_scene_of_its_own(world: World, tmp_path: Path) -> None:
     style = ["--references", str(world.references[0])]
     assert export(world, "cameras", "--images", *style, "--output", str(tmp_path)) == 0
-    scene, before = parse_scene(tmp_path, 1, None), world.load().known
+    scene = parse_scene(tmp_path, 1, None)
+    before = world.load().known
     assert np.allclose(scene.cameras.pose, before.cameras.pose, atol=1e-12)
     assert scene.train.tolist() == list(before.train) and scene.test.tolist() == list(before.test)
     styled = [*style, "--split", "all", "--no-matches", "--output", str(tmp_path / "styled")]
@@ -283,14 +314,21 @@ def test_bounds_and_options_reach_the_mesh(world: World, tmp_path: Path) -> None
     every = made()
     assert made("--mesh-edge", "4")["mesh_edge"] == 4 > every["mesh_edge"]
     assert made("--side", "16")["mesh_edge"] > every["mesh_edge"]
-    assert made("--reach", "28.6")["vertices"] != every["vertices"], "the model, hardly trained, shows haze at 28 to 29.3"
+    assert made("--reach", "28.6")["vertices"] != every["vertices"], (
+        "the model, hardly trained, shows haze at 28 to 29.3"
+    )
 
 
 def test_one_file_holds_one_look(world: World, tmp_path: Path) -> None:
     style = ["--references", str(world.references[0])]
     assert export(world, "glb", *style, "--output", str(tmp_path / "dusk.ply")) == 0
     assert len(trimesh.load(tmp_path / "dusk.ply").faces) > 100
-    assert export(world, "glb", *style, "--styles", f"x={world.references[1]}", "--output", str(tmp_path / "a.glb")) == 2
+    assert (
+        export(
+            world, "glb", *style, "--styles", f"x={world.references[1]}", "--output", str(tmp_path / "a.glb")
+        )
+        == 2
+    )
 
 
 @pytest.mark.parametrize("most", [50, 10_000])
@@ -298,32 +336,49 @@ def test_points_of_pixels_lie_where_the_view_sees_them_or_in_the_sky(world: Worl
     trained = world.load()
     cameras = trained.cameras.select(torch.tensor(trained.known.train))
     every = render_maps(trained, cameras, side=32, reach=1e9, report=lambda done, total: None)
-    reach = float(torch.cat([depth.flatten() for depth in every.depth]).median())  # half of what is seen counts as sky
+    reach = float(
+        torch.cat([depth.flatten() for depth in every.depth]).median()
+    )  # half of what is seen counts as sky
     maps = render_maps(trained, cameras, side=32, reach=reach, report=lambda done, total: None)
     points = seen_points(maps, most)
     sky = sum(int(depth.isinf().sum()) for depth in maps.depth)
-    assert len(points.position) == len(points.colour) == min(most, sum(depth.numel() for depth in maps.depth)) and sky > 0
+    assert (
+        len(points.position) == len(points.colour) == min(most, sum(depth.numel() for depth in maps.depth))
+        and sky > 0
+    )
     away = np.linalg.norm(points.position - cameras.pose[:, :, 3].mean(0).numpy(), axis=1)
     solid = np.linalg.norm(points.position[:, None] - cameras.pose[:, :, 3].numpy(), axis=2).min(1) < reach
-    assert away[~solid].min() > 1.5 * away[solid].max() and (~solid).mean() == pytest.approx(sky / 6144, abs=0.2)
+    assert away[~solid].min() > 1.5 * away[solid].max() and (~solid).mean() == pytest.approx(
+        sky / 6144, abs=0.2
+    )
 
 
 def test_splats_are_fitted_to_the_field(world: World, tmp_path: Path) -> None:
-    """The longer they are trained the nearer they come to the field's render; a style has the same ones in other colours."""
+    """The longer they are trained the nearer they come to the field's render; a style has the same ones in
+    other colours.
+    """
     more = ["--references", str(world.references[1]), "--fit-cap", "500"]
     assert export(world, "ply", "--fit", "1e-6", "--fit-cap", "500", "--output", str(tmp_path / "begun")) == 0
     assert export(world, "ply", "splat", "spz", *more, "--fit", "0.08", "--output", str(tmp_path)) == 0
     trained = world.load()
-    cameras, view = trained.known.cameras, trained.known.test[0]
+    cameras = trained.known.cameras
+    view = trained.known.test[0]
     shown = trained.render(cameras, view).rgb
 
     def quality(path: Path) -> float:
         capture = read_capture(path)
-        return psnr(draw(capture.gaussians, camera_of(cameras, view), antialiased=capture.antialiased).image.clamp(0, 1), shown)
+        return psnr(
+            draw(capture.gaussians, camera_of(cameras, view), antialiased=capture.antialiased).image.clamp(
+                0, 1
+            ),
+            shown,
+        )
 
     assert quality(tmp_path / "splats.ply") > quality(tmp_path / "begun" / "splats.ply") + 1
     plain, snow = (read_capture(tmp_path / f"splats{look}.ply").gaussians for look in ("", ".snow"))
-    assert len(plain) <= 500 and torch.equal(plain.means, snow.means) and torch.equal(plain.logits, snow.logits)
+    assert (
+        len(plain) <= 500 and torch.equal(plain.means, snow.means) and torch.equal(plain.logits, snow.logits)
+    )
     assert float((plain.colours - snow.colours).abs().mean()) > 0.02
     assert len(read_capture(tmp_path / "splats.snow.splat").gaussians) == len(snow)
     # Haze is fitted by Gaussians far away, some of which are beyond what .spz holds.

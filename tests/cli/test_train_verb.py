@@ -36,7 +36,9 @@ def test_another_config_in_an_existing_run_is_refused_before_any_work(
 ) -> None:
     monkeypatch.setattr("fprf.training.prepare.prepare", None)
     before = (world.run / "config.json").read_bytes()
-    assert cli.main(["train", "fprf-lite", *flags(world, world.run), "--render.chunk", "77", "--seed", "5"]) == 2
+    assert (
+        cli.main(["train", "fprf-lite", *flags(world, world.run), "--render.chunk", "77", "--seed", "5"]) == 2
+    )
     *progress, line = capsys.readouterr().err.splitlines()
     assert all(each.startswith("{") for each in progress), "progress alone stands before it"
     assert f"{world.run}: holds a run with seed 0 (5 is asked), render.chunk 8192 (77 is asked)" in line
@@ -71,7 +73,10 @@ def test_everything_that_is_missing_is_listed_at_once(
     @dataclass(frozen=True, kw_only=True)
     class Strange(EncoderConfig):
         def needs(self) -> tuple[Need, ...]:
-            return (Need("the model odd-1", "odd fetch odd-1"), Need("the file of labels", "odd labels", downloaded=True))
+            return (
+                Need("the model odd-1", "odd fetch odd-1"),
+                Need("the file of labels", "odd labels", downloaded=True),
+            )
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(registry, "name_of", lambda group, kind: "strange")
@@ -81,12 +86,19 @@ def test_everything_that_is_missing_is_listed_at_once(
     with pytest.raises(UsageError, match="4 things are missing; `fprf doctor m` looks again"):
         train(config, "m")
     told = capsys.readouterr().err
-    for part in ("odd fetch odd-1", "odd labels", "none.safetensors: no such weights file", "no scene is named"):
+    for part in (
+        "odd fetch odd-1",
+        "odd labels",
+        "none.safetensors: no such weights file",
+        "no scene is named",
+    ):
         assert part in told
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_size_that_is_found_stays_with_the_run(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_size_that_is_found_stays_with_the_run(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As a number in config.json; the same command goes on with it, whatever would be found today."""
     found = iter((2, 3))
     monkeypatch.setattr(TrainConfig, "find_downscale", lambda config, scene, device: next(found))

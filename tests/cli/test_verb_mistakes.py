@@ -1,4 +1,6 @@
-"""Mistakes that a user can make with each verb: exit 2, one line that names what is wrong, and nothing is written."""
+"""Mistakes that a user can make with each verb: exit 2, one line that names what is wrong, and nothing is
+written.
+"""
 
 import json
 import shlex

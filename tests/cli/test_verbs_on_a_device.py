@@ -16,7 +16,8 @@ from fprf.plugins.weights import read_weights
 VIEW = ["--views", "0000"]
 QUICK = ["--clusters", "3"]
 SMALL = ["--side", "16", "--views", "3", "--fit", "1e-6", "--fit-cap", "50"]
-DEVICE, APPLE = "cuda:0", "mps:0"
+DEVICE = "cuda:0"
+APPLE = "mps:0"
 
 
 def ran(args: list[str], device: str) -> dict[str, int]:
@@ -59,7 +60,9 @@ def between(world: World, folder: Path) -> list[str]:
     """A style on the way to another, with regions that are kept and pinned."""
     style = {"format": 1, "style": {"references": [str(world.references[1])], "clusters": 3}}
     (folder / "other.json").write_text(json.dumps(style))
-    controls = "--keep 0 --pin 1=dusk.png --forbid 2=snow.png --strength 0.7 --luminance 0.5 --at 0.3 --output OUT"
+    controls = (
+        "--keep 0 --pin 1=dusk.png --forbid 2=snow.png --strength 0.7 --luminance 0.5 --at 0.3 --output OUT"
+    )
     return [*references(world), "--between", str(folder / "other.json"), *controls.split()]
 
 
@@ -78,7 +81,12 @@ VERBS: dict[str, Callable[[World, Path], list[str]]] = {
 
 @pytest.mark.parametrize(
     ("name", "there"),
-    [("stylize", DEVICE), ("stylize", APPLE), ("render", DEVICE), pytest.param("export", DEVICE, marks=pytest.mark.slow)],
+    [
+        ("stylize", DEVICE),
+        ("stylize", APPLE),
+        ("render", DEVICE),
+        pytest.param("export", DEVICE, marks=pytest.mark.slow),
+    ],
 )
 def test_a_verb_writes_what_the_cpu_writes(world: World, tmp_path: Path, name: str, there: str) -> None:
     outputs = [tmp_path / device for device in ("cpu", "other")]

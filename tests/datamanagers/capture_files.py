@@ -17,7 +17,9 @@ from fprf.rendering.cameras import Cameras
 
 @dataclass(frozen=True)
 class Capture:
-    """V views of one pinhole or distorting camera, poses camera-to-world in OpenGL axes, and points in front of all."""
+    """V views of one pinhole or distorting camera, poses camera-to-world in OpenGL axes, and points in front
+    of all.
+    """
 
     names: tuple[str, ...]
     poses: np.ndarray
@@ -53,11 +55,14 @@ def cameras_of(
     k: tuple[float, ...] = (0.0,) * 6,
 ) -> Cameras:
     """Of poses [V 3 4]; sizes, focal lengths and centres are pairs, one for all or one a view."""
-    sides, focals = torch.as_tensor(size).expand(len(pose), 2), torch.as_tensor(focal, dtype=torch.float64)
+    sides = torch.as_tensor(size).expand(len(pose), 2)
+    focals = torch.as_tensor(focal, dtype=torch.float64)
     return Cameras(
         pose=pose,
         focal=focals.expand(len(pose), 2),
-        centre=sides.double() / 2 if centre is None else torch.tensor(centre, dtype=torch.float64).expand(len(pose), 2),
+        centre=sides.double() / 2
+        if centre is None
+        else torch.tensor(centre, dtype=torch.float64).expand(len(pose), 2),
         size=sides,
         distortion=torch.tensor([k], dtype=torch.float64).expand(len(pose), 6),
         lens=torch.full((len(pose),), int(any(k))),
@@ -87,10 +92,18 @@ def _images(folder: Path, capture: Capture) -> None:
         write_image(folder / name, capture.size, seed=seed)
 
 
-def write_transforms(folder: Path, capture: Capture, *, per_frame: bool = False, **top: object) -> dict[str, object]:
+def write_transforms(
+    folder: Path, capture: Capture, *, per_frame: bool = False, **top: object
+) -> dict[str, object]:
     """transforms.json with images and points; returns what was written."""
     _images(folder / "images", capture)
-    camera = dict(zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), (*capture.size, *capture.focal, *capture.centre), strict=True))
+    camera = dict(
+        zip(
+            ("w", "h", "fl_x", "fl_y", "cx", "cy"),
+            (*capture.size, *capture.focal, *capture.centre),
+            strict=True,
+        )
+    )
     camera |= dict(zip(("k1", "k2", "p1", "p2"), capture.k, strict=True))
     frames = []
     for name, pose in zip(capture.names, capture.poses, strict=True):
@@ -107,7 +120,9 @@ def write_llff(folder: Path, capture: Capture, images: str = "images", factor: i
     _images(folder / images, capture)
     rows = []
     for pose in capture.poses:
-        column = np.array([[capture.size[1] * factor], [capture.size[0] * factor], [capture.focal[0] * factor]])
+        column = np.array(
+            [[capture.size[1] * factor], [capture.size[0] * factor], [capture.focal[0] * factor]]
+        )
         right, up, back, place = pose.T
         rows.append([*np.concatenate([np.stack([-up, right, back, place], 1), column], 1).ravel(), 2.0, 9.0])
     array = np.array(rows)
@@ -144,14 +159,20 @@ def write_colmap(
     sparse.mkdir(parents=True, exist_ok=True)
     params = params or (*capture.focal, *capture.centre)
     posed = [
-        (k, name, *_world_to_camera(pose)) for k, (name, pose) in enumerate(zip(capture.names, capture.poses, strict=True))
+        (k, name, *_world_to_camera(pose))
+        for k, (name, pose) in enumerate(zip(capture.names, capture.poses, strict=True))
     ]
     points = list(enumerate(capture.points))
     if binary:
         id_ = [name for name, _ in MODELS].index(model)
         cameras = struct.pack("<QIiQQ", 1, 7, id_, *capture.size) + struct.pack(f"<{len(params)}d", *params)
-        features = struct.pack("<Q", len(points)) + b"".join(struct.pack("<ddq", 1.0, 2.0, k) for k, _ in points)
-        rows = [struct.pack("<I7dI", k + 1, *q, *t, 7) + name.encode() + b"\0" + features for k, name, q, t in posed]
+        features = struct.pack("<Q", len(points)) + b"".join(
+            struct.pack("<ddq", 1.0, 2.0, k) for k, _ in points
+        )
+        rows = [
+            struct.pack("<I7dI", k + 1, *q, *t, 7) + name.encode() + b"\0" + features
+            for k, name, q, t in posed
+        ]
         cloud = [struct.pack("<Q3d3BdQ4I", k, *point, 1, 2, 3, 0.5, 2, 1, 0, 2, 0) for k, point in points]
         (sparse / "cameras.bin").write_bytes(cameras)
         (sparse / "images.bin").write_bytes(struct.pack("<Q", len(rows)) + b"".join(rows))
@@ -163,9 +184,14 @@ def write_colmap(
 
     features = " ".join(f"1.0 2.0 {k}" for k, _ in points)
     lines = [f"{k + 1} {text((*q, *t))} 7 {name}\n{features}\n" for k, name, q, t in posed]
-    _write(sparse / "cameras.txt", f"# cameras\n7 {model} {capture.size[0]} {capture.size[1]} {text(params)}\n")
+    _write(
+        sparse / "cameras.txt", f"# cameras\n7 {model} {capture.size[0]} {capture.size[1]} {text(params)}\n"
+    )
     _write(sparse / "images.txt", "# images\n" + "".join(lines))
-    _write(sparse / "points3D.txt", "# points\n" + "".join(f"{k} {text(point)} 1 2 3 0.5 1 0 2 0\n" for k, point in points))
+    _write(
+        sparse / "points3D.txt",
+        "# points\n" + "".join(f"{k} {text(point)} 1 2 3 0.5 1 0 2 0\n" for k, point in points),
+    )
     return sparse
 
 
@@ -177,7 +203,10 @@ def write_polycam(folder: Path, capture: Capture, *, corrected: bool = False, **
     lens = dict(zip(names, (*capture.focal, *capture.centre, *capture.size), strict=True))
     for name, pose in zip(capture.names, capture.poses, strict=True):
         rows = {f"t_{r}{c}": float(pose[r, c]) for r in range(3) for c in range(4)}
-        _write(folder / f"{prefix}cameras" / f"{Path(name).stem}.json", rows | lens | {"blur_score": 100.0} | more)
+        _write(
+            folder / f"{prefix}cameras" / f"{Path(name).stem}.json",
+            rows | lens | {"blur_score": 100.0} | more,
+        )
     return folder / f"{prefix}cameras"
 
 
@@ -185,7 +214,9 @@ def write_record3d(folder: Path, capture: Capture, *, packed: bool = False, **mo
     """An export as JPG and EXR, or what is in a .r3d; images are numbered. Returns the metadata's path."""
     for seed in range(len(capture.names)):
         write_image(folder / ("rgbd" if packed else "rgb") / f"{seed}.png", capture.size, seed=seed)
-    poses = [[*np.roll(_quaternion(pose[:, :3]), -1).tolist(), *pose[:, 3].tolist()] for pose in capture.poses]
+    poses = [
+        [*np.roll(_quaternion(pose[:, :3]), -1).tolist(), *pose[:, 3].tolist()] for pose in capture.poses
+    ]
     k = [capture.focal[0], 0, 0, 0, capture.focal[1], 0, *capture.centre, 1]
     content = {"w": capture.size[0], "h": capture.size[1], "fps": 30, "K": k, "poses": poses, **more}
     return _write(folder / ("metadata" if packed else "metadata.json"), content)
@@ -194,37 +225,68 @@ def write_record3d(folder: Path, capture: Capture, *, packed: bool = False, **mo
 def write_odm(folder: Path, capture: Capture, *, report: bool = False, **camera: object) -> Path:
     """A project with a reconstruction, or a report. Returns what holds the shots."""
     _images(folder / "images", capture)
-    (width, height), longest = capture.size, max(capture.size)
-    lens: dict[str, object] = {"projection_type": "brown", "width": width, "height": height, "c_x": 0.0, "c_y": 0.0}
+    (width, height) = capture.size
+    longest = max(capture.size)
+    lens: dict[str, object] = {
+        "projection_type": "brown",
+        "width": width,
+        "height": height,
+        "c_x": 0.0,
+        "c_y": 0.0,
+    }
     lens |= {"focal_x": capture.focal[0] / longest, "focal_y": capture.focal[1] / longest}
     lens |= dict(zip(("k1", "k2", "p1", "p2"), capture.k, strict=True)) | camera
-    shots, features = {}, []
+    shots = {}
+    features = []
     for name, pose in zip(capture.names, capture.poses, strict=True):
         turn = (pose[:, :3] * [1, -1, -1]).T
         rotation = cv2.Rodrigues(turn)[0][:, 0].tolist()
-        shots[name] = {"camera": "v2 phone", "rotation": rotation, "translation": (-turn @ pose[:, 3]).tolist()}
-        features.append({"properties": {"filename": name, "rotation": rotation, "translation": pose[:, 3].tolist()}})
+        shots[name] = {
+            "camera": "v2 phone",
+            "rotation": rotation,
+            "translation": (-turn @ pose[:, 3]).tolist(),
+        }
+        features.append(
+            {"properties": {"filename": name, "rotation": rotation, "translation": pose[:, 3].tolist()}}
+        )
     if report:
         _write(folder / "cameras.json", {"v2 phone": lens})
-        return _write(folder / "odm_report/shots.geojson", {"type": "FeatureCollection", "features": features})
-    points = {str(k): {"coordinates": point.tolist(), "color": [1.0, 2.0, 3.0]} for k, point in enumerate(capture.points)}
+        return _write(
+            folder / "odm_report/shots.geojson", {"type": "FeatureCollection", "features": features}
+        )
+    points = {
+        str(k): {"coordinates": point.tolist(), "color": [1.0, 2.0, 3.0]}
+        for k, point in enumerate(capture.points)
+    }
     whole = [{"cameras": {"v2 phone": lens}, "shots": shots, "points": points}]
     return _write(folder / "opensfm/reconstruction.json", whole)
 
 
-def write_meganerf(folder: Path, capture: Capture, held: tuple[int, ...] = (2, 5), unit: float | None = None) -> None:
+def write_meganerf(
+    folder: Path, capture: Capture, held: tuple[int, ...] = (2, 5), unit: float | None = None
+) -> None:
     for k, name in enumerate(capture.names):
         part = folder / ("val" if k in held else "train")
         (part / "metadata").mkdir(parents=True, exist_ok=True)
         write_image(part / "rgbs" / name, capture.size, seed=k)
-        lens = {"W": capture.size[0], "H": capture.size[1], "intrinsics": torch.tensor([*capture.focal, *capture.centre])}
-        torch.save(lens | {"c2w": torch.from_numpy(capture.poses[k])}, part / "metadata" / f"{Path(name).stem}.pt")
+        lens = {
+            "W": capture.size[0],
+            "H": capture.size[1],
+            "intrinsics": torch.tensor([*capture.focal, *capture.centre]),
+        }
+        torch.save(
+            lens | {"c2w": torch.from_numpy(capture.poses[k])}, part / "metadata" / f"{Path(name).stem}.pt"
+        )
     if unit is not None:
         torch.save({"origin_drb": torch.zeros(3), "pose_scale_factor": unit}, folder / "coordinates.pt")
 
 
-def write_phototourism(folder: Path, capture: Capture, rows: list[tuple[str, str, str]] | None = None) -> None:
+def write_phototourism(
+    folder: Path, capture: Capture, rows: list[tuple[str, str, str]] | None = None
+) -> None:
     """A model in dense/, and the table of rows (file name, id, split); by default all are for training."""
     write_colmap(folder / "dense", capture)
     rows = [(name, str(k), "train") for k, name in enumerate(capture.names)] if rows is None else rows
-    _write(folder / "gate.tsv", "".join("\t".join(row) + "\n" for row in [("filename", "id", "split"), *rows]))
+    _write(
+        folder / "gate.tsv", "".join("\t".join(row) + "\n" for row in [("filename", "id", "split"), *rows])
+    )

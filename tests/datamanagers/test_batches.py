@@ -1,4 +1,6 @@
-"""Training batches: pure in (seed, step), uniform over the pixels that masks leave, right at every pixel, through points."""
+"""Training batches: pure in (seed, step), uniform over the pixels that masks leave, right at every pixel,
+through points.
+"""
 
 import errno
 import os
@@ -35,7 +37,9 @@ def scene(tmp_path: Path) -> ParsedScene:
     return ParsedScene(
         name="noise",
         paths=tuple(tmp_path / f"{view}.png" for view in range(len(SIZES))),
-        cameras=cameras_of(torch.eye(4, dtype=torch.float64)[:3].repeat(len(SIZES), 1, 1), SIZES, (20.0, 20.0)),
+        cameras=cameras_of(
+            torch.eye(4, dtype=torch.float64)[:3].repeat(len(SIZES), 1, 1), SIZES, (20.0, 20.0)
+        ),
         train=torch.tensor([0, 2, 3, 4]),
         test=torch.tensor([1]),
     )
@@ -47,11 +51,19 @@ def write_mask(path: Path, pixels: np.ndarray) -> Path:
 
 
 def make(
-    scene: ParsedScene, cache: Path, *, seed: int = 0, content: bool = False, semantic: bool = False, **fields: Any
+    scene: ParsedScene,
+    cache: Path,
+    *,
+    seed: int = 0,
+    content: bool = False,
+    semantic: bool = False,
+    **fields: Any,
 ) -> RayBatches:
     config = RayBatchesConfig(**{"rays": 512} | fields)
     encoders = (RandomConfig(channels=3, stride=2).build(), RandomConfig(channels=6, stride=4).build())
-    one, two = (encoder if asked else None for encoder, asked in zip(encoders, (content, semantic), strict=True))
+    one, two = (
+        encoder if asked else None for encoder, asked in zip(encoders, (content, semantic), strict=True)
+    )
     return RayBatches(config, scene=scene, content=one, semantic=two, dim=4, cache=cache, seed=seed)
 
 
@@ -92,7 +104,9 @@ def test_every_training_pixel_is_as_likely(scene: ParsedScene, tmp_path: Path) -
 
 
 @pytest.mark.parametrize(("share", "expected"), [(1.0, 512), (0.25, 128), (0.001, 1), (0.0, None)])
-def test_the_share_of_semantic_rays(scene: ParsedScene, tmp_path: Path, share: float, expected: int | None) -> None:
+def test_the_share_of_semantic_rays(
+    scene: ParsedScene, tmp_path: Path, share: float, expected: int | None
+) -> None:
     manager = make(scene, tmp_path, semantic_share=share, content=True, semantic=True)
     batch = manager.batch(2)
     assert batch.content is not None and batch.content.shape == (512, 3)
@@ -102,7 +116,9 @@ def test_the_share_of_semantic_rays(scene: ParsedScene, tmp_path: Path, share: f
     assert batch.semantic is not None and batch.semantic.shape == (expected, 4)
     store = manager.semantic_store
     assert store is not None and store.basis is not None
-    assert torch.equal(batch.semantic, store.at(batch.view[:expected], batch.pixel[:expected], batch.rgb[:expected]))
+    assert torch.equal(
+        batch.semantic, store.at(batch.view[:expected], batch.pixel[:expected], batch.rgb[:expected])
+    )
 
 
 MASKS = st.lists(st.lists(st.booleans(), min_size=1, max_size=12), max_size=5)
@@ -110,7 +126,9 @@ MASKS = st.lists(st.lists(st.booleans(), min_size=1, max_size=12), max_size=5)
 
 @given(MASKS, st.integers(0, 7))
 def test_runs_are_the_list(masks: list[list[bool]], first: int) -> None:
-    parts, start, wanted = [], first, []
+    parts = []
+    start = first
+    wanted = []
     for mask in masks:
         parts.append((start, torch.tensor(mask)))
         wanted += [start + k for k, each in enumerate(mask) if each]
@@ -122,7 +140,9 @@ def test_runs_are_the_list(masks: list[list[bool]], first: int) -> None:
     assert everything[runs.holds(everything)].tolist() == wanted
 
 
-def test_a_full_disk_is_told_before_anything_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_told_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(file: int, offset: int, size: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -152,7 +172,9 @@ def test_points_of_a_reconstruction_count_where_two_views_saw_them(world: World,
     first, second = scene.train.tolist()[:2]
     held = int(scene.test[0])
     both = torch.tensor([[first, 0], [second, 0]])
-    alone = torch.tensor([[first, point] for point in range(1, 50)] + [[held, point] for point in range(1, 50)])
+    alone = torch.tensor(
+        [[first, point] for point in range(1, 50)] + [[held, point] for point in range(1, 50)]
+    )
     pairs, wanted, none = (
         make(replace(scene, seen=seen), tmp_path, rays=64, depth_share=0.5).batch(0).distance
         for seen in (torch.cat([both, alone]), both, alone)
@@ -162,8 +184,13 @@ def test_points_of_a_reconstruction_count_where_two_views_saw_them(world: World,
 
 
 def test_pixels_that_are_left_out_are_never_drawn(scene: ParsedScene, tmp_path: Path) -> None:
-    allowed = [np.random.default_rng(9 + view).random((height, width)) > 0.7 for view, (width, height) in enumerate(SIZES)]
-    paths = [write_mask(tmp_path / f"mask{view}.png", np.uint8(255) * mask) for view, mask in enumerate(allowed)]
+    allowed = [
+        np.random.default_rng(9 + view).random((height, width)) > 0.7
+        for view, (width, height) in enumerate(SIZES)
+    ]
+    paths = [
+        write_mask(tmp_path / f"mask{view}.png", np.uint8(255) * mask) for view, mask in enumerate(allowed)
+    ]
     masked = replace(scene, masks=(paths[0], None, paths[2], None, paths[4]))
     batch = make(masked, tmp_path, rays=60_000).batch(0)
     seen = {view: np.zeros_like(mask) for view, mask in enumerate(allowed)}
@@ -181,7 +208,9 @@ def test_pixels_that_are_left_out_are_never_drawn(scene: ParsedScene, tmp_path: 
 
 
 def test_scenes_that_leave_nothing_to_learn_are_refused(scene: ParsedScene, tmp_path: Path) -> None:
-    dark = tuple(write_mask(tmp_path / f"n{k}.png", np.zeros((h, w), np.uint8)) for k, (w, h) in enumerate(SIZES))
+    dark = tuple(
+        write_mask(tmp_path / f"n{k}.png", np.zeros((h, w), np.uint8)) for k, (w, h) in enumerate(SIZES)
+    )
     other = write_mask(tmp_path / "m.png", np.ones((40, 10), np.uint8))
     for wrong in ({"train": scene.train[:0]}, {"masks": dark}, {"masks": (other,) * len(SIZES)}):
         with pytest.raises(DataError):

@@ -15,7 +15,8 @@ from fprf.datamanagers.scene import GAMMA, ParsedScene, exposures_differ, find_s
 from fprf.rendering.cameras import Cameras, ideal_cameras
 from fprf.splats.photographs import blurred_views, detail
 
-VIEWS, SIDE = 12, 128
+VIEWS = 12
+SIDE = 128
 
 
 def photographs() -> dict[int, Image]:
@@ -84,7 +85,8 @@ TOWN_VIEWS = 10
 
 
 def capture(world: World, gain: Tensor, wrong: float = 0.0) -> tuple[ParsedScene, Callable[[int], Tensor]]:
-    """The tiny town at 512 x 384, every point in any view that may see it; points painted as bright as `gain` says.
+    """The tiny town at 512 x 384, every point in any view that may see it; points painted as bright as `gain`
+    says.
 
     Of the sightings a share is `wrong`: something else is there.
     """

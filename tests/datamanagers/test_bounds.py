@@ -1,4 +1,6 @@
-"""Spaces found from cameras: which kind, where the centre is, and that the world's own origin, unit and axes don't matter."""
+"""Spaces found from cameras: which kind, where the centre is, and that the world's own origin, unit and axes
+don't matter.
+"""
 
 import math
 from dataclasses import replace
@@ -40,13 +42,17 @@ def ring(count: int = 24, radius: float = 4.0) -> ParsedScene:
     angle = torch.arange(count, dtype=F64) * (2 * math.pi / count)
     target = torch.tensor([1.0, 2.0, 0.5], dtype=F64)
     offset = torch.stack([1.2 * angle.cos(), angle.sin(), torch.full_like(angle, 0.3)], -1) * radius
-    ball = torch.nn.functional.normalize(torch.randn(200, 3, dtype=F64, generator=torch.Generator().manual_seed(0)), dim=-1)
+    ball = torch.nn.functional.normalize(
+        torch.randn(200, 3, dtype=F64, generator=torch.Generator().manual_seed(0)), dim=-1
+    )
     return scene_of(look_at(target + offset, target.expand_as(offset), UP), target + ball)
 
 
 def forward(points: bool = True) -> ParsedScene:
     """A grid of cameras on a wall, all looking along +y at points 5 to 20 away."""
-    x, z = torch.meshgrid(torch.linspace(-1, 1, 4, dtype=F64), torch.linspace(-0.5, 0.5, 3, dtype=F64), indexing="ij")
+    x, z = torch.meshgrid(
+        torch.linspace(-1, 1, 4, dtype=F64), torch.linspace(-0.5, 0.5, 3, dtype=F64), indexing="ij"
+    )
     place = torch.stack([x.flatten(), torch.zeros(12, dtype=F64), z.flatten()], -1)
     ahead = torch.tensor([[0.0, 1.0, 0.0]], dtype=F64).repeat(12, 1)
     draw = torch.rand(100, 3, dtype=F64, generator=torch.Generator().manual_seed(0))
@@ -75,7 +81,9 @@ def moved(scene: ParsedScene, scale: float, shift: Tensor, turn: Tensor) -> Pars
     place = (scale * pose[:, :, 3]) @ turn.T + shift
     cameras = replace(scene.cameras, pose=torch.cat([turn @ pose[:, :, :3], place[:, :, None]], -1))
     points = None if scene.points is None else scale * scene.points @ turn.T + shift
-    return replace(scene, cameras=cameras, points=points, depths=None if scene.depths is None else scene.depths * scale)
+    return replace(
+        scene, cameras=cameras, points=points, depths=None if scene.depths is None else scene.depths * scale
+    )
 
 
 def located(scene: ParsedScene, space: Space) -> Tensor:
@@ -89,7 +97,8 @@ def located(scene: ParsedScene, space: Space) -> Tensor:
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"), [("ring", "contraction"), ("forward", "ndc"), ("street", "contraction"), ("thing", "box")]
+    ("name", "kind"),
+    [("ring", "contraction"), ("forward", "ndc"), ("street", "contraction"), ("thing", "box")],
 )
 def test_the_kind_follows_from_the_capture(name: str, kind: str) -> None:
     scene = RIGS[name]()
@@ -110,7 +119,8 @@ def test_origin_and_unit_of_the_world_do_not_matter(name: str, scale: float, off
     scene = RIGS[name]()
     shift = torch.tensor([offset, -2 * offset, 0.3 * offset], dtype=F64)
     other = moved(scene, scale, shift, torch.eye(3, dtype=F64))
-    one, two = find_space(scene), find_space(other)
+    one = find_space(scene)
+    two = find_space(other)
     assert two.kind == one.kind
     assert (located(other, two) - located(scene, one)).abs().max() <= 1e-5
 
@@ -142,7 +152,9 @@ def test_ndc_frames_all_rays_and_starts_before_the_nearest_point() -> None:
     assert space.focal == pytest.approx((1.6, 2.0))
     inside = located(scene, space)
     assert 0.9 < float(inside[:, :2].abs().max()) <= 1.0
-    given = find_space(replace(forward(points=False), depths=torch.tensor([[4.0, 30.0]], dtype=F64).repeat(12, 1)))
+    given = find_space(
+        replace(forward(points=False), depths=torch.tensor([[4.0, 30.0]], dtype=F64).repeat(12, 1))
+    )
     assert given.kind == "ndc" and given.near == pytest.approx(3.6)
     behind = scene.points * torch.tensor([1.0, -1.0, 1.0], dtype=F64)
     assert find_kind(replace(scene, points=behind)) == "contraction", "points that no camera sees say nothing"

@@ -42,9 +42,12 @@ class Counting(Encoder):
 
     def __init__(self, channels: int = 5, gain: float = 1.0, name: str = "") -> None:
         super().__init__()
-        self.register_buffer("mix", gain * torch.randn(channels, 3, generator=torch.Generator().manual_seed(0)))
+        self.register_buffer(
+            "mix", gain * torch.randn(channels, 3, generator=torch.Generator().manual_seed(0))
+        )
         self.name = name or f"counting {channels} {gain}"
-        self.calls, self.fail_after = 0, 1 << 30
+        self.calls = 0
+        self.fail_after = 1 << 30
 
     @property
     def identity(self) -> str:
@@ -65,7 +68,9 @@ class Counting(Encoder):
 def picture(view: int) -> Tensor:
     height, width = SIZES[view]
     coarse = torch.rand(1, 3, 5, 6, generator=torch.Generator().manual_seed(view))
-    smooth = F.interpolate(coarse, (height, width), mode="bilinear") + F.interpolate(coarse.flip(2), (height, width))
+    smooth = F.interpolate(coarse, (height, width), mode="bilinear") + F.interpolate(
+        coarse.flip(2), (height, width)
+    )
     return (smooth[0].permute(1, 2, 0) * 127).byte().contiguous()
 
 
@@ -74,11 +79,18 @@ def draw(count: int = 300) -> tuple[Tensor, Tensor, Tensor]:
     view = torch.tensor(list(SIZES))[torch.randint(len(SIZES), (count,))]
     size = torch.tensor([SIZES[v] for v in view.tolist()])
     y, x = (torch.rand(count, 2) * size).long().unbind(1)
-    rgb = torch.stack([picture(v)[at] for v, at in zip(view.tolist(), zip(y, x, strict=True), strict=True)]).float() / 255
+    rgb = (
+        torch.stack(
+            [picture(v)[at] for v, at in zip(view.tolist(), zip(y, x, strict=True), strict=True)]
+        ).float()
+        / 255
+    )
     return view, torch.stack([x, y], 1) + 0.5, rgb
 
 
-def build(folder: Path, encoder: Encoder, config: GuidedConfig | None = None, dim: int | None = None) -> FeatureStore:
+def build(
+    folder: Path, encoder: Encoder, config: GuidedConfig | None = None, dim: int | None = None
+) -> FeatureStore:
     return extract(folder, list(SIZES), picture, encoder, config or GuidedConfig(radius=0.2), dim=dim)
 
 
@@ -121,7 +133,9 @@ def test_the_spread_is_that_of_the_targets(tmp_path: Path) -> None:
     for view, (height, width) in SIZES.items():
         y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
         pixel = torch.stack([x, y], -1).flatten(0, 1) + 0.5
-        values.append(store.at(torch.full((height * width,), view), pixel, picture(view).flatten(0, 1).float() / 255))
+        values.append(
+            store.at(torch.full((height * width,), view), pixel, picture(view).flatten(0, 1).float() / 255)
+        )
     every = torch.cat(values)
     # 4 x 2048 drawn pixels: a variance to sqrt(2 / 8192); three of those.
     assert store.std == pytest.approx(float(every.var(0).mean().sqrt()), rel=0.03)
@@ -130,8 +144,10 @@ def test_the_spread_is_that_of_the_targets(tmp_path: Path) -> None:
 
 def test_semantics_are_the_projected_features(tmp_path: Path) -> None:
     """The filter is linear, so projecting before it or after is the same."""
-    encoder, where = Counting(12), draw()
-    raw, store = build(tmp_path / "raw", encoder), build(tmp_path / "semantic", encoder, dim=3)
+    encoder = Counting(12)
+    where = draw()
+    raw = build(tmp_path / "raw", encoder)
+    store = build(tmp_path / "semantic", encoder, dim=3)
     assert store.basis is not None and store.channels == 3 and store.basis.energy > 0.99
     expected = store.basis.project(raw.at(*where))
     assert (store.at(*where) - expected).abs().max() <= 8e-3 * expected.std()
@@ -145,7 +161,12 @@ def test_whatever_changes_the_features_changes_the_files(tmp_path: Path) -> None
         (Counting(name="two"), GuidedConfig(radius=0.2), None, 4),
         (Counting(name="one"), GuidedConfig(radius=0.3), None, 4),
         (Counting(name="one"), GuidedConfig(radius=0.2, eps=1e-4), None, 4),
-        (Counting(name="one"), GuidedConfig(radius=0.2, stride=1), None, 3),  # view 9 is so narrow that it was 1 before
+        (
+            Counting(name="one"),
+            GuidedConfig(radius=0.2, stride=1),
+            None,
+            3,
+        ),  # view 9 is so narrow that it was 1 before
         (Counting(name="one"), GuidedConfig(radius=0.2), 2, 4),
     ):
         build(tmp_path, other, config, dim)
@@ -153,7 +174,8 @@ def test_whatever_changes_the_features_changes_the_files(tmp_path: Path) -> None
 
 
 def test_damaged_files_are_made_again(tmp_path: Path) -> None:
-    encoder, where = Counting(), draw(50)
+    encoder = Counting()
+    where = draw(50)
     expected = build(tmp_path, encoder).at(*where)
     one, two, *_ = sorted(tmp_path.glob("*.safetensors"))
     one.write_bytes(one.read_bytes()[:-7])
@@ -163,16 +185,21 @@ def test_damaged_files_are_made_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("size", "offset"), [(1e-6, 0.0), (1.0, -1e3), (1e8, 0.0)])
-def test_half_precision_keeps_eleven_bits_whatever_the_magnitudes(tmp_path: Path, size: float, offset: float) -> None:
+def test_half_precision_keeps_eleven_bits_whatever_the_magnitudes(
+    tmp_path: Path, size: float, offset: float
+) -> None:
     """No overflow, and no offset that eats the signal."""
 
     class Off(Counting):
         def forward(self, image: Tensor) -> Tensor:
             return size * (super().forward(image) + offset)
 
-    encoder, where = Off(name=f"off {size} {offset}"), draw()
+    encoder = Off(name=f"off {size} {offset}")
+    where = draw()
     expected = truth(encoder, *where)
-    assert (build(tmp_path, encoder).at(*where) - expected).abs().max() <= 4e-3 * expected.std() + 2e-6 * abs(offset) * size
+    assert (build(tmp_path, encoder).at(*where) - expected).abs().max() <= 4e-3 * expected.std() + 2e-6 * abs(
+        offset
+    ) * size
 
 
 def test_an_interrupted_extraction_goes_on(tmp_path: Path) -> None:
@@ -184,8 +211,11 @@ def test_an_interrupted_extraction_goes_on(tmp_path: Path) -> None:
     encoder.fail_after = 2
     with pytest.raises(KeyboardInterrupt):
         build(tmp_path, encoder)
-    assert len(list(tmp_path.glob("[!.]*"))) == 2 and [path.name for path in tmp_path.glob(".*")] == [".b.0000.safetensors"]
-    encoder.calls, encoder.fail_after = 0, 99
+    assert len(list(tmp_path.glob("[!.]*"))) == 2 and [path.name for path in tmp_path.glob(".*")] == [
+        ".b.0000.safetensors"
+    ]
+    encoder.calls = 0
+    encoder.fail_after = 99
     build(tmp_path, encoder)
     assert encoder.calls == len(SIZES) - 2 and len(list(tmp_path.glob("[!.]*"))) == len(SIZES)
 
@@ -207,8 +237,12 @@ def test_encoders_that_break_their_promise_are_named(tmp_path: Path) -> None:
 UNIT = 2.0**-24
 
 
-@given(samples=st.integers(1, 40), channels=st.integers(1, 12), dim=st.integers(1, 15), seed=st.integers(0, 99))
-def test_columns_are_orthonormal_and_energy_is_a_share(samples: int, channels: int, dim: int, seed: int) -> None:
+@given(
+    samples=st.integers(1, 40), channels=st.integers(1, 12), dim=st.integers(1, 15), seed=st.integers(0, 99)
+)
+def test_columns_are_orthonormal_and_energy_is_a_share(
+    samples: int, channels: int, dim: int, seed: int
+) -> None:
     x = torch.randn(samples, channels, generator=torch.Generator().manual_seed(seed))
     basis = fit_basis(x, dim)
     kept = min(dim, channels)
@@ -230,7 +264,9 @@ def test_against_the_singular_values() -> None:
 
 
 def test_a_plane_is_found_under_a_large_offset() -> None:
-    """float32 samples at an offset of 1000 keep 6e-5 each; the plane they lie on must come out to that, not worse."""
+    """float32 samples at an offset of 1000 keep 6e-5 each; the plane they lie on must come out to that, not
+    worse.
+    """
     plane = torch.linalg.qr(torch.randn(20, 3, dtype=torch.float64))[0]
     flat = torch.randn(500, 3, dtype=torch.float64) @ plane.T
     basis = fit_basis((flat + 1000).float(), 3)

@@ -18,7 +18,15 @@ from capture_files import Capture, write_image, write_transforms
 from photo_files import HEIC, oriented, turned_jpeg, upright
 from PIL import Image, ImageCms
 
-from fprf.datamanagers.images import image_names, load_image, load_images, load_mask, photographs, read_header, useless_masks
+from fprf.datamanagers.images import (
+    image_names,
+    load_image,
+    load_images,
+    load_mask,
+    photographs,
+    read_header,
+    useless_masks,
+)
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import DataError
 
@@ -40,7 +48,9 @@ def encoded(suffix: str, image: np.ndarray) -> bytes:
 
 def saved(image: Image.Image, form: str, **options: object) -> bytes:
     out = io.BytesIO()
-    image.copy().save(out, form, **options)  # Pillow keeps settings of the last format that an image was saved in
+    image.copy().save(
+        out, form, **options
+    )  # Pillow keeps settings of the last format that an image was saved in
     return out.getvalue()
 
 
@@ -63,7 +73,11 @@ KINDS: dict[str, tuple[bytes, np.ndarray, int]] = {
     "jpeg": (saved(PICTURE, "JPEG", **SOUND), COLOURS, 2),
     "progressive": (saved(PICTURE, "JPEG", progressive=True, **SOUND), COLOURS, 2),
     "trailing bytes": (saved(PICTURE, "JPEG", **SOUND) + b"\0" * 500, COLOURS, 2),
-    "two pictures (MPO)": (saved(PICTURE, "MPO", save_all=True, append_images=[TURNED.copy()], **SOUND), COLOURS, 2),
+    "two pictures (MPO)": (
+        saved(PICTURE, "MPO", save_all=True, append_images=[TURNED.copy()], **SOUND),
+        COLOURS,
+        2,
+    ),
     "cmyk jpeg": (saved(PICTURE.convert("CMYK"), "JPEG", quality=100), COLOURS, 3),
     "grey jpeg": (saved(PICTURE.convert("L"), "JPEG", quality=100), GREY, 1),
     "cmyk tiff": (saved(PICTURE.convert("CMYK"), "TIFF"), COLOURS, 1),
@@ -77,7 +91,11 @@ KINDS: dict[str, tuple[bytes, np.ndarray, int]] = {
     "rgb 16 tiff": (encoded(".tiff", COLOURS[..., ::-1].astype(np.uint16) * 257), COLOURS, 0),
     "bmp": (saved(PICTURE, "BMP"), COLOURS, 0),
     "webp": (saved(PICTURE, "WEBP", lossless=True), COLOURS, 0),
-    "animated webp": (saved(PICTURE, "WEBP", save_all=True, append_images=[TURNED.copy()], lossless=True), COLOURS, 0),
+    "animated webp": (
+        saved(PICTURE, "WEBP", save_all=True, append_images=[TURNED.copy()], lossless=True),
+        COLOURS,
+        0,
+    ),
     "animated png": (saved(PICTURE, "PNG", save_all=True, append_images=[TURNED.copy()]), COLOURS, 0),
     "avif": (saved(PICTURE, "AVIF", **FINE), COLOURS, 3),
     "palette": (saved(PICTURE.quantize(8), "PNG"), COLOURS, 1),
@@ -105,7 +123,11 @@ def test_every_kind_of_file_gives_its_pixels(tmp_path: Path, kind: str) -> None:
 def test_16_bits_are_rounded_and_not_cut(tmp_path: Path) -> None:
     values = np.array([[0, 100, 129, 255, 32767, 33023, 65406, 65535]], np.uint16)
     wanted = np.rint(values / 257).astype(int)
-    for name, pixels in (("grey", values), ("rgb", values[..., None].repeat(3, 2)), ("rgba", values[..., None].repeat(4, 2))):
+    for name, pixels in (
+        ("grey", values),
+        ("rgb", values[..., None].repeat(3, 2)),
+        ("rgba", values[..., None].repeat(4, 2)),
+    ):
         if name == "rgba":
             pixels[..., 3] = 65535
         for suffix in (".png", ".tiff"):
@@ -119,7 +141,13 @@ def test_grey_palettes_and_straight_transparency_become_rgb(tmp_path: Path) -> N
         "bilevel": (png((3, 1), 1, 0, [b"\xa0"]), [[255] * 3, [0] * 3, [255] * 3]),
         "grey_alpha": (png((3, 1), 8, 4, [bytes([10, 255, 10, 0, 0, 255])]), [[10] * 3, [255] * 3, [0] * 3]),
         "palette": (
-            png((3, 1), 8, 3, [bytes([0, 1, 0])], chunk(b"PLTE", bytes([1, 2, 3, 4, 5, 6])) + chunk(b"tRNS", b"\xff\x00")),
+            png(
+                (3, 1),
+                8,
+                3,
+                [bytes([0, 1, 0])],
+                chunk(b"PLTE", bytes([1, 2, 3, 4, 5, 6])) + chunk(b"tRNS", b"\xff\x00"),
+            ),
             [[1, 2, 3], [255] * 3, [1, 2, 3]],
         ),
         "alpha": (
@@ -127,7 +155,9 @@ def test_grey_palettes_and_straight_transparency_become_rgb(tmp_path: Path) -> N
             [[10, 20, 30], [255] * 3, [206, 208, 210]],
         ),
     }
-    shown: dict[int, tuple[bytes, int, list[int]]] = {  # of each depth the row, the transparent value and what is to be seen
+    shown: dict[
+        int, tuple[bytes, int, list[int]]
+    ] = {  # of each depth the row, the transparent value and what is to be seen
         1: (b"\xa0", 0, [255, 255, 255]),
         2: (b"\x1b", 2, [0, 85, 255, 255]),
         4: (b"\x05\xaf", 10, [0, 85, 255, 255]),
@@ -138,7 +168,8 @@ def test_grey_palettes_and_straight_transparency_become_rgb(tmp_path: Path) -> N
         kinds[f"tRNS {bits}"] = (data, [[level] * 3 for level in levels])
     key = chunk(b"tRNS", struct.pack(">3H", 1, 2, 3))
     kinds["tRNS rgb"] = (png((2, 1), 8, 2, [bytes([1, 2, 3, 1, 2, 4])], key), [[255] * 3, [1, 2, 4]])
-    key, row = chunk(b"tRNS", struct.pack(">3H", 1000, 2000, 3000)), struct.pack(">6H", 1000, 2000, 3000, 1000, 2000, 3001)
+    key = chunk(b"tRNS", struct.pack(">3H", 1000, 2000, 3000))
+    row = struct.pack(">6H", 1000, 2000, 3000, 1000, 2000, 3001)
     kinds["tRNS rgb 16"] = (png((2, 1), 16, 2, [row], key), [[255] * 3, [4, 8, 12]])
     for name, (data, expected) in kinds.items():
         (tmp_path / name).write_bytes(data)
@@ -149,7 +180,9 @@ def test_grey_palettes_and_straight_transparency_become_rgb(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("orientation", range(10))
-def test_captures_are_taken_as_stored_and_photographs_are_turned_upright(tmp_path: Path, orientation: int) -> None:
+def test_captures_are_taken_as_stored_and_photographs_are_turned_upright(
+    tmp_path: Path, orientation: int
+) -> None:
     clear = np.dstack([COLOURS, GREY])
     for name, pixels, form, options in (
         ("png", COLOURS, "PNG", {}),
@@ -162,7 +195,8 @@ def test_captures_are_taken_as_stored_and_photographs_are_turned_upright(tmp_pat
     ):
         if name == "lzw" and orientation not in range(1, 9):
             continue  # libtiff writes no other
-        path, plain = tmp_path / name, tmp_path / "plain"
+        path = tmp_path / name
+        plain = tmp_path / "plain"
         path.write_bytes(oriented(Image.fromarray(pixels), form, orientation, **options))
         plain.write_bytes(saved(Image.fromarray(pixels), form, **options))
         stored = load_image(plain)
@@ -171,7 +205,9 @@ def test_captures_are_taken_as_stored_and_photographs_are_turned_upright(tmp_pat
         assert np.array_equal(load_image(path, upright=True), upright(stored, orientation)), name
     stored = turned_jpeg(tmp_path / "b.jpg", NOISE, 1)
     if 0 < orientation < 9:
-        assert np.array_equal(turned_jpeg(tmp_path / "a.jpg", NOISE, orientation), load_image(tmp_path / "a.jpg", upright=True))
+        assert np.array_equal(
+            turned_jpeg(tmp_path / "a.jpg", NOISE, orientation), load_image(tmp_path / "a.jpg", upright=True)
+        )
         assert np.array_equal(load_image(tmp_path / "a.jpg"), stored)
 
 
@@ -203,7 +239,9 @@ def test_colmap_sees_the_pixels_that_captures_give(tmp_path: Path) -> None:
     for orientation in (0, 3, 6, 7):
         for form in ("JPEG", "PNG", "TIFF"):
             files[f"{form} {orientation}"] = oriented(PICTURE, form, orientation)
-    names = [f"{number}.{kind.split()[-1]}" for number, kind in enumerate(files)]  # the name says nothing of the format
+    names = [
+        f"{number}.{kind.split()[-1]}" for number, kind in enumerate(files)
+    ]  # the name says nothing of the format
     for name, data in zip(names, files.values(), strict=True):
         (tmp_path / name).write_bytes(data)
     read = (
@@ -212,17 +250,21 @@ def test_colmap_sees_the_pixels_that_captures_give(tmp_path: Path) -> None:
     )
     subprocess.run([sys.executable, "-c", read, *names], cwd=tmp_path, check=True, capture_output=True)
     for kind, name in zip(files, names, strict=True):
-        theirs, ours = np.load(tmp_path / f"{name}.npy").astype(int), load_image(tmp_path / name)
+        theirs = np.load(tmp_path / f"{name}.npy").astype(int)
+        ours = load_image(tmp_path / name)
         assert theirs.shape == ours.shape and np.abs(theirs - ours).max() <= 1, kind
 
 
 def profile(primaries: list[tuple[float, float]], gamma: float) -> bytes:
-    """An ICC profile (version 4) of a display with the primaries (x, y), white D65 and a curve of that exponent."""
+    """An ICC profile (version 4) of a display with the primaries (x, y), white D65 and a curve of that
+    exponent.
+    """
 
     def fixed(*values: float) -> bytes:
         return b"".join(struct.pack(">i", round(value * 65536)) for value in values)
 
-    white, d50 = np.array([0.3127 / 0.329, 1, 0.3583 / 0.329]), np.array([0.9642, 1, 0.8249])
+    white = np.array([0.3127 / 0.329, 1, 0.3583 / 0.329])
+    d50 = np.array([0.9642, 1, 0.8249])
     columns = np.array([[x / y, 1, (1 - x - y) / y] for x, y in primaries]).T
     bradford = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
     adapted = np.linalg.inv(bradford) @ np.diag(bradford @ d50 / (bradford @ white)) @ bradford
@@ -231,7 +273,9 @@ def profile(primaries: list[tuple[float, float]], gamma: float) -> bytes:
     tags = {b"wtpt": b"XYZ " + bytes(4) + fixed(*d50)}
     for k, name in enumerate((b"r", b"g", b"b")):
         tags[name + b"XYZ"], tags[name + b"TRC"] = b"XYZ " + bytes(4) + fixed(*matrix[:, k]), curve
-    table, body, at = b"", b"", 132 + 12 * len(tags)
+    table = b""
+    body = b""
+    at = 132 + 12 * len(tags)
     for name, data in tags.items():
         table += name + struct.pack(">II", at + len(body), len(data))
         body += data
@@ -245,9 +289,12 @@ ADOBE = profile([(0.64, 0.33), (0.21, 0.71), (0.15, 0.06)], 2.19921875)
 
 
 @pytest.mark.parametrize("given", [P3, ADOBE], ids=["Display P3", "Adobe RGB"])
-@pytest.mark.parametrize(("form", "tolerance"), [("PNG", 2), ("TIFF", 2), ("WEBP", 2), ("JPEG", 10), ("AVIF", 10)])
+@pytest.mark.parametrize(
+    ("form", "tolerance"), [("PNG", 2), ("TIFF", 2), ("WEBP", 2), ("JPEG", 10), ("AVIF", 10)]
+)
 def test_colours_of_a_profile_become_srgb(tmp_path: Path, given: bytes, form: str, tolerance: int) -> None:
-    there, srgb = ImageCms.ImageCmsProfile(io.BytesIO(given)), ImageCms.createProfile("sRGB")
+    there = ImageCms.ImageCmsProfile(io.BytesIO(given))
+    srgb = ImageCms.createProfile("sRGB")
     wide = ImageCms.profileToProfile(PICTURE, srgb, there, outputMode="RGB")
     assert wide is not None and np.abs(np.asarray(wide, dtype=int) - COLOURS).max() > 12
     options = {"WEBP": {"lossless": True}, "JPEG": SOUND, "AVIF": FINE}.get(form, {})
@@ -285,7 +332,11 @@ def test_heic_comes_upright_and_needs_its_package(tmp_path: Path, monkeypatch: p
     for turned in (False, True):
         loaded = load_image(tmp_path / "a.heic", upright=turned).astype(int)
         assert loaded.shape == (64, 48, 3)
-        for (y, x), colour in {(15, 24): (200, 40, 30), (50, 12): (20, 60, 220), (50, 36): (30, 180, 60)}.items():
+        for (y, x), colour in {
+            (15, 24): (200, 40, 30),
+            (50, 12): (20, 60, 220),
+            (50, 36): (30, 180, 60),
+        }.items():
             assert abs(loaded[y, x] - colour).max() < 8
     for damaged in (HEIC[:-40], HEIC[:452] + b"\x83" + HEIC[453:]):  # the second one without any image
         (tmp_path / "a.heic").write_bytes(damaged)
@@ -301,7 +352,9 @@ def test_folders_of_photographs_are_listed_without_what_cannot_be_read(tmp_path:
     (tmp_path / "deeper").mkdir()
     told: list[str] = []
     found = photographs([tmp_path / "b.png", tmp_path, tmp_path / "broken.jpg"], told.append)
-    assert [path.name for path in found] == ["b.png", "a.jpg", "broken.jpg"], "what is named by itself is taken as it is"
+    assert [path.name for path in found] == ["b.png", "a.jpg", "broken.jpg"], (
+        "what is named by itself is taken as it is"
+    )
     assert len(told) == 2 and "broken.jpg" in told[0] and "empty.webp: the file is empty" in told[1]
     assert image_names(tmp_path) == ["a.jpg", "b.png", "broken.jpg", "empty.webp"]
     with pytest.raises(DataError, match="deeper: no image among 0 files"):
@@ -327,8 +380,14 @@ def test_reduction_averages_areas(tmp_path: Path) -> None:
         (b"no image at all", "no PNG, JPEG"),
         (saved(PICTURE, "GIF"), "no PNG, JPEG"),
         (png((20_000, 20_000), 8, 2, []), "20000x20000 pixels; at most 1e+08"),
-        (png((9_700, 10_000), 8, 2, []), "cannot be decoded"),  # fewer than MAX_PIXELS, and Pillow would warn of them
-        (saved(PICTURE, "TIFF").replace(struct.pack("<I", 96), struct.pack("<I", 1_500_000)), "1500000x64 pixels"),
+        (
+            png((9_700, 10_000), 8, 2, []),
+            "cannot be decoded",
+        ),  # fewer than MAX_PIXELS, and Pillow would warn of them
+        (
+            saved(PICTURE, "TIFF").replace(struct.pack("<I", 96), struct.pack("<I", 1_500_000)),
+            "1500000x64 pixels",
+        ),
         (png((0, 5), 8, 2, []), "cannot be decoded"),
         (encoded(".png", NOISE)[:100] + b"?" + encoded(".png", NOISE)[101:], "checksum"),
         (saved(Image.fromarray(np.zeros((4, 4), np.float32)), "TIFF"), "32 bits"),
@@ -357,7 +416,20 @@ def test_a_file_is_refused_wherever_it_is_cut(tmp_path: Path, kind: str) -> None
             load_image(path)
 
 
-MASKS = ["L", "1", "01", "16", "01 of 16", "RGB", "01 RGB", "red on black", "red on white", "opaque RGBA", "RGBA", "black RGBA"]
+MASKS = [
+    "L",
+    "1",
+    "01",
+    "16",
+    "01 of 16",
+    "RGB",
+    "01 RGB",
+    "red on black",
+    "red on white",
+    "opaque RGBA",
+    "RGBA",
+    "black RGBA",
+]
 MASKS += ["other RGBA", "LA", "opaque LA", "palette", "swapped palette", "dark palette"]
 LEFT = np.zeros((64, 96), np.uint8)
 LEFT[:, :48] = 255
@@ -409,7 +481,9 @@ def test_masks_of_one_value_and_with_noise(tmp_path: Path) -> None:
     assert not load_mask(path).any(), "transparent is not used"
     draw = np.random.default_rng(0)
     for low in (0, 250):
-        path.write_bytes(saved(Image.fromarray(draw.integers(low, low + 5, (64, 96), dtype=np.uint8)), "JPEG", quality=95))
+        path.write_bytes(
+            saved(Image.fromarray(draw.integers(low, low + 5, (64, 96), dtype=np.uint8)), "JPEG", quality=95)
+        )
         assert (load_mask(path) == (low > 0)).all(), "noise of JPEG is no mask"
     soft = cv2.GaussianBlur(LEFT, (0, 0), 2)
     path.write_bytes(saved(Image.fromarray(soft), "PNG"))
@@ -420,7 +494,12 @@ def test_masks_that_leave_nothing_or_everything_are_told(tmp_path: Path) -> None
     write_transforms(tmp_path, Capture.make(3))
     scene = parse_scene(tmp_path, 1, None)
     assert useless_masks(scene) == ""
-    for values, said in (((0, 0, 0), "no pixel"), ((255, 1, 255), "every pixel"), ((0, 255, 0), ""), ((0, 0, None), "")):
+    for values, said in (
+        ((0, 0, 0), "no pixel"),
+        ((255, 1, 255), "every pixel"),
+        ((0, 255, 0), ""),
+        ((0, 0, None), ""),
+    ):
         paths = [None if value is None else tmp_path / f"{k}.png" for k, value in enumerate(values)]
         for path, value in zip(paths, values, strict=True):
             if path is not None:

@@ -41,7 +41,9 @@ def example(values: dict[str, Any], packed: bool = True) -> bytes:
             body = chunk(1, chunk(1, value))
         elif isinstance(value, list):
             whole = [varint(v) for v in value]
-            body = chunk(3, chunk(1, b"".join(whole)) if packed else b"".join(varint(1 << 3) + w for w in whole))
+            body = chunk(
+                3, chunk(1, b"".join(whole)) if packed else b"".join(varint(1 << 3) + w for w in whole)
+            )
         else:
             raw = value.astype("<f4").tobytes()
             parts = [varint(1 << 3 | 5) + raw[k : k + 4] for k in range(0, len(raw), 4)]
@@ -50,7 +52,9 @@ def example(values: dict[str, Any], packed: bool = True) -> bytes:
     return chunk(1, entries)
 
 
-def features(image: np.ndarray, origin: np.ndarray, direction: np.ndarray, **more: object) -> dict[str, object]:
+def features(
+    image: np.ndarray, origin: np.ndarray, direction: np.ndarray, **more: object
+) -> dict[str, object]:
     """Those of an image [H W 3] and its rays [H W 3]."""
     done, png = cv2.imencode(".png", image)
     assert done
@@ -73,7 +77,9 @@ def record(data: bytes) -> bytes:
 
 
 def bay_records(folder: Path, views: int = 16) -> Cameras:
-    """Two cameras of different focal length and exposure in turn, in three files; every fourth record is for validation."""
+    """Two cameras of different focal length and exposure in turn, in three files; every fourth record is for
+    validation.
+    """
     size = (32, 24)
     cameras = cameras_of(
         torch.from_numpy(Capture.make(views).poses),
@@ -82,12 +88,15 @@ def bay_records(folder: Path, views: int = 16) -> Cameras:
         (16.7, 11.6),
         (-0.05, 0.01, 0.0, 0.0, 0.001, -0.001),
     )
-    held, learned = [], []
+    held = []
+    learned = []
     for k in range(views):
         rays = rays_through(cameras, torch.full((size[0] * size[1],), k), pixel_grid(cameras, k))
         exposure = np.array([0.5 if k % 2 else 1.0], np.float32)
         more = {"image_hash": [-(k + 1) * 7919], "cam_idx": [k % 2], "equivalent_exposure": exposure}
-        whole = example(features(np.full((size[1], size[0], 3), k, np.uint8), *(ray.numpy() for ray in rays), **more))
+        whole = example(
+            features(np.full((size[1], size[0], 3), k, np.uint8), *(ray.numpy() for ray in rays), **more)
+        )
         (held if k % 4 == 3 else learned).append(record(whole))
     folder.mkdir(parents=True, exist_ok=True)
     half = len(learned) // 2
@@ -131,7 +140,9 @@ def test_what_was_written_is_read(tmp_path_factory, written, packed: bool) -> No
 
 
 @given(st.data())
-def test_a_flipped_bit_and_a_lost_end_are_found_wherever_they_are(tmp_path_factory, data: st.DataObject) -> None:  # type: ignore[no-untyped-def]
+def test_a_flipped_bit_and_a_lost_end_are_found_wherever_they_are(
+    tmp_path_factory, data: st.DataObject
+) -> None:  # type: ignore[no-untyped-def]
     whole = bytearray(record(b"some bytes") + record(b"more"))
     at = data.draw(st.integers(0, 8 * len(whole) - 1))
     whole[at // 8] ^= 1 << at % 8
@@ -148,7 +159,9 @@ number = st.floats(-1, 1)
 
 def rays_of(camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
     width, height = camera.size[0].tolist()
-    origin, direction = rays_through(camera, torch.zeros(width * height, dtype=torch.int64), pixel_grid(camera, 0))
+    origin, direction = rays_through(
+        camera, torch.zeros(width * height, dtype=torch.int64), pixel_grid(camera, 0)
+    )
     return (x.float().numpy().reshape(height, width, 3) for x in (origin, direction))  # type: ignore[return-value]
 
 
@@ -194,14 +207,17 @@ def test_the_scene_is_what_was_written(bay: tuple[Path, Cameras]) -> None:
         assert (view in scene.test.tolist()) == (k % 4 == 3)
         grid = pixel_grid(truth, k)
         mine, own = (
-            rays_through(cameras, torch.full((len(grid),), at), grid) for cameras, at in ((scene.cameras, view), (truth, k))
+            rays_through(cameras, torch.full((len(grid),), at), grid)
+            for cameras, at in ((scene.cameras, view), (truth, k))
         )
         torch.testing.assert_close(mine[0], own[0], atol=1e-4, rtol=0)
         torch.testing.assert_close(mine[1], own[1], atol=2e-4, rtol=0)
         assert load_image(scene.paths[view]).shape == (24, 32, 3)
 
 
-def test_a_complete_cache_is_not_read_again(bay: tuple[Path, Cameras], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_complete_cache_is_not_read_again(
+    bay: tuple[Path, Cameras], monkeypatch: pytest.MonkeyPatch
+) -> None:
     first = parse_scene(bay[0], 1, None)
     with monkeypatch.context() as patch:
         patch.setattr(blocknerf, "read_examples", lambda path: pytest.fail("read again"))
@@ -222,7 +238,8 @@ def test_some_cameras(bay: tuple[Path, Cameras]) -> None:
 
 X, Y = np.meshgrid(np.arange(32) + 0.5, np.arange(24) + 0.5)
 RAYS = np.stack([(X - 16) / 30, -(Y - 12) / 30, -np.ones_like(X)], -1)
-GREY, ORIGIN = np.full((24, 32, 3), 90, np.uint8), np.zeros((24, 32, 3))
+GREY = np.full((24, 32, 3), 90, np.uint8)
+ORIGIN = np.zeros((24, 32, 3))
 
 
 def test_rays_of_no_camera_are_refused_unless_told(tmp_path: Path) -> None:
@@ -230,7 +247,9 @@ def test_rays_of_no_camera_are_refused_unless_told(tmp_path: Path) -> None:
     bay_records(folder, views=4)
     rays = RAYS + np.random.default_rng(0).normal(0, 0.1, RAYS.shape)
     (folder / "odd_train.tfrecord").write_bytes(record(example(features(GREY, ORIGIN, rays))))
-    with pytest.raises(DataError, match=r"the rays of cam05-0000000000000063 are .* pixels .*parser.tolerance is 1"):
+    with pytest.raises(
+        DataError, match=r"the rays of cam05-0000000000000063 are .* pixels .*parser.tolerance is 1"
+    ):
         parse_scene(folder, 1, None)
     assert len(parse_scene(folder, 1, BlockNerfConfig(tolerance=50)).paths) == 5
 

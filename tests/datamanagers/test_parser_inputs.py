@@ -1,4 +1,6 @@
-"""What captures hold besides what their formats promise: odd names, parts, missing images and sizes, NaN, lenses, points."""
+"""What captures hold besides what their formats promise: odd names, parts, missing images and sizes, NaN,
+lenses, points.
+"""
 
 import json
 import os
@@ -54,8 +56,12 @@ def named(template: str, count: int = 3) -> Capture:
     return Capture(tuple(template.format(k) for k in range(count)), capture.poses, capture.points)
 
 
-def expect(scene: ParsedScene, capture: Capture, kept: list[int] | None = None, folder: Path | None = None) -> None:
-    """The scene has these views of the capture, with their poses, and the pixels that were written for them."""
+def expect(
+    scene: ParsedScene, capture: Capture, kept: list[int] | None = None, folder: Path | None = None
+) -> None:
+    """The scene has these views of the capture, with their poses, and the pixels that were written for
+    them.
+    """
     kept = list(range(len(capture.names))) if kept is None else kept
     assert np.allclose(scene.cameras.pose.numpy(), capture.poses[kept], atol=1e-9)
     for image, seed in zip(load_images(scene), kept, strict=True):
@@ -64,7 +70,9 @@ def expect(scene: ParsedScene, capture: Capture, kept: list[int] | None = None, 
     if scene.points is not None:
         assert np.allclose(scene.points.numpy(), capture.points, atol=1e-6)
     if scene.seen is not None:
-        assert scene.seen.tolist() == [[view, point] for view in range(len(kept)) for point in range(len(capture.points))]
+        assert scene.seen.tolist() == [
+            [view, point] for view in range(len(kept)) for point in range(len(capture.points))
+        ]
 
 
 def pixels(capture: Capture, seed: int) -> np.ndarray:
@@ -143,7 +151,11 @@ def test_what_is_left_out_is_in_no_split_and_sees_no_point(tmp_path: Path) -> No
     content = write_transforms(tmp_path, capture, test_filenames=["images/0001.png", "images/0003.png"])
     content["frames"][1]["fl_x"] = np.nan  # type: ignore[index]
     (tmp_path / "transforms.json").write_text(json.dumps(content))
-    np.savez(tmp_path / "points.npz", xyz=capture.points, seen=[[view, point] for view in range(4) for point in range(40)])
+    np.savez(
+        tmp_path / "points.npz",
+        xyz=capture.points,
+        seen=[[view, point] for view in range(4) for point in range(40)],
+    )
     scene = parse(tmp_path)
     expect(scene, capture, [0, 2, 3])
     assert (scene.train.tolist(), scene.test.tolist()) == ([0, 1], [2]) and scene.seen is not None
@@ -181,7 +193,9 @@ def test_a_camera_that_is_not_finite_loses_its_image(tmp_path: Path, wrong: str)
         broken = parts[0] + "0002.png" + parts[1].replace(old, old[: -len(old.split(": ")[-1])] + wrong, 1)
         (tmp_path / "a nan, b/transforms.json").write_text(broken)
         expect(parse(tmp_path / "a nan, b"), capture, [0, 1, 3])
-    (tmp_path / "a nan, b/transforms.json").write_text(text.replace('"frames"', f'"sharpness, nan, ": {wrong}, "frames"'))
+    (tmp_path / "a nan, b/transforms.json").write_text(
+        text.replace('"frames"', f'"sharpness, nan, ": {wrong}, "frames"')
+    )
     assert parse(tmp_path / "a nan, b").notes == ()
 
 
@@ -198,7 +212,9 @@ def test_binary_models_and_arrays_lose_what_is_not_finite(tmp_path: Path) -> Non
         np.save(tmp_path / "llff/poses_bounds.npy", rows)
         expect(parse(tmp_path / "llff"), capture, [0, 1, 3])
     cameras = write_polycam(tmp_path / "polycam/keyframes", capture)
-    (cameras / "0000.json").write_text((cameras / "0000.json").read_text().replace('"t_03": ', '"t_03": nan, "was": '))
+    (cameras / "0000.json").write_text(
+        (cameras / "0000.json").read_text().replace('"t_03": ', '"t_03": nan, "was": ')
+    )
     expect(parse(tmp_path / "polycam"), capture, [1, 2, 3])
     file = write_record3d(tmp_path / "record3d", capture)
     content = json.loads(file.read_text())
@@ -231,14 +247,25 @@ def test_of_several_models_the_largest_is_read(tmp_path: Path) -> None:
 
 def lensed(model: str) -> list[float]:
     """Small parameters of each model."""
-    values = {"f": 20.0, "fx": 20.0, "fy": 21.0, "cx": 12.0, "cy": 8.0, "k1": 0.05, "k2": -0.02, "k3": 0.003, "k4": 0.001}
+    values = {
+        "f": 20.0,
+        "fx": 20.0,
+        "fy": 21.0,
+        "cx": 12.0,
+        "cy": 8.0,
+        "k1": 0.05,
+        "k2": -0.02,
+        "k3": 0.003,
+        "k4": 0.001,
+    }
     values |= {"p1": 0.002, "p2": -0.001}
     if "THIN" in model:
         values |= {"p1": 0.0, "p2": 0.0}
     return [values.get(key, 0.0) for key in dict(MODELS)[model].split()]
 
 
-PANORAMA, EUCM = "EQUIRECTANGULAR", "EUCM"
+PANORAMA = "EQUIRECTANGULAR"
+EUCM = "EUCM"
 READ = [name for name, _ in MODELS if name not in (PANORAMA, EUCM)]
 
 
@@ -254,15 +281,26 @@ def test_lenses_project_as_opencv_s(tmp_path: Path) -> None:
             focal = [given.get("fx", 20.0), given.get("fy", 20.0)]
             matrix = np.array([[focal[0], 0, 12], [0, focal[1], 8], [0, 0, 1]])
             if "FISHEYE" in model:
-                wanted = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), matrix, np.array(k[:4]))[0][:, 0]
+                wanted = cv2.fisheye.projectPoints(
+                    points[:, None], np.zeros(3), np.zeros(3), matrix, np.array(k[:4])
+                )[0][:, 0]
             else:
-                wanted = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, np.array([k[0], k[1], k[4], k[5], k[2]]))[
-                    0
-                ][:, 0]
+                wanted = cv2.projectPoints(
+                    points, np.zeros(3), np.zeros(3), matrix, np.array([k[0], k[1], k[4], k[5], k[2]])
+                )[0][:, 0]
             still = cameras_of(torch.eye(4, dtype=torch.float64)[None, :3], (24, 16), focal)
             turned = torch.from_numpy(points * [1, -1, -1])
-            lens = {"distortion": cameras.distortion, "lens": cameras.lens, "focal": cameras.focal, "centre": cameras.centre}
-            seen = project(type(still)(pose=still.pose, size=still.size, **lens), torch.zeros(50, dtype=torch.int64), turned)[0]
+            lens = {
+                "distortion": cameras.distortion,
+                "lens": cameras.lens,
+                "focal": cameras.focal,
+                "centre": cameras.centre,
+            }
+            seen = project(
+                type(still)(pose=still.pose, size=still.size, **lens),
+                torch.zeros(50, dtype=torch.int64),
+                turned,
+            )[0]
             assert np.abs(seen.numpy() - wanted).max() < 1e-9, model
             for file in (tmp_path / "sparse/0").iterdir():
                 file.unlink()
@@ -282,7 +320,9 @@ def test_models_are_numbered_as_in_colmap() -> None:
     listed = json.loads(subprocess.run(command, capture_output=True, check=True, text=True).stdout)
     for (name, params), (wanted, count, info) in zip(MODELS, listed, strict=False):
         assert name == wanted and len(params.split()) == count
-        assert [key for key in params.split() if key[0] in "fc"] == [key for key in info.split(", ") if key[0] in "fc"]
+        assert [key for key in params.split() if key[0] in "fc"] == [
+            key for key in info.split(", ") if key[0] in "fc"
+        ]
 
 
 @pytest.mark.parametrize(
@@ -297,14 +337,22 @@ def test_models_are_numbered_as_in_colmap() -> None:
 def test_what_no_lens_here_can_do_is_refused_with_the_undistorter(
     tmp_path: Path, model: str, key: str, value: float, binary: bool
 ) -> None:
-    params = [value if each == key else given for each, given in zip(dict(MODELS)[model].split(), lensed(model), strict=True)]
+    params = [
+        value if each == key else given
+        for each, given in zip(dict(MODELS)[model].split(), lensed(model), strict=True)
+    ]
     write_colmap(tmp_path, Capture.make(2), model=model, params=tuple(params), binary=binary)
     with pytest.raises(DataError, match=f"{model}.*image_undistorter"):
         parse(tmp_path)
 
 
 @pytest.mark.parametrize(
-    "given", [{"camera_model": "OPENCV", "k5": 0.1}, {"k6": 0.1, "k4": 0.2}, {"camera_model": "FULL_OPENCV", "k4": 0.1}]
+    "given",
+    [
+        {"camera_model": "OPENCV", "k5": 0.1},
+        {"k6": 0.1, "k4": 0.2},
+        {"camera_model": "FULL_OPENCV", "k4": 0.1},
+    ],
 )
 def test_rational_terms_of_transforms_are_not_dropped(tmp_path: Path, given: dict[str, object]) -> None:
     write_transforms(tmp_path, Capture.make(2), **given)
@@ -347,7 +395,8 @@ def test_points_of_a_ply_file_are_read(tmp_path: Path, how: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", [None, b"", b"ply\nformat ascii 1.0\nend_header\n", b"ply\nelement vertex 9000000000\n", b"x" * 99]
+    "content",
+    [None, b"", b"ply\nformat ascii 1.0\nend_header\n", b"ply\nelement vertex 9000000000\n", b"x" * 99],
 )
 def test_a_ply_file_that_cannot_be_read_is_said_and_left(tmp_path: Path, content: bytes | None) -> None:
     capture = Capture.make(3)
@@ -357,7 +406,12 @@ def test_a_ply_file_that_cannot_be_read_is_said_and_left(tmp_path: Path, content
         (tmp_path / "sparse_pc.ply").write_bytes(content)
     scene = parse(tmp_path)
     expect(scene, capture)
-    assert scene.points is None and len(scene.notes) == 1 and "\n" not in scene.notes[0] and "sparse_pc.ply" in scene.notes[0]
+    assert (
+        scene.points is None
+        and len(scene.notes) == 1
+        and "\n" not in scene.notes[0]
+        and "sparse_pc.ply" in scene.notes[0]
+    )
 
 
 def test_a_frame_that_is_written_twice_is_one_view(tmp_path: Path) -> None:
@@ -369,7 +423,9 @@ def test_a_frame_that_is_written_twice_is_one_view(tmp_path: Path) -> None:
     scene = parse(tmp_path)
     expect(scene, capture)
     assert len(scene.notes) == 1
-    (tmp_path / "transforms.json").write_text(json.dumps(content | {"frames": [*frames, frames[1] | {"fl_x": 30.0}]}))
+    (tmp_path / "transforms.json").write_text(
+        json.dumps(content | {"frames": [*frames, frames[1] | {"fl_x": 30.0}]})
+    )
     with pytest.raises(DataError, match=r"0001\.png occurs twice"):
         parse(tmp_path)
 
@@ -385,7 +441,9 @@ def test_polycam_s_frames_are_corrected_where_they_can_be(tmp_path: Path, images
     scene = parse(tmp_path)
     mixed = np.concatenate([better.poses[:images], capture.poses[images:]])
     expect(scene, Capture(capture.names, mixed, capture.points))
-    assert [path.parent.name for path in scene.paths] == ["corrected_images"] * images + ["images"] * (9 - images)
+    assert [path.parent.name for path in scene.paths] == ["corrected_images"] * images + ["images"] * (
+        9 - images
+    )
     assert bool(scene.notes) == (images < 9)
 
 
@@ -401,7 +459,9 @@ def test_sizes_come_from_the_images_where_no_file_says_them(tmp_path: Path) -> N
     for folder in tmp_path.iterdir():
         scene = parse(folder)
         expect(scene, capture)
-        assert scene.cameras.size.tolist() == [[24, 16]] * 3 and scene.cameras.focal.tolist() == [[20, 20]] * 3
+        assert (
+            scene.cameras.size.tolist() == [[24, 16]] * 3 and scene.cameras.focal.tolist() == [[20, 20]] * 3
+        )
 
 
 def test_record3d_s_images_beyond_the_poses_are_left_out(tmp_path: Path) -> None:
@@ -416,15 +476,21 @@ def test_record3d_s_images_beyond_the_poses_are_left_out(tmp_path: Path) -> None
     expect(parse(tmp_path), capture, [0, 2])
 
 
-@pytest.mark.parametrize("change", [np.asfortranarray, lambda rows: rows.astype("f4"), lambda rows: rows.astype(">f8")])
-def test_llff_s_array_may_be_stored_in_any_order(tmp_path: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
+@pytest.mark.parametrize(
+    "change", [np.asfortranarray, lambda rows: rows.astype("f4"), lambda rows: rows.astype(">f8")]
+)
+def test_llff_s_array_may_be_stored_in_any_order(
+    tmp_path: Path, change: Callable[[np.ndarray], np.ndarray]
+) -> None:
     capture = Capture.make(9)
     np.save(tmp_path / "poses_bounds.npy", change(write_llff(tmp_path, capture)))
     for junk in ("._0000.png", ".DS_Store", "Thumbs.db"):
         (tmp_path / "images" / junk).write_bytes(b"x")
     scene = parse(tmp_path)
     assert torch.allclose(scene.cameras.pose, torch.from_numpy(capture.poses), atol=1e-6)
-    assert scene.depths is not None and torch.equal(scene.depths, torch.tensor([[2.0, 9.0]] * 9, dtype=torch.float64))
+    assert scene.depths is not None and torch.equal(
+        scene.depths, torch.tensor([[2.0, 9.0]] * 9, dtype=torch.float64)
+    )
     write_image(tmp_path / "images/0009.png")
     with pytest.raises(DataError, match=r"10 images.* 9 rows"):
         parse(tmp_path)

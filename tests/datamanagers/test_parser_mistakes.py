@@ -28,7 +28,8 @@ from fprf.datamanagers.parsers.files import path_inside, read_npz
 from fprf.datamanagers.parsers.views import rigid_pose
 from fprf.errors import DataError
 
-EYE, BENT = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]", "[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]"
+EYE = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
+BENT = "[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]"
 WRONG = {
     "transforms": """frames=[] frames=null fl_x=0 fl_y=-3 fl_x="20" w=25 w=0 camera_model="EQUIRECTANGULAR" near=3&far=1
         camera_model="OPENCV_FISHEYE"&p1=0.1 camera_model="PINHOLE"&k1=0.1 test_filenames=["images/0009.png"]
@@ -48,7 +49,9 @@ WRONG = {
     "llff": "1=3.0 4=0.0 9=1e30 14=-5.0 15=10.0 9=16.0",
     "rows": "=[] =[[1,2,3]] =[1,2,3]",
 }
-"""Changes `key=value` by what they are made to, several at once joined by &; of COLMAP's files the words of the first line."""
+"""Changes `key=value` by what they are made to, several at once joined by &; of COLMAP's files the words of
+the first line.
+"""
 
 
 def changed(file: Path, change: Callable[[Any], object]) -> None:
@@ -57,7 +60,9 @@ def changed(file: Path, change: Callable[[Any], object]) -> None:
     file.write_text(json.dumps(content if replaced is None else replaced))
 
 
-@pytest.mark.parametrize(("what", "change"), [(what, change) for what, line in WRONG.items() for change in line.split()])
+@pytest.mark.parametrize(
+    ("what", "change"), [(what, change) for what, line in WRONG.items() for change in line.split()]
+)
 def test_wrong_values_are_refused_in_one_line(tmp_path: Path, what: str, change: str) -> None:
     values = {key: json.loads(value) for key, _, value in (each.partition("=") for each in change.split("&"))}
     capture = Capture.make(2)
@@ -96,7 +101,9 @@ def test_wrong_values_are_refused_in_one_line(tmp_path: Path, what: str, change:
     assert "\n" not in str(fault.value) and str(tmp_path) in str(fault.value)
 
 
-@pytest.mark.parametrize("name", ["BlockNerf", "MegaNerf", "PhotoTourism", "Polycam", "Record3D", "Odm", "Llff", "Colmap"])
+@pytest.mark.parametrize(
+    "name", ["BlockNerf", "MegaNerf", "PhotoTourism", "Polycam", "Record3D", "Odm", "Llff", "Colmap"]
+)
 def test_a_folder_without_the_files_of_a_format_is_refused(tmp_path: Path, name: str) -> None:
     np.save(tmp_path / "poses_bounds.npy", np.zeros((3, 17)))
     with pytest.raises(DataError) as fault:
@@ -111,7 +118,13 @@ def test_paths_stay_inside_and_are_normalised() -> None:
     ):  # fmt: skip
         with pytest.raises(DataError, match="here: the path"):
             path_inside(Path("root"), "here", text)
-    for text in ("images/a b.png", "./images/a b.png", "images//a b.png", ".\\images\\a b.png", "x/../images/a b.png"):
+    for text in (
+        "images/a b.png",
+        "./images/a b.png",
+        "images//a b.png",
+        ".\\images\\a b.png",
+        "x/../images/a b.png",
+    ):
         assert path_inside(Path("root"), "here", text) == ("images/a b.png", Path("root/images/a b.png"))
 
 

@@ -1,4 +1,6 @@
-"""One capture is one scene in every format, also far from 0; what each may say besides: lenses, splits, masks, points."""
+"""One capture is one scene in every format, also far from 0; what each may say besides: lenses, splits,
+masks, points.
+"""
 
 import json
 import math
@@ -76,10 +78,16 @@ def test_one_capture_in_every_format_is_one_scene(tmp_path: Path, name: str) -> 
     write(tmp_path, capture)
     assert recognise(tmp_path) == config
     for downscale in (1, 2, 3):
-        scene, wanted = parse_scene(tmp_path, downscale, None), capture.cameras().scaled(downscale)
+        scene = parse_scene(tmp_path, downscale, None)
+        wanted = capture.cameras().scaled(downscale)
         for field in ("pose", "focal", "centre", "distortion"):
-            torch.testing.assert_close(getattr(scene.cameras, field), getattr(wanted, field), atol=1e-9, rtol=0)
-        assert scene.cameras.size.tolist() == wanted.size.tolist() and scene.cameras.lens.tolist() == wanted.lens.tolist()
+            torch.testing.assert_close(
+                getattr(scene.cameras, field), getattr(wanted, field), atol=1e-9, rtol=0
+            )
+        assert (
+            scene.cameras.size.tolist() == wanted.size.tolist()
+            and scene.cameras.lens.tolist() == wanted.lens.tolist()
+        )
     for file in [*tmp_path.rglob("*")]:  # macOS leaves these beside each file
         if file.is_file():
             file.with_name(f"._{file.name}").write_bytes(b"\0\5\x16\7Mac OS X")
@@ -95,7 +103,9 @@ def test_one_capture_in_every_format_is_one_scene(tmp_path: Path, name: str) -> 
     if name.startswith(("colmap", "phototourism")):
         depth = (capture.points - capture.poses[3, :, 3]) @ -capture.poses[3, :, 2]
         assert scene.depths is not None and scene.seen is not None
-        assert scene.depths[3].tolist() == pytest.approx(np.percentile(depth, (0.1, 99.9)).tolist(), rel=1e-12)
+        assert scene.depths[3].tolist() == pytest.approx(
+            np.percentile(depth, (0.1, 99.9)).tolist(), rel=1e-12
+        )
         assert scene.seen.tolist() == [[view, point] for view in range(9) for point in range(40)]
     if "llff" in name:
         assert scene.depths is not None and scene.depths.tolist() == [[2.0, 9.0]] * 9
@@ -112,12 +122,24 @@ LENSES: list[tuple[Writer, int, list[float]]] = [
     (partial(write_transforms, camera_model="PINHOLE"), PINHOLE, STRAIGHT),
     (partial(write_transforms, camera_model="OPENCV"), PINHOLE, STRAIGHT),
     (partial(write_transforms, camera_model="OPENCV", k3=0.1, k4=0.2), OPENCV, [0, 0, 0.1, 0.2, 0, 0]),
-    (partial(write_transforms, distortion_params=[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]), OPENCV, [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]),
+    (
+        partial(write_transforms, distortion_params=[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]),
+        OPENCV,
+        [0.1, 0.2, 0.3, 0.4, 0.5, 0.6],
+    ),
     (partial(write_transforms, camera_model="OPENCV_FISHEYE", k1=0.1), FISHEYE, [0.1, 0, 0, 0, 0, 0]),
     (partial(write_transforms, is_fisheye=True), FISHEYE, STRAIGHT),
     (partial(write_transforms, k1=None), PINHOLE, STRAIGHT),
-    (partial(write_odm, projection_type="perspective", focal=0.9, k1=0.1, k2=0.2), OPENCV, [0.1, 0.2, 0, 0, 0, 0]),
-    (partial(write_odm, projection_type="perspective", focal=20 / 24, focal_x=None, focal_y=None), PINHOLE, STRAIGHT),
+    (
+        partial(write_odm, projection_type="perspective", focal=0.9, k1=0.1, k2=0.2),
+        OPENCV,
+        [0.1, 0.2, 0, 0, 0, 0],
+    ),
+    (
+        partial(write_odm, projection_type="perspective", focal=20 / 24, focal_x=None, focal_y=None),
+        PINHOLE,
+        STRAIGHT,
+    ),
     (partial(write_odm, projection_type="fisheye", k1=0.1), FISHEYE, [0.1, 0, 0, 0, 0, 0]),
     (partial(write_odm, projection_type="fisheye_opencv"), FISHEYE, STRAIGHT),
     (partial(write_odm, k3=0.3), OPENCV, [0, 0, 0.3, 0, 0, 0]),
@@ -159,11 +181,19 @@ def test_reduced_images_must_be_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("shift", [0.0, 0.5])
 def test_poses_take_points_from_the_model_that_they_were_made_of(tmp_path: Path, shift: float) -> None:
-    capture = replace(Capture.make(5), names=("a/1.png", "b/1.png", "b/2.png", "b/3.png", "b/4.png"))  # a rig of two cameras
+    capture = replace(
+        Capture.make(5), names=("a/1.png", "b/1.png", "b/2.png", "b/3.png", "b/4.png")
+    )  # a rig of two cameras
     write_colmap(tmp_path, capture)
     write_transforms(tmp_path, capture)
-    scene, model = parse(tmp_path), parse(tmp_path, ColmapConfig())
-    assert scene.points is not None and model.points is not None and scene.seen is not None and model.seen is not None
+    scene = parse(tmp_path)
+    model = parse(tmp_path, ColmapConfig())
+    assert (
+        scene.points is not None
+        and model.points is not None
+        and scene.seen is not None
+        and model.seen is not None
+    )
     assert torch.equal(scene.points, model.points) and torch.equal(scene.seen, model.seen)
     for write in (write_colmap, write_llff):
         write(tmp_path / "llff", Capture.make(5))  # type: ignore[operator]
@@ -173,7 +203,8 @@ def test_poses_take_points_from_the_model_that_they_were_made_of(tmp_path: Path,
     (tmp_path / "llff/sparse/0/images.bin").write_bytes(b"1")  # a model that is broken, or of another program
     scene = parse(tmp_path / "llff")
     assert scene.points is None and len(scene.notes) == 1 and "points are not read: " in scene.notes[0]
-    # ns-process-data turns the poses and leaves the model as it is, in colmap/sparse/0; it once did not say how.
+    # ns-process-data turns the poses and leaves the model as it is, in colmap/sparse/0; it once did not say
+    # how.
     applied = np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1.0, shift]])
     turned = np.concatenate([applied[:, :3] @ capture.poses[:, :, :3], capture.poses[:, :, 3:]], 2)
     turned[:, :, 3] = capture.poses[:, :, 3] @ applied[:, :3].T + applied[:, 3]
@@ -185,7 +216,9 @@ def test_poses_take_points_from_the_model_that_they_were_made_of(tmp_path: Path,
     scene = parse(tmp_path / "ns")
     assert scene.points is not None and torch.equal(scene.seen, model.seen)
     assert np.allclose(scene.points.numpy(), capture.points @ applied[:, :3].T + applied[:, 3], atol=1e-12)
-    np.savez(tmp_path / "points.npz", xyz=[[np.nan] * 3, [0, 0, 1.0], [0, 1, 1.0]], seen=[[0, 0], [0, 2], [4, 1]])
+    np.savez(
+        tmp_path / "points.npz", xyz=[[np.nan] * 3, [0, 0, 1.0], [0, 1, 1.0]], seen=[[0, 0], [0, 2], [4, 1]]
+    )
     scene = parse(tmp_path)
     assert scene.points is not None and scene.seen is not None
     assert scene.points.tolist() == [[0, 0, 1], [0, 1, 1]] and scene.seen.tolist() == [[0, 1], [4, 0]]
@@ -225,15 +258,20 @@ def test_meganerf_s_lengths_are_metres_and_its_files_whole(tmp_path: Path) -> No
 def test_the_table_says_who_is_in_and_for_what(tmp_path: Path) -> None:
     capture = Capture.make(6)
     rows = [(name, str(k), "test" if k == 4 else "train") for k, name in enumerate(capture.names) if k != 2]
-    write_phototourism(tmp_path, capture, [*rows, ("other.jpg", "9", "train"), (capture.names[2], "nan", "train")])
+    write_phototourism(
+        tmp_path, capture, [*rows, ("other.jpg", "9", "train"), (capture.names[2], "nan", "train")]
+    )
     write_image(tmp_path / "dense/masks/0003.png")
-    scene, whole = parse(tmp_path), parse(tmp_path / "dense")
+    scene = parse(tmp_path)
+    whole = parse(tmp_path / "dense")
     kept = [0, 1, 3, 4, 5]
     assert [path.name for path in scene.paths] == [capture.names[k] for k in kept]
     assert (scene.train.tolist(), scene.test.tolist()) == ([0, 1, 2, 4], [3])
     assert torch.equal(scene.cameras.pose, whole.cameras.pose[kept])
     assert [mask is not None for mask in scene.masks] == [False, False, True, False, False]
-    assert scene.seen is not None and scene.seen.tolist() == [[view, point] for view in range(5) for point in range(40)]
+    assert scene.seen is not None and scene.seen.tolist() == [
+        [view, point] for view in range(5) for point in range(40)
+    ]
     with pytest.raises(DataError, match=r"gone.tsv: no such table"):
         parse(tmp_path, PhotoTourismConfig(list="gone.tsv"))
     (tmp_path / "b.tsv").write_text("filename\tid\tsplit\nelsewhere.png\t1\ttrain\n")
@@ -254,7 +292,8 @@ def test_polycam_s_images_without_a_camera_are_left_out(tmp_path: Path) -> None:
 
 
 def test_record3d_s_images_go_by_their_numbers_and_may_have_lenses_of_their_own(tmp_path: Path) -> None:
-    capture, lenses = Capture.make(12), [[20.0 + k, 21.0 + k, 11.0, 9.0] for k in range(12)]
+    capture = Capture.make(12)
+    lenses = [[20.0 + k, 21.0 + k, 11.0, 9.0] for k in range(12)]
     write_record3d(tmp_path, capture, perFrameIntrinsicCoeffs=lenses)
     for config, kept in ((Record3DConfig(), list(range(12))), (Record3DConfig(frames=4), [0, 4, 7, 11])):
         scene = parse(tmp_path, config)
@@ -284,8 +323,12 @@ def test_blender_s_two_files(tmp_path: Path) -> None:
     for part, count in (("train", 4), ("test", 2)):
         for k in range(count):
             write_image(tmp_path / part / f"r_{k}.png", (10, 10), channels=4, seed=k)
-        frames = [{"file_path": f"./{part}/r_{k}", "transform_matrix": np.eye(4).tolist()} for k in range(count)]
-        (tmp_path / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": 0.6911, "frames": frames}))
+        frames = [
+            {"file_path": f"./{part}/r_{k}", "transform_matrix": np.eye(4).tolist()} for k in range(count)
+        ]
+        (tmp_path / f"transforms_{part}.json").write_text(
+            json.dumps({"camera_angle_x": 0.6911, "frames": frames})
+        )
     scene = parse(tmp_path)
     assert scene.alpha and (len(scene.train), len(scene.test)) == (4, 2)
     assert {scene.paths[k].parent.name for k in scene.train} == {"train"}
@@ -302,11 +345,20 @@ def test_blender_s_two_files(tmp_path: Path) -> None:
         ({"train_filenames": ["images/0001.png"], "test_filenames": ["images/0003.png"]}, [1], [3]),
         ({"train_filenames": ["./images/0001.png"]}, [1], [0, 2, 3]),
         ({"train_filenames": ["images/0001.png"], "val_filenames": ["images/0000.png"]}, [1], [2, 3]),
-        ({"train_filenames": [f"images/000{k}.png" for k in range(3)], "val_filenames": ["./images/0003.png"]}, [0, 1, 2], [3]),
+        (
+            {
+                "train_filenames": [f"images/000{k}.png" for k in range(3)],
+                "val_filenames": ["./images/0003.png"],
+            },
+            [0, 1, 2],
+            [3],
+        ),
         ({"test_filenames": ["images/0000.png", "images/0002.png"]}, [1, 3], [0, 2]),
     ],
 )
-def test_the_capture_says_what_is_held_out(tmp_path: Path, lists: dict[str, object], train: list[int], test: list[int]) -> None:
+def test_the_capture_says_what_is_held_out(
+    tmp_path: Path, lists: dict[str, object], train: list[int], test: list[int]
+) -> None:
     write_transforms(tmp_path, Capture.make(4), **lists)
     scene = parse(tmp_path)
     assert scene.train.tolist() == train and scene.test.tolist() == test
@@ -350,7 +402,9 @@ ECEF = (4_000_000.0, 1_000_000.0, 4_900_000.0)
 
 @pytest.mark.parametrize("shift", [UTM, ECEF])
 @pytest.mark.parametrize("name", FORMATS)
-def test_every_format_is_read_in_float64(tmp_path: Path, name: str, shift: tuple[float, float, float]) -> None:
+def test_every_format_is_read_in_float64(
+    tmp_path: Path, name: str, shift: tuple[float, float, float]
+) -> None:
     own = Capture.make(9, focal=(20.0, 20.0))
     poses = own.poses.copy()
     poses[:, :, 3] += shift
@@ -359,7 +413,8 @@ def test_every_format_is_read_in_float64(tmp_path: Path, name: str, shift: tuple
     origin = np.array(scene.origin)
     assert np.abs(origin - shift).max() < 8 and float(scene.cameras.pose[:, :, 3].abs().max()) < 8
     assert np.abs(scene.cameras.pose.numpy()[:, :, :3] - own.poses[:, :, :3]).max() < 1e-9
-    # float64 has a nanometre there; ODM's rotation vectors, by which a world-to-camera pose is inverted, keep less.
+    # float64 has a nanometre there; ODM's rotation vectors, by which a world-to-camera pose is inverted, keep
+    # less.
     assert np.abs(scene.cameras.pose.numpy()[:, :, 3] + (origin - shift) - own.poses[:, :, 3]).max() < 1e-7
     if scene.points is not None:
         assert np.abs(scene.points.numpy() + (origin - shift) - own.points).max() < 1e-8

@@ -30,7 +30,9 @@ def assert_same(one: ParsedScene, other: ParsedScene) -> None:
     assert [path.stem for path in one.paths] == [path.stem for path in other.paths]
     assert torch.equal(one.train, other.train) and torch.equal(one.test, other.test)
     view = torch.arange(len(one.cameras)).repeat_interleave(4)
-    share = torch.tensor([[0.1, 0.2], [0.9, 0.15], [0.5, 0.5], [0.3, 0.95]], dtype=torch.float64).repeat(len(one.cameras), 1)
+    share = torch.tensor([[0.1, 0.2], [0.9, 0.15], [0.5, 0.5], [0.3, 0.95]], dtype=torch.float64).repeat(
+        len(one.cameras), 1
+    )
     rays = [rays_through(scene.cameras, view, share * scene.cameras.size[view]) for scene in (one, other)]
     for a, b in zip(*rays, strict=True):
         assert (a - b).abs().max() <= 1e-12
@@ -50,17 +52,28 @@ def test_formats_are_told_by_their_files(tmp_path: Path) -> None:
     (tmp_path / "transforms_8.json").touch()
     with pytest.raises(DataError, match="but 9 entries"):
         recognise(tmp_path)
-    for write, config in ((write_colmap, ColmapConfig()), (write_llff, LlffConfig()), (write_transforms, TransformsConfig())):
+    for write, config in (
+        (write_colmap, ColmapConfig()),
+        (write_llff, LlffConfig()),
+        (write_transforms, TransformsConfig()),
+    ):
         write(tmp_path, Capture.make(2))  # type: ignore[operator]
         assert recognise(tmp_path) == config
     (tmp_path / "transforms.json").rename(tmp_path / "transforms_train.json")
     assert recognise(tmp_path) == TransformsConfig()
 
 
-def test_the_embedded_garden_is_read_by_name_where_no_such_folder_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_embedded_garden_is_read_by_name_where_no_such_folder_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     scene = parse_scene(Path("garden"), 4, None)
-    assert scene.name == "garden" and len(scene.paths) == 25 and len(scene.test) == 4 and scene.points is not None
+    assert (
+        scene.name == "garden"
+        and len(scene.paths) == 25
+        and len(scene.test) == 4
+        and scene.points is not None
+    )
     Path("garden").mkdir()
     for made in (".lock", "config.json"):  # --output garden
         Path("garden", made).touch()
@@ -91,7 +104,9 @@ def test_a_strangers_parser_recognises_its_folders(packages: Packages, tmp_path:
     (folder / "faint.bin").touch()
     assert recognise(folder) == ColmapConfig()
     (folder / "even.bin").touch()
-    with pytest.raises(DataError, match=r"by 'colmap' \(a model in .*\) and by 'even' \(even\.bin\); choose one with"):
+    with pytest.raises(
+        DataError, match=r"by 'colmap' \(a model in .*\) and by 'even' \(even\.bin\); choose one with"
+    ):
         recognise(folder)
     (folder / "sure.bin").touch()
     assert type(recognise(folder)).__module__ == "acme_sure"
@@ -115,7 +130,9 @@ def test_a_broken_parser_is_named_and_skipped(
 ) -> None:
     folder = tmp_path / "scene"
     write_colmap(folder, Capture.make(2))
-    packages.install("acme-bad", {"fprf.dataparsers": {"bad": "acme_bad4:ScanConfig"}}, code={"acme_bad4": source})
+    packages.install(
+        "acme-bad", {"fprf.dataparsers": {"bad": "acme_bad4:ScanConfig"}}, code={"acme_bad4": source}
+    )
     assert recognise(folder) == ColmapConfig()
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("warning: data parser 'bad' (acme_bad4:ScanConfig from acme-bad 1) is skipped: ")
@@ -134,7 +151,11 @@ def test_real_scenes(shared: Path, name: str) -> None:
     scene = parse_scene(folder, 1, None)
     others: list[DataParserConfig] = [ColmapConfig()] if (folder / "sparse").exists() else []
     if (folder / "poses_bounds.npy").exists():
-        others += [LlffConfig(images="images_8"), LlffConfig(images="images_4"), TransformsConfig(file="transforms_4.json")]
+        others += [
+            LlffConfig(images="images_8"),
+            LlffConfig(images="images_4"),
+            TransformsConfig(file="transforms_4.json"),
+        ]
     for config in others:
         assert_same(scene, parse_scene(folder, 1, config))
     assert sorted(scene.train.tolist() + scene.test.tolist()) == list(range(len(scene.paths)))
@@ -155,14 +176,16 @@ class Parser(DataParser):
     """The built-in one, with one thing wrong."""
 
     def __init__(self, wrong: str) -> None:
-        self.wrong, self.calls = wrong, 0
+        self.wrong = wrong
+        self.calls = 0
 
     def parse(self, data: Path, downscale: int) -> ParsedScene:
         self.calls += 1
         if self.wrong == "absent" and not data.exists():
             raise FileNotFoundError(data)
         scene = TransformsConfig().build().parse(data, 1 if self.wrong == "size" else downscale)
-        cameras, pose = scene.cameras, scene.cameras.pose
+        cameras = scene.cameras
+        pose = scene.cameras.pose
         changes: dict[str, dict[str, Any]] = {
             "mirrored": {"cameras": replace(cameras, pose=pose * torch.tensor([[-1.0, 1, 1, 1]]))},
             "scaled": {"cameras": replace(cameras, pose=2 * pose)},
@@ -188,7 +211,11 @@ class ParserConfig(DataParserConfig):
 
 
 def test_built_in_and_plain_parsers_pass(tmp_path: Path) -> None:
-    for config, write in ((TransformsConfig(), write_transforms), (LlffConfig(), write_llff), (ColmapConfig(), write_colmap)):
+    for config, write in (
+        (TransformsConfig(), write_transforms),
+        (LlffConfig(), write_llff),
+        (ColmapConfig(), write_colmap),
+    ):
         write(tmp_path / write.__name__, Capture.make(9))  # type: ignore[operator]
         check_parser(config, tmp_path / write.__name__)
     check_parser(ParserConfig(), tmp_path / "write_transforms")
@@ -209,7 +236,9 @@ def test_built_in_and_plain_parsers_pass(tmp_path: Path) -> None:
         ("absent", FileNotFoundError, "no-such-folder"),
     ],
 )
-def test_a_breach_of_a_parser_is_told(tmp_path: Path, wrong: str, error: type[Exception], breach: str) -> None:
+def test_a_breach_of_a_parser_is_told(
+    tmp_path: Path, wrong: str, error: type[Exception], breach: str
+) -> None:
     write_transforms(tmp_path, Capture.make(9))
     with pytest.raises(error, match=breach):
         check_parser(ParserConfig(wrong=wrong), tmp_path)

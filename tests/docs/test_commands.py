@@ -1,4 +1,5 @@
-"""The commands and the Python of the README and the documents, on a tiny scene: run, or for heavy commands parsed to the end.
+"""The commands and the Python of the README and the documents, on a tiny scene: run, or for heavy commands
+parsed to the end.
 
 A command that is neither stands in `ELSEWHERE` with the reason; nothing else is left out.
 """
@@ -62,7 +63,16 @@ FEWER["restyle"] = ["--views", "3", "--size", "64", "48", "--regions", "3"]
 """The tiny model renders few frames, and has barely begun to agree with itself."""
 SCENES = ("my_scene", "SCENE", "DIR", "FOLDER", "scenes/yard", "fox")
 RUNS = ("RUN", "OTHER_RUN", "runs/my_scene-fprf-lite", "runs/my_scene-fprf-splats", "runs/yard-fprf-splats")
-PHOTOGRAPHS = ("autumn.jpg", "night.jpg", "dusk.jpg", "snow.jpg", "a.jpg", "A.jpg", "photos/one.jpg", "my_photos/one.jpg")
+PHOTOGRAPHS = (
+    "autumn.jpg",
+    "night.jpg",
+    "dusk.jpg",
+    "snow.jpg",
+    "a.jpg",
+    "A.jpg",
+    "photos/one.jpg",
+    "my_photos/one.jpg",
+)
 CAPTURES = ("capture.ply", "plant.splat", "my_scan.spz")
 WEIGHTS = ("vgg19.safetensors", "F")
 
@@ -90,7 +100,9 @@ def commands(page: Path) -> Iterator[Command]:
 
 EVERY = [command for page in PAGES for command in commands(page)]
 GAUSSIANS = ["--steps", "5", "--initial", "300", "--cap", "400"]
-OURS = [command for command in EVERY if command.words[0] == "fprf" and not set(command.words) & ELSEWHERE.keys()]
+OURS = [
+    command for command in EVERY if command.words[0] == "fprf" and not set(command.words) & ELSEWHERE.keys()
+]
 
 
 def smaller(words: Sequence[str]) -> list[str]:
@@ -116,11 +128,16 @@ def place(world: World, tmp_path: Path) -> Path:
         (folder / name).write_bytes(b"")
     pose = [float(x) for x in np.eye(4).ravel()]
     frames = [{"camera_to_world": pose, "fov": 50, "aspect": 1.3}] * 2
-    write_json(folder / "camera_path.json", {"camera_path": frames, "render_width": 32, "render_height": 24, "fps": 2})
+    write_json(
+        folder / "camera_path.json",
+        {"camera_path": frames, "render_width": 32, "render_height": 24, "fps": 2},
+    )
     for name in CAPTURES:
         write_gaussians(folder / name, ball(300))
     (folder / "night").mkdir()
-    write_json(folder / "night" / "style.json", {"format": 1, "style": {"references": [str(folder / "night.jpg")]}})
+    write_json(
+        folder / "night" / "style.json", {"format": 1, "style": {"references": [str(folder / "night.jpg")]}}
+    )
     write_video(folder / "clip.mp4", [np.full((24, 32, 3), 90, np.uint8)] * 2, 2)
     (folder / "clip.mp4").rename(folder / "IMG_0001.MOV")
     return folder
@@ -166,7 +183,8 @@ def test_it_is_understood(place: Path, lines: list[list[str]], monkeypatch: pyte
 def parsed(words: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
     """The config that a verb would start with."""
     module = importlib.import_module(f"fprf.cli.{words[1]}")
-    real, heard = module.parse, []
+    real = module.parse
+    heard = []
 
     def stop(*args: Any, **named: Any) -> None:
         heard.append(real(*args, **named))
@@ -187,7 +205,9 @@ def parsed(words: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
         if command.words[1] == "train" and not set(command.words) & {*WEIGHTS, "--view"}
     ],
 )
-def test_it_trains(world: World, place: Path, words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_trains(
+    world: World, place: Path, words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(place)
     words = smaller(words)
     if words[2] in ("fprf", "fprf-lite"):  # what the command says comes last, and so counts
@@ -198,11 +218,15 @@ def test_it_trains(world: World, place: Path, words: list[str], tmp_path: Path, 
     assert "--plan" in words or (tmp_path / "run" / "config.json").is_file()
 
 
-@pytest.mark.parametrize("command", [command for command in EVERY if command.words[0] in ("pip", "pytest")], ids=str)
+@pytest.mark.parametrize(
+    "command", [command for command in EVERY if command.words[0] in ("pip", "pytest")], ids=str
+)
 def test_what_is_installed_and_marked_exists(command: Command) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     extras = {extra for word in command.words for extra in re.findall(r"\[([\w,]+)\]", word)}
-    assert {name for extra in extras for name in extra.split(",")} <= project["project"]["optional-dependencies"].keys()
+    assert {name for extra in extras for name in extra.split(",")} <= project["project"][
+        "optional-dependencies"
+    ].keys()
     if command.words[:2] == ["pytest", "-m"]:
         markers = [line.partition(":")[0] for line in project["tool"]["pytest"]["ini_options"]["markers"]]
         assert command.words[2] in markers
@@ -226,7 +250,8 @@ def test_the_python_of_pages_runs_and_the_plug_in_of_the_readme_keeps_its_contra
 
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-PAGE, NOTEBOOK = DOCS / "python.md", DOCS / "tour.ipynb"
+PAGE = DOCS / "python.md"
+NOTEBOOK = DOCS / "tour.ipynb"
 
 
 def test_the_page_runs(
@@ -246,12 +271,18 @@ def test_the_page_runs(
     made = {path.name for path in tmp_path.iterdir()}
     assert {"autumn.png", "film.mp4", "mine.json", "between-0.png", "between-2.png"} <= made
     assert "(200, 3) True" in told
-    scans = [f"scan{name}" for name in ("_autumn.spz", "-0.5.ply", "-1.0.ply", "_night.splat", "_grey.ply", ".glb")]
+    scans = [
+        f"scan{name}" for name in ("_autumn.spz", "-0.5.ply", "-1.0.ply", "_night.splat", "_grey.ply", ".glb")
+    ]
     assert all(len(read_capture(Path(name)).gaussians) == 200 for name in scans)
 
 
 def cells(kind: str) -> list[str]:
-    return ["".join(cell["source"]) for cell in json.loads(NOTEBOOK.read_text("utf-8"))["cells"] if cell["cell_type"] == kind]
+    return [
+        "".join(cell["source"])
+        for cell in json.loads(NOTEBOOK.read_text("utf-8"))["cells"]
+        if cell["cell_type"] == kind
+    ]
 
 
 def test_every_cell_runs_in_order_on_the_garden(
@@ -259,7 +290,11 @@ def test_every_cell_runs_in_order_on_the_garden(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     few = replace(fprf_splats(), steps=10, initial=800, cap=900, downscale=8)
-    train(replace(few, data=Path(str(files("fprf") / "garden")), output=Path("demo/run")), "fprf-splats", quiet=True)
+    train(
+        replace(few, data=Path(str(files("fprf") / "garden")), output=Path("demo/run")),
+        "fprf-splats",
+        quiet=True,
+    )
     names: dict[str, object] = {}
     for number, source in enumerate(cells("code"), 1):
         exec(compile(source, f"cell {number}", "exec"), names)

@@ -1,4 +1,6 @@
-"""What the documents name exists: files, modules, anchors and flags; tables are those of the results; the site builds."""
+"""What the documents name exists: files, modules, anchors and flags; tables are those of the results; the
+site builds.
+"""
 
 import importlib.util
 import os
@@ -27,7 +29,17 @@ BELOW = re.compile(
 MODULE = re.compile(r"`(fprf(?:\.\w+)+)`")
 LINK = re.compile(r"\]\((?!https?:)([^)#\s]*)(#[\w-]*)?\)")
 FLAG = re.compile(r"`(--[a-z][\w.-]*)")
-OTHERS = {"--no-compile", "--check", "--strict", "--scene", "--view", "--changed-images", "--clean", "--help", "--gentle"}
+OTHERS = {
+    "--no-compile",
+    "--check",
+    "--strict",
+    "--scene",
+    "--view",
+    "--changed-images",
+    "--clean",
+    "--help",
+    "--gentle",
+}
 """Of pip, mkdocs and `benchmarks/gpu.sh`, and words that verbs take before their flags are parsed."""
 
 
@@ -101,12 +113,25 @@ MISSING = "the extra `docs` is not installed: pip install -e '.[docs]'"
 def test_it_builds_without_a_warning(tmp_path: Path) -> None:
     pytest.importorskip("mkdocs", reason=MISSING)
     pytest.importorskip("material", reason=MISSING)
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-f", str(ROOT / "mkdocs.yml"), "-d", str(tmp_path)]
+    command = [
+        sys.executable,
+        "-m",
+        "mkdocs",
+        "build",
+        "--strict",
+        "-q",
+        "-f",
+        str(ROOT / "mkdocs.yml"),
+        "-d",
+        str(tmp_path),
+    ]
     quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
     made = subprocess.run(command, capture_output=True, text=True, check=False, env=quiet)
     assert made.returncode == 0 and "WARNING" not in made.stderr, made.stderr
     assert {path.stem for path in (tmp_path / "verbs").glob("*.html")} == set(VERBS)
     for page in [tmp_path / "index.html", tmp_path / "verbs" / "export.html"]:
         text = page.read_text()
-        assert not re.search(r'<(?:script|img)[^>]+src="https?:|<link[^>]+rel="stylesheet"[^>]+href="https?:', text)
+        assert not re.search(
+            r'<(?:script|img)[^>]+src="https?:|<link[^>]+rel="stylesheet"[^>]+href="https?:', text
+        )
     assert "restyle" in (tmp_path / "search" / "search_index.json").read_text()

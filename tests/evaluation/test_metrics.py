@@ -1,4 +1,6 @@
-"""Scores of pictures and of films against their definitions, LPIPS against its authors; held-out views and fitted poses."""
+"""Scores of pictures and of films against their definitions, LPIPS against its authors; held-out views and
+fitted poses.
+"""
 
 import math
 from dataclasses import replace
@@ -48,17 +50,23 @@ def test_exposure_and_white_balance_cost_nothing_of_the_corrected_psnr() -> None
     draw = torch.Generator().manual_seed(0)
     truth = 0.1 + 0.5 * torch.rand(30, 40, 3, generator=draw)
     render = truth + 0.02 * torch.randn(30, 40, 3, generator=draw)
-    before, darker = image_metrics(render, truth), image_metrics(render * torch.tensor([0.5, 0.7, 0.6]), truth)
+    before = image_metrics(render, truth)
+    darker = image_metrics(render * torch.tensor([0.5, 0.7, 0.6]), truth)
     assert darker["psnr"] < 20 < before["psnr"]
     # 1e-3: rounding, and the least that the clamp to [0, 1] moves.
     assert before["psnr"] <= before["cc_psnr"] == pytest.approx(darker["cc_psnr"], abs=1e-3)
-    assert image_metrics(torch.zeros_like(truth), truth)["cc_psnr"] == pytest.approx(psnr(torch.zeros_like(truth), truth))
+    assert image_metrics(torch.zeros_like(truth), truth)["cc_psnr"] == pytest.approx(
+        psnr(torch.zeros_like(truth), truth)
+    )
 
 
 def test_what_a_mask_leaves_out_does_not_count() -> None:
-    """Any change there leaves PSNR as it is, and SSIM but for windows that reach into it: those see the same in both images."""
+    """Any change there leaves PSNR as it is, and SSIM but for windows that reach into it: those see the same
+    in both images.
+    """
     draw = torch.Generator().manual_seed(0)
-    truth, where = torch.rand(40, 30, 3, generator=draw), torch.zeros(40, 30, dtype=torch.bool)
+    truth = torch.rand(40, 30, 3, generator=draw)
+    where = torch.zeros(40, 30, dtype=torch.bool)
     where[:, :20] = True
     render = (truth + 0.1 * torch.randn(40, 30, 3, generator=draw)).clamp(0, 1)
     spoilt = torch.where(where[..., None], render, torch.rand(40, 30, 3, generator=draw))
@@ -73,7 +81,11 @@ def picture(height: int, width: int, phase: float) -> Tensor:
     """Smooth waves of colour and a disc [H W 3]."""
     y, x = torch.meshgrid(torch.linspace(0, 1, height), torch.linspace(0, 1, width), indexing="ij")
     waves = (
-        torch.stack([torch.sin(9 * x + phase), torch.sin(7 * y - phase), torch.cos(5 * (x + y) * (1 + phase))], -1) / 2 + 0.5
+        torch.stack(
+            [torch.sin(9 * x + phase), torch.sin(7 * y - phase), torch.cos(5 * (x + y) * (1 + phase))], -1
+        )
+        / 2
+        + 0.5
     )
     disc = ((x - 0.6) ** 2 + (y - 0.4) ** 2 < 0.05)[..., None]
     return torch.where(disc, 1 - waves, waves)
@@ -81,7 +93,9 @@ def picture(height: int, width: int, phase: float) -> Tensor:
 
 def noisy(image: Tensor) -> Tensor:
     steps = torch.arange(image.numel(), dtype=torch.float64)
-    return (image + 0.3 * torch.frac(torch.sin(steps * 12.9898) * 43758.5453).reshape(image.shape).float()).clamp(0, 1)
+    return (
+        image + 0.3 * torch.frac(torch.sin(steps * 12.9898) * 43758.5453).reshape(image.shape).float()
+    ).clamp(0, 1)
 
 
 STORED = {
@@ -103,7 +117,8 @@ def test_numbers_are_those_of_the_authors_package(name: str) -> None:
 
 def test_only_what_counts_is_judged() -> None:
     a = picture(96, 96, 0.0)
-    b, where = a.clone(), torch.zeros(96, 96, dtype=torch.bool)
+    b = a.clone()
+    where = torch.zeros(96, 96, dtype=torch.bool)
     b[:, :30] = 0
     where[:, 64:] = True
     assert lpips(a, b, ~where) > 0.1 > 10 * lpips(a, b, where)
@@ -123,7 +138,8 @@ def test_images_that_cannot_be_compared_are_refused() -> None:
 
 
 def test_metrics_are_those_of_the_renders(world: World) -> None:
-    trained, scene = world.load(), world.prepared.scene
+    trained = world.load()
+    scene = world.prepared.scene
     told: list[Any] = []
     images: dict[int, Image] = {}
 
@@ -136,7 +152,9 @@ def test_metrics_are_those_of_the_renders(world: World) -> None:
     assert metrics["views"] == 2 and metrics["per_view"].keys() == {"0000", "0008"}
     assert tuple(images) == trained.known.test
     for view, image in images.items():
-        again = render_view(trained.model, trained.known.facts, trained.known.cameras, view, trained.config.render)
+        again = render_view(
+            trained.model, trained.known.facts, trained.known.cameras, view, trained.config.render
+        )
         assert (to_uint8(again.rgb) == image).all()
         truth = torch.from_numpy(load_image(scene.paths[view], (32, 24))).float() / 255
         assert metrics["per_view"][scene.paths[view].stem] == image_metrics(again.rgb, truth)
@@ -151,7 +169,8 @@ def test_a_turned_view_comes_back(world: World, tmp_path: Path, monkeypatch: pyt
     """Its image is what the scene looks like from where it was; the fit starts a little beside."""
     trained = world.load()
     view = trained.known.test[0]
-    cameras, config = trained.known.cameras, trained.config.render
+    cameras = trained.known.cameras
+    config = trained.config.render
     truth = render_view(trained.model, trained.known.facts, cameras, view, config).rgb
     write_image(tmp_path / "truth.png", to_uint8(truth))
     paths = list(world.prepared.scene.paths)
@@ -168,7 +187,9 @@ def test_a_turned_view_comes_back(world: World, tmp_path: Path, monkeypatch: pyt
 
     def error(run: object) -> float:
         known = run.known  # type: ignore[attr-defined]
-        return float((render_view(trained.model, known.facts, known.cameras, view, config).rgb - truth).square().mean())
+        return float(
+            (render_view(trained.model, known.facts, known.cameras, view, config).rgb - truth).square().mean()
+        )
 
     assert error(found) < 0.5 * error(wrong)
     others = [k for k in range(len(pose)) if k != view]
@@ -176,7 +197,8 @@ def test_a_turned_view_comes_back(world: World, tmp_path: Path, monkeypatch: pyt
     assert all(torch.equal(t, before[name]) for name, t in trained.model.state_dict().items())
 
 
-WIDTH, HEIGHT = 48, 36
+WIDTH = 48
+HEIGHT = 36
 
 
 def row_of_cameras(count: int, step: float = 0.1) -> Cameras:
@@ -191,7 +213,9 @@ def row_of_cameras(count: int, step: float = 0.1) -> Cameras:
 def paint(points: torch.Tensor) -> torch.Tensor:
     """Colours of a place: smooth, within [0, 1]."""
     x, y, z = points.unbind(-1)
-    return torch.stack([0.5 + 0.4 * torch.sin(x), 0.5 + 0.4 * torch.cos(1.3 * y), 0.5 + 0.3 * torch.sin(x + z)], -1)
+    return torch.stack(
+        [0.5 + 0.4 * torch.sin(x), 0.5 + 0.4 * torch.cos(1.3 * y), 0.5 + 0.3 * torch.sin(x + z)], -1
+    )
 
 
 def seen(cameras: Cameras, view: int, *, plate: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
@@ -220,9 +244,12 @@ def consistency(
 @pytest.mark.parametrize("lens", [0, 1, 2])
 def test_a_plane_warps_exactly_to_interpolation(lens: int) -> None:
     cameras = row_of_cameras(2, step=0.6)
-    bent = torch.tensor([0.05, -0.01, 0, 0, 1e-3, -1e-3] if lens == 1 else [0.02, 0, 0, 0, 0, 0], dtype=torch.float64)
+    bent = torch.tensor(
+        [0.05, -0.01, 0, 0, 1e-3, -1e-3] if lens == 1 else [0.02, 0, 0, 0, 0, 0], dtype=torch.float64
+    )
     cameras = replace(cameras, lens=torch.full((2,), lens), distortion=(bent * (lens > 0)).repeat(2, 1))
-    (image_a, depth_a), (image_b, depth_b) = seen(cameras, 0), seen(cameras, 1)
+    (image_a, depth_a) = seen(cameras, 0)
+    (image_b, depth_b) = seen(cameras, 1)
     found, valid = warp(image_b, depth_a, depth_b, cameras, 0, 1)
     assert float(valid.float().mean()) > 0.8
     # One pixel is 0.06 of the scene; bilinear error <= 0.4 * 1.3^2 * 0.06^2 / 8 per axis.
@@ -236,13 +263,15 @@ def test_what_is_hidden_or_outside_is_not_compared() -> None:
     (image_a, depth_a), (image_b, depth_b) = (seen(cameras, view, plate=True) for view in (0, 1))
     found, valid = warp(image_b, depth_a, depth_b, cameras, 0, 1)
     difference = (found - image_a).abs().amax(-1)
-    # The plate is at half the distance: what mixes in beside its edge is at most 2 * 2 % of it before depths disagree.
+    # The plate is at half the distance: what mixes in beside its edge is at most 2 * 2 % of it before depths
+    # disagree.
     assert float(valid.float().mean()) > 0.7
     assert float(difference[valid].max()) < 0.04
     _, ignored = warp(image_b, depth_a, torch.full_like(depth_b, 0.0), cameras, 0, 1)
     assert not bool(ignored.any())
     # Without the occlusion test white would show: a depth of b that lies about it lets it through.
-    (plane_a, way_a), (_, way_b) = seen(cameras, 0), seen(cameras, 1)
+    (plane_a, way_a) = seen(cameras, 0)
+    (_, way_b) = seen(cameras, 1)
     fooled, shown = warp(image_b, way_a, way_b, cameras, 0, 1)
     assert float((fooled - plane_a)[shown].abs().max()) > 0.2
 
@@ -250,7 +279,8 @@ def test_what_is_hidden_or_outside_is_not_compared() -> None:
 def test_a_consistent_path_scores_zero_and_flicker_its_own_size() -> None:
     cameras = row_of_cameras(10, step=0.05)
     views = [seen(cameras, view) for view in range(10)]
-    images, depths = [image for image, _ in views], [depth for _, depth in views]
+    images = [image for image, _ in views]
+    depths = [depth for _, depth in views]
     pairs = [[(t, t + gap) for t in range(10 - gap)] for gap in (1, 7)]
     rows = [consistency(images, depths, cameras, each) for each in pairs]
     assert [row["pairs"] for row in rows] == [9, 3]
@@ -269,14 +299,19 @@ def test_the_relative_error_does_not_reward_dullness() -> None:
     views = [seen(cameras, view) for view in range(2)]
     depths = [depth for _, depth in views]
     draws = [torch.Generator().manual_seed(index) for index in range(2)]
-    noisy = [image + 0.1 * torch.randn(image.shape, generator=draw) for (image, _), draw in zip(views, draws, strict=True)]
+    noisy = [
+        image + 0.1 * torch.randn(image.shape, generator=draw)
+        for (image, _), draw in zip(views, draws, strict=True)
+    ]
     dull = [0.5 + 0.1 * (image - 0.5) for image in noisy]
     rich_row, dull_row = (consistency(images, depths, cameras, [(0, 1)]) for images in (noisy, dull))
     assert dull_row["rmse"] == pytest.approx(0.1 * rich_row["rmse"], rel=1e-4)
     assert dull_row["relative"] == pytest.approx(rich_row["relative"], rel=1e-4)
     unrelated = [torch.rand(HEIGHT, WIDTH, 3, generator=draw) for draw in draws]
     still = replace(cameras, pose=cameras.pose[:1].repeat(2, 1, 1))
-    assert consistency(unrelated, depths[:1] * 2, still, [(0, 1)])["relative"] == pytest.approx(math.sqrt(2), rel=0.05)
+    assert consistency(unrelated, depths[:1] * 2, still, [(0, 1)])["relative"] == pytest.approx(
+        math.sqrt(2), rel=0.05
+    )
     flat = [torch.full((HEIGHT, WIDTH, 3), 0.5)] * 2
     assert consistency(flat, depths, cameras, [(0, 1)])["relative"] is None
 

@@ -1,4 +1,6 @@
-"""Meshes against scenes that are known, and what `fprf export` writes, opened again by other programs' readers and our own."""
+"""Meshes against scenes that are known, and what `fprf export` writes, opened again by other programs'
+readers and our own.
+"""
 
 import json
 from dataclasses import replace
@@ -43,7 +45,9 @@ def test_surface_nets_of_a_ball_are_closed_and_turned_outwards(radius: float) ->
     found = trimesh.Trimesh(at.numpy(), face.numpy(), process=False)
     assert found.is_watertight and found.is_winding_consistent and found.euler_number == 2
     assert np.abs(np.linalg.norm(found.vertices, axis=1) - radius).max() < 0.2
-    assert found.volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.12), "negative if it were inside out"
+    assert found.volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.12), (
+        "negative if it were inside out"
+    )
 
 
 def test_the_mesh_lies_on_the_sphere_with_its_normals(mesh: Mesh) -> None:
@@ -64,7 +68,9 @@ def test_vertices_have_the_colours_of_what_views_see_there(seen: Maps, mesh: Mes
     assert float(apart(seen).mean()) < 0.01 and float(apart(seen).quantile(0.99)) < 0.05
     # A view that looks past all of it counts for nothing.
     dark = [rgb if view != 3 else 0 * rgb for view, rgb in enumerate(seen.rgb)]
-    gone = [depth if view != 3 else torch.full_like(depth, torch.inf) for view, depth in enumerate(seen.depth)]
+    gone = [
+        depth if view != 3 else torch.full_like(depth, torch.inf) for view, depth in enumerate(seen.depth)
+    ]
     without = apart(seen._replace(depth=gone, rgb=dark))
     assert float(without.mean()) < 0.015 and float(without.quantile(0.99)) < 0.08
 
@@ -98,27 +104,37 @@ def test_both_files_are_read_again_whole(mesh: Mesh, tmp_path: Path) -> None:
     ply = trimesh.load(tmp_path / "m.ply", process=False)
     [glb] = trimesh.load_scene(tmp_path / "m.glb", process=False).geometry.values()
     for found in (ply, glb):
-        assert np.array_equal(found.faces, mesh.face.numpy()) and np.array_equal(found.vertices, mesh.point.float().numpy())
+        assert np.array_equal(found.faces, mesh.face.numpy()) and np.array_equal(
+            found.vertices, mesh.point.float().numpy()
+        )
         assert np.allclose(found.bounds, [mesh.point.amin(0).numpy(), mesh.point.amax(0).numpy()], atol=1e-6)
         assert np.allclose(found.vertex_normals, mesh.normal.numpy(), atol=1e-3)
     assert np.array_equal(ply.visual.vertex_colors[:, :3], (colour * 255 + 0.5).to(torch.uint8).numpy())
     shade = np.asarray(glb.visual.vertex_attributes["color"])
     assert shade.dtype == np.uint16 and (shade[:, 3] == 65535).all()
-    assert np.abs(shade[:, :3] / 65535 - srgb_to_linear(colour.double().numpy())).max() < 1e-5, "glTF's colours are linear"
+    assert np.abs(shade[:, :3] / 65535 - srgb_to_linear(colour.double().numpy())).max() < 1e-5, (
+        "glTF's colours are linear"
+    )
     document = (tmp_path / "m.glb").read_bytes()
     assert document[:4] == b"glTF" and int.from_bytes(document[8:12], "little") == len(document)
 
 
 def test_far_from_0_the_mesh_lies_where_the_capture_does(mesh: Mesh, tmp_path: Path) -> None:
     """PLY in float64, glTF by its node, both local where that is asked for."""
-    origin, colour = (500_000.0, -16.0, 5_600_000.0), torch.rand(len(mesh.point), 3)
+    origin = (500_000.0, -16.0, 5_600_000.0)
+    colour = torch.rand(len(mesh.point), 3)
     write_mesh(tmp_path / "m.ply", mesh, colour, origin)
     write_mesh(tmp_path / "m.glb", mesh, colour, origin)
     glb = trimesh.load_scene(tmp_path / "m.glb", process=False)
     [node] = glb.graph.nodes_geometry
     matrix, name = glb.graph[node]
-    assert np.array_equal(matrix[:3, 3], origin) and np.array_equal(glb.geometry[name].vertices, mesh.point.float().numpy())
-    assert np.abs(trimesh.load(tmp_path / "m.ply", process=False).vertices - origin - mesh.point.numpy()).max() < 1e-8
+    assert np.array_equal(matrix[:3, 3], origin) and np.array_equal(
+        glb.geometry[name].vertices, mesh.point.float().numpy()
+    )
+    assert (
+        np.abs(trimesh.load(tmp_path / "m.ply", process=False).vertices - origin - mesh.point.numpy()).max()
+        < 1e-8
+    )
     for ending in ("ply", "glb"):
         path = tmp_path / f"local.{ending}"
         write_mesh(path, mesh, colour, origin, local=True)
@@ -175,7 +191,12 @@ def test_a_folder_takes_the_usual_kinds_or_those_that_are_named(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("kinds", "name", "kind"),
     [
-        *(([], "a.ply", "ply"), (["glb"], "a.ply", "glb"), ([], "a.SPLAT", "splat"), ([], "t.json", "cameras")),
+        *(
+            ([], "a.ply", "ply"),
+            (["glb"], "a.ply", "glb"),
+            ([], "a.SPLAT", "splat"),
+            ([], "t.json", "cameras"),
+        ),
         *(([], "a.compressed.ply", "compressed.ply"), (["sog"], "meta.json", "sog")),
     ],
 )
@@ -228,7 +249,9 @@ def table(data: bytes) -> np.ndarray:
     """The vertices of a binary PLY, by nothing but its header."""
     head, _, body = data.partition(b"end_header\n")
     kinds = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4"}
-    rows, count, inside = [], 0, False
+    rows = []
+    count = 0
+    inside = False
     for line in head.decode("ascii").splitlines():
         word = line.split()
         if word[:1] == ["element"]:

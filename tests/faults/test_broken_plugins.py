@@ -67,7 +67,9 @@ def test_the_verbs_of_a_user_with_all_of_them_installed(world: World, tmp_path: 
     shown = run(tmp_path, "train", "fprf-lite", "--help")
     assert shown.returncode == 0 and "--content.encoder" in shown.stdout
     photo = str(world.references[0])
-    styled = run(tmp_path, "stylize", str(world.run), "--references", photo, "--output", str(tmp_path / "styled"))
+    styled = run(
+        tmp_path, "stylize", str(world.run), "--references", photo, "--output", str(tmp_path / "styled")
+    )
     assert styled.returncode == 0, styled.stderr
     assert run(tmp_path, "train", "fprf-lite", "--content.encoder", "dies").returncode == 4
 
@@ -82,17 +84,32 @@ def broken(*_: object) -> object:
 
 
 BREACHES: list[tuple[str, str, Callable[[Any, Any], Any], str]] = [
-    ("field", "density", density(lambda d, _: d[:, None]), r"expected float32 \[5\] on cpu, found float32 \[5 1\] on cpu"),
+    (
+        "field",
+        "density",
+        density(lambda d, _: d[:, None]),
+        r"expected float32 \[5\] on cpu, found float32 \[5 1\] on cpu",
+    ),
     ("field", "density", density(lambda d, _: d.double()), r"found float64 \[5\]"),
     ("field", "density", density(lambda d, _: d.to("meta")), "on meta"),
-    ("field", "density", density(lambda d, _: d * torch.nan), "expected finite numbers, found 5 of 5 that are not"),
+    (
+        "field",
+        "density",
+        density(lambda d, _: d * torch.nan),
+        "expected finite numbers, found 5 of 5 that are not",
+    ),
     ("field", "density", density(lambda d, _: d - 1e3), r"expected numbers in \[0, inf\], found -"),
     ("field", "density", density(lambda d, _: d.tolist()), "found list"),
     ("field", "density", density(lambda _, points: points.mul_(2)[:, 0]), "an input that is left alone"),
     ("field", "density", broken, "expected an answer, found ZeroDivisionError: two;"),
     ("field", "content", lambda found, _: found[:, 1:], r"expected float32 \[5 \d+\] on cpu"),
     ("decoder", "forward", lambda found, _: found + 5, r"colours: expected numbers in \[0, 1\]"),
-    ("semantic", "forward", lambda found, _: found[:3], r"expected float32 \[5 8\] on cpu, found float32 \[3 8\]"),
+    (
+        "semantic",
+        "forward",
+        lambda found, _: found[:3],
+        r"expected float32 \[5 8\] on cpu, found float32 \[3 8\]",
+    ),
     ("sampler", "forward", lambda found, _: found._replace(t=found.t.flip(1)), "not decreasing along a ray"),
 ]
 """A part, its method, what comes instead of what it returned for its first argument, and what is told."""
@@ -100,16 +117,25 @@ BREACHES: list[tuple[str, str, Callable[[Any, Any], Any], str]] = [
 
 @pytest.mark.parametrize(("part", "method", "change", "told"), BREACHES)
 def test_a_part_that_breaks_its_contract_is_named(
-    world: World, monkeypatch: pytest.MonkeyPatch, part: str, method: str, change: Callable[[Any, Any], Any], told: str
+    world: World,
+    monkeypatch: pytest.MonkeyPatch,
+    part: str,
+    method: str,
+    change: Callable[[Any, Any], Any],
+    told: str,
 ) -> None:
     facts = world.prepared.facts
     parts = build_model(world.config, facts).parts
     check_parts(world.config, parts, facts.channels, facts.dim)
     module = getattr(parts, part)
     real = getattr(module, method)
-    monkeypatch.setattr(module, method, lambda first, *rest, **named: change(real(first, *rest, **named), first))
+    monkeypatch.setattr(
+        module, method, lambda first, *rest, **named: change(real(first, *rest, **named), first)
+    )
     group = {"field": "fields", "semantic": "fields"}.get(part, f"{part}s")
-    with pytest.raises(PluginError, match=rf"fprf\.{group}: '.*' \(fprf\..*from fprf .*\): .*{told}") as caught:
+    with pytest.raises(
+        PluginError, match=rf"fprf\.{group}: '.*' \(fprf\..*from fprf .*\): .*{told}"
+    ) as caught:
         check_parts(world.config, parts, facts.channels, facts.dim)
     assert "\n" not in str(caught.value)
 
@@ -134,7 +160,9 @@ class Mine(Stylizer):
         return content / 0 if self.wrong == "inf" else content
 
     def match(self, semantic: Tensor) -> Tensor:
-        return torch.ones(len(semantic), 1 if self.wrong == "codes" else 4) / (1 if self.wrong == "sum" else 4)
+        return torch.ones(len(semantic), 1 if self.wrong == "codes" else 4) / (
+            1 if self.wrong == "sum" else 4
+        )
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,5 @@
-"""Faults 1 to 4, 6, 7, 12, 14 and 17: kills, a save that dies anywhere, full disks and folders that cannot be written to, files
-gone bad, images that are gone, signals from outside, places and names of all kinds.
+"""Faults 1 to 4, 6, 7, 12, 14 and 17: kills, a save that dies anywhere, full disks and folders that cannot be
+written to, files gone bad, images that are gone, signals from outside, places and names of all kinds.
 """
 
 import json
@@ -84,8 +84,12 @@ def marked(root: Path, model: Model) -> tuple[int, float]:
     return saved.step, float(model.learned()[0].detach().view(-1)[0])
 
 
-def test_a_save_that_dies_at_any_call_leaves_the_old_or_the_new(root: Path, trainer: Trainer, monkeypatch) -> None:
-    """Every call to the system that Python makes for it, in turn; what was left is tidied and the next save works."""
+def test_a_save_that_dies_at_any_call_leaves_the_old_or_the_new(
+    root: Path, trainer: Trainer, monkeypatch
+) -> None:
+    """Every call to the system that Python makes for it, in turn; what was left is tidied and the next save
+    works.
+    """
     model, optimizer = trainer
     seen = []
     for at in range(500):
@@ -113,10 +117,14 @@ def test_a_save_that_dies_at_any_call_leaves_the_old_or_the_new(root: Path, trai
             mark(model, step)
             save_checkpoint(root, model, optimizer, step=step, seconds=step / 2)
     assert code == 0 and checkpoint.steps(root) == [9, 12]
-    assert seen == sorted(seen) and seen.count(9) > 8 and seen.count(12) > 2, "kills before and after the manifest"
+    assert seen == sorted(seen) and seen.count(9) > 8 and seen.count(12) > 2, (
+        "kills before and after the manifest"
+    )
 
 
-def test_a_file_that_the_system_cuts_off_is_one_line_and_costs_nothing(root: Path, trainer: Trainer, tmp_path: Path) -> None:
+def test_a_file_that_the_system_cuts_off_is_one_line_and_costs_nothing(
+    root: Path, trainer: Trainer, tmp_path: Path
+) -> None:
     """As on a full disk, by a limit to the size of files: safetensors' own writes fail."""
     model, optimizer = trainer
 
@@ -132,7 +140,9 @@ def test_a_file_that_the_system_cuts_off_is_one_line_and_costs_nothing(root: Pat
     assert forked(save) == 0
     os.close(handle)
     line = told.read_text()
-    assert "model.safetensors: cannot be written (" in line and "KiB are needed, " in line and "\n" not in line
+    assert (
+        "model.safetensors: cannot be written (" in line and "KiB are needed, " in line and "\n" not in line
+    )
     assert checkpoint.steps(root) == [5, 9] and marked(root, model) == (9, 9.0)
     assert sorted(p.name for p in root.iterdir()) == ["step-0000005", "step-0000009"]
 
@@ -225,18 +235,32 @@ print("latest", checkpoint.load_latest(folder / "run" / "checkpoints")[0] is not
 
 
 @pytest.mark.fault
-@pytest.mark.parametrize(("size", "reason"), [("300k", "No space left on device"), ("8m", "Read-only file system")])
+@pytest.mark.parametrize(
+    ("size", "reason"), [("300k", "No space left on device"), ("8m", "Read-only file system")]
+)
 def test_a_disk_that_is_full_or_read_only(world: World, tmp_path: Path, size: str, reason: str) -> None:
-    """A real one, in a name space of its own: 300 KiB hold a checkpoint and no more; 8 MiB are mounted read-only."""
+    """A real one, in a name space of its own: 300 KiB hold a checkpoint and no more; 8 MiB are mounted
+    read-only.
+    """
     if subprocess.run(["unshare", "-m", "true"], capture_output=True).returncode:
         pytest.skip("may not mount here")
     (tmp_path / "disk").mkdir()
     shutil.copytree(world.town, tmp_path / "town")
     project = Path(__file__).parents[2]
-    words = [sys.executable, "-c", MOUNTED, str(tmp_path / "disk"), str(tmp_path / "town"), size, str(project)]
+    words = [
+        sys.executable,
+        "-c",
+        MOUNTED,
+        str(tmp_path / "disk"),
+        str(tmp_path / "town"),
+        size,
+        str(project),
+    ]
     done = subprocess.run(["unshare", "-m", *words], capture_output=True, text=True, timeout=240)
     errors = [line for line in done.stderr.splitlines() if not line.startswith("{")]
-    assert len(errors) == 1 and errors[0].startswith("error: ") and f"cannot be written ({reason}" in errors[0], done.stderr
+    assert (
+        len(errors) == 1 and errors[0].startswith("error: ") and f"cannot be written ({reason}" in errors[0]
+    ), done.stderr
     assert done.stdout.startswith("2 ")
     if size == "8m":
         assert "2 []" in done.stdout and "checkpoint" not in errors[0], "before any work"
@@ -247,9 +271,22 @@ def test_a_disk_that_is_full_or_read_only(world: World, tmp_path: Path, size: st
 @pytest.mark.fault
 def test_kills_at_random_moments_leave_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a process of its own: threads of this one would not survive a fork."""
-    words = ["-m", "benchmarks", "kills", "--kills", "5", "--steps", "25", "--output", str(tmp_path / "kills.json")]
-    here, environment = Path(__file__).parents[2], os.environ | {"TMPDIR": str(tmp_path)}
-    subprocess.run([sys.executable, *words], check=True, cwd=here, timeout=280, env=environment, capture_output=True)
+    words = [
+        "-m",
+        "benchmarks",
+        "kills",
+        "--kills",
+        "5",
+        "--steps",
+        "25",
+        "--output",
+        str(tmp_path / "kills.json"),
+    ]
+    here = Path(__file__).parents[2]
+    environment = os.environ | {"TMPDIR": str(tmp_path)}
+    subprocess.run(
+        [sys.executable, *words], check=True, cwd=here, timeout=280, env=environment, capture_output=True
+    )
     found = json.loads((tmp_path / "kills.json").read_text())
     assert found["kills"] >= 5 and found["bitwise_equal"] == found["runs"] > 0
     assert not found["unfinished_files_left"] and not found["other_failures"]
@@ -293,7 +330,16 @@ def test_an_image_that_is_another_at_the_second_start_is_named(
 @pytest.mark.fault
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_from_outside_saves_and_ends_with_130(world: World, tmp_path: Path, number: int) -> None:
-    words = [sys.executable, "-m", "fprf", "train", "fprf-lite", *flags(world, tmp_path / "run"), "--steps", "100000"]
+    words = [
+        sys.executable,
+        "-m",
+        "fprf",
+        "train",
+        "fprf-lite",
+        *flags(world, tmp_path / "run"),
+        "--steps",
+        "100000",
+    ]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         end = time.monotonic() + 200
@@ -312,14 +358,24 @@ def test_a_signal_from_outside_saves_and_ends_with_130(world: World, tmp_path: P
 
 @pytest.mark.fault
 def test_places_names_clocks_and_languages_of_all_kinds(world: World, tmp_path: Path) -> None:
-    """A folder of spaces, other scripts and 200 letters; the C locale, another time zone, no HOME, no terminal."""
+    """A folder of spaces, other scripts and 200 letters; the C locale, another time zone, no HOME, no
+    terminal.
+    """
     place = tmp_path / "with space" / "ünïcode 場面 'quotes'" / ("x" * 200)
     place.mkdir(parents=True)
     shutil.copytree(world.town, place / "town")
     args = [*flags(world, place / "run"), "--data", str(place / "town")]
     environment = {k: v for k, v in os.environ.items() if k not in ("HOME", "LANG", "TERM")}
-    environment |= {"LC_ALL": "C", "TZ": "Pacific/Kiritimati", "PYTHONUTF8": "0", "XDG_CACHE_HOME": str(place / "cache")}
-    done = subprocess.run([sys.executable, "-m", "fprf", "train", "fprf-lite", *args], env=environment, capture_output=True)
+    environment |= {
+        "LC_ALL": "C",
+        "TZ": "Pacific/Kiritimati",
+        "PYTHONUTF8": "0",
+        "XDG_CACHE_HOME": str(place / "cache"),
+    }
+    done = subprocess.run(
+        [sys.executable, "-m", "fprf", "train", "fprf-lite", *args], env=environment, capture_output=True
+    )
     assert done.returncode == 0, done.stderr.decode(errors="replace")
-    here, there = parameters(Run(place / "run"), 15), parameters(Run(world.run), 15)
+    here = parameters(Run(place / "run"), 15)
+    there = parameters(Run(world.run), 15)
     assert all(torch.equal(here[name], there[name]) for name in there)

@@ -14,7 +14,9 @@ from tiny_world import World, flags
 from fprf.cli import main as cli
 from fprf.training import checkpoint
 
-pytestmark = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="sizes of processes are read from /proc")
+pytestmark = pytest.mark.skipif(
+    not Path("/proc/self/statm").exists(), reason="sizes of processes are read from /proc"
+)
 BEGIN = """
 import json, re, resource, sys
 from dataclasses import replace
@@ -96,7 +98,9 @@ raise SystemExit(cli.main(["train", "fprf-lite", *sys.argv[1:]]))
 def python(text: str, *args: object) -> subprocess.CompletedProcess[str]:
     words = [sys.executable, "-c", BEGIN + text, *map(str, args)]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "1"}
-    environment["MALLOC_MMAP_THRESHOLD_"] = "65536"  # freed memory goes back: no room lost in pieces of the heap
+    environment["MALLOC_MMAP_THRESHOLD_"] = (
+        "65536"  # freed memory goes back: no room lost in pieces of the heap
+    )
     return subprocess.run(words, capture_output=True, text=True, timeout=250, env=environment)
 
 
@@ -109,8 +113,13 @@ def test_renders_with_too_little_memory_for_their_chunk_are_the_same(world: Worl
 
 
 @pytest.mark.fault
-def test_training_with_too_little_memory_ends_in_one_line_and_keeps_its_checkpoint(world: World, tmp_path: Path) -> None:
-    args = [*flags(world, tmp_path / "run"), *["--datamanager.rays", "20000", "--steps", "6", "--checkpoint-minutes", "1e-9"]]
+def test_training_with_too_little_memory_ends_in_one_line_and_keeps_its_checkpoint(
+    world: World, tmp_path: Path
+) -> None:
+    args = [
+        *flags(world, tmp_path / "run"),
+        *["--datamanager.rays", "20000", "--steps", "6", "--checkpoint-minutes", "1e-9"],
+    ]
     done = python(TRAIN, *args)
     assert done.returncode == 2, done.stderr
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]

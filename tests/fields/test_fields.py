@@ -70,7 +70,8 @@ def quadrature() -> tuple[Tensor, Tensor]:
     z, weight = np.polynomial.legendre.leggauss(8)
     angle = 2 * math.pi * (np.arange(16) + 0.5) / 16
     radius = np.sqrt(1 - z * z)
-    x, y = radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)
+    x = radius[:, None] * np.cos(angle)
+    y = radius[:, None] * np.sin(angle)
     view = np.stack([x, y, np.broadcast_to(z[:, None], x.shape)], -1).reshape(-1, 3)
     return torch.from_numpy(view), torch.from_numpy(np.repeat(weight, 16) * 2 * math.pi / 16)
 

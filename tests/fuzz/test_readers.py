@@ -1,7 +1,7 @@
 """Every reader on mutated files: a value, or one line; none runs what it reads.
 
-`FPRF_FUZZ=100000 pytest tests/fuzz -m fault` for a night. corpus.zip holds what a search guided by coverage found
-(`benchmarks/fuzz_guided.py`): files that reach far into each reader.
+`FPRF_FUZZ=100000 pytest tests/fuzz -m fault` for a night. corpus.zip holds what a search guided by coverage
+found (`benchmarks/fuzz_guided.py`): files that reach far into each reader.
 """
 
 import os
@@ -41,7 +41,10 @@ NAMES = [
     "camera of Polycam",
     "metadata of Record3D",
     *(f"{kind} of ODM" for kind in ("reconstruction", "shots", "cameras")),
-    *(f"Gaussians, {name}" for name in ("x.ply", "x.compressed.ply", "x.splat", "x.spz", "x.sog", "meta.json")),
+    *(
+        f"Gaussians, {name}"
+        for name in ("x.ply", "x.compressed.ply", "x.splat", "x.spz", "x.sog", "meta.json")
+    ),
 ]
 LATER = [f"Gaussians, {name}" for name in ("x.glb", "x.gltf", "ascii.ply", "x.ksplat", "lod-meta.json")]
 """Readers that the corpus does not have."""
@@ -64,7 +67,8 @@ def test_mutations_are_read_or_refused_in_one_line(made: dict[str, Target], name
 def test_many_mutations(made: dict[str, Target], name: str) -> None:
     rounds = int(os.environ.get("FPRF_FUZZ", "2000"))
     found = fuzz(made[name], rounds, seed=random.SystemRandom().randrange(2**31), watch_memory=True)
-    # Images may have as many pixels as they say: four channels as they lie in the file, and once more as they are shown.
+    # Images may have as many pixels as they say: four channels as they lie in the file, and once more as they
+    # are shown.
     most = 8 * MAX_PIXELS if name.startswith("image, ") else 64 << 20
     assert not found.faults and found.memory < most
 
@@ -72,7 +76,9 @@ def test_many_mutations(made: dict[str, Target], name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_files_of_the_corpus_are_read_or_refused(made: dict[str, Target], name: str) -> None:
     target = made[name]
-    valid, values, refusals = target.file.read_bytes(), 0, 0
+    valid = target.file.read_bytes()
+    values = 0
+    refusals = 0
     with zipfile.ZipFile(CORPUS) as archive:
         for entry in archive.namelist():
             if entry.startswith(f"{name}/"):
@@ -133,10 +139,14 @@ def test_no_reader_runs_what_it_reads(tmp_path: Path, canary: Path) -> None:
 
 def test_the_code_has_no_way_to_run_what_it_reads() -> None:
     """No unpickling but of tensors, no evaluation of texts, no shell."""
-    bare = re.compile(r"pickle\.loads?\(|allow_pickle=True|shell=True|yaml\.load|\beval\(|\bexec\(|os\.system\(")
+    bare = re.compile(
+        r"pickle\.loads?\(|allow_pickle=True|shell=True|yaml\.load|\beval\(|\bexec\(|os\.system\("
+    )
     for path in Path(fprf.__file__).parent.rglob("*.py"):
         text = path.read_text()
-        code = "\n".join(line for line in text.splitlines() if ".eval()" not in line and "torch.jit" not in line)
+        code = "\n".join(
+            line for line in text.splitlines() if ".eval()" not in line and "torch.jit" not in line
+        )
         assert not bare.search(code), path
         for call in re.findall(r"torch\.load\([^)]*\)", text):
             assert "weights_only=True" in call, path

@@ -56,7 +56,9 @@ def test_whatever_the_system_refuses_is_one_line(tmp_path: Path, monkeypatch: py
         write_text(tmp_path / ("x" * 300), "new")
     for named in (True, False):  # PyAV names no file
         with pytest.raises(DataError, match=r"cannot be written"), atomic_path(final) as temporary:
-            raise FileNotFoundError(errno.ENOENT, "No such file or directory", str(temporary) if named else None)
+            raise FileNotFoundError(
+                errno.ENOENT, "No such file or directory", str(temporary) if named else None
+            )
     (tmp_path / ".m.0badf00d.json").touch()
     monkeypatch.setattr(os, "unlink", refuse)
     with pytest.raises(DataError, match=r"cannot be written \(Invalid argument"):
@@ -65,7 +67,9 @@ def test_whatever_the_system_refuses_is_one_line(tmp_path: Path, monkeypatch: py
         raise ValueError("x")
 
 
-@pytest.mark.parametrize("failure", [FileNotFoundError(errno.ENOENT, "", "photo.jpg"), BrokenPipeError(errno.EPIPE, "")])
+@pytest.mark.parametrize(
+    "failure", [FileNotFoundError(errno.ENOENT, "", "photo.jpg"), BrokenPipeError(errno.EPIPE, "")]
+)
 def test_what_the_block_meets_elsewhere_is_passed_on(tmp_path: Path, failure: OSError) -> None:
     with pytest.raises(type(failure)), atomic_path(tmp_path / "film.mp4"):
         raise failure
@@ -91,7 +95,15 @@ def test_unfinished_files_and_no_others_are_removed(tmp_path: Path) -> None:
     folder = tmp_path / "folder.0badf00d"
     for name in (".model.0123abcd.safetensors", ".tmpA1b2C3", ".events.89abcdef"):
         (tmp_path / name).touch()
-    kept = {".lock", ".hidden", "model.safetensors", ".tmp", ".model.safetensors", "model.0123abcd.json", folder.name}
+    kept = {
+        ".lock",
+        ".hidden",
+        "model.safetensors",
+        ".tmp",
+        ".model.safetensors",
+        "model.0123abcd.json",
+        folder.name,
+    }
     for name in kept - {folder.name}:
         (tmp_path / name).touch()
     folder.mkdir()
@@ -102,7 +114,8 @@ def test_unfinished_files_and_no_others_are_removed(tmp_path: Path) -> None:
 
 def test_data_is_on_disk_before_the_name_moves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[str] = []
-    fsync, replace = os.fsync, os.replace
+    fsync = os.fsync
+    replace = os.replace
     monkeypatch.setattr(os, "fsync", lambda handle: (calls.append("fsync"), fsync(handle))[1])
     monkeypatch.setattr(os, "replace", lambda a, b: (calls.append("replace"), replace(a, b))[1])
     write_bytes(tmp_path / "x", b"1")

@@ -19,7 +19,9 @@ from fprf.io.video import missing_frames, write_video
 
 def ramp(height: int = 40, width: int = 60) -> np.ndarray:
     y, x = np.mgrid[:height, :width]
-    return np.stack([x * 255 // max(1, width - 1), y * 255 // max(1, height - 1), x * 0 + 40], -1).astype(np.uint8)
+    return np.stack([x * 255 // max(1, width - 1), y * 255 // max(1, height - 1), x * 0 + 40], -1).astype(
+        np.uint8
+    )
 
 
 def read(path: Path) -> np.ndarray:
@@ -44,7 +46,12 @@ def test_png_is_exact_and_the_others_are_close(tmp_path: Path) -> None:
 def test_other_endings_and_other_arrays_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError):
         write_image(tmp_path / "a.tiff", ramp())
-    for wrong in (ramp().astype(np.float32), ramp()[..., 0], np.zeros((0, 4, 3), np.uint8), np.zeros((4, 4, 4), np.uint8)):
+    for wrong in (
+        ramp().astype(np.float32),
+        ramp()[..., 0],
+        np.zeros((0, 4, 3), np.uint8),
+        np.zeros((4, 4, 4), np.uint8),
+    ):
         with pytest.raises(DataError):
             encode(wrong, "png")
     with pytest.raises(DataError, match="use png"):
@@ -142,10 +149,16 @@ def test_missing_frames_are_those_not_there(tmp_path: Path) -> None:
     paths[1].write_bytes(b"x")
     (tmp_path / "mine.txt").write_text("stays")
     assert missing_frames(tmp_path, "a", paths) == [paths[0], paths[2]]
-    assert missing_frames(tmp_path, "b", paths) == paths and not paths[1].exists() and (tmp_path / "mine.txt").is_file()
+    assert (
+        missing_frames(tmp_path, "b", paths) == paths
+        and not paths[1].exists()
+        and (tmp_path / "mine.txt").is_file()
+    )
     for path in paths:
         path.write_bytes(b"x")
-    assert missing_frames(tmp_path, "c", paths[:1]) == paths[:1] and not paths[2].exists(), "frames of a longer film"
+    assert missing_frames(tmp_path, "c", paths[:1]) == paths[:1] and not paths[2].exists(), (
+        "frames of a longer film"
+    )
     for damaged in ("damaged", '{"key": "a", "frames": ["", "..", "."]}'):
         (tmp_path / ".render.json").write_text(damaged)
         assert missing_frames(tmp_path, "b", paths) == paths
@@ -160,7 +173,8 @@ def plain(height: int, width: int) -> Iterator[np.ndarray]:
 
 
 def frames_of(path: Path) -> tuple[list[np.ndarray], float]:
-    film, found = cv2.VideoCapture(str(path)), []
+    film = cv2.VideoCapture(str(path))
+    found = []
     while (read := film.read())[0]:
         found.append(cv2.cvtColor(read[1], cv2.COLOR_BGR2RGB))
     return found, film.get(cv2.CAP_PROP_FPS)

@@ -10,7 +10,8 @@ from fprf.ops.backend import float32_convolutions, tf32
 
 
 def test_plain_forms_alone_within_the_block() -> None:
-    x, table = torch.zeros(4, 3), torch.zeros(12, 8)
+    x = torch.zeros(4, 3)
+    table = torch.zeros(12, 8)
     with torch.no_grad():
         for _ in range(2):
             assert backend.compiled() and dense.usable(x) and triplane.usable(x, table)

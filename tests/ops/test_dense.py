@@ -22,7 +22,9 @@ def draw(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def layers_of(sizes: Sequence[int], seed: int = 0, biased: bool = True) -> tuple[list[Tensor], list[Tensor | None]]:
+def layers_of(
+    sizes: Sequence[int], seed: int = 0, biased: bool = True
+) -> tuple[list[Tensor], list[Tensor | None]]:
     weights = [draw(o, i, seed=seed + k) / i**0.5 for k, (i, o) in enumerate(itertools.pairwise(sizes))]
     biases = [draw(o, seed=seed + 50 + k) if biased else None for k, o in enumerate(sizes[1:])]
     return weights, biases
@@ -35,7 +37,9 @@ def oracle(
     shared: Tensor | None = None,
     row: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Values in fp64 and a bound of the error: (I + 3) u of each layer's magnitudes, carried through the next ones."""
+    """Values in fp64 and a bound of the error: (I + 3) u of each layer's magnitudes, carried through the next
+    ones.
+    """
     value = x.double() if shared is None else torch.cat([x, shared[row]], 1).double()
     error = torch.zeros_like(value)
     for k, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
@@ -44,7 +48,8 @@ def oracle(
         error = error @ weight.double().abs().T
         value = value @ weight.double().T
         if bias is not None:
-            value, size = value + bias.double(), size + bias.double().abs()
+            value = value + bias.double()
+            size = size + bias.double().abs()
         error = error + (weight.shape[1] + 3) * U * size
     return value, error
 
@@ -55,7 +60,12 @@ def check(found: Tensor, value: Tensor, bound: Tensor) -> None:
 
 
 @QUICK
-@given(st.lists(st.integers(1, 70), min_size=2, max_size=4), st.integers(1, 60), st.booleans(), st.integers(0, 99))
+@given(
+    st.lists(st.integers(1, 70), min_size=2, max_size=4),
+    st.integers(1, 60),
+    st.booleans(),
+    st.integers(0, 99),
+)
 @example([64, 200, 17], 101, True, 0)
 @example([80, 64, 48], 101, True, 0)
 @example([1, 1, 1, 1], 101, True, 0)
@@ -72,7 +82,8 @@ def test_both_forms_stay_within_the_bound(sizes: list[int], count: int, biased: 
 @pytest.mark.parametrize("hidden", [16, 21])
 def test_some_inputs_are_shared_by_several_points(hidden: int) -> None:
     weights, biases = layers_of((15, hidden, 5))
-    x, shared = draw(130, 12), draw(9, 3, seed=3)
+    x = draw(130, 12)
+    shared = draw(9, 3, seed=3)
     row = torch.randint(9, (130,), generator=torch.Generator().manual_seed(1))
     value, bound = oracle(x, weights, biases, shared, row)
     for form in (network, backend.plain()(network)):
@@ -83,7 +94,8 @@ def test_some_inputs_are_shared_by_several_points(hidden: int) -> None:
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread only: nothing to compare")
 def test_one_thread_and_two_give_the_same_bits() -> None:
     weights, biases = layers_of((24, 40, 7))
-    x, results = draw(5000, 24), []
+    x = draw(5000, 24)
+    results = []
     for count in (1, 2):
         numba.set_num_threads(count)
         results.append(network(x, weights, biases))

@@ -22,23 +22,30 @@ def oracle(features: Tensor, guide: Tensor, radius: int, eps: float) -> Tensor:
     guide = guide.double()
 
     def windows(row: int, column: int) -> tuple[slice, slice]:
-        return (slice(max(row - radius, 0), row + radius + 1), slice(max(column - radius, 0), column + radius + 1))
+        return (
+            slice(max(row - radius, 0), row + radius + 1),
+            slice(max(column - radius, 0), column + radius + 1),
+        )
 
     slope = torch.empty(*size, 3, p.shape[-1], dtype=torch.float64)
     offset = torch.empty(*size, p.shape[-1], dtype=torch.float64)
     for row in range(size[0]):
         for column in range(size[1]):
             window = windows(row, column)
-            colours, values = guide[window].flatten(0, 1), p[window].flatten(0, 1)
+            colours = guide[window].flatten(0, 1)
+            values = p[window].flatten(0, 1)
             centred = colours - colours.mean(0)
             left = centred.T @ centred / len(centred) + eps * torch.eye(3, dtype=torch.float64)
-            slope[row, column] = torch.linalg.solve(left, centred.T @ (values - values.mean(0)) / len(centred))
+            slope[row, column] = torch.linalg.solve(
+                left, centred.T @ (values - values.mean(0)) / len(centred)
+            )
             offset[row, column] = values.mean(0) - colours.mean(0) @ slope[row, column]
     result = torch.empty_like(p)
     for row in range(size[0]):
         for column in range(size[1]):
             window = windows(row, column)
-            a, b = slope[window].flatten(0, 1).mean(0), offset[window].flatten(0, 1).mean(0)
+            a = slope[window].flatten(0, 1).mean(0)
+            b = offset[window].flatten(0, 1).mean(0)
             result[row, column] = guide[row, column] @ a + b
     return result
 
@@ -50,8 +57,10 @@ def exact(features: Tensor, guide: Tensor, radius: int, eps: float) -> Tensor:
 
 
 def bound(features: Tensor, eps: float) -> float:
-    """A covariance is wrong by some units of round-off of |I||p| (|I| <= 1 once centred); the ridge turns that into at
-    most its 1 / (2 sqrt(eps)) per colour. Matrix products of n terms grow as sqrt(n) at most 32 here."""
+    """A covariance is wrong by some units of round-off of |I||p| (|I| <= 1 once centred); the ridge turns
+    that into at most its 1 / (2 sqrt(eps)) per colour. Matrix products of n terms grow as sqrt(n) at most 32
+    here.
+    """
     spread = (features - features.mean((1, 2), keepdim=True)).abs().max().item()
     return 32 * UNIT * (features.abs().max().item() + spread * (1 + 3 / (2 * math.sqrt(eps))))
 
@@ -68,7 +77,8 @@ def photo(height: int, width: int, seed: int = 0) -> Tensor:
 @pytest.mark.parametrize("eps", [1e-6, 1e-3, 1.0])
 @pytest.mark.parametrize("shape", [(4, 5), (14, 19), (30, 40), (1, 1)])
 def test_agrees_with_the_plain_loop(shape: tuple[int, int], eps: float) -> None:
-    guide, features = photo(14, 19), torch.randn(3, *shape)
+    guide = photo(14, 19)
+    features = torch.randn(3, *shape)
     found = exact(features, guide, 3, eps)
     assert (found - oracle(features, guide, 3, eps)).abs().max() <= bound(features, eps)
 
@@ -95,14 +105,17 @@ def test_constants_pass_whatever_the_sizes(
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 9999), views=st.integers(1, 4), channels=st.integers(1, 11))
 def test_packed_views_answer_what_each_one_says(seed: int, views: int, channels: int) -> None:
-    """Against `apply` in float64 for the very halves that are stored; also at borders and in a grid of one cell."""
+    """Against `apply` in float64 for the very halves that are stored; also at borders and in a grid of one
+    cell.
+    """
     draw = torch.Generator().manual_seed(seed)
     cells = torch.randint(1, 7, (views, 2), generator=draw)
     size = cells * 5 + torch.randint(0, 5, (views, 2), generator=draw)
     padded = channels + 3
     parts = [torch.randn(int(n), 4, padded, generator=draw).half() for n in cells.prod(1)]
     ends = cells.prod(1).cumsum(0)
-    scale, centre = torch.rand(views, channels, generator=draw) + 0.1, 10 * torch.randn(views, channels, generator=draw)
+    scale = torch.rand(views, channels, generator=draw) + 0.1
+    centre = 10 * torch.randn(views, channels, generator=draw)
     packed = guided.Packed(torch.cat(parts), ends - cells.prod(1), cells, size, scale, centre)
     view = torch.randint(views, (50,), generator=draw)
     pixel = (1.4 * torch.rand(50, 2, generator=draw) - 0.2) * size[view].flip(1)
@@ -132,11 +145,14 @@ def error(features: Tensor, guide: Tensor, radius: int, stride: int) -> float:
 def test_cheap_is_close_to_exact() -> None:
     guide = photo(120, 160)
     assert error(torch.randn(6, 15, 20), guide, 15, 4) <= 0.02
-    # White noise at twice the pixel's size is all but averaged away, so what is left to compare with is small.
+    # White noise at twice the pixel's size is all but averaged away, so what is left to compare with is
+    # small.
     assert error(torch.randn(6, 60, 80), guide, 15, 4) <= 0.03
 
 
-@pytest.mark.parametrize("shapes", [((2, 2), (4, 4, 3)), ((1, 2, 2), (4, 4)), ((1, 0, 2), (4, 4, 3)), ((1, 2, 2), (4, 4, 1))])
+@pytest.mark.parametrize(
+    "shapes", [((2, 2), (4, 4, 3)), ((1, 2, 2), (4, 4)), ((1, 0, 2), (4, 4, 3)), ((1, 2, 2), (4, 4, 1))]
+)
 def test_shapes_that_do_not_fit_are_named(shapes: tuple[tuple[int, ...], tuple[int, ...]]) -> None:
     with pytest.raises(DataError, match="guided filter: features"):
         guided.coefficients(torch.zeros(shapes[0]), torch.zeros(shapes[1]), radius=1, eps=1e-3, stride=1)

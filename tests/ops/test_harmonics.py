@@ -30,7 +30,9 @@ def double(directions: Directions) -> Directions:
 @pytest.mark.parametrize("bands", [1, 4, 9, 16, 25])
 @pytest.mark.parametrize("count", [0, 1, 1300])
 def test_maps_stay_within_the_bound(bands: int, count: int) -> None:
-    """Each number is a sum of 48 products (fitted again) and one of 4, of numbers that the largest input bounds."""
+    """Each number is a sum of 48 products (fitted again) and one of 4, of numbers that the largest input
+    bounds.
+    """
     harmonics, change, weight = inputs(count, bands)
     directions = all_around(bands)
     exact = recoloured(harmonics.double(), change.double(), weight.double(), double(directions))
@@ -59,11 +61,18 @@ def test_harmonics_become_those_of_colours_as_they_are_drawn() -> None:
     made[0, 0], made[0, 2] = 1.0, 0.2  # nowhere below 0
     made[1, 0] = -5.0  # black from everywhere
     made[2, 2] = 3.0  # below 0 on one side
-    around = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(2)), dim=1)
+    around = torch.nn.functional.normalize(
+        torch.randn(500, 3, generator=torch.Generator().manual_seed(2)), dim=1
+    )
     cut = (0.5 + torch.einsum("db,bc->dc", functions(around, 2), made[2])).clamp_min(0)
     nothing = torch.zeros(3, 4, 3), torch.ones(3), all_around(4)
     for out in (as_drawn(made, all_around(4)), recoloured(made, *nothing)):
         assert torch.allclose(out[0], made[0], atol=1e-6)
-        assert torch.allclose(0.5 + HARMONIC * out[1, 0], torch.zeros(3), atol=1e-5) and out[1, 1:].abs().max() < 1e-5
-        fitted, plain = (0.5 + torch.einsum("db,bc->dc", functions(around, 2), each) for each in (out[2], made[2]))
+        assert (
+            torch.allclose(0.5 + HARMONIC * out[1, 0], torch.zeros(3), atol=1e-5)
+            and out[1, 1:].abs().max() < 1e-5
+        )
+        fitted, plain = (
+            0.5 + torch.einsum("db,bc->dc", functions(around, 2), each) for each in (out[2], made[2])
+        )
         assert (fitted - cut).square().mean() < 0.4 * (plain - cut).square().mean()

@@ -1,8 +1,8 @@
-"""Mathematical functions of ops, style and rendering: no rows, one, an odd number, as many as in production; float32
-against float64 in values and gradients; nothing written to its inputs, nor beside its arrays.
+"""Mathematical functions of ops, style and rendering: no rows, one, an odd number, as many as in production;
+float32 against float64 in values and gradients; nothing written to its inputs, nor beside its arrays.
 
-A case makes its inputs in float64 from a number of rows; a function that works on one matrix has a number of rows that is
-its side.
+A case makes its inputs in float64 from a number of rows; a function that works on one matrix has a number of
+rows that is its side.
 """
 
 import os
@@ -41,11 +41,15 @@ class Case(NamedTuple):
 
 
 def _draw(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed + 7919 * sum(shape)))
+    return torch.randn(
+        shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed + 7919 * sum(shape))
+    )
 
 
 def _unit(*shape: int, seed: int = 1) -> Tensor:
-    return torch.rand(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed + 7919 * sum(shape)))
+    return torch.rand(
+        shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed + 7919 * sum(shape))
+    )
 
 
 def _edges(rays: int, steps: int, seed: int = 2) -> Tensor:
@@ -252,7 +256,9 @@ def test_gradients_are_those_of_float64(case: Case, n: int) -> None:
         for k in case.slopes:
             given[k] = given[k].detach().requires_grad_(True)
         out = [x for x in outputs(case.call(*given)) if x.requires_grad]
-        draws = [torch.rand(x.shape, generator=torch.Generator().manual_seed(k)) - 0.3 for k, x in enumerate(out)]
+        draws = [
+            torch.rand(x.shape, generator=torch.Generator().manual_seed(k)) - 0.3 for k, x in enumerate(out)
+        ]
         torch.autograd.backward([(x * w.to(dtype)).sum() for x, w in zip(out, draws, strict=True)])
         slopes.append([given[k].grad for k in case.slopes])
     for a, b in zip(*slopes, strict=True):
@@ -261,7 +267,8 @@ def test_gradients_are_those_of_float64(case: Case, n: int) -> None:
         if not b.numel() or float(b.norm()) == 0:
             assert float(a.norm()) == 0
             continue
-        apart, size = a.double() - b, b.norm()
+        apart = a.double() - b
+        size = b.norm()
         assert float(apart.abs().max()) <= 1e-3 * float(b.abs().max())
         assert float(apart.norm()) <= 1e-4 * float(size)
         assert float((a.double() * b).sum() / (a.double().norm() * size)) >= 1 - 1e-7

@@ -17,9 +17,12 @@ def scaled(x):
 """
 
 
-def test_kernels_are_compiled_anew_when_another_file_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_are_compiled_anew_when_another_file_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A constant of another file is compiled in: under the same sources what is kept is taken."""
-    path, found = tmp_path / "kernel_of_a_test.py", []
+    path = tmp_path / "kernel_of_a_test.py"
+    found = []
     path.write_text(KERNEL)
     monkeypatch.syspath_prepend(tmp_path)
     module = importlib.import_module(path.stem)

@@ -1,4 +1,6 @@
-"""Tri-plane lookup and its slopes in points: fused and plain forms against fp64; gradients: `test_operator_table.py`."""
+"""Tri-plane lookup and its slopes in points: fused and plain forms against fp64; gradients:
+`test_operator_table.py`.
+"""
 
 import importlib.util
 import itertools
@@ -46,8 +48,13 @@ def device(request: pytest.FixtureRequest) -> torch.device:
 def test_both_forms_stay_within_the_bound(
     resolutions: tuple[int, ...], channels: int, smooth: bool, device: torch.device
 ) -> None:
-    table, points = table_of(resolutions, channels, smooth=smooth).to(device), (points_of(30) * 256).round().to(device) / 256
-    assert triton_usable(points, table) if device.type == "cuda" else usable(points, table) == (channels % 8 == 0)
+    table = table_of(resolutions, channels, smooth=smooth).to(device)
+    points = (points_of(30) * 256).round().to(device) / 256
+    assert (
+        triton_usable(points, table)
+        if device.type == "cuda"
+        else usable(points, table) == (channels % 8 == 0)
+    )
     value = lookup_reference(points.double(), table.double(), resolutions)
     for form in (lookup, lookup_reference):
         found = form(points, table, resolutions)
@@ -61,7 +68,9 @@ WILD = (float("nan"), float("inf"), -float("inf"), 1e30, -1e30, 1.0 + 2e-7, -1.0
 @pytest.mark.parametrize("channels", [5, 8, 16])
 @pytest.mark.parametrize("size", [2, 3, 182])
 def test_no_coordinate_leaves_the_table(channels: int, size: int, device: torch.device) -> None:
-    """The table lies between sentinels: forward never reads them, backward never writes them. NaN is the lower border."""
+    """The table lies between sentinels: forward never reads them, backward never writes them. NaN is the
+    lower border.
+    """
     points = torch.tensor(list(itertools.product(WILD, repeat=3)), device=device)
     total = rows((size,))
     padded = torch.full((total + 2 * size * size, channels), float("nan"), device=device)
@@ -89,7 +98,8 @@ def test_the_plain_form_differentiates(resolutions: tuple[int, ...]) -> None:
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread only: nothing to compare")
 def test_one_thread_and_two_give_the_same_bits() -> None:
     resolutions = (16, 64, 182)
-    table, points = table_of(resolutions, 24).requires_grad_(True), points_of(4001)
+    table = table_of(resolutions, 24).requires_grad_(True)
+    points = points_of(4001)
     results = []
     for count in (1, 2, 2):
         numba.set_num_threads(count)
@@ -101,7 +111,9 @@ def test_one_thread_and_two_give_the_same_bits() -> None:
 
 
 def points_in_cells(count: int, resolution: int, seed: int = 0) -> Tensor:
-    """Inside of cells, at a quarter, half or three quarters of them: exact in float32 where cells are a power of two."""
+    """Inside of cells, at a quarter, half or three quarters of them: exact in float32 where cells are a power
+    of two.
+    """
     draw = torch.Generator().manual_seed(seed)
     cell = torch.randint(resolution - 1, (count, 3), generator=draw)
     share = torch.randint(1, 4, (count, 3), generator=draw) / 4
@@ -120,8 +132,11 @@ def slopes(form: Form, points: Tensor, table: Tensor, resolutions: tuple[int, ..
 def test_slopes_of_points_are_those_of_the_plain_form(
     resolutions: tuple[int, ...], channels: int, count: int, device: torch.device
 ) -> None:
-    points, table = points_in_cells(count, resolutions[0]).to(device), table_of(resolutions, channels).to(device)
-    grad = torch.randn(count, len(resolutions) * channels, generator=torch.Generator().manual_seed(3)).to(device)
+    points = points_in_cells(count, resolutions[0]).to(device)
+    table = table_of(resolutions, channels).to(device)
+    grad = torch.randn(count, len(resolutions) * channels, generator=torch.Generator().manual_seed(3)).to(
+        device
+    )
     exact = slopes(lookup_reference, points.double(), table.double(), resolutions, grad.double())
     found = slopes(lookup, points, table, resolutions, grad)
     assert usable(points, table) or triton_usable(points, table)
@@ -134,7 +149,8 @@ def test_slopes_of_points_are_those_of_the_plain_form(
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_outside_the_border_holds(place: float, axis: int) -> None:
     """No slope along the axis that a point has left, and those of the border along the others."""
-    table, point = table_of((5,), 8), torch.tensor([[0.25, -0.375, 0.125]])
+    table = table_of((5,), 8)
+    point = torch.tensor([[0.25, -0.375, 0.125]])
     point[0, axis] = place
     inside = point.clone()
     inside[0, axis] = 1.0 if place > 0 else -1.0
@@ -161,8 +177,11 @@ def test_where_triton_cannot_compile_the_plain_form_runs(monkeypatch: pytest.Mon
     triplane._compiles.cache_clear()
     try:
         with pretend_cuda():
-            points, table = torch.zeros(3, 3).to(CUDA), torch.zeros(12, 8).to(CUDA)
-            with pytest.warns(UserWarning, match=r"cuda:0 \(RuntimeError: no C compiler\): tri-planes run in plain torch"):
+            points = torch.zeros(3, 3).to(CUDA)
+            table = torch.zeros(12, 8).to(CUDA)
+            with pytest.warns(
+                UserWarning, match=r"cuda:0 \(RuntimeError: no C compiler\): tri-planes run in plain torch"
+            ):
                 assert not triton_usable(points, table)
             assert not triton_usable(points, table) and tried == [CUDA]
     finally:

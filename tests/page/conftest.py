@@ -42,5 +42,7 @@ def session(run: Path, listener: Listener) -> Iterator[Session]:
 @pytest.fixture
 def splats(listener: Listener, tmp_path: Path) -> Iterator[Session]:
     """A session of a ball of Gaussians."""
-    with Session(Viewed(seen(ball(400, 2)), "ball", 1, tmp_path / "ball", pixels=64), listener.post) as opened:
+    with Session(
+        Viewed(seen(ball(400, 2)), "ball", 1, tmp_path / "ball", pixels=64), listener.post
+    ) as opened:
         yield opened

@@ -29,14 +29,21 @@ def street(count: int = 4000) -> Gaussians:
     harmonics = 0.1 * torch.randn(count, 9, 3, generator=draw)
     harmonics[:, 0] += 1.2 * torch.rand(count, 3, generator=draw) - 0.4
     return Gaussians(
-        around * far, torch.randn(count, 4, generator=draw), sizes, 2 * torch.randn(count, generator=draw), harmonics
+        around * far,
+        torch.randn(count, 4, generator=draw),
+        sizes,
+        2 * torch.randn(count, generator=draw),
+        harmonics,
     )
 
 
 def recoloured(gaussians: Gaussians) -> torch.Tensor:
     """Harmonics after two affine maps of colours, above and below."""
     maps = torch.tensor(
-        [[[0.2, 0.1, 0.6], [0.1, 0.2, 0.3], [0.5, 0.3, 0.2]], [[0.9, 0.0, 0.1], [0.2, 0.7, 0.0], [0.0, 0.1, 1.1]]]
+        [
+            [[0.2, 0.1, 0.6], [0.1, 0.2, 0.3], [0.5, 0.3, 0.2]],
+            [[0.9, 0.0, 0.1], [0.2, 0.7, 0.0], [0.0, 0.1, 1.1]],
+        ]
     )
     return torch.einsum("nkc,ncd->nkd", gaussians.harmonics, maps[(gaussians.means[:, 1] > 0).long()])
 

@@ -1,4 +1,6 @@
-"""The whole viewer: a process, a browser, real drops and clicks. Skipped where playwright or Chromium are not there."""
+"""The whole viewer: a process, a browser, real drops and clicks. Skipped where playwright or Chromium are not
+there.
+"""
 
 import base64
 import shutil
@@ -40,7 +42,16 @@ DROP = """([data, name]) => {
 @contextmanager
 def served(run: Path | None, *args: str) -> Iterator[str]:
     """`fprf view`, without a run its start page, on a free port: its address."""
-    command = [sys.executable, "-m", "fprf", "view", *([] if run is None else [str(run)]), "--port", "0", *args]
+    command = [
+        sys.executable,
+        "-m",
+        "fprf",
+        "view",
+        *([] if run is None else [str(run)]),
+        "--port",
+        "0",
+        *args,
+    ]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         try:
@@ -96,7 +107,9 @@ def test_a_field_is_restyled_compared_picked_and_filmed(run: Path, world: World)
         picked = state(page, "state.picked !== null")["picked"]
         assert sum(row["share"] for row in picked["taken"]) == pytest.approx(1, abs=1e-3)
         page.locator("#region button", has_text="keep as it is").click()
-        assert state(page, "state.picked.rules.length === 1")["picked"]["rules"] == [{"action": "keep", "card": None}]
+        assert state(page, "state.picked.rules.length === 1")["picked"]["rules"] == [
+            {"action": "keep", "card": None}
+        ]
         page.locator("#panel summary", has_text="Film").click()
         page.locator("#add-key").click()
         state(page, "state.keys.length === 1")
@@ -128,7 +141,8 @@ def test_gaussians_take_photographs_looks_are_kept_and_two_pages_agree(world: Wo
         before = page.evaluate("() => [...fprf.place.splats.colours.get('Now').rows.subarray(0, 400)]")
         page.locator("#map").select_option("regions")
         page.wait_for_function(
-            "(b) => fprf.place.splats.colours.get('Now').rows.subarray(0, 400).some((x, i) => x !== b[i])", arg=before
+            "(b) => fprf.place.splats.colours.get('Now').rows.subarray(0, 400).some((x, i) => x !== b[i])",
+            arg=before,
         )
         wrong = tmp_path / "wrong.png"
         wrong.write_bytes(b"not a photograph")
@@ -155,7 +169,9 @@ def test_a_page_keeps_up_with_its_server(world: World) -> None:
             page.evaluate("() => { fprf.place.splats.worker.postMessage = () => {}; fprf.place.touch(); }")
             page.wait_for_function("() => fprf.place.sorting")
             session.reload(replace(viewed, step=1))
-            page.wait_for_function("() => fprf.live.scene.step === 1 && fprf.place.splats.kept && !fprf.place.sorting")
+            page.wait_for_function(
+                "() => fprf.live.scene.step === 1 && fprf.place.splats.kept && !fprf.place.sorting"
+            )
             # What is changed here is seen here.
             page.set_input_files("#photographs", str(world.references[0]))
             page.wait_for_function("() => fprf.stage.to === 'Now'", timeout=120_000)
@@ -172,7 +188,8 @@ def test_a_page_keeps_up_with_its_server(world: World) -> None:
 
 
 def test_photographs_become_a_restyled_ply_without_a_terminal(tmp_path: Path) -> None:
-    shipped, given = Path(str(files("fprf") / "garden")), tmp_path / "garden"
+    shipped = Path(str(files("fprf") / "garden"))
+    given = tmp_path / "garden"
     shutil.copytree(shipped / "images", given / "images")
     for name in ("transforms.json", "points.npz"):
         shutil.copyfile(shipped / name, given / name)
@@ -200,7 +217,9 @@ def test_photographs_become_a_restyled_ply_without_a_terminal(tmp_path: Path) ->
         assert saved is not None
         plain = from_tensors(saved.model)
         styled = read_capture(tmp_path / "restyled.ply").gaussians
-        assert torch.equal(styled.means, plain.means) and not torch.allclose(styled.harmonics, plain.harmonics, atol=0.1)
+        assert torch.equal(styled.means, plain.means) and not torch.allclose(
+            styled.harmonics, plain.harmonics, atol=0.1
+        )
         with page.expect_download(timeout=120_000) as downloaded:
             page.locator("#save-picture").click()
         downloaded.value.save_as(tmp_path / "picture.png")

@@ -55,7 +55,9 @@ def opened(browser: Any, path: Path, width: int = 640, height: int = 480, script
 def drawn(page: Any, scene: SplatScene, view: int, look: dict[str, Any]) -> np.ndarray:
     camera = camera_of(scene.cameras, view, scene.near)
     lens = [float(camera.intrinsics[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2))]
-    uri = page.evaluate(DRAW, [camera.world_to_camera.T.flatten().tolist(), lens, camera.width, camera.height, look])
+    uri = page.evaluate(
+        DRAW, [camera.world_to_camera.T.flatten().tolist(), lens, camera.width, camera.height, look]
+    )
     return cv2.imdecode(np.frombuffer(base64.b64decode(uri.split(",")[1]), np.uint8), 1)[..., ::-1] / 255
 
 
@@ -89,10 +91,14 @@ def test_it_draws_what_the_rasteriser_draws(browser: Any, tmp_path: Path, kind: 
         assert psnr(drawn(page, scene, view, {"first": "Captured", "blend": 0}), plain) > 38
         assert psnr(drawn(page, scene, view, {"first": "Captured", "second": "dusk", "blend": 1}), dusk) > 38
         half = rasterised(scene, view, (scene.gaussians.harmonics + styled) / 2)
-        assert psnr(drawn(page, scene, view, {"first": "Captured", "second": "dusk", "blend": 0.5}), half) > 36
+        assert (
+            psnr(drawn(page, scene, view, {"first": "Captured", "second": "dusk", "blend": 0.5}), half) > 36
+        )
         wiped = drawn(page, scene, view, {"first": "Captured", "second": "dusk", "wipe": 0.5})
         third = wiped.shape[1] // 3
-        assert psnr(wiped[:, :third], plain[:, :third]) > 33 and psnr(wiped[:, -third:], dusk[:, -third:]) > 33
+        assert (
+            psnr(wiped[:, :third], plain[:, :third]) > 33 and psnr(wiped[:, -third:], dusk[:, -third:]) > 33
+        )
     assert page.errors == []
 
 
@@ -106,15 +112,19 @@ def page(browser: Any, tmp_path: Path) -> Iterator[Any]:
 
 def pixels(page: Any) -> np.ndarray:
     """What is seen of the scene once it rests."""
-    page.wait_for_function("() => fprf.place.exact && !fprf.place.waiting && !fprf.place.changed", timeout=60_000)
+    page.wait_for_function(
+        "() => fprf.place.exact && !fprf.place.waiting && !fprf.place.changed", timeout=60_000
+    )
     page.wait_for_timeout(400)
     return cv2.imdecode(np.frombuffer(page.locator("#canvas").screenshot(), np.uint8), 1).astype(float) / 255
 
 
 def test_drags_and_keys_move_the_camera_and_styles_change(page: Any) -> None:
-    start, plain = page.evaluate(POSE), pixels(page)
+    start = page.evaluate(POSE)
+    plain = pixels(page)
     box = page.locator("#canvas").bounding_box()
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    x = box["x"] + box["width"] / 2
+    y = box["y"] + box["height"] / 2
     page.mouse.move(x, y)
     page.mouse.down()
     page.mouse.move(x + 60, y + 10, steps=4)
@@ -158,7 +168,8 @@ def test_the_whole_page_works_by_keyboard(page: Any) -> None:
     before = page.evaluate(POSE)
     page.keyboard.down("ArrowLeft")
     page.wait_for_function(
-        "(v) => Math.abs(fprf.place.camera.view[0] - v[0]) + Math.abs(fprf.place.camera.view[2] - v[2]) > 1e-3", arg=before
+        "(v) => Math.abs(fprf.place.camera.view[0] - v[0]) + Math.abs(fprf.place.camera.view[2] - v[2]) > 1e-3",
+        arg=before,
     )
     page.keyboard.up("ArrowLeft")
     page.keyboard.press("c")
@@ -179,7 +190,9 @@ def test_a_pixel_has_a_point_in_space(page: Any) -> None:
 
 def test_a_lost_context_comes_back(page: Any) -> None:
     before = pixels(page)
-    page.evaluate("() => { window.lose = fprf.place.splats.gl.getExtension('WEBGL_lose_context'); lose.loseContext(); }")
+    page.evaluate(
+        "() => { window.lose = fprf.place.splats.gl.getExtension('WEBGL_lose_context'); lose.loseContext(); }"
+    )
     page.wait_for_function("() => fprf.place.lost")
     page.evaluate("() => lose.restoreContext()")
     page.wait_for_function("() => !fprf.place.lost")
@@ -206,5 +219,7 @@ def test_without_webgl_or_room_for_all_gaussians_there_are_pictures(
     page.locator(".look", has_text="dusk").click()
     assert page.locator(".still.two").is_visible() and not page.locator("#canvas").is_visible()
     page.locator("#wiping").click()
-    assert page.evaluate("() => document.querySelector('.still.two').style.clipPath") == "inset(0px 0px 0px 50%)"
+    assert (
+        page.evaluate("() => document.querySelector('.still.two').style.clipPath") == "inset(0px 0px 0px 50%)"
+    )
     assert page.errors == []

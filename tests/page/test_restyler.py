@@ -20,7 +20,14 @@ from fprf.io.images import Picture, to_uint8
 from fprf.io.maps import match_image
 from fprf.page import drawing, messages
 from fprf.page import session as viewer_session
-from fprf.page.drawing import Restyler, ScenePainter, film_cameras, film_frames, matching_regions, write_film_files
+from fprf.page.drawing import (
+    Restyler,
+    ScenePainter,
+    film_cameras,
+    film_frames,
+    matching_regions,
+    write_film_files,
+)
 from fprf.page.session import Session
 from fprf.page.state import Look, Photograph, Shown
 from fprf.style.config import StyleConfig
@@ -34,15 +41,21 @@ from fprf.training.views import render_view
 
 def rendered(restyler: Restyler, restyle: Restyle | None) -> torch.Tensor:
     trained = restyler.scene
-    return render_view(trained.model, trained.known.facts, trained.known.cameras, 2, trained.config.render, restyle).rgb
+    return render_view(
+        trained.model, trained.known.facts, trained.known.cameras, 2, trained.config.render, restyle
+    ).rgb
 
 
-def test_a_look_is_the_style_that_the_command_line_makes(restyler: Restyler, encoded: tuple[Photograph, Photograph]) -> None:
+def test_a_look_is_the_style_that_the_command_line_makes(
+    restyler: Restyler, encoded: tuple[Photograph, Photograph]
+) -> None:
     a, b = encoded
     style = StyleConfig(strength=0.8, clusters=3, luminance=0.2)
     look = Look(mix=((a, 1.0), (b, 0.5)), style=style).ruled(1, "pin", b)
     wanted = apply_style(restyler.scene, StyleFile(look.config()))
-    assert torch.allclose(rendered(restyler, restyler.restyle(look)), rendered(restyler, wanted.restyle), atol=2e-5)
+    assert torch.allclose(
+        rendered(restyler, restyler.restyle(look)), rendered(restyler, wanted.restyle), atol=2e-5
+    )
 
 
 def test_styles_are_kept_and_bounded(restyler: Restyler, encoded: tuple[Photograph, Photograph]) -> None:
@@ -60,7 +73,9 @@ def test_styles_are_kept_and_bounded(restyler: Restyler, encoded: tuple[Photogra
 
 def test_a_pixel_finds_the_region_that_is_there(restyler: Restyler) -> None:
     cameras = restyler.scene.cameras.select(torch.tensor([2]))
-    share, _ = membership_view(Regions(restyler.scene, restyler.encoders.scene_style, restyler.encoders.basis), 2, 1000)
+    share, _ = membership_view(
+        Regions(restyler.scene, restyler.encoders.scene_style, restyler.encoders.basis), 2, 1000
+    )
     for x, y in ((3, 4), (20, 18), (31, 23)):
         assert restyler.region_at(cameras, (x + 0.5, y + 0.5)) == int(share[y, x].argmax())
 
@@ -68,7 +83,9 @@ def test_a_pixel_finds_the_region_that_is_there(restyler: Restyler) -> None:
 def test_regions_are_matched_whatever_their_order(restyler: Restyler) -> None:
     generator = torch.Generator().manual_seed(0)
     keys, noise = torch.randn(2, 6, 8, generator=generator)
-    style = restyler.encoders.scene_style._replace(keys=keys, semantic_mean=torch.randn(8, generator=generator))
+    style = restyler.encoders.scene_style._replace(
+        keys=keys, semantic_mean=torch.randn(8, generator=generator)
+    )
     order = torch.randperm(6, generator=generator)
     moved = style._replace(keys=keys[order] + 0.01 * noise)
     assert torch.equal(order[matching_regions(style, moved)], torch.arange(6))
@@ -87,7 +104,9 @@ class Watched(ScenePainter):
         super().__init__(restyler.scene, restyler, lambda client, *picture: self.pictures.append(picture), 32)
         self.pictures: list[tuple[str, Picture, bool]] = []
 
-    def look(self, shown: Shown | None = None, view: int = 2, client: Hashable = 1, captured: bool = False) -> list[Any]:
+    def look(
+        self, shown: Shown | None = None, view: int = 2, client: Hashable = 1, captured: bool = False
+    ) -> list[Any]:
         self.pictures.clear()
         camera = camera_of(self._scene, view)
         for _ in self.render(client, messages.View(camera=camera, captured=captured), shown or Shown(Look())):
@@ -101,8 +120,11 @@ def watched(restyler: Restyler) -> Watched:
 
 
 def rendered_view(restyler: Restyler, look: Look) -> Picture:
-    trained, restyle = restyler.scene, restyler.restyle(look)
-    view = render_view(trained.model, trained.known.facts, trained.known.cameras, 2, trained.config.render, restyle)
+    trained = restyler.scene
+    restyle = restyler.restyle(look)
+    view = render_view(
+        trained.model, trained.known.facts, trained.known.cameras, 2, trained.config.render, restyle
+    )
     return to_uint8(view.rgb)
 
 
@@ -137,9 +159,12 @@ def test_memory_is_bounded(watched: Watched, monkeypatch: pytest.MonkeyPatch) ->
 def test_maps_are_what_the_command_line_renders(watched: Watched, restyler: Restyler, encoded: Pair) -> None:
     a, b = encoded
     look = Look(mix=((a, 1.0), (b, 1.0)), style=StyleConfig(clusters=3)).ruled(0, "keep")
-    trained, styled = restyler.scene, restyler.styled(look)
+    trained = restyler.scene
+    styled = restyler.styled(look)
     found = match_map(trained, styled, 2)
-    wanted = match_image(found.attention, styled.codes.reference, styled.codes.names, found.opacity, found.kept)
+    wanted = match_image(
+        found.attention, styled.codes.reference, styled.codes.names, found.opacity, found.kept
+    )
     assert np.abs(watched.look(Shown(look, "matches"))[-1][1].astype(int) - wanted).mean() < 0.5
     assert (watched.look(Shown(Look(), "matches"))[-1][1] == 128).all(), "grey without a style"
 
@@ -171,7 +196,8 @@ def test_the_film_is_what_fprf_render_makes_of_its_folder(
     scene = restyler.scene
     few = StyleConfig(clusters=3)
     one = Look(mix=((a, 1.0),), style=few).ruled(0, "keep")
-    two, faint = Look(mix=((b, 1.0),), style=few), Look(mix=((a, 1.0),), style=replace(few, strength=0.75))
+    two = Look(mix=((b, 1.0),), style=few)
+    faint = Look(mix=((a, 1.0),), style=replace(few, strength=0.75))
     folder = run / "films" / "0001"
     folder.mkdir(parents=True)
     write_film_files(folder, keys_of(scene, [Look(), one, two, faint, one]), 0.125, scene, side=32)

@@ -27,8 +27,18 @@ COOKIE = "fprf-token-8080"
 
 def test_this_machine_alone_is_let_in_by_its_names_and_from_its_own_pages() -> None:
     for name in ("127.0.0.1:8080", "localhost:8080", "localhost", "[::1]:8080", "127.9.8.7:1"):
-        assert HERE.refusal({"host": name}) is None and HERE.refusal({"host": name, "origin": f"http://{name}"}) is None
-    for name in ("evil.example:8080", "127.0.0.1.evil.example", "", "[", "192.168.0.7:8080", "localhost.evil"):
+        assert (
+            HERE.refusal({"host": name}) is None
+            and HERE.refusal({"host": name, "origin": f"http://{name}"}) is None
+        )
+    for name in (
+        "evil.example:8080",
+        "127.0.0.1.evil.example",
+        "",
+        "[",
+        "192.168.0.7:8080",
+        "localhost.evil",
+    ):
         assert HERE.refusal({"host": name}) is not None
     for origin in ("http://evil.example", "null", "http://127.0.0.1:9999", "", "https://localhost:8080"):
         assert HERE.refusal({"host": "127.0.0.1:8080", "origin": origin}) is not None
@@ -43,8 +53,12 @@ def test_from_elsewhere_a_token_is_needed_in_one_of_three_places() -> None:
     assert THERE.refusal(host, "wrong-token-of-16-chars") is not None
     assert THERE.refusal(host, "töken-that-is-no-ascii") is not None
     assert THERE.refusal({**host, "cookie": f"{COOKIE}=x{TOKEN}"}) is not None
-    both = {"cookie": f"{COOKIE}={TOKEN}; fprf-token-8081=another; fprf-token-80={TOKEN}"}  # viewers on other ports
-    assert THERE.refusal({**host, **both}) is None and THERE.refusal({"host": "[::1]:8081", **both}) is not None
+    both = {
+        "cookie": f"{COOKIE}={TOKEN}; fprf-token-8081=another; fprf-token-80={TOKEN}"
+    }  # viewers on other ports
+    assert (
+        THERE.refusal({**host, **both}) is None and THERE.refusal({"host": "[::1]:8081", **both}) is not None
+    )
     assert THERE.refusal({"host": "[::1]", **both}) is None
     assert THERE.refusal({**host, "origin": "http://evil.example", "cookie": f"{COOKIE}={TOKEN}"}) is not None
 
@@ -71,7 +85,12 @@ class Probe(ViewerServer):
         async def full(request: Request) -> Response:
             raise PermissionError(13, "Permission denied", "/made/yard")
 
-        return [Route("/full", full), Route("/echo", echo, methods=["POST"]), Route("/film64", film), *super()._routes()]
+        return [
+            Route("/full", full),
+            Route("/echo", echo, methods=["POST"]),
+            Route("/film64", film),
+            *super()._routes(),
+        ]
 
 
 @pytest.fixture
@@ -97,7 +116,10 @@ def talk(http: ViewerServer, data: bytes) -> bytes:
 
 
 def request(http: ViewerServer, line: str, *headers: str, body: bytes = b"") -> bytes:
-    return talk(http, "\r\n".join([f"{line} HTTP/1.1", f"Host: 127.0.0.1:{http.port}", *headers, "", ""]).encode() + body)
+    return talk(
+        http,
+        "\r\n".join([f"{line} HTTP/1.1", f"Host: 127.0.0.1:{http.port}", *headers, "", ""]).encode() + body,
+    )
 
 
 def status(http: ViewerServer, line: str, *headers: str, body: bytes = b"") -> int:
@@ -116,7 +138,10 @@ def test_bodies_and_queries_arrive(http: ViewerServer) -> None:
     chunked = f"{len(body):x}\r\n".encode() + body + b"\r\n0\r\n\r\n"
     for header, sent in (("Content-Length: 100000", body), ("Transfer-Encoding: chunked", chunked)):
         answer = request(http, "POST /echo?name=a%20b&x=1", header, body=sent)
-        assert json.loads(answer.rpartition(b"\r\n\r\n")[2]) == {"size": 100_000, "query": {"name": "a b", "x": "1"}}
+        assert json.loads(answer.rpartition(b"\r\n\r\n")[2]) == {
+            "size": 100_000,
+            "query": {"name": "a b", "x": "1"},
+        }
 
 
 @pytest.mark.parametrize(
@@ -128,7 +153,12 @@ def test_bodies_and_queries_arrive(http: ViewerServer) -> None:
         ("POST /echo", ("Content-Length: -1",), b"", 400),
         ("POST /echo", ("Content-Length: 100001",), b"", 413),
         ("POST /echo", ("Content-Length: 99999999999999",), b"", 413),
-        ("POST /echo", ("Transfer-Encoding: chunked",), b"186a1\r\n" + b"x" * 0x186A1 + b"\r\n0\r\n\r\n", 413),
+        (
+            "POST /echo",
+            ("Transfer-Encoding: chunked",),
+            b"186a1\r\n" + b"x" * 0x186A1 + b"\r\n0\r\n\r\n",
+            413,
+        ),
         ("POST /echo", ("Content-Length: 1", "Content-Length: 2"), b"", 400),
         ("POST /echo", ("Content-Length: 10",), b"slow", 408),
         ("GET /", ("Origin: http://evil.example",), b"", 403),
@@ -137,7 +167,9 @@ def test_bodies_and_queries_arrive(http: ViewerServer) -> None:
         ("GET /?" + "a=1&" * 20, (), b"", 400),
     ],
 )
-def test_what_is_wrong_is_refused(http: ViewerServer, line: str, headers: tuple[str, ...], body: bytes, expected: int) -> None:
+def test_what_is_wrong_is_refused(
+    http: ViewerServer, line: str, headers: tuple[str, ...], body: bytes, expected: int
+) -> None:
     assert status(http, line, *headers, body=body) == expected
     assert status(http, "GET /") == 200
 
@@ -156,7 +188,12 @@ def test_what_the_system_refuses_is_told(http: ViewerServer) -> None:
 
 
 def test_nonsense_and_half_heads_end_their_own_connection_alone(http: ViewerServer) -> None:
-    for data in (b"", b"\x16\x03\x01\x02\x00", b"\0" * 100 + b"\r\n\r\n", b"GET / HTTP/1.1\r\nX: " + b"y" * 20_000):
+    for data in (
+        b"",
+        b"\x16\x03\x01\x02\x00",
+        b"\0" * 100 + b"\r\n\r\n",
+        b"GET / HTTP/1.1\r\nX: " + b"y" * 20_000,
+    ):
         talk(http, data)
         assert status(http, "GET /") == 200
 
@@ -186,7 +223,8 @@ def test_a_token_in_the_address_becomes_a_cookie() -> None:
     with Probe(Access("127.0.0.1", TOKEN), 0) as http:
         assert http.address.endswith(f"/?token={TOKEN}")
         assert status(http, "GET /scene") == status(http, "GET /") == status(http, "GET /?token=wrong") == 403
-        answer, name = request(http, f"GET /?token={TOKEN}"), cookie_name(f"127.0.0.1:{http.port}")
+        answer = request(http, f"GET /?token={TOKEN}")
+        name = cookie_name(f"127.0.0.1:{http.port}")
         assert answer.startswith(b"HTTP/1.1 303 ") and b"location: /\r\n" in answer
         assert f"set-cookie: {name}={TOKEN}; Path=/; HttpOnly; SameSite=Lax".encode() in answer
         assert status(http, "GET /", f"Cookie: {name}={TOKEN}") == 200
@@ -221,9 +259,12 @@ def test_messages_pass_until_one_is_bad_and_then_that_client_is_out(http: Viewer
 
 
 @pytest.mark.parametrize(
-    "message", ["x" * (1 << 17), ["x" * 60_000, "x" * 60_000], b"bytes", b"\xff", GOOD + "x", "", "[" * 60_000]
+    "message",
+    ["x" * (1 << 17), ["x" * 60_000, "x" * 60_000], b"bytes", b"\xff", GOOD + "x", "", "[" * 60_000],
 )
-def test_messages_that_are_no_message_end_the_connection(http: ViewerServer, message: bytes | list[str] | str) -> None:
+def test_messages_that_are_no_message_end_the_connection(
+    http: ViewerServer, message: bytes | list[str] | str
+) -> None:
     with opened(http) as client, pytest.raises(ConnectionClosed):
         client.recv()
         client.send(message)
@@ -231,7 +272,9 @@ def test_messages_that_are_no_message_end_the_connection(http: ViewerServer, mes
     assert status(http, "GET /") == 200
 
 
-def test_websockets_of_other_sites_and_too_many_are_refused(http: ViewerServer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_websockets_of_other_sites_and_too_many_are_refused(
+    http: ViewerServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(InvalidStatus) as told, opened(http, origin="http://evil.example"):
         pass
     assert told.value.response.status_code == 403

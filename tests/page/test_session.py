@@ -24,13 +24,18 @@ from fprf.splats.files import read_capture
 def unpacked(body: bytes) -> tuple[dict[str, object], dict[str, bytes]]:
     """Head and sections of a body that browsers read."""
     length = int.from_bytes(body[:4], "little")
-    head, parts, at = json.loads(body[4 : 4 + length]), {}, 4 + length
+    head = json.loads(body[4 : 4 + length])
+    parts = {}
+    at = 4 + length
     for name, size in head["sizes"].items():
-        parts[name], at = zlib.decompress(body[at : at + size]), at + size
+        parts[name] = zlib.decompress(body[at : at + size])
+        at = at + size
     return head, parts
 
 
-def test_a_photograph_restyles_what_every_client_of_a_field_sees(session: Session, listener: Listener, world: World) -> None:
+def test_a_photograph_restyles_what_every_client_of_a_field_sees(
+    session: Session, listener: Listener, world: World
+) -> None:
     for client in (1, 2):
         session.handle(client, messages.View(camera=camera_of(session.viewed.scene, client)))
     sharp = lambda client: [each for each in listener.pictures(client) if max(each.shape) == 64]  # noqa: E731
@@ -47,7 +52,9 @@ def test_a_photograph_restyles_what_every_client_of_a_field_sees(session: Sessio
     listener.until(lambda: bool(listener.pictures(1, "captured")))
 
 
-def test_a_photograph_recolours_gaussians_and_they_can_be_saved(splats: Session, listener: Listener, world: World) -> None:
+def test_a_photograph_recolours_gaussians_and_they_can_be_saved(
+    splats: Session, listener: Listener, world: World
+) -> None:
     head, parts = unpacked(splats.geometry)
     assert head["count"] == 400 and len(parts["shape"]) == 16 * 400 and len(parts["style-0"]) == 4 * 400 + 36
     splats.upload(world.references[0].read_bytes(), "dusk.png")
@@ -63,11 +70,16 @@ def test_a_photograph_recolours_gaussians_and_they_can_be_saved(splats: Session,
         listener.until(lambda count=count: any(kind == "colours Now" for _, kind, _ in listener.sent[count:]))  # type: ignore[misc]
     with pytest.raises(UsageError, match="no such colours"):
         splats.colours("else")
-    saved, scene = read_capture(splats.gaussians()).gaussians, splats.viewed.scene
-    assert torch.equal(saved.means, scene.gaussians.means) and not torch.equal(saved.harmonics, scene.gaussians.harmonics)
+    saved = read_capture(splats.gaussians()).gaussians
+    scene = splats.viewed.scene
+    assert torch.equal(saved.means, scene.gaussians.means) and not torch.equal(
+        saved.harmonics, scene.gaussians.harmonics
+    )
 
 
-def test_a_client_may_come_while_looks_are_coloured(splats: Session, listener: Listener, world: World) -> None:
+def test_a_client_may_come_while_looks_are_coloured(
+    splats: Session, listener: Listener, world: World
+) -> None:
     splats.upload(world.references[0].read_bytes(), "dusk.png")
     interval = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
@@ -80,7 +92,9 @@ def test_a_client_may_come_while_looks_are_coloured(splats: Session, listener: L
         sys.setswitchinterval(interval)
 
 
-def test_a_click_picks_a_region_and_its_rules_change_the_look(session: Session, listener: Listener, world: World) -> None:
+def test_a_click_picks_a_region_and_its_rules_change_the_look(
+    session: Session, listener: Listener, world: World
+) -> None:
     camera = camera_of(session.viewed.scene, 2)
     session.handle(1, messages.Pick(camera=camera, x=0.5, y=0.8))
     listener.until(lambda: session.state.picked is not None)
@@ -117,10 +131,15 @@ def test_what_is_wrong_is_said_and_changes_nothing(session: Session, world: Worl
 
 
 @pytest.mark.parametrize(("name", "told"), [("none.jpg", "No such file"), ("text.jpg", "no PNG")])
-def test_references_that_cannot_be_taken_are_named(splats: Session, tmp_path: Path, name: str, told: str) -> None:
+def test_references_that_cannot_be_taken_are_named(
+    splats: Session, tmp_path: Path, name: str, told: str
+) -> None:
     (tmp_path / "text.jpg").write_text("text")
     viewed = replace(splats.viewed, references=(tmp_path / name,))
-    with ViewerServer(Access("127.0.0.1", None), 0) as server, pytest.raises(DataError, match=f"{name}: {told}"):
+    with (
+        ViewerServer(Access("127.0.0.1", None), 0) as server,
+        pytest.raises(DataError, match=f"{name}: {told}"),
+    ):
         server.open(lambda: viewed)
 
 
@@ -160,17 +179,22 @@ def test_the_warm_up_leaves_nothing_behind(session: Session, listener: Listener)
     assert session.state == State() and listener.sent == [] and not session.restyler._styles
 
 
-def test_newer_states_of_a_training_are_shown_as_they_come(splats: Session, listener: Listener, world: World) -> None:
+def test_newer_states_of_a_training_are_shown_as_they_come(
+    splats: Session, listener: Listener, world: World
+) -> None:
     def reloaded(*names: str, **changes: Any) -> None:
         """Show a newer state, whose colours come anew."""
         count = len(listener.sent)
         splats.reload(replace(splats.viewed, **changes))
-        listener.until(lambda: {f"colours {name}" for name in names} <= {kind for _, kind, _ in listener.sent[count:]})
+        listener.until(
+            lambda: {f"colours {name}" for name in names} <= {kind for _, kind, _ in listener.sent[count:]}
+        )
 
     splats.upload(world.references[0].read_bytes(), "dusk.png")
     splats.handle(1, messages.Keep(name="dark", action="keep"))
     listener.until(lambda: {"colours Now", "colours dark"} <= {kind for _, kind, _ in listener.sent})
-    before, scene = splats.geometry, splats.viewed.scene
+    before = splats.geometry
+    scene = splats.viewed.scene
     moved = replace(scene, gaussians=replace(scene.gaussians, means=scene.gaussians.means + 0.1))  # type: ignore[type-var]
     count = len(listener.sent)
     reloaded("Now", "dark", scene=moved, step=9)

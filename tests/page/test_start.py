@@ -1,4 +1,6 @@
-"""The start page without a browser, and following a run: programs that find poses and train are stood in for by a script."""
+"""The start page without a browser, and following a run: programs that find poses and train are stood in for
+by a script.
+"""
 
 import os
 import shutil
@@ -122,7 +124,9 @@ def test_photographs_are_posed_trained_and_shown(page: Shown, photographs: Path,
 
 
 @pytest.mark.parametrize(("asked", "stage"), [(Stop(), "open"), (Leave(), "idle")])
-def test_a_scene_in_training_is_shown_until_it_is_left(page: Shown, photographs: Path, asked: Any, stage: str) -> None:
+def test_a_scene_in_training_is_shown_until_it_is_left(
+    page: Shown, photographs: Path, asked: Any, stage: str
+) -> None:
     page.handle(Open(path=str(photographs)))
     state = page.reached(stage="training", share=0.5)
     assert state["detail"] == "step 7 · 20.0 dB · 1:01 left"
@@ -157,7 +161,10 @@ def test_a_training_that_failed_past_its_first_checkpoint_is_put_away(page: Show
     assert len(page.shown) == 1
     page.handle(Stop())
     recent = page.reached(stage="idle")["recent"]
-    assert page.shown == [] and [(row["name"], row["kind"]) for row in recent] == [("yard", "trained"), ("yard", "train on")]
+    assert page.shown == [] and [(row["name"], row["kind"]) for row in recent] == [
+        ("yard", "trained"),
+        ("yard", "train on"),
+    ]
     page.handle(Open(path=recent[1]["path"]))
     page.reached(name="yard", stage="training", share=0.5)
     page.handle(Leave())

@@ -26,7 +26,9 @@ from fprf.style.dictionary import Reference
 
 def card(number: int) -> Photograph:
     empty = Reference(f"{number}", torch.zeros(0, 2), torch.zeros(0, 2))
-    return Photograph(number, f"{number}.png", Path(f"/tmp/{number}.png"), np.zeros((1, 1, 3), np.uint8), empty)
+    return Photograph(
+        number, f"{number}.png", Path(f"/tmp/{number}.png"), np.zeros((1, 1, 3), np.uint8), empty
+    )
 
 
 A, B, C = (card(i) for i in range(3))
@@ -38,14 +40,22 @@ def test_pins_replace_each_other_and_forbidden_references_add_up() -> None:
     assert {*look.ruled(1, "pin", A).ruled(1, "pin", B).rules} == {(1, "pin", B)}
     look = look.ruled(1, "forbid", A).ruled(1, "forbid", B)
     assert {*look.rules} == {(1, "forbid", A), (1, "forbid", B)}
-    assert look.ruled(1, "forbid", C).rules == look.ruled(1, None).rules == frozenset(), "something must be left to take"
+    assert look.ruled(1, "forbid", C).rules == look.ruled(1, None).rules == frozenset(), (
+        "something must be left to take"
+    )
     assert {*look.mixed([(B, 1.0)]).rules} == {(1, "forbid", B)}, "rules go with their photographs"
-    assert {*look.ruled(0, "keep").renumbered([2, 0]).rules} == {(0, "forbid", A), (0, "forbid", B), (2, "keep", None)}
+    assert {*look.ruled(0, "keep").renumbered([2, 0]).rules} == {
+        (0, "forbid", A),
+        (0, "forbid", B),
+        (2, "keep", None),
+    }
 
 
 def test_a_look_in_the_terms_of_a_style() -> None:
     set_ = StyleConfig(strength=0.7, clusters=4, luminance=0.3)
-    look = Look(mix=((A, 1.0), (B, 0.5)), style=set_).ruled(2, "pin", B).ruled(0, "forbid", A).ruled(5, "keep")
+    look = (
+        Look(mix=((A, 1.0), (B, 0.5)), style=set_).ruled(2, "pin", B).ruled(0, "forbid", A).ruled(5, "keep")
+    )
     style = look.config()
     assert style.references == (A.path, B.path) and style.weights == (1.0, 0.5)
     assert (style.strength, style.clusters, style.luminance, style.stylizer) == (0.7, 4, 0.3, set_.stylizer)
@@ -54,7 +64,13 @@ def test_a_look_in_the_terms_of_a_style() -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("strength", 1.5), ("bold", -1.0), ("clusters", 0), ("stylizer.temperature", 0.0), ("stylizer.smoothness", -1.0)],
+    [
+        ("strength", 1.5),
+        ("bold", -1.0),
+        ("clusters", 0),
+        ("stylizer.temperature", 0.0),
+        ("stylizer.smoothness", -1.0),
+    ],
 )
 def test_an_impossible_look_is_refused(name: str, value: float) -> None:
     with pytest.raises(ConfigError):
@@ -74,7 +90,9 @@ def test_a_stylizer_without_a_slider_s_field_has_no_such_slider() -> None:
     state = State(look=Look(style=StyleConfig(stylizer=AdainConfig())))
     shown = state.described()["look"]
     assert "strength" in shown and "stylizer.temperature" not in shown
-    with pytest.raises(UsageError, match=r"stylizer\.temperature: the stylizer of this scene has no such field"):
+    with pytest.raises(
+        UsageError, match=r"stylizer\.temperature: the stylizer of this scene has no such field"
+    ):
         state.changed(Set(name="stylizer.temperature", value=0.5))
 
 
@@ -94,13 +112,21 @@ def test_the_shelf_is_bounded(together: bool) -> None:
     state = State(together=together).added(A).changed(Keep(name="mine", action="keep"))
     for number in range(10, 10 + 3 * SHELF):
         state = state.added(card(number))
-        assert len(state.shelf) <= SHELF and state.look.mix[-1][0] is state.shelf[-1] and state.shelf[-1].number == number
+        assert (
+            len(state.shelf) <= SHELF
+            and state.look.mix[-1][0] is state.shelf[-1]
+            and state.shelf[-1].number == number
+        )
     assert together or A in state.shelf, "the look that was kept needs it"
 
 
 def test_kept_looks_outlive_their_photographs() -> None:
     state = STATE.changed(Keep(name="  autumn   light ", action="keep"))
-    assert state.kept == (("autumn light", state.look),) == state.changed(Keep(name="autumn light", action="keep")).kept
+    assert (
+        state.kept
+        == (("autumn light", state.look),)
+        == state.changed(Keep(name="autumn light", action="keep")).kept
+    )
     gone = state.changed(Card(card=0, action="remove"))
     assert gone.shelf == () and gone.look.plain and gone.kept == state.kept and A in gone.in_use
     assert gone.changed(Keep(name="autumn light", action="restore")).look == state.look
@@ -133,7 +159,12 @@ def test_keys_are_added_moved_and_removed() -> None:
             before.changed(message)
 
 
-CAMERA = {"place": [0, 1, 2.5], "axes": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "lens": [300, 300, 160, 120], "size": [320, 240]}
+CAMERA = {
+    "place": [0, 1, 2.5],
+    "axes": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "lens": [300, 300, 160, 120],
+    "size": [320, 240],
+}
 MESSAGES: list[dict[str, Any]] = [
     {"type": "view", "camera": CAMERA, "captured": True},
     {"type": "set", "name": "strength", "value": 0.5},
@@ -165,7 +196,20 @@ WRONG: list[tuple[str, dict[str, Any]]] = [
     ("keep", {"name": "x" * 81}), ("keep", {"name": 3}), ("film", {"seconds": 1e9}),
     ("key", {"at": -1}), ("set", {"type": "shutdown"}), ("set", {"type": None}), ("set", {"type": ["set"]}),
 ]  # fmt: skip
-TEXTS = ["", "x", "[]", "{}", "null", "3", '{"type": 3}', "[" * 100_000, '{"type": "set"}', "\ud800", b"\xff\xfe", b"{}"]
+TEXTS = [
+    "",
+    "x",
+    "[]",
+    "{}",
+    "null",
+    "3",
+    '{"type": 3}',
+    "[" * 100_000,
+    '{"type": "set"}',
+    "\ud800",
+    b"\xff\xfe",
+    b"{}",
+]
 
 
 def test_anything_else_does_not() -> None:
@@ -179,8 +223,15 @@ def test_anything_else_does_not() -> None:
 
 
 def test_requests_of_the_start_page_are_messages_too() -> None:
-    assert read_message('{"type": "open", "path": "yard", "minutes": 10}', StartRequest) == messages.Open("yard", 10)
-    for text in ('{"type": "open"}', '{"type": "open", "path": "yard", "minutes": "2"}', '{"type": "view"}', *TEXTS):
+    assert read_message('{"type": "open", "path": "yard", "minutes": 10}', StartRequest) == messages.Open(
+        "yard", 10
+    )
+    for text in (
+        '{"type": "open"}',
+        '{"type": "open", "path": "yard", "minutes": "2"}',
+        '{"type": "view"}',
+        *TEXTS,
+    ):
         with pytest.raises(DataError, match="message"):
             read_message(text, StartRequest)
     for minutes in ("0", "1e9", "true", "NaN"):

@@ -15,7 +15,15 @@ from hypothesis import strategies as st
 from photo_files import HEIC, turned_jpeg
 
 from fprf.errors import DataError, UsageError
-from fprf.page.uploads import MAX_BYTES, MAX_SIDE, SceneFiles, Uploads, check_photograph, find_source, shown_name
+from fprf.page.uploads import (
+    MAX_BYTES,
+    MAX_SIDE,
+    SceneFiles,
+    Uploads,
+    check_photograph,
+    find_source,
+    shown_name,
+)
 
 
 def png(width: int, height: int) -> bytes:
@@ -45,8 +53,12 @@ def test_a_photograph_becomes_a_png_of_ours(uploaded: Uploads) -> None:
 
 
 def test_photographs_of_phones_come_upright(uploaded: Uploads, tmp_path: Path) -> None:
-    shown = turned_jpeg(tmp_path / "a.jpg", cv2.imdecode(np.frombuffer(png(60, 40), np.uint8), cv2.IMREAD_COLOR), 6)
-    assert np.array_equal(cv2.imread(str(uploaded.store((tmp_path / "a.jpg").read_bytes())))[:, :, ::-1], shown)
+    shown = turned_jpeg(
+        tmp_path / "a.jpg", cv2.imdecode(np.frombuffer(png(60, 40), np.uint8), cv2.IMREAD_COLOR), 6
+    )
+    assert np.array_equal(
+        cv2.imread(str(uploaded.store((tmp_path / "a.jpg").read_bytes())))[:, :, ::-1], shown
+    )
     pytest.importorskip("pillow_heif")
     assert cv2.imread(str(uploaded.store(HEIC))).shape == (64, 48, 3)
 
@@ -64,7 +76,13 @@ def test_a_photograph_is_refused_by_its_first_bytes_before_anything_is_decoded(u
 
 
 @pytest.mark.parametrize(
-    "data", [claimed(30, 20), claimed(0, 10), png(30, 20)[:-40], b"\xff\xd8\xff" + b"\xc0\0\x0b\x08\0\x10\0\x10" + b"\0" * 40]
+    "data",
+    [
+        claimed(30, 20),
+        claimed(0, 10),
+        png(30, 20)[:-40],
+        b"\xff\xd8\xff" + b"\xc0\0\x0b\x08\0\x10\0\x10" + b"\0" * 40,
+    ],
 )
 def test_damaged_ones_are_told_and_the_next_one_goes(uploaded: Uploads, data: bytes) -> None:
     with pytest.raises(DataError, match="photograph: ") as told:
@@ -124,9 +142,16 @@ HEADS = {
 }
 
 
-@given(more=st.binary(max_size=200), piece=st.integers(60, 300), name=st.sampled_from(["a.png", "images/01 é.png"]))
-def test_a_file_in_pieces_is_the_file(tmp_path_factory: pytest.TempPathFactory, more: bytes, piece: int, name: str) -> None:
-    folder, data = tmp_path_factory.mktemp("x") / "files", PICTURE + more
+@given(
+    more=st.binary(max_size=200),
+    piece=st.integers(60, 300),
+    name=st.sampled_from(["a.png", "images/01 é.png"]),
+)
+def test_a_file_in_pieces_is_the_file(
+    tmp_path_factory: pytest.TempPathFactory, more: bytes, piece: int, name: str
+) -> None:
+    folder = tmp_path_factory.mktemp("x") / "files"
+    data = PICTURE + more
     files = SceneFiles(folder)
     for at in range(0, len(data), piece):
         assert not (folder / name).exists()

@@ -80,7 +80,11 @@ def test_nothing_is_loaded_from_anywhere(page: Read) -> None:
 
 
 def test_it_holds_shapes_once_and_four_bytes_a_style(page: Read) -> None:
-    parts = {name: zlib.decompress(base64.b64decode(text)) for name, text in page.scripts.items() if name.startswith("data-")}
+    parts = {
+        name: zlib.decompress(base64.b64decode(text))
+        for name, text in page.scripts.items()
+        if name.startswith("data-")
+    }
     assert len(parts["data-shape"]) == 16 * 500
     rows = [len(parts[f"data-style-{k}"]) - 36 * page.data["styles"][k]["maps"] for k in range(3)]
     assert rows == [4 * 500] * 3
@@ -90,7 +94,9 @@ def test_it_holds_shapes_once_and_four_bytes_a_style(page: Read) -> None:
 
 def test_embedded_pictures_decode_and_are_of_the_size_they_claim(page: Read) -> None:
     for image in page.all("img", loading="lazy"):
-        pixels = cv2.imdecode(np.frombuffer(base64.b64decode(image["src"].split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
+        pixels = cv2.imdecode(
+            np.frombuffer(base64.b64decode(image["src"].split(",")[1]), np.uint8), cv2.IMREAD_COLOR
+        )
         assert pixels.shape[:2] == (int(image["height"]), int(image["width"])) and image["alt"]
 
 
@@ -103,7 +109,9 @@ def test_names_are_text_whatever_they_hold(tmp_path: Path) -> None:
         lead=EVIL,
         facts={EVIL: EVIL},
         views=[PageView(EVIL, view.original, view.photograph) for view in plain.views],
-        styles=[style._replace(name=EVIL + str(k), references=[EVIL]) for k, style in enumerate(plain.styles)],
+        styles=[
+            style._replace(name=EVIL + str(k), references=[EVIL]) for k, style in enumerate(plain.styles)
+        ],
         references=[plain.references[0]._replace(name=EVIL)],
         credits=[EVIL],
     )
@@ -134,10 +142,18 @@ def test_a_budget_drops_what_shows_least(tmp_path: Path) -> None:
 
 def test_without_gaussians_there_are_pictures(tmp_path: Path) -> None:
     views = [PageView(str(k), np.full((20, 30, 3), 40 * k, np.uint8)) for k in range(3)]
-    page = replace(page_of(seen(ball(50))), scene=None, views=views, styles=[Style("dusk", [view.original for view in views])])
+    page = replace(
+        page_of(seen(ball(50))),
+        scene=None,
+        views=views,
+        styles=[Style("dusk", [view.original for view in views])],
+    )
     assert write_page(tmp_path / "field.html", page) == 0
     data = Read(tmp_path / "field.html").data
-    assert data["scene"] is None and {name: len(rows) for name, rows in data["stills"].items()} == {"Captured": 3, "dusk": 3}
+    assert data["scene"] is None and {name: len(rows) for name, rows in data["stills"].items()} == {
+        "Captured": 3,
+        "dusk": 3,
+    }
 
 
 def unpacked(gaussians: Gaussians, entries: int = 4096) -> tuple[torch.Tensor, Gaussians]:
@@ -151,12 +167,19 @@ def unpacked(gaussians: Gaussians, entries: int = 4096) -> tuple[torch.Tensor, G
     means = chunk[:, :3] + place * (chunk[:, 3:6] - chunk[:, :3])
     scales = chunk[:, 6:9] + size * (chunk[:, 9:] - chunk[:, 6:9])
     level = packed.palette[..., :3].astype(np.float64) / 127
-    rest = (packed.largest * level * abs(level))[words[:, 1] >> 16] if level.size else np.zeros((len(words), 0, 3))
+    rest = (
+        (packed.largest * level * abs(level))[words[:, 1] >> 16]
+        if level.size
+        else np.zeros((len(words), 0, 3))
+    )
     colours = packed.colours(gaussians.harmonics)
     mean = colours.low + colours.rows[:, :3] / 255 * (colours.high - colours.low)
     harmonics = np.concatenate([((mean - 0.5) / HARMONIC)[:, None], rest], 1)
     opacity = torch.logit(torch.from_numpy(words[:, 3] >> 24) / 255, 1e-6)
-    parts = [torch.from_numpy(each).float() for each in (means, three_to_four(words[:, 2] >> 30, turn), scales, harmonics)]
+    parts = [
+        torch.from_numpy(each).float()
+        for each in (means, three_to_four(words[:, 2] >> 30, turn), scales, harmonics)
+    ]
     return packed.order, Gaussians(parts[0], parts[1], parts[2], opacity.float(), parts[3])
 
 
@@ -189,6 +212,8 @@ def test_the_maps_of_a_style_carry_its_view_dependence() -> None:
     gaussians = ball(2000, 2)
     styled = recoloured(gaussians)
     label, maps = fit_maps(gaussians.harmonics[:, 1:], styled[:, 1:])
-    made = torch.einsum("nkc,ncd->nkd", gaussians.harmonics[:, 1:], torch.from_numpy(maps).view(-1, 3, 3)[label.astype(int)])
+    made = torch.einsum(
+        "nkc,ncd->nkd", gaussians.harmonics[:, 1:], torch.from_numpy(maps).view(-1, 3, 3)[label.astype(int)]
+    )
     assert float((made - styled[:, 1:]).abs().max()) < 1e-4
     assert len(maps) <= 256

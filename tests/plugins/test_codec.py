@@ -87,7 +87,10 @@ def test_any_config_survives_json_text(leaf: Leaf) -> None:
         ({"wholes": 3}, "config: Leaf has no field 'wholes'; did you mean 'whole'?"),
         ({"encoder": {}}, 'config.encoder: expected the plug-in\'s name as "type", found None'),
         ({"encoder": {"type": [[0] * 999]}}, 'name as "type", found [[' + 18 * "0, " + "0..."),
-        ({"encoder": {"type": "random", "chanels": 3}}, "config.encoder: RandomConfig has no field 'chanels'; did you mean"),
+        (
+            {"encoder": {"type": "random", "chanels": 3}},
+            "config.encoder: RandomConfig has no field 'chanels'; did you mean",
+        ),
         ({"encoder": {"type": "random", "channels": 0}}, "config.encoder: channels: 0 must be at least 1"),
         ([], "config: expected an object, found []"),
     ],
@@ -126,7 +129,10 @@ def _saved(folder: Path, change: Callable[[dict[str, Any]], object]) -> Path:
         (lambda w: w.update(format=2, fprf="9.0"), "is of format 2, written by fprf 9.0"),
         (lambda w: w.pop("plugins"), "Object missing required field `plugins`"),
         (lambda w: w.update(metod="x"), "Object contains unknown field `metod`"),
-        (lambda w: w["config"].update(stepz=1), "config: TrainConfig has no field 'stepz'; did you mean 'steps'?"),
+        (
+            lambda w: w["config"].update(stepz=1),
+            "config: TrainConfig has no field 'stepz'; did you mean 'steps'?",
+        ),
         (lambda w: w["config"]["loss"].update(rgb="1"), 'config.loss.rgb: expected a number, found "1"'),
         (lambda w: w["config"].update(downscale=0), "config: downscale: 0 must be at least 1"),
     ],
@@ -162,9 +168,12 @@ def test_a_file_that_is_no_config_is_refused(tmp_path: Path, text: bytes, messag
 
 
 def test_a_missing_plugin_is_kept_as_data_and_fails_when_built(packages: Packages, tmp_path: Path) -> None:
-    path, again = tmp_path / "config.json", tmp_path / "again.json"
+    path = tmp_path / "config.json"
+    again = tmp_path / "again.json"
     code = {"acme_gone": ENCODER.format(name="Gone")}
-    packages.install("acme-gone", {"fprf.encoders": {"gone": "acme_gone:GoneConfig"}}, code=code, version="0.3")
+    packages.install(
+        "acme-gone", {"fprf.encoders": {"gone": "acme_gone:GoneConfig"}}, code=code, version="0.3"
+    )
     chosen = registry.load("fprf.encoders", "gone", EncoderConfig)
     save_config(path, replace(fprf(), "semantic.encoder", chosen()), "fprf")
     (packages.root / "acme_gone-0.3.dist-info" / "entry_points.txt").write_text("")
@@ -175,16 +184,35 @@ def test_a_missing_plugin_is_kept_as_data_and_fails_when_built(packages: Package
     save_config(again, config, method)
     assert json.loads(again.read_text()) == json.loads(path.read_text())
     assert load_config(again) == (config, method) and hash(config)
-    with pytest.raises(PluginError, match=r"^semantic.encoder: fprf.encoders: no plug-in 'gone' is installed") as caught:
+    with pytest.raises(
+        PluginError, match=r"^semantic.encoder: fprf.encoders: no plug-in 'gone' is installed"
+    ) as caught:
         config.semantic.encoder.build()
     assert "install acme-gone 0.3, or choose another with --semantic.encoder NAME" in str(caught.value)
 
 
 def acme(packages: Packages, folder: Path) -> Path:
     """A saved config of a stranger's method with fields of its own."""
-    packages.install("acme-method", {"fprf.methods": {"acme": "acme_method:acme"}}, code={"acme_method": METHOD}, version="0.3")
+    packages.install(
+        "acme-method",
+        {"fprf.methods": {"acme": "acme_method:acme"}},
+        code={"acme_method": METHOD},
+        version="0.3",
+    )
     config, name = load_method("acme")
-    args = ["--knob", "7", "--teacher", "random", "--teacher.channels", "5", "--steps", "3", "--shares", "0.25", "0.75"]
+    args = [
+        "--knob",
+        "7",
+        "--teacher",
+        "random",
+        "--teacher.channels",
+        "5",
+        "--steps",
+        "3",
+        "--shares",
+        "0.25",
+        "0.75",
+    ]
     save_config(folder / "config.json", parse(config, args, prog="x", description=""), name)
     return folder / "config.json"
 
@@ -193,7 +221,12 @@ def test_a_strangers_method_keeps_its_own_fields(packages: Packages, tmp_path: P
     path = acme(packages, tmp_path)
     config, method = load_method(str(path))
     assert method == "acme" and type(config) is type(load_method("acme")[0])
-    assert (config.knob, config.shares, config.teacher, config.steps) == (7, (0.25, 0.75), RandomConfig(channels=5), 3)  # type: ignore[attr-defined]
+    assert (config.knob, config.shares, config.teacher, config.steps) == (
+        7,
+        (0.25, 0.75),
+        RandomConfig(channels=5),
+        3,
+    )  # type: ignore[attr-defined]
     assert parse(config, ["--knob", "8"], prog="x", description="") == dataclasses.replace(config, knob=8)  # type: ignore[call-arg]
     whole = json.loads(path.read_text())
     assert whole["plugins"]["method"] == "acme-method 0.3" and "knob" in whole["config"]
@@ -210,7 +243,8 @@ def test_a_strangers_method_keeps_its_own_fields(packages: Packages, tmp_path: P
 
 @pytest.mark.parametrize("broken", [False, True])
 def test_a_method_with_fields_of_its_own_must_load(packages: Packages, tmp_path: Path, broken: bool) -> None:
-    path, info = acme(packages, tmp_path), packages.root / "acme_method-0.3.dist-info" / "entry_points.txt"
+    path = acme(packages, tmp_path)
+    info = packages.root / "acme_method-0.3.dist-info" / "entry_points.txt"
     info.write_text("[fprf.methods]\nacme = acme_method:no_such_thing\n" if broken else "")
     registry.forget()
     with pytest.raises(PluginError, match=r"; install acme-method 0\.3$") as caught:
@@ -220,7 +254,9 @@ def test_a_method_with_fields_of_its_own_must_load(packages: Packages, tmp_path:
 
 def test_a_plugin_field_called_type_is_refused(packages: Packages) -> None:
     source = ENCODER.format(name="Typed").replace("tile: int", "type: int")
-    packages.install("acme-typed", {"fprf.encoders": {"typed": "acme_typed:TypedConfig"}}, code={"acme_typed": source})
+    packages.install(
+        "acme-typed", {"fprf.encoders": {"typed": "acme_typed:TypedConfig"}}, code={"acme_typed": source}
+    )
     chosen = registry.load("fprf.encoders", "typed", EncoderConfig)
     with pytest.raises(ConfigError, match="has a field `type`"):
         to_json(Leaf(encoder=chosen()))

@@ -31,7 +31,9 @@ def test_built_ins_are_listed_by_name_and_found_by_class() -> None:
 
 
 def test_a_strangers_plugin_is_listed_without_being_imported(packages: Packages) -> None:
-    packages.install("acme-clip", {GROUP: {"acme": "acme_a:ClipConfig"}}, code={"acme_a": ENCODER.format(name="Clip")})
+    packages.install(
+        "acme-clip", {GROUP: {"acme": "acme_a:ClipConfig"}}, code={"acme_a": ENCODER.format(name="Clip")}
+    )
     assert "acme" in registry.installed(GROUP)
     assert "acme_a" not in sys.modules
     found = registry.load(GROUP, "acme", EncoderConfig)
@@ -54,7 +56,9 @@ def test_a_strangers_plugin_is_listed_without_being_imported(packages: Packages)
 def test_a_broken_import_names_the_package_and_the_cause(packages: Packages, source: str, shown: str) -> None:
     packages.install("acme-bad", {GROUP: {"bad": "acme_bad:BadConfig"}}, code={"acme_bad": source})
     assert "bad" in registry.installed(GROUP)
-    with pytest.raises(PluginError, match=r"'bad' \(acme_bad:BadConfig from acme-bad 1\) failed to import") as caught:
+    with pytest.raises(
+        PluginError, match=r"'bad' \(acme_bad:BadConfig from acme-bad 1\) failed to import"
+    ) as caught:
         registry.load(GROUP, "bad", EncoderConfig)
     assert shown in str(caught.value)
 
@@ -85,7 +89,9 @@ def test_any_unknown_name_is_one_plugin_error(name: str) -> None:
 
 
 def test_an_interrupt_while_importing_is_an_interrupt(packages: Packages) -> None:
-    packages.install("acme-slow", {GROUP: {"slow": "acme_slow:S"}}, code={"acme_slow": "raise KeyboardInterrupt"})
+    packages.install(
+        "acme-slow", {GROUP: {"slow": "acme_slow:S"}}, code={"acme_slow": "raise KeyboardInterrupt"}
+    )
     with pytest.raises(KeyboardInterrupt):
         registry.load(GROUP, "slow", EncoderConfig)
 
@@ -138,7 +144,9 @@ def test_resolving_in_any_order_keeps_the_field_flags() -> None:
     config, rest = resolve(fprf(), args)
     assert config.semantic.encoder == RandomConfig() and config.sampler == UniformConfig()
     assert rest == ["--semantic.encoder.channels", "4"]
-    assert resolve(fprf(), ["--sampler", "proposal", "--sampler=uniform"])[0].sampler == UniformConfig(), "the last one counts"
+    assert resolve(fprf(), ["--sampler", "proposal", "--sampler=uniform"])[0].sampler == UniformConfig(), (
+        "the last one counts"
+    )
 
 
 def test_none_empties_an_optional_slot_only() -> None:
@@ -150,13 +158,17 @@ def test_none_empties_an_optional_slot_only() -> None:
 
 def test_a_chosen_plugin_brings_slots_of_its_own(packages: Packages) -> None:
     packages.install("shapes", SHAPES)
-    config, rest = resolve(Tree(), ["--shape.inner.inner", "round", "--shape.inner", "group", "--shape", "group"])
+    config, rest = resolve(
+        Tree(), ["--shape.inner.inner", "round", "--shape.inner", "group", "--shape", "group"]
+    )
     assert config.shape == GroupConfig(inner=GroupConfig(inner=RoundConfig())) and not rest
     assert resolve(Tree(), ["--other", "round"])[0].other == RoundConfig()
 
 
 def test_errors_say_which_slot() -> None:
-    with pytest.raises(PluginError, match=r"^--sampler: fprf.samplers: no plug-in 'unifrom'.*did you mean 'uniform'"):
+    with pytest.raises(
+        PluginError, match=r"^--sampler: fprf.samplers: no plug-in 'unifrom'.*did you mean 'uniform'"
+    ):
         resolve(fprf(), ["--sampler", "unifrom"])
     with pytest.raises(PluginError, match=r"^--content.field: .*not a ContentFieldConfig"):
         resolve(fprf(), ["--content.field", "semantic-planes"])
@@ -170,7 +182,11 @@ def test_a_refusal_offers_no_plugin_of_another_kind(name: str) -> None:
 
 
 def test_types_that_cannot_be_resolved_are_named(packages: Packages) -> None:
-    source = "from __future__ import annotations\n" + ENCODER.format(name="Lost").replace("tile: int", "tile: Nowhere")
-    packages.install("acme-lost", {"fprf.encoders": {"lost": "acme_lost:LostConfig"}}, code={"acme_lost": source})
+    source = "from __future__ import annotations\n" + ENCODER.format(name="Lost").replace(
+        "tile: int", "tile: Nowhere"
+    )
+    packages.install(
+        "acme-lost", {"fprf.encoders": {"lost": "acme_lost:LostConfig"}}, code={"acme_lost": source}
+    )
     with pytest.raises(PluginError, match=r"acme_lost:LostConfig: its field types cannot be resolved"):
         resolve(fprf(), ["--semantic.encoder", "lost"])

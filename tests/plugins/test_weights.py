@@ -14,7 +14,9 @@ from fprf.plugins.weights import read_weights, tensors_hash, write_weights
 
 @settings(max_examples=15, deadline=None)
 @given(shape=st.lists(st.integers(1, 4), max_size=3), half=st.booleans(), seed=st.integers(0, 9))
-def test_round_trip(tmp_path_factory: pytest.TempPathFactory, shape: list[int], half: bool, seed: int) -> None:
+def test_round_trip(
+    tmp_path_factory: pytest.TempPathFactory, shape: list[int], half: bool, seed: int
+) -> None:
     path = tmp_path_factory.mktemp("w") / "deep/er.safetensors"
     value = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
     value = value.half() if half else value

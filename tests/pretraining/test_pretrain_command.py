@@ -1,4 +1,6 @@
-"""`fprf pretrain` and `tools.distil`: files that load, losses that count, resuming, and the same on a device."""
+"""`fprf pretrain` and `tools.distil`: files that load, losses that count, resuming, and the same on a
+device.
+"""
 
 import json
 import shlex
@@ -36,7 +38,8 @@ def report_of(capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
 
 
 def test_content(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    output, teacher = tmp_path / "content.safetensors", str(vgg_file(tmp_path, 64))
+    output = tmp_path / "content.safetensors"
+    teacher = str(vgg_file(tmp_path, 64))
     small = ["--output", str(output), "--size", "32", "--crops", "2", *QUICK]
     assert main(["content", "--images", str(photos), "--teachers", teacher, *small]) == 0
     report = report_of(capsys)
@@ -52,7 +55,8 @@ def test_content(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 def test_semantic(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """From photographs and streets."""
-    output, teachers = tmp_path / "semantic.safetensors", map(str, teacher_files(tmp_path))
+    output = tmp_path / "semantic.safetensors"
+    teachers = map(str, teacher_files(tmp_path))
     small = ["--output", str(output), "--size", "64", "--towns", "1", *QUICK]
     assert main(["semantic", "--images", str(photos), "--teachers", *teachers, *small]) == 0
     said = capsys.readouterr()
@@ -64,11 +68,17 @@ def test_semantic(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert encoder(torch.rand(1, 3, 40, 70)).shape == (1, 26 + 25, 5, 9)
 
 
-def test_a_decoder_learns_and_its_report_is_honest(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    output, encoder, found = tmp_path / "d.safetensors", RandomConfig(channels=12).build(), []
+def test_a_decoder_learns_and_its_report_is_honest(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "d.safetensors"
+    encoder = RandomConfig(channels=12).build()
+    found = []
     chosen = ["--encoder", "random", "--encoder.channels", "12", "--rate", "0.02", "--batch", "512"]
     for steps in ("1", "300"):
-        assert run(["decoder", "--images", str(photos), "--output", str(output), *chosen, "--steps", steps]) == 0
+        assert (
+            run(["decoder", "--images", str(photos), "--output", str(output), *chosen, "--steps", steps]) == 0
+        )
         report = report_of(capsys)
         assert report["encoder"] == encoder.identity
         found.append(report["psnr_db"])
@@ -113,8 +123,11 @@ def network() -> nn.Linear:
 
 
 def test_a_resumed_run_ends_where_an_unbroken_one_does(photos: Path, tmp_path: Path) -> None:
-    config, output = PretrainConfig(images=(photos,), steps=9), tmp_path / "w.safetensors"
-    whole, broken, resumed = network(), network(), network()
+    config = PretrainConfig(images=(photos,), steps=9)
+    output = tmp_path / "w.safetensors"
+    whole = network()
+    broken = network()
+    resumed = network()
     train(whole, quadratic(whole), config, tmp_path / "other.safetensors", lambda _: None)
     with pytest.raises(KeyboardInterrupt):
         train(broken, quadratic(broken, broken_at=6), config, output, lambda _: None)
@@ -127,7 +140,8 @@ def test_a_resumed_run_ends_where_an_unbroken_one_does(photos: Path, tmp_path: P
 def test_checkpoints_stay_until_the_weights_are_written_and_serve_the_same_photographs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    photos, output = photo_folder(tmp_path / "photos", 3), tmp_path / "w.safetensors"
+    photos = photo_folder(tmp_path / "photos", 3)
+    output = tmp_path / "w.safetensors"
     full = Mock(wraps=pretraining.write_weights, side_effect=[DataError("full"), DataError("full"), DEFAULT])
     monkeypatch.setattr(pretraining, "write_weights", full)
     for _ in range(2):
@@ -140,17 +154,42 @@ def test_checkpoints_stay_until_the_weights_are_written_and_serve_the_same_photo
 
 
 def test_the_same_weights_and_report_on_a_device(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    own = ["--encoder", "random", "--encoder.channels", "5", "--pixels", "50", "--style", "0.1", "--content", "0.1", "--every",
-           "1", "--size", "16", "--style-weights", str(vgg_file(tmp_path)), "--steps", "2", "--batch", "2"]  # fmt: skip
-    args, found = ["decoder", "--images", str(photo_folder(tmp_path / "photos", 4)), *own], {}
+    own = [
+        "--encoder",
+        "random",
+        "--encoder.channels",
+        "5",
+        "--pixels",
+        "50",
+        "--style",
+        "0.1",
+        "--content",
+        "0.1",
+        "--every",
+        "1",
+        "--size",
+        "16",
+        "--style-weights",
+        str(vgg_file(tmp_path)),
+        "--steps",
+        "2",
+        "--batch",
+        "2",
+    ]
+    args = ["decoder", "--images", str(photo_folder(tmp_path / "photos", 4)), *own]
+    found = {}
     for device, within in (("cpu", backend.plain), ("cuda:0", pretend_cuda)):
         output = tmp_path / device.replace(":", "") / "weights.safetensors"
         with within() as seen:
             assert run([*args, "--output", str(output), "--device", device]) == 0
         assert seen is None or seen.uploads, "nothing was on the device"
         report = json.loads(capsys.readouterr().out)
-        found[device] = read_weights(output), {k: v for k, v in report.items() if k not in ("seconds", "weights")}
-    ((there, about), report), ((here, before), expected) = found["cuda:0"], found["cpu"]
+        found[device] = (
+            read_weights(output),
+            {k: v for k, v in report.items() if k not in ("seconds", "weights")},
+        )
+    ((there, about), report) = found["cuda:0"]
+    ((here, before), expected) = found["cpu"]
     assert (about, report) == (before, expected)
     assert there.keys() == here.keys() and all(torch.equal(there[name], here[name]) for name in here)
 
@@ -189,11 +228,18 @@ def test_without_weights_for_it_no_style_is_measured(photos: Path, vgg: str, tmp
 
 
 def test_the_line_that_users_are_told_makes_a_decoder_that_fits(photos: Path, tmp_path: Path) -> None:
-    encoder, output, lite = RandomConfig(channels=4, seed=3), tmp_path / "made.safetensors", fprf_lite()
+    encoder = RandomConfig(channels=4, seed=3)
+    output = tmp_path / "made.safetensors"
+    lite = fprf_lite()
     config = replace(lite, content=replace(lite.content, encoder=encoder, decoder=MlpDecoderConfig()))
     with pytest.raises(WeightsError) as raised:
         build_decoder(config, encoder=encoder.build().identity, channels=4)
-    line = str(raised.value).split("`")[1].replace("DIR", str(photos)).replace("decoder.safetensors", str(output))
+    line = (
+        str(raised.value)
+        .split("`")[1]
+        .replace("DIR", str(photos))
+        .replace("decoder.safetensors", str(output))
+    )
     assert run([*shlex.split(line)[2:], "--steps", "1", "--pixels", "20"]) == 0
     fitting = replace(config, content=replace(config.content, decoder=MlpDecoderConfig(weights=output)))
     build_decoder(fitting, encoder=encoder.build().identity, channels=4)

@@ -28,8 +28,11 @@ PLACES = dict(zip((0, 2, 5, 7, 10, 12, 14, 16, 19), (4, 4, 6, 6, 8, 8, 8, 8, 10)
 
 def network() -> StyleNetwork:
     tensors = vgg_convolutions(dict(list(PLACES.items())[:8]), seed=1, biased=False)
-    mean, std = torch.full((3,), 0.45), torch.full((3,), 0.25)
-    return StyleNetwork(VggEncoder("relu3_4", tensors, mean=mean, std=std, scale=torch.ones(1), source="seeded"))
+    mean = torch.full((3,), 0.45)
+    std = torch.full((3,), 0.25)
+    return StyleNetwork(
+        VggEncoder("relu3_4", tensors, mean=mean, std=std, scale=torch.ones(1), source="seeded")
+    )
 
 
 def test_layers_end_where_the_weights_do(tmp_path: Path) -> None:
@@ -47,7 +50,8 @@ def test_layers_end_where_the_weights_do(tmp_path: Path) -> None:
 
 
 def test_activations_are_the_convolutions_in_float64() -> None:
-    net, image = network(), torch.rand(2, 3, 18, 22)
+    net = network()
+    image = torch.rand(2, 3, 18, 22)
     x = (image.double() - 0.45) / 0.25
     expected = []
     for i, name in enumerate(("1_1", "1_2", "2_1", "2_2", "3_1", "3_2", "3_3", "3_4")):
@@ -62,8 +66,11 @@ def test_activations_are_the_convolutions_in_float64() -> None:
 
 
 def test_a_perfect_decoder_loses_nothing_on_its_own_crop(photos: Path) -> None:
-    """Colours as features: AdaIN with itself is the crop, so decoding it by doing nothing has neither loss."""
-    encoder, net = RandomConfig(channels=3, stride=1).build(), network()
+    """Colours as features: AdaIN with itself is the crop, so decoding it by doing nothing has neither
+    loss.
+    """
+    encoder = RandomConfig(channels=3, stride=1).build()
+    net = network()
     made = prepare_crops(encoder, net, find_photos([photos]), side=24, longest=96, seed=0, measure=True)
     rgb = torch.stack([load_photo(path, 96)[:24, :24].reshape(-1, 3) for path in find_photos([photos])])
     seen = net(rgb.view(-1, 24, 24, 3).permute(0, 3, 1, 2))
@@ -76,7 +83,8 @@ def test_a_perfect_decoder_loses_nothing_on_its_own_crop(photos: Path) -> None:
         structure=(seen[CONTENT] - mean) / std,
         style=tuple(statistics),
     )
-    same, other = torch.tensor([1]), torch.tensor([2])
+    same = torch.tensor([1])
+    other = torch.tensor([2])
     assert all(float(loss) < 1e-6 for loss in restyling_losses(crops, net, lambda f: f, same, same))
     content, style = restyling_losses(crops, net, lambda f: f, same, other)
     assert float(style) > 1e-4
@@ -85,10 +93,13 @@ def test_a_perfect_decoder_loses_nothing_on_its_own_crop(photos: Path) -> None:
 
 
 def test_gradients_reach_the_decoder_alone(photos: Path) -> None:
-    encoder, net = RandomConfig(channels=3, stride=2).build(), network()
+    encoder = RandomConfig(channels=3, stride=2).build()
+    net = network()
     crops = prepare_crops(encoder, net, find_photos([photos]), side=16, longest=64, seed=0, measure=True)
     decoder = torch.nn.Linear(3, 3)
-    losses = restyling_losses(crops, net, lambda f: torch.sigmoid(decoder(f)), torch.tensor([0, 1]), torch.tensor([2, 3]))
+    losses = restyling_losses(
+        crops, net, lambda f: torch.sigmoid(decoder(f)), torch.tensor([0, 1]), torch.tensor([2, 3])
+    )
     for loss in losses:
         (gradient,) = torch.autograd.grad(loss, [decoder.weight], retain_graph=True)
         assert bool(gradient.isfinite().all()) and float(gradient.abs().sum()) > 0
@@ -107,7 +118,9 @@ def test_photos_are_found_at_every_depth_in_an_order_of_their_own(folder: Path, 
     (folder / "notes.txt").write_text("no photograph")
     found = find_photos([folder])
     assert sorted(path.name for path in found) == sorted(f"{index}.png" for index in range(13))
-    assert [path.name for path in find_photos([photo_folder(tmp_path / "b", 13)])] == [path.name for path in found]
+    assert [path.name for path in find_photos([photo_folder(tmp_path / "b", 13)])] == [
+        path.name for path in found
+    ]
     learn, held = split(found)
     assert len(held) == 1
     assert not set(learn) & set(held)
@@ -115,7 +128,8 @@ def test_photos_are_found_at_every_depth_in_an_order_of_their_own(folder: Path, 
 
 
 def test_filtered_pixels_are_those_of_the_whole_image(folder: Path) -> None:
-    photo, encoder = load_photo(find_photos([folder])[0]), RandomConfig(channels=3, stride=2).build()
+    photo = load_photo(find_photos([folder])[0])
+    encoder = RandomConfig(channels=3, stride=2).build()
     pixels = random_pixels(photo, 40, generator())
     features, rgb = filtered_at(encoder, photo, pixels)
     assert torch.equal(rgb, photo[pixels[:, 0], pixels[:, 1]])

@@ -8,7 +8,12 @@ import torch
 import torch.nn.functional as F
 
 from fprf.plugins.decoders.config import MlpDecoderConfig, Objective
-from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, EncoderConfig, Vgg19Config
+from fprf.plugins.encoders.config import (
+    BundledContentConfig,
+    BundledSemanticConfig,
+    EncoderConfig,
+    Vgg19Config,
+)
 from fprf.pretraining.decoder import decoder_report
 from fprf.pretraining.photos import find_photos, load_photo, split
 from tools.distil.examples import nightfall
@@ -35,7 +40,8 @@ def test_photographs_survive_encoding_and_decoding(
 def test_day_and_night_agree_better_than_their_colours_do(photos: tuple[list[Path], list[Path]]) -> None:
     encoder = BundledSemanticConfig().build()
     generator = torch.Generator().manual_seed(0)
-    features, colours = [], []
+    features = []
+    colours = []
     for path in photos[1][:6]:
         day = load_photo(path).permute(2, 0, 1)[None]
         night = nightfall(day[0], generator)[None]

@@ -16,14 +16,21 @@ from benchmarks.town.write import write_town
 from fprf.cli import main as cli
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.video import write_video
-from fprf.reconstruction.colmap import build_vocabulary, descriptors, sequential_pairs, similar_pairs, vlad_vectors
+from fprf.reconstruction.colmap import (
+    build_vocabulary,
+    descriptors,
+    sequential_pairs,
+    similar_pairs,
+    vlad_vectors,
+)
 from fprf.reconstruction.scene_folder import MatchTables, count_rows, report
 
 MOST = 2147483647
 
 
 def misses(found: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
-    """How far poses [V 3 4] are from the truth after the similarity that brings their places closest (Umeyama, 1991).
+    """How far poses [V 3 4] are from the truth after the similarity that brings their places closest
+    (Umeyama, 1991).
 
     Largest distance as a share of the diagonal of the true places' box, and largest angle in degrees.
     """
@@ -52,7 +59,9 @@ def database(tmp_path: Path) -> Path:
     )
     base.execute("INSERT INTO descriptors VALUES (1, 2, 128, ?)", (bytes(range(128)) * 2,))
     pairs = {(1, 5): 30, (5, 9): 5, (1, 10): 30, (5, 10): 30, (7, 8): 50}
-    base.executemany("INSERT INTO two_view_geometries VALUES (?, ?)", [(a * MOST + b, n) for (a, b), n in pairs.items()])
+    base.executemany(
+        "INSERT INTO two_view_geometries VALUES (?, ?)", [(a * MOST + b, n) for (a, b), n in pairs.items()]
+    )
     base.commit()
     base.close()
     return path
@@ -71,13 +80,24 @@ def test_progress_and_descriptors(database: Path, tmp_path: Path) -> None:
 
 def test_every_image_has_its_reason(database: Path) -> None:
     images = dict.fromkeys(["a", "apart", "b", "sub/c", "lonely", "odd"])
-    state = {"source": "/photos", "images": images, "dropped": {"x.jpg": "the JPEG is truncated"}, "seconds": {}}
+    state = {
+        "source": "/photos",
+        "images": images,
+        "dropped": {"x.jpg": "the JPEG is truncated"},
+        "seconds": {},
+    }
     figures = {"points": 10, "error_pixels": 0.5, "track_length": 3.0}
     models = [{"images": ["a"], **figures}, {"images": ["sub/c", "elsewhere"], **figures}]
     content = report(state, "exhaustive", MatchTables(database), models, "1.0")
     assert content["images"] == {"given": 7, "used": 6, "posed": 1} and content["parts"] == [1, 2]
     rows = [(drop["step"], drop["image"], drop["reason"]) for drop in content["dropped"]]
-    told = [("choosing", "x.jpg"), ("features", "apart"), ("features", "b"), ("matching", "lonely"), ("mapping", "sub/c")]
+    told = [
+        ("choosing", "x.jpg"),
+        ("features", "apart"),
+        ("features", "b"),
+        ("matching", "lonely"),
+        ("mapping", "sub/c"),
+    ]
     assert [row[:2] for row in rows] == [*told, ("mapping", "odd")]
     assert rows[0][2] == "the JPEG is truncated" and "no other image" in rows[3][2]
     assert rows[4][2] == "in part 2 (2 images), apart from the rest; take views in between"
@@ -110,13 +130,18 @@ def test_similar_finds_the_nearest_by_angle(count: int, nearest: int, seed: int)
 
 
 def test_images_of_one_place_are_alike() -> None:
-    """Eight places, three images of each: a place has features of its own, seen with noise and among others."""
-    drawn, images = np.random.default_rng(0), []
+    """Eight places, three images of each: a place has features of its own, seen with noise and among
+    others.
+    """
+    drawn = np.random.default_rng(0)
+    images = []
     for _ in range(8):
         own = drawn.gamma(0.6, 40, (120, 128))
         for _ in range(3):
             seen = own[drawn.permutation(120)[:80]] + drawn.normal(0, 6, (80, 128))
-            images.append(np.concatenate([seen, drawn.gamma(0.6, 40, (30, 128))]).clip(0, 255).astype(np.uint8))
+            images.append(
+                np.concatenate([seen, drawn.gamma(0.6, 40, (30, 128))]).clip(0, 255).astype(np.uint8)
+            )
     vocabulary = build_vocabulary(lambda i: images[i], len(images), 16)
     found = vlad_vectors(lambda i: images[i], len(images), vocabulary)
     assert vocabulary.shape == (16, 128) and found.shape == (24, 16 * 128)
@@ -130,12 +155,16 @@ pytestmark = pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap 
 
 
 def process(town: Path, source: Path, *options: str) -> tuple[Path, dict[int, int]]:
-    """The town's views through COLMAP, from photographs of a phone where `source` is a folder: the scene, and its view of
-    each frame of the source.
+    """The town's views through COLMAP, from photographs of a phone where `source` is a folder: the scene, and
+    its view of each frame of the source.
     """
     views = [cv2.imread(str(path)) for path in sorted((town / "images").glob("*.png"))]
     if source.suffix:  # each view twice, the second time as a shaking hand takes it
-        pairs = [cv2.cvtColor(frame, cv2.COLOR_BGR2RGB) for view in views for frame in (view, cv2.blur(view, (15, 1)))]
+        pairs = [
+            cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+            for view in views
+            for frame in (view, cv2.blur(view, (15, 1)))
+        ]
         write_video(source, pairs, 12)
     else:
         source.mkdir()
@@ -152,8 +181,11 @@ def test_a_few_small_photographs_find_their_poses(tmp_path: Path) -> None:
     """COLMAP itself, in processes of its own; the long test below asks for more."""
     write_town(tmp_path / "town", seed=0, palette="day", views=16, width=320, height=240)
     scene, views = process(tmp_path / "town", tmp_path / "phone")
-    found, truth = parse_scene(scene, 1, None), parse_scene(tmp_path / "town", 1, None)
-    away, degrees = misses(found.cameras.pose[list(views.values())].numpy(), truth.cameras.pose[list(views)].numpy())
+    found = parse_scene(scene, 1, None)
+    truth = parse_scene(tmp_path / "town", 1, None)
+    away, degrees = misses(
+        found.cameras.pose[list(views.values())].numpy(), truth.cameras.pose[list(views)].numpy()
+    )
     assert len(views) >= 12 and away < 0.03 and degrees < 4
 
 
@@ -163,8 +195,11 @@ def test_a_few_small_photographs_find_their_poses(tmp_path: Path) -> None:
 def test_poses_of_the_town_are_within_a_percent_of_the_truth(tmp_path: Path, source: str, each: int) -> None:
     write_town(tmp_path / "town", seed=0, palette="day", views=40, width=640, height=480)
     scene, views = process(tmp_path / "town", tmp_path / source, "--frames", "40")
-    assert len(views) >= 38 and not any(number % each for number in views), "the sharp ones, and nearly all of them"
-    found, truth = parse_scene(scene, 1, None), parse_scene(tmp_path / "town", 1, None)
+    assert len(views) >= 38 and not any(number % each for number in views), (
+        "the sharp ones, and nearly all of them"
+    )
+    found = parse_scene(scene, 1, None)
+    truth = parse_scene(tmp_path / "town", 1, None)
     true = truth.cameras.pose[[number // each for number in views]].numpy()
     away, degrees = misses(found.cameras.pose[list(views.values())].numpy(), true)
     assert away < 0.01 and degrees < 0.5

@@ -18,7 +18,15 @@ from fprf.datamanagers.images import load_image
 from fprf.errors import ConfigError, DataError, UsageError
 from fprf.io.video import write_video
 from fprf.reconstruction.config import SfmConfig
-from fprf.reconstruction.images import Lens, choose_frames, gather_images, lost_files, natural_order, read_lens, save_frames
+from fprf.reconstruction.images import (
+    Lens,
+    choose_frames,
+    gather_images,
+    lost_files,
+    natural_order,
+    read_lens,
+    save_frames,
+)
 from fprf.reconstruction.scene_folder import SceneFolder, State
 
 NOISE = np.random.default_rng(0).integers(0, 256, (8, 12, 3), dtype=np.uint8)
@@ -26,7 +34,9 @@ NOISE = np.random.default_rng(0).integers(0, 256, (8, 12, 3), dtype=np.uint8)
 
 def photo(path: Path, seed: int = 0, size: tuple[int, int] = (24, 16)) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8))
+    assert cv2.imwrite(
+        str(path), np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+    )
     return path
 
 
@@ -53,7 +63,12 @@ def test_the_lens_is_read_from_every_format_and_no_lens_is_an_empty_one(tmp_path
     for suffix in ("jpg", "png", "webp", "tif", "avif"):
         assert read_lens(with_lens(tmp_path / f"lens.{suffix}")) == Lens("Phone 9", 4.25, 26)
     (tmp_path / "text.jpg").write_text("no image")
-    for path in (photo(tmp_path / "a.jpg"), photo(tmp_path / "a.png"), tmp_path / "gone", tmp_path / "text.jpg"):
+    for path in (
+        photo(tmp_path / "a.jpg"),
+        photo(tmp_path / "a.png"),
+        tmp_path / "gone",
+        tmp_path / "text.jpg",
+    ):
         assert read_lens(path) == Lens()
 
 
@@ -87,7 +102,9 @@ def gathered(source: Path, place: SceneFolder, **knobs: object) -> State:
 
 
 def names(place: SceneFolder) -> list[str]:
-    return natural_order([p.relative_to(place.images).as_posix() for p in place.images.rglob("*") if p.is_file()])
+    return natural_order(
+        [p.relative_to(place.images).as_posix() for p in place.images.rglob("*") if p.is_file()]
+    )
 
 
 def test_images_are_copied_as_they_are(photos: Path, tmp_path: Path) -> None:
@@ -119,7 +136,9 @@ def test_what_cannot_be_used_is_dropped_with_its_reason(photos: Path, tmp_path: 
     assert lost_files(state).startswith(told)
 
 
-def test_heic_becomes_jpeg_with_its_lens_or_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_heic_becomes_jpeg_with_its_lens_or_says_what_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     source = tmp_path / "in"
     source.mkdir()
     for k in range(3):
@@ -143,7 +162,8 @@ def test_heic_becomes_jpeg_with_its_lens_or_says_what_is_missing(tmp_path: Path,
 
 
 def test_what_colmap_does_not_read_becomes_jpeg_whatever_it_is_called(tmp_path: Path) -> None:
-    source, image = tmp_path / "in", Image.fromarray(cv2.resize(NOISE, (48, 32), interpolation=cv2.INTER_CUBIC))
+    source = tmp_path / "in"
+    image = Image.fromarray(cv2.resize(NOISE, (48, 32), interpolation=cv2.INTER_CUBIC))
     source.mkdir()
     foreign = {"a.webp": "WEBP", "b.JPG": "WEBP", "c.avif": "AVIF", "d.png": "AVIF"}
     kinds = foreign | {"e.webp": "JPEG", "f.jpg": "PNG", "g.tif": "TIFF"}
@@ -159,8 +179,15 @@ def test_what_colmap_does_not_read_becomes_jpeg_whatever_it_is_called(tmp_path: 
         if name in kinds:
             assert (place.images / name).read_bytes() == (source / name).read_bytes()
         else:  # upright, and nothing left that would turn it again
-            assert abs(kept.astype(int) - load_image(source / name.removesuffix(".jpg"), upright=True)).mean() < 3
-            assert np.array_equal(kept, load_image(place.images / name, upright=True)) and kept.shape == (48, 32, 3)
+            assert (
+                abs(kept.astype(int) - load_image(source / name.removesuffix(".jpg"), upright=True)).mean()
+                < 3
+            )
+            assert np.array_equal(kept, load_image(place.images / name, upright=True)) and kept.shape == (
+                48,
+                32,
+                3,
+            )
 
 
 def test_a_second_time_follows_what_has_changed(photos: Path, tmp_path: Path) -> None:
@@ -171,7 +198,9 @@ def test_a_second_time_follows_what_has_changed(photos: Path, tmp_path: Path) ->
     (photos / "IMG_10.jpg").unlink()
     state = gathered(photos, place)
     assert list(state.images) == names(place) == ["IMG_1.jpg", "IMG_2.jpg", "IMG_3.jpg"]
-    assert (place.images / "IMG_1.jpg").stat().st_mtime_ns == before["IMG_1.jpg"], "what is the same is not copied again"
+    assert (place.images / "IMG_1.jpg").stat().st_mtime_ns == before["IMG_1.jpg"], (
+        "what is the same is not copied again"
+    )
     assert (place.images / "IMG_2.jpg").read_bytes() == (photos / "IMG_2.jpg").read_bytes()
 
 
@@ -217,7 +246,8 @@ def test_a_video_gives_its_sharp_frames(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["copy", "webp", "video"])
 def test_pictures_of_others_stay(photos: Path, tmp_path: Path, kind: str) -> None:
-    place, source = SceneFolder(tmp_path / "scene"), tmp_path / "clip.mp4" if kind == "video" else photos
+    place = SceneFolder(tmp_path / "scene")
+    source = tmp_path / "clip.mp4" if kind == "video" else photos
     name = {"copy": "IMG_10.jpg", "webp": "a.webp.jpg", "video": "frame_000000.jpg"}[kind]
     write_video(tmp_path / "clip.mp4", [cv2.imread(str(photos / "IMG_1.jpg"))] * 3, 12, h264=False)
     Image.fromarray(NOISE).save(photos / "a.webp")
@@ -233,7 +263,9 @@ def test_pictures_of_others_stay(photos: Path, tmp_path: Path, kind: str) -> Non
     assert name in gathered(source, place).images
 
 
-def test_a_scene_inside_of_the_source_is_none_of_its_photographs(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_inside_of_the_source_is_none_of_its_photographs(
+    photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(photos)
     for _ in range(2):
         assert len(gathered(Path(), SceneFolder(Path("scenes/in"))).images) == 3
@@ -249,7 +281,8 @@ def test_mistakes_are_named(photos: Path, tmp_path: Path) -> None:
     photo(tmp_path / "few" / "a.jpg")
     (tmp_path / "few" / "b.jpg").write_bytes(b"")
     with pytest.raises(
-        DataError, match=r"1 of 2 files could not .*: b\.jpg \(the file is empty\); 1 usable images, at least 3"
+        DataError,
+        match=r"1 of 2 files could not .*: b\.jpg \(the file is empty\); 1 usable images, at least 3",
     ):
         gathered(tmp_path / "few", place)
     (tmp_path / "few" / "no.mp4").write_bytes(b"nothing of the kind" * 100)
@@ -263,6 +296,13 @@ def test_mistakes_are_named(photos: Path, tmp_path: Path) -> None:
     (place.work / "state.json").write_text(json.dumps({"format": 1, "wrong": 3}))
     with pytest.raises(DataError, match=r"state\.json: cannot be read"):
         State.load(place)
-    for knob, value in {"frames": 2, "blurred": 1.5, "features": 5, "side": 9, "overlap": 0, "threads": 0}.items():
+    for knob, value in {
+        "frames": 2,
+        "blurred": 1.5,
+        "features": 5,
+        "side": 9,
+        "overlap": 0,
+        "threads": 0,
+    }.items():
         with pytest.raises(ConfigError, match=knob):
             SfmConfig(**{knob: value})

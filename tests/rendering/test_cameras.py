@@ -13,7 +13,16 @@ from hypothesis import strategies as st
 from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor
 
-from fprf.rendering.cameras import LIMIT, Cameras, PixelRays, grid_rays, normals, pixel_grid, project, rays_through
+from fprf.rendering.cameras import (
+    LIMIT,
+    Cameras,
+    PixelRays,
+    grid_rays,
+    normals,
+    pixel_grid,
+    project,
+    rays_through,
+)
 from fprf.rendering.lens import FISHEYE, OPENCV, PINHOLE, bend, lens_reach, unbend
 from fprf.rendering.paths import look_at, pinhole
 
@@ -25,14 +34,26 @@ K = {
 
 
 def cameras(
-    lenses: list[int], k: tuple[float, ...] | None = None, seed: int = 0, *, tiny: bool = False, offset: float = 0.0
+    lenses: list[int],
+    k: tuple[float, ...] | None = None,
+    seed: int = 0,
+    *,
+    tiny: bool = False,
+    offset: float = 0.0,
 ) -> Cameras:
     """Views of any pose and intrinsics, of 40 to 90 pixels across, or 5 to 12."""
-    count, draw = len(lenses), torch.Generator().manual_seed(seed)
+    count = len(lenses)
+    draw = torch.Generator().manual_seed(seed)
     turn, _ = torch.linalg.qr(torch.randn(count, 3, 3, dtype=torch.float64, generator=draw))
-    size = torch.randint(5, 13, (count, 2), generator=draw) if tiny else torch.randint(40, 90, (count, 2), generator=draw)
+    size = (
+        torch.randint(5, 13, (count, 2), generator=draw)
+        if tiny
+        else torch.randint(40, 90, (count, 2), generator=draw)
+    )
     return Cameras(
-        pose=torch.cat([turn * torch.linalg.det(turn)[:, None, None], offset + 5 * random(draw, count, 3, 1)], -1),
+        pose=torch.cat(
+            [turn * torch.linalg.det(turn)[:, None, None], offset + 5 * random(draw, count, 3, 1)], -1
+        ),
         focal=(random(draw, count, 2) + 60) * (1 / 3 if tiny else 1),
         centre=size * 0.5 + random(draw, count, 2),
         size=size,
@@ -87,9 +108,11 @@ def test_lenses_are_those_of_opencv(lens: int) -> None:
     scene = cameras([lens], (k1, k2, k3, k4 if lens == FISHEYE else 0.0, p1, p2))
     view, pixel = pixels(scene, 50)
     origin, direction = rays_through(scene, view, pixel)
-    points, pose = (origin + 2 * direction).numpy()[:, None], scene.pose[0].numpy()
+    points = (origin + 2 * direction).numpy()[:, None]
+    pose = scene.pose[0].numpy()
     rotation = (pose[:, :3] * [1, -1, -1]).T
-    (fx, fy), (cx, cy) = scene.focal[0].tolist(), scene.centre[0].tolist()
+    (fx, fy) = scene.focal[0].tolist()
+    (cx, cy) = scene.centre[0].tolist()
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
     own = cv2.fisheye.projectPoints if lens == FISHEYE else cv2.projectPoints
     bent = np.array([k1, k2, k3, k4] if lens == FISHEYE else [k1, k2, p1, p2, k3])
@@ -156,13 +179,16 @@ def test_resized_views_look_the_same_way() -> None:
     rig = mixed()
     larger = rig.resized(rig.size * torch.tensor([3, 2]))
     view, pixel = every_pixel(rig)
-    torch.testing.assert_close(rays_through(larger, view, pixel * torch.tensor([3.0, 2.0])), rays_through(rig, view, pixel))
+    torch.testing.assert_close(
+        rays_through(larger, view, pixel * torch.tensor([3.0, 2.0])), rays_through(rig, view, pixel)
+    )
 
 
 def test_rays_of_whole_views_are_those_of_their_pixels() -> None:
     rig = mixed()
     for view in (0, 1, 2, 3, 1, 4):  # the last two lenses are remembered
-        (origin, direction), (wanted_origin, wanted) = grid_rays(rig, view), view_rays(rig, view)
+        (origin, direction) = grid_rays(rig, view)
+        (wanted_origin, wanted) = view_rays(rig, view)
         assert torch.equal(origin, wanted_origin) and (direction - wanted).abs().max() <= 1e-14
 
 
@@ -194,16 +220,21 @@ def test_a_plane_has_its_normal_everywhere(plain: Cameras, normal: tuple[float, 
 def test_whatever_the_depths_normals_face_the_camera(plain: Cameras) -> None:
     found = normals(plain, 0, torch.rand(30, 40, generator=torch.Generator().manual_seed(0)) * 3 + 0.1)
     _, direction = view_rays(plain)
-    assert ((found.view(-1, 3).double() * direction).sum(-1) < 1e-6).all() and (found.norm(dim=-1) > 0.99).all()
+    assert ((found.view(-1, 3).double() * direction).sum(-1) < 1e-6).all() and (
+        found.norm(dim=-1) > 0.99
+    ).all()
 
 
 @pytest.mark.parametrize("k1", [-0.3, -1.0, 0.2])
 def test_a_radius_that_hardly_grows_is_inverted(k1: float) -> None:
     """With k2 = 0.45 k1² the slope touches 0; above it Newton alone overshoots by far."""
     u = torch.cat([torch.linspace(0, 3, 301), torch.tensor([1e-9, 30.0, 1e4])]).double() / abs(k1) ** 0.5
-    distortion = torch.tensor([[k1, 0.451 * k1 * k1, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64).expand(len(u), 6)
+    distortion = torch.tensor([[k1, 0.451 * k1 * k1, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64).expand(
+        len(u), 6
+    )
     lens = torch.full((len(u),), OPENCV)
-    reach, plane = lens_reach(distortion, lens), torch.stack([u, torch.zeros_like(u)], 1)
+    reach = lens_reach(distortion, lens)
+    plane = torch.stack([u, torch.zeros_like(u)], 1)
     assert bool(reach.isinf().all())
     back = bend(distortion, lens, reach, unbend(distortion, lens, reach, plane))
     assert ((back - plane).abs() <= 1e-11 * (1 + u[:, None])).all()

@@ -56,7 +56,9 @@ def surrounding(seed: int = 0, count: int = 60) -> Cameras:
 
 def street(seed: int = 0, count: int = 30) -> Cameras:
     """Along a line, looking ahead."""
-    position = torch.stack([torch.arange(count), torch.zeros(count), torch.zeros(count)], -1) + 0.05 * random(count, seed)
+    position = torch.stack([torch.arange(count), torch.zeros(count), torch.zeros(count)], -1) + 0.05 * random(
+        count, seed
+    )
     return looking(position, position + torch.tensor([10.0, 0, 0]) + 0.2 * random(count, seed + 1))
 
 
@@ -95,7 +97,9 @@ def spacing(cameras: Cameras) -> float:
 @pytest.mark.parametrize("capture", CAPTURES)
 @settings(max_examples=8)
 @given(seed=st.integers(0, 1000))
-def test_a_spiral_stays_with_the_cameras_closed_and_smooth(capture: Callable[[int], Cameras], seed: int) -> None:
+def test_a_spiral_stays_with_the_cameras_closed_and_smooth(
+    capture: Callable[[int], Cameras], seed: int
+) -> None:
     cameras = capture(seed)
     path = spiral(cameras, 90)
     assert len(path) == 90
@@ -159,7 +163,8 @@ def test_an_interpolation_has_about_the_frames_asked_for(frames: int) -> None:
 
 @given(st.integers(0, 1000))
 def test_look_at_is_level_and_survives_looking_along_up(seed: int) -> None:
-    position, target = random(6, seed), random(6, seed + 7)
+    position = random(6, seed)
+    target = random(6, seed + 7)
     target[0] = position[0] + UP
     target[1] = position[1] - 1e-13 * UP
     pose = look_at(position, target, UP)
@@ -193,7 +198,12 @@ def test_up_is_the_cameras_own_or_against_their_view() -> None:
     angle = torch.arange(8, dtype=torch.float64)
     position = torch.stack([angle, angle.square(), torch.full_like(angle, 30.0)], -1)
     heading = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
-    poses = torch.cat([look_at(place[None], place[None] - 30 * UP, way) for place, way in zip(position, heading, strict=True)])
+    poses = torch.cat(
+        [
+            look_at(place[None], place[None] - 30 * UP, way)
+            for place, way in zip(position, heading, strict=True)
+        ]
+    )
     up = upwards(pinhole(poses, width=8, height=8, fov=60))
     assert torch.allclose(up / up.norm(), UP, atol=1e-6)
 
@@ -202,14 +212,21 @@ def turn(axis: torch.Tensor, angle: float) -> torch.Tensor:
     """Rodrigues' formula."""
     x, y, z = torch.nn.functional.normalize(axis, dim=-1).tolist()
     cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
-    return torch.eye(3, dtype=torch.float64) + math.sin(angle) * cross + 2 * math.sin(angle / 2) ** 2 * cross @ cross
+    return (
+        torch.eye(3, dtype=torch.float64)
+        + math.sin(angle) * cross
+        + 2 * math.sin(angle / 2) ** 2 * cross @ cross
+    )
 
 
 def axis(seed: int) -> torch.Tensor:
     return torch.randn(3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
-@given(st.integers(0, 10_000), st.floats(-math.pi, math.pi) | st.sampled_from([0.0, 1e-9, math.pi, math.pi - 1e-9]))
+@given(
+    st.integers(0, 10_000),
+    st.floats(-math.pi, math.pi) | st.sampled_from([0.0, 1e-9, math.pi, math.pi - 1e-9]),
+)
 def test_quaternions_round_trip(seed: int, angle: float) -> None:
     rotation = turn(axis(seed), angle)[None]
     quaternion = quaternions(rotation)
@@ -218,7 +235,9 @@ def test_quaternions_round_trip(seed: int, angle: float) -> None:
     torch.testing.assert_close(rotations(-3 * quaternion), rotation, atol=1e-13, rtol=0)
 
 
-@given(st.integers(0, 10_000), st.floats(1e-12, math.pi - 1e-6) | st.just(0.0), st.floats(0, 1), st.booleans())
+@given(
+    st.integers(0, 10_000), st.floats(1e-12, math.pi - 1e-6) | st.just(0.0), st.floats(0, 1), st.booleans()
+)
 def test_slerp_is_the_part_of_the_turn(seed: int, angle: float, u: float, flip: bool) -> None:
     start = turn(axis(seed + 1), 1.3)
     ends = quaternions(torch.stack([start, start @ turn(axis(seed), angle)]))
@@ -235,7 +254,9 @@ def test_catmull_rom_passes_through_keys_with_one_velocity(count: int, seed: int
     ends = torch.full((count - 1,), 1 - 1e-12, dtype=torch.float64)
     torch.testing.assert_close(catmull_rom(keys, gaps, ends), keys[1:], atol=1e-10, rtol=0)
     step = 1e-6
-    before = keys[1:-1] - catmull_rom(keys, gaps[:-1], torch.full((count - 2,), 1 - step, dtype=torch.float64))
+    before = keys[1:-1] - catmull_rom(
+        keys, gaps[:-1], torch.full((count - 2,), 1 - step, dtype=torch.float64)
+    )
     after = catmull_rom(keys, gaps[1:], torch.full((count - 2,), step, dtype=torch.float64)) - keys[1:-1]
     torch.testing.assert_close(before / step, after / step, atol=1e-4, rtol=0)
 
@@ -266,7 +287,11 @@ def test_what_is_written_reads_back(
 ) -> None:
     draw = torch.Generator().manual_seed(seed)
     position = torch.randn(count, 3, dtype=torch.float64, generator=draw)
-    pose = look_at(position, position + torch.randn(count, 3, dtype=torch.float64, generator=draw), torch.eye(3).double()[2])
+    pose = look_at(
+        position,
+        position + torch.randn(count, 3, dtype=torch.float64, generator=draw),
+        torch.eye(3).double()[2],
+    )
     cameras = pinhole(pose, width=320, height=240, fov=math.degrees(2 * math.atan(120 / focal)))
     path = tmp_path_factory.getbasetemp() / "path.json"
     write_camera_path(path, cameras, fps)
@@ -278,14 +303,18 @@ def test_what_is_written_reads_back(
 
 
 def test_a_file_as_the_viewer_exports_it(tmp_path: Path) -> None:
-    cameras, fps = read_camera_path(file(tmp_path / "p.json", camera_type="perspective", seconds=4, keyframes=[{}]))
+    cameras, fps = read_camera_path(
+        file(tmp_path / "p.json", camera_type="perspective", seconds=4, keyframes=[{}])
+    )
     assert fps == 24 and cameras.focal.tolist() == [[pytest.approx(100.0)] * 2]
     assert cameras.centre.tolist() == [[150, 100]] and cameras.size.tolist() == [[300, 200]]
 
 
 def test_a_rounded_rotation_is_made_exact(tmp_path: Path) -> None:
     turned = [0.70711, -0.70711, 0, 1, 0.70711, 0.70711, 0, 2, 0, 0, 1, 3, 0, 0, 0, 1]
-    cameras, _ = read_camera_path(file(tmp_path / "p.json", camera_path=[{"camera_to_world": turned, "fov": 60}]))
+    cameras, _ = read_camera_path(
+        file(tmp_path / "p.json", camera_path=[{"camera_to_world": turned, "fov": 60}])
+    )
     rotation = cameras.pose[0, :, :3]
     assert float((rotation.T @ rotation - torch.eye(3)).abs().max()) < 1e-14
     assert cameras.pose[0, :, 3].tolist() == [1, 2, 3]
@@ -294,7 +323,13 @@ def test_a_rounded_rotation_is_made_exact(tmp_path: Path) -> None:
 FRAME = {"camera_to_world": IDENTITY, "fov": 60}
 
 
-WRONG = [("camera_type", "equirectangular"), ("render_width", 0), ("render_width", 10**400), ("fps", 0), ("camera_path", [])]
+WRONG = [
+    ("camera_type", "equirectangular"),
+    ("render_width", 0),
+    ("render_width", 10**400),
+    ("fps", 0),
+    ("camera_path", []),
+]
 WRONG_FRAMES = [{"fov": 60}, {**FRAME, "fov": 180}]
 # letters, what is too large, a scale, a mirroring
 WRONG_FRAMES += [{**FRAME, "camera_to_world": [first, *IDENTITY[1:]]} for first in ("x", 10**400, 2, -1)]

@@ -1,4 +1,6 @@
-"""The renderer against a loop over rays and samples, and its promises: error budget, strength 0, what moves density."""
+"""The renderer against a loop over rays and samples, and its promises: error budget, strength 0, what moves
+density.
+"""
 
 import itertools
 import math
@@ -20,7 +22,8 @@ from fprf.style.look import Restyle
 from fprf.types import FieldSample, Rays, Rendered, Want
 
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-C, D = 5, 3
+C = 5
+D = 3
 
 
 class Squash(Decoder):
@@ -95,8 +98,12 @@ def space_of(kind: Kind) -> Space:
     return Space(kind, (0.0, 0.0, 0.0), EYE, 1.0, 0.05, 1e3, focal=(1.5, 1.5))
 
 
-def parts_of(kind: Kind = "contraction", seed: int = 0, thickness: float = 3.0, proposal: bool = False) -> Parts:
-    sampler = ProposalConfig(samples=(12,), final=9, resolutions=(6,)) if proposal else UniformConfig(samples=17)
+def parts_of(
+    kind: Kind = "contraction", seed: int = 0, thickness: float = 3.0, proposal: bool = False
+) -> Parts:
+    sampler = (
+        ProposalConfig(samples=(12,), final=9, resolutions=(6,)) if proposal else UniformConfig(samples=17)
+    )
     field = PlanesConfig(resolutions=(4, 9), channels=8, hidden=16).build(channels=C, seed=seed)
     with torch.no_grad():
         for name, weight in field.named_parameters():
@@ -118,7 +125,9 @@ def rays_of(kind: Kind, count: int, seed: int = 0) -> Rays:
 ALL = Want.DENSITY | Want.COLOUR | Want.CONTENT | Want.SEMANTIC
 
 
-def composite_oracle(rays: Rays, parts: Parts, rendered: Rendered, restyle: Restyle | None) -> list[dict[str, Any]]:
+def composite_oracle(
+    rays: Rays, parts: Parts, rendered: Rendered, restyle: Restyle | None
+) -> list[dict[str, Any]]:
     """One ray and one sample at a time, fp64 but for what the fields themselves say."""
     assert rendered.sampled is not None and parts.semantic is not None
     result = []
@@ -126,7 +135,8 @@ def composite_oracle(rays: Rays, parts: Parts, rendered: Rendered, restyle: Rest
         t = rendered.sampled.t[r].tolist()
         middle = [(near + far) / 2 for near, far in itertools.pairwise(t)]
         points = parts.space.locate(torch.stack([rays.origin[r] + rays.direction[r] * m for m in middle]))
-        sample, semantic = parts.field.density(points), parts.semantic(points)
+        sample = parts.field.density(points)
+        semantic = parts.semantic(points)
         content = parts.field.content(sample.latent, rays.view[r].expand(len(points), 3))
         styled = content
         if restyle is not None:
@@ -141,18 +151,29 @@ def composite_oracle(rays: Rays, parts: Parts, rendered: Rendered, restyle: Rest
             before += tau
             for name, value in values.items():
                 sums[name] += weight * value[k].double()
-            depth, total = depth + weight * m, total + weight
-        result.append(sums | {"depth": depth / total, "opacity": -math.expm1(-before), "through": math.exp(-before)})
+            depth = depth + weight * m
+            total = total + weight
+        result.append(
+            sums | {"depth": depth / total, "opacity": -math.expm1(-before), "through": math.exp(-before)}
+        )
     return result
 
 
 @torch.no_grad()
 @pytest.mark.parametrize(
     ("kind", "proposal", "restyle"),
-    [("contraction", True, Restyle(Shift(reads=True), 0.4)), ("box", False, None), ("ndc", False, Restyle(Shift(), 1.0))],
+    [
+        ("contraction", True, Restyle(Shift(reads=True), 0.4)),
+        ("box", False, None),
+        ("ndc", False, Restyle(Shift(), 1.0)),
+    ],
 )
-def test_a_render_is_the_loop_over_rays_and_samples(kind: Kind, proposal: bool, restyle: Restyle | None) -> None:
-    parts, rays, background = parts_of(kind, proposal=proposal), rays_of(kind, 5), torch.tensor([0.9, 0.1, 0.4])
+def test_a_render_is_the_loop_over_rays_and_samples(
+    kind: Kind, proposal: bool, restyle: Restyle | None
+) -> None:
+    parts = parts_of(kind, proposal=proposal)
+    rays = rays_of(kind, 5)
+    background = torch.tensor([0.9, 0.1, 0.4])
     found = render_rays(rays, parts, want=ALL, budget=0.0, restyle=restyle, background=background)
     assert found.rgb is not None and found.content is not None and found.semantic is not None
     for r, wanted in enumerate(composite_oracle(rays, parts, found, restyle)):
@@ -168,7 +189,8 @@ def test_a_render_is_the_loop_over_rays_and_samples(kind: Kind, proposal: bool, 
 @settings(max_examples=15)
 @given(st.integers(0, 9999), st.sampled_from([1e-4, 1 / 512, 0.02, 0.3]), st.floats(0.3, 6.0))
 def test_the_budget_bounds_the_colour_error(seed: int, budget: float, thickness: float) -> None:
-    parts, rays = parts_of(seed=seed, thickness=thickness), rays_of("contraction", 24, seed)
+    parts = parts_of(seed=seed, thickness=thickness)
+    rays = rays_of("contraction", 24, seed)
     with torch.no_grad():
         exact, quick = (render_rays(rays, parts, want=Want.COLOUR, budget=b) for b in (0.0, budget))
     assert exact.rgb is not None and quick.rgb is not None
@@ -181,7 +203,9 @@ def test_the_budget_bounds_the_colour_error(seed: int, budget: float, thickness:
 
 @torch.no_grad()
 def test_style_changes_colour_alone_and_sees_only_what_is_kept() -> None:
-    parts, rays, stylizer = parts_of(), rays_of("contraction", 16), Shift(reads=True)
+    parts = parts_of()
+    rays = rays_of("contraction", 16)
+    stylizer = Shift(reads=True)
     plain = render_rays(rays, parts, want=ALL, budget=0.05)
     styled = render_rays(rays, parts, want=ALL, budget=0.05, restyle=Restyle(stylizer))
     for name in ("content", "semantic", "depth", "opacity"):
@@ -195,7 +219,8 @@ def gradients(loss: Tensor, module: nn.Module) -> list[Tensor | None]:
 
 
 def test_semantics_never_move_density() -> None:
-    parts, rays = parts_of(proposal=True), rays_of("contraction", 12)
+    parts = parts_of(proposal=True)
+    rays = rays_of("contraction", 12)
     found = render_rays(rays, parts, want=ALL, budget=0.0, step=0, semantic_samples=4)
     assert found.semantic is not None and found.rgb is not None and parts.semantic is not None
     assert all(g is None for g in gradients(found.semantic.square().sum(), parts.field))
@@ -206,10 +231,17 @@ def test_semantics_never_move_density() -> None:
 
 @pytest.mark.parametrize("moves", [False, True])
 def test_content_moves_density_only_where_it_may(moves: bool) -> None:
-    parts, rays = parts_of(), rays_of("contraction", 12)
+    parts = parts_of()
+    rays = rays_of("contraction", 12)
     found = render_rays(rays, parts, want=ALL, budget=0.0, content_moves_density=moves)
     assert found.content is not None and found.rgb is not None
-    reached = dict(zip(dict(parts.field.named_parameters()), gradients(found.content.square().sum(), parts.field), strict=True))
+    reached = dict(
+        zip(
+            dict(parts.field.named_parameters()),
+            gradients(found.content.square().sum(), parts.field),
+            strict=True,
+        )
+    )
     assert (reached["to_density.weight"] is not None) == moves
     assert all(g is not None and g.any() for name, g in reached.items() if "to_density" not in name)
     assert all(g is not None and g.any() for g in gradients(found.rgb.square().sum(), parts.field))
@@ -218,13 +250,19 @@ def test_content_moves_density_only_where_it_may(moves: bool) -> None:
 @pytest.mark.parametrize("density", [0.0, 0.1, 1e4])
 def test_a_background_is_seen_through_and_density_learns_from_it(density: float) -> None:
     """Colour c (1 - e^-x) + b e^-x over a length L, x = density L; its derivative is L (c - b) e^-x."""
-    parts = Parts(space_of("box"), UniformConfig(samples=8).build(seed=0), Uniform(density, 0.3), None, Squash())
+    parts = Parts(
+        space_of("box"), UniformConfig(samples=8).build(seed=0), Uniform(density, 0.3), None, Squash()
+    )
     ahead = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
-    rays, background = parts.space.rays(-2 * ahead, ahead), torch.tensor([1.0, 0.5, 0.0])
-    colour, through = 1 / (1 + math.exp(-0.3)), math.exp(-2 * density)
+    rays = parts.space.rays(-2 * ahead, ahead)
+    background = torch.tensor([1.0, 0.5, 0.0])
+    colour = 1 / (1 + math.exp(-0.3))
+    through = math.exp(-2 * density)
     found = render_rays(rays, parts, want=Want.COLOUR, budget=0.0, background=background)
     assert found.rgb is not None
-    assert torch.allclose(found.rgb, (colour * -math.expm1(-2 * density) + background * through)[None], atol=1e-6)
+    assert torch.allclose(
+        found.rgb, (colour * -math.expm1(-2 * density) + background * through)[None], atol=1e-6
+    )
     assert float(found.opacity) == pytest.approx(-math.expm1(-2 * density), rel=1e-6)
     if density == 0:
         assert torch.equal(found.rgb[0], background)
@@ -232,7 +270,9 @@ def test_a_background_is_seen_through_and_density_learns_from_it(density: float)
     for channel in range(3):
         (gradient,) = gradients(found.rgb[0, channel], parts.field)
         assert gradient is not None
-        assert float(gradient) == pytest.approx(2 * (colour - float(background[channel])) * through, rel=1e-4, abs=1e-6)
+        assert float(gradient) == pytest.approx(
+            2 * (colour - float(background[channel])) * through, rel=1e-4, abs=1e-6
+        )
 
 
 @torch.no_grad()
@@ -240,7 +280,9 @@ def test_a_background_is_seen_through_and_density_learns_from_it(density: float)
 def test_semantics_of_some_rays_and_samples_keep_the_opacity(samples: int | None, count: int | None) -> None:
     parts = parts_of()._replace(semantic=Ones())
     rays = rays_of("contraction", 9)
-    found = render_rays(rays, parts, want=Want.SEMANTIC, budget=0.0, semantic_rays=count, semantic_samples=samples)
+    found = render_rays(
+        rays, parts, want=Want.SEMANTIC, budget=0.0, semantic_rays=count, semantic_samples=samples
+    )
     assert found.semantic is not None
     assert found.semantic.shape == (9 if count is None else count, 3)
     wanted = found.opacity[: len(found.semantic), None].expand_as(found.semantic)
@@ -249,7 +291,8 @@ def test_semantics_of_some_rays_and_samples_keep_the_opacity(samples: int | None
 
 @torch.no_grad()
 def test_nothing_is_computed_that_nobody_wants() -> None:
-    parts, rays = parts_of(), rays_of("contraction", 4)
+    parts = parts_of()
+    rays = rays_of("contraction", 4)
     still = parts._replace(semantic=Never(), decoder=Never())  # type: ignore[arg-type]
     found = render_rays(rays, still, want=Want.DENSITY, budget=0.0)
     assert found.rgb is None and found.content is None and found.semantic is None
@@ -258,7 +301,9 @@ def test_nothing_is_computed_that_nobody_wants() -> None:
     assert found.content is not None and found.rgb is None
     found = render_rays(rays, parts._replace(semantic=None), want=ALL, budget=0.0)
     assert found.rgb is not None and found.semantic is None
-    found = render_rays(rays, parts._replace(semantic=Never()), want=Want.COLOUR, budget=0.0, restyle=Restyle(Shift()))  # type: ignore[arg-type]
+    found = render_rays(
+        rays, parts._replace(semantic=Never()), want=Want.COLOUR, budget=0.0, restyle=Restyle(Shift())
+    )  # type: ignore[arg-type]
     assert found.rgb is not None
 
 
@@ -269,12 +314,19 @@ def test_near_densities_learn_by_the_square_of_their_distance(kind: Kind) -> Non
     rays = parts.space.rays(torch.zeros(4, 3).double(), torch.tensor([[0.0, 0.6, 0.8]]).double().expand(4, 3))
 
     def gradient(step: int | None) -> Tensor:
-        (grad,) = torch.autograd.grad(march(rays, parts, budget=0.0, step=step).weights.square().sum(), field.value)
+        (grad,) = torch.autograd.grad(
+            march(rays, parts, budget=0.0, step=step).weights.square().sum(), field.value
+        )
         return grad.view(4, -1)
 
-    plain, training = gradient(None), gradient(0)
+    plain = gradient(None)
+    training = gradient(0)
     middle = midpoints(march(rays, parts, budget=0.0).sampled.t)
-    share = (middle / (4 * rays.near[:, None])).square().clamp(max=1) if kind == "contraction" else torch.ones(4, 64)
+    share = (
+        (middle / (4 * rays.near[:, None])).square().clamp(max=1)
+        if kind == "contraction"
+        else torch.ones(4, 64)
+    )
     assert bool((share < 0.5).any()) == (kind == "contraction")
     torch.testing.assert_close(training, plain * share, rtol=1e-5, atol=1e-9)
 
@@ -291,5 +343,7 @@ def test_a_pose_learns_from_what_is_seen_but_not_from_semantics() -> None:
     assert other.content is not None and other.semantic is not None and other.sampled is not None
     (gradient,) = torch.autograd.grad(other.content.square().sum(), moved.origin, retain_graph=True)
     assert gradient.isfinite().all() and (gradient.norm(dim=1) > 0).all()
-    assert torch.autograd.grad(other.semantic.sum(), moved.origin, allow_unused=True, retain_graph=True) == (None,)
+    assert torch.autograd.grad(other.semantic.sum(), moved.origin, allow_unused=True, retain_graph=True) == (
+        None,
+    )
     assert not other.sampled.t.requires_grad

@@ -1,4 +1,6 @@
-"""Spaces and local frames: contraction, spacing, NDC against NeRF's formulas, boxes against slabs; origins far from 0."""
+"""Spaces and local frames: contraction, spacing, NDC against NeRF's formulas, boxes against slabs; origins
+far from 0.
+"""
 
 import math
 from fractions import Fraction
@@ -11,7 +13,14 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from fprf.errors import DataError
-from fprf.rendering.local_frame import added_and_beside, extent_of, local_origin, offset_file, read_offset, write_offset
+from fprf.rendering.local_frame import (
+    added_and_beside,
+    extent_of,
+    local_origin,
+    offset_file,
+    read_offset,
+    write_offset,
+)
 from fprf.rendering.space import Kind, Space, contract
 
 U = 2.0**-24
@@ -48,12 +57,16 @@ def test_contraction_is_the_formula(x: tuple[float, ...]) -> None:
 
 
 def spacing_oracle(s: float, near: float, far: float) -> float:
-    """g(t) = t/2 up to 1, 1 - 1/(2t) beyond, is linear in s. In fractions of integers there is nothing to cancel."""
+    """g(t) = t/2 up to 1, 1 - 1/(2t) beyond, is linear in s. In fractions of integers there is nothing to
+    cancel.
+    """
 
     def g(t: Fraction) -> Fraction:
         return t / 2 if t < 1 else 1 - 1 / (2 * t)
 
-    n, f, at = Fraction(near), Fraction(far), Fraction(s)
+    n = Fraction(near)
+    f = Fraction(far)
+    at = Fraction(s)
     y = g(n) + (g(f) - g(n)) * at
     return float(2 * y if 2 * y < 1 else 1 / (2 * (1 - y)))
 
@@ -63,11 +76,20 @@ RANGES = [(0.05, 1e3), (1e-3, 1e6), (0.9, 1e6), (2.0, 1e6), (1e-3, 0.5), (0.5, 1
 
 @pytest.mark.parametrize(("near", "far"), RANGES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_spacing_keeps_its_relative_accuracy_and_its_order(near: float, far: float, dtype: torch.dtype) -> None:
+def test_spacing_keeps_its_relative_accuracy_and_its_order(
+    near: float, far: float, dtype: torch.dtype
+) -> None:
     draw = torch.Generator().manual_seed(0)
-    s = torch.cat([torch.linspace(0, 1, 400), torch.rand(300, generator=draw), 1 - torch.rand(300, generator=draw) * 1e-4])
+    s = torch.cat(
+        [
+            torch.linspace(0, 1, 400),
+            torch.rand(300, generator=draw),
+            1 - torch.rand(300, generator=draw) * 1e-4,
+        ]
+    )
     s = s.clamp(0, 1).sort().values.to(dtype)
-    n, f = torch.tensor([near], dtype=dtype), torch.tensor([far], dtype=dtype)
+    n = torch.tensor([near], dtype=dtype)
+    f = torch.tensor([far], dtype=dtype)
     t = space_of("contraction").distance(s[None], n, f)[0]
     assert (t.diff() >= 0).all()
     assert abs(float(t[0]) - float(n)) <= 4 * U * near and abs(float(t[-1]) - float(f)) <= 4 * U * far
@@ -87,18 +109,27 @@ def forward_rays(count: int, seed: int, origin: float = 0.3, spread: float = 0.4
 
 def ndc_point(x: Tensor, near: float, focal: tuple[float, float]) -> Tensor:
     """NeRF, appendix C, for a far plane at infinity: a projected point, fp64."""
-    return torch.stack([-focal[0] * x[:, 0] / x[:, 2], -focal[1] * x[:, 1] / x[:, 2], 1 + 2 * near / x[:, 2]], -1)
+    return torch.stack(
+        [-focal[0] * x[:, 0] / x[:, 2], -focal[1] * x[:, 1] / x[:, 2], 1 + 2 * near / x[:, 2]], -1
+    )
 
 
 @pytest.mark.parametrize("offset", [0.0, 4.5e6])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_ndc_is_nerfs_projection(offset: float, seed: int) -> None:
-    """Points of a ray project to points of its NDC ray; t = 0 is the near plane, and `metric` gives the distance back."""
-    near, focal, turn = 1.3, (1.7, 2.1), rotation(seed)
+    """Points of a ray project to points of its NDC ray; t = 0 is the near plane, and `metric` gives the
+    distance back.
+    """
+    near = 1.3
+    focal = (1.7, 2.1)
+    turn = rotation(seed)
     centre = torch.tensor([offset, -offset, 0.5 * offset], dtype=torch.float64)
-    space = Space("ndc", (float(centre[0]), float(centre[1]), float(centre[2])), rows(turn), 1.0, near, 1.0, focal=focal)
+    space = Space(
+        "ndc", (float(centre[0]), float(centre[1]), float(centre[2])), rows(turn), 1.0, near, 1.0, focal=focal
+    )
     local_o, local_d = forward_rays(50, seed)
-    origin, direction = local_o @ turn + centre, local_d @ turn
+    origin = local_o @ turn + centre
+    direction = local_d @ turn
     rays = space.rays(origin, direction)
     assert rays.origin.dtype == torch.float32 and torch.equal(rays.view, direction.float())
     assert (rays.near == 0).all() and (rays.far == 1).all()
@@ -119,7 +150,8 @@ def test_ndc_is_nerfs_projection(offset: float, seed: int) -> None:
 @pytest.mark.parametrize("kind", ["box", "contraction"])
 @pytest.mark.parametrize("offset", [0.0, 4.5e6])
 def test_world_rays_are_recentred_turned_and_scaled_in_float64(kind: Kind, offset: float) -> None:
-    turn, scale = rotation(3), 0.25
+    turn = rotation(3)
+    scale = 0.25
     centre = torch.tensor([offset, offset, 1.0], dtype=torch.float64)
     space = Space(kind, (offset, offset, 1.0), rows(turn), scale, 0.05, 1e3)
     origin, direction = forward_rays(40, 0)
@@ -138,14 +170,17 @@ def test_world_rays_are_recentred_turned_and_scaled_in_float64(kind: Kind, offse
 
 
 def slab_oracle(o: list[float], d: list[float], least: float) -> tuple[float, float] | None:
-    near, far = least, math.inf
+    near = least
+    far = math.inf
     for a, b in zip(o, d, strict=True):
         if b == 0:
             if abs(a) > 1:
                 return None
             continue
-        one, two = (-1 - a) / b, (1 - a) / b
-        near, far = max(near, min(one, two)), min(far, max(one, two))
+        one = (-1 - a) / b
+        two = (1 - a) / b
+        near = max(near, min(one, two))
+        far = min(far, max(one, two))
     return (near, far) if near < far else None
 
 
@@ -160,11 +195,14 @@ def test_box_rays_enter_and_leave_where_slabs_say(seed: int, axis_aligned: bool)
     rays = space_of("box", near=0.1).rays(origin, direction)
     for k in range(20):
         expected = slab_oracle(origin[k].tolist(), direction[k].tolist(), 0.1)
-        near, far = float(rays.near[k]), float(rays.far[k])
+        near = float(rays.near[k])
+        far = float(rays.far[k])
         if expected is None:
             assert near == far
         else:
-            assert near == pytest.approx(expected[0], rel=1e-6) and far == pytest.approx(expected[1], rel=1e-6)
+            assert near == pytest.approx(expected[0], rel=1e-6) and far == pytest.approx(
+                expected[1], rel=1e-6
+            )
             ends = origin[k] + torch.tensor([[near], [far]], dtype=torch.float64) * direction[k]
             assert ends.abs().max() <= 1 + 1e-5
 
@@ -210,16 +248,22 @@ def test_outliers_and_numbers_that_are_not_finite_decide_nothing() -> None:
 
 
 def test_offset_files_are_read_again_and_do_not_outlive_their_file(tmp_path: Path) -> None:
-    path, offset = tmp_path / "a.splat", (500000.0, -0.0009765625, 5.6e6)
+    path = tmp_path / "a.splat"
+    offset = (500000.0, -0.0009765625, 5.6e6)
     assert read_offset(path) == (0, 0, 0)
     write_offset(path, offset)
     assert offset_file(path).name == "a.splat.offset.json" and read_offset(path) == offset
     write_offset(path, (0.0, 0.0, 0.0))
     assert not offset_file(path).exists()
-    assert added_and_beside(offset, False) == (offset, (0, 0, 0)) and added_and_beside(offset, True) == ((0, 0, 0), offset)
+    assert added_and_beside(offset, False) == (offset, (0, 0, 0)) and added_and_beside(offset, True) == (
+        (0, 0, 0),
+        offset,
+    )
 
 
-@pytest.mark.parametrize("text", ["[]", "{}", '{"offset": [1, 2]}', '{"offset": "far"}', '{"offset": [1, 2, null]}', "{"])
+@pytest.mark.parametrize(
+    "text", ["[]", "{}", '{"offset": [1, 2]}', '{"offset": "far"}', '{"offset": [1, 2, null]}', "{"]
+)
 def test_damaged_offset_files_are_refused(tmp_path: Path, text: str) -> None:
     offset_file(tmp_path / "a.ply").write_text(text)
     with pytest.raises(DataError, match=r"a\.ply\.offset\.json"):

@@ -1,4 +1,6 @@
-"""Step functions: weights at their derived bound on zip-NeRF's grid, resampling and losses against loops in fp64."""
+"""Step functions: weights at their derived bound on zip-NeRF's grid, resampling and losses against loops in
+fp64.
+"""
 
 import itertools
 import math
@@ -21,7 +23,8 @@ SMALLEST = 2.0**-126
 
 def weights_oracle(tau: list[float]) -> list[float]:
     """One ray, float64, a loop."""
-    before, result = 0.0, []
+    before = 0.0
+    result = []
     for x in tau:
         result.append(math.exp(-before) * -math.expm1(-x))
         before += x
@@ -32,7 +35,9 @@ def gradient_oracle(tau: list[float], g: list[float]) -> list[float]:
     """dL/dtau_i = exp(-sum_{j<=i} tau_j) g_i - sum_{j>i} w_j g_j, summed exactly."""
     w = weights_oracle(tau)
     through = [math.exp(-math.fsum(tau[: i + 1])) for i in range(len(tau))]
-    return [through[i] * g[i] - math.fsum(w[j] * g[j] for j in range(i + 1, len(tau))) for i in range(len(tau))]
+    return [
+        through[i] * g[i] - math.fsum(w[j] * g[j] for j in range(i + 1, len(tau))) for i in range(len(tau))
+    ]
 
 
 def edges_of(width: Tensor) -> Tensor:
@@ -60,7 +65,9 @@ def test_weights_on_the_grid_of_extremes(count: int) -> None:
         g = torch.randn(w.shape, generator=torch.Generator().manual_seed(shift))
         (found,) = torch.autograd.grad((w * g).sum(), depth)
         assert found.isfinite().all()
-        exact = torch.tensor([gradient_oracle(t, x) for t, x in zip(depth.double().tolist(), g.double().tolist(), strict=True)])
+        exact = torch.tensor(
+            [gradient_oracle(t, x) for t, x in zip(depth.double().tolist(), g.double().tolist(), strict=True)]
+        )
         assert ((found - exact).abs() <= 1e-5 * g.abs().amax(-1, keepdim=True)).all()
 
 
@@ -77,7 +84,8 @@ def test_fog_before_a_wall_is_not_lost(wall: float) -> None:
 def inverse_cdf(s: list[float], w: list[float], padding: float, u: float) -> float:
     """Where a share u of the padded distribution lies before, float64."""
     w = [x + padding / len(w) for x in w]
-    total, before = math.fsum(w), 0.0
+    total = math.fsum(w)
+    before = 0.0
     for i, x in enumerate(w):
         if u * total < before + x or i == len(w) - 1:
             return s[i] + (s[i + 1] - s[i]) * min((u * total - before) / x, 1.0) if x > 0 else s[i]
@@ -123,7 +131,8 @@ def test_resampled_edges_are_sorted_and_inside(bins: int, count: int, seed: int,
 
 
 def test_draws_move_all_edges_of_a_ray_together_and_follow_the_distribution() -> None:
-    s, w = torch.linspace(0, 1, 5).repeat(20_000, 1), torch.tensor([0.1, 0.0, 0.6, 0.3]).repeat(20_000, 1)
+    s = torch.linspace(0, 1, 5).repeat(20_000, 1)
+    w = torch.tensor([0.1, 0.0, 0.6, 0.3]).repeat(20_000, 1)
     drawn = resample(s, w, 3, padding=1e-6, generator=torch.Generator().manual_seed(0))
     share = torch.histc(drawn, 4, 0, 1) / drawn.numel()
     # Binomial deviation of 80 000 draws is at most 0.0018.
@@ -141,15 +150,26 @@ def interlevel_oracle(s: list[float], w: list[float], ps: list[float], pw: list[
     return total / len(w)
 
 
-@given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 999), st.booleans(), st.sampled_from([1.0, 1e-3, 1e-7]))
-def test_interlevel_is_the_weight_that_is_not_bounded(samples: int, proposed: int, seed: int, same: bool, size: float) -> None:
-    """Also for a proposal on the same edges, which bounds each step alone, and for faint weights, which cost a finite share."""
+@given(
+    st.integers(1, 12),
+    st.integers(1, 12),
+    st.integers(0, 999),
+    st.booleans(),
+    st.sampled_from([1.0, 1e-3, 1e-7]),
+)
+def test_interlevel_is_the_weight_that_is_not_bounded(
+    samples: int, proposed: int, seed: int, same: bool, size: float
+) -> None:
+    """Also for a proposal on the same edges, which bounds each step alone, and for faint weights, which cost
+    a finite share.
+    """
     draw = torch.Generator().manual_seed(seed)
     s = torch.rand(1, samples + 1, generator=draw).sort(-1).values
     ps = torch.cat([torch.zeros(1, 1), torch.rand(1, proposed, generator=draw).sort(-1).values], -1)
     ps[0, -1] = 1
     s = ps if same else s
-    w, pw = size * torch.rand(1, s.shape[1] - 1, generator=draw), size * torch.rand(1, proposed, generator=draw)
+    w = size * torch.rand(1, s.shape[1] - 1, generator=draw)
+    pw = size * torch.rand(1, proposed, generator=draw)
     wanted = interlevel_oracle(s[0].tolist(), w[0].tolist(), ps[0].tolist(), pw[0].tolist())
     # Differences of prefix sums: a few u of their total, through a slope of at most 2.
     assert abs(float(interlevel(s, w, ps, pw)) - wanted) <= 20 * U * (size + float(pw.sum()))
@@ -175,14 +195,16 @@ def test_distortion_is_the_double_sum(samples: int, seed: int) -> None:
     s = torch.rand(5, samples + 1, generator=draw).sort(-1).values
     w = torch.rand(5, samples, generator=draw)
     w = (w / w.sum(-1, keepdim=True)).requires_grad_(True)
-    exact_w, exact_s = w.detach().double().requires_grad_(True), s.double()
+    exact_w = w.detach().double().requires_grad_(True)
+    exact_s = s.double()
     m = midpoints(exact_s)
     pairs = exact_w[:, :, None] * exact_w[:, None] * (m[:, :, None] - m[:, None]).abs()
     wanted = (pairs.sum((1, 2)) + (exact_w.square() * exact_s.diff(dim=-1)).sum(-1) / 3).mean()
     found = stepfun.distortion(s, w)
     # Weights sum to 1 and places lie in [0, 1]: prefix sums are off by a few u, whatever the result.
     assert abs(found.item() - wanted.item()) <= 16 * U
-    (a,), (b,) = torch.autograd.grad(found, w), torch.autograd.grad(wanted, exact_w)
+    (a,) = torch.autograd.grad(found, w)
+    (b,) = torch.autograd.grad(wanted, exact_w)
     assert (a - b).abs().max() <= 1e-5 * max(1e-2, float(b.abs().max()))
 
 
@@ -199,7 +221,8 @@ def test_the_heaviest_are_kept_and_no_more_than_needed(samples: int, seed: int, 
     slack = samples * U * budget + SMALLEST
     assert (dropped <= budget + slack).all()
     for ray in range(6):
-        inside, outside = w[ray][kept[ray]], w[ray][~kept[ray]]
+        inside = w[ray][kept[ray]]
+        outside = w[ray][~kept[ray]]
         if len(inside) and len(outside):
             assert outside.max() <= inside.min()
         if len(inside):  # dropping the lightest of the kept as well would exceed the budget

@@ -24,5 +24,12 @@ def stepped(learner: GaussianLearner, begin: int = 0, end: int = STEPS) -> Gauss
 def quality(found: Gaussians, scene: ParsedScene) -> float:
     """Mean PSNR of the held-out views, drawn by the CPU's kernels."""
     images = load_images(scene)
-    drawn = {view: draw(found, camera_of(scene.cameras, view), antialiased=True).image for view in scene.test.tolist()}
-    return float(np.mean([psnr(x.clamp(0, 1), torch.from_numpy(images[view]).float() / 255) for view, x in drawn.items()]))
+    drawn = {
+        view: draw(found, camera_of(scene.cameras, view), antialiased=True).image
+        for view in scene.test.tolist()
+    }
+    return float(
+        np.mean(
+            [psnr(x.clamp(0, 1), torch.from_numpy(images[view]).float() / 255) for view, x in drawn.items()]
+        )
+    )

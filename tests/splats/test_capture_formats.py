@@ -1,4 +1,6 @@
-"""Formats of files of Gaussians as plug-ins: a stranger's one file and one entry point are enough for every reader and verb."""
+"""Formats of files of Gaussians as plug-ins: a stranger's one file and one entry point are enough for every
+reader and verb.
+"""
 
 from pathlib import Path
 
@@ -72,7 +74,8 @@ def test_built_in_formats_keep_to_the_contract(name: str) -> None:
 def test_a_strangers_format_is_read_restyled_and_written(toy: None, photograph: Path, tmp_path: Path) -> None:
     testing.check_capture_format(format_of(Path("x.toy")))
     assert ".toy" in endings() and cli.main(["plugins", "--check"]) == 0
-    made, path = ball(300, degree=0), tmp_path / "in.toy"
+    made = ball(300, degree=0)
+    path = tmp_path / "in.toy"
     write_gaussians(path, made)
     assert torch.allclose(read_capture(path).gaussians.colours, made.colours, atol=1e-6)
     # The viewer takes it by its name, and by what it begins with.
@@ -81,7 +84,16 @@ def test_a_strangers_format_is_read_restyled_and_written(toy: None, photograph: 
     for name, head in (("x.toy", b"other"), ("x.usdz", b"PK\3\4")):  # damaged; a format that is written alone
         with pytest.raises(DataError):
             check_file(name, head, 60)
-    words = ["restyle", str(path), "--references", str(photograph), "--semantic.encoder", "bundled-semantic", "--regions", "3"]
+    words = [
+        "restyle",
+        str(path),
+        "--references",
+        str(photograph),
+        "--semantic.encoder",
+        "bundled-semantic",
+        "--regions",
+        "3",
+    ]
     words += ["--views", "4", "--size", "64", "48", "--cache", str(tmp_path / "cache")]
     assert cli.main([*words, "--output", str(tmp_path / "out.toy")]) == 0
     assert cli.main([*words, "--output", str(tmp_path / "out.ply")]) == 0
@@ -93,5 +105,7 @@ def test_a_strangers_format_is_read_restyled_and_written(toy: None, photograph: 
 def test_a_name_of_no_format_is_refused_with_those_that_there_are(toy: None, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"x\.obj.*\.compressed\.ply.*\.toy"):
         read_capture(tmp_path / "x.obj")
-    assert format_of(Path("a.COMPRESSED.ply")) == registry.make("fprf.captures", "compressed.ply", CaptureFormat)
+    assert format_of(Path("a.COMPRESSED.ply")) == registry.make(
+        "fprf.captures", "compressed.ply", CaptureFormat
+    )
     assert format_of(tmp_path / "meta.json") == format_of(Path("x.sog"))

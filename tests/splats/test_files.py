@@ -1,4 +1,6 @@
-"""Files of Gaussians: byte for byte back where nothing changed, within each format's steps where it is written anew."""
+"""Files of Gaussians: byte for byte back where nothing changed, within each format's steps where it is
+written anew.
+"""
 
 import gzip
 import json
@@ -27,7 +29,8 @@ FORMATS = {ending: format_of(Path(f"x{ending}")) for ending in endings()}
 WRITTEN = [ending for ending, form in FORMATS.items() if form.writes and form.reads]
 SHAPE = ("means", "quaternions", "log_scales", "logits")
 COUNT = 600
-STEP = {  # most that positions in [-2, 2], ln-scales, opacities, mean colours and harmonics change by: half a step
+# most that positions in [-2, 2], ln-scales, opacities, mean colours and harmonics change by: half a step
+STEP = {
     ".ply": (0.0, 0.0, 1e-7, 0.0, 0.0),
     ".compressed.ply": (2 / 1023, 2 / 1023, 0.5 / 255, 0.65 / 255, 4 / 256),
     ".splat": (0.0, 4e-7, 0.5 / 255, 0.5 / 255, 0.0),
@@ -47,10 +50,14 @@ def cloud(degree: int, count: int = COUNT, seed: int = 0) -> Gaussians:
     harmonics = 0.2 * (random(count, (degree + 1) ** 2, 3) - 0.5)
     harmonics[:, 0] *= 15
     turns = torch.nn.functional.normalize(random(count, 4) - 0.5, dim=1)
-    return Gaussians(4 * random(count, 3) - 2, turns, -6 + 4 * random(count, 3), 8 * random(count) - 4, harmonics)
+    return Gaussians(
+        4 * random(count, 3) - 2, turns, -6 + 4 * random(count, 3), 8 * random(count) - 4, harmonics
+    )
 
 
-def written(path: Path, gaussians: Gaussians, *, antialiased: bool = False, views: Cameras | None = None) -> Capture:
+def written(
+    path: Path, gaussians: Gaussians, *, antialiased: bool = False, views: Cameras | None = None
+) -> Capture:
     """A file of Gaussians, as it is read."""
     write_gaussians(path, gaussians, antialiased=antialiased, views=views)
     return read_capture(path)
@@ -79,7 +86,8 @@ def capture(request: pytest.FixtureRequest, tmp_path: Path) -> Capture:
 
 
 def test_new_colours_change_nothing_else_and_unchanged_ones_nothing(capture: Capture, tmp_path: Path) -> None:
-    there, before = tmp_path / "there" / capture.path.name, capture.gaussians
+    there = tmp_path / "there" / capture.path.name
+    before = capture.gaussians
     write_capture(there, capture, before.harmonics.clone())
     for path in [capture.path] if there.name != "meta.json" else capture.path.parent.glob("*.*"):
         assert (there.parent / path.name).read_bytes() == path.read_bytes()
@@ -90,7 +98,9 @@ def test_new_colours_change_nothing_else_and_unchanged_ones_nothing(capture: Cap
     assert all(torch.equal(getattr(after, name), getattr(before, name)) for name in SHAPE)
     tolerance = 0.03 if capture.path.suffix != ".ply" or ".compressed" in capture.path.name else 0.0
     assert (after.harmonics - new).abs().max() <= tolerance
-    assert (after.harmonics - new).square().mean().sqrt() <= 0.1 * (before.harmonics - new).square().mean().sqrt()
+    assert (after.harmonics - new).square().mean().sqrt() <= 0.1 * (
+        before.harmonics - new
+    ).square().mean().sqrt()
 
 
 @pytest.mark.parametrize("ending", STEP)
@@ -126,11 +136,15 @@ def test_captures_change_their_format_with_the_ending(tmp_path: Path) -> None:
 
 
 def test_without_view_dependence_a_file_holds_the_colours_that_views_show(tmp_path: Path) -> None:
-    """One Gaussian seen from the front alone, and one that no view shows and that is looked at from there as well."""
+    """One Gaussian seen from the front alone, and one that no view shows and that is looked at from there as
+    well.
+    """
     harmonics = torch.zeros(2, 4, 3)
     harmonics[:, 2] = torch.tensor([0.6, -0.3, 0.0])  # Y = 0.4886 z
     means = torch.tensor([[0.0, 0.0, 0.0], [0.0, 50.0, 0.0]])
-    there = Gaussians(means, torch.tensor([[1.0, 0, 0, 0]] * 2), torch.full((2, 3), -2.0), torch.full((2,), 3.0), harmonics)
+    there = Gaussians(
+        means, torch.tensor([[1.0, 0, 0, 0]] * 2), torch.full((2, 3), -2.0), torch.full((2,), 3.0), harmonics
+    )
     seen = written(tmp_path / "seen.splat", there, views=from_the_front(32, 40)).gaussians.colours
     direction = torch.nn.functional.normalize(means - torch.tensor([0.0, 0, 2]), dim=1)
     wanted = 0.5 + 0.48860251 * direction[:, 2:] * harmonics[:, 2]
@@ -141,7 +155,9 @@ def test_without_view_dependence_a_file_holds_the_colours_that_views_show(tmp_pa
 
 @pytest.mark.parametrize("ending", [".ply", ".splat"])
 def test_plain_opacities_show_thin_gaussians_as_compensation_does(tmp_path: Path, ending: str) -> None:
-    """Needles that one view shows apart from each other: without compensation they would be up to five times as heavy."""
+    """Needles that one view shows apart from each other: without compensation they would be up to five times
+    as heavy.
+    """
     means = torch.tensor([[0.4 * x, 0.4 * y, 0.0] for x in (-1, 0, 1) for y in (-1, 0, 1)])
     scales = torch.log(torch.tensor([0.1, 1e-3, 1e-3])) + torch.linspace(0, 2, 9)[:, None]
     turns = torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 9)
@@ -152,7 +168,8 @@ def test_plain_opacities_show_thin_gaussians_as_compensation_does(tmp_path: Path
     assert not plain.antialiased
     camera = camera_of(views, 0)
     wanted, shown, heavy = (
-        draw(g, camera, antialiased=aa).opacity for g, aa in ((there, True), (plain.gaussians, False), (there, False))
+        draw(g, camera, antialiased=aa).opacity
+        for g, aa in ((there, True), (plain.gaussians, False), (there, False))
     )
     assert (shown - wanted).abs().max() < (1e-4 if ending == ".ply" else 0.03)
     assert (heavy - wanted).abs().max() > 0.4
@@ -161,17 +178,41 @@ def test_plain_opacities_show_thin_gaussians_as_compensation_does(tmp_path: Path
 
 
 def test_a_ply_keeps_header_order_and_what_it_does_not_know(tmp_path: Path) -> None:
-    kinds = [("f_dc_2", "double"), ("label", "int"), *((f"rot_{i}", "float") for i in range(4)), ("z", "float"), ("y", "float")]
-    kinds += [("x", "float"), ("opacity", "float"), ("f_dc_0", "float"), ("f_dc_1", "float"), ("confidence", "uchar")]
+    kinds = [
+        ("f_dc_2", "double"),
+        ("label", "int"),
+        *((f"rot_{i}", "float") for i in range(4)),
+        ("z", "float"),
+        ("y", "float"),
+    ]
+    kinds += [
+        ("x", "float"),
+        ("opacity", "float"),
+        ("f_dc_0", "float"),
+        ("f_dc_1", "float"),
+        ("confidence", "uchar"),
+    ]
     kinds += [(f"scale_{i}", "float") for i in range(3)]
     codes = {"double": "<f8", "int": "<i4", "float": "<f4", "uchar": "u1"}
     table = np.zeros(5, [(name, codes[kind]) for name, kind in kinds])
     for k, (name, _) in enumerate(kinds):
         table[name] = np.arange(5) + 0.1 * k + 1
-    lines = ["ply", "format binary_little_endian 1.0", "comment by hand", "element sensor 1", "property double t"]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment by hand",
+        "element sensor 1",
+        "property double t",
+    ]
     lines += ["element vertex 5", *(f"property {kind} {name}" for name, kind in kinds)]
     lines += ["element face 1", "property list uchar int vertex_indices", "end_header", ""]
-    data = "\r\n".join(lines).encode() + struct.pack("<d", 3.5) + table.tobytes() + b"\3" + struct.pack("<3i", 0, 1, 2)
+    data = (
+        "\r\n".join(lines).encode()
+        + struct.pack("<d", 3.5)
+        + table.tobytes()
+        + b"\3"
+        + struct.pack("<3i", 0, 1, 2)
+    )
     path = tmp_path / "x.ply"
     path.write_bytes(data)
     capture = read_capture(path)
@@ -181,7 +222,9 @@ def test_a_ply_keeps_header_order_and_what_it_does_not_know(tmp_path: Path) -> N
     expected = table.copy()
     for name in ("f_dc_0", "f_dc_1", "f_dc_2"):
         expected[name][3] = 0.25
-    assert restyled(tmp_path / "y.ply", capture, new).data == data.replace(table.tobytes(), expected.tobytes())
+    assert restyled(tmp_path / "y.ply", capture, new).data == data.replace(
+        table.tobytes(), expected.tobytes()
+    )
 
 
 def older_spz(version: int) -> bytes:
@@ -196,11 +239,17 @@ def older_spz(version: int) -> bytes:
     streams += [bytes([255, 128, 128, 128, 255, 128]) if version < 3 else struct.pack("<2I", 3 << 30, 0)]
     streams += [bytes(range(120, 129)) * 2]
     if version < 4:
-        return gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, version, 2, 1, 12, 1, 0) + b"".join(streams) + b"more")
+        return gzip.compress(
+            struct.pack("<IIIBBBB", 0x5053474E, version, 2, 1, 12, 1, 0) + b"".join(streams) + b"more"
+        )
     zstandard = pytest.importorskip("zstandard")
     packed = [zstandard.ZstdCompressor().compress(each) for each in streams]
     head = struct.pack("<IIIBBBBI12x", 0x5053474E, 4, 2, 1, 12, 1, 6, 40) + b"extended"
-    return head + b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True)) + b"".join(packed)
+    return (
+        head
+        + b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True))
+        + b"".join(packed)
+    )
 
 
 @pytest.mark.parametrize("version", [1, 2, 3, 4])
@@ -209,7 +258,9 @@ def test_every_version_of_spz(version: int, tmp_path: Path) -> None:
     capture = read_capture(tmp_path / "x.spz")
     found = capture.gaussians
     assert capture.antialiased and found.degree == 1
-    assert torch.equal(found.means, torch.tensor([[1.0, -2.0, 3.0], [0.5, 0.0, -0.25]])), "axes become those of a PLY"
+    assert torch.equal(found.means, torch.tensor([[1.0, -2.0, 3.0], [0.5, 0.0, -0.25]])), (
+        "axes become those of a PLY"
+    )
     assert torch.equal(found.log_scales[0], torch.tensor([0.0, -1.0, -2.0]))
     assert found.opacities[1] == pytest.approx(0.2, abs=1e-6) and found.opacities[0] > 0.99999
     turn = [[0, 1, 0, 0], [0, 0, -1, 0]] if version < 3 else [[1, 0, 0, 0], [0, 1, 0, 0]]
@@ -234,16 +285,22 @@ def test_sog_of_version_1(tmp_path: Path) -> None:
     for name, content in parts.items():
         (tmp_path / name).write_bytes(content if name != "meta.json" else json.dumps(old).encode())
     capture = read_capture(tmp_path)
-    pixels = cv2.cvtColor(cv2.imread(str(tmp_path / "sh0.webp"), cv2.IMREAD_UNCHANGED), cv2.COLOR_BGRA2RGBA).reshape(-1, 4)[:40]
+    pixels = cv2.cvtColor(
+        cv2.imread(str(tmp_path / "sh0.webp"), cv2.IMREAD_UNCHANGED), cv2.COLOR_BGRA2RGBA
+    ).reshape(-1, 4)[:40]
     assert np.allclose(capture.gaussians.harmonics[:, 0], pixels[:, :3] / 255 * 2 - 1, atol=1e-6)
     assert np.allclose(capture.gaussians.logits, pixels[:, 3] / 255 * 10 - 5, atol=1e-6)
     new = capture.gaussians.harmonics * 0.5
     again = restyled(tmp_path / "there" / "meta.json", capture, new).gaussians
-    assert (again.harmonics - new).abs().max() < 2 / 255 and torch.equal(again.logits, capture.gaussians.logits)
+    assert (again.harmonics - new).abs().max() < 2 / 255 and torch.equal(
+        again.logits, capture.gaussians.logits
+    )
 
 
 def test_what_is_refused_is_refused_in_one_line(tmp_path: Path) -> None:
-    data, spz, sog = (written(tmp_path / f"x{ending}", cloud(1, 4)).data for ending in (".ply", ".spz", ".sog"))
+    data, spz, sog = (
+        written(tmp_path / f"x{ending}", cloud(1, 4)).data for ending in (".ply", ".spz", ".sog")
+    )
     for name, content in (
         ("1d.ply", data.replace(b"scale_1", b"scale_9")),
         ("text.ply", data.replace(b"binary_little_endian", b"ascii")),
@@ -271,10 +328,14 @@ def test_what_is_refused_is_refused_in_one_line(tmp_path: Path) -> None:
 def test_a_small_file_that_claims_much_takes_no_memory(ending: str, tmp_path: Path) -> None:
     path = tmp_path / f"x{ending}"
     if ending == ".spz":
-        path.write_bytes(gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, 2**30, 3, 12, 0, 0) + bytes(1 << 20)))
+        path.write_bytes(
+            gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, 2**30, 3, 12, 0, 0) + bytes(1 << 20))
+        )
     else:
         parts = unbundle(path, written(path, cloud(0, 40)).data)
-        wide = cv2.imencode(".webp", np.zeros((4000, 4000, 4), np.uint8), [cv2.IMWRITE_WEBP_QUALITY, 101])[1].tobytes()
+        wide = cv2.imencode(".webp", np.zeros((4000, 4000, 4), np.uint8), [cv2.IMWRITE_WEBP_QUALITY, 101])[
+            1
+        ].tobytes()
         meta = parts["meta.json"].replace(b'"count":40', b'"count":16000000')
         path.write_bytes(bundle(parts | {"means_l.webp": wide, "meta.json": meta}))
     tracemalloc.start()

@@ -1,4 +1,6 @@
-"""Captures as people have them: rows that cannot be drawn, outliers, few Gaussians, large coordinates, other units."""
+"""Captures as people have them: rows that cannot be drawn, outliers, few Gaussians, large coordinates, other
+units.
+"""
 
 import itertools
 from collections.abc import Callable
@@ -54,7 +56,9 @@ def converted(capture: Capture, path: Path) -> tuple[Gaussians, Written]:
 
 def errors(of: Gaussians, found: Gaussians) -> tuple[float, float]:
     """Largest errors of positions and ln-scales: each Gaussian against the nearest that was found."""
-    apart = torch.cdist(of.means.double(), found.means.double(), p=torch.inf, compute_mode="donot_use_mm_for_euclid_dist")
+    apart = torch.cdist(
+        of.means.double(), found.means.double(), p=torch.inf, compute_mode="donot_use_mm_for_euclid_dist"
+    )
     nearest = apart.argmin(1)
     assert len(nearest.unique()) == len(of), "each is there"
     scales = (found.log_scales[nearest] - of.log_scales).abs().nan_to_num(0, 0)
@@ -108,7 +112,9 @@ def test_surroundings_and_object_keep_their_precision(tmp_path: Path) -> None:
         assert converted(capture_of(tmp_path, made), tmp_path / f"out{ending}")[1] == Written()
 
 
-SPOILED = st.lists(st.tuples(st.integers(0, 299), st.sampled_from([*BAD, "far", "huge", "bright", "flat"])), max_size=20)
+SPOILED = st.lists(
+    st.tuples(st.integers(0, 299), st.sampled_from([*BAD, "far", "huge", "bright", "flat"])), max_size=20
+)
 
 
 @settings(max_examples=25)
@@ -116,7 +122,9 @@ SPOILED = st.lists(st.tuples(st.integers(0, 299), st.sampled_from([*BAD, "far", 
 def test_the_others_survive_any_mixture_of_bad_rows_between_any_two_formats(
     tmp_path: Path, spoiled: list[tuple[int, str]], power: float, endings: tuple[str, str]
 ) -> None:
-    made, whole, sound = ball(300, seed=1), ball(300, seed=1), torch.ones(300, dtype=torch.bool)
+    made = ball(300, seed=1)
+    whole = ball(300, seed=1)
+    sound = torch.ones(300, dtype=torch.bool)
     for i, fault in spoiled:
         sound[i] = False
         if fault == "far":
@@ -136,7 +144,9 @@ def test_the_others_survive_any_mixture_of_bad_rows_between_any_two_formats(
     for ending in endings:
         path = tmp_path / f"between{ending}"
         written = write_capture(path, capture, capture.gaussians.harmonics)
-        assert written.faulty or ending == ".ply" or bool(capture.gaussians.finite.all()), "what is left out is said"
+        assert written.faulty or ending == ".ply" or bool(capture.gaussians.finite.all()), (
+            "what is left out is said"
+        )
         capture = read_capture(path)
     found = capture.gaussians.select((capture.gaussians.means.abs() < 3).all(1) & capture.gaussians.finite)
     position, scale = errors(whole.select(sound), found)
@@ -148,7 +158,9 @@ def test_the_others_survive_any_mixture_of_bad_rows_between_any_two_formats(
 
 def test_sizes_beyond_those_of_spz_are_said(tmp_path: Path) -> None:
     small = ball(200)
-    small = Gaussians(small.means * 1e-3, small.quaternions, small.log_scales - 9, small.logits, small.harmonics)
+    small = Gaussians(
+        small.means * 1e-3, small.quaternions, small.log_scales - 9, small.logits, small.harmonics
+    )
     assert converted(capture_of(tmp_path, small), tmp_path / "out.spz")[1].notes[0].startswith("200 ")
 
 
@@ -156,7 +168,19 @@ def test_colours_of_bytes_and_flat_gaussians_are_read_and_recoloured_in_place(tm
     made = ball(30, degree=0)
     made.harmonics[:, 0] = torch.linspace(-1, 1, 90).view(30, 3)
     columns = np.frombuffer(plain_ply(made).partition(b"end_header\n")[2], "<f4").reshape(30, 17)
-    names = [*"xyz", "nx", "ny", "nz", "red", "green", "blue", "opacity", "scale_0", "scale_1", *(f"rot_{i}" for i in range(4))]
+    names = [
+        *"xyz",
+        "nx",
+        "ny",
+        "nz",
+        "red",
+        "green",
+        "blue",
+        "opacity",
+        "scale_0",
+        "scale_1",
+        *(f"rot_{i}" for i in range(4)),
+    ]
     kinds = [(name, "u1" if name in ("red", "green", "blue") else "<f4") for name in names]
     columns = np.delete(columns, 12, 1)
     columns[:, 6:9] = np.rint(255 * made.colours.numpy())
@@ -168,7 +192,9 @@ def test_colours_of_bytes_and_flat_gaussians_are_read_and_recoloured_in_place(tm
     capture = read_capture(tmp_path / "x.ply")
     assert (capture.gaussians.colours - made.colours).abs().max() <= 0.5 / 255 + 1e-6
     assert torch.equal(capture.gaussians.log_scales[:, :2], made.log_scales[:, :2])
-    assert bool((capture.gaussians.log_scales[:, 2] == -torch.inf).all()) and bool(capture.gaussians.finite.all())
+    assert bool((capture.gaussians.log_scales[:, 2] == -torch.inf).all()) and bool(
+        capture.gaussians.finite.all()
+    )
     write_capture(tmp_path / "y.ply", capture, capture.gaussians.harmonics * 0.5)
     new = (tmp_path / "y.ply").read_bytes()
     apart = np.frombuffer(new, np.uint8).astype(int) - np.frombuffer(data, np.uint8)
@@ -195,9 +221,13 @@ def few(name: str) -> Gaussians:
 def test_few_gaussians_and_those_in_a_plane_are_looked_at(name: str, tmp_path: Path) -> None:
     made = few(name)
     drawable = made.drawable()
-    scene = look_at_capture(drawable, False, BundledSemanticConfig().build(), LookConfig(views=4, size=(64, 48), regions=3))
+    scene = look_at_capture(
+        drawable, False, BundledSemanticConfig().build(), LookConfig(views=4, size=(64, 48), regions=3)
+    )
     assert bool(scene.views.pose.isfinite().all()) and bool(scene.found().features.isfinite().all())
-    opacity = torch.stack([draw(drawable, camera_of(scene.views, v)).opacity.mean() for v in range(len(scene.views))])
+    opacity = torch.stack(
+        [draw(drawable, camera_of(scene.views, v)).opacity.mean() for v in range(len(scene.views))]
+    )
     assert opacity.max() > (0.002 if name == "needles" else 0.02)
     for ending in STEPS:
         found, written = converted(capture_of(tmp_path, made), tmp_path / f"out{ending}")
@@ -220,10 +250,13 @@ def test_a_capture_of_which_nothing_is_left_is_refused(tmp_path: Path) -> None:
 
 
 def test_stray_gaussians_decide_neither_views_nor_semantics() -> None:
-    made, look = ball(400), LookConfig(views=4, size=(64, 48), regions=3)
+    made = ball(400)
+    look = LookConfig(views=4, size=(64, 48), regions=3)
     stray = ball(400)
     stray.means[7] = torch.tensor([3e4, -2e5, 1e5])
-    first, second = (look_at_capture(each, False, BundledSemanticConfig().build(), look) for each in (made, stray))
+    first, second = (
+        look_at_capture(each, False, BundledSemanticConfig().build(), look) for each in (made, stray)
+    )
     away = [each.views.pose[:, :, 3].norm(dim=1) for each in (first, second)]
     assert torch.allclose(away[0].mean(), away[1].mean(), rtol=0.05)
     features = [each.found().style.share for each in (first, second)]
@@ -249,7 +282,8 @@ def nearest(found: np.ndarray, wanted: np.ndarray) -> float:
 @pytest.mark.parametrize("local", [False, True])
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_positions_come_back_from_every_format(tmp_path: Path, ending: str, local: bool) -> None:
-    made, path = ball(300), tmp_path / f"a.{ending}"
+    made = ball(300)
+    path = tmp_path / f"a.{ending}"
     write_gaussians(path, made, origin=UTM, local=local)
     assert nearest(in_world(path), made.means.double().numpy()) < ENDINGS[ending]
     world = ending == "ply" and not local
@@ -267,7 +301,11 @@ def test_parts_of_a_large_file_are_the_file(tmp_path: Path, monkeypatch: pytest.
         write_gaussians(tmp_path / "a.ply", made, origin=UTM, local=local)
         write_gaussians(tmp_path / "b.ply", GaussianRows(50, made.select, False), origin=UTM, local=local)
         assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
-        assert read_offset(tmp_path / "a.ply") == read_offset(tmp_path / "b.ply") == (UTM if local else (0, 0, 0))
+        assert (
+            read_offset(tmp_path / "a.ply")
+            == read_offset(tmp_path / "b.ply")
+            == (UTM if local else (0, 0, 0))
+        )
     write_gaussians(tmp_path / "c.ply", made)
     assert (tmp_path / "c.ply").read_bytes() == plain_ply(made), "float32 where there is no origin"
 
@@ -292,7 +330,9 @@ def test_what_is_written_again_keeps_its_place(tmp_path: Path) -> None:
         new = capture.gaussians.harmonics + 0.1
         for ending in ENDINGS:
             write_capture(tmp_path / f"out.{ending}", capture, new)
-            assert nearest(in_world(tmp_path / f"out.{ending}"), made.means.double().numpy()) < ENDINGS[ending]
+            assert (
+                nearest(in_world(tmp_path / f"out.{ending}"), made.means.double().numpy()) < ENDINGS[ending]
+            )
         ending = name.partition(".")[2]
         write_capture(tmp_path / f"same.{ending}", capture, capture.gaussians.harmonics)
         assert (tmp_path / f"same.{ending}").read_bytes() == (tmp_path / name).read_bytes()
@@ -300,19 +340,28 @@ def test_what_is_written_again_keeps_its_place(tmp_path: Path) -> None:
     (tmp_path / "folder.splat").mkdir()
     with pytest.raises(DataError):
         write_gaussians(tmp_path / "folder.splat", made, origin=UTM)
-    assert not offset_file(tmp_path / "folder.splat").exists(), "nothing is said of a file that was not written"
+    assert not offset_file(tmp_path / "folder.splat").exists(), (
+        "nothing is said of a file that was not written"
+    )
 
 
 def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
-    return replace(gaussians, means=gaussians.means * factor, log_scales=gaussians.log_scales + float(np.log(factor)))
+    return replace(
+        gaussians, means=gaussians.means * factor, log_scales=gaussians.log_scales + float(np.log(factor))
+    )
 
 
 @pytest.mark.parametrize("factor", [1e-6, 1e-3, 1e3, 1e6])
 def test_in_other_units_the_same_is_seen(factor: float) -> None:
-    own, other = ball(300), scaled(ball(300), factor)
+    own = ball(300)
+    other = scaled(ball(300), factor)
     views = [find_views(each, count=4, size=(48, 36), up=UP, inside=False) for each in (own, other)]
-    assert torch.allclose(views[0].pose[:, :, 3] * factor, views[1].pose[:, :, 3], rtol=1e-4, atol=1e-4 * factor)
+    assert torch.allclose(
+        views[0].pose[:, :, 3] * factor, views[1].pose[:, :, 3], rtol=1e-4, atol=1e-4 * factor
+    )
     assert torch.allclose(views[0].pose[:, :, :3], views[1].pose[:, :, :3], atol=1e-5)
-    first, second = (seen_means(each, shown, antialiased=True) for each, shown in zip((own, other), views, strict=True))
+    first, second = (
+        seen_means(each, shown, antialiased=True) for each, shown in zip((own, other), views, strict=True)
+    )
     assert torch.allclose(first.opacities, second.opacities, atol=1e-3)
     assert clip_distance(own) == 0.01 and 5e-5 < clip_distance(other) / factor < 0.03

@@ -38,7 +38,8 @@ def _camera(distance: float, focal: float) -> Pinhole:
 def test_culling_and_merging_within_a_pixel_do_not_show_and_save(
     distance: float, focal: float, pixels: float, error: float, left: float
 ) -> None:
-    gaussians, camera = _scattered(20_000), _camera(distance, focal)
+    gaussians = _scattered(20_000)
+    camera = _camera(distance, focal)
     shown = make_levels_of_detail(gaussians).select(camera, pixels)
     apart = draw(gaussians, camera, antialiased=True).image - draw(shown, camera, antialiased=True).image
     assert float(apart.square().mean()) ** 0.5 < error and len(shown) < left * len(gaussians)
@@ -49,7 +50,9 @@ def test_equal_gaussians_merge_into_one_of_them() -> None:
     many = one.select(torch.zeros(64, dtype=torch.int64))
     found = make_levels_of_detail(many).select(_camera(10.0, 100.0), 0.5)
     assert len(found) == 1
-    assert torch.allclose(found.means, one.means, atol=1e-5) and torch.allclose(found.harmonics, one.harmonics, atol=1e-5)
+    assert torch.allclose(found.means, one.means, atol=1e-5) and torch.allclose(
+        found.harmonics, one.harmonics, atol=1e-5
+    )
     assert torch.allclose(found.log_scales.sort().values, one.log_scales.sort().values, atol=1e-4)
 
 
@@ -74,7 +77,9 @@ def _inverted(gaussians: Gaussians, index: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("room", [1 << 28, 100_000])
-def test_a_look_shows_the_levels_of_recoloured_gaussians(room: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_look_shows_the_levels_of_recoloured_gaussians(
+    room: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("fprf.splats.levels._KEPT", room)
     gaussians = _scattered(20_000)
     index = torch.arange(len(gaussians))
@@ -99,7 +104,9 @@ def test_a_look_shows_the_levels_of_recoloured_gaussians(room: int, tmp_path: Pa
     assert (len(asked) == before) == (room > 1 << 20)  # what is kept is not computed again
 
 
-def test_levels_stay_those_of_before_where_writing_ends_early(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_levels_stay_those_of_before_where_writing_ends_early(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_levels(tmp_path, _scattered(2000), "before")
 
     def interrupted(*args: object, **named: object) -> None:

@@ -1,4 +1,5 @@
-"""Files of Gaussians held against independent programs: splat-transform (PlayCanvas) and the glTF loader of three.js.
+"""Files of Gaussians held against independent programs: splat-transform (PlayCanvas) and the glTF loader of
+three.js.
 
 Both run in Node; their packages are installed once, into the user's cache.
 """
@@ -68,11 +69,14 @@ def convert(node: Path) -> Callable[[Path, Path], None]:
 
 
 def same(found: Gaussians, wanted: Gaussians, turns: float = 1e-5) -> None:
-    """The same Gaussians in any order, their shapes to a share `turns`; what both decode from one file leaves no steps."""
+    """The same Gaussians in any order, their shapes to a share `turns`; what both decode from one file leaves
+    no steps.
+    """
     assert len(found) == len(wanted) and found.degree == wanted.degree
     wanted = wanted.select(torch.cdist(found.means, wanted.means).argmin(1))
     assert torch.allclose(found.means, wanted.means, atol=1e-6)
-    shapes, theirs = covariances(found).flatten(1), covariances(wanted).flatten(1)
+    shapes = covariances(found).flatten(1)
+    theirs = covariances(wanted).flatten(1)
     assert ((shapes - theirs).norm(dim=1) <= turns * theirs.norm(dim=1)).all()
     assert torch.allclose(found.opacities, wanted.opacities, atol=1e-6)
     assert torch.allclose(found.harmonics, wanted.harmonics, atol=1e-5)
@@ -119,13 +123,18 @@ def test_splat_transform_reads_a_ksplat_as_we_do(
 def test_the_glb_of_splat_transform_is_the_ply_it_is_made_of(
     degree: int, convert: Callable[[Path, Path], None], tmp_path: Path
 ) -> None:
-    """Turned by 180 degrees about the vertical axis: it takes y of PLY files up by a turn about z, we by one about x."""
+    """Turned by 180 degrees about the vertical axis: it takes y of PLY files up by a turn about z, we by one
+    about x.
+    """
     made = cloud(degree, 300)
     write_gaussians(tmp_path / "x.ply", made)
     convert(tmp_path / "x.ply", tmp_path / "y.glb")
-    found, turn = read_capture(tmp_path / "y.glb").gaussians, torch.diag(torch.tensor([-1.0, 1.0, -1.0]))
+    found = read_capture(tmp_path / "y.glb").gaussians
+    turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0]))
     assert torch.allclose(found.means @ turn, made.means, atol=1e-6)
-    assert torch.allclose(turn.double() @ covariances(found) @ turn.double(), covariances(made), rtol=1e-4, atol=1e-9)
+    assert torch.allclose(
+        turn.double() @ covariances(found) @ turn.double(), covariances(made), rtol=1e-4, atol=1e-9
+    )
     assert torch.allclose(found.opacities, made.opacities, atol=1e-6)
     assert torch.allclose(found.colours, made.colours, atol=1e-6)
     assert torch.allclose(found.harmonics.norm(dim=1), made.harmonics.norm(dim=1), atol=1e-5)
@@ -138,13 +147,19 @@ def test_three_reads_our_glb_as_the_gaussians_it_was_made_of(degree: int, node: 
     write_gaussians(tmp_path / "x.glb", made)
     script = node / "read.mjs"
     script.write_text(LOADER)
-    shown = subprocess.run(["node", str(script), str(tmp_path / "x.glb")], check=True, capture_output=True, text=True)
+    shown = subprocess.run(
+        ["node", str(script), str(tmp_path / "x.glb")], check=True, capture_output=True, text=True
+    )
     found = {name: torch.tensor(values).double() for name, values in json.loads(shown.stdout).items()}
     # Up and towards the viewer in three.js, down and forward in PLY files.
-    assert torch.allclose(found["matrix"].reshape(4, 4), torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]).double()), atol=1e-12)
+    assert torch.allclose(
+        found["matrix"].reshape(4, 4), torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]).double()), atol=1e-12
+    )
     assert torch.allclose(found["position"].reshape(-1, 3), made.means.double(), atol=1e-6)
     rows, columns = torch.triu_indices(3, 3)
-    assert torch.allclose(found["covariance"].reshape(-1, 6), covariances(made)[:, rows, columns], rtol=1e-4, atol=1e-8)
+    assert torch.allclose(
+        found["covariance"].reshape(-1, 6), covariances(made)[:, rows, columns], rtol=1e-4, atol=1e-8
+    )
     colours = torch.cat([made.colours.clamp(0, 1), made.opacities[:, None]], 1).double()
     assert (found["color"].reshape(-1, 4) / 255 - colours).abs().max() <= 0.5001 / 255
     start = 1

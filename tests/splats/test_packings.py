@@ -39,7 +39,9 @@ HEADS: dict[str, Callable[[bytes], bytes]] = {
     "CR LF": lambda head: head.replace(b"\n", b"\r\n"),
     "CR": lambda head: head.replace(b"\n", b"\r"),
     "blanks": lambda head: head.replace(b"\n", b" \t\n").replace(b"property float", b"property  float"),
-    "latin-1": lambda head: head.replace(b"\nelement", b"\ncomment caf\xe9 \x85 \x0c odd \x1d end_header \xa0\nelement"),
+    "latin-1": lambda head: head.replace(
+        b"\nelement", b"\ncomment caf\xe9 \x85 \x0c odd \x1d end_header \xa0\nelement"
+    ),
     "long": lambda head: head.replace(b"\nelement", b"\ncomment " + b"x" * 70_000 + b"\nelement"),
     "lines": lambda head: head.replace(b"\nelement", b"\nobj_info made\ncomment\n\ncomment y\nelement"),
 }
@@ -48,7 +50,8 @@ HEADS: dict[str, Callable[[bytes], bytes]] = {
 @pytest.mark.parametrize("kind", HEADS)
 @pytest.mark.parametrize("ending", [".ply", ".compressed.ply"])
 def test_headers_of_any_making(kind: str, ending: str, tmp_path: Path) -> None:
-    made, path = ball(40), tmp_path / f"x{ending}"
+    made = ball(40)
+    path = tmp_path / f"x{ending}"
     made.means[0, 0] = float(np.frombuffer(b"\n\r\n?", "<f4")[0])  # data that begins like the end of a line
     write_gaussians(path, made)
     plain = read_capture(path)
@@ -57,7 +60,9 @@ def test_headers_of_any_making(kind: str, ending: str, tmp_path: Path) -> None:
     assert all(map(torch.equal, vars(capture.gaussians).values(), vars(plain.gaussians).values()))
     write_capture(tmp_path / f"out{ending}", capture, capture.gaussians.harmonics * 0.5)
     write_capture(tmp_path / f"plain{ending}", plain, plain.gaussians.harmonics * 0.5)
-    assert (tmp_path / f"out{ending}").read_bytes() == headed((tmp_path / f"plain{ending}").read_bytes(), HEADS[kind])
+    assert (tmp_path / f"out{ending}").read_bytes() == headed(
+        (tmp_path / f"plain{ending}").read_bytes(), HEADS[kind]
+    )
 
 
 @pytest.mark.parametrize("lists", ["equal", "unequal", "cut"])
@@ -93,7 +98,9 @@ def test_big_endian_and_integer_positions_are_read_and_recoloured_in_place(tmp_p
     columns = np.frombuffer(body, "<f4").reshape(30, -1)
     kinds = [("x", ">i4"), ("y", ">f8"), *((f"p{k}", ">f4") for k in range(columns.shape[1] - 2))]
     rows = np.rec.fromarrays(columns.T, dtype=np.dtype(kinds))
-    head = head.replace(b"little", b"big").replace(b"float x\n", b"int x\n").replace(b"float y\n", b"double y\n")
+    head = (
+        head.replace(b"little", b"big").replace(b"float x\n", b"int x\n").replace(b"float y\n", b"double y\n")
+    )
     (tmp_path / "x.ply").write_bytes(head + end + rows.tobytes())
     capture = read_capture(tmp_path / "x.ply")
     assert all(map(torch.equal, vars(capture.gaussians).values(), vars(made).values()))
@@ -107,7 +114,13 @@ def ascii_ply(data: bytes, newline: str) -> bytes:
     count = int(head.split(b"element vertex ")[1].split()[0])
     rows = np.frombuffer(body, "<f4").reshape(count, -1)
     lines = head.decode().replace("binary_little_endian", "ascii").splitlines()
-    extra = ["comment Vertical axis: z", "element face 2", "property list uchar int v", "element time 1", "property double t"]
+    extra = [
+        "comment Vertical axis: z",
+        "element face 2",
+        "property list uchar int v",
+        "element time 1",
+        "property double t",
+    ]
     extra += ["property char c", "property ushort u"]
     lines = [*lines[:2], *extra, *lines[2:], "end_header", "3 0 1 2", "0", "2.5 -1 9"]
     return newline.join([*lines, *(" ".join(repr(float(v)) for v in row) for row in rows), ""]).encode()
@@ -115,7 +128,8 @@ def ascii_ply(data: bytes, newline: str) -> bytes:
 
 @pytest.mark.parametrize("newline", ["\n", "\r\n"])
 def test_ascii_files_are_read_and_become_binary(newline: str, tmp_path: Path) -> None:
-    made, path = ball(30, degree=2), tmp_path / "x.ply"
+    made = ball(30, degree=2)
+    path = tmp_path / "x.ply"
     path.write_bytes(ascii_ply(plain_ply(made), newline))
     capture = read_capture(path)
     assert equal(capture.gaussians, made) and capture.up == (0, 0, -1)
@@ -125,7 +139,12 @@ def test_ascii_files_are_read_and_become_binary(newline: str, tmp_path: Path) ->
     assert b"element time 1" in (tmp_path / "y.ply").read_bytes()
     text = path.read_bytes()
     one = b"".join(text.splitlines(keepends=True)[:-29]).replace(b"vertex 30", b"vertex 5")
-    for wrong in (text[: len(text) // 2], one, text.replace(b"2.5", b"two"), text.replace(b"vertex 30", b"vertex 999999999")):
+    for wrong in (
+        text[: len(text) // 2],
+        one,
+        text.replace(b"2.5", b"two"),
+        text.replace(b"vertex 30", b"vertex 999999999"),
+    ):
         path.write_bytes(wrong)
         with pytest.raises(DataError):
             read_capture(path)
@@ -145,7 +164,9 @@ def test_ascii_files_are_read_and_become_binary(newline: str, tmp_path: Path) ->
     ],
 )
 @pytest.mark.parametrize("ending", [".ply", ".compressed.ply"])
-def test_comments_say_what_points_up(said: str, up: tuple[float, ...] | None, ending: str, tmp_path: Path) -> None:
+def test_comments_say_what_points_up(
+    said: str, up: tuple[float, ...] | None, ending: str, tmp_path: Path
+) -> None:
     path = tmp_path / f"x{ending}"
     write_gaussians(path, ball(300), antialiased=True)
 
@@ -170,8 +191,13 @@ def test_the_camera_in_a_file_is_the_first_view(legacy: bool, tmp_path: Path) ->
         world = np.concatenate([world, [[0, 0, 0, 1]]]).astype("<f4")
     lens = [500, 400, 640, 320] if legacy else [500, 0, 300, 0, 400, 170, 0, 0, 1]
     sizes = [] if legacy else [("image_size", "<u4", [640, 320], "uint")]
-    head, rows = b"", b""
-    for name, kind, values, word in [("extrinsic", "<f4", world, "float"), ("intrinsic", "<f4", lens, "float"), *sizes]:
+    head = b""
+    rows = b""
+    for name, kind, values, word in [
+        ("extrinsic", "<f4", world, "float"),
+        ("intrinsic", "<f4", lens, "float"),
+        *sizes,
+    ]:
         values = np.asarray(values, kind).ravel()
         head += f"element {name} {len(values)}\nproperty {word} {name}\n".encode()
         rows += values.tobytes()
@@ -184,21 +210,29 @@ def test_the_camera_in_a_file_is_the_first_view(legacy: bool, tmp_path: Path) ->
     assert np.allclose(seen.world_to_camera[:3], np.concatenate([turn, place], 1), atol=1e-6)
     assert (seen.width, seen.height) == (640, 320) and float(seen.intrinsics[1, 1]) == 400
     assert np.allclose(capture.up, -turn[1], atol=1e-6), "the camera's up"
-    scene = look_at_capture(made, False, BundledSemanticConfig().build(), LookConfig(views=5, size=(64, 48)), camera=camera)
+    scene = look_at_capture(
+        made, False, BundledSemanticConfig().build(), LookConfig(views=5, size=(64, 48)), camera=camera
+    )
     assert torch.equal(scene.views.size, torch.tensor([[64, 48]] * len(scene.views)))
     centre = -turn.T @ place[:, 0]
     apart = (scene.views.pose[:, :, 3].numpy() - centre) / 4
     assert np.allclose(apart[0], 0, atol=1e-6) and np.abs(apart).max() < 0.5, "the others stand about it"
     whole = draw(made, seen).image
     small = draw(made, camera_of(scene.views, 0)).image[8:40]
-    mean = torch.nn.functional.interpolate(whole.permute(2, 0, 1)[None], (32, 64), mode="area")[0].permute(1, 2, 0)
+    mean = torch.nn.functional.interpolate(whole.permute(2, 0, 1)[None], (32, 64), mode="area")[0].permute(
+        1, 2, 0
+    )
     assert (small - mean).abs().mean() < 0.02
 
 
 def test_an_unsound_camera_is_left_alone(tmp_path: Path) -> None:
     head, end, body = plain_ply(ball(20)).partition(b"end_header\n")
     element = b"element extrinsic 16\nproperty float e\nelement intrinsic 4\nproperty float i\n"
-    for extrinsic, intrinsic in ((np.zeros(16), [9, 9, 9, 9]), (np.eye(4), [0, 9, 9, 9]), (np.eye(4), [9, np.nan, 9, 9])):
+    for extrinsic, intrinsic in (
+        (np.zeros(16), [9, 9, 9, 9]),
+        (np.eye(4), [0, 9, 9, 9]),
+        (np.eye(4), [9, np.nan, 9, 9]),
+    ):
         rows = np.concatenate([extrinsic.ravel(), intrinsic]).astype("<f4").tobytes()
         (tmp_path / "x.ply").write_bytes(head + element + end + body + rows)
         assert read_capture(tmp_path / "x.ply").camera is None
@@ -206,9 +240,21 @@ def test_an_unsound_camera_is_left_alone(tmp_path: Path) -> None:
 
 def test_up_of_the_file_decides_the_views_and_a_flag_before_it(photograph: Path, tmp_path: Path) -> None:
     made = ball(300)
-    data = headed(plain_ply(made), lambda head: head.replace(b"\nelement", b"\ncomment Vertical axis: 0 0 1\nelement"))
+    data = headed(
+        plain_ply(made), lambda head: head.replace(b"\nelement", b"\ncomment Vertical axis: 0 0 1\nelement")
+    )
     (tmp_path / "in.ply").write_bytes(data)
-    words = ["restyle", str(tmp_path / "in.ply"), "--references", str(photograph), "--views", "4", "--size", "64", "48"]
+    words = [
+        "restyle",
+        str(tmp_path / "in.ply"),
+        "--references",
+        str(photograph),
+        "--views",
+        "4",
+        "--size",
+        "64",
+        "48",
+    ]
     words += ["--cache", str(tmp_path / "cache"), "--output", str(tmp_path / "out.ply")]
     for flag, up in (([], [0.0, 0.0, 1.0]), (["--up", "1", "0", "0"], [1.0, 0.0, 0.0])):
         assert cli.main([*words, *flag]) == 0
@@ -224,12 +270,16 @@ def spz_parts(made: Gaussians, path: Path) -> bytes:
 
 
 def test_a_spz_however_it_is_packed(tmp_path: Path) -> None:
-    made, path = ball(300), tmp_path / "x.spz"
+    made = ball(300)
+    path = tmp_path / "x.spz"
     content = spz_parts(made, path)
-    plain, zipped = read_capture(path), gzip.compress(content, mtime=0)
+    plain = read_capture(path)
+    zipped = gzip.compress(content, mtime=0)
     packings = {
         "raw": content,
-        "members": b"".join(gzip.compress(part, mtime=0) for part in (content[:7], content[7:500], b"", content[500:])),
+        "members": b"".join(
+            gzip.compress(part, mtime=0) for part in (content[:7], content[7:500], b"", content[500:])
+        ),
         "trailing": zipped + bytes(100),
         "without checksum": zipped[:-8],
         "stored": gzip.compress(content, 0, mtime=0),
@@ -243,8 +293,12 @@ def test_a_spz_however_it_is_packed(tmp_path: Path) -> None:
         write_capture(tmp_path / "y.spz", capture, capture.gaussians.harmonics * 0.5)
         again = read_capture(tmp_path / "y.spz")
         assert torch.equal(again.gaussians.means, plain.gaussians.means)
-        assert (again.gaussians.harmonics - plain.gaussians.harmonics * 0.5).abs().max() < 0.5 / 255 / 0.15 + 1e-6
-        assert again.data.startswith(b"NGSP") == (name == "raw") and again.data.endswith(bytes(100)) == (name == "trailing")
+        assert (
+            again.gaussians.harmonics - plain.gaussians.harmonics * 0.5
+        ).abs().max() < 0.5 / 255 / 0.15 + 1e-6
+        assert again.data.startswith(b"NGSP") == (name == "raw") and again.data.endswith(bytes(100)) == (
+            name == "trailing"
+        )
     for wrong in (
         zipped[:-8] + b"\1\2\3\4" + zipped[-4:],
         zipped[: len(zipped) // 2],
@@ -257,7 +311,24 @@ def test_a_spz_however_it_is_packed(tmp_path: Path) -> None:
             read_capture(path)
 
 
-LETTERS = ["LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LBD", "RBD", "LBU", "RBU", "LFD", "RFD", "LFU", "RFU"]
+LETTERS = [
+    "LDB",
+    "RDB",
+    "LUB",
+    "RUB",
+    "LDF",
+    "RDF",
+    "LUF",
+    "RUF",
+    "LBD",
+    "RBD",
+    "LBU",
+    "RBU",
+    "LFD",
+    "RFD",
+    "LFU",
+    "RFU",
+]
 
 
 WAYS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
@@ -274,7 +345,9 @@ def test_a_spz_says_its_axes(number: int, tmp_path: Path) -> None:
     path.write_bytes(gzip.compress(bytes(content)))
     capture = read_capture(path)
     found = capture.gaussians
-    axes = torch.tensor([WAYS[letter] for letter in LETTERS[number - 1]]).double().T  # file to right down front
+    axes = (
+        torch.tensor([WAYS[letter] for letter in LETTERS[number - 1]]).double().T
+    )  # file to right down front
     change = axes @ torch.tensor([WAYS[letter] for letter in "RUB"]).double()
     assert torch.allclose(found.means.double(), plain.means.double() @ change.T)
 
@@ -309,15 +382,24 @@ def test_a_sog_however_it_is_archived(tmp_path: Path, monkeypatch: pytest.Monkey
         write_capture(tmp_path / "y.sog", capture, capture.gaussians.harmonics * 0.5)
         again = unbundle(tmp_path / "y.sog", (tmp_path / "y.sog").read_bytes())
         assert list(again) == list(files)
-        kept = [name for name in files if not name.endswith(("meta.json", "sh0.webp", "shN_centroids.webp")) or "._" in name]
+        kept = [
+            name
+            for name in files
+            if not name.endswith(("meta.json", "sh0.webp", "shN_centroids.webp")) or "._" in name
+        ]
         assert all(again[name] == files[name] for name in kept)
         write_capture(tmp_path / "folder" / "meta.json", capture, capture.gaussians.harmonics * 0.5)
         found = read_capture(tmp_path / "folder").gaussians
         assert torch.equal(found.means, plain.gaussians.means)
-        assert {each.name for each in (tmp_path / "folder").iterdir()} == {*parts}, "no other file is replaced"
+        assert {each.name for each in (tmp_path / "folder").iterdir()} == {*parts}, (
+            "no other file is replaced"
+        )
     # A folder that is cut off while its files take their names is none.
-    calls, replaced = count(1), os.replace
-    monkeypatch.setattr(os, "replace", lambda *names: replaced(*names) if next(calls) < 3 else os.stat("absent"))
+    calls = count(1)
+    replaced = os.replace
+    monkeypatch.setattr(
+        os, "replace", lambda *names: replaced(*names) if next(calls) < 3 else os.stat("absent")
+    )
     with pytest.raises(DataError):
         write_capture(tmp_path / "folder" / "meta.json", plain, plain.gaussians.harmonics * 0.5)
     with pytest.raises(DataError, match="cannot be read"):
@@ -330,10 +412,12 @@ def test_a_sog_however_it_is_archived(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_short_codebooks_and_models_of_sog(tmp_path: Path) -> None:
-    path, made = tmp_path / "x.sog", ball(200, degree=0)
+    path = tmp_path / "x.sog"
+    made = ball(200, degree=0)
     made.log_scales.copy_((made.log_scales * 4).round() / 4)
     parts = sog_of(made, path)
-    plain, meta = read_capture(path), json.loads(parts["meta.json"])
+    plain = read_capture(path)
+    meta = json.loads(parts["meta.json"])
     used = len(np.unique(plain.gaussians.log_scales))
 
     def read(**changes: object) -> Capture:
@@ -347,9 +431,14 @@ def test_short_codebooks_and_models_of_sog(tmp_path: Path) -> None:
     assert torch.equal(read(scales=short).gaussians.log_scales, plain.gaussians.log_scales) and used < 16
     with pytest.raises(DataError):
         read(scales=short | {"codebook": short["codebook"][:-1]})
-    assert read(scales=short, model="antialiased").antialiased and not read(scales=short, model="default").antialiased
+    assert (
+        read(scales=short, model="antialiased").antialiased
+        and not read(scales=short, model="default").antialiased
+    )
     flat = read(scales=short, model="2dgs").gaussians.log_scales
-    assert bool((flat[:, 2] == -torch.inf).all()) and torch.equal(flat[:, :2], plain.gaussians.log_scales[:, :2])
+    assert bool((flat[:, 2] == -torch.inf).all()) and torch.equal(
+        flat[:, :2], plain.gaussians.log_scales[:, :2]
+    )
     for wrong in ({"version": 3}, {"count": 0}, {"count": 4000}):
         with pytest.raises(DataError):
             read(scales=short, **wrong)

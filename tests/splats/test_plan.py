@@ -1,4 +1,6 @@
-"""The plan of a training: size of the photographs and number of Gaussians, from minutes, machine and photographs."""
+"""The plan of a training: size of the photographs and number of Gaussians, from minutes, machine and
+photographs.
+"""
 
 import json
 from dataclasses import replace
@@ -23,20 +25,28 @@ def steady(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "machine_speed", lambda: 1.0)
 
 
-def planned(config: GaussiansConfig, width: int = 2832, height: int = 2128, views: int = 30) -> GaussiansConfig:
+def planned(
+    config: GaussiansConfig, width: int = 2832, height: int = 2128, views: int = 30
+) -> GaussiansConfig:
     size = torch.tensor([[width, height]] * views)
     scene = SimpleNamespace(cameras=SimpleNamespace(size=size), train=torch.arange(views))
     return module.plan(config, scene, torch.device("cpu"))  # type: ignore[arg-type]
 
 
-@given(st.floats(0.2, 60), st.floats(1.1, 8), st.integers(300, 6000), st.integers(300, 6000), st.integers(1, 600))
+@given(
+    st.floats(0.2, 60), st.floats(1.1, 8), st.integers(300, 6000), st.integers(300, 6000), st.integers(1, 600)
+)
 def test_more_time_never_plans_less(minutes: float, more: float, width: int, height: int, views: int) -> None:
-    short, long = (planned(replace(CONFIG, minutes=each), width, height, views) for each in (minutes, more * minutes))
+    short, long = (
+        planned(replace(CONFIG, minutes=each), width, height, views) for each in (minutes, more * minutes)
+    )
     assert short.downscale is not None and long.downscale is not None
     assert long.downscale <= short.downscale and long.most >= short.most
     for each in (short, long):
         assert round(max(width, height) / (each.downscale or 1), 6) <= CONFIG.longest
-        assert each.most * CONFIG.pixels_per_gaussian <= max(views * width * height / (each.downscale or 1) ** 2, 20)
+        assert each.most * CONFIG.pixels_per_gaussian <= max(
+            views * width * height / (each.downscale or 1) ** 2, 20
+        )
 
 
 @pytest.mark.parametrize(("minutes", "size"), [(0.5, 4), (1, 3), (3, 1.77), (10, 1.77)])
@@ -55,7 +65,9 @@ def test_what_is_given_stays() -> None:
     assert without.downscale == 1.77 and without.most == 60_000 and without.limited(30) == 100
 
 
-def test_views_are_judged_at_the_size_of_the_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_views_are_judged_at_the_size_of_the_photographs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Whatever size they were trained at; `--size` says another."""
     run = tmp_path / "run"
     assert main(["train", "--data", "garden", "--downscale", "4", "--steps", "30", "--output", str(run)]) == 0

@@ -51,14 +51,21 @@ def test_the_union_holds_each_cell_s_own(town: Path, tmp_path: Path) -> None:
     words = command(town, run, "--cells", "3")
     assert main(words) == 0
     assert main(["export", str(run), "ply", "--output", str(tmp_path / "a.ply")]) == 0
-    gaussians, cut = read_capture(tmp_path / "a.ply").gaussians, load_cells(run)
+    gaussians = read_capture(tmp_path / "a.ply").gaussians
+    cut = load_cells(run)
     assert [*map(repr, cut)] == [*map(repr, bisect_sightings(parse_scene(town, 1, None), 3))]
-    assert len(gaussians) > 0 and torch.stack([cell.holds(gaussians.means) for cell in cut]).sum(0).eq(1).all()
+    assert (
+        len(gaussians) > 0 and torch.stack([cell.holds(gaussians.means) for cell in cut]).sum(0).eq(1).all()
+    )
     assert main(["eval", str(run), "--split", "test"]) == 0
 
 
-def test_cells_go_on_from_the_exposures_of_the_whole_scene(town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Which knows those of the photographs that it had memory for. Each cell moves its own, and not their mean."""
+def test_cells_go_on_from_the_exposures_of_the_whole_scene(
+    town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which knows those of the photographs that it had memory for. Each cell moves its own, and not their
+    mean.
+    """
     monkeypatch.setattr(cells, "_PIXELS", 1500)
     run = tmp_path / "run"
     assert main(command(town, run, "--steps", "60", "--tones", "true")) == 0
@@ -77,16 +84,23 @@ def test_cells_go_on_from_the_exposures_of_the_whole_scene(town: Path, tmp_path:
         outside = torch.ones(len(gain), dtype=torch.bool)
         outside[list(cell.windows)] = False
         moved = saved.optimizer["tones.gain.value"]
-        assert torch.equal(moved[outside], torch.zeros(int(outside.sum()), 3)) and (moved[~outside] != 0).any()
+        assert (
+            torch.equal(moved[outside], torch.zeros(int(outside.sum()), 3)) and (moved[~outside] != 0).any()
+        )
         tones = start.going_on(tuple(outside.nonzero()[:, 0].tolist()))
         tones.load_state_dict({name: saved.optimizer[f"tones.{name}.value"] for name in ("gain", "exponent")})
-        torch.testing.assert_close(tones.gains()[~outside].mean(0), start.gains()[~outside].mean(0), atol=1e-5, rtol=0)
+        torch.testing.assert_close(
+            tones.gains()[~outside].mean(0), start.gains()[~outside].mean(0), atol=1e-5, rtol=0
+        )
         means.append(torch.where(outside[:, None], torch.nan, tones.gains().detach()))
     union, _ = load_latest(run / "checkpoints")
     assert union is not None
     mean = torch.stack(means).nanmean(0)
     torch.testing.assert_close(
-        union.optimizer["tones.gain.value"], torch.where(mean.isnan(), start.gains().detach(), mean), atol=1e-6, rtol=1e-5
+        union.optimizer["tones.gain.value"],
+        torch.where(mean.isnan(), start.gains().detach(), mean),
+        atol=1e-6,
+        rtol=1e-5,
     )
 
 
@@ -95,7 +109,8 @@ def test_cells_see_from_where_the_whole_scene_found_its_views(town: Path, tmp_pa
     assert main(command(town, run, "--steps", "60", "--poses", "0.002")) == 0
     overview, union = (load_latest(folder / "checkpoints")[0] for folder in (run / "overview", run))
     assert overview is not None and union is not None
-    moves, given = overview.optimizer[MOVES], Run(run).load_known()
+    moves = overview.optimizer[MOVES]
+    given = Run(run).load_known()
     assert torch.equal(union.optimizer[MOVES], moves)
     assert (moves[list(given.train)] != 0).any(1).all() and not moves[list(given.test)].any()
     known = part_of(run, town, 0).build().known
@@ -105,7 +120,8 @@ def test_cells_see_from_where_the_whole_scene_found_its_views(town: Path, tmp_pa
 
 
 def test_cells_know_where_the_sky_is(town: Path, tmp_path: Path) -> None:
-    data, run = tmp_path / "town", tmp_path / "run"
+    data = tmp_path / "town"
+    run = tmp_path / "run"
     shutil.copytree(town, data)
     above = np.zeros((72, 96, 3), np.uint8)
     above[:30] = 255

@@ -54,13 +54,17 @@ SECOND: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("name", SECOND)
-def test_every_field_changes_something(config: GaussiansConfig, scene: ParsedScene, tmp_path: Path, name: str) -> None:
+def test_every_field_changes_something(
+    config: GaussiansConfig, scene: ParsedScene, tmp_path: Path, name: str
+) -> None:
     if name == "masks":
         width, height = scene.cameras.size[0].tolist()
         write_image(tmp_path / "mask.png", np.zeros((height, width, 3), np.uint8))
         scene = replace(scene, masks=(tmp_path / "mask.png",) * len(scene.paths))
     end = STEPS if name in ("cap", "grow", "relocate_every", "pixels_per_gaussian") else 3
-    first, second = (stepped(build(each, scene), 0, end) for each in (config, replace(config, **{name: SECOND[name]})))
+    first, second = (
+        stepped(build(each, scene), 0, end) for each in (config, replace(config, **{name: SECOND[name]}))
+    )
     assert not equal(first.gaussians(), second.gaussians())
 
 
@@ -73,20 +77,32 @@ def test_a_view_without_numbers_changes_nothing(config: GaussiansConfig, scene: 
     assert learner.figures()[2:5] == (1, 1, "the loss") and equal(learner.gaussians(), before)
 
 
-def test_colours_that_no_view_shows_fall_back_to_their_mean(config: GaussiansConfig, scene: ParsedScene) -> None:
-    """Else a Gaussian could have any colour from where it was not photographed, and a style would bring that into view."""
+def test_colours_that_no_view_shows_fall_back_to_their_mean(
+    config: GaussiansConfig, scene: ParsedScene
+) -> None:
+    """Else a Gaussian could have any colour from where it was not photographed, and a style would bring that
+    into view.
+    """
     learner = build(config, scene)
     start = learner.gaussians()
-    faint = replace(start, logits=torch.full_like(start.logits, -20), harmonics=torch.ones_like(start.harmonics))
+    faint = replace(
+        start, logits=torch.full_like(start.logits, -20), harmonics=torch.ones_like(start.harmonics)
+    )
     learner.start_from(faint)
     stepped(learner, 0, 100)
     after = learner.gaussians().harmonics
     assert torch.equal(after[:, 0], faint.harmonics[:, 0])
-    assert float(after[:, 1:].min()) == float(after[:, 1:].max()) == pytest.approx(math.exp(-0.06 * 3.96), abs=0.01)
+    assert (
+        float(after[:, 1:].min())
+        == float(after[:, 1:].max())
+        == pytest.approx(math.exp(-0.06 * 3.96), abs=0.01)
+    )
 
 
 def test_a_gaussian_learns_alike_however_late_it_is_seen(config: GaussiansConfig, scene: ParsedScene) -> None:
-    """Two views in opposite directions: what the second one shows moves as if nothing had been learnt before."""
+    """Two views in opposite directions: what the second one shows moves as if nothing had been learnt
+    before.
+    """
     pose = scene.cameras.pose[0].clone()
     back = pose * torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=pose.dtype)
     cameras = replace(scene.cameras.select(torch.zeros(2, dtype=torch.int64)), pose=torch.stack([pose, back]))
@@ -97,7 +113,9 @@ def test_a_gaussian_learns_alike_however_late_it_is_seen(config: GaussiansConfig
     spread, quaternions = (torch.from_numpy(draws.normal(size=(32, k))) for k in (3, 4))
     means = pose[:, 3] - torch.where(torch.arange(32) < 16, 4.0, -4.0)[:, None] * pose[:, 2] + 0.5 * spread
     harmonics = torch.zeros(32, (config.degree + 1) ** 2, 3)
-    start = Gaussians(means.float(), quaternions.float(), torch.full((32, 3), -1.5), torch.zeros(32), harmonics)
+    start = Gaussians(
+        means.float(), quaternions.float(), torch.full((32, 3), -1.5), torch.zeros(32), harmonics
+    )
 
     def learnt(order: list[int]) -> Tensor:
         learner = GaussianLearner(config, levels, 1.0, 32)
@@ -112,15 +130,23 @@ def test_a_gaussian_learns_alike_however_late_it_is_seen(config: GaussiansConfig
     assert torch.equal(learnt([0] * 40 + [1] * 3), alone)
 
 
-def test_an_exposure_learns_alike_however_rarely_its_view_is_seen(config: GaussiansConfig, scene: ParsedScene) -> None:
-    """Nothing lies in view, so a render is the background times the factor; all photographs but one are of that colour."""
+def test_an_exposure_learns_alike_however_rarely_its_view_is_seen(
+    config: GaussiansConfig, scene: ParsedScene
+) -> None:
+    """Nothing lies in view, so a render is the background times the factor; all photographs but one are of
+    that colour.
+    """
     many = 40
-    same = replace(scene, cameras=scene.cameras.select(torch.zeros(many, dtype=torch.int64)), train=torch.arange(many))
+    same = replace(
+        scene, cameras=scene.cameras.select(torch.zeros(many, dtype=torch.int64)), train=torch.arange(many)
+    )
     grey = replace(config, background=(0.4, 0.4, 0.4))
     images = {view: np.full((24, 32, 3), 204 if view == 0 else 102, np.uint8) for view in range(many)}
     camera = scene.cameras.pose[0]
     behind = (camera[:, 3] + 5 * camera[:, 2]).float().expand(16, 3)
-    nothing = Gaussians(behind, torch.ones(16, 4), torch.full((16, 3), -3.0), torch.zeros(16), torch.zeros(16, 9, 3))
+    nothing = Gaussians(
+        behind, torch.ones(16, 4), torch.full((16, 3), -3.0), torch.zeros(16), torch.zeros(16, 9, 3)
+    )
 
     def gain(views: int) -> Tensor:
         tones = Tones(torch.zeros(many), ())
@@ -132,14 +158,17 @@ def test_an_exposure_learns_alike_however_rarely_its_view_is_seen(config: Gaussi
             assert not learner.failed
         return tones.gain.detach()
 
-    often, rarely = gain(1), gain(many)
+    often = gain(1)
+    rarely = gain(many)
     assert (often[0] > 0.01).all()
     torch.testing.assert_close(rarely[0], often[0], rtol=0.1, atol=0)  # apart by the mean of all, which stays
 
 
 def test_tones_are_told_from_the_scene(config: GaussiansConfig, scene: ParsedScene) -> None:
     """Photographs that were taken darker or warmer: factors are found up to their mean."""
-    asked = replace(config, tones=True, ssim=0.0)  # what SSIM keeps of the targets would be that of the others
+    asked = replace(
+        config, tones=True, ssim=0.0
+    )  # what SSIM keeps of the targets would be that of the others
     learner = build(asked, scene)
     wanted = torch.linspace(-0.3, 0.3, len(scene.paths))[:, None] * torch.tensor([1.0, 0.5, -0.5])
     for level in learner.levels:
@@ -155,9 +184,13 @@ def test_tones_are_told_from_the_scene(config: GaussiansConfig, scene: ParsedSce
 
 
 def test_poses_that_are_off_are_found(config: GaussiansConfig, scene: ParsedScene) -> None:
-    """Training views were turned by three degrees: refined, they come back, up to what turns all of them alike."""
+    """Training views were turned by three degrees: refined, they come back, up to what turns all of them
+    alike.
+    """
     draw = torch.Generator().manual_seed(0)
-    turn = math.radians(3) * torch.nn.functional.normalize(torch.randn(len(scene.paths), 3, generator=draw).double(), dim=1)
+    turn = math.radians(3) * torch.nn.functional.normalize(
+        torch.randn(len(scene.paths), 3, generator=draw).double(), dim=1
+    )
     turn[scene.test] = 0
     moves = torch.cat([turn, torch.zeros_like(turn)], 1)
     off = replace(scene, cameras=moved_cameras(scene.cameras, moves))
@@ -174,7 +207,9 @@ def test_poses_that_are_off_are_found(config: GaussiansConfig, scene: ParsedScen
     assert error(found) < 0.6 * error(off.cameras)
 
 
-def test_nothing_floats_before_a_sky_that_is_masked(config: GaussiansConfig, scene: ParsedScene, tmp_path: Path) -> None:
+def test_nothing_floats_before_a_sky_that_is_masked(
+    config: GaussiansConfig, scene: ParsedScene, tmp_path: Path
+) -> None:
     above = np.zeros((24, 32, 3), np.uint8)
     above[:8] = 255
     write_image(tmp_path / "sky.png", above)
@@ -184,9 +219,12 @@ def test_nothing_floats_before_a_sky_that_is_masked(config: GaussiansConfig, sce
     def before_the_sky(masks: bool) -> float:
         """Weight of all but the surroundings in the upper third of the views."""
         found = stepped(build(replace(config, masks=masks), masked)).gaussians()
-        sky, seen = torch.from_numpy(above[..., :1] / 255).float(), torch.zeros(len(found), 1)
+        sky = torch.from_numpy(above[..., :1] / 255).float()
+        seen = torch.zeros(len(found), 1)
         for view in scene.train.tolist():
-            seen += lift(*list(vars(found).values())[:4], camera_of(scene.cameras, view), sky, antialiased=True)
+            seen += lift(
+                *list(vars(found).values())[:4], camera_of(scene.cameras, view), sky, antialiased=True
+            )
         distance = (found.means - centre).norm(dim=1)
         return float(seen[distance < 0.4 * distance.max()].sum())
 
@@ -211,31 +249,75 @@ def test_verbs_of_a_run(run: Path, tmp_path: Path) -> None:
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["method"] == "fprf-splats" and metrics["train_steps"] == 40 and metrics["psnr"] > 10
     assert len([*(run / "renders" / "test").iterdir()]) == metrics["views"]
-    assert main(["render", str(run), "--path", "dataset", "--show", "colour", "depth", "--output", str(tmp_path / "film")]) == 0
+    assert (
+        main(
+            [
+                "render",
+                str(run),
+                "--path",
+                "dataset",
+                "--show",
+                "colour",
+                "depth",
+                "--output",
+                str(tmp_path / "film"),
+            ]
+        )
+        == 0
+    )
     assert len([*(tmp_path / "film").glob("*.png")]) == 10
     assert main(["eval", str(run), "--fit-poses"]) == 0
     fitted = json.loads((run / "metrics.json").read_text())
     assert len(fitted["fitted_poses"]) == fitted["views"] and fitted["psnr"] > metrics["psnr"]
     assert main(["export", str(run), "--side", "64"]) == 0
-    assert {f"mesh.{ending}" for ending in ("ply", "glb")} <= {path.name for path in (run / "exports").iterdir()}
+    assert {f"mesh.{ending}" for ending in ("ply", "glb")} <= {
+        path.name for path in (run / "exports").iterdir()
+    }
     capture = read_capture(run / "exports" / "splats.ply")
     assert len(capture.gaussians) == metrics["gaussians"] and capture.antialiased
     assert main(["export", str(run), "cameras", "ply", "--images", "--output", str(tmp_path / "files")]) == 0
     again = parse_scene(tmp_path / "files", 1, None)
-    assert torch.allclose(again.cameras.pose, fprf.load(run).cameras.pose) and (tmp_path / "files" / "splats.ply").is_file()
+    assert (
+        torch.allclose(again.cameras.pose, fprf.load(run).cameras.pose)
+        and (tmp_path / "files" / "splats.ply").is_file()
+    )
     # A run that is done goes on doing nothing, also where other semantics are asked for.
     before = (run / "checkpoints" / "step-0000040" / "manifest.json").read_bytes()
     assert main(["train", str(run / "config.json")]) == 0
     shutil.copytree(run, tmp_path / "other")
-    words = ["--semantic.encoder", "random", "--semantic.encoder.channels", "6", "--regions", "3", "--semantic-size", "32"]
+    words = [
+        "--semantic.encoder",
+        "random",
+        "--semantic.encoder.channels",
+        "6",
+        "--regions",
+        "3",
+        "--semantic-size",
+        "32",
+    ]
     assert main(["train", str(tmp_path / "other" / "config.json"), *words]) == 0
     for folder in (run, tmp_path / "other"):
         assert (folder / "checkpoints" / "step-0000040" / "manifest.json").read_bytes() == before
     plain, other = (open_run(folder, "cpu").scene for folder in (run, tmp_path / "other"))
     assert plain.semantic_encoder == SEMANTICS.build().identity and len(plain.measured()[0].share) > 3
     encoder = RandomConfig(channels=6).build().identity
-    assert other.semantic_encoder == other.encoders().semantic.identity == encoder and len(other.measured()[0].share) == 3
-    assert main(["train", str(run / "config.json"), "--semantic.encoder", "vgg19", "--semantic.encoder.weights", "no.pth"]) == 2
+    assert (
+        other.semantic_encoder == other.encoders().semantic.identity == encoder
+        and len(other.measured()[0].share) == 3
+    )
+    assert (
+        main(
+            [
+                "train",
+                str(run / "config.json"),
+                "--semantic.encoder",
+                "vgg19",
+                "--semantic.encoder.weights",
+                "no.pth",
+            ]
+        )
+        == 2
+    )
 
 
 def test_training_is_watched_and_changes_no_bit(
@@ -271,7 +353,8 @@ def test_styles_on_a_run(
         write_image(tmp_path / f"{name}.png", (np.array(colour) + noise).clip(0, 255).astype(np.uint8))
     dusk, snow = (str(tmp_path / f"{name}.png") for name in ("dusk", "snow"))
     known = json.loads((run / "scene.json").read_text())
-    view, both = known["names"][known["test"][0]], ["--references", dusk, snow]
+    view = known["names"][known["test"][0]]
+    both = ["--references", dusk, snow]
 
     def made(verb: str, name: str, *flags: str) -> Path:
         """What a verb writes of the run."""
@@ -301,9 +384,14 @@ def test_styles_on_a_run(
     made("render", "keyed", *dataset, "--keyframes", str(tmp_path / "keys.json"))
     # A look that is held is one scene, whose Gaussians are recoloured once.
     (tmp_path / "held.json").write_text(json.dumps({"format": 1, "keyframes": [keys[1] | {"frame": 0}]}))
-    scenes, restyled = [], SplatScene.restyled
-    monkeypatch.setattr(SplatScene, "restyled", lambda scene, look: scenes.append(look) or restyled(scene, look))
-    held = made("render", "held", "--path", "orbit", "--frames", "3", "--keyframes", str(tmp_path / "held.json"))
+    scenes = []
+    restyled = SplatScene.restyled
+    monkeypatch.setattr(
+        SplatScene, "restyled", lambda scene, look: scenes.append(look) or restyled(scene, look)
+    )
+    held = made(
+        "render", "held", "--path", "orbit", "--frames", "3", "--keyframes", str(tmp_path / "held.json")
+    )
     assert len(scenes) == 1 and len([*held.glob("*.png")]) == 3
     files = made("export", "files", "ply", "--references", snow)
     plain, styled = (read_capture(files / f"splats{name}.ply").gaussians for name in ("", ".snow"))
@@ -330,13 +418,18 @@ def test_what_gaussians_do_not_know_is_refused_in_one_line(
     assert len([text for text in told if text.startswith("error: ")]) == 1
 
 
-def after_a_step_of_wide_ones(config: GaussiansConfig, scene: ParsedScene, restored: bool = False) -> tuple[Tensor, Tensor]:
-    """Means of the first Gaussians, and their widths after a step that begins with 3000 times as wide ones."""
+def after_a_step_of_wide_ones(
+    config: GaussiansConfig, scene: ParsedScene, restored: bool = False
+) -> tuple[Tensor, Tensor]:
+    """Means of the first Gaussians, and their widths after a step that begins with 3000 times as wide
+    ones.
+    """
     learner = build(config, scene)
     before = learner.gaussians()
     for each in (learner, build(config, scene) if restored else learner):
         wide = tensors_of(replace(before, log_scales=before.log_scales + 8.0), each.near)
-        moments, learner = learner.state().optimizer, each
+        moments = learner.state().optimizer
+        learner = each
         learner.load(State(wide, moments))
     learner.step(0, 0.0)
     assert not learner.failed
@@ -344,8 +437,12 @@ def after_a_step_of_wide_ones(config: GaussiansConfig, scene: ParsedScene, resto
 
 
 @pytest.mark.parametrize("restored", [False, True])
-def test_surroundings_do_not_reach_the_cameras(config: GaussiansConfig, scene: ParsedScene, restored: bool) -> None:
-    """However wide one becomes, it is cut to a fifth of its distance: from beside, it would be drawn before the scene."""
+def test_surroundings_do_not_reach_the_cameras(
+    config: GaussiansConfig, scene: ParsedScene, restored: bool
+) -> None:
+    """However wide one becomes, it is cut to a fifth of its distance: from beside, it would be drawn before
+    the scene.
+    """
     before, widths = after_a_step_of_wide_ones(config, scene, restored)
     distance = before.norm(dim=1, keepdim=True)
     far = distance[:, 0] > 0.5 * distance.max()
@@ -353,7 +450,9 @@ def test_surroundings_do_not_reach_the_cameras(config: GaussiansConfig, scene: P
 
 
 @pytest.mark.parametrize(("cells", "share"), [(1, 0.5), (2, 0.25)])
-def test_nothing_covers_a_camera(config: GaussiansConfig, scene: ParsedScene, cells: int, share: float) -> None:
+def test_nothing_covers_a_camera(
+    config: GaussiansConfig, scene: ParsedScene, cells: int, share: float
+) -> None:
     before, widths = after_a_step_of_wide_ones(replace(config, cells=cells, surroundings=0), scene)
     near = torch.cdist(before, scene.cameras.pose[scene.train][:, :, 3].float()).amin(1)[:, None]
     assert (widths <= 1.04 * share * near).all() and (widths > 0.8 * share * near).any()
@@ -369,7 +468,9 @@ def test_the_nearest_of_many_cameras_is_found(scene: ParsedScene, spread: float)
     means = means.transpose(1, 2).reshape(-1, 3)
     gaussians = TrainableGaussians(len(means), bands=1)
     gaussians.start(torch.cat([means, torch.full((len(means), 11), 20.0)], 1).numpy())
-    training.limit_widths(replace(scene, cameras=cameras, train=torch.arange(0, 400, 2)), 1e-3, cells=True)(gaussians, 0)
+    training.limit_widths(replace(scene, cameras=cameras, train=torch.arange(0, 400, 2)), 1e-3, cells=True)(
+        gaussians, 0
+    )
     widest = gaussians.read(LOG_SCALES)
     apart = (means[:, None].double() - centre[::2]).norm(dim=2).amin(1, keepdim=True)
     # Roundings of coordinates to float32, and of the logarithm.
@@ -377,7 +478,9 @@ def test_the_nearest_of_many_cameras_is_found(scene: ParsedScene, spread: float)
     assert ((torch.from_numpy(widest).double().exp() / 0.25 - apart).abs() <= allowed).all()
 
 
-def test_blurred_views_are_shown_in_every_eighth_epoch_alone(config: GaussiansConfig, scene: ParsedScene) -> None:
+def test_blurred_views_are_shown_in_every_eighth_epoch_alone(
+    config: GaussiansConfig, scene: ParsedScene
+) -> None:
     images = {view: np.zeros((24, 32, 3), np.uint8) for view in scene.train.tolist()}
     level = photographs.make_levels(scene, images, {}, 0.01)[0]
     views = len(level)
@@ -389,7 +492,8 @@ def test_blurred_views_are_shown_in_every_eighth_epoch_alone(config: GaussiansCo
     # None is blurred: each epoch is a permutation of all.
     assert all(sorted(shown(range(e * views, (e + 1) * views))) == sorted(level) for e in range(9))
     level.blurred = frozenset(list(level)[:2])
-    sharp, cycle = views - 2, views + 7 * (views - 2)
+    sharp = views - 2
+    cycle = views + 7 * (views - 2)
     for begin in (0, cycle):
         assert sorted(shown(range(begin, begin + views))) == sorted(level)
         for epoch in range(7):

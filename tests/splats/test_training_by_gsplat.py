@@ -1,4 +1,6 @@
-"""Gaussians trained by gsplat: on the CPU and on the pretended device, through a stand-in (tests/gsplat_stand_in.py)."""
+"""Gaussians trained by gsplat: on the CPU and on the pretended device, through a stand-in
+(tests/gsplat_stand_in.py).
+"""
 
 import json
 import sys
@@ -31,7 +33,9 @@ def by_gsplat(learner: GaussianLearner) -> GaussianLearner:
 
 
 def test_it_learns_what_the_kernels_of_the_cpu_learn(config: GaussiansConfig, scene: ParsedScene) -> None:
-    """Rounding grows over steps of Adam and splits by chance: over three seeds they came out 0.12 dB apart at most."""
+    """Rounding grows over steps of Adam and splits by chance: over three seeds they came out 0.12 dB apart at
+    most.
+    """
     asked = replace(config, tones=True, poses=1e-4)
     start = build(asked, scene)
     before = quality(start.gaussians(), scene)
@@ -42,16 +46,25 @@ def test_it_learns_what_the_kernels_of_the_cpu_learn(config: GaussiansConfig, sc
     assert quality(learner.gaussians(), scene) == pytest.approx(ours, abs=0.3)
 
 
-def test_the_device_gives_what_the_cpu_gives_with_one_wait_a_step(config: GaussiansConfig, scene: ParsedScene) -> None:
-    """Bit for bit: both are torch here. Widths are limited every tenth step, and Gaussians moved every twentieth."""
-    asked, waits, uploads = replace(config, tones=True, poses=1e-4), {}, {}
-    part, end = (205, 225), 230
+def test_the_device_gives_what_the_cpu_gives_with_one_wait_a_step(
+    config: GaussiansConfig, scene: ParsedScene
+) -> None:
+    """Bit for bit: both are torch here. Widths are limited every tenth step, and Gaussians moved every
+    twentieth.
+    """
+    asked = replace(config, tones=True, poses=1e-4)
+    waits = {}
+    uploads = {}
+    part = (205, 225)
+    end = 230
     with stand_in():
         wanted = stepped(by_gsplat(build(asked, scene)), *part)
         with pretend_cuda() as seen:
             learner = build(asked, scene, device=CUDA)
             assert learner.device == CUDA and isinstance(learner.model, GsplatGaussians)
-            assert all(level[view].there is not None for level in learner.levels for view in level), "they stay there"
+            assert all(level[view].there is not None for level in learner.levels for view in level), (
+                "they stay there"
+            )
             for step in range(*part):
                 before = seen.syncs.total(), seen.uploads.total()
                 stepped(learner, step, step + 1)
@@ -89,7 +102,9 @@ def test_auto_trains_where_gsplat_draws(
     said = capsys.readouterr()
     events = [json.loads(line)["event"] for line in (said.out + said.err).splitlines() if '"event"' in line]
     assert sum("on cuda:0 by gsplat" in each for each in events) == installed
-    assert sum("Gaussians are trained on the CPU" in each and "fprf[cuda]" in each for each in events) == (not installed)
+    assert sum("Gaussians are trained on the CPU" in each and "fprf[cuda]" in each for each in events) == (
+        not installed
+    )
     scene = open_run(tmp_path / "run", "cpu").scene
     assert len(scene.gaussians) > 100
     with pretend_cuda(), stand_in(), monkeypatch.context() as patched:

@@ -26,15 +26,22 @@ def test_matches_between_views_give_points_on_the_surface() -> None:
     """Views of a textured plane z = 0: what is triangulated lies in it."""
     draws = np.random.default_rng(1)
     texture = np.kron(draws.integers(0, 256, (60, 60, 3)), np.ones((8, 8, 1))).astype(np.uint8)
-    count, width, height, focal = 4, 200, 160, 180.0
+    count = 4
+    width = 200
+    height = 160
+    focal = 180.0
     pose = torch.eye(4, dtype=torch.float64)[:3].repeat(count, 1, 1)
     pose[:, 0, 3], pose[:, 2, 3] = torch.linspace(-0.3, 0.3, count, dtype=torch.float64), 3.0
     cameras = pinhole(pose, width=width, height=height, fov=math.degrees(2 * math.atan(height / 2 / focal)))
     x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
     u, v = ((along * 3 / focal) * 100 + 240 for along in (x, y))
-    images = {view: texture[v.astype(int), (u + 100 * float(pose[view, 0, 3])).astype(int)] for view in range(count)}
+    images = {
+        view: texture[v.astype(int), (u + 100 * float(pose[view, 0, 3])).astype(int)] for view in range(count)
+    }
     train = torch.arange(count)
-    scene = ParsedScene(name="plane", paths=(Path("a"),) * count, cameras=cameras, train=train, test=train[:0])
+    scene = ParsedScene(
+        name="plane", paths=(Path("a"),) * count, cameras=cameras, train=train, test=train[:0]
+    )
     found, origin = initial_points(scene, images, 1000, draws)
     assert origin == "points matched between views" and len(found.position) > 100
     assert np.median(np.abs(found.position[:, 2])) < 0.03
@@ -48,7 +55,9 @@ def test_points_begin_where_there_are_none(scene: ParsedScene) -> None:
 
 
 def test_a_lens_moves_pixels_where_projection_says(scene: ParsedScene) -> None:
-    """A dot drawn through `cover` and `distorted` lies where the lens maps its place; `undistorted` brings it back."""
+    """A dot drawn through `cover` and `distorted` lies where the lens maps its place; `undistorted` brings it
+    back.
+    """
     distortion = torch.zeros(len(scene.paths), 6, dtype=torch.float64)
     distortion[:, 0] = -0.2
     cameras = replace(scene.cameras, distortion=distortion, lens=torch.ones_like(scene.cameras.lens))
@@ -57,9 +66,12 @@ def test_a_lens_moves_pixels_where_projection_says(scene: ParsedScene) -> None:
     local = torch.tensor([0.32, 0.22, -1.0], dtype=torch.float64)
     place = pose[:, :3] @ local + pose[:, 3]
     pixel, _ = project(cameras, torch.tensor([0]), place[None])
-    straight, _ = project(replace(cameras, lens=torch.zeros_like(cameras.lens)), torch.tensor([0]), place[None])
+    straight, _ = project(
+        replace(cameras, lens=torch.zeros_like(cameras.lens)), torch.tensor([0]), place[None]
+    )
     assert (pixel - straight).norm() > 1
-    turn, size = torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), -4.0)
+    turn = torch.tensor([[1.0, 0, 0, 0]])
+    size = torch.full((1, 3), -4.0)
     dot = Gaussians(place[None].float(), turn, size, torch.full((1,), 4.0), torch.ones(1, 1, 3))
     camera, where = photographs.cover(cameras, 0, 0.01)
     assert where is not None
@@ -78,7 +90,9 @@ def test_a_lens_moves_pixels_where_projection_says(scene: ParsedScene) -> None:
 
 
 def test_surroundings_fill_what_no_photograph_shows(scene: ParsedScene) -> None:
-    """All directions have a Gaussian far away: grey photographs give grey surroundings, in and out of view."""
+    """All directions have a Gaussian far away: grey photographs give grey surroundings, in and out of
+    view.
+    """
     images = {view: np.full((24, 32, 3), 102, np.uint8) for view in scene.train.tolist()}
     points = initial.Points(np.zeros((1, 3)), np.zeros((1, 3), np.float32))
     far = initial.surroundings(scene, images, points, 200)
@@ -97,7 +111,9 @@ def test_means_move_by_what_views_see_not_by_how_far_apart_they_are(scene: Parse
     both = Cameras(**{**columns, "pose": torch.cat([pose, moved])})
     assert scene.points is not None
     train = torch.cat([scene.train, scene.train + len(pose)])
-    twice = replace(scene, cameras=both, train=train, points=torch.cat([scene.points, scene.points + apart]), seen=None)
+    twice = replace(
+        scene, cameras=both, train=train, points=torch.cat([scene.points, scene.points + apart]), seen=None
+    )
     assert scene_scale(twice) < 1.5 * scene_scale(replace(scene, seen=None))
     assert scene_scale(replace(twice, points=None)) > 500
 
@@ -105,13 +121,16 @@ def test_means_move_by_what_views_see_not_by_how_far_apart_they_are(scene: Parse
 @pytest.mark.parametrize("lens", [1, 2])
 @pytest.mark.parametrize("k", [(0.0, 0.0, 0.0), (-0.3, 0.1, 0.0), (0.2, -0.05, 0.01)])
 def test_a_pinhole_covers_all_that_a_lens_shows(lens: int, k: tuple[float, float, float]) -> None:
-    """No pixel lies outside of the pinhole's image or in its border of two pixels, and some reach that on each side."""
+    """No pixel lies outside of the pinhole's image or in its border of two pixels, and some reach that on
+    each side.
+    """
     cameras = ideal_cameras(torch.eye(3, 4, dtype=torch.float64)[None], 60.0, (80, 64))
     distortion = torch.tensor([[*k, 0.0, 0.001, -0.001]], dtype=torch.float64)
     cameras = replace(cameras, distortion=distortion, lens=torch.tensor([lens]))
     camera, place = photographs.cover(cameras, 0, 0.01)
     assert place is not None
-    low, high = place.amin((0, 1)), torch.tensor([camera.width, camera.height]) - place.amax((0, 1))
+    low = place.amin((0, 1))
+    high = torch.tensor([camera.width, camera.height]) - place.amax((0, 1))
     assert (low >= 2).all() and (high >= 2).all() and (low < 3).all() and (high < 3).all()
 
 

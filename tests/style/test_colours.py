@@ -16,7 +16,8 @@ from fprf.style.look import ColourMaps, Restyle, colour_maps
 from fprf.style.scene_style import RegionWeight, SceneStyle, own_style, scene_style
 from fprf.types import Want
 
-COUNT, KINDS = 600, 3
+COUNT = 600
+KINDS = 3
 
 
 class Unchanged(Stylizer):
@@ -60,7 +61,13 @@ def reference(seed: int, coloured: bool = True) -> Reference:
 def setting(*seeds: int, blend: float = 0.0) -> tuple[Tensor, Tensor, Tensor, SceneStyle, StyleDictionary]:
     content, semantic, kind = points(0)
     scene = scene_style(content, semantic, torch.ones(COUNT), None, KINDS, 0)
-    return content, semantic, kind, scene, build_dictionary([reference(s) for s in seeds or (1,)], clusters=KINDS, blend=blend)
+    return (
+        content,
+        semantic,
+        kind,
+        scene,
+        build_dictionary([reference(s) for s in seeds or (1,)], clusters=KINDS, blend=blend),
+    )
 
 
 def carried(maps: ColourMaps | None, colour: Tensor, semantic: Tensor | None) -> Tensor:
@@ -76,19 +83,26 @@ def test_colours_get_mean_and_covariance_of_their_match() -> None:
     assert d.colour_mean is not None and d.colour_covariance is not None
     code = sharp.match(semantic).argmax(1)
     for k in range(KINDS):
-        own, taken = found[kind == k].double(), int(code[kind == k][0])
+        own = found[kind == k].double()
+        taken = int(code[kind == k][0])
         assert torch.allclose(own.mean(0), d.colour_mean[taken].double(), atol=2e-3)
         # 512 draws know a deviation to 3 %, and _QUIET widens both sides.
-        assert torch.allclose(torch.cov(own.T), d.colour_covariance[taken].double(), atol=0.2 * float(own.var(0).max()))
+        assert torch.allclose(
+            torch.cov(own.T), d.colour_covariance[taken].double(), atol=0.2 * float(own.var(0).max())
+        )
 
 
 def test_regions_that_overlap_take_the_colours_that_they_match() -> None:
-    """Their keys belong to several regions: what the stylizer says of these is mixed already, and would be mixed again."""
+    """Their keys belong to several regions: what the stylizer says of these is mixed already, and would be
+    mixed again.
+    """
     content, semantic, _ = points(0)
     semantic = semantic + 2 * torch.randn(COUNT, 4, generator=torch.Generator().manual_seed(5))
     scene = scene_style(content, semantic, torch.ones(COUNT), None, 24, 0)
     d = build_dictionary([reference(1)], clusters=KINDS, blend=0.0)
-    stylizer = RegionToneConfig(temperature=1e-3, features=0.0, smoothness=0.0).build(dictionary=d, scene=scene)
+    stylizer = RegionToneConfig(temperature=1e-3, features=0.0, smoothness=0.0).build(
+        dictionary=d, scene=scene
+    )
     table = stylizer.region_match(scene.keys)
     assert (stylizer.match(scene.keys) - table).abs().max() > 0.05
     maps = colour_maps(stylizer, d, scene, Straight(), features=0.0)
@@ -111,19 +125,28 @@ def test_nothing_asked_nothing_made() -> None:
     ("own", "theirs", "gain", "error"),
     [
         (1e-4, 0.2, 3.0, 1e-5),  # would be a thousandfold: a flat region's noise must stay unseen
-        (1e-3, 3e-3, math.sqrt((9e-6 + 2e-4) / (1e-6 + 2e-4)), 2e-3),  # below four 8-bit steps nothing has a shape
+        (
+            1e-3,
+            3e-3,
+            math.sqrt((9e-6 + 2e-4) / (1e-6 + 2e-4)),
+            2e-3,
+        ),  # below four 8-bit steps nothing has a shape
         (0.03, 0.06, math.sqrt((3.6e-3 + 2e-4) / (9e-4 + 2e-4)), 0.07),  # 512 draws know a deviation to 3 %
     ],
 )
 def test_how_much_colours_are_spread_out(own: float, theirs: float, gain: float, error: float) -> None:
-    """One region whose colours deviate by `own` alike in all directions, a reference by `theirs`: the map is a multiple."""
+    """One region whose colours deviate by `own` alike in all directions, a reference by `theirs`: the map is
+    a multiple.
+    """
     noise = torch.randn(COUNT, 6, generator=torch.Generator().manual_seed(0))
     noise = torch.linalg.qr(noise - noise.mean(0)).Q * COUNT**0.5
     scene = scene_style(0.5 + own * noise, None, torch.ones(COUNT), None, 1, 0)
     d = build_dictionary([Reference("r", noise, torch.zeros(COUNT, 0), colour=0.5 + theirs * noise[:, 3:])])
     maps = colour_maps(Unchanged(len(d.keys)), d, scene, Straight())
     assert maps is not None
-    assert torch.linalg.svdvals(maps.matrix[0] + torch.eye(3)).tolist() == pytest.approx([gain] * 3, rel=error)
+    assert torch.linalg.svdvals(maps.matrix[0] + torch.eye(3)).tolist() == pytest.approx(
+        [gain] * 3, rel=error
+    )
 
 
 @settings(max_examples=30, deadline=None)
@@ -132,7 +155,9 @@ def test_colours_stay_colours_and_kept_regions_stay(seed: int, strength: float) 
     draw = torch.Generator().manual_seed(seed)
     content, semantic, _, scene, d = setting()
     stylizer = RegionToneConfig().build(dictionary=d, scene=scene)
-    wild = ColourMaps(scene, 3 * torch.randn(KINDS, 3, 3, generator=draw), torch.randn(KINDS, 3, generator=draw), 1.0)
+    wild = ColourMaps(
+        scene, 3 * torch.randn(KINDS, 3, 3, generator=draw), torch.randn(KINDS, 3, generator=draw), 1.0
+    )
     weight = RegionWeight(scene, torch.tensor([[0.0], [1.0], [0.5]]))
     look = Restyle(stylizer, strength, weight, colours=wild)
     rgb = look.colour(Straight(), content, semantic)
@@ -154,7 +179,8 @@ def test_a_look_fades_in() -> None:
 
 
 def test_dictionaries_know_the_colours_of_their_pixels() -> None:
-    r, kind = reference(1), points(1)[2]
+    r = reference(1)
+    kind = points(1)[2]
     d = build_dictionary([r], clusters=KINDS, blend=0.0)
     both = build_dictionary([reference(2), r], clusters=KINDS, blend=0.0)
     part, _ = choose(both, torch.tensor([name == r.name for name in both.names]))
@@ -171,7 +197,9 @@ def test_dictionaries_know_the_colours_of_their_pixels() -> None:
 def test_a_reference_of_one_colour_gives_that_colour(pixels: int, clusters: int) -> None:
     content, semantic, _, scene, _ = setting()
     flat = torch.full((pixels, 1), 0.7)
-    one = Reference("one", flat.expand(-1, 6), flat.expand(-1, 4), colour=flat * torch.tensor([1.0, 0.5, 0.0]))
+    one = Reference(
+        "one", flat.expand(-1, 6), flat.expand(-1, 4), colour=flat * torch.tensor([1.0, 0.5, 0.0])
+    )
     d = build_dictionary([one], clusters=clusters)
     stylizer = RegionToneConfig().build(dictionary=d, scene=scene)
     found = carried(colour_maps(stylizer, d, scene, Straight(), features=0.0), content[:, :3], semantic)

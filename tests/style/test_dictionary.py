@@ -12,11 +12,20 @@ from fprf.datamanagers.basis import Basis
 from fprf.errors import DataError
 from fprf.ops.guided import upsample
 from fprf.plugins.encoders.config import RandomConfig
-from fprf.style.dictionary import Encoders, Reference, StyleDictionary, build_dictionary, encode_photograph, whole_style
+from fprf.style.dictionary import (
+    Encoders,
+    Reference,
+    StyleDictionary,
+    build_dictionary,
+    encode_photograph,
+    whole_style,
+)
 from fprf.testing.cases import scene
 
 
-def reference(name: str, n: int = 900, c: int = 5, d: int = 4, seed: int = 0, weight: float = 1.0) -> Reference:
+def reference(
+    name: str, n: int = 900, c: int = 5, d: int = 4, seed: int = 0, weight: float = 1.0
+) -> Reference:
     """Three kinds of pixels, each with its own semantics and style."""
     g = torch.Generator().manual_seed(seed)
     kind = torch.arange(n) % 3
@@ -26,7 +35,11 @@ def reference(name: str, n: int = 900, c: int = 5, d: int = 4, seed: int = 0, we
 
 
 def equal(a: StyleDictionary, b: StyleDictionary) -> bool:
-    return a.names == b.names and a.blend == b.blend and all(torch.equal(x, y) for x, y in zip(a[:6], b[:6], strict=True))
+    return (
+        a.names == b.names
+        and a.blend == b.blend
+        and all(torch.equal(x, y) for x, y in zip(a[:6], b[:6], strict=True))
+    )
 
 
 @pytest.mark.parametrize("blend", [0.0, 0.3, 1.0])
@@ -35,14 +48,22 @@ def test_codes_are_the_blended_statistics_of_each_cluster_in_plain_float64(blend
     d = build_dictionary([r], clusters=3, blend=blend)
     kind = torch.arange(900) % 3
     content = r.content.double()
-    whole_mean, whole = content.mean(0), torch.cov(content.T, correction=0)
+    whole_mean = content.mean(0)
+    whole = torch.cov(content.T, correction=0)
     assert len(d.keys) == 3
     for t in range(3):
         inside = kind == int((d.keys[t]).argmax())
-        torch.testing.assert_close(d.keys[t].double(), r.semantic[inside].double().mean(0), rtol=1e-5, atol=1e-6)
-        mean, own = content[inside].mean(0), torch.cov(content[inside].T, correction=0)
-        torch.testing.assert_close(d.mean[t].double(), (1 - blend) * mean + blend * whole_mean, rtol=1e-5, atol=1e-5)
-        torch.testing.assert_close(d.covariance[t].double(), (1 - blend) * own + blend * whole, rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(
+            d.keys[t].double(), r.semantic[inside].double().mean(0), rtol=1e-5, atol=1e-6
+        )
+        mean = content[inside].mean(0)
+        own = torch.cov(content[inside].T, correction=0)
+        torch.testing.assert_close(
+            d.mean[t].double(), (1 - blend) * mean + blend * whole_mean, rtol=1e-5, atol=1e-5
+        )
+        torch.testing.assert_close(
+            d.covariance[t].double(), (1 - blend) * own + blend * whole, rtol=1e-5, atol=1e-5
+        )
     torch.testing.assert_close(d.share, torch.full((3,), 1 / 3))
 
 
@@ -66,7 +87,9 @@ def test_the_whole_style_is_that_of_all_pixels_whatever_the_blend(blend: float) 
 
 def test_unusable_references_are_named() -> None:
     with pytest.raises(DataError, match=r"x\.jpg: "):
-        build_dictionary([reference("a"), Reference("x.jpg", torch.full((4, 3), float("nan")), torch.zeros(4, 2))])
+        build_dictionary(
+            [reference("a"), Reference("x.jpg", torch.full((4, 3), float("nan")), torch.zeros(4, 2))]
+        )
     with pytest.raises(DataError):
         build_dictionary([])
 
@@ -92,13 +115,19 @@ def test_degenerate_photographs_have_codes(kind: str, clusters: int) -> None:
 
 CONTENT = RandomConfig(channels=6, stride=2).build()
 SEMANTIC = RandomConfig(channels=9, stride=8, seed=1).build()
-BASIS = Basis(torch.randn(9, generator=torch.Generator().manual_seed(0)), torch.linalg.qr(torch.randn(9, 4))[0])
+BASIS = Basis(
+    torch.randn(9, generator=torch.Generator().manual_seed(0)), torch.linalg.qr(torch.randn(9, 4))[0]
+)
 ENCODERS = Encoders(CONTENT, SEMANTIC, BASIS, scene(1, 6, 4))
 
 
 def photo(folder: Path, height: int, width: int, *, flat: bool = False) -> Path:
     rng = np.random.default_rng(0)
-    pixels = np.full((height, width, 3), (40, 90, 200)) if flat else rng.integers(0, 256, (height // 4 + 1, width // 4 + 1, 3))
+    pixels = (
+        np.full((height, width, 3), (40, 90, 200))
+        if flat
+        else rng.integers(0, 256, (height // 4 + 1, width // 4 + 1, 3))
+    )
     smooth = cv2.resize(pixels.astype(np.uint8), (width, height), interpolation=cv2.INTER_LINEAR)
     path = folder / f"{height}x{width}.png"
     cv2.imwrite(str(path), smooth)
@@ -121,7 +150,8 @@ def test_samples_have_the_statistics_of_the_whole_filtered_image(tmp_path: Path)
 
 
 def test_a_photograph_on_its_side_is_the_upright_one_bit_for_bit(tmp_path: Path) -> None:
-    stored, mask = cv2.imread(str(photo(tmp_path, 96, 128))), np.zeros((96, 128, 3), np.uint8)
+    stored = cv2.imread(str(photo(tmp_path, 96, 128)))
+    mask = np.zeros((96, 128, 3), np.uint8)
     mask[:40, :90] = 255
     for name, pixels in (("photo", stored), ("mask", mask)):
         upright = turned_jpeg(tmp_path / f"{name}.jpg", pixels, 6)
@@ -129,13 +159,20 @@ def test_a_photograph_on_its_side_is_the_upright_one_bit_for_bit(tmp_path: Path)
     for masked in (False, True):
         turned, plain = (
             encode_photograph(
-                tmp_path / f"photo.{kind}", ENCODERS, name="it", mask=tmp_path / f"mask.{kind}" if masked else None
+                tmp_path / f"photo.{kind}",
+                ENCODERS,
+                name="it",
+                mask=tmp_path / f"mask.{kind}" if masked else None,
             )
             for kind in ("jpg", "png")
         )
         for a, b in zip(turned[1:3], plain[1:3], strict=True):
             assert isinstance(a, torch.Tensor) and torch.equal(a, b)
-        assert turned.colour is not None and plain.colour is not None and torch.equal(turned.colour, plain.colour)
+        assert (
+            turned.colour is not None
+            and plain.colour is not None
+            and torch.equal(turned.colour, plain.colour)
+        )
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 700), (700, 3), (64, 64), (65, 1000)])
@@ -145,7 +182,9 @@ def test_any_shape_gives_a_dictionary(tmp_path: Path, height: int, width: int) -
     assert all(bool(t.isfinite().all()) for t in build_dictionary([r])[:6])
 
 
-def two_halves(folder: Path, *, mask_size: tuple[int, int] = (80, 120), white: int = 255) -> tuple[Path, Path]:
+def two_halves(
+    folder: Path, *, mask_size: tuple[int, int] = (80, 120), white: int = 255
+) -> tuple[Path, Path]:
     """A photograph that is dark on the left and light on the right, and a mask of its right half."""
     image = np.zeros((80, 120, 3), np.uint8)
     image[:, :60], image[:, 60:] = (30, 40, 50), (210, 200, 190)
@@ -158,10 +197,14 @@ def two_halves(folder: Path, *, mask_size: tuple[int, int] = (80, 120), white: i
 
 def test_a_mask_leaves_only_what_is_white(tmp_path: Path) -> None:
     path, mask = two_halves(tmp_path)
-    whole, some = (encode_photograph(path, ENCODERS._replace(longest=120), name="it", mask=m) for m in (None, mask))
+    whole, some = (
+        encode_photograph(path, ENCODERS._replace(longest=120), name="it", mask=m) for m in (None, mask)
+    )
     assert len(some.content) == len(some.semantic) == len(whole.content) // 2
     grid = whole.content.view(80, 120, -1)
-    assert torch.equal(some.content, grid[:, 60:].reshape(-1, grid.shape[-1])), "the same features, of fewer pixels"
+    assert torch.equal(some.content, grid[:, 60:].reshape(-1, grid.shape[-1])), (
+        "the same features, of fewer pixels"
+    )
 
 
 def test_unreadable_files_and_masks_that_cannot_be_are_named(tmp_path: Path) -> None:

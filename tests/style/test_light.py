@@ -1,4 +1,6 @@
-"""Light where a match is not sure: maps of colours, confidence, casts, and the same in fields and on Gaussians."""
+"""Light where a match is not sure: maps of colours, confidence, casts, and the same in fields and on
+Gaussians.
+"""
 
 from typing import Annotated
 
@@ -16,7 +18,8 @@ from fprf.style.light import APPLIED, Light, light_maps, light_of, unrivalled
 from fprf.style.look import Restyle, region_maps, regional
 from fprf.style.scene_style import SceneStyle, own_style, scene_style
 
-KINDS, EACH = 4, 150
+KINDS = 4
+EACH = 150
 CONFIG = RegionToneConfig(smoothness=0.0)
 OWN = torch.tensor([[0.4, 0.5, 0.7], [0.3, 0.45, 0.2], [0.5, 0.45, 0.4], [0.55, 0.35, 0.3]])
 """Sky, plants, ground, brick."""
@@ -31,7 +34,9 @@ class Straight(Decoder):
         return content
 
 
-def samples(colours: Tensor, seed: int, *, turned: bool = False, spread: float = 0.04) -> tuple[Tensor, Tensor]:
+def samples(
+    colours: Tensor, seed: int, *, turned: bool = False, spread: float = 0.04
+) -> tuple[Tensor, Tensor]:
     """Colours and semantics of points of each kind; `turned` = of kinds that the scene does not know."""
     draw = torch.Generator().manual_seed(seed)
     kind = torch.arange(KINDS * EACH) % KINDS
@@ -45,7 +50,9 @@ def made_scene() -> tuple[Tensor, Tensor, SceneStyle]:
     return colour, semantic, scene_style(colour, semantic, torch.ones(len(colour)), None, KINDS, 0)
 
 
-def reference(colours: Tensor, name: str = "r", *, turned: bool = False, kinds: tuple[int, ...] = (0, 1, 2, 3)) -> Reference:
+def reference(
+    colours: Tensor, name: str = "r", *, turned: bool = False, kinds: tuple[int, ...] = (0, 1, 2, 3)
+) -> Reference:
     colour, semantic = samples(colours, len(name), turned=turned)
     some = torch.isin(torch.arange(KINDS * EACH) % KINDS, torch.tensor(kinds))
     return Reference(name, colour[some], semantic[some], colour=colour[some])
@@ -89,7 +96,8 @@ def test_bold_1_paints_bit_for_bit_and_0_paints_nothing() -> None:
     assert plain.light is None and bool((plain.confidence(semantic) == 1).all())
     assert float(lights(look_of(scene, reference(MEADOW), bold=0.0)).paint(semantic).abs().max()) == 0
     shares = [
-        float(lights(look_of(scene, reference(MEADOW, kinds=(0, 1)), bold=b)).paint(semantic).mean()) for b in (0.2, 0.5, 0.9)
+        float(lights(look_of(scene, reference(MEADOW, kinds=(0, 1)), bold=b)).paint(semantic).mean())
+        for b in (0.2, 0.5, 0.9)
     ]
     assert shares == sorted(shares) and shares[0] < shares[2] - 0.3
 
@@ -127,10 +135,14 @@ def shown_light(colours: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("tint", [(1.15, 1.0, 0.8), (0.8, 1.0, 1.2)])
 def test_the_cast_of_an_evenly_tinted_reference_is_found(tint: tuple[float, float, float]) -> None:
-    """A light is what all share: grey things seen through a tint give grey things that tint, as far as it is applied."""
+    """A light is what all share: grey things seen through a tint give grey things that tint, as far as it is
+    applied.
+    """
     greys = torch.tensor([0.3, 0.4, 0.5, 0.6])[:, None] * torch.tensor(tint)
     found = shown_light(greys)
-    assert torch.allclose(found[:, 0] / found[:, 2], torch.full((KINDS,), (tint[0] / tint[2]) ** APPLIED), rtol=0.1)
+    assert torch.allclose(
+        found[:, 0] / found[:, 2], torch.full((KINDS,), (tint[0] / tint[2]) ** APPLIED), rtol=0.1
+    )
     meadow = shown_light(MEADOW)
     assert torch.allclose(meadow[:, 0], meadow[:, 2], rtol=0.02), "a meadow with a sky and a barn has no cast"
 
@@ -150,11 +162,15 @@ def test_the_sky_follows_its_match_and_things_what_all_agree_on() -> None:
 
 
 def test_half_way_from_blue_to_yellow_is_not_green() -> None:
-    blue, yellow = torch.tensor([0.35, 0.55, 0.9]), torch.tensor([0.95, 0.85, 0.4])
-    there, mean = MEADOW.clone(), OWN.double()
-    there[0], mean[0] = yellow, blue
+    blue = torch.tensor([0.35, 0.55, 0.9])
+    yellow = torch.tensor([0.95, 0.85, 0.4])
+    there = MEADOW.clone()
+    mean = OWN.double()
+    there[0] = yellow
+    mean[0] = blue
     d = build_dictionary([reference(OWN)], clusters=KINDS)._replace(colour_mean=there)
-    covariance, even = 0.01 * torch.eye(3).double().expand(KINDS, 3, 3), torch.full((KINDS,), 0.25).double()
+    covariance = 0.01 * torch.eye(3).double().expand(KINDS, 3, 3)
+    even = torch.full((KINDS,), 0.25).double()
     maps, between = light_maps(mean, covariance, even, torch.eye(KINDS).double(), d, torch.zeros_like(even))
     lit = mean[0] @ maps[0, :3] + maps[0, 3]
     assert float(lit[2]) > float(lit[0]) + 0.2, "it is still blue"
@@ -177,9 +193,13 @@ def test_a_kind_that_a_reference_lacks_keeps_its_own_chroma() -> None:
 
 
 def test_a_code_that_another_kind_claims_is_no_match_and_one_that_its_like_claims_is() -> None:
-    """Without brick in the reference, brick takes the ground's code; two regions of one kind do not rob each other."""
+    """Without brick in the reference, brick takes the ground's code; two regions of one kind do not rob each
+    other.
+    """
     _, _, scene = made_scene()
-    twin = scene._replace(keys=torch.cat([scene.keys, scene.keys[:1] + 0.05]), share=torch.ones(KINDS + 1) / (KINDS + 1))
+    twin = scene._replace(
+        keys=torch.cat([scene.keys, scene.keys[:1] + 0.05]), share=torch.ones(KINDS + 1) / (KINDS + 1)
+    )
     d = build_dictionary([reference(MEADOW)], clusters=KINDS, blend=0.0)
     alike = torch.nn.functional.normalize(twin.keys, dim=1) @ torch.nn.functional.normalize(d.keys, dim=1).T
     right = torch.nn.functional.one_hot(alike.argmax(1), KINDS).double()
@@ -189,11 +209,18 @@ def test_a_code_that_another_kind_claims_is_no_match_and_one_that_its_like_claim
 
 
 def test_a_pin_to_the_scene_itself_changes_no_colour() -> None:
-    """Regions that lend each other their styles across soft borders stop so on both sides where one of them is pinned."""
+    """Regions that lend each other their styles across soft borders stop so on both sides where one of them
+    is pinned.
+    """
     scene = made_scene()[2]._replace(contacts=torch.full((KINDS, KINDS), 0.05).fill_diagonal_(0))
-    own, config = own_style(scene), RegionToneConfig()
+    own = own_style(scene)
+    config = RegionToneConfig()
     own = own._replace(colour_mean=own.mean, colour_covariance=own.covariance)
-    both, allowed = concatenate([own, own], ["a", "b"], [1.0, 1.0]), torch.ones(KINDS, 2).bool()
+    both = concatenate([own, own], ["a", "b"], [1.0, 1.0])
+    allowed = torch.ones(KINDS, 2).bool()
     allowed[0, 1] = False
     maps = region_maps(regional(both, scene, allowed, config), both, scene, config, allowed)
-    assert maps is not None and float((scene.region_mean[:, None] @ maps.matrix + maps.bias[:, None]).abs().max()) < 1e-6
+    assert (
+        maps is not None
+        and float((scene.region_mean[:, None] @ maps.matrix + maps.bias[:, None]).abs().max()) < 1e-6
+    )

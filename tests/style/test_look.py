@@ -20,7 +20,11 @@ from fprf.style.scene_style import Membership, RegionWeight
 from fprf.types import Want
 
 COLOUR = st.tuples(
-    *[st.sampled_from([0.0, 1e-7, 0.2, 0.5, 1 / 3, 0.999, 1.0]) | st.floats(0, 1, width=32, allow_subnormal=False)] * 3
+    *[
+        st.sampled_from([0.0, 1e-7, 0.2, 0.5, 1 / 3, 0.999, 1.0])
+        | st.floats(0, 1, width=32, allow_subnormal=False)
+    ]
+    * 3
 )
 
 
@@ -58,8 +62,10 @@ def test_kept_regions_stay_bit_for_bit_and_the_others_are_styled() -> None:
     assert stylizer.needs == Want.CONTENT and look.needs == Want.CONTENT | Want.SEMANTIC
     share = Membership(scene.keys, scene.semantic_mean)(semantic)
     decoder = Sigmoid()
-    colour, plain = look.colour(decoder, content, semantic), decoder(content)
-    kept, full = share[:, 0] == 1, share[:, 1] == 1
+    colour = look.colour(decoder, content, semantic)
+    plain = decoder(content)
+    kept = share[:, 0] == 1
+    full = share[:, 1] == 1
     assert int(kept.sum()) > 20 and torch.equal(colour[kept], plain[kept])
     styled = decoder(stylizer(content, None))
     torch.testing.assert_close(colour[full], keep_luminance(styled, plain, 0.7)[full], rtol=0.0, atol=1e-6)
@@ -77,9 +83,15 @@ def test_between_two_styles_features_strengths_and_luminances_are_linear(at: flo
     b = Restyle(RegionOtConfig().build(dictionary=d, scene=scene), 1.0, weight, luminance=0.6)
     mixed = a.mixed(b, at)
     assert mixed.needs == Want.CONTENT | Want.SEMANTIC
-    decoder, plain = Sigmoid(), Sigmoid()(content)
-    strength = 0.8, Membership(scene.keys, scene.semantic_mean)(semantic) @ torch.tensor([[0.0], [1.0], [1.0]])
-    features = [content + s * (x.stylizer(content, semantic) - content) for x, s in zip((a, b), strength, strict=True)]
+    decoder = Sigmoid()
+    plain = Sigmoid()(content)
+    strength = (
+        0.8,
+        Membership(scene.keys, scene.semantic_mean)(semantic) @ torch.tensor([[0.0], [1.0], [1.0]]),
+    )
+    features = [
+        content + s * (x.stylizer(content, semantic) - content) for x, s in zip((a, b), strength, strict=True)
+    ]
     wanted = keep_luminance(decoder(torch.lerp(*features, at)), plain, (1 - at) * 0.2 + at * 0.6)
     torch.testing.assert_close(mixed.colour(decoder, content, semantic), wanted, rtol=0.0, atol=1e-5)
     expected = torch.cat([(1 - at) * a.match(semantic), at * b.match(semantic)], 1)
@@ -92,7 +104,8 @@ def test_between_two_styles_features_strengths_and_luminances_are_linear(at: flo
 def test_kept_luminance_is_the_scenes_and_colours_stay_colours(
     styled: tuple[float, float, float], own: tuple[float, float, float], share: float
 ) -> None:
-    a, b = torch.tensor([styled]), torch.tensor([own])
+    a = torch.tensor([styled])
+    b = torch.tensor([own])
     out = keep_luminance(a, b, share)
     assert float(out.min()) >= 0 and float(out.max()) <= 1
     # Rounding: a handful of float32 operations on numbers up to 1, and the tint's share of the clamp.
@@ -111,15 +124,21 @@ def test_hues_survive_where_there_is_room_and_fade_where_not() -> None:
     assert torch.equal(keep_luminance(orange, dark, 1.0), dark)
     # Too light for so strong a tint: the direction of the tint is the same, its length is what fits.
     light = keep_luminance(torch.tensor([[1.0, 0.0, 0.0]]), torch.full((1, 3), 0.9), 1.0)
-    tint, full = (light - luma(light))[0], torch.tensor([1.0, 0.0, 0.0]) - 0.2126
-    torch.testing.assert_close(torch.linalg.vecdot(tint, full), tint.norm() * full.norm(), rtol=1e-5, atol=0.0)
+    tint = (light - luma(light))[0]
+    full = torch.tensor([1.0, 0.0, 0.0]) - 0.2126
+    torch.testing.assert_close(
+        torch.linalg.vecdot(tint, full), tint.norm() * full.norm(), rtol=1e-5, atol=0.0
+    )
     assert float(light.amax()) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("box:0,-1,-1:1,1,1:0.5", [1.0, 0.84375, 0.5, 0.0, 1.0]),  # a smoothstep from the border's inside to its outside
+        (
+            "box:0,-1,-1:1,1,1:0.5",
+            [1.0, 0.84375, 0.5, 0.0, 1.0],
+        ),  # a smoothstep from the border's inside to its outside
         ("box:1,1,1:0,-1,-1", [1.0, 0.0, 0.0, 0.0, 1.0]),
         ("path:-1,0,0:0.5,0,0:0.5,2,0:1,0.5", [1.0, 0.84375, 0.5, 0.0, 1.0]),
         ("everywhere", [1.0] * 5),
@@ -128,7 +147,9 @@ def test_hues_survive_where_there_is_room_and_fade_where_not() -> None:
 def test_a_place_is_full_inside_and_fades_over_its_border(text: str, expected: list[float]) -> None:
     place = parse_place("pin", text)
     assert place is not None and parse_place("pin", "3") is None
-    points = torch.tensor([[0.5, 0.0, 0.0], [1.125, 0.0, 0.0], [1.25, 0.0, 0.0], [1.6, 0.0, 0.0], [0.4, 0.9, 0.0]])
+    points = torch.tensor(
+        [[0.5, 0.0, 0.0], [1.125, 0.0, 0.0], [1.25, 0.0, 0.0], [1.6, 0.0, 0.0], [0.4, 0.9, 0.0]]
+    )
     assert place_weight(place, points).tolist() == pytest.approx(expected)
 
 
@@ -149,23 +170,28 @@ def test_a_dictionary_of_some_references_is_the_one_built_of_them() -> None:
 
 @pytest.mark.parametrize("config", STYLIZERS)
 def test_each_region_is_styled_by_what_it_may_take_from(config: StylizerConfig) -> None:
-    """Those that are made of regions apply the choice themselves: each map is the one that it has with these references."""
+    """Those that are made of regions apply the choice themselves: each map is the one that it has with these
+    references.
+    """
     content, semantic, scene, d = setting(1.0, 2.0, 3.0, clusters=2)
     allowed = torch.tensor([[True, False, False], [True, True, True], [False, True, True]])
     made = regional(d, scene, allowed, config)
     assert made.needs == Want.CONTENT | Want.SEMANTIC
     assert isinstance(made, TwoSidedStylizer) == config.handles_allowed_references
     share = Membership(scene.keys, scene.semantic_mean)(semantic)
-    out, match = torch.zeros_like(content), torch.zeros(300, len(d.keys))
+    out = torch.zeros_like(content)
+    match = torch.zeros(300, len(d.keys))
     for k in range(3):
         part, codes = choose(d, allowed[k])
         alone = config.build(dictionary=part, scene=scene)
         if isinstance(alone, TwoSidedStylizer):
             away = content - alone.centre
             moved = away * alone.matrix[k] if alone.matrix.ndim == 2 else away @ alone.matrix[k]
-            styled, taken = moved + alone.bias[k], alone.table[k]
+            styled = moved + alone.bias[k]
+            taken = alone.table[k]
         else:
-            styled, taken = alone(content, semantic), alone.match(semantic)
+            styled = alone(content, semantic)
+            taken = alone.match(semantic)
         out += share[:, k, None] * styled
         match[:, codes] += share[:, k, None] * taken
     torch.testing.assert_close(made(content, semantic), out, rtol=1e-4, atol=1e-4)
@@ -185,5 +211,7 @@ def test_a_scene_without_semantics_can_be_pinned_as_a_whole() -> None:
     for config in (AdainConfig(), region_adain(gain=1e6)):
         made = regional(d, scene, allowed, config)
         assert made.needs == Want.CONTENT
-        torch.testing.assert_close(made(content, None).double().mean(0), whole_style(alone)[0], rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(
+            made(content, None).double().mean(0), whole_style(alone)[0], rtol=1e-4, atol=1e-4
+        )
         assert made.match(content[:2, :0]).tolist() == [[0.0, 1.0]] * 2

@@ -33,7 +33,9 @@ def plain_shares(
     return torch.stack(out) if out else x.double().new_zeros(0, len(keys))
 
 
-@pytest.mark.parametrize(("norm", "temperature"), [(30.0, 100.0), (100.0, 100.0), (100.0, 1.0), (265.0, 100.0), (1.0, 0.05)])
+@pytest.mark.parametrize(
+    ("norm", "temperature"), [(30.0, 100.0), (100.0, 100.0), (100.0, 1.0), (265.0, 100.0), (1.0, 0.05)]
+)
 def test_attention_is_the_papers_within_the_float32_bound(norm: float, temperature: float) -> None:
     q, k = (norm * torch.nn.functional.normalize(torch.randn(n, 64), dim=1) for n in (40, 9))
     a = attention(q, k, temperature)
@@ -48,9 +50,12 @@ def test_attention_is_the_papers_within_the_float32_bound(norm: float, temperatu
 @pytest.mark.parametrize("faint", [0.0, 0.2])
 @pytest.mark.parametrize("count", [0, 1, 50])
 @torch.no_grad()
-def test_shares_of_points_are_those_of_a_loop(wide: torch.dtype, centred: bool, faint: float, count: int) -> None:
+def test_shares_of_points_are_those_of_a_loop(
+    wide: torch.dtype, centred: bool, faint: float, count: int
+) -> None:
     draw = torch.Generator().manual_seed(count)
-    x, keys = torch.randn(count, 8, generator=draw) * 3 + 5, torch.randn(6, 8, generator=draw)
+    x = torch.randn(count, 8, generator=draw) * 3 + 5
+    keys = torch.randn(6, 8, generator=draw)
     centre = torch.full((8,), 5.0) if centred else None
     if centre is not None and count > 1:
         x[0] = centre
@@ -69,7 +74,12 @@ def test_shares_of_points_are_those_of_a_loop(wide: torch.dtype, centred: bool, 
 
 Side = tuple[torch.Tensor, torch.Tensor]
 """Keys and their shares."""
-FRAMES: list[dict[str, Any]] = [{}, {"whitening": 0.5}, {"whitening": 1.0}, {"whitening": 0.5, "recentred": 5}]
+FRAMES: list[dict[str, Any]] = [
+    {},
+    {"whitening": 0.5},
+    {"whitening": 1.0},
+    {"whitening": 0.5, "recentred": 5},
+]
 
 
 def side(count: int, dims: int, seed: int) -> Side:
@@ -90,7 +100,9 @@ def table(here: Side, there: Side, temperature: float = 0.3, **frame: Any) -> to
 
 @pytest.mark.parametrize("frame", FRAMES)
 def test_where_a_side_lies_and_how_both_are_turned_decides_nothing(frame: dict[str, Any]) -> None:
-    (here, share), (there, weight), rotation = side(6, 5, 2), side(9, 5, 3), turned(5, 4)
+    (here, share) = side(6, 5, 2)
+    (there, weight) = side(9, 5, 3)
+    rotation = turned(5, 4)
     plain = table((here, share), (there, weight), **frame)
     moved = table((here + 7, share), (there - 3, 5 * weight), **frame)
     both = table((here @ rotation, share), (there @ rotation, weight), **frame)
@@ -116,24 +128,38 @@ def test_whitening_takes_the_share_of_the_spread_that_it_is_told() -> None:
 
 def test_what_references_show_too_much_of_does_not_move_the_centre() -> None:
     """Three kinds in the scene; the references show the first almost alone."""
-    kinds, share = torch.eye(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
-    here, there = (kinds, share), (kinds + 0.5, torch.tensor([0.9, 0.05, 0.05], dtype=torch.float64))
+    kinds = torch.eye(3, dtype=torch.float64)
+    share = torch.ones(3, dtype=torch.float64)
+    here = (kinds, share)
+    there = (kinds + 0.5, torch.tensor([0.9, 0.05, 0.05], dtype=torch.float64))
     once, settled = (table(here, there, 0.5, recentred=times) for times in (0, 5))
     even = table(here, (kinds + 0.5, share), 0.5)
-    assert float((settled - even).abs().max()) < 0.2 * float((once - even).abs().max()), "as if they showed all alike"
+    assert float((settled - even).abs().max()) < 0.2 * float((once - even).abs().max()), (
+        "as if they showed all alike"
+    )
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.integers(1, 6), st.integers(1, 9), st.integers(1, 5), st.sampled_from([0.0, 1e-12, 1e9]), st.sampled_from(FRAMES))
-def test_rows_are_shares_whatever_comes(k: int, t: int, dims: int, scale: float, frame: dict[str, Any]) -> None:
-    (here, share), (there, weight) = side(k, dims, k), side(t, dims, t + 9)
+@given(
+    st.integers(1, 6),
+    st.integers(1, 9),
+    st.integers(1, 5),
+    st.sampled_from([0.0, 1e-12, 1e9]),
+    st.sampled_from(FRAMES),
+)
+def test_rows_are_shares_whatever_comes(
+    k: int, t: int, dims: int, scale: float, frame: dict[str, Any]
+) -> None:
+    (here, share) = side(k, dims, k)
+    (there, weight) = side(t, dims, t + 9)
     found = table((here * scale, share), ((there * scale).float(), weight.float()), **frame)
     assert found.shape == (k, t) and found.dtype == torch.float64 and bool((found >= 0).all())
     torch.testing.assert_close(found.sum(1), torch.ones(k, dtype=torch.float64))
 
 
 def test_weights_of_codes_multiply_their_odds() -> None:
-    here, there = side(4, 3, 7), side(5, 3, 8)
+    here = side(4, 3, 7)
+    there = side(5, 3, 8)
     favoured = torch.tensor([5.0, 1.0, 1.0, 1.0, 1.0])
     for frame in FRAMES[:2]:
         more = match_keys(*here, *there, favoured, temperature=0.3, **frame)

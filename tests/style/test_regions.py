@@ -1,4 +1,6 @@
-"""Regions: their statistics; by number, pixel, mask and key; what users ask of them; the list that explains them."""
+"""Regions: their statistics; by number, pixel, mask and key; what users ask of them; the list that explains
+them.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,7 +20,15 @@ from fprf.plugins.stylizers.config import AdainConfig
 from fprf.style.config import StyleConfig
 from fprf.style.files import RegionKey, StyleFile
 from fprf.style.match_maps import explain, region_row, region_tile
-from fprf.style.regions import RegionControls, RegionMatch, Regions, find_regions, key_of, membership_view, region_controls
+from fprf.style.regions import (
+    RegionControls,
+    RegionMatch,
+    Regions,
+    find_regions,
+    key_of,
+    membership_view,
+    region_controls,
+)
 from fprf.style.restyle import Styled, apply_style
 from fprf.style.scene_style import Membership, from_tensors, region_smoothing, scene_style, to_tensors
 from fprf.training.loading import load_style
@@ -56,13 +66,16 @@ def test_a_mask_means_what_it_covers(world: World, tmp_path: Path) -> None:
     assert chosen in found
     everything = find_regions(regions, f"0002:{draw(tmp_path, np.ones((24, 32)))}")
     mass = (share * opacity[..., None]).sum((0, 1))
-    assert {each.number for each in everything} == set((mass >= 1).nonzero().flatten().tolist()) | {int(mass.argmax())}
+    assert {each.number for each in everything} == set((mass >= 1).nonzero().flatten().tolist()) | {
+        int(mass.argmax())
+    }
 
 
 def test_keys_find_their_own_regions_and_those_like_them(world: World) -> None:
     regions = regions_of(world)
     assert regions.basis is not None
-    count, middle = len(regions.scene_style.share), regions.scene_style.semantic_mean
+    count = len(regions.scene_style.share)
+    middle = regions.scene_style.semantic_mean
     keys = {f"r{k}": key_of(regions, k) for k in range(count)}
     assert {len(key) for key in keys.values()} == {len(regions.basis.mean)}, "in the encoder's own channels"
     weaker = middle + 0.4 * (regions.scene_style.keys - middle)
@@ -81,7 +94,9 @@ def style_of(references: Sequence[Path]) -> StyleConfig:
     return StyleConfig(references=tuple(references), clusters=3)
 
 
-def controls_of(world: World, styled: Styled, file: StyleFile | None = None, **wishes: object) -> RegionControls:
+def controls_of(
+    world: World, styled: Styled, file: StyleFile | None = None, **wishes: object
+) -> RegionControls:
     style = replace(style_of(world.references), **wishes)  # type: ignore[arg-type]
     old = styled.controls.regions
     regions = Regions(old.scene, old.scene_style, old.basis, {} if file is None else file.regions)
@@ -89,7 +104,9 @@ def controls_of(world: World, styled: Styled, file: StyleFile | None = None, **w
 
 
 def test_forbidding_keeping_and_strengths(world: World, styled: Styled) -> None:
-    controls = controls_of(world, styled, forbid=("0=snow.png",), keep=("1",), region_strength=("2=0.25", "0=0.5"))
+    controls = controls_of(
+        world, styled, forbid=("0=snow.png",), keep=("1",), region_strength=("2=0.25", "0=0.5")
+    )
     assert controls.allowed[0].tolist() == [name != "snow.png" for name in styled.dictionary.names]
     assert controls.strength[:3].tolist() == [0.5, 0.0, 0.25]
 
@@ -108,8 +125,14 @@ def test_poor_matches_are_kept_unless_pinned(world: World, styled: Styled) -> No
     own = styled.dictionary.names.index("dusk.png")
     k = int(score[:, styled.dictionary.reference == own].amax(1).argmax())
     left = float(score[k, styled.dictionary.reference != own].max())
-    assert controls_of(world, styled, keep_below=1.0).notes[-1].startswith("keep_below 1: every region stays as it is")
-    forbidden = controls_of(world, styled, keep_below=left + 1e-3 if left < 0.999 else 1.0, forbid=(f"{k}=dusk.png",))
+    assert (
+        controls_of(world, styled, keep_below=1.0)
+        .notes[-1]
+        .startswith("keep_below 1: every region stays as it is")
+    )
+    forbidden = controls_of(
+        world, styled, keep_below=left + 1e-3 if left < 0.999 else 1.0, forbid=(f"{k}=dusk.png",)
+    )
     assert forbidden.strength[k] == 0
 
 
@@ -124,7 +147,9 @@ def test_poor_matches_are_kept_unless_pinned(world: World, styled: Styled) -> No
         ({"keep": ("44",)}, "region 44"),
     ],
 )
-def test_contradictions_and_unknown_names(world: World, styled: Styled, wishes: dict[str, object], said: str) -> None:
+def test_contradictions_and_unknown_names(
+    world: World, styled: Styled, wishes: dict[str, object], said: str
+) -> None:
     with pytest.raises(UsageError, match=said):
         controls_of(world, styled, **wishes)
 
@@ -138,23 +163,45 @@ def test_what_is_saved_means_the_same_on_the_same_scene(world: World, styled: St
         keep=("2",) if len(styled.scene_style.share) > 2 else (),
     )
     saved = controls.saved
-    assert all(text.partition("=")[0] in saved.regions for text in (*saved.style.pin, *saved.style.forbid, *saved.style.keep))
+    assert all(
+        text.partition("=")[0] in saved.regions
+        for text in (*saved.style.pin, *saved.style.forbid, *saved.style.keep)
+    )
     old = styled.controls.regions
-    again = region_controls(Regions(old.scene, old.scene_style, old.basis, saved.regions), styled.dictionary, saved.style)
+    again = region_controls(
+        Regions(old.scene, old.scene_style, old.basis, saved.regions), styled.dictionary, saved.style
+    )
     assert torch.equal(again.allowed, controls.allowed) and torch.equal(again.strength, controls.strength)
     assert again.saved == saved, "names and keys stay as they are, however often it is saved"
-    other = Regions(old.scene, old.scene_style, old.basis, {"sky": old.scene_style.keys[0].tolist() * 99}, "another encoder")
+    other = Regions(
+        old.scene,
+        old.scene_style,
+        old.basis,
+        {"sky": old.scene_style.keys[0].tolist() * 99},
+        "another encoder",
+    )
     here = region_controls(other, styled.dictionary, replace(style_of(world.references), keep=("0",))).saved
-    assert here.regions == saved.regions and here.style.keep == ("region0",), "keys of another encoder are not kept"
+    assert here.regions == saved.regions and here.style.keep == ("region0",), (
+        "keys of another encoder are not kept"
+    )
     named = {text.partition("=")[0] for text in (*saved.style.pin, *saved.style.forbid, *saved.style.keep)}
-    assert len(again.notes) == len(named) and "region 'region0' of the style is region 0 here (cosine 1.00)" in again.notes
+    assert (
+        len(again.notes) == len(named)
+        and "region 'region0' of the style is region 0 here (cosine 1.00)" in again.notes
+    )
 
 
-def test_a_photograph_with_an_equals_sign_in_its_name_is_saved_by_number(world: World, styled: Styled) -> None:
+def test_a_photograph_with_an_equals_sign_in_its_name_is_saved_by_number(
+    world: World, styled: Styled
+) -> None:
     style = style_of((Path("a=b.png"), *world.references[1:]))
-    dictionary = styled.dictionary._replace(names=tuple({"dusk.png": "a=b.png"}.get(n, n) for n in styled.dictionary.names))
+    dictionary = styled.dictionary._replace(
+        names=tuple({"dusk.png": "a=b.png"}.get(n, n) for n in styled.dictionary.names)
+    )
     first = region_controls(styled.controls.regions, dictionary, replace(style, pin=("0=0",)))
-    again = region_controls(styled.controls.regions._replace(keys=first.saved.regions), dictionary, first.saved.style)
+    again = region_controls(
+        styled.controls.regions._replace(keys=first.saved.regions), dictionary, first.saved.style
+    )
     assert first.saved.style.pin == ("region0=0",) and torch.equal(again.allowed, first.allowed)
 
 
@@ -164,7 +211,8 @@ def test_the_place_of_a_region_is_in_the_view_that_shows_most_of_it(world: World
     shares = [membership_view(regions, v, 32) for v in range(len(names))]
     mass = torch.stack([(share * opacity[..., None]).mean((0, 1)) for share, opacity in shares])
     for each in explain(regions):
-        view, k = names.index(each.view), each.number
+        view = names.index(each.view)
+        k = each.number
         assert float(mass[view, k]) >= 0.95 * float(mass[:, k].max())
         own = shares[view][0][each.pixel[1], each.pixel[0], k]
         assert float(own) >= 0.5 * float(shares[view][0][..., k].max())
@@ -187,18 +235,25 @@ def test_what_regions_take_is_the_stylizers_match_at_their_keys(world: World, st
         assert [t.share for t in each.taken] == sorted((t.share for t in each.taken), reverse=True)
         bits = -(match[each.number] * match[each.number].clamp_min(1e-30).log2()).sum()
         assert each.entropy == pytest.approx(float(bits), abs=1e-4)
-    assert [each.strength for each in found][:2] == [1.0, 0.0] and [each.restricted for each in found][:2] == [True, False]
+    assert [each.strength for each in found][:2] == [1.0, 0.0] and [each.restricted for each in found][
+        :2
+    ] == [True, False]
     tile = region_tile(found[1], styled.dictionary.names)
     assert tile.lines[-1] == "kept as it is" and sum(tile.shares) == 0
     assert sum(region_tile(found[0], styled.dictionary.names).shares) == pytest.approx(1, abs=1e-4)
     row = region_row(found[0])
-    assert {"references", "entropy_bits", "strength", "restricted"} < row.keys() and len(row["references"]) == 2
+    assert {"references", "entropy_bits", "strength", "restricted"} < row.keys() and len(
+        row["references"]
+    ) == 2
 
 
 @pytest.mark.parametrize(
-    "text", ["17", "sky", "0099:1,1", "²", "0002:32,0", "0002:-1,0", "0002:5,5", "0002:black.png", "0002:absent.png"]
+    "text",
+    ["17", "sky", "0099:1,1", "²", "0002:32,0", "0002:-1,0", "0002:5,5", "0002:black.png", "0002:absent.png"],
 )
-def test_what_means_nothing_is_refused(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+def test_what_means_nothing_is_refused(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
     """Places outside of the view or where nothing is, masks of nothing, keys of another encoder."""
     monkeypatch.chdir(tmp_path)
     cv2.imwrite("black.png", np.zeros((24, 32), np.uint8))
@@ -243,7 +298,8 @@ def test_without_semantics_there_is_one_region() -> None:
 @settings(max_examples=15, deadline=None)
 @given(st.integers(1, 30), st.integers(1, 40), st.integers(1, 3), st.sampled_from([0.0, 1e-3, 1.0, 1e4]))
 def test_any_scene_has_a_finite_style(n: int, regions: int, d: int, spread: float) -> None:
-    content, semantic = torch.randn(n, 3) * spread, torch.randn(n, d) * spread + 5
+    content = torch.randn(n, 3) * spread
+    semantic = torch.randn(n, d) * spread + 5
     scene = scene_style(content, semantic, torch.rand(n) + 0.01, None, regions, 0)
     assert all(bool(t.isfinite().all()) for t in scene)
     assert 1 <= len(scene.keys) <= min(n, regions)
@@ -260,7 +316,8 @@ def test_tensors_round_trip_and_runs_without_contacts_are_read() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("share", None), ("region_mean", torch.zeros(3, 9)), ("keys", torch.full((3, 4), float("inf")))]
+    ("name", "value"),
+    [("share", None), ("region_mean", torch.zeros(3, 9)), ("keys", torch.full((3, 4), float("inf")))],
 )
 def test_damaged_tensors_are_named(name: str, value: torch.Tensor | None) -> None:
     tensors = to_tensors(scene_style(*weighted(), None, 3, 0))
@@ -271,7 +328,9 @@ def test_damaged_tensors_are_named(name: str, value: torch.Tensor | None) -> Non
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(1, 6), st.floats(0, 1e4), st.integers(0, 99))
-def test_smoothing_mixes_and_keeps_the_mean_over_the_scene(regions: int, smoothness: float, seed: int) -> None:
+def test_smoothing_mixes_and_keeps_the_mean_over_the_scene(
+    regions: int, smoothness: float, seed: int
+) -> None:
     draw = torch.Generator().manual_seed(seed)
     scene = scene_style(*weighted(), None, 8, 0)
     contacts = torch.rand(regions, regions, generator=draw)

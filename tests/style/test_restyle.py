@@ -1,4 +1,6 @@
-"""Photographs to styles of a run: every field changes what is rendered, mistakes are told; maps of matches."""
+"""Photographs to styles of a run: every field changes what is rendered, mistakes are told; maps of
+matches.
+"""
 
 from dataclasses import fields, replace
 from pathlib import Path
@@ -49,7 +51,8 @@ class Bench:
         self.first = self.show(self.base)
 
     def show(self, style: StyleConfig | None) -> torch.Tensor:
-        known, config = self.trained.known, self.trained.config.render
+        known = self.trained.known
+        config = self.trained.config.render
         look = None if style is None else apply_style(self.trained, StyleFile(style), self.encoders).restyle
         return render_view(self.trained.model, known.facts, known.cameras, 0, config, look).rgb
 
@@ -73,7 +76,9 @@ def test_references_and_masks_change_the_picture(bench: Bench, tmp_path: Path) -
     mask = np.zeros((40, 56), np.uint8)
     mask[20:] = 255
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
-    assert not torch.allclose(bench.show(replace(bench.base, references=bench.base.references[:1])), bench.first, atol=1e-4)
+    assert not torch.allclose(
+        bench.show(replace(bench.base, references=bench.base.references[:1])), bench.first, atol=1e-4
+    )
     masked = bench.show(replace(bench.base, masks=(tmp_path / "mask.png", NO_MASK)))
     assert not torch.allclose(masked, bench.first, atol=1e-4)
     assert torch.equal(bench.show(replace(bench.base, masks=(NO_MASK, NO_MASK))), bench.first)
@@ -82,7 +87,9 @@ def test_references_and_masks_change_the_picture(bench: Bench, tmp_path: Path) -
 def test_between_two_styles(bench: Bench, tmp_path: Path) -> None:
     other = replace(bench.base, references=bench.base.references[:1], stylizer=AdainConfig(), luminance=0.5)
     write_style(tmp_path / "other.json", StyleFile(other))
-    mixes = [bench.show(replace(bench.base, between=tmp_path / "other.json", at=at)) for at in (0.0, 0.3, 0.7, 1.0)]
+    mixes = [
+        bench.show(replace(bench.base, between=tmp_path / "other.json", at=at)) for at in (0.0, 0.3, 0.7, 1.0)
+    ]
     end = bench.show(other)
     assert torch.equal(mixes[0], bench.first) and torch.equal(mixes[3], end)
     away = [float((mix - bench.first).abs().mean()) for mix in mixes]
@@ -91,7 +98,8 @@ def test_between_two_styles(bench: Bench, tmp_path: Path) -> None:
 
 
 def test_styles_that_lead_back_to_themselves_are_refused(bench: Bench, tmp_path: Path) -> None:
-    a, b = tmp_path / "a.json", tmp_path / "b.json"
+    a = tmp_path / "a.json"
+    b = tmp_path / "b.json"
     b.write_text("{}")
     for path, towards in ((a, b), (b, a)):
         write_style(path, StyleFile(replace(bench.base, between=towards)))
@@ -106,13 +114,17 @@ def test_the_order_of_references_does_not_matter_to_wishes(bench: Bench) -> None
     assert torch.equal(bench.show(one), bench.show(two))
 
 
-def styled_by(world: World, stylizer: StylizerConfig | None = None, **wishes: object) -> tuple[Trained, Styled]:
+def styled_by(
+    world: World, stylizer: StylizerConfig | None = None, **wishes: object
+) -> tuple[Trained, Styled]:
     trained = world.load()
     style = StyleConfig(references=world.references, clusters=3, stylizer=stylizer or RegionOtConfig())
     return trained, apply_style(trained, StyleFile(replace(style, **wishes)))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("stylizer", [AdainConfig(), LocalAdainConfig(), RegionOtConfig()], ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize(
+    "stylizer", [AdainConfig(), LocalAdainConfig(), RegionOtConfig()], ids=lambda s: type(s).__name__
+)
 def test_what_is_taken_is_the_stylizers_match(world: World, stylizer: StylizerConfig) -> None:
     trained, styled = styled_by(world, stylizer)
     found = match_map(trained, styled, 0)
@@ -129,13 +141,16 @@ def test_kept_regions_take_nothing(world: World) -> None:
     assert torch.allclose(found.kept, found.region[..., 0], atol=1e-4) and float(found.kept.max()) > 0.01
     assert torch.allclose(found.taken.sum(-1) + found.kept, torch.ones(()), atol=1e-4)
     summary = summarize(found, styled.codes)
-    assert summary["kept_share"] == pytest.approx(float((found.kept * found.opacity).sum() / found.opacity.sum()), abs=1e-5)
+    assert summary["kept_share"] == pytest.approx(
+        float((found.kept * found.opacity).sum() / found.opacity.sum()), abs=1e-5
+    )
 
 
 def test_the_score_is_the_mean_cosine_with_what_is_taken(world: World) -> None:
     trained, styled = styled_by(world, keep=("0",))
     found = match_map(trained, styled, 0)
-    centre, keys = styled.scene_style.semantic_mean.double(), styled.dictionary.keys.double()
+    centre = styled.scene_style.semantic_mean.double()
+    keys = styled.dictionary.keys.double()
     there = torch.nn.functional.normalize(keys - centre, dim=1)
 
     def of_points(semantic: torch.Tensor, points: torch.Tensor | None) -> torch.Tensor:
@@ -145,7 +160,9 @@ def test_the_score_is_the_mean_cosine_with_what_is_taken(world: World) -> None:
         return torch.cat([taken, taken * cosine], 1).float()
 
     cameras = trained.known.cameras
-    values, _ = paint_pixels(trained.model, cameras, 0, pixel_grid(cameras, 0), trained.config.render, of_points)
+    values, _ = paint_pixels(
+        trained.model, cameras, 0, pixel_grid(cameras, 0), trained.config.render, of_points
+    )
     taken, weighted = values.double().chunk(2, dim=1)
     expected = (weighted.sum(1) / taken.sum(1).clamp_min(1e-10)).view(24, 32)
     some = found.kept < 0.99
@@ -168,4 +185,7 @@ def test_summaries_count_what_is_there() -> None:
     assert summary["entropy_bits"] == pytest.approx(0.5) and summary["confidence"] == pytest.approx(0.6)
     assert summary["codes"][0] == {"reference": "a.jpg", "cluster": 0, "share": pytest.approx(1 / 3)}
     assert {(c["reference"], c["cluster"]) for c in summary["codes"][1:]} == {("b.jpg", 0), ("b.jpg", 1)}
-    assert summary["regions"] == [{"region": 0, "share": pytest.approx(1 / 3)}, {"region": 1, "share": pytest.approx(2 / 3)}]
+    assert summary["regions"] == [
+        {"region": 0, "share": pytest.approx(1 / 3)},
+        {"region": 1, "share": pytest.approx(2 / 3)},
+    ]

@@ -9,14 +9,17 @@ from fprf.errors import NumericsError
 from fprf.style.statistics import covariance, deviation, empty, group_moments, kmeans, merge, moments, monge
 
 
-def rows(n: int, c: int, *, scale: float = 1.0, offset: float = 0.0, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+def rows(
+    n: int, c: int, *, scale: float = 1.0, offset: float = 0.0, seed: int = 0
+) -> tuple[torch.Tensor, torch.Tensor]:
     g = torch.Generator().manual_seed(seed)
     return torch.randn(n, c, generator=g) * scale + offset, torch.rand(n, generator=g)
 
 
 def two_pass(x: torch.Tensor, w: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Plain float64 loops."""
-    mean, scatter = torch.zeros(x.shape[1]).double(), torch.zeros(x.shape[1], x.shape[1]).double()
+    mean = torch.zeros(x.shape[1]).double()
+    scatter = torch.zeros(x.shape[1], x.shape[1]).double()
     for row, weight in zip(x.double(), w.double(), strict=True):
         mean += weight * row
     mean /= w.double().sum()
@@ -44,7 +47,8 @@ def test_any_order_and_partition_gives_the_same(n: int, pieces: int, seed: int, 
     x, w = rows(n, 3, offset=offset, seed=seed)
     order = torch.randperm(n, generator=torch.Generator().manual_seed(seed))
     parts = [moments(x[i], w[i]) for i in order.chunk(pieces)] if n else [empty(3)]
-    left, right = empty(3), empty(3)
+    left = empty(3)
+    right = empty(3)
     for part in parts:
         left = merge(left, part)
     for part in reversed(parts):
@@ -52,7 +56,8 @@ def test_any_order_and_partition_gives_the_same(n: int, pieces: int, seed: int, 
     whole = moments(x, w)
     scale = whole.scatter.abs().max().clamp_min(1e-12)
     for merged in (left, right):
-        # Rounding of the means, offset * 2^-53, enters the scatter times its square root: far below its scale.
+        # Rounding of the means, offset * 2^-53, enters the scatter times its square root: far below its
+        # scale.
         assert float((merged.scatter - whole.scatter).abs().max() / scale) < 1e-11
         assert float((merged.mean - whole.mean).abs().max()) <= 1e-12 * max(1.0, offset)
         assert float((merged.weight - whole.weight).abs()) <= 1e-12 * max(1.0, float(whole.weight))
@@ -81,7 +86,11 @@ def test_group_moments_equal_moments_per_group() -> None:
 @pytest.mark.parametrize(
     ("mean", "variance", "floored"),
     [
-        ([0.0] * 5, [25e-6, 1e-4, 4e-4, 1e-12, 0.0], [5e-3, 1e-2, 2e-2, 5e-5, 5e-5]),  # a hundredth of the median
+        (
+            [0.0] * 5,
+            [25e-6, 1e-4, 4e-4, 1e-12, 0.0],
+            [5e-3, 1e-2, 2e-2, 5e-5, 5e-5],
+        ),  # a hundredth of the median
         ([1e4, 0.0, 1.0], [0.0] * 3, [1e-2] * 3),  # rounding of the largest mean
         ([0.0] * 3, [-1e-9, 1.0, 1.0], [1e-2, 1.0, 1.0]),  # a variance that rounding made negative
         ([1e6] * 3, [0.25] * 3, [1.0] * 3),
@@ -98,12 +107,15 @@ def test_deviation_biases_no_live_channel_and_floors_dead_ones(
 @pytest.mark.parametrize(("feature", "weight"), [(0.0, -1.0), (0.0, float("nan")), (float("inf"), 1.0)])
 def test_one_bad_number_among_good_ones_is_refused(feature: float, weight: float) -> None:
     x, w = rows(20, 3)
-    x[7, 1], w[7] = feature, weight
+    x[7, 1] = feature
+    w[7] = weight
     with pytest.raises(NumericsError):
         moments(x, w)
 
 
-def spectrum(c: int, *, rank: int | None = None, decay: float = 2.0, scale: float = 1.0, seed: int = 0) -> torch.Tensor:
+def spectrum(
+    c: int, *, rank: int | None = None, decay: float = 2.0, scale: float = 1.0, seed: int = 0
+) -> torch.Tensor:
     g = torch.Generator().manual_seed(seed)
     q, _ = torch.linalg.qr(torch.randn(c, c, generator=g, dtype=torch.float64))
     value = torch.logspace(0, -decay, c, dtype=torch.float64)
@@ -116,8 +128,16 @@ def with_ridge(c: torch.Tensor) -> torch.Tensor:
 
 
 @settings(max_examples=15, deadline=None)
-@given(st.integers(1, 24), st.integers(0, 24), st.integers(0, 24), st.sampled_from([1e-4, 1.0, 1e4]), st.integers(0, 99))
-def test_the_map_carries_one_covariance_to_the_other_at_any_rank(c: int, ra: int, rb: int, scale: float, seed: int) -> None:
+@given(
+    st.integers(1, 24),
+    st.integers(0, 24),
+    st.integers(0, 24),
+    st.sampled_from([1e-4, 1.0, 1e4]),
+    st.integers(0, 99),
+)
+def test_the_map_carries_one_covariance_to_the_other_at_any_rank(
+    c: int, ra: int, rb: int, scale: float, seed: int
+) -> None:
     content = spectrum(c, rank=min(ra, c), decay=4.0, seed=seed)
     style = spectrum(c, rank=min(rb, c), decay=3.0, scale=scale, seed=seed + 1)
     t = monge(content, style, gain=1e300)
@@ -125,7 +145,8 @@ def test_the_map_carries_one_covariance_to_the_other_at_any_rank(c: int, ra: int
     assert torch.equal(t, t.mT)
     assert float(torch.linalg.eigvalsh(t)[0]) >= -1e-9 * float(t.abs().max())
     if ra and rb:
-        reached, aim = t @ with_ridge(content) @ t, with_ridge(style)
+        reached = t @ with_ridge(content) @ t
+        aim = with_ridge(style)
         assert float((reached - aim).abs().max() / aim.abs().max()) < 1e-8
 
 
@@ -136,12 +157,17 @@ def test_equal_covariances_give_the_identity(c: int, rank: int) -> None:
 
 
 def test_gain_is_capped_where_the_scene_is_flat() -> None:
-    flat, lively = torch.zeros(5, 5), torch.eye(5)
-    torch.testing.assert_close(monge(flat, lively, gain=8.0), 8.0 * torch.eye(5).double(), rtol=1e-9, atol=1e-9)
+    flat = torch.zeros(5, 5)
+    lively = torch.eye(5)
+    torch.testing.assert_close(
+        monge(flat, lively, gain=8.0), 8.0 * torch.eye(5).double(), rtol=1e-9, atol=1e-9
+    )
     assert float(monge(lively, flat, gain=8.0).abs().max()) < 1e-6
 
 
-def blobs(n: int, d: int, k: int, *, spread: float, norm: float, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+def blobs(
+    n: int, d: int, k: int, *, spread: float, norm: float, seed: int = 0
+) -> tuple[torch.Tensor, torch.Tensor]:
     g = torch.Generator().manual_seed(seed)
     label = torch.arange(n) % k
     centres = torch.randn(k, d, generator=g) * 8 * spread
@@ -162,7 +188,9 @@ def test_the_result_is_a_fixed_point_of_lloyd_in_plain_float64(norm: float) -> N
 
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 40), st.integers(0, 12), st.integers(1, 4), st.integers(1, 6), st.integers(0, 99))
-def test_any_size_gives_non_empty_clusters_and_finite_centres(n: int, k: int, d: int, distinct: int, seed: int) -> None:
+def test_any_size_gives_non_empty_clusters_and_finite_centres(
+    n: int, k: int, d: int, distinct: int, seed: int
+) -> None:
     g = torch.Generator().manual_seed(seed)
     x = torch.randn(distinct, d, generator=g)[torch.randint(0, distinct, (n,), generator=g)]
     found = kmeans(x, k, seed=seed)

@@ -1,4 +1,6 @@
-"""Style files, keyframes and what users say of regions and references: there and back, moved, shared, and mistakes."""
+"""Style files, keyframes and what users say of regions and references: there and back, moved, shared, and
+mistakes.
+"""
 
 import json
 import shutil
@@ -35,7 +37,8 @@ def photo(path: Path, text: str = "pixels") -> Path:
 
 def full(folder: Path) -> StyleFile:
     """A style with a second value of every field."""
-    a, b = photo(folder / "photos" / "a.jpg"), photo(folder / "b.jpg", "others")
+    a = photo(folder / "photos" / "a.jpg")
+    b = photo(folder / "b.jpg", "others")
     style = StyleConfig(
         references=(a, b),
         weights=(1.0, 2.5),
@@ -58,7 +61,8 @@ def full(folder: Path) -> StyleFile:
 
 
 def test_every_field_survives(tmp_path: Path) -> None:
-    file, path = full(tmp_path), tmp_path / "style.json"
+    file = full(tmp_path)
+    path = tmp_path / "style.json"
     assert all(getattr(file.style, name) != value for name, value in vars(StyleConfig()).items())
     write_style(path, file, {"seconds": 1.5})
     read = read_style(path)
@@ -92,7 +96,9 @@ def test_photographs_in_its_folder_move_with_it_and_others_are_absolute(tmp_path
 
 
 def test_a_shared_style_finds_its_photographs_beside_it(tmp_path: Path) -> None:
-    write_style(tmp_path / "style.json", StyleFile(StyleConfig(references=(photo(tmp_path / "mine" / "a.jpg"),))))
+    write_style(
+        tmp_path / "style.json", StyleFile(StyleConfig(references=(photo(tmp_path / "mine" / "a.jpg"),)))
+    )
     text = (tmp_path / "style.json").read_text().replace("mine/a.jpg", "/of/somebody/else/a.jpg")
     photo(tmp_path / "theirs" / "a.jpg")
     photo(tmp_path / "theirs" / "style.json", text)
@@ -100,13 +106,16 @@ def test_a_shared_style_finds_its_photographs_beside_it(tmp_path: Path) -> None:
     assert read.style.references == (tmp_path / "theirs" / "a.jpg",)
     check_photographs(tmp_path / "theirs" / "style.json", read)
     photo(tmp_path / "theirs" / "a.jpg", "another photograph of that name")
-    with pytest.raises(DataError, match=r"style\.json: .*a\.jpg has changed since the style was saved \(sha256 "):
+    with pytest.raises(
+        DataError, match=r"style\.json: .*a\.jpg has changed since the style was saved \(sha256 "
+    ):
         check_photographs(tmp_path / "theirs" / "style.json", read)
 
 
 def test_a_hand_written_file_says_only_what_it_wants(tmp_path: Path) -> None:
     photo(
-        tmp_path / "s.json", '{"format": 1, "style": {"references": ["a.jpg"], "stylizer": {"type": "adain"}, "strength": 1}}'
+        tmp_path / "s.json",
+        '{"format": 1, "style": {"references": ["a.jpg"], "stylizer": {"type": "adain"}, "strength": 1}}',
     )
     read = read_style(tmp_path / "s.json")
     assert read.style == StyleConfig(references=(tmp_path / "a.jpg",), stylizer=AdainConfig())
@@ -122,7 +131,10 @@ def test_a_hand_written_file_says_only_what_it_wants(tmp_path: Path) -> None:
         ('{"format": 1, "style": {"strenght": 1}}', "has no field 'strenght'; did you mean 'strength'"),
         ('{"format": 1, "style": {"strength": 7}}', "strength: 7.0 must lie in"),
         ('{"format": 1, "style": {"pin": ["3"]}}', "pin: '3' is not REGION=VALUE"),
-        ('{"format": 1, "style": {"weights": [1], "references": ["a", "b"]}}', "weights: 1 weights for 2 references"),
+        (
+            '{"format": 1, "style": {"weights": [1], "references": ["a", "b"]}}',
+            "weights: 1 weights for 2 references",
+        ),
         ('{"format": 1, "style": {}, "regions": {"3": [1.0]}}', "regions: '3' is no name"),
         ('{"format": 1, "style": {}, "regions": {"sky": ["x"]}}', "expected a number"),
         ('{"format": 1, "style": {}, "sha256": {"a": 1}}', "expected a text"),
@@ -139,7 +151,15 @@ PHOTOS = [Path("a/autumn.jpg"), Path("b/night.jpg"), Path("b/7.jpg"), Path("c/ni
 
 @pytest.mark.parametrize(
     ("text", "index"),
-    [("autumn.jpg", 0), ("a/autumn.jpg", 0), ("autumn", 0), ("night.jpg", 1), ("1", 1), ("3", 3), ("night.png", 3)],
+    [
+        ("autumn.jpg", 0),
+        ("a/autumn.jpg", 0),
+        ("autumn", 0),
+        ("night.jpg", 1),
+        ("1", 1),
+        ("3", 3),
+        ("night.png", 3),
+    ],
 )
 def test_references_are_found_by_path_name_number_and_stem(text: str, index: int) -> None:
     assert find_reference(text, PHOTOS) == index
@@ -161,7 +181,10 @@ def test_labels_are_short_and_different(paths: list[str], names: tuple[str, ...]
 @pytest.mark.parametrize(
     ("kind", "mistake"),
     [
-        *((ConfigError, partial(parse_strength, "region_strength", text)) for text in ("3=1.5", "3=nan", "3=much")),
+        *(
+            (ConfigError, partial(parse_strength, "region_strength", text))
+            for text in ("3=1.5", "3=nan", "3=much")
+        ),
         *((UsageError, partial(find_reference, text, PHOTOS)) for text in ("x", "night")),
     ],
 )
@@ -173,7 +196,9 @@ def test_what_cannot_be_is_refused(kind: type[Exception], mistake: Callable[[], 
 PLAIN = {"frame": 1, "style": None}
 
 
-@pytest.mark.parametrize("rows", [[], [PLAIN, PLAIN], [PLAIN | {"frame": -1}], [PLAIN, 3], [{"frame": 1}], {}])
+@pytest.mark.parametrize(
+    "rows", [[], [PLAIN, PLAIN], [PLAIN | {"frame": -1}], [PLAIN, 3], [{"frame": 1}], {}]
+)
 def test_what_is_wrong_with_the_file_is_told(tmp_path: Path, rows: object) -> None:
     file = tmp_path / "k.json"
     file.write_text(json.dumps({"format": 1, "keyframes": [PLAIN]}))
@@ -200,16 +225,25 @@ def test_a_fade_lies_between_its_neighbours(frames: list[int], at: int) -> None:
 def test_each_frame_has_its_look(world: World, tmp_path: Path) -> None:
     styles = (tmp_path / "dusk.json", tmp_path / "snow.json")
     for path, reference, strength in zip(styles, world.references, (1.0, 0.8), strict=True):
-        style = StyleConfig(references=(reference,), clusters=2, stylizer=AdainConfig(), strength=strength, luminance=0.5)
+        style = StyleConfig(
+            references=(reference,), clusters=2, stylizer=AdainConfig(), strength=strength, luminance=0.5
+        )
         write_style(path, StyleFile(style))
     looks = keyed_looks(
         world.load(),
-        [Keyframe(2, None), Keyframe(6, styles[0]), Keyframe(10, styles[1]), Keyframe(14, None), Keyframe(20, None)],
+        [
+            Keyframe(2, None),
+            Keyframe(6, styles[0]),
+            Keyframe(10, styles[1]),
+            Keyframe(14, None),
+            Keyframe(20, None),
+        ],
     )
     held = keyed_looks(world.load(), [Keyframe(0, styles[0]), Keyframe(9, styles[0])])
     assert held(4) is held(0), "nothing fades"
     assert looks(0) is looks(2) is looks(14) is looks(17) is looks(30) is None
-    first, second = looks(6), looks(10)
+    first = looks(6)
+    second = looks(10)
     assert first is not None and second is not None and first.others == second.others == ()
     middle = looks(8)
     assert middle is not None and [part.share for part in middle.parts] == [0.5, 0.5]
@@ -217,7 +251,9 @@ def test_each_frame_has_its_look(world: World, tmp_path: Path) -> None:
     for at, strengths in ((4, [0.0, 1.0]), (12, [0.8, 0.0])):
         rising = looks(at)
         assert rising is not None and [part.strength for part in rising.parts] == strengths
-        assert {part.luminance for part in rising.parts} == {0.5}, "luminance does not fade: it is kept throughout"
+        assert {part.luminance for part in rising.parts} == {0.5}, (
+            "luminance does not fade: it is kept throughout"
+        )
 
 
 def test_a_style_of_before_names_how_regions_are_matched(tmp_path: Path) -> None:
@@ -233,7 +269,10 @@ def test_a_style_of_before_names_how_regions_are_matched(tmp_path: Path) -> None
 def test_a_photograph_may_be_named_twice_beside_a_folder_that_holds_it(world: World, tmp_path: Path) -> None:
     for photograph in world.references:
         shutil.copy(photograph, tmp_path)
-    dusk, sky = tmp_path / "dusk.png", tmp_path / "masks" / "sky.png"
-    style = with_folders(StyleConfig(references=(tmp_path, dusk, dusk), weights=(1, 2, 3), masks=(NO_MASK, sky, NO_MASK)))
+    dusk = tmp_path / "dusk.png"
+    sky = tmp_path / "masks" / "sky.png"
+    style = with_folders(
+        StyleConfig(references=(tmp_path, dusk, dusk), weights=(1, 2, 3), masks=(NO_MASK, sky, NO_MASK))
+    )
     assert style.references == (tmp_path / "snow.png", dusk, dusk)
     assert style.weights == (1, 2, 3) and style.masks == (NO_MASK, sky, NO_MASK)

@@ -110,17 +110,31 @@ class TaskWorld:
         return folder
 
     def train(
-        self, root: Path, part: int, report: REPORT = lambda event: None, data: Path | None = None, **change: Any
+        self,
+        root: Path,
+        part: int,
+        report: REPORT = lambda event: None,
+        data: Path | None = None,
+        **change: Any,
     ) -> bool:
         """Train a part as a worker does; False where it is finished already."""
-        words = {"root": str(root), "data": str(data or self.data), "part": part, "minutes": None, "quiet": True}
+        words = {
+            "root": str(root),
+            "data": str(data or self.data),
+            "part": part,
+            "minutes": None,
+            "quiet": True,
+        }
         return train_part(self.open(Task(**words | change)), report)
 
     def tensors(self, root: Path, part: int) -> dict[str, torch.Tensor]:
         """All that the newest checkpoint of a part holds."""
         saved, _ = checkpoint.load_latest(self.folder_of(root, part) / "checkpoints")
         assert saved is not None
-        return {k: t.clone() for k, t in (*saved.model.items(), *((f"optimizer.{k}", t) for k, t in saved.optimizer.items()))}
+        return {
+            k: t.clone()
+            for k, t in (*saved.model.items(), *((f"optimizer.{k}", t) for k, t in saved.optimizer.items()))
+        }
 
     def done(self, root: Path, part: int) -> dict[str, Any]:
         document: dict[str, Any] = json.loads((self.folder_of(root, part) / "done.json").read_text())

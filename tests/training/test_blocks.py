@@ -1,4 +1,6 @@
-"""Scenes of blocks: what each learns from, what makes it another task, finished blocks in files and in memory."""
+"""Scenes of blocks: what each learns from, what makes it another task, finished blocks in files and in
+memory.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -56,16 +58,19 @@ def test_finished_blocks_come_back_and_what_does_not_fit_is_refused(block_world:
 def asked(world: BlockWorld, block: int, moved: str = "", **change: Any) -> str:
     """Digest of a block's task in a config with other fields, or with a field of the cameras moved."""
     config = replace(world.config, **change)
-    scene, rays = read_scene(config), tensorfiles.read(folder_of(world.root, block) / RAYS)
+    scene = read_scene(config)
+    rays = tensorfiles.read(folder_of(world.root, block) / RAYS)
     cameras = {moved: getattr(scene.cameras, moved) + 1} if moved else {}
     scene = replace(scene, cameras=replace(scene.cameras, **cameras))
-    cells, facts = make_plan(scene, config.blocks).cells, Run(world.root).load_known().facts
+    cells = make_plan(scene, config.blocks).cells
+    facts = Run(world.root).load_known().facts
     digest: str = block_task(config, facts, scene, cells, block, rays)["task"]
     return digest
 
 
 def test_what_makes_it_another_task_and_what_does_not(block_world: BlockWorld) -> None:
-    base, was = block_world.config, asked(block_world, 1)
+    base = block_world.config
+    was = asked(block_world, 1)
     assert was == done_of(block_world.root, "01")["asked"]["task"]
     assert was == asked(block_world, 1, steps=99, minutes=3.0, checkpoint_minutes=1.0, device="auto")
     others: list[dict[str, Any]] = [
@@ -96,13 +101,17 @@ def size_of(world: BlockWorld) -> int:
 
 
 def test_the_least_recently_used_goes_first(block_world: BlockWorld) -> None:
-    room, around = 2, around_of(block_world).member
+    room = 2
+    around = around_of(block_world).member
     restore(around, "member", load_finished(folder_of(block_world.root, WHOLE))[1])
     limit = (room + 1) * size_of(block_world)
-    shelf = BlockCache(block_world.root, load_blocks(block_world.root), around, device=torch.device("cpu"), limit=limit)
+    shelf = BlockCache(
+        block_world.root, load_blocks(block_world.root), around, device=torch.device("cpu"), limit=limit
+    )
     kept: dict[int, Member] = {}
     for block in (0, 1, 0, 2, 1, 0, 0, 2, 1, 2):
-        old, found = kept.pop(block, None), shelf.member(block)
+        old = kept.pop(block, None)
+        found = shelf.member(block)
         assert old is None or found is old, "what is at hand is not fetched again"
         kept[block] = found
         if len(kept) > room:
@@ -114,15 +123,19 @@ def test_pictures_do_not_depend_on_the_limit(block_world: BlockWorld) -> None:
     pictures = []
     for limit in (None, 1e-6, 2.5 * size_of(block_world) / (1 << 20)):
         trained = load_run(block_world.root, "cpu", limit)
-        trained = replace(trained, config=replace(trained.config, render=replace(trained.config.render, chunk=400)))
+        trained = replace(
+            trained, config=replace(trained.config, render=replace(trained.config.render, chunk=400))
+        )
         pictures.append(trained.render(trained.cameras, 0).rgb)
     assert torch.equal(pictures[0], pictures[1]) and torch.equal(pictures[0], pictures[2])
 
 
 def test_another_cut_trains_only_the_blocks_that_it_concerns(block_world: BlockWorld, tmp_path: Path) -> None:
     """Halving the heaviest block leaves the others what they were, under whatever number."""
-    coarse, fine = AdaptiveConfig(rays=3700, smallest=2.0), AdaptiveConfig(rays=3300, smallest=2.0)
-    config, root = replace(small(block_world.config.data, tmp_path / "run"), blocks=coarse), tmp_path / "run"
+    coarse = AdaptiveConfig(rays=3700, smallest=2.0)
+    fine = AdaptiveConfig(rays=3300, smallest=2.0)
+    config = replace(small(block_world.config.data, tmp_path / "run"), blocks=coarse)
+    root = tmp_path / "run"
     train(config, "fprf-lite", quiet=True)
     first = {folder.name: done_of(root, folder.name) for folder in (root / "blocks").iterdir()}
     train(replace(config, blocks=fine), "fprf-lite", quiet=True)
@@ -136,9 +149,16 @@ def test_another_cut_trains_only_the_blocks_that_it_concerns(block_world: BlockW
 
 @pytest.mark.parametrize(
     "name, text",
-    [("done.json", "{"), ("done.json", '{"format": 1, "step": 6}'), ("done.json", None), ("block.safetensors", "x" * 40)],
+    [
+        ("done.json", "{"),
+        ("done.json", '{"format": 1, "step": 6}'),
+        ("done.json", None),
+        ("block.safetensors", "x" * 40),
+    ],
 )
-def test_damaged_blocks_are_refused(block_world: BlockWorld, tmp_path: Path, name: str, text: str | None) -> None:
+def test_damaged_blocks_are_refused(
+    block_world: BlockWorld, tmp_path: Path, name: str, text: str | None
+) -> None:
     root = world_of_blocks(block_world.config, block_world.root).copy(tmp_path)
     file = root / "blocks/surroundings" / name
     file.unlink()

@@ -25,7 +25,9 @@ def draw(*shape: int, seed: int) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def poses_with(offset: Tensor, centres: Tensor, held: tuple[int, ...] = (), reach: float = 2.0, pace: float = 0.1) -> Poses:
+def poses_with(
+    offset: Tensor, centres: Tensor, held: tuple[int, ...] = (), reach: float = 2.0, pace: float = 0.1
+) -> Poses:
     poses = Poses(centres, held, reach=reach, pace=pace)
     with torch.no_grad():
         poses.offset.copy_(offset)
@@ -34,21 +36,27 @@ def poses_with(offset: Tensor, centres: Tensor, held: tuple[int, ...] = (), reac
 
 @given(SEEDS, st.floats(0, 3))
 def test_a_turn_is_the_exponential_of_its_vector(seed: int, size: float) -> None:
-    turn, x = size * torch.nn.functional.normalize(draw(4, 3, seed=seed)), draw(4, 3, seed=seed + 1)
-    skew = torch.stack([torch.linalg.cross(turn, axis.expand_as(turn)) for axis in torch.eye(3, dtype=torch.float64)], -1)
+    turn = size * torch.nn.functional.normalize(draw(4, 3, seed=seed))
+    x = draw(4, 3, seed=seed + 1)
+    skew = torch.stack(
+        [torch.linalg.cross(turn, axis.expand_as(turn)) for axis in torch.eye(3, dtype=torch.float64)], -1
+    )
     wanted = (torch.linalg.matrix_exp(skew) @ x[..., None])[..., 0]
     torch.testing.assert_close(rotated(x, turn), wanted, atol=1e-12, rtol=0)
 
 
 def test_no_turn_has_a_slope_too() -> None:
-    turn, x = torch.zeros(2, 3, dtype=torch.float64, requires_grad=True), draw(2, 3, seed=1)
+    turn = torch.zeros(2, 3, dtype=torch.float64, requires_grad=True)
+    x = draw(2, 3, seed=1)
     torch.testing.assert_close(rotated(x, turn), x, atol=1e-15, rtol=0)
     assert torch.autograd.gradcheck(lambda t: rotated(x, t), (turn,))
 
 
 @given(st.integers(2, 7), st.integers(0, 3), SEEDS)
 def test_what_no_image_can_tell_is_taken_out(count: int, held: int, seed: int) -> None:
-    """Moves have no mean shift, and none along a common turn or a change of scale; held-out views have none at all."""
+    """Moves have no mean shift, and none along a common turn or a change of scale; held-out views have none
+    at all.
+    """
     views = count + held
     centres = 5 * draw(views, 3, seed=seed)
     poses = poses_with(draw(views, 6, seed=seed + 1), centres, tuple(range(count, views)))
@@ -65,7 +73,8 @@ def test_what_no_image_can_tell_is_taken_out(count: int, held: int, seed: int) -
 def test_rays_are_those_of_the_refined_cameras(world: World) -> None:
     cameras = world.prepared.scene.cameras
     poses = poses_with(draw(len(cameras), 6, seed=3), cameras.pose[:, :, 3], held=(1,))
-    view, pixel = torch.tensor([0, 1, 5, 5]), torch.tensor([[3.5, 4.5], [1.5, 2.5], [9.5, 0.5], [7.5, 7.5]])
+    view = torch.tensor([0, 1, 5, 5])
+    pixel = torch.tensor([[3.5, 4.5], [1.5, 2.5], [9.5, 0.5], [7.5, 7.5]])
     moved = poses.refined(cameras)
     found = poses(view, *rays_through(cameras, view, pixel))
     for ours, theirs in zip(found, rays_through(moved, view, pixel), strict=True):
@@ -97,9 +106,13 @@ def test_cameras_that_were_turned_come_back(world: World, tmp_path: Path) -> Non
         wrong[bad, :, axis] = rotated(wrong[bad, :, axis], away)
     cameras = replace(scene.cameras, pose=wrong)
     held = tuple(sorted(set(range(len(wrong))) - set(scene.train.tolist())))
-    facts = replace(world.prepared.facts, centres=tuple(map(tuple, wrong[:, :, 3].tolist())), held=held, reach=20.0)
+    facts = replace(
+        world.prepared.facts, centres=tuple(map(tuple, wrong[:, :, 3].tolist())), held=held, reach=20.0
+    )
     config = replace(world.config, poses=0.1, steps=80)
-    changed = replace(world, prepared=world.prepared._replace(facts=facts, scene=replace(scene, cameras=cameras)))
+    changed = replace(
+        world, prepared=world.prepared._replace(facts=facts, scene=replace(scene, cameras=cameras))
+    )
     found = parameters(trained_for(changed, tmp_path / "run", config), 80)
     built = poses_of(facts, config.poses)
     assert built is not None
@@ -120,14 +133,20 @@ def test_blocks_start_from_what_their_surroundings_found(block_world: BlockWorld
     moves = poses.moves().detach()
     assert float(moves.abs().max()) > 0 and not moves[list(trained.known.test)].any()
     gain = tensors_of(root, "surroundings")["tones.gain"]
-    assert float(gain.abs().max()) > 0 and trained.model.tones is not None and torch.equal(trained.model.tones.gain, gain)
+    assert (
+        float(gain.abs().max()) > 0
+        and trained.model.tones is not None
+        and torch.equal(trained.model.tones.gain, gain)
+    )
     for name in ("00", "01", "02"):
         assert torch.equal(tensors_of(root, name)["tones.gain"], gain)
         torch.testing.assert_close(tensors_of(root, name)["poses.known"], moves)
         assert float(tensors_of(root, name)["poses.offset"].abs().max()) > 0
     plain = load_run(block_world.root, "cpu").known.cameras
     torch.testing.assert_close(trained.known.cameras.pose, poses.refined(plain).pose)
-    assert torch.equal(trained.known.cameras.pose[list(trained.known.test)], plain.pose[list(trained.known.test)])
+    assert torch.equal(
+        trained.known.cameras.pose[list(trained.known.test)], plain.pose[list(trained.known.test)]
+    )
 
 
 @given(st.integers(1, 6), st.integers(0, 5), st.integers(0, 2**31 - 1))
@@ -147,11 +166,13 @@ def test_what_the_training_views_share_belongs_to_the_scene(count: int, held: in
 def test_tones_that_go_on_with_other_views_start_as_they_were_and_keep_the_mean_of_these() -> None:
     """Else every cell would choose how bright the scene is, and views that nobody learns from would move."""
     draw = torch.Generator().manual_seed(0)
-    views, before = torch.arange(8), Tones(torch.linspace(-0.5, 0.5, 8), (5, 6, 7))
+    views = torch.arange(8)
+    before = Tones(torch.linspace(-0.5, 0.5, 8), (5, 6, 7))
     with torch.no_grad():
         before.gain.copy_(torch.randn(8, 3, generator=draw))
         before.exponent.fill_(0.6)
-    after, learned = before.going_on((0, 1, 2, 7)), torch.tensor([3, 4, 5, 6])
+    after = before.going_on((0, 1, 2, 7))
+    learned = torch.tensor([3, 4, 5, 6])
     torch.testing.assert_close(after(views), before(views))
     start = before(views).log().detach()
     optimizer = torch.optim.Adam(after.parameters(), lr=0.1)
@@ -168,7 +189,9 @@ def test_tones_that_go_on_with_other_views_start_as_they_were_and_keep_the_mean_
 def test_known_exposures_speak_for_views_that_are_held_out() -> None:
     tones = Tones(torch.tensor([1.0, 2.0, 4.0, 2.0]).log() - torch.tensor(2.0).log(), (3,))
     assert tones(torch.tensor([3]))[0].tolist() == pytest.approx([1.0] * 3)
-    assert (tones(torch.tensor([2])) / tones(torch.tensor([0])))[0].tolist() == pytest.approx([4 ** (1 / 2.2)] * 3)
+    assert (tones(torch.tensor([2])) / tones(torch.tensor([0])))[0].tolist() == pytest.approx(
+        [4 ** (1 / 2.2)] * 3
+    )
 
 
 def test_views_that_were_taken_darker_are_found(world: World, tmp_path: Path) -> None:
@@ -181,10 +204,14 @@ def test_views_that_were_taken_darker_are_found(world: World, tmp_path: Path) ->
     steps = 40
     config = replace(world.config, tones=True, steps=steps)
     facts = replace(
-        world.prepared.facts, exposure=(0.0,) * 10, held=tuple(set(range(10)) - set(world.prepared.scene.train.tolist()))
+        world.prepared.facts,
+        exposure=(0.0,) * 10,
+        held=tuple(set(range(10)) - set(world.prepared.scene.train.tolist())),
     )
     changed = replace(world, prepared=world.prepared._replace(facts=facts))
-    gain = parameters(trained_for(changed, tmp_path / "run", config, change=dim), steps)["model.tones.gain"].mean(1)
+    gain = parameters(trained_for(changed, tmp_path / "run", config, change=dim), steps)[
+        "model.tones.gain"
+    ].mean(1)
     train = torch.zeros(10, dtype=torch.bool)
     train[world.prepared.scene.train] = True
     assert float(gain[train & dark].mean()) < float(gain[train & ~dark].mean()) - 0.1

@@ -1,4 +1,6 @@
-"""Checkpoints and their tensor files: everything comes back, and what was cut short or damaged does not count."""
+"""Checkpoints and their tensor files: everything comes back, and what was cut short or damaged does not
+count.
+"""
 
 import errno
 import os
@@ -63,7 +65,8 @@ def test_an_old_checkpoint_that_cannot_be_removed_ends_nothing(
 def test_what_was_cut_short_does_not_count_and_tidying_removes_nothing_else(root: Path) -> None:
     """A kill between the tensors and the manifest leaves files without one."""
     whole = {p: p.read_bytes() for p in root.rglob("*") if p.is_file()}
-    cut, mine = root / "step-0000020", root / "step-by-step" / "manifest.json"
+    cut = root / "step-0000020"
+    mine = root / "step-by-step" / "manifest.json"
     shutil.copytree(root / "step-0000009", cut)
     (cut / "manifest.json").unlink()
     for name in (".model.0123abcd.safetensors", ".tmpAb12Cd"):
@@ -74,7 +77,9 @@ def test_what_was_cut_short_does_not_count_and_tidying_removes_nothing_else(root
     assert saved is not None and saved.step == 9 and not damaged
     assert checkpoint.steps(root) == [5, 9]
     checkpoint.tidy(root)
-    assert {p: p.read_bytes() for p in root.rglob("*") if p.is_file()} == whole | {mine: b"mine"} and not cut.exists()
+    assert {p: p.read_bytes() for p in root.rglob("*") if p.is_file()} == whole | {
+        mine: b"mine"
+    } and not cut.exists()
     checkpoint.tidy(root / "absent")
 
 
@@ -100,8 +105,11 @@ def tensors() -> dict[str, torch.Tensor]:
 
 
 @given(kind=st.sampled_from(KINDS), shape=st.lists(st.integers(0, 4), max_size=3), seed=st.integers(0, 99))
-def test_any_tensor_comes_back_bit_for_bit(tmp_path: Path, kind: torch.dtype, shape: list[int], seed: int) -> None:
-    path, made = tmp_path / "x.safetensors", (torch.randn(shape, generator=torch.Generator().manual_seed(seed)) * 9).to(kind)
+def test_any_tensor_comes_back_bit_for_bit(
+    tmp_path: Path, kind: torch.dtype, shape: list[int], seed: int
+) -> None:
+    path = tmp_path / "x.safetensors"
+    made = (torch.randn(shape, generator=torch.Generator().manual_seed(seed)) * 9).to(kind)
     entry = tensorfiles.save(path, {"t": made})
     found = [tensorfiles.load(path, entry)["t"]]
     tensorfiles.save(path, {"t": made}, sealed=True)
@@ -120,7 +128,9 @@ def test_what_differs_from_its_manifest_is_refused(tmp_path: Path) -> None:
         tensorfiles.load(tmp_path / "x", entry)
 
 
-@pytest.mark.parametrize("seal", ["", "3", "{", '{"a.weight": 3}', '{"a.weight": {}}', "[" * 9999, "{}", None])
+@pytest.mark.parametrize(
+    "seal", ["", "3", "{", '{"a.weight": 3}', '{"a.weight": {}}', "[" * 9999, "{}", None]
+)
 def test_a_seal_of_nonsense_is_damage(tmp_path: Path, seal: str | None) -> None:
     save_file(tensors(), tmp_path / "x", {"format": "pt"} if seal is None else {"manifest": seal})
     with pytest.raises(CheckpointError, match="x: "):
@@ -131,7 +141,8 @@ def test_a_seal_of_nonsense_is_damage(tmp_path: Path, seal: str | None) -> None:
 @given(st.data())
 def test_a_flipped_bit_of_a_sealed_file_is_found_or_harmless(tmp_path: Path, data: st.DataObject) -> None:
     torch.manual_seed(1)
-    path, made = tmp_path / "x.safetensors", tensors()
+    path = tmp_path / "x.safetensors"
+    made = tensors()
     tensorfiles.save(path, made, sealed=True)
     raw = bytearray(path.read_bytes())
     at = data.draw(st.integers(0, len(raw) - 1))
@@ -142,4 +153,6 @@ def test_a_flipped_bit_of_a_sealed_file_is_found_or_harmless(tmp_path: Path, dat
     except CheckpointError as error:
         assert str(path) in str(error) and "\n" not in str(error)
     else:
-        assert all(torch.equal(found[name], made[name]) and found[name].dtype == made[name].dtype for name in made)
+        assert all(
+            torch.equal(found[name], made[name]) and found[name].dtype == made[name].dtype for name in made
+        )

@@ -35,7 +35,8 @@ def moved(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
 
 
 def test_a_moved_run_renders_the_same_bits(world: World, moved: Path) -> None:
-    here, there = world.load(), load_run(moved)
+    here = world.load()
+    there = load_run(moved)
     assert there.method == "fprf-lite" and there.step == 15 and there.seconds > 0
     assert there.known.data == "/nowhere/at/all"
     for v in there.known.test:
@@ -45,7 +46,11 @@ def test_a_moved_run_renders_the_same_bits(world: World, moved: Path) -> None:
 
 def test_rendering_needs_no_encoder(moved: Path) -> None:
     path = moved / "config.json"
-    path.write_text(path.read_text().replace('"bundled-content"', '"gone-content"').replace('"bundled-semantic"', '"gone"'))
+    path.write_text(
+        path.read_text()
+        .replace('"bundled-content"', '"gone-content"')
+        .replace('"bundled-semantic"', '"gone"')
+    )
     trained = load_run(moved)
     assert bool(trained.render(trained.cameras, 0).rgb.isfinite().all())
 
@@ -64,7 +69,9 @@ def test_what_is_missing_is_named_with_what_to_do(moved: Path, tmp_path: Path) -
     with pytest.raises(CheckpointError, match="so it is no run folder; `fprf train` makes one"):
         load_run(tmp_path)
     shutil.rmtree(moved / "checkpoints")
-    with pytest.raises(CheckpointError, match=r"no checkpoint yet; go on with `fprf train elsewhere/run/config\.json"):
+    with pytest.raises(
+        CheckpointError, match=r"no checkpoint yet; go on with `fprf train elsewhere/run/config\.json"
+    ):
         load_run(moved)
     (moved / "scene.json").unlink()
     with pytest.raises(CheckpointError, match=r"scene\.json: cannot be read.*train the scene again"):
@@ -75,7 +82,9 @@ def test_a_run_of_a_method_with_fields_of_its_own(world: World, moved: Path, tmp
     """It goes on with its own fields alone, and needs its method."""
     trained = load_run(moved)
     with packages_in(tmp_path / "site") as packages:
-        packages.install("acme-method", {"fprf.methods": {"acme": "acme_method2:acme"}}, code={"acme_method2": METHOD})
+        packages.install(
+            "acme-method", {"fprf.methods": {"acme": "acme_method2:acme"}}, code={"acme_method2": METHOD}
+        )
         config = replace(load_method("acme")[0], **vars(trained.config))
         trained.run.save_config(config, "acme")
         with pytest.raises(UsageError, match=r"a run with knob 2 \(8 is asked\)"):
@@ -103,7 +112,9 @@ def test_a_reduced_view_is_the_small_one_enlarged(world: World) -> None:
     small = trained.render(known.cameras.scaled(2), 2)
     assert half.rgb.shape == whole.rgb.shape and half.depth.shape == whole.depth.shape == half.opacity.shape
     assert float(half.rgb.min()) >= 0 and float(half.rgb.max()) <= 1
-    assert {*half.depth.flatten().tolist()} == {*small.depth.flatten().tolist()}, "no depth that nobody measured"
+    assert {*half.depth.flatten().tolist()} == {*small.depth.flatten().tolist()}, (
+        "no depth that nobody measured"
+    )
     blocks = half.opacity.view(12, 2, 16, 2).mean((1, 3))
     assert torch.allclose(blocks[1:-1, 1:-1], small.opacity[1:-1, 1:-1], atol=0.05)
     assert float((half.rgb - whole.rgb).abs().mean()) < 0.05 and not torch.equal(half.rgb, whole.rgb)

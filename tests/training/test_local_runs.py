@@ -1,4 +1,6 @@
-"""Runs of a capture in projected metres: as good as in its own coordinates, and everything comes out where the capture is."""
+"""Runs of a capture in projected metres: as good as in its own coordinates, and everything comes out where
+the capture is.
+"""
 
 import json
 import shutil
@@ -61,9 +63,14 @@ def psnr(run: Path, *flags: str) -> float:
     return float(json.loads((run / "metrics.json").read_text())["psnr"])
 
 
-def test_fields_are_as_good_and_go_on_as_they_are(world: World, fields: Path, utm: Path, tmp_path: Path) -> None:
+def test_fields_are_as_good_and_go_on_as_they_are(
+    world: World, fields: Path, utm: Path, tmp_path: Path
+) -> None:
     known = Run(fields).load_known()
-    assert np.abs(np.array(known.facts.origin) - UTM).max() < 64 and float(known.cameras.pose[:, :, 3].abs().max()) < 200
+    assert (
+        np.abs(np.array(known.facts.origin) - UTM).max() < 64
+        and float(known.cameras.pose[:, :, 3].abs().max()) < 200
+    )
     shutil.copytree(world.run, tmp_path / "own")
     assert psnr(fields) == pytest.approx(psnr(tmp_path / "own"), abs=0.1)
     shutil.copytree(fields, tmp_path / "more")
@@ -76,14 +83,16 @@ def test_fields_are_as_good_and_go_on_as_they_are(world: World, fields: Path, ut
 
 def test_surfaces_are_exported_where_the_capture_is(fields: Path, tmp_path: Path) -> None:
     origin = np.array(load_run(fields, "cpu").origin)
-    world, local = tmp_path / "world", tmp_path / "local"
+    world = tmp_path / "world"
+    local = tmp_path / "local"
     kinds = ["ply", "splat", "glb", "cameras"]
     few = ["--fit", "1e-6", "--fit-cap", "200"]  # as many steps, one, in both
     assert main(["export", str(fields), *kinds, *few, "--output", str(world)]) == 0
     assert main(["export", str(fields), *kinds, *few, "--local", "true", "--output", str(local)]) == 0
     for name in ("splats.ply", "mesh.ply", "mesh.glb"):
         there, here = (
-            np.asarray(trimesh.load_scene(folder / name, process=False).to_geometry().vertices) for folder in (world, local)
+            np.asarray(trimesh.load_scene(folder / name, process=False).to_geometry().vertices)
+            for folder in (world, local)
         )
         assert len(there) > 50 and np.abs(here).max() < 1e4
         # A local float32 has the same digits.
@@ -96,7 +105,9 @@ def test_surfaces_are_exported_where_the_capture_is(fields: Path, tmp_path: Path
     assert np.abs(given[0][:, :3, 3] - origin - given[1][:, :3, 3]).max() < 1e-8
 
 
-def test_gaussians_are_as_good_and_lie_where_the_capture_is(world: World, splats: Path, utm: Path, tmp_path: Path) -> None:
+def test_gaussians_are_as_good_and_lie_where_the_capture_is(
+    world: World, splats: Path, utm: Path, tmp_path: Path
+) -> None:
     own = tmp_path / "own"
     assert main(["train", "fprf-splats", "--data", str(world.town), *SPLATS, "--output", str(own)]) == 0
     assert psnr(splats) == pytest.approx(psnr(own), abs=0.2)
@@ -104,18 +115,35 @@ def test_gaussians_are_as_good_and_lie_where_the_capture_is(world: World, splats
     scene = open_run(splats, "cpu").scene
     assert isinstance(scene, SplatScene)
     for flags in ([], ["--local", "true"], ["--plain", "true"]):
-        assert main(["export", str(splats), "ply", "splat", "cameras", *flags, "--output", str(tmp_path / "files")]) == 0
+        assert (
+            main(
+                [
+                    "export",
+                    str(splats),
+                    "ply",
+                    "splat",
+                    "cameras",
+                    *flags,
+                    "--output",
+                    str(tmp_path / "files"),
+                ]
+            )
+            == 0
+        )
         for name in ("splats.ply", "splats.splat"):
             capture = read_capture(tmp_path / "files" / name)
             found = capture.gaussians.means.double().numpy() + (np.array(capture.origin) - scene.origin)
             assert np.abs(found - scene.gaussians.means.double().numpy()).max() < 1e-6 * np.abs(found).max()
     assert main(["export", str(splats), "cameras", "--output", str(tmp_path / "again"), "--images"]) == 0
-    again, first = parse_scene(tmp_path / "again", 1, None), parse_scene(utm, 1, None)
+    again = parse_scene(tmp_path / "again", 1, None)
+    first = parse_scene(utm, 1, None)
     there = [each.cameras.pose[:, :, 3].numpy() + each.origin for each in (again, first)]
     assert np.abs(there[0] - there[1]).max() < 1e-8
 
 
-def test_paths_and_places_are_given_in_the_capture_s_coordinates(world: World, splats: Path, utm: Path, tmp_path: Path) -> None:
+def test_paths_and_places_are_given_in_the_capture_s_coordinates(
+    world: World, splats: Path, utm: Path, tmp_path: Path
+) -> None:
     scene = fprf.load(splats)
     frames = json.loads((utm / "transforms.json").read_text())["frames"]
     place = {frame["file_path"].rpartition("/")[2]: np.array(frame["transform_matrix"]) for frame in frames}
@@ -130,9 +158,12 @@ def test_paths_and_places_are_given_in_the_capture_s_coordinates(world: World, s
     at = pose[:3, 3]
     aimed = scene.camera_at(at.tolist(), (at - 10 * pose[:3, 2]).tolist(), fov=fov, width=32, height=24)
     assert np.abs(scene.cameras.pose[2, :, 3].numpy() - at).max() < 1e-8
-    assert float((scene.render(aimed).rgb - wanted).abs().mean()) < 0.05, "level, where the photograph may lean a little"
+    assert float((scene.render(aimed).rgb - wanted).abs().mean()) < 0.05, (
+        "level, where the photograph may lean a little"
+    )
     # The viewer's film says where it flew in the capture's coordinates, too.
-    cameras, origin = scene.trained.known.cameras, scene.trained.scene.origin
+    cameras = scene.trained.known.cameras
+    origin = scene.trained.scene.origin
     pinhole = camera_of(cameras, 2)
     axes = tuple(tuple(row) for row in pinhole.world_to_camera[:3, :3].tolist())
     key = Key(Camera(tuple(cameras.pose[2, :, 3].tolist()), axes, (30, 30, 16, 12), (32, 24)), Look())
@@ -160,8 +191,14 @@ def test_cells_and_blocks_are_in_the_local_frame(world: World, utm: Path, tmp_pa
         write_town(town, seed=0, palette="day", views=10, width=96, height=72)
     scores = []
     for name, data in (("own", town), ("utm", moved_scene(town, tmp_path / "utm", UTM))):
-        cells, blocks = tmp_path / f"{name} cells", tmp_path / f"{name} blocks"
-        assert main(["train", "fprf-splats", "--data", str(data), *SPLATS, "--cells", "2", "--output", str(cells)]) == 0
+        cells = tmp_path / f"{name} cells"
+        blocks = tmp_path / f"{name} blocks"
+        assert (
+            main(
+                ["train", "fprf-splats", "--data", str(data), *SPLATS, "--cells", "2", "--output", str(cells)]
+            )
+            == 0
+        )
         train(small(data, blocks), "fprf-lite", quiet=True)
         scores.append([psnr(cells), psnr(blocks)])
     assert scores[1] == pytest.approx(scores[0], abs=0.25)

@@ -40,30 +40,46 @@ def rendered(world: World, model: Model, batch: Batch, config: LossConfig) -> Re
 
 
 def test_each_term_is_what_it_says(world: World) -> None:
-    model, batch, facts = world.load().model, world.prepared.manager.batch(0), world.prepared.facts
+    model = world.load().model
+    batch = world.prepared.manager.batch(0)
+    facts = world.prepared.facts
     config = LossConfig()
     out = rendered(world, model, batch, config)
     found = terms(config, facts, out, batch, model, step=0)
     assert set(found) == set(TERMS)
-    rgb, content, semantic = (getattr(out, name).double() - getattr(batch, name) for name in ("rgb", "content", "semantic"))
+    rgb, content, semantic = (
+        getattr(out, name).double() - getattr(batch, name) for name in ("rgb", "content", "semantic")
+    )
     assert float(found["rgb"]) == pytest.approx(float(rgb.square().mean()), rel=1e-5)
-    assert float(found["content"]) == pytest.approx(float(content.square().mean()) / facts.content_scale**2, rel=1e-5)
-    assert float(found["semantic"]) == pytest.approx(float(semantic.abs().mean()) / facts.semantic_scale, rel=1e-5)
+    assert float(found["content"]) == pytest.approx(
+        float(content.square().mean()) / facts.content_scale**2, rel=1e-5
+    )
+    assert float(found["semantic"]) == pytest.approx(
+        float(semantic.abs().mean()) / facts.semantic_scale, rel=1e-5
+    )
 
 
 def test_penalties_come_when_they_are_due_and_weigh_as_many_times_more(world: World) -> None:
-    model, batch = world.load().model, world.prepared.manager.batch(0)
+    model = world.load().model
+    batch = world.prepared.manager.batch(0)
     config = replace(LossConfig(), penalty_every=4)
     out = rendered(world, model, batch, config)
-    due = [step for step in range(9) if "variation" in terms(config, world.prepared.facts, out, batch, model, step=step)]
+    due = [
+        step
+        for step in range(9)
+        if "variation" in terms(config, world.prepared.facts, out, batch, model, step=step)
+    ]
     assert due == [0, 4, 8]
     parts = {"variation": torch.tensor(2.0), "proposal_variation": torch.tensor(3.0)}
-    assert float(total(config, parts)) == pytest.approx(4 * (2 * config.variation + 3 * config.proposal_variation))
+    assert float(total(config, parts)) == pytest.approx(
+        4 * (2 * config.variation + 3 * config.proposal_variation)
+    )
 
 
 def test_a_penalty_of_any_name_counts(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     """At the weight that the plug-in states, unless a weight is named."""
-    model, batch = world.load().model, world.prepared.manager.batch(0)
+    model = world.load().model
+    batch = world.prepared.manager.batch(0)
     monkeypatch.setattr(model.field, "penalties", lambda: {"entropy": torch.tensor(3.0)})
     for penalties, weight in (((), 1.0), ((("entropy", 0.5),), 0.5), ((("entropy", 0.0),), 0.0)):
         config = replace(only(rgb=1.0), penalties=penalties, penalty_every=4)
@@ -73,7 +89,9 @@ def test_a_penalty_of_any_name_counts(world: World, monkeypatch: pytest.MonkeyPa
         assert set(found) == {"rgb", *(["entropy"] if weight else [])}
         assert float(total(config, found)) == pytest.approx(float(found["rgb"]) + 4 * weight * 3, rel=1e-6)
         assert set(terms(config, world.prepared.facts, out, batch, model, step=3)) == {"rgb"}
-    with pytest.raises(ConfigError, match=r"'entrpy'; did you mean 'entropy'\? \(penalties that can be named: entropy\)"):
+    with pytest.raises(
+        ConfigError, match=r"'entrpy'; did you mean 'entropy'\? \(penalties that can be named: entropy\)"
+    ):
         check_penalties(LossConfig(penalties=(("entrpy", 1.0),)), model)
     monkeypatch.setattr(model.field, "penalties", lambda: {"content": torch.tensor(3.0)})
     del model.penalty_names
@@ -94,8 +112,15 @@ class Weights(LossTerm):
     def __call__(
         self, rendered: Rendered, batch: Batch, parts: Parts, *, step: int, generator: torch.Generator | None
     ) -> torch.Tensor:
-        assert rendered.semantic is not None and rendered.weights is not None and parts.space is not None and step >= 0
-        value = rendered.weights.square().mean() * (1 if generator is None else torch.rand((), generator=generator))
+        assert (
+            rendered.semantic is not None
+            and rendered.weights is not None
+            and parts.space is not None
+            and step >= 0
+        )
+        value = rendered.weights.square().mean() * (
+            1 if generator is None else torch.rand((), generator=generator)
+        )
         wrong = {"type": 3.0, "shape": value[None], "dtype": value.double(), "device": value.to("meta")}
         return wrong.get(self.wrong, value)  # type: ignore[return-value]
 
@@ -109,11 +134,18 @@ class WeightsConfig(LossTermConfig):
 
 
 def test_a_term_of_a_package_counts(world: World) -> None:
-    model, batch = build_model(world.config, world.prepared.facts), world.prepared.manager.batch(0)
+    model = build_model(world.config, world.prepared.facts)
+    batch = world.prepared.manager.batch(0)
     config = replace(only(rgb=1.0), extra=WeightsConfig(weight=0.5))
     extra = extra_term(config)
     assert extra is not None and wanted(config, batch, extra) == Want.DENSITY | Want.COLOUR | Want.SEMANTIC
-    out = render_rays(rays_of(world, world.load(), batch), model.parts, want=wanted(config, batch, extra), budget=0.0, step=0)
+    out = render_rays(
+        rays_of(world, world.load(), batch),
+        model.parts,
+        want=wanted(config, batch, extra),
+        budget=0.0,
+        step=0,
+    )
     found = terms(config, world.prepared.facts, out, batch, model, step=7, extra=extra)
     assert out.weights is not None and set(found) == {"rgb", "extra"}
     assert float(found["extra"].detach()) == pytest.approx(float(out.weights.detach().square().mean()))
@@ -123,7 +155,9 @@ def test_a_term_of_a_package_counts(world: World) -> None:
     assert extra_term(replace(config, extra=WeightsConfig(weight=0.0))) is None
     for wrong in ("type", "shape", "dtype", "device"):
         bad = replace(config, extra=WeightsConfig(wrong=wrong))
-        with pytest.raises(PluginError, match=r"WeightsConfig: the term: expected float32 \[\] on cpu, found"):
+        with pytest.raises(
+            PluginError, match=r"WeightsConfig: the term: expected float32 \[\] on cpu, found"
+        ):
             terms(bad, world.prepared.facts, out, batch, model, step=0, extra=extra_term(bad))
 
 
@@ -163,12 +197,17 @@ def test_only_known_rays_count_and_the_mean_is_theirs(distances: list[float], se
 @pytest.mark.parametrize("found", [3.0, 5.0, 8.0])
 def test_in_device_coordinates_it_is_about_depths_too(found: float) -> None:
     """Straight ahead of a near plane at 1, depth z has the ray parameter 1 - 1/z."""
-    depths, end = straight_rays(1)[:, 10:], torch.tensor([5.0])
+    depths = straight_rays(1)[:, 10:]
+    end = torch.tensor([5.0])
     weights = spike(found)[:, 10:]
-    torch.testing.assert_close(ending(1 - 1 / depths, weights, 1 - 1 / end, ndc=True), ending(depths, weights, end))
+    torch.testing.assert_close(
+        ending(1 - 1 / depths, weights, 1 - 1 / end, ndc=True), ending(depths, weights, end)
+    )
 
 
-@pytest.mark.parametrize(("shell", "wanted"), [(4.0, (0.3**2 + 1.0**2) / 2), (math.inf, (0.9**2 + 1.0**2) / 2), (0.5, 0.0)])
+@pytest.mark.parametrize(
+    ("shell", "wanted"), [(4.0, (0.3**2 + 1.0**2) / 2), (math.inf, (0.9**2 + 1.0**2) / 2), (0.5, 0.0)]
+)
 def test_what_sky_rays_meet_before_the_shell(shell: float, wanted: float) -> None:
     t = torch.tensor([[1.0, 3.0, 6.0]]).repeat(3, 1)
     weights = torch.tensor([[0.3, 0.6], [0.5, 0.5], [1.0, 0.0]], requires_grad=True)

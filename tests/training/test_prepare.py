@@ -27,7 +27,8 @@ def test_without_semantics(world: World) -> None:
 
 def test_tones_are_learnt_where_exposures_differ(world: World) -> None:
     """Unless the config decides; a run that goes on keeps what it began with."""
-    scene, image = world.prepared.scene, world.prepared.manager.image
+    scene = world.prepared.scene
+    image = world.prepared.manager.image
     evenly = replace(scene, exposure=torch.full((len(scene.paths),), 3.0, dtype=torch.float64))
     unevenly = replace(scene, exposure=torch.linspace(1.0, 4.0, len(scene.paths), dtype=torch.float64))
 
@@ -45,7 +46,9 @@ def test_the_start_is_a_function_of_the_seed(world: World) -> None:
     )
     torch.testing.assert_close(first, second, atol=0, rtol=0)
     moved = {name for name in first if not torch.equal(first[name], other[name])}
-    assert moved == {name for name in first if not name.startswith("decoder.")} - {"field.offset"}, "that one starts at 0"
+    assert moved == {name for name in first if not name.startswith("decoder.")} - {"field.offset"}, (
+        "that one starts at 0"
+    )
     tables = [value.flatten()[:8] for name, value in first.items() if name.endswith("planes.table")]
     assert len(tables) == 3
     assert not any(torch.equal(a, b) for i, a in enumerate(tables) for b in tables[:i])
@@ -70,7 +73,9 @@ def test_photographs_are_reduced_as_far_as_docs_say() -> None:
     more=st.floats(1, 10),
     gpu=st.booleans(),
 )
-def test_more_time_and_fewer_images_never_reduce_further(side: int, views: int, minutes: float, more: float, gpu: bool) -> None:
+def test_more_time_and_fewer_images_never_reduce_further(
+    side: int, views: int, minutes: float, more: float, gpu: bool
+) -> None:
     device = "cuda" if gpu else "cpu"
     found = factor(side, side, views, minutes, device)
     assert factor(side, side, views, minutes * more, device) <= found
@@ -93,14 +98,18 @@ def test_a_config_gets_the_size_of_its_scene(world: World, monkeypatch: pytest.M
 
 
 def test_what_training_came_to(world: World, tmp_path: Path) -> None:
-    config, scene = world.config, world.prepared.scene
+    config = world.config
+    scene = world.prepared.scene
     told = training_summary(Run(world.run), config, scene)
-    assert told.startswith(f"warning: too few steps to judge the scene by: 15 steps, {15 * 256 / (8 * 32 * 24):.2g} rays")
+    assert told.startswith(
+        f"warning: too few steps to judge the scene by: 15 steps, {15 * 256 / (8 * 32 * 24):.2g} rays"
+    )
     assert f"fprf train {world.run}/config.json --steps 600" in told
     assert training_summary(Run(tmp_path), config, scene) == "no step was made"
     Run(tmp_path).log({"step": 4000, "seconds": 9.0, "psnr": 24.5})
     timed, reduced = (
-        training_summary(Run(tmp_path), replace(fprf_lite(), **field), scene) for field in ({"minutes": 8.0}, {"downscale": 5})
+        training_summary(Run(tmp_path), replace(fprf_lite(), **field), scene)
+        for field in ({"minutes": 8.0}, {"downscale": 5})
     )
     assert "--minutes 16" in timed and "--downscale" not in timed
     assert "--steps 24000" in reduced and "--downscale 4" in reduced

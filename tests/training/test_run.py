@@ -39,13 +39,17 @@ def run(world: World, tmp_path: Path) -> Run:
 
 
 def test_scene_json_gives_the_scene_back(world: World) -> None:
-    known, scene = Run(world.run).load_known(), world.prepared.scene
+    known = Run(world.run).load_known()
+    scene = world.prepared.scene
     for name in ("pose", "focal", "centre", "size", "distortion", "lens"):
         torch.testing.assert_close(getattr(known.cameras, name), getattr(scene.cameras, name), atol=0, rtol=0)
     assert known.names == tuple(p.stem for p in scene.paths)
     assert known.facts == Run(world.run).saved_facts() == world.prepared.facts
     assert Run(world.folder / "none").saved_facts() is None
-    assert (known.split("train"), known.split("test")) == (tuple(scene.train.tolist()), tuple(scene.test.tolist()))
+    assert (known.split("train"), known.split("test")) == (
+        tuple(scene.train.tolist()),
+        tuple(scene.test.tolist()),
+    )
     assert known.split("all") == tuple(sorted(known.train + known.test)) == tuple(range(10))
 
 
@@ -79,7 +83,9 @@ def test_a_second_process_is_told_who_is_there_until_that_is_killed(tmp_path: Pa
     try:
         assert process.stdout is not None and process.stdout.readline() == "held\n"
         with (
-            pytest.raises(DataError, match=rf"run: process {process.pid} on .+ is training here; wait") as told,
+            pytest.raises(
+                DataError, match=rf"run: process {process.pid} on .+ is training here; wait"
+            ) as told,
             lock_folder(folder),
         ):
             pytest.fail("two hold it")

@@ -1,4 +1,6 @@
-"""Every JSON file of a run, spoilt: what reads it gives a value or an error of one line, whatever is in the file."""
+"""Every JSON file of a run, spoilt: what reads it gives a value or an error of one line, whatever is in the
+file.
+"""
 
 import json
 from collections.abc import Callable, Iterator
@@ -32,7 +34,22 @@ from fprf.training.tasks import WHOLE, begin, read_done, renumber, task_of
 from fprf.types import Cell
 
 LARGE = "1" + "0" * 400
-JUNK = ("null", "true", "-1", "0.5", "1e300", "1e999", "NaN", "9" * 30, LARGE, "9" * 5000, '"x"', r'"\ud800"', "[]", "{}")
+JUNK = (
+    "null",
+    "true",
+    "-1",
+    "0.5",
+    "1e300",
+    "1e999",
+    "NaN",
+    "9" * 30,
+    LARGE,
+    "9" * 5000,
+    '"x"',
+    r'"\ud800"',
+    "[]",
+    "{}",
+)
 JUNK += ("[[]]", '{"format": 1}', '{"a": 1, "a": 2}', "[" * 500 + "]" * 500, "[" * 10**5)
 MARK = "what stands in the place of junk"
 TENSORS = {"planes": torch.arange(6.0)}
@@ -49,7 +66,11 @@ class Example:
     @property
     def parts(self) -> tuple[Path, ...]:
         """Folders of a block, of the whole scene and of a cell."""
-        return blocks.folder_of(self.root, 0), cells.folder_of(self.root, WHOLE), cells.folder_of(self.root, 1)
+        return (
+            blocks.folder_of(self.root, 0),
+            cells.folder_of(self.root, WHOLE),
+            cells.folder_of(self.root, 1),
+        )
 
     def cells(self) -> Cells:
         """Its scene, ready to be cut into cells."""
@@ -83,9 +104,11 @@ class Example:
 @pytest.fixture(scope="module")
 def example(tmp_path_factory: pytest.TempPathFactory) -> Example:
     folder = tmp_path_factory.mktemp("spoilt")
-    town, root = folder / "town", folder / "run"
+    town = folder / "town"
+    root = folder / "run"
     write_town(town, seed=0, palette="day", views=4, width=96, height=72)
-    scene, run = parse_scene(town, 1, None), Run(root)
+    scene = parse_scene(town, 1, None)
+    run = Run(root)
     axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     facts = Facts(
         space=Space("box", (0.0, 0.0, 0.0), axes, 1.0, 0.1, 9.0), channels=4, dim=2, content_encoder="a", semantic_encoder="b",
@@ -115,7 +138,9 @@ def lines_of(path: Path, text: str) -> list[str]:
 
 def places(value: Any) -> Iterator[tuple[Any, Any]]:
     """Each container in a JSON value, with each of its keys; of long lists the first two items."""
-    for key in list(value) if isinstance(value, dict) else range(len(value))[:2] if isinstance(value, list) else ():
+    for key in (
+        list(value) if isinstance(value, dict) else range(len(value))[:2] if isinstance(value, list) else ()
+    ):
         yield value, key
         yield from places(value[key])
 
@@ -161,7 +186,11 @@ def test_a_part_whose_task_is_damaged_is_begun_anew(example: Example) -> None:
     for part in example.parts:
         (part / "task.json").write_text('{"task": "a')
         begin(part, "d")
-        assert task_of(part) == "d" and not (part / "done.json").exists() and not checkpoint.steps(part / "checkpoints")
+        assert (
+            task_of(part) == "d"
+            and not (part / "done.json").exists()
+            and not checkpoint.steps(part / "checkpoints")
+        )
     example.restore()
 
 
@@ -175,7 +204,9 @@ def test_a_spoilt_cut_is_named_and_its_cells_stay(example: Example) -> None:
 
 def test_a_line_of_events_with_a_number_too_large_is_passed_over(example: Example) -> None:
     events = example.parts[0] / "events.jsonl"
-    events.write_text(events.read_text() + f'{{"step": 4, "seconds": {LARGE}}}\n{{"step": {LARGE}, "seconds": 2}}\n')
+    events.write_text(
+        events.read_text() + f'{{"step": 4, "seconds": {LARGE}}}\n{{"step": {LARGE}, "seconds": 2}}\n'
+    )
     events.write_text(events.read_text() + '{"step": 5, "seconds": 3, "psnr": 1e308}\n')
     (history,) = (each for each in read_history(example.root) if each.name in ("", example.parts[0].name))
     assert history.step == [3, 5] and history.values["psnr"] == [20.0, None]

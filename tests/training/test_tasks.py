@@ -1,4 +1,6 @@
-"""Parts of a scene as tasks, of both kinds: lost, interrupted, killed, contended, gone on with, renumbered."""
+"""Parts of a scene as tasks, of both kinds: lost, interrupted, killed, contended, gone on with,
+renumbered.
+"""
 
 import json
 import os
@@ -78,8 +80,12 @@ def open_or_unite(world: TaskWorld, root: Path) -> None:
         open_run(root, "cpu")
 
 
-def test_two_workers_on_a_part_the_second_is_told_and_changes_nothing(task_world: TaskWorld, tmp_path: Path) -> None:
-    """It is refused while the first holds the folder, and finds the part finished afterwards; others are free."""
+def test_two_workers_on_a_part_the_second_is_told_and_changes_nothing(
+    task_world: TaskWorld, tmp_path: Path
+) -> None:
+    """It is refused while the first holds the folder, and finds the part finished afterwards; others are
+    free.
+    """
     root = task_world.copy(tmp_path)
     task_world.unfinish(root, 1)
     met: list[str] = []
@@ -100,14 +106,16 @@ def test_two_workers_on_a_part_the_second_is_told_and_changes_nothing(task_world
 
 @pytest.mark.parametrize("other", ["seed", "images"])
 def test_another_task_in_the_folder_starts_anew(task_world: TaskWorld, tmp_path: Path, other: str) -> None:
-    root, town = task_world.copy(tmp_path), tmp_path / "town"
+    root = task_world.copy(tmp_path)
+    town = tmp_path / "town"
     shutil.copytree(task_world.data, town)
     if other == "seed":
         config, method = Run(root).load_config()
         Run(root).save_config(replace(config, seed=5), method)
     else:
         shutil.copy(town / "images/0004.png", town / "images/0003.png")
-    folder, before = task_world.folder_of(root, 0), task_of(task_world.folder_of(root, 0))
+    folder = task_world.folder_of(root, 0)
+    before = task_of(task_world.folder_of(root, 0))
     (folder / "events.jsonl").write_text('{"step": 99}\n')
     assert task_world.train(root, 0, data=town)
     assert not same(task_world.tensors(root, 0), task_world.tensors(task_world.root, 0))
@@ -122,14 +130,17 @@ def test_more_steps_go_on_from_where_it_stopped(task_world: TaskWorld, tmp_path:
         before, after = (task_world.done(each, part) for each in (task_world.root, root))
         assert after["step"] == 2 * before["step"] and after["asked"]["task"] == before["asked"]["task"]
         made = [event["step"] for event in events(Run(task_world.folder_of(root, part)), "step")]
-        assert made == sorted(made) and made[-1] == after["step"] and before["step"] in made, "the log goes on"
+        assert made == sorted(made) and made[-1] == after["step"] and before["step"] in made, (
+            "the log goes on"
+        )
 
 
 class Remembering(Executor):
     """Takes a minute for each task, and remembers them."""
 
     def __init__(self, clock: list[float]) -> None:
-        self.clock, self.given = clock, list[list[Task]]()
+        self.clock = clock
+        self.given = list[list[Task]]()
 
     def map(self, function: Any, tasks: Sequence[Any]) -> list[Any]:
         self.given.append(list(tasks))
@@ -145,7 +156,9 @@ def test_a_time_limit_is_shared_between_the_whole_scene_and_its_parts(
     monkeypatch.setattr("fprf.training.tasks.time", SimpleNamespace(perf_counter=lambda: clock[0]))
     executor = Remembering(clock)
     config = GaussiansConfig(data=tmp_path, minutes=10.0)
-    train_all(config, Run(tmp_path), executor, pytest.fail, [2, 0, 1], whole_share=0.2, spent=spent, quiet=True)
+    train_all(
+        config, Run(tmp_path), executor, pytest.fail, [2, 0, 1], whole_share=0.2, spent=spent, quiet=True
+    )
     (whole,), parts = executor.given
     assert (whole.part, [task.part for task in parts]) == (WHOLE, [2, 0, 1])
     assert whole.minutes == pytest.approx(0.2 * left)
@@ -182,7 +195,8 @@ def test_each_part_finds_what_was_trained_for_it(before: list[str], now: list[st
 @given(tasks, st.permutations(range(6)), st.integers(0, 12))
 def test_cut_off_anywhere_the_next_call_finishes_it(before: list[str], order: list[int], until: int) -> None:
     now = {number: before[at] for number, at in enumerate([k for k in order if k < len(before)])}
-    real, left = os.rename, [until]
+    real = os.rename
+    left = [until]
 
     def rename(source: Path, target: Path) -> None:
         left[0] -= 1
@@ -198,7 +212,9 @@ def test_cut_off_anywhere_the_next_call_finishes_it(before: list[str], order: li
         except KeyboardInterrupt:
             left[0] = 99
             renumber(Path(name), now)
-        assert {k: v for k, v in weights_in(Path(name)).items() if k.isdigit()} == {f"{k:02d}": v for k, v in now.items()}
+        assert {k: v for k, v in weights_in(Path(name)).items() if k.isdigit()} == {
+            f"{k:02d}": v for k, v in now.items()
+        }
 
 
 @pytest.mark.fault
@@ -206,7 +222,8 @@ def test_cut_off_anywhere_the_next_call_finishes_it(before: list[str], order: li
 def test_killed_parts_are_resumed_to_the_same_bits(task_world: TaskWorld, tmp_path: Path) -> None:
     """SIGKILL in the middle of one part after the other; each call goes on from the last checkpoint."""
     steps = 8 * task_world.config.steps
-    calm, root = tmp_path / "calm", tmp_path / "run"
+    calm = tmp_path / "calm"
+    root = tmp_path / "run"
     config = replace(task_world.config, steps=steps, output=calm)
     train(config, task_world.method, quiet=True)
     root.mkdir()
@@ -215,7 +232,10 @@ def test_killed_parts_are_resumed_to_the_same_bits(task_world: TaskWorld, tmp_pa
     killed = []
     for part in (WHOLE, 1):
         worker = subprocess.Popen(
-            command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ | {"OMP_NUM_THREADS": "1"}
+            command,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            env=os.environ | {"OMP_NUM_THREADS": "1"},
         )
         folder = task_world.folder_of(root, part)
         while worker.poll() is None and len(list(folder.glob("checkpoints/step-*/manifest.json"))) < 2:

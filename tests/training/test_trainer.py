@@ -21,7 +21,8 @@ from fprf.training.model import build_model
 from fprf.training.run import Run
 from fprf.types import Batch
 
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
+INF = float("inf")
 
 
 def stopped(world: World, folder: Path, config: TrainConfig, change: Change) -> Run:
@@ -35,7 +36,9 @@ def test_a_resumed_run_is_bitwise_the_one_that_never_stopped(world: World, tmp_p
     config = replace(world.config, steps=12)
     straight = trained_for(world, tmp_path / "straight", config)
     folder = tmp_path / "stopped"
-    assert checkpoint.steps(stopped(world, folder, config, stopping(6)).checkpoints) == [6], "an interrupt saves first"
+    assert checkpoint.steps(stopped(world, folder, config, stopping(6)).checkpoints) == [6], (
+        "an interrupt saves first"
+    )
     resumed = trained_for(world, folder, config)
     assert checkpoint.steps(resumed.checkpoints) == [6, 12]
     assert same(parameters(straight, 12), parameters(resumed, 12))
@@ -43,7 +46,8 @@ def test_a_resumed_run_is_bitwise_the_one_that_never_stopped(world: World, tmp_p
 
 
 def test_a_damaged_checkpoint_costs_its_steps_alone_and_is_named(world: World, tmp_path: Path) -> None:
-    config, folder = replace(world.config, steps=8), tmp_path / "run"
+    config = replace(world.config, steps=8)
+    folder = tmp_path / "run"
     stopped(world, folder, config, stopping(4))
     run = trained_for(world, folder, config)
     whole = parameters(run, 8)
@@ -60,7 +64,9 @@ def test_a_damaged_checkpoint_costs_its_steps_alone_and_is_named(world: World, t
 
 
 def test_a_finished_run_stays_as_it_is(world: World, tmp_path: Path) -> None:
-    config, times, reports = replace(world.config, steps=2), [], list[Report]()
+    config = replace(world.config, steps=2)
+    times = []
+    reports = list[Report]()
     for report in (lambda event: None, reports.append):
         run = trained_for(world, tmp_path / "run", config, report=report)
         times.append({p: p.stat().st_mtime_ns for p in run.checkpoints.rglob("*")})
@@ -85,16 +91,23 @@ def test_checkpoints_come_by_the_clock_and_two_stay(world: World, tmp_path: Path
         seen.append(len(checkpoint.steps(tmp_path / "run" / "checkpoints")))
         return batch
 
-    run = trained_for(world, tmp_path / "run", replace(world.config, steps=5, checkpoint_minutes=1e-9), change=count)
+    run = trained_for(
+        world, tmp_path / "run", replace(world.config, steps=5, checkpoint_minutes=1e-9), change=count
+    )
     assert seen == [0, 1, 2, 2, 2] and checkpoint.steps(run.checkpoints) == [4, 5]
 
 
 TINY = torch.finfo(torch.float32).tiny
 
 
-def bad_gradients(world: World, folder: Path, config: TrainConfig, value: float, *bad: int, stop: int = -1) -> Run:
-    """Train where the loss is fine, and one number of one gradient isn't, in the steps `bad`; interrupted in step `stop`."""
-    steps, interrupt = [-1], stopping(stop)
+def bad_gradients(
+    world: World, folder: Path, config: TrainConfig, value: float, *bad: int, stop: int = -1
+) -> Run:
+    """Train where the loss is fine, and one number of one gradient isn't, in the steps `bad`; interrupted in
+    step `stop`.
+    """
+    steps = [-1]
+    interrupt = stopping(stop)
 
     def watch(step: int, batch: Batch) -> Batch:
         steps.append(step)
@@ -115,17 +128,25 @@ def bad_gradients(world: World, folder: Path, config: TrainConfig, value: float,
 
 
 @pytest.mark.parametrize("kind", ["loss", "gradient"])
-def test_a_step_that_is_not_finite_changes_nothing_and_is_named(world: World, tmp_path: Path, kind: str) -> None:
-    config, three, reports = replace(world.config, steps=4), tmp_path / "three", list[Report]()
+def test_a_step_that_is_not_finite_changes_nothing_and_is_named(
+    world: World, tmp_path: Path, kind: str
+) -> None:
+    config = replace(world.config, steps=4)
+    three = tmp_path / "three"
+    reports = list[Report]()
     stopped(world, three, config, stopping(3))
     if kind == "loss":
         run = trained_for(world, tmp_path / "four", config, change=spoilt(NAN, 3), report=reports.append)
-        assert reports[-1].skipped == 1 and all(math.isfinite(v) for v in (reports[-1].psnr, *reports[-1].losses.values()))
+        assert reports[-1].skipped == 1 and all(
+            math.isfinite(v) for v in (reports[-1].psnr, *reports[-1].losses.values())
+        )
     else:
         run = bad_gradients(world, tmp_path / "four", config, 3e38, 3)
     assert same(parameters(Run(three), 3), parameters(run, 4))
     (event,) = events(run, "skipped")
-    assert event["step"] == 3 and event["skipped"].startswith("rgb" if kind == "loss" else "the loss or a gradient")
+    assert event["step"] == 3 and event["skipped"].startswith(
+        "rgb" if kind == "loss" else "the loss or a gradient"
+    )
 
 
 def test_a_run_with_skipped_steps_is_the_same_when_it_is_resumed(world: World, tmp_path: Path) -> None:
@@ -136,11 +157,16 @@ def test_a_run_with_skipped_steps_is_the_same_when_it_is_resumed(world: World, t
         bad_gradients(world, tmp_path / "halves", config, NAN, 2, 3, 7, stop=5)
     halves = bad_gradients(world, tmp_path / "halves", config, NAN, 2, 3, 7)
     assert same(parameters(straight, 10), parameters(halves, 10))
-    assert [e["step"] for e in events(straight, "skipped")] == [e["step"] for e in events(halves, "skipped")] == [2, 3, 7]
+    assert (
+        [e["step"] for e in events(straight, "skipped")]
+        == [e["step"] for e in events(halves, "skipped")]
+        == [2, 3, 7]
+    )
 
 
 def test_three_in_a_row_go_back_to_the_last_checkpoint_once(world: World, tmp_path: Path) -> None:
-    config, folder = replace(world.config, steps=12), tmp_path / "run"
+    config = replace(world.config, steps=12)
+    folder = tmp_path / "run"
     stopped(world, folder, config, stopping(4))
     kept = parameters(Run(folder), 4)
     with pytest.raises(NumericsError, match=r"step 8: .* in a row, again after going back to step 4; lower"):
@@ -151,9 +177,13 @@ def test_three_in_a_row_go_back_to_the_last_checkpoint_once(world: World, tmp_pa
     assert checkpoint.steps(Run(folder).checkpoints) == [4] and same(kept, parameters(Run(folder), 4))
 
 
-def test_a_passing_fault_costs_the_steps_since_the_checkpoint_and_nothing_else(world: World, tmp_path: Path) -> None:
+def test_a_passing_fault_costs_the_steps_since_the_checkpoint_and_nothing_else(
+    world: World, tmp_path: Path
+) -> None:
     """Something that hits once, as a failing device does: after going back the run is the one without it."""
-    config, folder, left = replace(world.config, steps=9), tmp_path / "run", [5, 6, 7]
+    config = replace(world.config, steps=9)
+    folder = tmp_path / "run"
+    left = [5, 6, 7]
     stopped(world, folder, config, stopping(3))
 
     def once(step: int, batch: Batch) -> Batch:
@@ -198,8 +228,11 @@ def signalled(at: int, *numbers: int) -> Change:
     return change
 
 
-def test_the_first_signal_lets_the_step_end_and_the_second_saves_nothing_doubtful(world: World, tmp_path: Path) -> None:
-    config, run = replace(world.config, steps=9), Run(tmp_path / "run")
+def test_the_first_signal_lets_the_step_end_and_the_second_saves_nothing_doubtful(
+    world: World, tmp_path: Path
+) -> None:
+    config = replace(world.config, steps=9)
+    run = Run(tmp_path / "run")
     stopped(world, run.root, config, signalled(3, signal.SIGTERM))
     assert checkpoint.steps(run.checkpoints) == [4]
     before = parameters(run, 4)
@@ -209,7 +242,9 @@ def test_the_first_signal_lets_the_step_end_and_the_second_saves_nothing_doubtfu
     assert same(*ends)
 
 
-def test_handlers_that_were_not_set_from_python_stay(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_handlers_that_were_not_set_from_python_stay(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     change = Mock(return_value=None)
     monkeypatch.setattr(signal, "getsignal", lambda number: None)
     monkeypatch.setattr(signal, "signal", change)

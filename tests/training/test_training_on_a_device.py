@@ -1,4 +1,6 @@
-"""Training on the pretended device gives what the CPU gives, and the host neither waits nor copies in a step."""
+"""Training on the pretended device gives what the CPU gives, and the host neither waits nor copies in a
+step.
+"""
 
 import shutil
 import threading
@@ -18,7 +20,13 @@ from fprf.interfaces import DataManager
 from fprf.methods import fprf
 from fprf.ops import backend
 from fprf.plugins.samplers.config import UniformConfig
-from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
+from fprf.plugins.stylizers.config import (
+    AdainConfig,
+    LocalAdainConfig,
+    RegionOtConfig,
+    RegionToneConfig,
+    StylizerConfig,
+)
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.restyle import apply_style
@@ -63,10 +71,14 @@ class Steps:
 
 
 def trained(
-    config: TrainConfig, folder: Path, change: Change | None = None, wrap: Callable[..., DataManager] = Altered
+    config: TrainConfig,
+    folder: Path,
+    change: Change | None = None,
+    wrap: Callable[..., DataManager] = Altered,
 ) -> tuple[Run, list[Report]]:
     """Prepare and train; the reports."""
-    prepared, reports = prepared_for(config), []
+    prepared = prepared_for(config)
+    reports = []
     if change is not None:
         prepared = prepared._replace(manager=wrap(prepared.manager, change))
     folder.mkdir(exist_ok=True)
@@ -74,7 +86,9 @@ def trained(
     return Run(folder), reports
 
 
-def on_device(config: TrainConfig, folder: Path, steps: Steps | None = None, **how: Any) -> tuple[Run, list[Report]]:
+def on_device(
+    config: TrainConfig, folder: Path, steps: Steps | None = None, **how: Any
+) -> tuple[Run, list[Report]]:
     with pretend_cuda() as seen:
         if steps is not None:
             steps.seen = seen
@@ -82,15 +96,24 @@ def on_device(config: TrainConfig, folder: Path, steps: Steps | None = None, **h
 
 
 def agrees(
-    run: Run, config: TrainConfig, folder: Path, within: float = 1e-4, train: Callable[..., Any] = trained, **how: Any
+    run: Run,
+    config: TrainConfig,
+    folder: Path,
+    within: float = 1e-4,
+    train: Callable[..., Any] = trained,
+    **how: Any,
 ) -> Report:
-    """Check that a run's parameters are those of another training, within a share of the way that this came; its last report.
+    """Check that a run's parameters are those of another training, within a share of the way that this came;
+    its last report.
 
-    Compiled sums and torch's round differently, and Adam turns a gradient that is rounding alone into a whole step.
+    Compiled sums and torch's round differently, and Adam turns a gradient that is rounding alone into a whole
+    step.
     """
     other, reports = train(config, folder / "other", **how)
     start, _ = train(replace(config, steps=0), folder / "start")
-    a, b, begun = parameters(run, config.steps), parameters(other, config.steps), parameters(start, 0)
+    a = parameters(run, config.steps)
+    b = parameters(other, config.steps)
+    begun = parameters(start, 0)
     assert a.keys() == b.keys()
     names = [name for name in a if name.startswith("model.") and a[name].is_floating_point()]
     off = sum(float((a[name] - b[name]).double().square().sum()) for name in names)
@@ -118,7 +141,9 @@ def variant(name: str, config: TrainConfig) -> TrainConfig:
                 steps=STEPS,
                 device=config.device,
                 datamanager=replace(method.datamanager, rays=128),
-                sampler=replace(method.sampler, samples=(12, 8), final=6, resolutions=(8, 8), channels=8, anneal_steps=2),
+                sampler=replace(
+                    method.sampler, samples=(12, 8), final=6, resolutions=(8, 8), channels=8, anneal_steps=2
+                ),
                 content=replace(method.content, encoder=content.encoder, field=content.field),
                 semantic=replace(config.semantic, samples=48),
             )
@@ -129,7 +154,9 @@ def variant(name: str, config: TrainConfig) -> TrainConfig:
 def test_training_is_that_of_the_cpu_without_waits_or_copies(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    config, steps, change = variant(name, world.config), Steps(monkeypatch), marked if name.startswith("marked") else None
+    config = variant(name, world.config)
+    steps = Steps(monkeypatch)
+    change = marked if name.startswith("marked") else None
     run, reports = on_device(config, tmp_path / "device", steps, change=change)
     assert steps.waits == [0] * STEPS
     assert steps.uploads[2:] == [0] * (STEPS - 2), "constants are copied when they are first met"
@@ -137,7 +164,9 @@ def test_training_is_that_of_the_cpu_without_waits_or_copies(
     assert reports[-1].losses == pytest.approx(expected.losses, rel=1e-5, abs=1e-9)
 
 
-def test_a_step_that_is_not_finite_changes_nothing(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_that_is_not_finite_changes_nothing(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As on the CPU, but told at a report."""
     monkeypatch.setattr(driver, "REPORT_SECONDS", 1e9)
     config = replace(world.config, steps=STEPS)
@@ -156,7 +185,8 @@ def test_apple_s_device_needs_no_float64(world: World, tmp_path: Path) -> None:
     with pretend_cuda(mps=True):
         run, reports = trained(replace(config, device="mps:0"), tmp_path / "mps")
         prepared = prepared_for(config)
-        scene, model = prepared.scene, build_model(config, prepared.facts)
+        scene = prepared.scene
+        model = build_model(config, prepared.facts)
         checkpoint.restore(checkpoint.load(run.checkpoints, 2).state, model, None)
         found = measure_style(config, model.to("mps:0"), scene.cameras, scene.train)
     _, expected = trained(config, tmp_path / "cpu")
@@ -183,7 +213,9 @@ def test_batches_of_host_memory_come_one_step_ahead(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, foreign: bool
 ) -> None:
     """Those of a data manager that draws in host memory alone, and those that the device has no room for."""
-    config, steps, made = replace(world.config, steps=STEPS), Steps(monkeypatch), []
+    config = replace(world.config, steps=STEPS)
+    steps = Steps(monkeypatch)
+    made = []
 
     def wrap(inner: DataManager, change: Change) -> DataManager:
         made.append(Foreign(inner, change) if foreign else Altered(inner, change))
@@ -218,20 +250,26 @@ def test_a_thread_draws_again_after_going_back() -> None:
     assert asked[:8] == [0, 1, 2, 3, 0, 1, 2, 4]
 
 
-def test_features_are_made_on_the_device(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_features_are_made_on_the_device(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     with pretend_cuda() as seen:
         assert device_of("auto") == CUDA
         there = prepared_for(replace(world.config, device="auto"))
     assert seen.uploads["aten._to_copy.default"] > 2 * len(there.scene.train), "each image, to each encoder"
-    here, batch = world.prepared.manager.batch(0), there.manager.batch(0)
+    here = world.prepared.manager.batch(0)
+    batch = there.manager.batch(0)
     for kind, scale in (("content", there.facts.content_scale), ("semantic", there.facts.semantic_scale)):
         assert (getattr(batch, kind) - getattr(here, kind)).abs().max() <= 1e-3 * scale
 
 
-def test_a_block_is_trained_on_a_device(block_world: BlockWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_block_is_trained_on_a_device(
+    block_world: BlockWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A block inside of surroundings that the CPU has trained."""
-    root, steps = tmp_path / "run", Steps(monkeypatch)
+    root = tmp_path / "run"
+    steps = Steps(monkeypatch)
     shutil.copytree(block_world.root, root)
     config, method = Run(root).load_config()
     Run(root).save_config(replace(config, device="cuda:0"), method)
@@ -239,7 +277,8 @@ def test_a_block_is_trained_on_a_device(block_world: BlockWorld, tmp_path: Path,
     with pretend_cuda() as steps.seen:
         assert world_of_blocks(block_world.config, root).train(root, 1)
     assert set(steps.waits) == {0} and set(steps.uploads[2:]) == {0}
-    found, expected = tensors_of(root, "01"), tensors_of(block_world.root, "01")
+    found = tensors_of(root, "01")
+    expected = tensors_of(block_world.root, "01")
     assert found.keys() == expected.keys()
     for key, value in expected.items():
         assert (found[key] - value).double().norm() <= 1e-5 * value.double().norm(), key
@@ -250,7 +289,8 @@ STYLIZERS = (AdainConfig(), LocalAdainConfig(), RegionOtConfig(), RegionToneConf
 
 @pytest.mark.parametrize("stylizer", STYLIZERS, ids=lambda config: type(config).__name__)
 def test_every_stylizer_is_drawn_on_a_device(world: World, stylizer: StylizerConfig) -> None:
-    style, drawn = StyleFile(StyleConfig(references=world.references, stylizer=stylizer, clusters=4)), []
+    style = StyleFile(StyleConfig(references=world.references, stylizer=stylizer, clusters=4))
+    drawn = []
     for device, within in (("cpu", backend.plain), (str(CUDA), pretend_cuda)):
         with within():
             run = load_run(world.run, device)

@@ -1,4 +1,6 @@
-"""Distil an encoder that ships from large ones: `python -m tools.distil content|semantic --images DIR... --output FILE`."""
+"""Distil an encoder that ships from large ones: `python -m tools.distil content|semantic --images DIR...
+--output FILE`.
+"""
 
 import sys
 
@@ -9,7 +11,9 @@ from .config import DistilConfig, SemanticDistilConfig
 
 
 def main(args: list[str]) -> int:
-    """0 when the weights are written; 2 for a mistake in the arguments, which one line on standard error names."""
+    """0 when the weights are written; 2 for a mistake in the arguments, which one line on standard error
+    names.
+    """
     kind, rest = (args[0], args[1:]) if args else ("", [])
     try:
         if kind == "content":
@@ -21,11 +25,16 @@ def main(args: list[str]) -> int:
             from .semantic import pretrain_semantic
 
             about = "A small semantic encoder that imitates MobileNetV2s."
-            return pretrain(SemanticDistilConfig(), rest, "python -m tools.distil semantic", about, pretrain_semantic)
+            return pretrain(
+                SemanticDistilConfig(), rest, "python -m tools.distil semantic", about, pretrain_semantic
+            )
     except FprfError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print("usage: python -m tools.distil content|semantic --images DIR... --output FILE [--help]", file=sys.stderr)
+    print(
+        "usage: python -m tools.distil content|semantic --images DIR... --output FILE [--help]",
+        file=sys.stderr,
+    )
     return 0 if kind in ("-h", "--help") else 2
 
 

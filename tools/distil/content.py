@@ -1,7 +1,8 @@
-"""Distillation of the content encoder: a slim network learns the principal components of normalised VGG-19 relu2_1.
+"""Distillation of the content encoder: a slim network learns the principal components of normalised VGG-19
+relu2_1.
 
-The components are those of guided-filtered features, which is what scenes learn; the student imitates the raw ones.
-Components are accumulated in float64.
+The components are those of guided-filtered features, which is what scenes learn; the student imitates the raw
+ones. Components are accumulated in float64.
 """
 
 from collections.abc import Callable, Sequence
@@ -46,12 +47,15 @@ class Basis:
 
 
 def fit_basis(samples: Annotated[Tensor, "N F"], choices: tuple[int, ...], energy: float) -> Basis:
-    """The fewest channels among `choices` that keep `energy` of the centred variance (or the most, if none does)."""
+    """The fewest channels among `choices` that keep `energy` of the centred variance (or the most, if none
+    does).
+    """
     x = double(samples)
     mean = x.mean(0)
     centred = x - mean
     values, vectors = torch.linalg.eigh(centred.T @ centred / len(x))
-    values, vectors = values.flip(0).clamp_min(0), vectors.flip(1)
+    values = values.flip(0).clamp_min(0)
+    vectors = vectors.flip(1)
     shares = values.cumsum(0) / values.sum()
     enough = [n for n in sorted(choices) if n <= len(values) and float(shares[n - 1]) >= energy]
     channels = enough[0] if enough else min(max(choices), len(values))
@@ -67,7 +71,8 @@ def fit_basis(samples: Annotated[Tensor, "N F"], choices: tuple[int, ...], energ
 
 CHOICES = (24, 32, 48)
 ENERGY = 0.99
-BASIS_PHOTOS, BASIS_PIXELS = 60, 1000
+BASIS_PHOTOS = 60
+BASIS_PIXELS = 1000
 SCALES = (0.6, 1.5)
 """Crops are that much larger or smaller than the photograph."""
 REPORT_PHOTOS = 16
@@ -77,7 +82,9 @@ Report = dict[str, float | int | str]
 def pretrain_content(config: DistilConfig, output: Path, say: Callable[[str], None]) -> Report:
     """Train, write `output`, and measure it on held-out photographs."""
     if len(config.teachers) != 1:
-        raise UsageError(f"--teachers: {len(config.teachers)} files; `content` takes one, the weights of VGG-19")
+        raise UsageError(
+            f"--teachers: {len(config.teachers)} files; `content` takes one, the weights of VGG-19"
+        )
     device = device_of(config.device)
     teacher = Vgg19Config(weights=config.teachers[0]).build().to(device)
     photos, held = split(find_photos(config.images)[: config.photos])
@@ -102,12 +109,16 @@ def pretrain_content(config: DistilConfig, output: Path, say: Callable[[str], No
         "licence": "Apache-2.0; trained by this project, holds no weights of its teacher",
     }
     write_weights(output, {name: value.half() for name, value in student.state_dict().items()}, metadata)
-    report = content_report(load_content_encoder(output).to(device), teacher, basis, held[:REPORT_PHOTOS], device)
+    report = content_report(
+        load_content_encoder(output).to(device), teacher, basis, held[:REPORT_PHOTOS], device
+    )
     prepared_path(output).unlink(missing_ok=True)
     return {"steps": steps, "channels": len(basis.axes), "energy_kept": round(basis.kept, 5), **report}
 
 
-def content_basis(teacher: Encoder, photos: Sequence[Path], seed: int, device: torch.device | None = None) -> Basis:
+def content_basis(
+    teacher: Encoder, photos: Sequence[Path], seed: int, device: torch.device | None = None
+) -> Basis:
     """Principal components of the teacher's guided-filtered features."""
     samples = []
     for index, path in enumerate(photos):
@@ -118,10 +129,17 @@ def content_basis(teacher: Encoder, photos: Sequence[Path], seed: int, device: t
 
 
 def content_report(
-    student: Encoder, teacher: Encoder, basis: Basis, photos: Sequence[Path], device: torch.device | None = None
+    student: Encoder,
+    teacher: Encoder,
+    basis: Basis,
+    photos: Sequence[Path],
+    device: torch.device | None = None,
 ) -> Report:
-    """Relative L2 error of the student against its projected teacher, raw and guided-filtered, over whole photographs."""
-    error, energy = torch.zeros(2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
+    """Relative L2 error of the student against its projected teacher, raw and guided-filtered, over whole
+    photographs.
+    """
+    error = torch.zeros(2, dtype=torch.float64)
+    energy = torch.zeros(2, dtype=torch.float64)
     projected = _Projected(teacher, basis)
     for path in photos:
         photo = load_photo(path).to(device)
@@ -142,7 +160,8 @@ class _Projected(Encoder):
 
     def __init__(self, teacher: Encoder, basis: Basis) -> None:
         super().__init__()
-        self.teacher, self.basis = teacher, basis
+        self.teacher = teacher
+        self.basis = basis
 
     @property
     def identity(self) -> str:
@@ -160,12 +179,17 @@ class _Projected(Encoder):
 def _crops(
     teacher: Encoder, basis: Basis, photos: Sequence[Path], config: DistilConfig, device: torch.device
 ) -> tuple[Annotated[Tensor, "N 3 s s"], Annotated[Tensor, "N C t t"]]:
-    """Crops as bytes and their targets in half precision; some darker, flatter or tinted, as night scenes are."""
-    images, targets = [], []
+    """Crops as bytes and their targets in half precision; some darker, flatter or tinted, as night scenes
+    are.
+    """
+    images = []
+    targets = []
     for index, path in enumerate(photos):
         generator = generator_of(config.seed + 1, index)
         photo = load_photo(path)
-        batch = torch.stack([toned(crop(photo, config.size, SCALES, generator), generator) for _ in range(config.crops)])
+        batch = torch.stack(
+            [toned(crop(photo, config.size, SCALES, generator), generator) for _ in range(config.crops)]
+        )
         batch = (batch * 255).round()
         images.append(batch.byte())
         targets.append(basis.project(teacher((batch / 255).to(device))).half().cpu())

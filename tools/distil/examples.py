@@ -24,12 +24,15 @@ Pair = tuple[Tensor, Tensor]
 def crop(
     photo: Annotated[Tensor, "H W 3"], size: int, scales: tuple[float, float], generator: torch.Generator
 ) -> Annotated[Tensor, "3 size size"]:
-    """A random square, `scales` (log-uniform) times as large in the result as in the photo, mirrored half the time."""
+    """A random square, `scales` (log-uniform) times as large in the result as in the photo, mirrored half the
+    time.
+    """
     draw = torch.rand(4, generator=generator).tolist()
     scale = math.exp(math.log(scales[0]) + draw[0] * (math.log(scales[1]) - math.log(scales[0])))
     height, width = photo.shape[:2]
     side = max(2, min(round(size / scale), height, width))
-    top, left = int(draw[1] * (height - side + 1)), int(draw[2] * (width - side + 1))
+    top = int(draw[1] * (height - side + 1))
+    left = int(draw[2] * (width - side + 1))
     piece = photo[top : top + side, left : left + side].permute(2, 0, 1)[None]
     if side != size:
         smaller = side > size
@@ -39,7 +42,9 @@ def crop(
 
 
 def toned(image: Annotated[Tensor, "3 H W"], generator: torch.Generator) -> Annotated[Tensor, "3 H W"]:
-    """Random gamma, contrast, saturation, hue and tint; one in four times night, one in five times none at all."""
+    """Random gamma, contrast, saturation, hue and tint; one in four times night, one in five times none at
+    all.
+    """
     kind = float(torch.rand(1, generator=generator))
     draw = (2 * torch.rand(8, generator=generator) - 1).tolist()
     if kind < 0.2:
@@ -68,7 +73,8 @@ def _turned(image: Tensor, angle: float) -> Tensor:
     """Colours turned about the grey axis by `angle` in radians (Rodrigues)."""
     axis = torch.full((3,), 3**-0.5)
     cross = torch.tensor([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]]) * 3**-0.5
-    cosine, sine = torch.cos(torch.tensor(angle)), torch.sin(torch.tensor(angle))
+    cosine = torch.cos(torch.tensor(angle))
+    sine = torch.sin(torch.tensor(angle))
     matrix = cosine * torch.eye(3) + sine * cross + (1 - cosine) * torch.outer(axis, axis)
     return torch.einsum("ij,jhw->ihw", matrix, image)
 

@@ -1,9 +1,10 @@
-"""Distillation of the semantic encoder: one small network learns what several large ones say together, in any light.
+"""Distillation of the semantic encoder: one small network learns what several large ones say together, in any
+light.
 
-The student sees a photograph in a random light, the teachers saw it as it is. Teachers are averaged over scales and mirror
-images, which is steadier and finer than a single pass: on 40 pairs of photographs two MobileNetV2s averaged find the right
-region in 83 % of the cells, the better one alone in 77 %. Rendered streets of the town, each in every palette, are learnt as
-well.
+The student sees a photograph in a random light, the teachers saw it as it is. Teachers are averaged over
+scales and mirror images, which is steadier and finer than a single pass: on 40 pairs of photographs two
+MobileNetV2s averaged find the right region in 83 % of the cells, the better one alone in 77 %. Rendered
+streets of the town, each in every palette, are learnt as well.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,7 +44,8 @@ class MobileNetTeacher:
     """A network that is not resized to: borders are repeated until cells cover the image."""
 
     def __init__(self, name: str, network: MobileNetV2) -> None:
-        self.name, self._network = name, network
+        self.name = name
+        self._network = network
 
     def to(self, device: torch.device) -> "MobileNetTeacher":
         """Move the network to a device."""
@@ -63,7 +65,9 @@ class MobileNetTeacher:
 
 
 def load_teacher(path: Path) -> MobileNetTeacher:
-    """MobileNetV2 (`features.N`, up to block 13) or DeepLab's backbone (`backbone.N`, folded, up to block 17)."""
+    """MobileNetV2 (`features.N`, up to block 13) or DeepLab's backbone (`backbone.N`, folded, up to block
+    17).
+    """
     tensors, _ = read_weights(path)
     if "backbone.17.conv.2.weight" in tensors:
         network = MobileNetV2(fold(tensors, "backbone."), layout=DEEPLAB, last=17)
@@ -71,7 +75,9 @@ def load_teacher(path: Path) -> MobileNetTeacher:
     if "features.13.conv.3.running_var" in tensors:
         network = MobileNetV2(fold(tensors, "features."), layout=CLASSIFIER, last=13)
         return MobileNetTeacher("mobilenetv2:features.13", network)
-    raise WeightsError(f"{path}: neither MobileNetV2 (features.N) nor DeepLab's MobileNetV2 backbone (backbone.N)")
+    raise WeightsError(
+        f"{path}: neither MobileNetV2 (features.N) nor DeepLab's MobileNetV2 backbone (backbone.N)"
+    )
 
 
 COMPONENTS = 32
@@ -82,8 +88,12 @@ Ensemble = Sequence[tuple[MobileNetTeacher, Basis]]
 
 
 @torch.no_grad()
-def look(teacher: MobileNetTeacher, images: Annotated[Tensor, "B 3 H W"], stride: int) -> Annotated[Tensor, "B F h w"]:
-    """Mean of a teacher's features over scales and mirror images, one per `stride` pixels, rounded up, on its device."""
+def look(
+    teacher: MobileNetTeacher, images: Annotated[Tensor, "B 3 H W"], stride: int
+) -> Annotated[Tensor, "B F h w"]:
+    """Mean of a teacher's features over scales and mirror images, one per `stride` pixels, rounded up, on its
+    device.
+    """
     images = images.to(teacher.device)
     cells = [-(-n // stride) for n in images.shape[-2:]]
     total: Tensor | float = 0.0
@@ -99,14 +109,21 @@ def look(teacher: MobileNetTeacher, images: Annotated[Tensor, "B 3 H W"], stride
 def semantic_ensemble(
     teachers: Sequence[MobileNetTeacher], images: Sequence[Annotated[Tensor, "3 H W"]], stride: int
 ) -> Ensemble:
-    """The principal components of each teacher; each is scaled to unit variance per channel, so that all weigh the same."""
-    samples = [[look(teacher, image[None], stride).flatten(2)[0].T for image in images] for teacher in teachers]
+    """The principal components of each teacher; each is scaled to unit variance per channel, so that all
+    weigh the same.
+    """
+    samples = [
+        [look(teacher, image[None], stride).flatten(2)[0].T for image in images] for teacher in teachers
+    ]
     return [
-        (teacher, fit_basis(torch.cat(found), (COMPONENTS,), 1.0)) for teacher, found in zip(teachers, samples, strict=True)
+        (teacher, fit_basis(torch.cat(found), (COMPONENTS,), 1.0))
+        for teacher, found in zip(teachers, samples, strict=True)
     ]
 
 
-def taught(ensemble: Ensemble, images: Annotated[Tensor, "B 3 H W"], stride: int) -> Annotated[Tensor, "B C h w"]:
+def taught(
+    ensemble: Ensemble, images: Annotated[Tensor, "B 3 H W"], stride: int
+) -> Annotated[Tensor, "B C h w"]:
     """What the teachers say together: their components, one after the other."""
     return torch.cat([basis.project(look(teacher, images, stride)) for teacher, basis in ensemble], dim=1)
 
@@ -130,7 +147,8 @@ class Streets(NamedTuple):
 
 def render_streets(count: int, size: int, stride: int) -> Streets:
     """`count` streets, the same ones every time."""
-    images, classes = [], []
+    images = []
+    classes = []
     for number in range(count):
         town = build_town(FIRST_SEED + number)
         for view in walk(seed=FIRST_SEED + number, views=VIEWS, width=size, height=size):
@@ -143,9 +161,13 @@ def render_streets(count: int, size: int, stride: int) -> Streets:
 
 
 def street_targets(ensemble: Ensemble, streets: Streets, stride: int) -> Annotated[Tensor, "V C t t"]:
-    """What the teachers say of each view by day, half-way to the mean of the cell's classes over all views."""
+    """What the teachers say of each view by day, half-way to the mean of the cell's classes over all
+    views.
+    """
     said = torch.cat([taught(ensemble, views[:1].float() / 255, stride).cpu() for views in streets.images])
-    weight = streets.classes.sum((0, 2, 3)).clamp_min(1e-6)  # a class that no view shows has no mean, and needs none
+    weight = streets.classes.sum((0, 2, 3)).clamp_min(
+        1e-6
+    )  # a class that no view shows has no mean, and needs none
     mean = torch.einsum("vkij,vcij->kc", streets.classes, said) / weight[:, None]
     return torch.lerp(said, torch.einsum("vkij,kc->vcij", streets.classes, mean), TO_CLASS)
 
@@ -168,7 +190,9 @@ Report = dict[str, float | int | str]
 def pretrain_semantic(config: SemanticDistilConfig, output: Path, say: Callable[[str], None]) -> Report:
     """Train, write `output`, and measure it on held-out photographs."""
     if not config.teachers:
-        raise UsageError("--teachers: none; `semantic` takes the weights of MobileNetV2, of DeepLab's backbone, or both")
+        raise UsageError(
+            "--teachers: none; `semantic` takes the weights of MobileNetV2, of DeepLab's backbone, or both"
+        )
     if config.size % STRIDE:
         raise UsageError(f"--size: {config.size}; `semantic` takes multiples of {STRIDE}, its stride")
     device = device_of(config.device)
@@ -176,7 +200,8 @@ def pretrain_semantic(config: SemanticDistilConfig, output: Path, say: Callable[
     photos, held = split(find_photos(config.images)[: config.photos])
     say(f"{len(photos)} photographs to learn from, {len(held)} held out")
     samples = [
-        crop(load_photo(p), config.size, SCALES, generator_of(config.seed + 2, i)) for i, p in enumerate(photos[:BASIS_CROPS])
+        crop(load_photo(p), config.size, SCALES, generator_of(config.seed + 2, i))
+        for i, p in enumerate(photos[:BASIS_CROPS])
     ]
     ensemble = semantic_ensemble(teachers, samples, STRIDE)
     kept = ", ".join(f"{100 * basis.kept:.1f} %" for _, basis in ensemble)
@@ -210,7 +235,10 @@ def pretrain_semantic(config: SemanticDistilConfig, output: Path, say: Callable[
 
 
 def relations(
-    found: Annotated[Tensor, "B C h w"], wanted: Annotated[Tensor, "B C h w"], cells: int, generator: torch.Generator
+    found: Annotated[Tensor, "B C h w"],
+    wanted: Annotated[Tensor, "B C h w"],
+    cells: int,
+    generator: torch.Generator,
 ) -> Annotated[Tensor, ""]:
     """Mean square difference of the cosines between `cells` random cells of a batch: what matching goes by.
 
@@ -223,11 +251,17 @@ def relations(
 
 
 @torch.no_grad()
-def semantic_report(student: Encoder, ensemble: Ensemble, photos: Sequence[Path], config: SemanticDistilConfig) -> Report:
+def semantic_report(
+    student: Encoder, ensemble: Ensemble, photos: Sequence[Path], config: SemanticDistilConfig
+) -> Report:
     """Agreement with the teachers on held-out crops, and of each crop with itself at night; mean cosines."""
     images, wanted = _crops(ensemble, photos, config, config.seed + 3)
-    generator, device = generator_of(config.seed + 4, 0), device_of(config.device)
-    cosines, nights, error, energy = 0.0, 0.0, 0.0, 0.0
+    generator = generator_of(config.seed + 4, 0)
+    device = device_of(config.device)
+    cosines = 0.0
+    nights = 0.0
+    error = 0.0
+    energy = 0.0
     for image, target in zip(images, wanted.float(), strict=True):
         day = image[None].float() / 255
         target = target.to(device)
@@ -260,14 +294,20 @@ def view(
     rows, columns = (slice(STRIDE * first, STRIDE * (first + side)) for first in (top, left))
     seen = toned(image[:, rows, columns].float() / 255, generator)
     shown = max(1, round(SEEN * cells))
-    seen = F.interpolate(seen[None], (STRIDE * shown,) * 2, mode="bilinear", align_corners=False, antialias=shown < side)[0]
-    right = F.interpolate(right[None], (shown, shown), mode="bilinear", align_corners=False, antialias=shown < side)[0]
+    seen = F.interpolate(
+        seen[None], (STRIDE * shown,) * 2, mode="bilinear", align_corners=False, antialias=shown < side
+    )[0]
+    right = F.interpolate(
+        right[None], (shown, shown), mode="bilinear", align_corners=False, antialias=shown < side
+    )[0]
     if torch.rand(1, generator=generator) < 0.5:
         return seen.flip(-1), right.flip(-1)
     return seen, right
 
 
-def _examples(ensemble: Ensemble, photos: Sequence[Path], config: SemanticDistilConfig) -> tuple[Tensor, Tensor]:
+def _examples(
+    ensemble: Ensemble, photos: Sequence[Path], config: SemanticDistilConfig
+) -> tuple[Tensor, Tensor]:
     """Crops of photographs, then streets: every palette of a view with the same target."""
     images, targets = _crops(ensemble, photos, config, config.seed + 1)
     if config.towns == 0:
@@ -283,9 +323,11 @@ def _crops(
     ensemble: Ensemble, photos: Sequence[Path], config: SemanticDistilConfig, seed: int
 ) -> tuple[Annotated[Tensor, "N 3 s s"], Annotated[Tensor, "N C t t"]]:
     """Crops as bytes and their targets in half precision."""
-    images, targets = [], []
+    images = []
+    targets = []
     for index, path in enumerate(photos):
-        generator, photo = generator_of(seed, index), load_photo(path)
+        generator = generator_of(seed, index)
+        photo = load_photo(path)
         batch = torch.stack([crop(photo, config.size, SCALES, generator) for _ in range(config.crops)])
         batch = (batch * 255).round()
         images.append(batch.byte())

@@ -11,7 +11,8 @@ def test_keeps_to_the_contract() -> None:
 
 
 def test_half_transparent_rays_cost_most() -> None:
-    term, nothing = OpacityConfig().build(), torch.zeros(3)
+    term = OpacityConfig().build()
+    nothing = torch.zeros(3)
     assert isinstance(term, LossTerm)
     for share, cost in ((0.0, 0.0), (0.125, 0.75), (0.25, 1.0), (0.375, 0.75), (0.5, 0.0)):
         rendered = Rendered(nothing, nothing, weights=torch.full((3, 2), share))

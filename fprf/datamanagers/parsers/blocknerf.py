@@ -1,15 +1,17 @@
-"""San Francisco Mission Bay (Block-NeRF): TFRecord files of images with an origin and a direction for each pixel.
+"""San Francisco Mission Bay (Block-NeRF): TFRecord files of images with an origin and a direction for each
+pixel.
 
-Files whose name holds `val` or `test` are held out. Each record keeps `image` (PNG), `cam_idx`, `image_hash`, `height`,
-`width`, `equivalent_exposure`, `ray_origins` and `ray_dirs`. Images are taken out once, into the user's cache; what lies in a
-complete cache is not read again.
+Files whose name holds `val` or `test` are held out. Each record keeps `image` (PNG), `cam_idx`, `image_hash`,
+`height`, `width`, `equivalent_exposure`, `ray_origins` and `ray_dirs`. Images are taken out once, into the
+user's cache; what lies in a complete cache is not read again.
 
-A file is a row of records: length (8 bytes), its masked CRC-32C, the bytes, their masked CRC-32C, all little-endian. An Example
-is a protobuf message, read without TensorFlow: features (field 1) map a name to a list of bytes (1), floats (2) or ints (3).
+A file is a row of records: length (8 bytes), its masked CRC-32C, the bytes, their masked CRC-32C, all
+little-endian. An Example is a protobuf message, read without TensorFlow: features (field 1) map a name to a
+list of bytes (1), floats (2) or ints (3).
 
-A camera is fitted to each image's rays: a pose, focal lengths, a principal point and OpenCV's k1 k2 p1 p2, to a lattice of the
-rays, by OpenCV's calibration. What is left is told: a rolling shutter's rays come from many places, and one pose is
-only their mean.
+A camera is fitted to each image's rays: a pose, focal lengths, a principal point and OpenCV's k1 k2 p1 p2, to
+a lattice of the rays, by OpenCV's calibration. What is left is told: a rolling shutter's rays come from many
+places, and one pose is only their mean.
 """
 
 import functools
@@ -46,7 +48,8 @@ def _crc_kernel() -> Callable[[NDArray[np.uint8]], np.uint32]:
     """The loop over bytes, compiled at its first use."""
     import numba
 
-    # The remainder of each byte by the reversed polynomial, bit after bit; then a step of the loop is one look-up.
+    # The remainder of each byte by the reversed polynomial, bit after bit; then a step of the loop is one
+    # look-up.
     table = np.arange(256, dtype=np.uint32)
     for _ in range(8):
         table = np.where(table & 1, (table >> 1) ^ np.uint32(0x82F63B78), table >> 1).astype(np.uint32)
@@ -68,7 +71,9 @@ def crc32c(data: bytes) -> int:
 
 
 def masked(checksum: int) -> int:
-    """The checksum as TFRecord files keep it: turned and offset, so that a checksum of checksums stays one."""
+    """The checksum as TFRecord files keep it: turned and offset, so that a checksum of checksums stays
+    one.
+    """
     return ((checksum >> 15 | checksum << 17) + 0xA282EAD8) & 0xFFFFFFFF
 
 
@@ -118,7 +123,9 @@ class Example(NamedTuple):
         """The floats of a feature, so many of them. Raises DataError, also where one is not finite."""
         numbers = np.array(self._values(name, "floats", count), np.float32)
         if not np.isfinite(numbers).all():
-            raise DataError(f"{self.where}: {name} holds numbers that are not finite; download the file again")
+            raise DataError(
+                f"{self.where}: {name} holds numbers that are not finite; download the file again"
+            )
         return numbers
 
     def _values(self, name: str, kind: str, count: int) -> Sequence[Any]:
@@ -139,13 +146,15 @@ def read_records(path: Path) -> Iterator[bytes]:
             where = f"{path}: record {number}"
             if len(head) < 12:
                 raise DataError(f"{where}: the file ends within its head; download it again")
-            # A length that is wrong would make nonsense of everything behind it: it has a checksum of its own.
+            # A length that is wrong would make nonsense of everything behind it: it has a checksum of its
+            # own.
             length, check = struct.unpack("<QI", head)
             if masked(crc32c(head[:8])) != check:
                 raise DataError(f"{where}: the checksum of its length is wrong; download the file again")
             if length > LONGEST:
                 raise DataError(f"{where}: claims {length} bytes, at most {LONGEST} are read; split the file")
-            data, tail = file.read(length), file.read(4)
+            data = file.read(length)
+            tail = file.read(4)
             if missing := length + 4 - len(data) - len(tail):
                 raise DataError(f"{where}: the file ends {missing} bytes early; download it again")
             if masked(crc32c(data)) != struct.unpack("<I", tail)[0]:
@@ -166,7 +175,10 @@ def read_examples(path: Path) -> Iterator[Example]:
         features: dict[str, tuple[str, Sequence[Any]]] = {}
         for entry in message.features.feature:
             kind = entry.value.WhichOneof("kind") or "bytes"
-            features[entry.key] = "byte strings" if kind == "bytes" else kind, getattr(entry.value, kind).value
+            features[entry.key] = (
+                "byte strings" if kind == "bytes" else kind,
+                getattr(entry.value, kind).value,
+            )
         yield Example(where, features)
 
 
@@ -174,7 +186,9 @@ def read_examples(path: Path) -> Iterator[Example]:
 def _message_class() -> type[Message]:
     """The class of an Example, in a pool of its own: TensorFlow has the same in the common one."""
     pool = descriptor_pool.DescriptorPool()
-    pool.AddSerializedFile(text_format.Parse(_SCHEMA, descriptor_pb2.FileDescriptorProto()).SerializeToString())
+    pool.AddSerializedFile(
+        text_format.Parse(_SCHEMA, descriptor_pb2.FileDescriptorProto()).SerializeToString()
+    )
     message: type[Message] = message_factory.GetMessageClass(pool.FindMessageTypeByName("fprf.Example"))
     return message
 
@@ -197,7 +211,9 @@ class RayCamera(NamedTuple):
 
 
 def fit_camera(origin: NDArray[np.float32], direction: NDArray[np.float32]) -> RayCamera:
-    """The camera of rays [H W 3] through pixel centres. Raises ValueError where they are not those of any lens."""
+    """The camera of rays [H W 3] through pixel centres. Raises ValueError where they are not those of any
+    lens.
+    """
     # Unit directions of a lattice of the rays, and their pixels.
     height, width = origin.shape[:2]
     lines = np.unique(np.linspace(0, height - 1, min(_LATTICE, height)).round().astype(np.int64))
@@ -214,13 +230,17 @@ def fit_camera(origin: NDArray[np.float32], direction: NDArray[np.float32]) -> R
         raise ValueError("rays that span no image")
     # As many pixels a radian as along the diagonal are where the search begins.
     focal = np.linalg.norm(pixel[-1] - pixel[0]) / (2 * math.tan(angle / 2))
-    matrix, none = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), np.zeros(5)
+    matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    none = np.zeros(5)
     # Two points on each ray, near and far: only a camera in the rays' own place sees both in one pixel.
-    points, seen = np.concatenate([ray, 2 * ray]).astype(np.float32), np.concatenate([pixel, pixel]).astype(np.float32)
+    points = np.concatenate([ray, 2 * ray]).astype(np.float32)
+    seen = np.concatenate([pixel, pixel]).astype(np.float32)
     # k3 stays 0: what two radial and two tangential terms leave is told as the error.
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
     try:
-        error, matrix, bent, turns, _ = cv2.calibrateCamera([points], [seen], (width, height), matrix, none, flags=flags)
+        error, matrix, bent, turns, _ = cv2.calibrateCamera(
+            [points], [seen], (width, height), matrix, none, flags=flags
+        )
     except cv2.error as fault:
         raise ValueError("rays that no lens makes") from fault
     if not (matrix.diagonal() > 0).all():
@@ -270,7 +290,9 @@ class BlockNerfParser(DataParser):
         chosen = [e for e in entries if not self.config.cameras or e["camera"] in self.config.cameras]
         if not chosen:
             present = sorted({e["camera"] for e in entries})
-            raise DataError(f"{data}: no images of cameras {list(self.config.cameras)}; parser.cameras may name {present}")
+            raise DataError(
+                f"{data}: no images of cameras {list(self.config.cameras)}; parser.cameras may name {present}"
+            )
         chosen.sort(key=lambda entry: str(entry["name"]))
         worst = max(chosen, key=lambda entry: float(entry["error"]))
         if worst["error"] > self.config.tolerance:
@@ -281,7 +303,9 @@ class BlockNerfParser(DataParser):
         views, kept, notes = read_views(data, chosen, lambda entry: _view(folder, entry))
         split = split_by([entry["held"] for entry in kept])
         scene = assemble_scene(data, views, downscale=downscale, split=split, notes=notes)
-        return replace(scene, exposure=torch.tensor([entry["exposure"] for entry in kept], dtype=torch.float64))
+        return replace(
+            scene, exposure=torch.tensor([entry["exposure"] for entry in kept], dtype=torch.float64)
+        )
 
 
 def _unpacked(folder: Path) -> list[dict[str, Any]]:
@@ -289,7 +313,9 @@ def _unpacked(folder: Path) -> list[dict[str, Any]]:
     try:
         document = json.loads((folder / "views.json").read_text())
         entries: list[dict[str, Any]] = document["views"]
-        complete = document["format"] == _FORMAT and all((folder / "images" / f"{e['name']}.png").is_file() for e in entries)
+        complete = document["format"] == _FORMAT and all(
+            (folder / "images" / f"{e['name']}.png").is_file() for e in entries
+        )
     except (OSError, ValueError, KeyError, TypeError):
         return []
     return entries if complete else []
@@ -297,19 +323,25 @@ def _unpacked(folder: Path) -> list[dict[str, Any]]:
 
 def _entry(example: Example, folder: Path, held: bool) -> dict[str, Any]:
     """Writes the image; what is known of its camera."""
-    height, width = example.integer("height"), example.integer("width")
+    height = example.integer("height")
+    width = example.integer("width")
     if not (4 <= height <= 10**5 and 4 <= width <= 10**5):
         raise DataError(f"{example.where}: an image of {width}x{height} pixels; download the file again")
     origin, direction = (
-        example.numbers(name, 3 * height * width).reshape(height, width, 3) for name in ("ray_origins", "ray_dirs")
+        example.numbers(name, 3 * height * width).reshape(height, width, 3)
+        for name in ("ray_origins", "ray_dirs")
     )
     try:
         camera = fit_camera(origin, direction)
     except ValueError as error:
-        raise DataError(f"{example.where}: its rays are not those of a camera ({error}); leave its file out") from error
+        raise DataError(
+            f"{example.where}: its rays are not those of a camera ({error}); leave its file out"
+        ) from error
     exposure = float(example.numbers("equivalent_exposure", 1)[0])
     if exposure <= 0:
-        raise DataError(f"{example.where}: equivalent_exposure is {exposure}, it must be above 0; leave its file out")
+        raise DataError(
+            f"{example.where}: equivalent_exposure is {exposure}, it must be above 0; leave its file out"
+        )
     # The image under a name that says its camera.
     index = example.integer("cam_idx")
     # Hashes are unsigned: neither a minus nor an order by size belongs in a file's name.

@@ -1,10 +1,11 @@
 """COLMAP sparse models, binary or text, to scenes.
 
-Every count in a binary file is checked against the bytes that remain before anything is allocated, and every error says
-where in the file it was found.
+Every count in a binary file is checked against the bytes that remain before anything is allocated, and every
+error says where in the file it was found.
 
-COLMAP's lenses become ours; its world-to-camera poses in OpenCV axes become camera-to-world in OpenGL's. The world frame
-is kept. Each view's depths are the 0.1 and 99.9 percentile of the points that it observes (LLFF's rule).
+COLMAP's lenses become ours; its world-to-camera poses in OpenCV axes become camera-to-world in OpenGL's. The
+world frame is kept. Each view's depths are the 0.1 and 99.9 percentile of the points that it observes (LLFF's
+rule).
 """
 
 import contextlib
@@ -26,7 +27,16 @@ from ...rendering.splines import rotations
 from ..scene import ParsedScene
 from .config import ColmapConfig, model_folders
 from .files import NamedFiles, path_inside, read_bytes, read_float, read_npz, read_ply_points
-from .views import View, assemble_scene, index_tensor, lens_of, pixel_size, quaternion_rotation, read_views, rigid_pose
+from .views import (
+    View,
+    assemble_scene,
+    index_tensor,
+    lens_of,
+    pixel_size,
+    quaternion_rotation,
+    read_views,
+    rigid_pose,
+)
 
 MODELS = (
     ("SIMPLE_PINHOLE", "f cx cy"),
@@ -48,7 +58,9 @@ MODELS = (
     ("EUCM", "fx fy cx cy alpha beta"),
     ("EQUIRECTANGULAR", "w h"),
 )
-"""Name and parameters, in the order of COLMAP's model ids (4.2); k1 to k4 are the polynomial's, d1 to d3 a denominator's."""
+"""Name and parameters, in the order of COLMAP's model ids (4.2); k1 to k4 are the polynomial's, d1 to d3 a
+denominator's.
+"""
 
 
 @dataclass(frozen=True)
@@ -87,9 +99,15 @@ class ColmapModel:
 def read_model(folder: Path) -> ColmapModel:
     """The model in a folder: `cameras` and `images`, and `points3D` if it is there, .bin before .txt."""
     if (folder / "cameras.bin").is_file():
-        suffix, cameras_of, images_of, points_of = "bin", _cameras_bin, _images_bin, _points_bin
+        suffix = "bin"
+        cameras_of = _cameras_bin
+        images_of = _images_bin
+        points_of = _points_bin
     else:
-        suffix, cameras_of, images_of, points_of = "txt", _cameras_txt, _images_txt, _points_txt
+        suffix = "txt"
+        cameras_of = _cameras_txt
+        images_of = _images_txt
+        points_of = _points_txt
     cameras: dict[int, ColmapCamera] = {}
     for place, id_, camera in cameras_of(folder / f"cameras.{suffix}"):
         if id_ in cameras:
@@ -98,7 +116,9 @@ def read_model(folder: Path) -> ColmapModel:
     # Points may be absent: some tools write cameras and images alone.
     cloud = folder / f"points3D.{suffix}"
     images = list(images_of(folder / f"images.{suffix}"))
-    points = np.fromiter(points_of(cloud) if cloud.is_file() else (), np.dtype([("id", "i8"), ("xyz", "f8", 3)]))
+    points = np.fromiter(
+        points_of(cloud) if cloud.is_file() else (), np.dtype([("id", "i8"), ("xyz", "f8", 3)])
+    )
     return ColmapModel(cameras, images, points["id"], points["xyz"])
 
 
@@ -151,7 +171,9 @@ def _cameras_bin(path: Path) -> Iterator[tuple[str, int, ColmapCamera]]:
         # Models are numbers in these files, and their count of parameters follows from them.
         id_, model, width, height = file.take(_CAMERA, "a camera")
         if not 0 <= model < len(MODELS):
-            raise file.error(f"camera model {model} is unknown, 0 to {len(MODELS) - 1} are known; {_undistort(path.parent)}")
+            raise file.error(
+                f"camera model {model} is unknown, 0 to {len(MODELS) - 1} are known; {_undistort(path.parent)}"
+            )
         name, params = MODELS[int(model)]
         numbers = file.take(struct.Struct(f"<{len(params.split())}d"), "its parameters")
         yield f"byte {file.at}", int(id_), ColmapCamera(name, int(width), int(height), numbers)
@@ -174,7 +196,9 @@ def _images_bin(path: Path) -> Iterator[ColmapImage]:
         count = file.count(_FEATURE.itemsize, "features")
         point = np.frombuffer(file.data, dtype=_FEATURE, count=count, offset=file.at)["point"]
         file.at += count * _FEATURE.itemsize
-        yield ColmapImage(name, int(camera), (qw, qx, qy, qz), (tx, ty, tz), point[point >= 0].astype(np.int64))
+        yield ColmapImage(
+            name, int(camera), (qw, qx, qy, qz), (tx, ty, tz), point[point >= 0].astype(np.int64)
+        )
     file.end()
 
 
@@ -194,7 +218,9 @@ def _rows(path: Path) -> Iterator[tuple[str, list[str]]]:
 
 
 def _lines(path: Path) -> Iterator[tuple[str, str]]:
-    """The place and text of each line that is no comment; empty ones too. Blanks at its end may belong to a name."""
+    """The place and text of each line that is no comment; empty ones too. Blanks at its end may belong to a
+    name.
+    """
     try:
         text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -225,7 +251,9 @@ def _cameras_txt(path: Path) -> Iterator[tuple[str, int, ColmapCamera]]:
     known = dict(MODELS)
     for place, words in _rows(path):
         if len(words) >= 4 and words[1].isidentifier() and words[1] not in known:
-            raise DataError(f"{path}: {place}: the camera model {words[1]} is unknown; {_undistort(path.parent)}")
+            raise DataError(
+                f"{path}: {place}: the camera model {words[1]} is unknown; {_undistort(path.parent)}"
+            )
         if len(words) < 4 or words[1] not in known or len(words) != 4 + len(known[words[1]].split()):
             raise _bad(path, place, "not `ID MODEL WIDTH HEIGHT` and as many parameters as the model has")
         id_, width, height = _ints(path, place, [words[0], *words[2:4]])
@@ -235,7 +263,8 @@ def _cameras_txt(path: Path) -> Iterator[tuple[str, int, ColmapCamera]]:
 def _images_txt(path: Path) -> Iterator[ColmapImage]:
     lines = _lines(path)
     for place, line in lines:
-        # The name is the rest of the line; as bytes only ASCII's blanks part words, of which a name may begin with others.
+        # The name is the rest of the line; as bytes only ASCII's blanks part words, of which a name may begin
+        # with others.
         words = [word.decode() for word in line.encode().split(maxsplit=9)]
         if not words:
             continue
@@ -246,7 +275,11 @@ def _images_txt(path: Path) -> Iterator[ColmapImage]:
         below, features = next(lines, (place, ""))
         cells = features.split()
         if len(cells) % 3:
-            raise _bad(path, below, f"{len(cells)} numbers are no multiple of the three `X Y POINT3D_ID` of a feature")
+            raise _bad(
+                path,
+                below,
+                f"{len(cells)} numbers are no multiple of the three `X Y POINT3D_ID` of a feature",
+            )
         point = np.array(_ints(path, below, cells[2::3]), dtype=np.int64)
         yield ColmapImage(words[9], camera, (qw, qx, qy, qz), (tx, ty, tz), point[point >= 0])
 
@@ -283,11 +316,15 @@ def cloud_of_images(model: ColmapModel, observed: Sequence[NDArray[np.int64]]) -
     """Finite points of a model, and the pairs of views, in the order of `observed`, and points, each once."""
     # A view may observe a point with several features.
     views = [np.unique(rows) for rows in observed]
-    pairs = np.stack([np.repeat(np.arange(len(views)), [len(rows) for rows in views]), np.concatenate(views)], 1)
+    pairs = np.stack(
+        [np.repeat(np.arange(len(views)), [len(rows) for rows in views]), np.concatenate(views)], 1
+    )
     return _finite(model.points, pairs.astype(np.int64))
 
 
-def _finite(points: NDArray[np.float64], seen: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _finite(
+    points: NDArray[np.float64], seen: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """The points that are finite, and their pairs."""
     finite = np.asarray(np.isfinite(points).all(1))
     view, point = seen[finite[seen[:, 1]]].T
@@ -297,17 +334,19 @@ def _finite(points: NDArray[np.float64], seen: NDArray[np.int64]) -> tuple[NDArr
 def cloud_of_model(
     data: Path, views: Sequence[View], applied: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.int64] | None, list[str]]:
-    """The points of a folder's model whose images are these views, by file name and place, and their pairs; and notes.
+    """The points of a folder's model whose images are these views, by file name and place, and their pairs;
+    and notes.
 
-    None where it is another's or cannot be read. The views may stand as in the model, or moved by `applied` [3 4], which then
-    moves the points too.
+    None where it is another's or cannot be read. The views may stand as in the model, or moved by `applied`
+    [3 4], which then moves the points too.
     """
     folder = largest_model(data)[0]
     try:
         model = None if folder is None else read_model(folder)
     except DataError as fault:
         return None, None, [f"points are not read: {fault}"]
-    # The same images, by the names of their files, with as many of their folders (those of a rig's cameras) as tell them apart?
+    # The same images, by the names of their files, with as many of their folders (those of a rig's cameras)
+    # as tell them apart?
     names = [PurePosixPath(view.name).parts for view in views]
     depth = next(n for n in itertools.count(1) if len({name[-n:] for name in names}) == len(names))
     images = {PurePosixPath(image.name).parts[-depth:]: image for image in model.images} if model else {}
@@ -339,7 +378,9 @@ def read_cloud(path: Path, views: int) -> Cloud:
             return xyz[np.asarray(np.isfinite(xyz).all(1))], None
     seen = read_npz(path, "seen")
     if seen.ndim != 2 or seen.shape[1] != 2 or not ((seen >= 0) & (seen < (views, len(xyz)))).all():
-        raise DataError(f"{path}: seen is no [O 2] of {views} views and {len(xyz)} points; write it again or leave it out")
+        raise DataError(
+            f"{path}: seen is no [O 2] of {views} views and {len(xyz)} points; write it again or leave it out"
+        )
     return _finite(xyz, seen.astype(np.int64))
 
 
@@ -350,7 +391,9 @@ def _undistort(folder: Path, images: str = "IMAGES") -> str:
 
 
 def largest_model(data: Path) -> tuple[Path | None, list[str]]:
-    """Folder of the sparse model with the most images, the first of equals, and a note where there are several."""
+    """Folder of the sparse model with the most images, the first of equals, and a note where there are
+    several.
+    """
     folders = model_folders(data)
     if len(folders) < 2:
         return next(iter(folders), None), []
@@ -377,11 +420,14 @@ class ColmapParser(DataParser):
     def parse(self, data: Path, downscale: float, roles: Mapping[str, str] | None = None) -> ParsedScene:
         """The scene at 1/downscale of the size of the images in the chosen folder.
 
-        Of `roles`, train or test by file name, images without one are left out; else every 8th is for testing.
+        Of `roles`, train or test by file name, images without one are left out; else every 8th is for
+        testing.
         """
         folder, notes = largest_model(data)
         if folder is None:
-            raise DataError(f"{data}: no cameras.bin or cameras.txt in sparse/0, sparse or here; run COLMAP's mapper")
+            raise DataError(
+                f"{data}: no cameras.bin or cameras.txt in sparse/0, sparse or here; run COLMAP's mapper"
+            )
         # The model, and the files that its images are.
         model = read_model(folder)
         if not model.images:
@@ -394,14 +440,18 @@ class ColmapParser(DataParser):
             if roles is None or PurePosixPath(image.name).name in roles
         ]
         if not named:
-            raise DataError(f"{folder}: the model has none of the images that are asked for; are they another scene's?")
+            raise DataError(
+                f"{folder}: the model has none of the images that are asked for; are they another scene's?"
+            )
 
         def view(each: tuple[str, Path, ColmapImage, NDArray[np.int64]]) -> View:
             inner, path, image, rows = each
             where = f"{folder}: image {image.name!r}"
             camera = model.cameras.get(image.camera)
             if camera is None:
-                raise DataError(f"{where}: its camera {image.camera} is not in the model; export the model again")
+                raise DataError(
+                    f"{where}: its camera {image.camera} is not in the model; export the model again"
+                )
             # World to camera in OpenCV's axes becomes camera to world in OpenGL's: y and z turn round.
             back = quaternion_rotation(where, image.quaternion).T
             # A damaged translation may overflow; `rigid_pose` leaves out what is not finite.
@@ -414,8 +464,13 @@ class ColmapParser(DataParser):
             given = dict(zip(dict(MODELS)[camera.model].split(), camera.params, strict=True))
             focal = given.pop("f", 0.0)
             k = [given.pop(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
-            fx, fy, cx, cy = given.pop("fx", focal), given.pop("fy", focal), given.pop("cx", 0.0), given.pop("cy", 0.0)
-            distortion, lens = lens_of(own, camera.model, k, list(given.values()), _undistort(folder, str(root)))
+            fx = given.pop("fx", focal)
+            fy = given.pop("fy", focal)
+            cx = given.pop("cx", 0.0)
+            cy = given.pop("cy", 0.0)
+            distortion, lens = lens_of(
+                own, camera.model, k, list(given.values()), _undistort(folder, str(root))
+            )
             return View(
                 name=inner,
                 path=path,
@@ -437,18 +492,28 @@ class ColmapParser(DataParser):
             beside = (folder / "points3D.ply", folder / "input.ply", data / "input.ply")
             file = next((path for path in beside if path.is_file()), None)
             extra, said = (None, []) if file is None else read_ply_points(file)
-            points, notes = points if extra is None else extra, notes + said
+            points = points if extra is None else extra
+            notes = notes + said
         split = None
         if roles is not None:
             learned = [roles[PurePosixPath(image.name).name] == "train" for _, _, image, _ in kept]
             split = index_tensor(learned), index_tensor([not each for each in learned])
         return assemble_scene(
-            data, views, downscale=downscale, split=split, points=points, seen=seen, reduced=name != "images", notes=notes
+            data,
+            views,
+            downscale=downscale,
+            split=split,
+            points=points,
+            seen=seen,
+            reduced=name != "images",
+            notes=notes,
         )
 
 
 def _depths(points: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[float, float] | None:
-    """Bounds of the depths of the points that an image observes; None where they are too few for a percentile."""
+    """Bounds of the depths of the points that an image observes; None where they are too few for a
+    percentile.
+    """
     # Damaged coordinates may overflow; what is not finite is left out.
     with np.errstate(over="ignore", invalid="ignore"):
         depth = (points - pose[:, 3]) @ -pose[:, 2]

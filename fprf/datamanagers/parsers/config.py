@@ -1,7 +1,9 @@
-"""Parser configs, the files that each format is known by, and the choice among all parsers that are installed.
+"""Parser configs, the files that each format is known by, and the choice among all parsers that are
+installed.
 
-Confidence of the built-in formats: 0.6 to 0.9 where files were prepared for training, 0.5 for a reconstruction that comes
-with its images, 0.3 for raw recordings. Prepared folders often hold the reconstruction that they were made of.
+Confidence of the built-in formats: 0.6 to 0.9 where files were prepared for training, 0.5 for a
+reconstruction that comes with its images, 0.3 for raw recordings. Prepared folders often hold the
+reconstruction that they were made of.
 """
 
 from __future__ import annotations
@@ -35,7 +37,9 @@ class Recognised(NamedTuple):
 
 
 def model_folders(data: Path) -> list[Path]:
-    """Folders of COLMAP's models in a scene folder: sparse/0, sparse/1, ... sparse, the folder itself, colmap/sparse/0, ..."""
+    """Folders of COLMAP's models in a scene folder: sparse/0, sparse/1, ... sparse, the folder itself,
+    colmap/sparse/0, ...
+    """
     numbered = [sorted(path for path in (data / place).glob("*")) for place in ("sparse", "colmap/sparse")]
     folders = [*numbered[0], data / "sparse", data, *numbered[1]]
     return [each for each in folders if (each / "cameras.bin").is_file() or (each / "cameras.txt").is_file()]
@@ -47,10 +51,16 @@ def is_record(name: str) -> bool:
 
 
 def keyframes(data: Path) -> list[tuple[Path, Path]]:
-    """Folders of Polycam's images and cameras, corrected ones first; they lie in `keyframes`, which `data` may be."""
+    """Folders of Polycam's images and cameras, corrected ones first; they lie in `keyframes`, which `data`
+    may be.
+    """
     for root in (data / "keyframes", data):
         pairs = [(root / f"{kind}images", root / f"{kind}cameras") for kind in ("corrected_", "")]
-        there = [(images, cameras) for images, cameras in pairs if images.is_dir() and next(cameras.glob("[!.]*.json"), None)]
+        there = [
+            (images, cameras)
+            for images, cameras in pairs
+            if images.is_dir() and next(cameras.glob("[!.]*.json"), None)
+        ]
         if there:
             return there
     return []
@@ -76,7 +86,8 @@ class DataParserConfig(PluginConfig):
     group: ClassVar[str] = "fprf.dataparsers"
 
     def recognises(self, data: Path) -> Recognised | None:
-        """The confidence that `data`, which may be absent or a file, is of this format, by file names alone; None = not.
+        """The confidence that `data`, which may be absent or a file, is of this format, by file names alone;
+        None = not.
 
         By default None: such a parser is used only where it is chosen by name.
         """
@@ -105,14 +116,19 @@ class LlffConfig(DataParserConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class TransformsConfig(DataParserConfig):
-    """Nerfstudio and instant-ngp `transforms.json`, or Blender's `transforms_train.json` and `transforms_test.json`."""
+    """Nerfstudio and instant-ngp `transforms.json`, or Blender's `transforms_train.json` and
+    `transforms_test.json`.
+    """
 
     file: str = ""
-    """One JSON file of the folder, for example transforms_4.json; empty = transforms.json, else Blender's pair, else the
-    only transforms*.json."""
+    """One JSON file of the folder, for example transforms_4.json; empty = transforms.json, else Blender's
+    pair, else the only transforms*.json.
+    """
 
     def recognises(self, data: Path) -> Recognised | None:
-        """By `transforms.json` or `transforms_train.json`, with less confidence by the only other transforms*.json."""
+        """By `transforms.json` or `transforms_train.json`, with less confidence by the only other
+        transforms*.json.
+        """
         names = sorted(path.name for path in data.glob("transforms*.json"))
         known = [name for name in names if name in ("transforms.json", "transforms_train.json")]
         if known:
@@ -127,10 +143,14 @@ class TransformsConfig(DataParserConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapConfig(DataParserConfig):
-    """A COLMAP sparse model, binary or text: of those in `sparse/*`, `sparse` and the folder itself that of the most images."""
+    """A COLMAP sparse model, binary or text: of those in `sparse/*`, `sparse` and the folder itself that of
+    the most images.
+    """
 
     images: str = "images"
-    """Image folder. `images_N` holds images reduced by N: the model's cameras are then scaled to their size."""
+    """Image folder. `images_N` holds images reduced by N: the model's cameras are then scaled to their
+    size.
+    """
 
     def recognises(self, data: Path) -> Recognised | None:
         folder = next(iter(model_folders(data)), None)
@@ -148,7 +168,9 @@ class GardenConfig(DataParserConfig):
 
     def recognises(self, data: Path) -> Recognised | None:
         """By the path `garden`, where there is no such folder, or one that a run of it has begun or left."""
-        left = data.is_dir() and ((data / "config.json").is_file() or all(each.name.startswith(".") for each in data.iterdir()))
+        left = data.is_dir() and (
+            (data / "config.json").is_file() or all(each.name.startswith(".") for each in data.iterdir())
+        )
         mine = data == Path("garden") and (left or not data.exists())
         return Recognised(0.1 if left else 1.0, "the embedded scene") if mine else None
 
@@ -165,7 +187,9 @@ class BlockNerfConfig(DataParserConfig):
     cameras: tuple[int, ...] = ()
     """Numbers of the cameras that are used; empty = all."""
     tolerance: float = 1.0
-    """Pixels (root mean square) by which an image's rays may differ from those of the camera that is fitted to them."""
+    """Pixels (root mean square) by which an image's rays may differ from those of the camera that is fitted
+    to them.
+    """
 
     def __post_init__(self) -> None:
         for number in self.cameras:
@@ -174,7 +198,11 @@ class BlockNerfConfig(DataParserConfig):
 
     def recognises(self, data: Path) -> Recognised | None:
         """By TFRecord files, at most three folders down."""
-        names = (path.name for depth in ("*", "*/*", "*/*/*", "*/*/*/*") for path in data.glob(f"{depth}.tfrecord*"))
+        names = (
+            path.name
+            for depth in ("*", "*/*", "*/*/*", "*/*/*/*")
+            for path in data.glob(f"{depth}.tfrecord*")
+        )
         record = next(filter(is_record, names), None)
         return Recognised(0.3, record) if record is not None else None
 
@@ -252,7 +280,9 @@ class Record3DConfig(DataParserConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class OdmConfig(DataParserConfig):
-    """OpenDroneMap's projects (ODM, WebODM): photographs with `opensfm/reconstruction.json` or `odm_report/shots.geojson`."""
+    """OpenDroneMap's projects (ODM, WebODM): photographs with `opensfm/reconstruction.json` or
+    `odm_report/shots.geojson`.
+    """
 
     images: str = "images"
     """Folder of the photographs, of any size."""
@@ -268,13 +298,15 @@ class OdmConfig(DataParserConfig):
 
 
 def recognise(data: Path) -> DataParserConfig:
-    """The parser with the highest confidence, with its defaults; `garden`, where no such folder exists, is the embedded scene.
+    """The parser with the highest confidence, with its defaults; `garden`, where no such folder exists, is
+    the embedded scene.
 
-    A parser that raises is skipped, with a warning on standard error. Raises DataError where no parser recognises the folder,
-    or where several have the same confidence.
+    A parser that raises is skipped, with a warning on standard error. Raises DataError where no parser
+    recognises the folder, or where several have the same confidence.
     """
     # Every installed parser is asked; those of the highest confidence are kept.
-    group, best = DataParserConfig.group, 0.0
+    group = DataParserConfig.group
+    best = 0.0
     surest: dict[str, tuple[DataParserConfig, str]] = {}
     for name, entries in registry.installed(group).items():
         try:
@@ -299,9 +331,15 @@ def recognise(data: Path) -> DataParserConfig:
     if not data.exists():
         raise DataError(f"{data}: no such folder; give a scene folder, or `garden` for the embedded one")
     if not data.is_dir():
-        raise DataError(f"{data}: a file; give the scene folder that it lies in, and name it with the parser's own field")
+        raise DataError(
+            f"{data}: a file; give the scene folder that it lies in, and name it with the parser's own field"
+        )
     names = sorted(path.name + "/" * path.is_dir() for path in data.iterdir())
-    content = f"{len(names)} entries ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})" if names else "nothing"
+    content = (
+        f"{len(names)} entries ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})"
+        if names
+        else "nothing"
+    )
     raise DataError(
         f"{data}: no transforms.json, sparse/0/cameras.bin or other file that a parser knows, but {content}; "
         "choose a parser with --datamanager.parser NAME, for Gaussians --parser NAME "
@@ -310,9 +348,11 @@ def recognise(data: Path) -> DataParserConfig:
 
 
 def parse_scene(data: Path, downscale: float, parser: DataParserConfig | None) -> ParsedScene:
-    """The scene of a folder at 1/downscale of its size, by the parser that is named or, without one, recognised.
+    """The scene of a folder at 1/downscale of its size, by the parser that is named or, without one,
+    recognised.
 
-    Where the capture lies far from 0 the scene is in a local frame, whatever the parser (`ParsedScene.origin`).
+    Where the capture lies far from 0 the scene is in a local frame, whatever the parser
+    (`ParsedScene.origin`).
     """
     from ..scene import in_local_frame
 

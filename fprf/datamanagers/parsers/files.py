@@ -1,7 +1,8 @@
-"""Untrusted files of a scene folder: JSON and its records, paths that stay inside, NumPy arrays without pickle, PLY points.
+"""Untrusted files of a scene folder: JSON and its records, paths that stay inside, NumPy arrays without
+pickle, PLY points.
 
-Whatever the bytes, the outcome is a value or a DataError of one line; nothing is allocated on a file's word alone.
-Links inside the folder are followed: only what a file *says* must stay inside.
+Whatever the bytes, the outcome is a value or a DataError of one line; nothing is allocated on a file's word
+alone. Links inside the folder are followed: only what a file *says* must stay inside.
 """
 
 import io
@@ -40,11 +41,15 @@ def read_bytes(path: Path) -> bytes:
 
 
 _NOT_FINITE = re.compile(r'"(?:[^"\\]|\\.)*"|[+-]?\b(nan(?:\(\w*\))?|inf(?:inity)?|1\.#\w+)', re.IGNORECASE)
-"""Strings of JSON, which are left alone, and what C++ writes of numbers that are not finite: -nan(ind), inf, 1.#QNAN."""
+"""Strings of JSON, which are left alone, and what C++ writes of numbers that are not finite: -nan(ind), inf,
+1.#QNAN.
+"""
 
 
 def read_json(path: Path) -> Json:
-    """The JSON value of a file (see `parse_json`), numbers that are not finite included, however they are written."""
+    """The JSON value of a file (see `parse_json`), numbers that are not finite included, however they are
+    written.
+    """
     data = read_bytes(path)
     try:
         # Strict first: only where that fails is the text searched for what C++ writes instead of numbers.
@@ -54,12 +59,16 @@ def read_json(path: Path) -> Json:
         except ValueError:
             value = parse_json(_NOT_FINITE.sub(lambda found: "NaN" if found[1] else found[0], text), nan=True)
     except ValueError as error:
-        raise DataError(f"{path}: no valid JSON ({error}); write it again with the tool it came from") from error
+        raise DataError(
+            f"{path}: no valid JSON ({error}); write it again with the tool it came from"
+        ) from error
     return value
 
 
 def read_float(text: str) -> float:
-    """A number as text; NaN for what C++ writes of those that are not finite. Raises ValueError for anything else."""
+    """A number as text; NaN for what C++ writes of those that are not finite. Raises ValueError for anything
+    else.
+    """
     return math.nan if _NOT_FINITE.fullmatch(text) else float(text)
 
 
@@ -68,12 +77,15 @@ _CONTROL = re.compile("[\0-\x08\n-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 def path_inside(root: Path, where: str, text: str) -> tuple[str, Path]:
-    """A path that a file gives, relative to `root` or absolute: its normal form with slashes, and the whole path.
+    """A path that a file gives, relative to `root` or absolute: its normal form with slashes, and the whole
+    path.
 
     Raises DataError, opened by `where`, for paths that leave `root`, for none, and for control characters.
     """
     if control := _CONTROL.search(text):
-        raise DataError(f"{where}: the path {text!r} has the control character {control[0]!r} in it; rename the file")
+        raise DataError(
+            f"{where}: the path {text!r} has the control character {control[0]!r} in it; rename the file"
+        )
     # A backslash is Windows' slash, except where a file is called so.
     name = text if "\\" in text and os.path.lexists(os.path.join(root, text)) else text.replace("\\", "/")
     foreign = os.name != "nt" and PureWindowsPath(text).is_absolute()
@@ -82,21 +94,26 @@ def path_inside(root: Path, where: str, text: str) -> tuple[str, Path]:
         if whole.is_relative_to(top) and not foreign:
             parts = whole.relative_to(top).parts
             if not parts:
-                raise DataError(f"{where}: the path {text!r} names no file; give one inside of {root}, like images/0001.png")
+                raise DataError(
+                    f"{where}: the path {text!r} names no file; give one inside of {root}, like images/0001.png"
+                )
             return "/".join(parts), root.joinpath(*parts)
     raise DataError(f"{where}: the path {text!r} leaves {root}; give paths inside, like images/0001.png")
 
 
 class NamedFiles:
-    """Files inside a folder by the names that a capture gives them, which other systems may have spelt another way."""
+    """Files inside a folder by the names that a capture gives them, which other systems may have spelt
+    another way.
+    """
 
     def __init__(self, root: Path) -> None:
         self.root = root
         self._listed: dict[Path, dict[str, str]] = {}
 
     def find(self, where: str, text: str, suffixes: frozenset[str] = frozenset()) -> tuple[str, Path]:
-        """The path as `path_inside` gives it, and where no such file is, that of the one file whose name differs in case,
-        outer blanks or Unicode's normal form (macOS), or by one of `suffixes`, in lower case, that the path lacks.
+        """The path as `path_inside` gives it, and where no such file is, that of the one file whose name
+        differs in case, outer blanks or Unicode's normal form (macOS), or by one of `suffixes`, in lower
+        case, that the path lacks.
         """
         name, path = path_inside(self.root, where, text)
         if os.path.lexists(path):
@@ -105,8 +122,11 @@ class NamedFiles:
         if path.parent not in self._listed:
             listed: dict[str, str] = {}
             names = os.listdir(path.parent) if path.parent.is_dir() else []
-            for entry in sorted(names, key=lambda entry: (not entry.lower().endswith(".png"), entry)):  # PNG before JPEG
-                whole, suffix = _spelling(entry), os.path.splitext(entry)[1]
+            for entry in sorted(
+                names, key=lambda entry: (not entry.lower().endswith(".png"), entry)
+            ):  # PNG before JPEG
+                whole = _spelling(entry)
+                suffix = os.path.splitext(entry)[1]
                 # Two files of one spelling are told apart by nothing: neither is found.
                 listed[whole] = "" if whole in listed else entry
                 if suffix.lower() in suffixes:
@@ -124,7 +144,9 @@ def _spelling(name: str) -> str:
 
 
 def read_ply_points(path: Path) -> tuple[NDArray[np.float64] | None, list[str]]:
-    """The finite positions [P 3] of a PLY file, text or binary; where there are none, None and a note that says why."""
+    """The finite positions [P 3] of a PLY file, text or binary; where there are none, None and a note that
+    says why.
+    """
     from trimesh.exchange.ply import load_ply
 
     try:
@@ -133,7 +155,9 @@ def read_ply_points(path: Path) -> tuple[NDArray[np.float64] | None, list[str]]:
     except DataError as fault:
         return None, [f"points are not read: {fault}"]
     except Exception as error:  # whatever trimesh makes of the bytes
-        return None, [f"points are not read: {path}: no PLY file with points ({' '.join(str(error).split())[:80]})"]
+        return None, [
+            f"points are not read: {path}: no PLY file with points ({' '.join(str(error).split())[:80]})"
+        ]
     points = points[np.isfinite(points).all(1)]
     return (points, []) if len(points) else (None, [f"points are not read: {path}: holds none"])
 
@@ -144,16 +168,21 @@ def name_of(data: Path) -> str:
 
 
 def read_npy(where: str, data: bytes) -> NDArray[np.float64]:
-    """The numbers of a .npy file as float64; DataError, opened by `where`, for anything but a whole numeric array."""
+    """The numbers of a .npy file as float64; DataError, opened by `where`, for anything but a whole numeric
+    array.
+    """
     stream = io.BytesIO(data)
     try:
         version = npy.read_magic(stream)
         read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         shape, fortran, dtype = read_header(stream)
     except Exception as error:  # the header is a literal of Python, and says so in many ways
-        raise DataError(f"{where}: no NumPy array ({' '.join(str(error).split())[:80]}); write it with numpy.save") from error
+        raise DataError(
+            f"{where}: no NumPy array ({' '.join(str(error).split())[:80]}); write it with numpy.save"
+        ) from error
     # The header's word must fit the bytes that follow, before anything is made of them.
-    count, held = math.prod(shape), len(data) - stream.tell()
+    count = math.prod(shape)
+    held = len(data) - stream.tell()
     if dtype.kind not in "fiu" or min(shape, default=0) < 0 or count * dtype.itemsize != held:
         raise DataError(
             f"{where}: the header says {shape} of {dtype}, but {held} bytes follow; numbers are read: write them with "
@@ -169,16 +198,32 @@ def read_npz(path: Path, key: str) -> NDArray[np.float64]:
         with zipfile.ZipFile(path) as archive:
             entry = archive.getinfo(f"{key}.npy")
             if entry.file_size > _MAX_ARRAY:
-                raise DataError(f"{path}: {key} claims {entry.file_size} bytes; at most {_MAX_ARRAY} are read: thin it out")
+                raise DataError(
+                    f"{path}: {key} claims {entry.file_size} bytes; at most {_MAX_ARRAY} are read: thin it out"
+                )
             # What is claimed is allocated before it is read.
             held = path.stat().st_size
             if entry.compress_size > held or entry.file_size > _RATIO * held:
-                raise DataError(f"{path}: {key} claims {entry.file_size} bytes, but the file has {held}; copy it again")
+                raise DataError(
+                    f"{path}: {key} claims {entry.file_size} bytes, but the file has {held}; copy it again"
+                )
             data = archive.read(entry)
     except KeyError as error:
-        raise DataError(f"{path}: no array {key!r} in it; write it with numpy.savez(..., {key}=...)") from error
-    except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error, OverflowError) as error:
-        raise DataError(f"{path}: no readable .npz archive ({error}); write it again with numpy.savez") from error
+        raise DataError(
+            f"{path}: no array {key!r} in it; write it with numpy.savez(..., {key}=...)"
+        ) from error
+    except (
+        OSError,
+        ValueError,
+        EOFError,
+        RuntimeError,
+        zipfile.BadZipFile,
+        zlib.error,
+        OverflowError,
+    ) as error:
+        raise DataError(
+            f"{path}: no readable .npz archive ({error}); write it again with numpy.savez"
+        ) from error
     return read_npy(f"{path}: {key}", data)
 
 
@@ -251,18 +296,24 @@ class Record:
         return rows
 
     def _wrong(self, key: str, wanted: str) -> DataError:
-        return DataError(f"{self.where}: {key} is {_short(self.get(key))}, not {wanted}; correct it, or export it again")
+        return DataError(
+            f"{self.where}: {key} is {_short(self.get(key))}, not {wanted}; correct it, or export it again"
+        )
 
     def records(self, key: str) -> "list[Record]":
         """A list of objects, each falling back to this one."""
         value = self.own.get(key)
         if not isinstance(value, list) or not value:
-            raise DataError(f"{self.where}: no list of {key}, or an empty one; an entry for each image is needed")
+            raise DataError(
+                f"{self.where}: no list of {key}, or an empty one; an entry for each image is needed"
+            )
         return [as_record(f"{self.where}: {key}[{k}]", item, self.own) for k, item in enumerate(value)]
 
 
 def _number(value: Json) -> float | None:
-    """A number of JSON as float64, finite or not; None for anything else, and beyond 1e300, where products overflow."""
+    """A number of JSON as float64, finite or not; None for anything else, and beyond 1e300, where products
+    overflow.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float) or 1e300 < abs(value) < math.inf:
         return None
     return float(value)
@@ -285,5 +336,11 @@ def as_record(where: str | Path, value: Json, common: dict[str, Json] | None = N
 def _short(value: Json) -> str:
     if value is None:
         return "missing"
-    text = repr(value) if not isinstance(value, dict | list) else "a list" if isinstance(value, list) else "an object"
+    text = (
+        repr(value)
+        if not isinstance(value, dict | list)
+        else "a list"
+        if isinstance(value, list)
+        else "an object"
+    )
     return text if len(text) <= 60 else text[:57] + "..."

@@ -1,8 +1,8 @@
 """LLFF captures: `poses_bounds.npy`, one row an image in the order of their names.
 
-A row is a 3x5 matrix [R | t | (height, width, focal)] and the nearest and farthest depth. Columns of R are the camera's
-down, right and back axes in the world; ours are right, up and back. The world frame is kept. Points are those of the COLMAP
-model that the poses came from, where it is there.
+A row is a 3x5 matrix [R | t | (height, width, focal)] and the nearest and farthest depth. Columns of R are
+the camera's down, right and back axes in the world; ours are right, up and back. The world frame is kept.
+Points are those of the COLMAP model that the poses came from, where it is there.
 """
 
 import re
@@ -27,13 +27,22 @@ class LlffParser(DataParser):
         self.config = config
 
     def parse(self, data: Path, downscale: float) -> ParsedScene:
-        """The scene at 1/downscale of the images in the chosen folder, whatever size the poses were estimated at."""
+        """The scene at 1/downscale of the images in the chosen folder, whatever size the poses were estimated
+        at.
+        """
         file = data / "poses_bounds.npy"
         rows = read_npy(str(file), read_bytes(file))
         if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
-            raise DataError(f"{file}: an array of shape {rows.shape}; LLFF has one row of 17 numbers an image")
-        # The folder that is named, else the images as they were delivered, else the copies that are reduced least.
-        reduced = [path for path in data.glob("images_*") if re.fullmatch(r"images_[0-9]{1,4}", path.name) and path.is_dir()]
+            raise DataError(
+                f"{file}: an array of shape {rows.shape}; LLFF has one row of 17 numbers an image"
+            )
+        # The folder that is named, else the images as they were delivered, else the copies that are reduced
+        # least.
+        reduced = [
+            path
+            for path in data.glob("images_*")
+            if re.fullmatch(r"images_[0-9]{1,4}", path.name) and path.is_dir()
+        ]
         if self.config.images:
             folder = path_inside(data, "parser.images", self.config.images)[1]
         elif (data / "images").is_dir():
@@ -41,7 +50,9 @@ class LlffParser(DataParser):
         elif reduced:
             folder = min(reduced, key=lambda path: int(path.name.removeprefix("images_")))
         else:
-            raise DataError(f"{data}: poses_bounds.npy, but no folder images or images_N; put the images there")
+            raise DataError(
+                f"{data}: poses_bounds.npy, but no folder images or images_N; put the images there"
+            )
         names = image_names(folder)
         if len(names) != len(rows):
             raise DataError(
@@ -71,7 +82,13 @@ class LlffParser(DataParser):
 
         views, _, notes = read_views(data, enumerate(names), view)
         points, seen, said = cloud_of_model(data, views, np.eye(3, 4))
-        if names != sorted(names, key=lambda name: (len(name), name)) and all(Path(name).stem.isdecimal() for name in names):
-            notes.append(f"rows of poses_bounds.npy are taken in LLFF's order of names: {', '.join(names[:3])}, ...")
+        if names != sorted(names, key=lambda name: (len(name), name)) and all(
+            Path(name).stem.isdecimal() for name in names
+        ):
+            notes.append(
+                f"rows of poses_bounds.npy are taken in LLFF's order of names: {', '.join(names[:3])}, ..."
+            )
         notes += said
-        return assemble_scene(data, views, downscale=downscale, points=points, seen=seen, reduced=True, notes=notes)
+        return assemble_scene(
+            data, views, downscale=downscale, points=points, seen=seen, reduced=True, notes=notes
+        )

@@ -1,7 +1,9 @@
-"""Mega-NeRF's layout (Mill 19, Quad 6k, UrbanScene3D): `train` and `val`, each with `metadata/NAME.pt` and `rgbs/NAME.jpg`.
+"""Mega-NeRF's layout (Mill 19, Quad 6k, UrbanScene3D): `train` and `val`, each with `metadata/NAME.pt` and
+`rgbs/NAME.jpg`.
 
-Metadata are tensors written by torch.save: `H W c2w intrinsics`. They are read without running any code that they name. Poses
-are OpenGL's, in world axes down, right, back; `coordinates.pt` tells how many metres their unit is.
+Metadata are tensors written by torch.save: `H W c2w intrinsics`. They are read without running any code that
+they name. Poses are OpenGL's, in world axes down, right, back; `coordinates.pt` tells how many metres their
+unit is.
 """
 
 from pathlib import Path
@@ -23,14 +25,19 @@ class MegaNerfParser(DataParser):
     """`train` and `val` folders."""
 
     def parse(self, data: Path, downscale: float) -> ParsedScene:
-        """The scene at 1/downscale of the delivered size; `val` is held out. Lengths are metres where the capture says."""
+        """The scene at 1/downscale of the delivered size; `val` is held out. Lengths are metres where the
+        capture says.
+        """
         # Metres of a unit of the poses; 1 where nothing is said.
-        unit, path = 1.0, data / "coordinates.pt"
+        unit = 1.0
+        path = data / "coordinates.pt"
         if path.is_file():
             try:
                 unit = float(_load(path).get("pose_scale_factor", 1.0))
             except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-                raise DataError(f"{path}: pose_scale_factor is no number ({_first_line(error)}); write it again") from error
+                raise DataError(
+                    f"{path}: pose_scale_factor is no number ({_first_line(error)}); write it again"
+                ) from error
             if not 0 < unit < 1e9:
                 raise DataError(f"{path}: pose_scale_factor is {unit}; it must be above 0: write it again")
         # Both parts in one order by name.
@@ -43,7 +50,9 @@ class MegaNerfParser(DataParser):
                     f"{folder}: no *.pt files; name the folder of a scene, with train/metadata and train/rgbs in it"
                 )
         files.sort(key=lambda each: each[0].stem)
-        views, kept, notes = read_views(data, files, lambda each: _view(each[0], data / each[1] / "rgbs", unit))
+        views, kept, notes = read_views(
+            data, files, lambda each: _view(each[0], data / each[1] / "rgbs", unit)
+        )
         parts = split_by([split == "val" for _, split in kept])
         return assemble_scene(data, views, downscale=downscale, split=parts, reduced=True, notes=notes)
 
@@ -56,9 +65,13 @@ def _load(path: Path) -> dict[str, Any]:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # the unpickler raises whatever the bytes lead it to
-        raise DataError(f"{path}: no tensors of torch.save ({_first_line(error)}); copy the file again") from error
+        raise DataError(
+            f"{path}: no tensors of torch.save ({_first_line(error)}); copy the file again"
+        ) from error
     if not isinstance(content, dict):
-        raise DataError(f"{path}: holds a {type(content).__name__}, not names and tensors; copy the file again")
+        raise DataError(
+            f"{path}: holds a {type(content).__name__}, not names and tensors; copy the file again"
+        )
     return content
 
 

@@ -1,10 +1,11 @@
-"""OpenDroneMap's projects (ODM, WebODM): images with `opensfm/reconstruction.json`, or `odm_report/shots.geojson` with
-`cameras.json` where a download holds no more than those.
+"""OpenDroneMap's projects (ODM, WebODM): images with `opensfm/reconstruction.json`, or
+`odm_report/shots.geojson` with `cameras.json` where a download holds no more than those.
 
-OpenSfM's coordinates on the image plane have their origin in the middle and the larger side as their unit, so they hold for
-images of any size. A shot's `rotation` (axis times angle) and, in a reconstruction, `translation` take the world to the camera,
-whose x is right, y down and z forward. In shots.geojson `translation` is the camera's place in projected metres. Frames are
-kept. Of several reconstructions that of most shots is read. WebODM's download leaves the photographs out: put them in `images`.
+OpenSfM's coordinates on the image plane have their origin in the middle and the larger side as their unit, so
+they hold for images of any size. A shot's `rotation` (axis times angle) and, in a reconstruction,
+`translation` take the world to the camera, whose x is right, y down and z forward. In shots.geojson
+`translation` is the camera's place in projected metres. Frames are kept. Of several reconstructions that of
+most shots is read. WebODM's download leaves the photographs out: put them in `images`.
 """
 
 from collections.abc import Mapping
@@ -47,15 +48,21 @@ class OdmParser(DataParser):
         self.config = config
 
     def parse(self, data: Path, downscale: float) -> ParsedScene:
-        """The scene at 1/downscale of its photographs, with the reconstruction's points where they are there."""
+        """The scene at 1/downscale of its photographs, with the reconstruction's points where they are
+        there.
+        """
         file = project_file(data)
         if file is None:
             raise DataError(f"{data}: neither {' nor '.join(ODM_FILES)}; give the folder of an ODM project")
         # A whole project brings points; a report has poses alone.
-        shots, points = _reconstruction(file) if file.name == "reconstruction.json" else (_shots(data, file), None)
+        shots, points = (
+            _reconstruction(file) if file.name == "reconstruction.json" else (_shots(data, file), None)
+        )
         folder = path_inside(data, "parser.images", self.config.images)[1]
         files = NamedFiles(folder)
-        named = sorted(((*files.find(str(file), shot.name), shot) for shot in shots), key=lambda each: each[0])
+        named = sorted(
+            ((*files.find(str(file), shot.name), shot) for shot in shots), key=lambda each: each[0]
+        )
         views, _, notes = read_views(data, named, lambda each: _view(str(file), *each))
         return assemble_scene(data, views, downscale=downscale, points=points, notes=notes)
 
@@ -63,7 +70,9 @@ class OdmParser(DataParser):
 def _reconstruction(file: Path) -> tuple[list[_Shot], NDArray[np.float64]]:
     """Shots and points of the largest part."""
     whole = read_json(file)
-    parts = [as_record(f"{file}: [{k}]", part) for k, part in enumerate(whole)] if isinstance(whole, list) else []
+    parts = (
+        [as_record(f"{file}: [{k}]", part) for k, part in enumerate(whole)] if isinstance(whole, list) else []
+    )
     largest = max(parts, key=lambda part: len(_objects(part, "shots")), default=None)
     if largest is None or not _objects(largest, "shots"):
         raise DataError(f"{file}: no list of reconstructions with shots; run ODM again")
@@ -74,7 +83,8 @@ def _reconstruction(file: Path) -> tuple[list[_Shot], NDArray[np.float64]]:
         key = record.text("camera") or ""
         if key not in cameras:
             raise DataError(f"{record.where}: its camera {key!r} is none of cameras; run ODM again")
-        turn, offset = _turn(record), record.numbers("translation", 3)
+        turn = _turn(record)
+        offset = record.numbers("translation", 3)
         shots.append(_Shot(name, cameras[key], turn, -turn.T @ offset))
     points = [point.numbers("coordinates", 3) for point in _objects(largest, "points").values()]
     cloud = np.array(points).reshape(-1, 3)
@@ -89,20 +99,24 @@ def _shots(data: Path, file: Path) -> list[_Shot]:
     shots = []
     for feature in as_record(file, read_json(file)).records("features"):
         record = as_record(f"{feature.where}: properties", feature.own.get("properties"))
-        name, key = record.text("filename"), record.text("camera")
+        name = record.text("filename")
+        key = record.text("camera")
         if name is None:
             raise DataError(f"{record.where}: filename is missing; each shot names its image")
         if key is None and len(cameras) == 1:
             key = next(iter(cameras))
         if key is None or key not in cameras:
-            raise DataError(f"{record.where}: which of {len(cameras)} cameras took it is not said; keep {ODM_FILES[0]}")
+            raise DataError(
+                f"{record.where}: which of {len(cameras)} cameras took it is not said; keep {ODM_FILES[0]}"
+            )
         shots.append(_Shot(name, cameras[key], _turn(record), record.numbers("translation", 3)))
     return shots
 
 
 def _view(where: str, name: str, path: Path, shot: _Shot) -> View:
     width, height = image_size(path)
-    camera, longest = shot.camera, max(width, height)
+    camera = shot.camera
+    longest = max(width, height)
     # Another size is fine, another shape means that the photographs were cropped or turned.
     own = camera.number("width"), camera.number("height")
     if None not in own and abs((own[0] or 0) * height - (own[1] or 0) * width) > 2 * longest:
@@ -110,7 +124,9 @@ def _view(where: str, name: str, path: Path, shot: _Shot) -> View:
     # The lens, and the focal lengths in pixels: OpenSfM's unit is the longer side.
     kind = camera.text("projection_type") or "perspective"
     if kind not in _LENSES:
-        raise DataError(f"{camera.where}: projection_type {kind!r} is not read; known are {', '.join(_LENSES)}")
+        raise DataError(
+            f"{camera.where}: projection_type {kind!r} is not read; known are {', '.join(_LENSES)}"
+        )
     k = [camera.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
     distortion, lens = lens_of(camera.where, _LENSES[kind], k)
     fx, fy = (camera.number(key) or camera.number("focal") for key in ("focal_x", "focal_y"))
@@ -124,7 +140,10 @@ def _view(where: str, name: str, path: Path, shot: _Shot) -> View:
         size=(width, height),
         focal=(fx * longest, (fx if fy is None else fy) * longest),
         # OpenSfM counts pixels from the middle of the first one, we from its corner: the half cancels.
-        centre=(width / 2 + (camera.number("c_x") or 0) * longest, height / 2 + (camera.number("c_y") or 0) * longest),
+        centre=(
+            width / 2 + (camera.number("c_x") or 0) * longest,
+            height / 2 + (camera.number("c_y") or 0) * longest,
+        ),
         distortion=distortion,
         lens=lens,
     )
@@ -133,7 +152,9 @@ def _view(where: str, name: str, path: Path, shot: _Shot) -> View:
 def _turn(record: Record) -> NDArray[np.float64]:
     vector = record.numbers("rotation", 3)
     if np.abs(vector).max() > _TURN:
-        raise DataError(f"{record.where}: rotation is {vector.tolist()}, not an axis times an angle; run ODM again")
+        raise DataError(
+            f"{record.where}: rotation is {vector.tolist()}, not an axis times an angle; run ODM again"
+        )
     return np.asarray(cv2.Rodrigues(vector)[0], dtype=np.float64)
 
 

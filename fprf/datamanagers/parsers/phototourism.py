@@ -1,7 +1,8 @@
-"""Photo Tourism with a list: a COLMAP model of photographs from many hands, and a table of which are for training.
+"""Photo Tourism with a list: a COLMAP model of photographs from many hands, and a table of which are for
+training.
 
-The table (`*.tsv`: filename, id, split, dataset) is that of NeRF in the Wild; photographs without an id or not in it are left
-out. The model lies in the folder or in `dense`.
+The table (`*.tsv`: filename, id, split, dataset) is that of NeRF in the Wild; photographs without an id or
+not in it are left out. The model lies in the folder or in `dense`.
 """
 
 import csv
@@ -27,14 +28,18 @@ class PhotoTourismParser(DataParser):
         # The table says which photographs are used; their poses are those of the model beside it.
         tables = [data / self.config.list] if self.config.list else sorted(data.glob("[!.]*.tsv"))
         if len(tables) != 1:
-            raise DataError(f"{data}: {len(tables)} tables *.tsv; exactly one is needed, or its name in parser.list")
+            raise DataError(
+                f"{data}: {len(tables)} tables *.tsv; exactly one is needed, or its name in parser.list"
+            )
         table = tables[0]
         if not table.is_file():
             raise DataError(f"{table}: no such table; name one of the folder's with parser.list")
         inner = data / "dense" if not model_folders(data) and (data / "dense").is_dir() else data
         scene = ColmapParser(ColmapConfig()).parse(inner, downscale, read_list(table))
         if not len(scene.train):
-            raise DataError(f"{table}: none of its training photographs is in the model of {inner}; is it another scene's?")
+            raise DataError(
+                f"{table}: none of its training photographs is in the model of {inner}; is it another scene's?"
+            )
         return replace(scene, name=name_of(data))
 
 
@@ -48,9 +53,13 @@ def read_list(path: Path) -> dict[str, str]:
     # Photographs without an id were left out of the split.
     views = {}
     for number, row in enumerate(rows, 2):
-        name, split, id_ = row.get("filename"), row.get("split"), row.get("id")
+        name = row.get("filename")
+        split = row.get("split")
+        id_ = row.get("id")
         if not name or split is None or id_ is None:
-            raise DataError(f"{path}: line {number} lacks filename, id or split; they are columns apart by tabs")
+            raise DataError(
+                f"{path}: line {number} lacks filename, id or split; they are columns apart by tabs"
+            )
         if not id_.strip() or id_.strip().lower() == "nan":
             continue
         if split not in ("train", "test"):

@@ -1,9 +1,11 @@
-"""Polycam's raw data (LiDAR captures, developer mode): `keyframes/` with images and a JSON file for each camera.
+"""Polycam's raw data (LiDAR captures, developer mode): `keyframes/` with images and a JSON file for each
+camera.
 
-`corrected_images` and `corrected_cameras`, which Polycam writes after its global optimisation, are used for each frame that
-both have; else `images` and `cameras`. `t_00` ... `t_23` are camera to world, three rows of four, in OpenGL axes (ARKit's: y is
-up in the world); `fx fy cx cy width height` are in pixels, and files without the last two belong to images as they are. The
-world frame is kept, in metres. An image without a camera is left out.
+`corrected_images` and `corrected_cameras`, which Polycam writes after its global optimisation, are used for
+each frame that both have; else `images` and `cameras`. `t_00` ... `t_23` are camera to world, three rows of
+four, in OpenGL axes (ARKit's: y is up in the world); `fx fy cx cy width height` are in pixels, and files
+without the last two belong to images as they are. The world frame is kept, in metres. An image without a
+camera is left out.
 """
 
 from pathlib import Path
@@ -26,22 +28,32 @@ class PolycamParser(DataParser):
         """The scene at 1/downscale of its images."""
         folders = keyframes(data)
         if not folders:
-            raise DataError(f"{data}: no keyframes/images with keyframes/cameras/*.json; export raw data from Polycam")
+            raise DataError(
+                f"{data}: no keyframes/images with keyframes/cameras/*.json; export raw data from Polycam"
+            )
         # Corrected frames come first and stay; images that no camera knows are counted.
         frames: dict[str, tuple[Path, Path]] = {}
         alone: set[str] = set()
         for images, cameras in folders:
             known = {path.stem for path in cameras.glob("[!.]*.json")}
-            paths = {path.stem: path for path in images.glob("[!.]*") if path.suffix.lower() in IMAGE_SUFFIXES}
-            frames = {stem: (path, cameras / f"{stem}.json") for stem, path in paths.items() if stem in known} | frames
+            paths = {
+                path.stem: path for path in images.glob("[!.]*") if path.suffix.lower() in IMAGE_SUFFIXES
+            }
+            frames = {
+                stem: (path, cameras / f"{stem}.json") for stem, path in paths.items() if stem in known
+            } | frames
             alone |= paths.keys()
         if not frames:
             images, cameras = folders[0]
-            raise DataError(f"{cameras}: no file has the name of an image in {images}; export the raw data again")
+            raise DataError(
+                f"{cameras}: no file has the name of an image in {images}; export the raw data again"
+            )
         views, kept, notes = read_views(data, [frames[stem] for stem in sorted(frames)], _view)
         corrected = sum(image.parent == folders[0][0] for image, _ in kept)
         if corrected < len(kept):
-            notes.append(f"{corrected} of {len(kept)} frames are in {folders[0][0].name}; the others are taken as recorded")
+            notes.append(
+                f"{corrected} of {len(kept)} frames are in {folders[0][0].name}; the others are taken as recorded"
+            )
         if alone := alone - frames.keys():
             notes.append(
                 f"{len(alone)} of {len(alone) + len(frames)} images have no camera and are left out, like {min(alone)}"

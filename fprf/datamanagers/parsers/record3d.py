@@ -1,8 +1,10 @@
-"""Record3D's exports of LiDAR videos: `metadata.json` with `rgb/` (EXR and JPG), or an unpacked .r3d: `metadata` with `rgbd/`.
+"""Record3D's exports of LiDAR videos: `metadata.json` with `rgb/` (EXR and JPG), or an unpacked .r3d:
+`metadata` with `rgbd/`.
 
-Images are numbered. `poses` has a row for each: a quaternion x y z w and the position, camera to world in OpenGL axes, metres.
-`perFrameIntrinsicCoeffs` has fx fy cx cy for each image; without it `K` holds for all, its 3x3 matrix column after column.
-Both are in pixels of the images, which are `w` by `h`, or as they are where the file says nothing.
+Images are numbered. `poses` has a row for each: a quaternion x y z w and the position, camera to world in
+OpenGL axes, metres. `perFrameIntrinsicCoeffs` has fx fy cx cy for each image; without it `K` holds for all,
+its 3x3 matrix column after column. Both are in pixels of the images, which are `w` by `h`, or as they are
+where the file says nothing.
 """
 
 import re
@@ -31,18 +33,26 @@ class Record3DParser(DataParser):
         """The scene at 1/downscale of its images: at most `frames` of them, evenly through the recording."""
         files = recording(data)
         if files is None:
-            raise DataError(f"{data}: no metadata.json with rgb/; export from Record3D as EXR and JPG, or unpack its .r3d")
+            raise DataError(
+                f"{data}: no metadata.json with rgb/; export from Record3D as EXR and JPG, or unpack its .r3d"
+            )
         file, folder = files
         record = as_record(file, read_json(file))
         # Numbered images belong to the rows of poses.
         poses = record.table("poses", 7)
-        numbered = sorted((int(Path(name).stem), name) for name in image_names(folder) if _NUMBER.fullmatch(Path(name).stem))
+        numbered = sorted(
+            (int(Path(name).stem), name) for name in image_names(folder) if _NUMBER.fullmatch(Path(name).stem)
+        )
         posed = [each for each in numbered if each[0] < len(poses)]
         if not posed:
             last = numbered[-1][1] if numbered else "nothing numbered"
-            raise DataError(f"{folder}: {last}, but {file.name} has {len(poses)} poses, from 0 on; export the recording again")
+            raise DataError(
+                f"{folder}: {last}, but {file.name} has {len(poses)} poses, from 0 on; export the recording again"
+            )
         if len(poses) > 1 and not np.nan_to_num(np.ptp(poses, axis=0), nan=1.0).any():
-            raise DataError(f"{file}: all poses are one (front cameras have none); find poses with `fprf process {folder}`")
+            raise DataError(
+                f"{file}: all poses are one (front cameras have none); find poses with `fprf process {folder}`"
+            )
         # fx fy cx cy of each image, or one K for all.
         lenses = np.zeros((0, 4))
         if record.get("perFrameIntrinsicCoeffs") is not None:
@@ -55,7 +65,8 @@ class Record3DParser(DataParser):
         def view(each: tuple[int, str]) -> View:
             number, name = each
             fx, fy, cx, cy = lenses[number].tolist()
-            where, row = f"{file}: poses[{number}]", poses[number]
+            where = f"{file}: poses[{number}]"
+            row = poses[number]
             # The file has x y z w, we w x y z.
             turn = quaternion_rotation(where, row[[3, 0, 1, 2]])
             return View(
@@ -69,5 +80,7 @@ class Record3DParser(DataParser):
 
         views, _, notes = read_views(data, [posed[k] for k in even], view)
         if len(posed) < len(numbered):
-            notes.append(f"{len(numbered) - len(posed)} of {len(numbered)} images have no pose and are left out")
+            notes.append(
+                f"{len(numbered) - len(posed)} of {len(numbered)} images have no pose and are left out"
+            )
         return assemble_scene(data, views, downscale=downscale, notes=notes)

@@ -1,11 +1,12 @@
-"""`transforms.json` of Nerfstudio and instant-ngp, and Blender's `transforms_train.json` / `transforms_test.json`.
+"""`transforms.json` of Nerfstudio and instant-ngp, and Blender's `transforms_train.json` /
+`transforms_test.json`.
 
-Poses are camera-to-world in OpenGL axes and are kept as they are (an `applied_transform` is not undone). Intrinsics
-(`fl_x fl_y cx cy w h`, else `camera_angle_x`; `distortion_params`, else `k1 k2 k3 k4 p1 p2`; `camera_model`; `near`, `far`)
-stand once or by frame.
-`mask_path` names an image's mask (black pixels are left out), `sky_mask_path` one of its sky (white).
-`points.npz` beside the file or the PLY file that `ply_file_path` names hold sparse points in the same frame; so does the
-COLMAP model, in `sparse/0` or elsewhere, that it was made of, whose points are moved by `applied_transform`.
+Poses are camera-to-world in OpenGL axes and are kept as they are (an `applied_transform` is not undone).
+Intrinsics (`fl_x fl_y cx cy w h`, else `camera_angle_x`; `distortion_params`, else `k1 k2 k3 k4 p1 p2`;
+`camera_model`; `near`, `far`) stand once or by frame. `mask_path` names an image's mask (black pixels are
+left out), `sky_mask_path` one of its sky (white). `points.npz` beside the file or the PLY file that
+`ply_file_path` names hold sparse points in the same frame; so does the COLMAP model, in `sparse/0` or
+elsewhere, that it was made of, whose points are moved by `applied_transform`.
 """
 
 import math
@@ -55,7 +56,8 @@ class TransformsParser(DataParser):
         # The frames of all files, by name.
         files = self._files(data)
         tops = [as_record(file, read_json(file)) for file, _ in files]
-        entries, inside = [], NamedFiles(data)
+        entries = []
+        inside = NamedFiles(data)
         for top, (_, role) in zip(tops, files, strict=True):
             for record in top.records("frames"):
                 text = record.text("file_path")
@@ -70,17 +72,22 @@ class TransformsParser(DataParser):
         if any(same):
             notes.append(f"frames that are written twice are read once: {sum(same)}")
         if tops[0].get("fisheye_crop_radius") is not None:
-            notes.append("fisheye_crop_radius is not applied: leave out what lies outside of the circle with masks/")
+            notes.append(
+                "fisheye_crop_radius is not applied: leave out what lies outside of the circle with masks/"
+            )
         points, seen, said = _cloud(inside, tops[0], once, views)
         split = _split(inside, tops, once, kept)
-        return assemble_scene(data, views, downscale=downscale, split=split, points=points, seen=seen, notes=notes + said)
+        return assemble_scene(
+            data, views, downscale=downscale, split=split, points=points, seen=seen, notes=notes + said
+        )
 
     def _files(self, data: Path) -> list[tuple[Path, str]]:
         if self.config.file:
             return [(path_inside(data, "parser.file", self.config.file)[1], "")]
         # Nerfstudio's file before Blender's pair, and any other name only where there is no doubt.
         single = data / "transforms.json"
-        train, test = data / "transforms_train.json", data / "transforms_test.json"
+        train = data / "transforms_train.json"
+        test = data / "transforms_test.json"
         if single.is_file():
             return [(single, "")]
         if train.is_file():
@@ -88,14 +95,18 @@ class TransformsParser(DataParser):
         others = list(data.glob("transforms*.json"))
         if len(others) == 1:
             return [(others[0], "")]
-        raise DataError(f"{data}: neither transforms.json nor transforms_train.json; name the file with parser.file")
+        raise DataError(
+            f"{data}: neither transforms.json nor transforms_train.json; name the file with parser.file"
+        )
 
 
 class GardenParser(DataParser):
     """Reads the scene that ships with the package, whatever folder is named."""
 
     def parse(self, data: Path, downscale: float) -> ParsedScene:
-        return TransformsParser(TransformsConfig()).parse(Path(str(resources.files("fprf") / "garden")), downscale)
+        return TransformsParser(TransformsConfig()).parse(
+            Path(str(resources.files("fprf") / "garden")), downscale
+        )
 
 
 def _cloud(
@@ -103,9 +114,11 @@ def _cloud(
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.int64] | None, list[str]]:
     """Sparse points, which views see them, and notes.
 
-    The points are those of points.npz, of `ply_file_path`, or of the COLMAP model that the transforms came from.
+    The points are those of points.npz, of `ply_file_path`, or of the COLMAP model that the transforms came
+    from.
     """
-    cloud, ply = inside.root / "points.npz", top.text("ply_file_path")
+    cloud = inside.root / "points.npz"
+    ply = top.text("ply_file_path")
     points, seen = read_cloud(cloud, len(entries)) if cloud.is_file() else (None, None)
     notes: list[str] = []
     if seen is not None and len(views) < len(entries):
@@ -128,8 +141,10 @@ def _view(entry: _Entry, inside: NamedFiles) -> View:
     record = entry.record
     # Without a size the intrinsics belong to the image as it is, and the principal point is its middle.
     size = stated_size(record.where, entry.path, record.number("w"), record.number("h"))
-    near, far = record.number("near"), record.number("far")
-    cx, cy = record.number("cx"), record.number("cy")
+    near = record.number("near")
+    far = record.number("far")
+    cx = record.number("cx")
+    cy = record.number("cy")
     distortion, lens = _lens(record)
     return View(
         name=entry.name,
@@ -154,7 +169,8 @@ def _named(entry: _Entry, inside: NamedFiles, key: str) -> Path | None:
 
 def _focal(record: Record, size: tuple[int, int]) -> tuple[float, float]:
     def one(key: str, angle_key: str, pixels: int) -> float | None:
-        focal, angle = record.number(key), record.number(angle_key)
+        focal = record.number(key)
+        angle = record.number(angle_key)
         if focal is not None or angle is None:
             return focal
         if math.isnan(angle):
@@ -164,16 +180,20 @@ def _focal(record: Record, size: tuple[int, int]) -> tuple[float, float]:
         return pixels / 2 / math.tan(angle / 2)
 
     # Either one serves for both.
-    fx, fy = one("fl_x", "camera_angle_x", size[0]), one("fl_y", "camera_angle_y", size[1])
+    fx = one("fl_x", "camera_angle_x", size[0])
+    fy = one("fl_y", "camera_angle_y", size[1])
     first = fy if fx is None else fx
     if first is None:
-        raise DataError(f"{record.where}: neither fl_x nor camera_angle_x; give the focal length in pixels as fl_x")
+        raise DataError(
+            f"{record.where}: neither fl_x nor camera_angle_x; give the focal length in pixels as fl_x"
+        )
     return first, first if fy is None else fy
 
 
 def _lens(record: Record) -> tuple[tuple[float, float, float, float, float, float], int]:
     # Nerfstudio's list in this order counts before single terms.
-    # Terms beyond six are those of lenses that cannot be represented: `lens_of` refuses them unless they are 0.
+    # Terms beyond six are those of lenses that cannot be represented: `lens_of` refuses them unless they are
+    # 0.
     k = [record.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
     if record.get("distortion_params") is not None:
         k = record.numbers("distortion_params", 6).tolist()
@@ -182,18 +202,26 @@ def _lens(record: Record) -> tuple[tuple[float, float, float, float, float, floa
     if model is None:
         model = "OPENCV_FISHEYE" if record.get("is_fisheye") is True else "OPENCV"
     if model not in _LENSES:
-        raise DataError(f"{record.where}: camera_model {model!r} is none of {', '.join(sorted(_LENSES))}; {UNDISTORT}")
+        raise DataError(
+            f"{record.where}: camera_model {model!r} is none of {', '.join(sorted(_LENSES))}; {UNDISTORT}"
+        )
     if model == "FULL_OPENCV":  # whose k4 is a denominator's; nerfstudio's OPENCV has a polynomial of four
-        k[3], others = 0.0, [k[3], *others]
+        others = [k[3], *others]
+        k[3] = 0.0
     return lens_of(record.where, model, k, others)
 
 
-def _split(inside: NamedFiles, tops: list[Record], entries: list[_Entry], kept: list[_Entry]) -> tuple[Tensor, Tensor] | None:
-    """Blender's two files, or the lists of file names of the one, among those kept; None: the rule decides."""
+def _split(
+    inside: NamedFiles, tops: list[Record], entries: list[_Entry], kept: list[_Entry]
+) -> tuple[Tensor, Tensor] | None:
+    """Blender's two files, or the lists of file names of the one, among those kept; None: the rule
+    decides.
+    """
     if len(tops) > 1:
         return index_tensor([e.role == "train" for e in kept]), index_tensor([e.role == "test" for e in kept])
     top = tops[0]
-    train, test = top.texts("train_filenames"), top.texts("test_filenames")
+    train = top.texts("train_filenames")
+    test = top.texts("test_filenames")
     if train is None and test is None:
         return None
     # What is listed must be there, and on one side.
@@ -202,16 +230,23 @@ def _split(inside: NamedFiles, tops: list[Record], entries: list[_Entry], kept: 
     for key, texts in (("train_filenames", train), ("test_filenames", test)):
         members = {inside.find(f"{top.where}: {key}", text, IMAGE_SUFFIXES)[0] for text in texts or ()}
         if not members <= names:
-            raise DataError(f"{top.where}: {key} has {min(members - names)!r}, which no frame is; remove it there")
+            raise DataError(
+                f"{top.where}: {key} has {min(members - names)!r}, which no frame is; remove it there"
+            )
         listed.append(members)
     both = listed[0] & listed[1]
     if both:
-        raise DataError(f"{top.where}: {min(both)!r} is in train_filenames and in test_filenames; remove it from one")
+        raise DataError(
+            f"{top.where}: {min(both)!r} is in train_filenames and in test_filenames; remove it from one"
+        )
     # A side without a list has the rest; where nothing is left for testing, the views for validation serve.
     learned = names - listed[1] if train is None else listed[0]
     held = listed[1]
     if test is None:
-        where, key = top.where, "val_filenames"
-        val = {inside.find(f"{where}: {key}", text, IMAGE_SUFFIXES)[0] for text in top.texts(key) or ()} - listed[0]
+        where = top.where
+        key = "val_filenames"
+        val = {
+            inside.find(f"{where}: {key}", text, IMAGE_SUFFIXES)[0] for text in top.texts(key) or ()
+        } - listed[0]
         held = names - listed[0] - val or val
     return index_tensor([e.name in learned for e in kept]), index_tensor([e.name in held for e in kept])

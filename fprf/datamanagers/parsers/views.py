@@ -1,8 +1,10 @@
-"""From what a capture says of each view to a `ParsedScene`: exact poses, sizes and images checked against files, masks.
+"""From what a capture says of each view to a `ParsedScene`: exact poses, sizes and images checked against
+files, masks.
 
-`masks/` says what is used (black is left out: people, cars, the capture's own shadow), `sky_masks/` what is sky (white). A mask
-of images/a/0001.jpg is masks/a/0001.jpg.png (as COLMAP has it), masks/a/0001.png or masks/a/0001.jpg. Images without one are
-used whole; a folder in which no mask carries an image's name is none.
+`masks/` says what is used (black is left out: people, cars, the capture's own shadow), `sky_masks/` what is
+sky (white). A mask of images/a/0001.jpg is masks/a/0001.jpg.png (as COLMAP has it), masks/a/0001.png or
+masks/a/0001.jpg. Images without one are used whole; a folder in which no mask carries an image's name is
+none.
 """
 
 import math
@@ -83,7 +85,8 @@ Entry = TypeVar("Entry")
 def read_views(
     data: Path, entries: Iterable[Entry], view: Callable[[Entry], View]
 ) -> tuple[list[View], list[Entry], list[str]]:
-    """The views of a capture's entries, the entries that they are of, and notes on those left out (see `UnusableView`).
+    """The views of a capture's entries, the entries that they are of, and notes on those left out (see
+    `UnusableView`).
 
     Raises DataError where images are missing, where one occurs twice, and where nothing is left.
     """
@@ -109,7 +112,9 @@ def read_views(
         if max(map(abs, numbers)) > 1e9:
             raise DataError(f"{one.path}: the camera's numbers {numbers} go beyond 1e9; calibrate again")
         if min(one.focal) <= 0:
-            raise DataError(f"{one.path}: the focal length is {min(one.focal)}, it must be above 0; calibrate again")
+            raise DataError(
+                f"{one.path}: the focal length is {min(one.focal)}, it must be above 0; calibrate again"
+            )
         if one.depths is not None and not 0 < one.depths[0] < one.depths[1]:
             raise DataError(
                 f"{one.path}: nearest and farthest depth are {one.depths[0]} and {one.depths[1]}, "
@@ -119,14 +124,17 @@ def read_views(
             raise DataError(f"{data}: the image {one.name} occurs twice; remove one of its cameras")
         views[one.name] = one
         kept.append(entry)
-    # A reconstruction may fail for single images, but a missing one is mostly a folder that was copied in part.
+    # A reconstruction may fail for single images, but a missing one is mostly a folder that was copied in
+    # part.
     count = len(views) + len(lost) + len(missing)
     if missing:
         raise DataError(
             f"{data}: {len(missing)} of {count} images are missing, the first is {missing[0]}; "
             "copy them there or remove their entries"
         )
-    notes = [f"{len(lost)} of {count} images are left out, whose camera is not finite: {lost[0]}"] if lost else []
+    notes = (
+        [f"{len(lost)} of {count} images are left out, whose camera is not finite: {lost[0]}"] if lost else []
+    )
     if not views:
         raise DataError(f"{data}: no view is left: {'; '.join(notes)}; run the reconstruction again")
     return list(views.values()), kept, notes
@@ -146,12 +154,16 @@ def pixel_size(where: str, width: float, height: float) -> tuple[int, int]:
         raise UnusableView(where)
     size = round(float(width)), round(float(height))
     if min(size) < 1 or max(size) > 10**6:
-        raise DataError(f"{where}: {width:g}x{height:g} pixels; a side has 1 to 1000000: correct it, or export it again")
+        raise DataError(
+            f"{where}: {width:g}x{height:g} pixels; a side has 1 to 1000000: correct it, or export it again"
+        )
     return size
 
 
 def stated_size(where: str, path: Path, width: float | None, height: float | None) -> tuple[int, int]:
-    """Width and height that a capture says of an image, and the image's own where it says none. Raises as the two above."""
+    """Width and height that a capture says of an image, and the image's own where it says none. Raises as the
+    two above.
+    """
     own = image_size(path)
     return pixel_size(where, own[0] if width is None else width, own[1] if height is None else height)
 
@@ -163,9 +175,11 @@ UNDISTORT = "undistort the images (`colmap image_undistorter` does) and write th
 def lens_of(
     where: str, model: str, distortion: Sequence[float], others: Sequence[float] = (), remedy: str = UNDISTORT
 ) -> tuple[tuple[float, float, float, float, float, float], int]:
-    """Distortion k1 k2 k3 k4 p1 p2 and lens of a camera model by COLMAP's name, whose `others` are its remaining parameters.
+    """Distortion k1 k2 k3 k4 p1 p2 and lens of a camera model by COLMAP's name, whose `others` are its
+    remaining parameters.
 
-    A polynomial without terms is a pinhole. Raises DataError, opened by `where`, for what the lenses cannot represent.
+    A polynomial without terms is a pinhole. Raises DataError, opened by `where`, for what the lenses cannot
+    represent.
     """
     if not np.isfinite([*distortion, *others]).all():
         raise UnusableView(where)
@@ -175,44 +189,68 @@ def lens_of(
             f"{where}: a panorama ({model}), which `colmap image_undistorter` cannot undistort either; cut the images "
             "into pinhole views, as COLMAP's panorama_sfm.py and `ns-process-data images --camera-type equirectangular` do"
         )
-    # A lens that is close to one of ours would bend rays a little wrong: any term that is left over refuses it.
+    # A lens that is close to one of ours would bend rays a little wrong: any term that is left over refuses
+    # it.
     fisheye = "FISHEYE" in model
     if any(others) or (fisheye and (p1 or p2)) or (model.endswith("PINHOLE") and any(distortion)):
-        known = "no terms" if model.endswith("PINHOLE") else "k1 k2 k3 k4" if fisheye else "k1 k2 k3 k4 p1 p2 in a polynomial"
+        known = (
+            "no terms"
+            if model.endswith("PINHOLE")
+            else "k1 k2 k3 k4"
+            if fisheye
+            else "k1 k2 k3 k4 p1 p2 in a polynomial"
+        )
         raise DataError(f"{where}: the lens {model} has more terms than are represented ({known}); {remedy}")
     return (k1, k2, k3, k4, p1, p2), FISHEYE if fisheye else OPENCV if any(distortion) else PINHOLE
 
 
 def quaternion_rotation(where: str, quaternion: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rotation [3 3] of a quaternion w x y z. Raises DataError, opened by `where`, unless its length is about 1."""
+    """The rotation [3 3] of a quaternion w x y z. Raises DataError, opened by `where`, unless its length is
+    about 1.
+    """
     length = math.hypot(*quaternion)
     if not math.isfinite(length):
         raise UnusableView(where)
     if not 0.9 < length < 1.1:
-        raise DataError(f"{where}: a quaternion of length {length:.3g} is no rotation; export the capture again")
+        raise DataError(
+            f"{where}: a quaternion of length {length:.3g} is no rotation; export the capture again"
+        )
     return rotations(torch.tensor(quaternion, dtype=torch.float64)[None])[0].numpy()
 
 
 def rigid_pose(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """A camera-to-world pose [3 4] from [3 4] or [4 4], its rotation made orthonormal to rounding.
 
-    Raises DataError, opened by `where`, for anything that is not a rotation and a finite position within 1e-3.
+    Raises DataError, opened by `where`, for anything that is not a rotation and a finite position within
+    1e-3.
     """
     if matrix.shape not in ((3, 4), (4, 4)):
-        raise DataError(f"{where}: the pose has the shape {matrix.shape}, not 3x4 or 4x4; run the reconstruction again")
+        raise DataError(
+            f"{where}: the pose has the shape {matrix.shape}, not 3x4 or 4x4; run the reconstruction again"
+        )
     if not np.isfinite(matrix).all():
         raise UnusableView(where)
     if matrix.shape == (4, 4) and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
-        raise DataError(f"{where}: the pose's last row is {matrix[3].tolist()}; write 0 0 0 1, or leave that row out")
+        raise DataError(
+            f"{where}: the pose's last row is {matrix[3].tolist()}; write 0 0 0 1, or leave that row out"
+        )
     # Scale, shear or a mirroring would go unnoticed until renders are wrong.
     rotation = matrix[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if not deviation <= _LOOSE or np.linalg.det(rotation) < 0:
-        kind = f"off by {deviation:.2g}, at most {_LOOSE} is repaired" if not deviation <= _LOOSE else "a reflection"
-        raise DataError(f"{where}: the pose holds no rotation ({kind}); remove scale and shear from the capture's poses")
+        kind = (
+            f"off by {deviation:.2g}, at most {_LOOSE} is repaired"
+            if not deviation <= _LOOSE
+            else "a reflection"
+        )
+        raise DataError(
+            f"{where}: the pose holds no rotation ({kind}); remove scale and shear from the capture's poses"
+        )
     if np.abs(matrix[:3, 3]).max() > _FAR:
-        raise DataError(f"{where}: the position {matrix[:3, 3].tolist()} lies beyond {_FAR:g}; run the reconstruction again")
+        raise DataError(
+            f"{where}: the position {matrix[:3, 3].tolist()} lies beyond {_FAR:g}; run the reconstruction again"
+        )
     # The nearest rotation: what is left of R = U S V^T without its stretching S.
     left, _, right = np.linalg.svd(rotation)
     return np.concatenate([left @ right, matrix[:3, 3:]], 1)
@@ -231,8 +269,8 @@ def assemble_scene(
 ) -> ParsedScene:
     """The scene of at least one view, in the given order; without a split every 8th view is held out.
 
-    The files' headers are read: their size must be the camera's, unless `reduced` says that the image folder holds
-    smaller copies of the same shape, which the cameras are then scaled to.
+    The files' headers are read: their size must be the camera's, unless `reduced` says that the image folder
+    holds smaller copies of the same shape, which the cameras are then scaled to.
     """
     # Sizes as the files have them, from headers alone.
     clear: list[Path] = []
@@ -259,7 +297,8 @@ def assemble_scene(
         lens=torch.tensor([view.lens for view in views], dtype=torch.int64),
     ).resized(torch.tensor(sizes))
     depths = [view.depths for view in views if view.depths is not None]
-    # Every 8th, from the first on, is for testing (LLFF); but a single view is for training: there must be something to learn.
+    # Every 8th, from the first on, is for testing (LLFF); but a single view is for training: there must be
+    # something to learn.
     held = [k % 8 == 0 and len(views) > 1 for k in range(len(views))]
     train, test = split or (index_tensor([not each for each in held]), index_tensor(held))
     return ParsedScene(
@@ -279,8 +318,12 @@ def assemble_scene(
     )
 
 
-def _masks(data: Path, views: Sequence[View], named: Sequence[Path | None], folder: str) -> tuple[Path | None, ...]:
-    """Masks of the views: those that the capture names, or where it names none, those that lie beside the images."""
+def _masks(
+    data: Path, views: Sequence[View], named: Sequence[Path | None], folder: str
+) -> tuple[Path | None, ...]:
+    """Masks of the views: those that the capture names, or where it names none, those that lie beside the
+    images.
+    """
     if any(named):
         missing = [path for path in named if path is not None and not os.path.isfile(path)]
         if missing:
@@ -290,7 +333,8 @@ def _masks(data: Path, views: Sequence[View], named: Sequence[Path | None], fold
     found: list[Path | None] = []
     for view in views:
         mask = None
-        # Beside the image's folder, or beside a folder around that, up to the scene's; images may lie in that itself.
+        # Beside the image's folder, or beside a folder around that, up to the scene's; images may lie in that
+        # itself.
         start = int(view.path.parent != data)
         for above in view.path.parents[start:]:
             if mask is None and (above / folder).is_dir():

@@ -1,8 +1,9 @@
-"""Compiled backward pass of the rasteriser of 3D Gaussians; blocks, splats and entries are those of `forward_kernels`.
+"""Compiled backward pass of the rasteriser of 3D Gaussians; blocks, splats and entries are those of
+`forward_kernels`.
 
-Of every entry SUMS floats are kept: the sums over its pixels of p, p dx, p dx^2, p dy, p dx dy, p dy^2, where p is
-dL / d ln alpha, then of weight times the gradient of each channel. Slots of one Gaussian lie together, so its sums have one
-order on any number of threads.
+Of every entry SUMS floats are kept: the sums over its pixels of p, p dx, p dx^2, p dy, p dx dy, p dy^2, where
+p is dL / d ln alpha, then of weight times the gradient of each channel. Slots of one Gaussian lie together,
+so its sums have one order on any number of threads.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg, var-annotated"
@@ -58,11 +59,17 @@ _BLOCK = SUMS * LANES
 
 
 @traced
-def _begin(row, memory, channels, geometry, bx, by, width, height, out, left, grad, grad_left, d, padded, area):
-    """Of four rows of pixels: transmittance; what is behind everything so far, times the gradient; the gradient."""
-    at, behind = row * (4 * LANES), []
+def _begin(
+    row, memory, channels, geometry, bx, by, width, height, out, left, grad, grad_left, d, padded, area
+):
+    """Of four rows of pixels: transmittance; what is behind everything so far, times the gradient; the
+    gradient.
+    """
+    at = row * (4 * LANES)
+    behind = []
     for k in range(4):
-        x, y = bx + 4 * k, by + row * 4
+        x = bx + 4 * k
+        y = by + row * 4
         store(memory, at + k * LANES, inside(memory, x, y, 0, width, height))
     if geometry:
         behind = [load(grad_left, d + padded * y) * load(left, d + padded * y) for y in range(4)]
@@ -86,7 +93,8 @@ def _composite_block(entry, block, memory, places, found, geometry):
     """Add a block to the sums of an entry: those of the shape, then of channels."""
     # Alpha as in the forward pass, and what it lets pass.
     dx, dy, a, b, c, d, *value = entry
-    dx, dy = dx + memory[block + places], dy + memory[block + places + LANES]
+    dx = dx + memory[block + places]
+    dy = dy + memory[block + places + LANES]
     power = d + dx * (a * dx + b * dy) + c * dy * dy
     alpha = alpha_of(power)
     at = block * LANES
@@ -107,7 +115,8 @@ def _composite_block(entry, block, memory, places, found, geometry):
     store(memory, at + TILE, behind)
     p = gain - behind * (alpha / (1 - alpha))
     p = where_greater(_LOG_MAX, power, p, 0)  # a cut alpha does not move
-    px, py = p * dx, p * dy
+    px = p * dx
+    py = p * dy
     moments = (p, px, px * dx, py, px * dy, py * dy)
     return *(each + moment for each, moment in zip(shape, moments, strict=True)), *summed
 
@@ -118,37 +127,48 @@ def _keep(summed, found, at):
 
 
 def _composite_back(channels, geometry):
-    places, count = TILE * (2 + channels), channels + GEOMETRY * geometry
+    places = TILE * (2 + channels)
+    count = channels + GEOMETRY * geometry
     room = places + 2 * LANES
 
     @jit
     def composite_back(
         counters, start, ids, slots, blocks, splats_in, values, stride, offset, width, height, out, left, grad, grad_left, found
     ):  # fmt: skip
-        across, down = (width + SIDE - 1) // SIDE, (height + SIDE - 1) // SIDE
-        padded, area = across * SIDE, across * SIDE * down * SIDE
+        across = (width + SIDE - 1) // SIDE
+        down = (height + SIDE - 1) // SIDE
+        padded = across * SIDE
+        area = across * SIDE * down * SIDE
         memory = stack(room)
         block_places(memory, places)
         while True:
             tile = take(counters, 0)
             if tile >= across * down:
                 break
-            bx, by = tile % across * SIDE, tile // across * SIDE
+            bx = tile % across * SIDE
+            by = tile // across * SIDE
             for row in range(4):
                 d = (by + 4 * row) * padded + bx
                 _begin(
                     row, memory, channels, geometry, bx, by, width, height, out, left, grad, grad_left, d, padded, area
                 )  # fmt: skip
             # Front to back as in the forward pass, with the same blocks left alone.
-            k, end, unsaturated = start[tile], start[tile + 1], 0xFFFF
+            k = start[tile]
+            end = start[tile + 1]
+            unsaturated = 0xFFFF
             while k < end and unsaturated != 0:
                 stop = min(k + 32, end)
                 for q in range(k, stop):
-                    todo, summed = blocks[q] & unsaturated, _nothing(memory, count)
+                    todo = blocks[q] & unsaturated
+                    summed = _nothing(memory, count)
                     if todo != 0:
-                        entry = entry_of(splats_in, ids[q] * SLOTS, bx, by, values, ids[q] * stride + offset, channels)
+                        entry = entry_of(
+                            splats_in, ids[q] * SLOTS, bx, by, values, ids[q] * stride + offset, channels
+                        )
                         while todo != 0:
-                            summed = _composite_block(entry, lowest_bit(todo), memory, places, summed, geometry)
+                            summed = _composite_block(
+                                entry, lowest_bit(todo), memory, places, summed, geometry
+                            )
                             todo &= todo - 1
                     _keep(summed, found, slots[q] * SUMS)
                 k = stop
@@ -172,7 +192,9 @@ def composite_back(
 
 
 def lift(tiles: Tiles, channels: int, pixels: Floats) -> Floats:
-    """SUMS of each slot that begin with those of 8 or 16 channels, of weight times pixel; there are none of the shape."""
+    """SUMS of each slot that begin with those of 8 or 16 channels, of weight times pixel; there are none of
+    the shape.
+    """
     nothing = np.empty(0, np.float32)
     return _summed(_LIFT[channels], tiles, tiles.splats, SLOTS, 0, nothing, nothing, pixels, nothing)
 
@@ -201,9 +223,18 @@ def _lift_values(counters, found, first_slot, count, out, stride, offset, channe
 
 
 def lift_values(
-    tiles: Tiles, found: Floats, out: Floats, stride: int, offset: int, channels: int, *, skipped: int = GEOMETRY
+    tiles: Tiles,
+    found: Floats,
+    out: Floats,
+    stride: int,
+    offset: int,
+    channels: int,
+    *,
+    skipped: int = GEOMETRY,
 ) -> None:
-    """out[stride * i + offset ...] = the sums of the channels of each Gaussian, which follow on `skipped` others."""
+    """out[stride * i + offset ...] = the sums of the channels of each Gaussian, which follow on `skipped`
+    others.
+    """
     on_threads(_lift_values, found, tiles.first_slot, tiles.total, out, stride, offset, channels, skipped)
 
 
@@ -213,17 +244,20 @@ def _add(memory, at, found, slot):
 
 
 def _block_gradient(blocks, at, bands, view, summed):
-    """The gradient of the parameters of a block, a vector a row, from sums: shape (6), colour, depth; and its part of the
-    gradient of the camera: the turn about its own centre (rotation vector in camera axes), and the shift in the world.
+    """The gradient of the parameters of a block, a vector a row, from sums: shape (6), colour, depth; and its
+    part of the gradient of the camera: the turn about its own centre (rotation vector in camera axes), and
+    the shift in the world.
 
-    Sigma' = -Sigma^-1 G Sigma^-1 turns the shape's sums into those of the covariance; then back through `footprint` and `axes`.
-    A camera that turns and shifts sees what it would see if all Gaussians did the opposite.
+    Sigma' = -Sigma^-1 G Sigma^-1 turns the shape's sums into those of the covariance; then back through
+    `footprint` and `axes`. A camera that turns and shifts sees what it would see if all Gaussians did the
+    opposite.
     """
     mean, centre, scales, (qw, qx, qy, qz, q_inverse), world, camera = axes(blocks, at, view)
     (u, v, near_u, near_v, inverse, fx, fy), (j00, j01, j02, j10, j11, j12), (xx0, yy0, xy, det0) = footprint(
         centre, camera, view
     )
-    xx, yy = xx0 + BLUR, yy0 + BLUR
+    xx = xx0 + BLUR
+    yy = yy0 + BLUR
     det = det0 + BLUR * (xx0 + yy0) + BLUR * BLUR
     invert = 1 / det
     s0, sx, sxx, sy, sxy, syy, red, green, blue, depth = summed[:10]
@@ -231,39 +265,68 @@ def _block_gradient(blocks, at, bands, view, summed):
     drawn = where_greater(centre[2], view[23], where_greater(_HUGE, xx + yy, splat(xx, 1), 0), 0)
 
     # Image position and covariance.
-    ca, cb, cc = yy * invert, -xy * invert, xx * invert
-    g_px, g_py = ca * sx + cb * sy, cb * sx + cc * sy
-    e00, e01, e10, e11 = ca * sxx + cb * sxy, ca * sxy + cb * syy, cb * sxx + cc * sxy, cb * sxy + cc * syy
-    g_xx, g_yy, g_xy = 0.5 * (e00 * ca + e01 * cb), 0.5 * (e10 * cb + e11 * cc), e00 * cb + e01 * cc
+    ca = yy * invert
+    cb = -xy * invert
+    cc = xx * invert
+    g_px = ca * sx + cb * sy
+    g_py = cb * sx + cc * sy
+    e00 = ca * sxx + cb * sxy
+    e01 = ca * sxy + cb * syy
+    e10 = cb * sxx + cc * sxy
+    e11 = cb * sxy + cc * syy
+    g_xx = 0.5 * (e00 * ca + e01 * cb)
+    g_yy = 0.5 * (e10 * cb + e11 * cc)
+    g_xy = e00 * cb + e01 * cc
     ratio = det0 * invert  # anti-aliased: alpha falls with its square root
     k = where_greater(view[24], 0, 0.5 * s0 / (ratio + 1e-8) * invert, 0)
-    g_xx, g_yy = g_xx + k * (yy0 - ratio * yy), g_yy + k * (xx0 - ratio * xx)
+    g_xx = g_xx + k * (yy0 - ratio * yy)
+    g_yy = g_yy + k * (xx0 - ratio * xx)
     g_xy = g_xy - 2 * k * xy * (1 - ratio)
 
     # Axes in pixels, then in camera and world coordinates.
-    h00, h01, h02 = 2 * g_xx * j00 + g_xy * j10, 2 * g_xx * j01 + g_xy * j11, 2 * g_xx * j02 + g_xy * j12
-    h10, h11, h12 = 2 * g_yy * j10 + g_xy * j00, 2 * g_yy * j11 + g_xy * j01, 2 * g_yy * j12 + g_xy * j02
+    h00 = 2 * g_xx * j00 + g_xy * j10
+    h01 = 2 * g_xx * j01 + g_xy * j11
+    h02 = 2 * g_xx * j02 + g_xy * j12
+    h10 = 2 * g_yy * j10 + g_xy * j00
+    h11 = 2 * g_yy * j11 + g_xy * j01
+    h12 = 2 * g_yy * j12 + g_xy * j02
     g_z = -inverse * (j00 * h00 + j01 * h01 + j02 * h02 + j10 * h10 + j11 * h11 + j12 * h12)
     g_z = g_z + depth
-    h00, h01, h02, h10, h11, h12 = h00 * fx, h01 * fx, h02 * fx, h10 * fy, h11 * fy, h12 * fy
+    h00 = h00 * fx
+    h01 = h01 * fx
+    h02 = h02 * fx
+    h10 = h10 * fy
+    h11 = h11 * fy
+    h12 = h12 * fy
     inside_u = where_greater(u, view[19], where_greater(view[20], u, splat(u, 1), 0), 0)
     inside_v = where_greater(v, view[21], where_greater(view[22], v, splat(v, 1), 0), 0)
     g_u = view[12] * g_px - inside_u * (camera[6] * h00 + camera[7] * h01 + camera[8] * h02)
     g_v = view[13] * g_py - inside_v * (camera[6] * h10 + camera[7] * h11 + camera[8] * h12)
-    g_x, g_y = g_u * inverse, g_v * inverse
+    g_x = g_u * inverse
+    g_y = g_v * inverse
     g_z = g_z - (u * g_u + v * g_v) * inverse
-    b0, b1, b2 = -(near_u * h00 + near_v * h10), -(near_u * h01 + near_v * h11), -(near_u * h02 + near_v * h12)
+    b0 = -(near_u * h00 + near_v * h10)
+    b1 = -(near_u * h01 + near_v * h11)
+    b2 = -(near_u * h02 + near_v * h12)
     n = [
-        [view[r] * h0 + view[3 + r] * h1 + view[6 + r] * b for h0, h1, b in ((h00, h10, b0), (h01, h11, b1), (h02, h12, b2))]
+        [
+            view[r] * h0 + view[3 + r] * h1 + view[6 + r] * b
+            for h0, h1, b in ((h00, h10, b0), (h01, h11, b1), (h02, h12, b2))
+        ]
         for r in range(3)
     ]
     of_scales = [n[0][c] * world[c] + n[1][c] * world[3 + c] + n[2][c] * world[6 + c] for c in range(3)]
     pairs = [(centre, (g_x, g_y, g_z))]
     pairs += [(camera[c::3], g) for c, g in enumerate(((h00, h10, b0), (h01, h11, b1), (h02, h12, b2)))]
-    of_turn = [sum(g[(r + 1) % 3] * a[(r + 2) % 3] - g[(r + 2) % 3] * a[(r + 1) % 3] for a, g in pairs) for r in range(3)]
+    of_turn = [
+        sum(g[(r + 1) % 3] * a[(r + 2) % 3] - g[(r + 2) % 3] * a[(r + 1) % 3] for a, g in pairs)
+        for r in range(3)
+    ]
 
     # Quaternion: of the unit one, then across it.
-    (n00, n01, n02), (n10, n11, n12), (n20, n21, n22) = ([each * s for each, s in zip(row, scales, strict=True)] for row in n)
+    (n00, n01, n02), (n10, n11, n12), (n20, n21, n22) = (
+        [each * s for each, s in zip(row, scales, strict=True)] for row in n
+    )
     kw = 2 * (qx * (n21 - n12) + qy * (n02 - n20) + qz * (n10 - n01))
     kx = 2 * (qy * (n01 + n10) + qz * (n02 + n20) + qw * (n21 - n12) - 2 * qx * (n11 + n22))
     ky = 2 * (qx * (n01 + n10) + qz * (n12 + n21) + qw * (n02 - n20) - 2 * qy * (n00 + n22))
@@ -275,7 +338,8 @@ def _block_gradient(blocks, at, bands, view, summed):
     dx, dy, dz, shrink = direction(mean, view)
     values = basis(dx, dy, dz, bands)
     colours = [
-        where_greater(was, 0, slope, 0) for was, slope in zip(colour(blocks, at, values), (red, green, blue), strict=True)
+        where_greater(was, 0, slope, 0)
+        for was, slope in zip(colour(blocks, at, values), (red, green, blue), strict=True)
     ]
     gx, gy, gz = direction_slopes(dx, dy, dz, bands, blocks, at, *colours)
     along = gx * dx + gy * dy + gz * dz
@@ -302,7 +366,8 @@ def _learn_block(blocks, first, second, weight, start, bands, view, memory, rate
         store(of_camera, start * CAMERA + row * LANES, g)
     for row, g in enumerate(rows):
         o = at + row * LANES
-        m, s = load(first, o), load(second, o)
+        m = load(first, o)
+        s = load(second, o)
         m = m + (1 - _BETAS[0]) * (g - m)
         s = s + (1 - _BETAS[1]) * (g * g - s)
         store(first, o, m)
@@ -382,14 +447,26 @@ def adam(
 ) -> Annotated[np.ndarray[Any, np.dtype[np.float64]], "6"]:
     """One step of Adam, in place, for the blocks that have an entry; the others keep their moments as well.
 
-    Returns the gradient of the camera, float64: its turn about its own centre (rotation vector in camera axes) and its shift.
+    Returns the gradient of the camera, float64: its turn about its own centre (rotation vector in camera
+    axes) and its shift.
 
-    found: sums of shape and colour. rates: a learning rate for each row of a block. moments: the first, the second, and the sum
-    of the weights in the second of a Gaussian, 1 - 0.99^k after k steps: what is seen for the first time moves as it would have
-    in the first step. The first moment is not corrected, so the rates rise over a Gaussian's first ten steps.
+    found: sums of shape and colour. rates: a learning rate for each row of a block. moments: the first, the
+    second, and the sum of the weights in the second of a Gaussian, 1 - 0.99^k after k steps: what is seen for
+    the first time moves as it would have in the first step. The first moment is not corrected, so the rates
+    rise over a Gaussian's first ten steps.
     """
     of_camera = np.zeros((-(-tiles.total // LANES), CAMERA, LANES), np.float32)
-    on_threads(_ADAM[bands], blocks, *moments, tiles.total, view, found, tiles.first_slot, rates, of_camera.reshape(-1))
+    on_threads(
+        _ADAM[bands],
+        blocks,
+        *moments,
+        tiles.total,
+        view,
+        found,
+        tiles.first_slot,
+        rates,
+        of_camera.reshape(-1),
+    )
     gradient: np.ndarray[Any, np.dtype[np.float64]] = of_camera.sum((0, 2), dtype=np.float64)
     return gradient
 

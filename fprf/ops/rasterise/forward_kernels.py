@@ -1,12 +1,13 @@
-"""Compiled forward pass of the rasteriser of 3D Gaussians: projection, tiles, compositing. `rasterise` is their bridge.
+"""Compiled forward pass of the rasteriser of 3D Gaussians: projection, tiles, compositing. `rasterise` is
+their bridge.
 
 Blocks     Parameters of LANES Gaussians, a row each (`layout`).
 Camera     25 numbers: rotation world to camera 0-8, translation 9-11, fx fy cx cy 12-15, place in the world 16-18, limits of
            the tangents (left right top bottom) 19-22, near 23, and 1 for anti-aliasing 24.
 Splats     SLOTS numbers a Gaussian after projection: x y 0-1, A B C D with log2 alpha = A dx^2 + B dx dy + C dy^2 + D 2-5, red
-           green blue 6-8, depth 9, half width and height of the ellipse where alpha is 1/255 10-11, then what cuts it into
-           columns 12-15: xy/yy, det/yy, 1/yy, and dy of its right end. A half width of no more than 0 says why there is nothing
-           to draw: FAINT, BEHIND, OUTSIDE, INVALID.
+           green blue 6-8, depth 9, half width and height of the ellipse where alpha is 1/255 10-11, then what
+           cuts it into columns 12-15: xy/yy, det/yy, 1/yy, and dy of its right end. A half width of no more
+           than 0 says why there is nothing to draw: FAINT, BEHIND, OUTSIDE, INVALID.
 Tiles      16 x 16 pixels in 16 blocks of 4 x 4, row by row; such a block of pixels is a vector.
 Entries    A Gaussian in a tile, with a bit for each block of pixels that it may reach.
 """
@@ -47,29 +48,40 @@ from . import BLUR, MAX_ALPHA, MIN_ALPHA
 from .layout import BLOCKS, FIXED, MARK, Floats, basis, colour, direction, jit
 
 _Ints = np.ndarray[Any, np.dtype[np.int32]]
-SLOTS, SIDE = 16, 16
+SLOTS = 16
+SIDE = 16
 """Numbers of a splat; pixels of a tile's side."""
 STOP = 1e-3
 """Blocks of a tile through which no more than this share of light passes are left alone."""
-FAINT, BEHIND, OUTSIDE, INVALID = 0, 1, 2, 3
+FAINT = 0
+BEHIND = 1
+OUTSIDE = 2
+INVALID = 3
 
 _f = np.float32
-_LOG2E, _LN2 = 1 / math.log(2), math.log(2)
+_LOG2E = 1 / math.log(2)
+_LN2 = math.log(2)
 LOG_MIN = _f(math.log2(MIN_ALPHA))
-_ZERO, _VECTOR = _f(0), LANES
+_ZERO = _f(0)
+_VECTOR = LANES
 _HUGE = 1e16
 """Square pixels beyond which a Gaussian is invalid."""
 
 
 def axes(blocks, at, view):
-    """Camera coordinates of the means, and the scaled axes of the Gaussians in world and in camera coordinates."""
+    """Camera coordinates of the means, and the scaled axes of the Gaussians in world and in camera
+    coordinates.
+    """
     x, y, z = (load(blocks, at + c * LANES) for c in range(3))
     mean = x, y, z
     centre = [view[3 * r] * x + view[3 * r + 1] * y + view[3 * r + 2] * z + view[9 + r] for r in range(3)]
     # The unit quaternion; one of zeros is no rotation.
     w, x, y, z = (load(blocks, at + c * LANES) for c in range(6, 10))
     shrink = 1 / square_root(maximum(w * w + x * x + y * y + z * z, 1e-24))
-    w, x, y, z = w * shrink, x * shrink, y * shrink, z * shrink
+    w = w * shrink
+    x = x * shrink
+    y = y * shrink
+    z = z * shrink
     rows = (
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
@@ -87,20 +99,33 @@ def axes(blocks, at, view):
 
 
 def footprint(centre, camera, view):
-    """The image position u, v (tangents), the axes in pixels j, their covariance xx, yy, xy and its determinant, blur apart.
+    """The image position u, v (tangents), the axes in pixels j, their covariance xx, yy, xy and its
+    determinant, blur apart.
 
-    The determinant is the squared length of a cross product: xx yy - xy^2 would lose the digits of thin ellipses.
+    The determinant is the squared length of a cross product: xx yy - xy^2 would lose the digits of thin
+    ellipses.
     """
     cx, cy, cz = centre
     inverse = 1 / where_greater(cz, view[23], cz, 1)
-    u, v = cx * inverse, cy * inverse
-    near_u, near_v = minimum(maximum(u, view[19]), view[20]), minimum(maximum(v, view[21]), view[22])
-    fx, fy = view[12] * inverse, view[13] * inverse
+    u = cx * inverse
+    v = cy * inverse
+    near_u = minimum(maximum(u, view[19]), view[20])
+    near_v = minimum(maximum(v, view[21]), view[22])
+    fx = view[12] * inverse
+    fy = view[13] * inverse
     j00, j01, j02 = (fx * (camera[c] - near_u * camera[6 + c]) for c in range(3))
     j10, j11, j12 = (fy * (camera[3 + c] - near_v * camera[6 + c]) for c in range(3))
-    xx, yy, xy = j00 * j00 + j01 * j01 + j02 * j02, j10 * j10 + j11 * j11 + j12 * j12, j00 * j10 + j01 * j11 + j02 * j12
-    c0, c1, c2 = j01 * j12 - j02 * j11, j02 * j10 - j00 * j12, j00 * j11 - j01 * j10
-    return (u, v, near_u, near_v, inverse, fx, fy), (j00, j01, j02, j10, j11, j12), (xx, yy, xy, c0 * c0 + c1 * c1 + c2 * c2)
+    xx = j00 * j00 + j01 * j01 + j02 * j02
+    yy = j10 * j10 + j11 * j11 + j12 * j12
+    xy = j00 * j10 + j01 * j11 + j02 * j12
+    c0 = j01 * j12 - j02 * j11
+    c1 = j02 * j10 - j00 * j12
+    c2 = j00 * j11 - j01 * j10
+    return (
+        (u, v, near_u, near_v, inverse, fx, fy),
+        (j00, j01, j02, j10, j11, j12),
+        (xx, yy, xy, c0 * c0 + c1 * c1 + c2 * c2),
+    )
 
 
 def opacity(logit):
@@ -113,7 +138,8 @@ def _project_block(blocks, at, bands, view, width, height, splats_out, to):
     # Sigma' and its inverse, whose determinants differ by the blur.
     mean, centre, _, _, _, camera = axes(blocks, at, view)
     (u, v, *_), _, (xx0, yy0, xy, det0) = footprint(centre, camera, view)
-    xx, yy = xx0 + BLUR, yy0 + BLUR
+    xx = xx0 + BLUR
+    yy = yy0 + BLUR
     det = det0 + BLUR * (xx0 + yy0) + BLUR * BLUR
     invert = 1 / det
     # Opacity, fainter where the blur makes it wider.
@@ -123,8 +149,10 @@ def _project_block(blocks, at, bands, view, width, height, splats_out, to):
     highest = log2(alpha)
     # Where log2 alpha falls below that of MIN_ALPHA: (dx, dy) Sigma^-1 (dx, dy) = reach.
     reach = (highest - LOG_MIN) * (2 * _LN2)
-    half_width, half_height = square_root(maximum(reach, 0) * xx), square_root(maximum(reach, 0) * yy)
-    px, py = view[12] * u + view[14], view[13] * v + view[15]
+    half_width = square_root(maximum(reach, 0) * xx)
+    half_height = square_root(maximum(reach, 0) * yy)
+    px = view[12] * u + view[14]
+    py = view[13] * v + view[15]
     # Half the width, or why there is nothing to draw.
     shown = where_greater(as_float(width), px - half_width, half_width, -OUTSIDE)
     shown = where_greater(px + half_width, 0, shown, -OUTSIDE)
@@ -165,7 +193,8 @@ _PROJECT = {bands: _project(bands) for bands in (1, 4, 9, 16)}
 
 
 class Tiles(NamedTuple):
-    """Gaussians as a camera sees them, and the entries of those that are seen: sorted by tile, then by depth. int32.
+    """Gaussians as a camera sees them, and the entries of those that are seen: sorted by tile, then by depth.
+    int32.
 
     Slots number entries Gaussian by Gaussian. Depths closer than 2^-20 of what is seen keep their order.
     """
@@ -190,31 +219,45 @@ class Tiles(NamedTuple):
 
 @traced
 def _bands(splats_in, o, row, height, width):
-    """First and last column of blocks that a Gaussian may reach in 16 rows of blocks, 1e9 and -1 where there is none.
+    """First and last column of blocks that a Gaussian may reach in 16 rows of blocks, 1e9 and -1 where there
+    is none.
 
-    Between the pixel centres of a row of blocks the ellipse is widest at its right and left end or where these are cut off.
+    Between the pixel centres of a row of blocks the ellipse is widest at its right and left end or where
+    these are cut off.
     """
     # Rows of pixels of each row of blocks, cut to the ellipse, relative to its middle.
-    mx, my, rx, ry = splats_in[o] - 0.5, splats_in[o + 1] - 0.5, splats_in[o + 10], splats_in[o + 11]
-    slope, part, inverse_yy, right = splats_in[o + 12], splats_in[o + 13], splats_in[o + 14], splats_in[o + 15]
+    mx = splats_in[o] - 0.5
+    my = splats_in[o + 1] - 0.5
+    rx = splats_in[o + 10]
+    ry = splats_in[o + 11]
+    slope = splats_in[o + 12]
+    part = splats_in[o + 13]
+    inverse_yy = splats_in[o + 14]
+    right = splats_in[o + 15]
     y = as_float(row) * 4 + lanes(mx, range(0, 4 * LANES, 4))
     above = maximum(y, maximum(-floor(ry - my), 0)) - my
     below = minimum(y + 3, minimum(floor(my + ry), as_float(height) - 1)) - my
     # Where the ellipse is widest between them, and how far it reaches there.
-    end, begin = minimum(maximum(right, above), below), minimum(maximum(-right, above), below)
+    end = minimum(maximum(right, above), below)
+    begin = minimum(maximum(-right, above), below)
     reach = ry * ry * inverse_yy
     far = mx + slope * end + square_root(maximum(part * (reach - end * end * inverse_yy), 0))
     near = mx + slope * begin - square_root(maximum(part * (reach - begin * begin * inverse_yy), 0))
     first = maximum(-floor(-maximum(near, mx - rx)), 0)
     last = minimum(floor(minimum(far, mx + rx)), as_float(width) - 1)
     reached = where_greater(above, below, splat(mx, 0), where_greater(first, last, splat(mx, 0), 1))
-    return where_greater(reached, 0, floor(first * 0.25), 1e9), where_greater(reached, 0, floor(last * 0.25), -1)
+    return where_greater(reached, 0, floor(first * 0.25), 1e9), where_greater(
+        reached, 0, floor(last * 0.25), -1
+    )
 
 
 @traced
 def _masks(first, last, column, memory):
-    """Of the four tiles in a column, the bits of the blocks that a Gaussian reaches, to memory[0, 4, 8, 12]."""
-    c, bits = as_float(column) * 4, splat(first, 0)
+    """Of the four tiles in a column, the bits of the blocks that a Gaussian reaches, to memory[0, 4, 8,
+    12].
+    """
+    c = as_float(column) * 4
+    bits = splat(first, 0)
     for k in range(4):
         bits = bits + where_greater(first, c + k, splat(c, 0), where_greater(c + k, last, splat(c, 0), 2**k))
     store(memory, 0, added_in_fours(bits * lanes(first, [16 ** (lane % 4) for lane in range(LANES)])))
@@ -224,8 +267,11 @@ def _masks(first, last, column, memory):
 def _find(splats_in, bits, count, width, height, first_slot, seen, key, tile_of, blocks_of, start, skipped):
     """Fill what has room; return how many entries and Gaussians there are, and the range of the keys."""
     across = (width + SIDE - 1) // SIDE
-    visible, entries, room = 0, 0, len(tile_of)
-    low, high = 0x7FFFFFFF, 0
+    visible = 0
+    entries = 0
+    room = len(tile_of)
+    low = 0x7FFFFFFF
+    high = 0
     memory = stack(_VECTOR)
     for i in range(count):
         first_slot[i] = entries
@@ -235,11 +281,14 @@ def _find(splats_in, bits, count, width, height, first_slot, seen, key, tile_of,
             continue
         # Four rows of tiles at a time: the range of blocks in each row, then the tiles of each column.
         before = entries
-        top, bottom = splats_in[o + 1] - splats_in[o + 11], splats_in[o + 1] + splats_in[o + 11]
-        r0, r1 = int(top) // SIDE if top > _ZERO else 0, int(bottom) // SIDE if bottom < height else (height - 1) // SIDE
+        top = splats_in[o + 1] - splats_in[o + 11]
+        bottom = splats_in[o + 1] + splats_in[o + 11]
+        r0 = int(top) // SIDE if top > _ZERO else 0
+        r1 = int(bottom) // SIDE if bottom < height else (height - 1) // SIDE
         for r in range(r0, r1 + 1, 4):
             first, last = _bands(splats_in, o, 4 * r, height, width)
-            begin, end = least(first), largest(last)
+            begin = least(first)
+            end = largest(last)
             if begin > end:
                 continue
             for c in range(int(begin) // 4, int(end) // 4 + 1):
@@ -249,13 +298,16 @@ def _find(splats_in, bits, count, width, height, first_slot, seen, key, tile_of,
                     if mask != 0:
                         if entries < room:
                             tile = (r + k) * across + c
-                            tile_of[entries], blocks_of[entries] = tile, mask
+                            tile_of[entries] = tile
+                            blocks_of[entries] = mask
                             start[tile + 1] += 1
                         entries += 1
         if entries > before:
             k = bits[o + 9]  # positive floats sort as their bits do
-            low, high = k if k < low else low, k if k > high else high
-            seen[visible], key[visible] = i, k
+            low = k if k < low else low
+            high = k if k > high else high
+            seen[visible] = i
+            key[visible] = k
             visible += 1
         else:
             skipped[OUTSIDE] += 1
@@ -266,9 +318,26 @@ def _find(splats_in, bits, count, width, height, first_slot, seen, key, tile_of,
 
 @jit
 def _sort(
-    seen, key, visible, low, high, digits, other, other_key, first_slot, tile_of, blocks_of, start, fill, ids, slots, blocks
+    seen,
+    key,
+    visible,
+    low,
+    high,
+    digits,
+    other,
+    other_key,
+    first_slot,
+    tile_of,
+    blocks_of,
+    start,
+    fill,
+    ids,
+    slots,
+    blocks,
 ):
-    """Radix sort of the Gaussians by 22 bits of the depth's range, 11 at a time; then each one's entries to their tiles."""
+    """Radix sort of the Gaussians by 22 bits of the depth's range, 11 at a time; then each one's entries to
+    their tiles.
+    """
     shift = 0
     while (high - low) >> shift >= 1 << 22:
         shift += 1
@@ -286,7 +355,8 @@ def _sort(
         k = key[q]
         d = digits[0, k & 2047]
         digits[0, k & 2047] = d + 1
-        other[d], other_key[d] = seen[q], k >> 11
+        other[d] = seen[q]
+        other_key[d] = k >> 11
     for q in range(visible):
         k = other_key[q]
         d = digits[1, k]
@@ -301,38 +371,66 @@ def _sort(
         for slot in range(first_slot[i], first_slot[i + 1]):
             at = fill[tile_of[slot]]
             fill[tile_of[slot]] = at + 1
-            ids[at], slots[at], blocks[at] = i, slot, blocks_of[slot]
+            ids[at] = i
+            slots[at] = slot
+            blocks[at] = blocks_of[slot]
 
 
-def see(blocks: Floats, count: int, bands: int, view: Floats, width: int, height: int, splats: Floats) -> Tiles:
-    """Project `count` Gaussians and sort them into the tiles of an image. `splats` is room for whole blocks of them."""
+def see(
+    blocks: Floats, count: int, bands: int, view: Floats, width: int, height: int, splats: Floats
+) -> Tiles:
+    """Project `count` Gaussians and sort them into the tiles of an image. `splats` is room for whole blocks
+    of them.
+    """
     on_threads(_PROJECT[bands], blocks, count, view, width, height, splats)
     tiles = ((width + SIDE - 1) // SIDE) * ((height + SIDE - 1) // SIDE)
     room = 4 * count + 1024
-    first_slot, (seen, key, *others) = np.empty(count + 1 + LANES, np.int32), np.empty((4, count), np.int32)
+    first_slot = np.empty(count + 1 + LANES, np.int32)
+    (seen, key, *others) = np.empty((4, count), np.int32)
     while True:
-        # How many entries there are is known when all have been found: where room is too small, once more with enough.
+        # How many entries there are is known when all have been found: where room is too small, once more
+        # with enough.
         tile_of, blocks_of = np.empty((2, room), np.int32)
-        start, skipped = np.zeros(tiles + 1, np.int32), np.zeros(4, np.int32)
+        start = np.zeros(tiles + 1, np.int32)
+        skipped = np.zeros(4, np.int32)
         entries, visible, low, high = _find(
             splats, splats.view(np.int32), count, width, height, first_slot, seen, key, tile_of, blocks_of, start, skipped
         )  # fmt: skip
         if entries <= room:
             break
         room = entries
-    digits, fill = np.zeros((2, 2049), np.int32), np.empty(tiles, np.int32)
+    digits = np.zeros((2, 2049), np.int32)
+    fill = np.empty(tiles, np.int32)
     ids, slots, bits = np.empty((3, entries), np.int32)
-    _sort(seen, key, visible, low, high, digits, *others, first_slot, tile_of, blocks_of, start, fill, ids, slots, bits)
+    _sort(
+        seen,
+        key,
+        visible,
+        low,
+        high,
+        digits,
+        *others,
+        first_slot,
+        tile_of,
+        blocks_of,
+        start,
+        fill,
+        ids,
+        slots,
+        bits,
+    )
     return Tiles(splats, count, width, height, start, ids, slots, bits, first_slot, skipped)
 
 
 TILE = SIDE * SIDE
-_X, _Y = [k % 4 for k in range(LANES)], [k // 4 for k in range(LANES)]
+_X = [k % 4 for k in range(LANES)]
+_Y = [k // 4 for k in range(LANES)]
 
 
 def inside(like, bx, by, block, width, height):
     """1 for the pixels of a block that are in the image, else 0."""
-    x, y = lanes(like, _X) + (as_float(bx) + block % 4 * 4), lanes(like, _Y) + (as_float(by) + block // 4 * 4)
+    x = lanes(like, _X) + (as_float(bx) + block % 4 * 4)
+    y = lanes(like, _Y) + (as_float(by) + block // 4 * 4)
     return where_greater(as_float(width), x, where_greater(as_float(height), y, splat(like, 1), 0), 0)
 
 
@@ -359,18 +457,19 @@ def alpha_of(power):
 
 @traced
 def entry_of(splats_in, o, bx, by, values, at, channels):
-    """dx and dy of the pixels of a tile's first block, the polynomial of log2 alpha, and the values of a Gaussian."""
-    dx, dy = (
-        lanes(splats_in, _X) + 0.5 + as_float(bx) - splats_in[o],
-        lanes(splats_in, _Y) + 0.5 + as_float(by) - splats_in[o + 1],
-    )
+    """dx and dy of the pixels of a tile's first block, the polynomial of log2 alpha, and the values of a
+    Gaussian.
+    """
+    dx = lanes(splats_in, _X) + 0.5 + as_float(bx) - splats_in[o]
+    dy = lanes(splats_in, _Y) + 0.5 + as_float(by) - splats_in[o + 1]
     return dx, dy, *(splats_in[o + k] for k in range(2, 6)), *(values[at + c] for c in range(channels))
 
 
 @traced
 def _composite_block(entry, block, memory, places):
     dx, dy, a, b, c, d, *value = entry
-    dx, dy = dx + memory[block + places], dy + memory[block + places + LANES]
+    dx = dx + memory[block + places]
+    dy = dy + memory[block + places + LANES]
     alpha = alpha_of(d + dx * (a * dx + b * dy) + c * dy * dy)
     at = block * LANES
     passing = load(memory, at)
@@ -396,7 +495,10 @@ def _finish(row, memory, background, channels, out, left, d, padded, area):
     for y, each in enumerate(swapped(blocks)):
         store(left, d + padded * y, each)
     for c in range(channels):
-        seen = [load(memory, row * (4 * LANES) + k * LANES + (c + 1) * TILE) + blocks[k] * background[c] for k in range(4)]
+        seen = [
+            load(memory, row * (4 * LANES) + k * LANES + (c + 1) * TILE) + blocks[k] * background[c]
+            for k in range(4)
+        ]
         for y, each in enumerate(swapped(seen)):
             store(out, area * c + d + padded * y, each)
 
@@ -406,25 +508,35 @@ def _composite(channels):
     room = places + 2 * LANES
 
     @jit
-    def composite(counters, start, ids, blocks, splats_in, values, stride, offset, background, width, height, out, left):
-        across, down = (width + SIDE - 1) // SIDE, (height + SIDE - 1) // SIDE
-        padded, area, skipped = across * SIDE, across * SIDE * down * SIDE, 0
+    def composite(
+        counters, start, ids, blocks, splats_in, values, stride, offset, background, width, height, out, left
+    ):
+        across = (width + SIDE - 1) // SIDE
+        down = (height + SIDE - 1) // SIDE
+        padded = across * SIDE
+        area = across * SIDE * down * SIDE
+        skipped = 0
         memory = stack(room)  # transmittance, sums of the channels, places of the blocks
         block_places(memory, places)
         while True:
             tile = take(counters, 0)
             if tile >= across * down:
                 break
-            bx, by = tile % across * SIDE, tile // across * SIDE
+            bx = tile % across * SIDE
+            by = tile // across * SIDE
             # Nothing passes outside of the image.
             _begin(memory, channels, bx, by, width, height)
-            k, end, unsaturated = start[tile], start[tile + 1], 0xFFFF
+            k = start[tile]
+            end = start[tile + 1]
+            unsaturated = 0xFFFF
             while k < end and unsaturated != 0:
                 stop = min(k + 32, end)
                 for q in range(k, stop):
                     todo = blocks[q] & unsaturated
                     if todo != 0:
-                        entry = entry_of(splats_in, ids[q] * SLOTS, bx, by, values, ids[q] * stride + offset, channels)
+                        entry = entry_of(
+                            splats_in, ids[q] * SLOTS, bx, by, values, ids[q] * stride + offset, channels
+                        )
                         while todo != 0:
                             _composite_block(entry, lowest_bit(todo), memory, places)
                             todo &= todo - 1
@@ -433,7 +545,9 @@ def _composite(channels):
                 unsaturated = open_blocks(memory)
             skipped += end - k
             for row in range(4):
-                _finish(row, memory, background, channels, out, left, (by + 4 * row) * padded + bx, padded, area)
+                _finish(
+                    row, memory, background, channels, out, left, (by + 4 * row) * padded + bx, padded, area
+                )
         return skipped
 
     return composite
@@ -443,10 +557,19 @@ _COMPOSITE = {channels: _composite(channels) for channels in (3, 4, 8)}
 
 
 def composite(
-    tiles: Tiles, channels: int, values: Floats, stride: int, offset: int, background: Floats, out: Floats, left: Floats
+    tiles: Tiles,
+    channels: int,
+    values: Floats,
+    stride: int,
+    offset: int,
+    background: Floats,
+    out: Floats,
+    left: Floats,
 ) -> int:
-    """Planes out [channels, H16, W16] of values[stride * i + offset ...] and the transmittance left [H16, W16], both padded
-    to whole tiles; returns how many entries were skipped because nothing passed any more. Channels: 3, 4 or 8 at once."""
+    """Planes out [channels, H16, W16] of values[stride * i + offset ...] and the transmittance left [H16,
+    W16], both padded to whole tiles; returns how many entries were skipped because nothing passed any more.
+    Channels: 3, 4 or 8 at once.
+    """
     return sum(
         on_threads(
             _COMPOSITE[channels], tiles.start, tiles.ids, tiles.blocks, tiles.splats, values, stride, offset, background,

@@ -1,8 +1,8 @@
 """3D Gaussians on a CUDA device by gsplat (Ye et al. 2025): drawn with gradients, and trained.
 
-gsplat computes what `rasterise_reference` defines, with two differences: it cuts alphas at 0.999 instead of 0.99, and a ray
-ends where 1/10000 of the light is left. It is imported when something is drawn, never before. N, K, C, H, W and R are those
-of `rendering` and `training`.
+gsplat computes what `rasterise_reference` defines, with two differences: it cuts alphas at 0.999 instead of
+0.99, and a ray ends where 1/10000 of the light is left. It is imported when something is drawn, never before.
+N, K, C, H, W and R are those of `rendering` and `training`.
 """
 
 import functools
@@ -22,17 +22,32 @@ from . import BLUR
 from .forward_kernels import SIDE
 from .layout import FIXED
 from .reference import Pinhole
-from .training import HARMONICS, LOG_SCALES, LOGIT, MEANS, QUATERNION, Floats, Learnt, Target, TrainableGaussians, camera_array
+from .training import (
+    HARMONICS,
+    LOG_SCALES,
+    LOGIT,
+    MEANS,
+    QUATERNION,
+    Floats,
+    Learnt,
+    Target,
+    TrainableGaussians,
+    camera_array,
+)
 
-_MOST_LOG, _LARGE = 30.0, 1e15
+_MOST_LOG = 30.0
+_LARGE = 1e15
 """Bounds of logarithms and logits, and of means and quaternions, as in `rasterise_reference`."""
-_BETAS, _EPS = (0.9, 0.99), 1e-15
+_BETAS = (0.9, 0.99)
+_EPS = 1e-15
 """Decay of Adam's moments, and what keeps 0 / 0 from being NaN: those of `backward_kernels`."""
 _COLUMNS = 3, 3, 4, 1
 """Columns of means, logarithms of scales, quaternions and logits; those of the harmonics follow."""
 _UPRIGHT = 1e-15
 """Added to w of a quaternion, so that one without a length is drawn, as if it turned nothing."""
-_SIGMA, _C1, _C2 = 1.5, 0.01**2, 0.03**2
+_SIGMA = 1.5
+_C1 = 0.01**2
+_C2 = 0.03**2
 """SSIM: standard deviation of its window in pixels, and its two constants for colours in [0, 1]."""
 
 
@@ -45,7 +60,8 @@ def usable(device: torch.device) -> bool:
 def obstacle(device: torch.device) -> str | None:
     """The reason why gsplat can't draw on a CUDA device; None where it has drawn a Gaussian there.
 
-    gsplat compiles its kernels at the first use where its wheel has none, which takes minutes and CUDA's toolkit.
+    gsplat compiles its kernels at the first use where its wheel has none, which takes minutes and CUDA's
+    toolkit.
     """
     if importlib.util.find_spec("gsplat") is None:
         return "gsplat is not installed; `pip install 'fprf[cuda]'` installs it"
@@ -53,8 +69,13 @@ def obstacle(device: torch.device) -> str | None:
     try:
         with torch.inference_mode(False), torch.enable_grad():
             means = torch.ones(1, 3, device=device, requires_grad=True)
-            rest = (torch.ones(1, 4, device=device), torch.zeros(1, 3, device=device), torch.zeros(1, device=device))
-            values, background = torch.ones(1, 3, device=device), torch.zeros(3, device=device)
+            rest = (
+                torch.ones(1, 4, device=device),
+                torch.zeros(1, 3, device=device),
+                torch.zeros(1, device=device),
+            )
+            values = torch.ones(1, 3, device=device)
+            background = torch.zeros(3, device=device)
             image, _ = rasterise_gsplat(means, *rest, values, camera, background, antialiased=True)
             torch.autograd.grad(image.sum(), means)
     except (ImportError, AttributeError, OSError, RuntimeError) as fault:
@@ -73,8 +94,12 @@ def rasterise_gsplat(
     *,
     antialiased: bool,
 ) -> tuple[Annotated[Tensor, "H W C+1"], Annotated[Tensor, "H W"]]:
-    """Composited values, the composited depth behind them, and the transmittance left, float32: as `rasterise_reference`."""
-    camera = camera._replace(intrinsics=camera.intrinsics.to(means), world_to_camera=camera.world_to_camera.to(means))
+    """Composited values, the composited depth behind them, and the transmittance left, float32: as
+    `rasterise_reference`.
+    """
+    camera = camera._replace(
+        intrinsics=camera.intrinsics.to(means), world_to_camera=camera.world_to_camera.to(means)
+    )
     rows = torch.cat([means, log_scales, quaternions, logits[:, None], values], 1)
     image, opacity, _ = _render(rows, camera, background, bands=None, antialiased=antialiased, mode="RGB+D")
     return image, 1 - opacity
@@ -92,7 +117,9 @@ class _Guards(NamedTuple):
 
 def _guards(columns: int, like: Tensor) -> _Guards:
     """Guards of rows with so many columns, of the dtype and on the device of a tensor."""
-    most, harmless, upright = np.full(columns, torch.finfo(like.dtype).max), np.zeros(columns), np.zeros(4)
+    most = np.full(columns, torch.finfo(like.dtype).max)
+    harmless = np.zeros(columns)
+    upright = np.zeros(4)
     most[MEANS] = most[QUATERNION] = _LARGE
     most[LOG_SCALES] = most[LOGIT] = np.inf  # these are cut
     harmless[LOGIT], harmless[QUATERNION.start], upright[0] = -_MOST_LOG, 1, _UPRIGHT
@@ -111,8 +138,8 @@ def _render(
 ) -> tuple[Annotated[Tensor, "H W C"], Annotated[Tensor, "H W"], Annotated[Tensor, "N"]]:
     """Image, opacity, and which Gaussians lie in view, for parameters in the columns of `training`.
 
-    Behind the logits come harmonics of so many bands, or values where `bands` is None. What is not finite, or far beyond
-    everything, is not drawn: it would spoil the gradients of all others.
+    Behind the logits come harmonics of so many bands, or values where `bands` is None. What is not finite, or
+    far beyond everything, is not drawn: it would spoil the gradients of all others.
     """
     from gsplat import rasterization
 
@@ -172,19 +199,32 @@ def target_on(
         None if sky is None else there(sky),
     )
     nothing = np.zeros(0, np.float32)
-    return Target(camera.width, camera.height, camera_array(camera, antialiased), nothing, nothing, None, there=photograph)
+    return Target(
+        camera.width,
+        camera.height,
+        camera_array(camera, antialiased),
+        nothing,
+        nothing,
+        None,
+        there=photograph,
+    )
 
 
 class GsplatGaussians:
     """`TrainableGaussians` on a device, drawn by gsplat: the same methods, parameters, loss and optimiser.
 
-    Whoever calls gives and gets arrays of host memory. A step waits for the device where gsplat does, and once for its figures.
+    Whoever calls gives and gets arrays of host memory. A step waits for the device where gsplat does, and
+    once for its figures.
     """
 
     def __init__(self, room: int, bands: int, device: torch.device) -> None:
-        self.bands, self.rows, self.device = bands, FIXED + 3 * bands, device
+        self.bands = bands
+        self.rows = FIXED + 3 * bands
+        self.device = device
         self.count = 0
-        self._values, self._first, self._second = (torch.zeros(room, self.rows, device=device) for _ in range(3))
+        self._values, self._first, self._second = (
+            torch.zeros(room, self.rows, device=device) for _ in range(3)
+        )
         self._weight = torch.zeros(room, device=device)
         self._guards = _guards(self.rows, self._values)
 
@@ -204,14 +244,24 @@ class GsplatGaussians:
         self._weight.zero_()
         self._weight[: self.count] = weight if isinstance(weight, int | float) else self._there(weight)
 
-    def read(self, columns: slice = slice(None), index: NDArray[np.int64] | None = None) -> Annotated[Floats, "M c"]:
+    def read(
+        self, columns: slice = slice(None), index: NDArray[np.int64] | None = None
+    ) -> Annotated[Floats, "M c"]:
         """A copy of some columns of the parameters, of all Gaussians or of some."""
-        found = self._values[: self.count, columns] if index is None else self._values[self._there(index), columns]
+        found = (
+            self._values[: self.count, columns]
+            if index is None
+            else self._values[self._there(index), columns]
+        )
         return _here(found)
 
     def moments(self) -> tuple[Annotated[Floats, "N R"], Annotated[Floats, "N R"], Annotated[Floats, "N"]]:
         """Copies of the first moments, the second ones, and the weights in the second."""
-        return _here(self._first[: self.count]), _here(self._second[: self.count]), _here(self._weight[: self.count])
+        return (
+            _here(self._first[: self.count]),
+            _here(self._second[: self.count]),
+            _here(self._weight[: self.count]),
+        )
 
     def multiply(self, columns: slice, factor: float) -> None:
         """Multiply columns of the parameters of all Gaussians."""
@@ -220,14 +270,22 @@ class GsplatGaussians:
     def limit_scales(self, most: Annotated[Floats, "M"], index: Annotated[NDArray[np.int64], "M"]) -> None:
         """Cut logarithms of standard deviations of some Gaussians that are above `most`."""
         some = self._there(index)
-        self._values[some, LOG_SCALES] = torch.minimum(self._values[some, LOG_SCALES], self._there(most)[:, None])
+        self._values[some, LOG_SCALES] = torch.minimum(
+            self._values[some, LOG_SCALES], self._there(most)[:, None]
+        )
 
     def split(
-        self, index: NDArray[np.int64], to: NDArray[np.int64], one: Annotated[Floats, "M R"], other: Annotated[Floats, "M R"]
+        self,
+        index: NDArray[np.int64],
+        to: NDArray[np.int64],
+        one: Annotated[Floats, "M R"],
+        other: Annotated[Floats, "M R"],
     ) -> None:
-        """As `TrainableGaussians.split`: `one` in the place of M Gaussians, `other` to `to`; both begin without a first moment
-        and with half of the second."""
-        places, others = self._there(index), self._there(to)
+        """As `TrainableGaussians.split`: `one` in the place of M Gaussians, `other` to `to`; both begin
+        without a first moment and with half of the second.
+        """
+        places = self._there(index)
+        others = self._there(to)
         self._values[places], self._values[others] = self._there(one), self._there(other)
         second = 0.5 * self._second[places]
         for each in (places, others):
@@ -251,15 +309,22 @@ class GsplatGaussians:
         rates: Annotated[Floats, "R"],
         factors: Annotated[Floats, "3"] | None = None,
     ) -> Learnt:
-        """As `TrainableGaussians.learn`: render, compare, move by a step of Adam; nothing where the loss is not finite."""
+        """As `TrainableGaussians.learn`: render, compare, move by a step of Adam; nothing where the loss is
+        not finite.
+        """
         # One copy takes all numbers of the step to the device.
         exposure = np.ones(3, np.float32) if factors is None else factors
         numbers = self._there(np.concatenate([target.camera, background, exposure, rates]).astype(np.float32))
         seen_from, colour, exposed, rate = torch.split(numbers, [len(target.camera), 3, 3, self.rows])
         photograph = self._photograph(target)
         camera = _camera(target, seen_from)
-        pose, rows = camera.world_to_camera.requires_grad_(), self._values[: self.count].detach().requires_grad_()
-        how: dict[str, Any] = {"bands": self.bands, "antialiased": bool(target.camera[24]), "guards": self._guards}
+        pose = camera.world_to_camera.requires_grad_()
+        rows = self._values[: self.count].detach().requires_grad_()
+        how: dict[str, Any] = {
+            "bands": self.bands,
+            "antialiased": bool(target.camera[24]),
+            "guards": self._guards,
+        }
         image, _, seen = _render(rows, camera, colour, mode="RGB", **how)
         # The loss and its slope by every pixel, then by parameters and pose.
         shown = (image.detach() * exposed).permute(2, 0, 1)
@@ -270,20 +335,31 @@ class GsplatGaussians:
         pull = (slope * shown).sum((1, 2))
         of_rows, of_pose = torch.autograd.grad(image, [rows, pose], slope.permute(1, 2, 0) * exposed)
         self._adam(of_rows, seen & (l1 + similar).isfinite(), rate)
-        # A turn w about the camera's own axes moves the pose [R t] by -[w]x [R t]; a shift c of its centre moves t by -R c.
+        # A turn w about the camera's own axes moves the pose [R t] by -[w]x [R t]; a shift c of its centre
+        # moves t by -R c.
         moment = of_pose[:3] @ pose.detach()[:3].T
-        of_turn = torch.stack([moment[1, 2] - moment[2, 1], moment[2, 0] - moment[0, 2], moment[0, 1] - moment[1, 0]])
+        of_turn = torch.stack(
+            [moment[1, 2] - moment[2, 1], moment[2, 0] - moment[0, 2], moment[0, 1] - moment[1, 0]]
+        )
         of_shift = -pose.detach()[:3, :3].T @ of_pose[:3, 3]
         measured = torch.stack([l1, similar, (shown - photograph.colours).square().mean()])
         found = _here(torch.cat([measured, pull, of_turn, of_shift]))  # the step's one wait
         if not np.isfinite(found[:2]).all():
             return Learnt(float(found[0]), float(found[1]), np.nan, np.zeros(3, np.float32), np.zeros(6))
         of_exposure = np.zeros(3, np.float32) if factors is None else found[3:6]
-        return Learnt(float(found[0]), float(found[1]), float(found[2]), of_exposure, found[6:].astype(np.float64))
+        return Learnt(
+            float(found[0]), float(found[1]), float(found[2]), of_exposure, found[6:].astype(np.float64)
+        )
 
-    def _adam(self, gradient: Annotated[Tensor, "N R"], seen: Annotated[Tensor, "N"], rates: Annotated[Tensor, "R"]) -> None:
-        """Move all of a block of LANES where one was seen, as `backward_kernels.adam`; moments of others stay."""
-        values, first, second, weight = (part[: self.count] for part in (self._values, self._first, self._second, self._weight))
+    def _adam(
+        self, gradient: Annotated[Tensor, "N R"], seen: Annotated[Tensor, "N"], rates: Annotated[Tensor, "R"]
+    ) -> None:
+        """Move all of a block of LANES where one was seen, as `backward_kernels.adam`; moments of others
+        stay.
+        """
+        values, first, second, weight = (
+            part[: self.count] for part in (self._values, self._first, self._second, self._weight)
+        )
         # Masks that are multiplied with, not indexed by: the host need not know how many there are.
         blocks = torch.nn.functional.pad(seen, (0, -len(seen) % LANES)).view(-1, LANES)
         seen = blocks.any(1).repeat_interleave(LANES)[: len(seen)]
@@ -293,18 +369,26 @@ class GsplatGaussians:
         weight.lerp_(torch.ones_like(weight), (1 - _BETAS[1]) * share[:, 0])
         first.lerp_(gradient, (1 - _BETAS[0]) * share)
         second.lerp_(gradient.square(), (1 - _BETAS[1]) * share)
-        size = (second / weight[:, None].clamp_min(1 - _BETAS[1])).sqrt() + _EPS  # a weight is at least that where seen
+        size = (
+            second / weight[:, None].clamp_min(1 - _BETAS[1])
+        ).sqrt() + _EPS  # a weight is at least that where seen
         values.sub_(torch.where(seen, rates * first / size, 0.0))
 
     @torch.no_grad()
     def errors(
-        self, target: Target, background: tuple[float, float, float], factors: Annotated[Floats, "3"] | None = None
+        self,
+        target: Target,
+        background: tuple[float, float, float],
+        factors: Annotated[Floats, "3"] | None = None,
     ) -> Annotated[Floats, "N 3"]:
-        """As `TrainableGaussians.errors`: each Gaussian's weight times |render - photograph|, in sky, and of all."""
+        """As `TrainableGaussians.errors`: each Gaussian's weight times |render - photograph|, in sky, and of
+        all.
+        """
         exposure = np.ones(3, np.float32) if factors is None else factors
         numbers = self._there(np.concatenate([target.camera, background, exposure]).astype(np.float32))
         seen_from, colour, exposed = torch.split(numbers, [len(target.camera), 3, 3])
-        camera, photograph = _camera(target, seen_from), self._photograph(target)
+        camera = _camera(target, seen_from)
+        photograph = self._photograph(target)
         how: dict[str, Any] = {"antialiased": bool(target.camera[24]), "mode": "RGB"}
         rows = self._values[: self.count]
         image, _, _ = _render(rows, camera, colour, bands=self.bands, guards=self._guards, **how)
@@ -312,7 +396,9 @@ class GsplatGaussians:
         if photograph.valid is not None:
             apart = apart * photograph.valid
         whole = torch.ones_like(apart)
-        pixels = torch.stack([apart, torch.zeros_like(whole) if photograph.sky is None else photograph.sky, whole], -1)
+        pixels = torch.stack(
+            [apart, torch.zeros_like(whole) if photograph.sky is None else photograph.sky, whole], -1
+        )
         # Rendering is linear in the values, so their gradient for given pixels is its transpose.
         with torch.enable_grad():
             lifted = torch.zeros(self.count, 3, device=self.device, requires_grad=True)
@@ -321,7 +407,9 @@ class GsplatGaussians:
             return _here(torch.autograd.grad(back, lifted, pixels)[0])
 
     def _photograph(self, target: Target) -> Photograph:
-        """A target's photograph on this device; copied there where it lies in the layout of the CPU's kernels."""
+        """A target's photograph on this device; copied there where it lies in the layout of the CPU's
+        kernels.
+        """
         if target.there is not None:
             return target.there
         wide = -(-target.width // SIDE) * SIDE
@@ -350,21 +438,26 @@ def trainable(room: int, bands: int, device: torch.device) -> Trainable:
 def photometric_loss(
     shown: Annotated[Tensor, "C H W"], target: Annotated[Tensor, "C H W"], share: float
 ) -> tuple[Tensor, Tensor, Annotated[Tensor, "C H W"]]:
-    """Mean |shown - target|, mean SSIM, and the slope of (1 - share) L1 + share (1 - SSIM): `photometric.loss`, in torch.
+    """Mean |shown - target|, mean SSIM, and the slope of (1 - share) L1 + share (1 - SSIM):
+    `photometric.loss`, in torch.
 
     SSIM counts as 0, without a slope, where `share` is 0 and where the image is smaller than a window.
     """
     shown = shown.detach()
-    apart, similar = shown - target, shown.new_zeros(())
+    apart = shown - target
+    similar = shown.new_zeros(())
     slope = apart.sign() * ((1 - share) / apart.numel())
     if share > 0 and min(shown.shape[1:]) >= WINDOW:
         # Means m and mean products q in every window that lies inside.
         squares = [shown.square(), target.square(), shown * target]
         ma, mb, qaa, qbb, qab = _windowed(torch.cat([shown, target, *squares]), 0).chunk(5)
         # Wang et al. 2004, Eq. 13: S = a1 a2 / (b1 b2).
-        square, product = ma.square() + mb.square(), ma * mb
-        a1, a2 = 2 * product + _C1, 2 * (qab - product) + _C2
-        b1, b2 = square + _C1, qaa + qbb - square + _C2
+        square = ma.square() + mb.square()
+        product = ma * mb
+        a1 = 2 * product + _C1
+        a2 = 2 * (qab - product) + _C2
+        b1 = square + _C1
+        b2 = qaa + qbb - square + _C2
         scale = 1 / (b1 * b2)
         index = a1 * a2 * scale
         similar = index.mean()
@@ -379,7 +472,8 @@ def photometric_loss(
 def _windowed(images: Annotated[Tensor, "C H W"], padding: int) -> Annotated[Tensor, "C h w"]:
     """Means under SSIM's window where it lies inside, with so many zeros around the images."""
     at = torch.arange(WINDOW, dtype=images.dtype, device=images.device) - WINDOW // 2
-    weights, many = torch.softmax(-at.square() / (2 * _SIGMA**2), 0), len(images)
+    weights = torch.softmax(-at.square() / (2 * _SIGMA**2), 0)
+    many = len(images)
     # One window a channel: torch's own kernels for that never round to TF32, which would lose the variances.
     down, across = (weights.view(1, 1, *shape).expand(many, -1, -1, -1) for shape in ((-1, 1), (1, -1)))
     columns = F.conv2d(images[None], down, padding=(padding, 0), groups=many)
@@ -388,7 +482,10 @@ def _windowed(images: Annotated[Tensor, "C H W"], padding: int) -> Annotated[Ten
 
 def _camera(target: Target, numbers: Annotated[Tensor, "25"]) -> Pinhole:
     """A photograph's camera on the device, from its numbers there (see `camera_array`)."""
-    turn, shift, focal, centre = numbers[:9].view(3, 3), numbers[9:12, None], numbers[12:14], numbers[14:16]
+    turn = numbers[:9].view(3, 3)
+    shift = numbers[9:12, None]
+    focal = numbers[12:14]
+    centre = numbers[14:16]
     last = torch.eye(4, dtype=numbers.dtype, device=numbers.device)[3:]
     pose = torch.cat([torch.cat([turn, shift], 1), last])
     intrinsics = torch.cat([torch.cat([focal.diag(), centre[:, None]], 1), last[:, 1:]])

@@ -1,7 +1,8 @@
 """Blocks of Gaussians in the compiled rasteriser: how their parameters lie, and the colours that they give.
 
-Parameters of LANES Gaussians lie together, one row of LANES numbers each: mean 0-2, ln scale 3-5, quaternion wxyz 6-9, logit
-of the opacity 10, then harmonics [K 3], K = 1, 4, 9 or 16 `bands`. A flat array of blocks, so that every load is one vector.
+Parameters of LANES Gaussians lie together, one row of LANES numbers each: mean 0-2, ln scale 3-5, quaternion
+wxyz 6-9, logit of the opacity 10, then harmonics [K 3], K = 1, 4, 9 or 16 `bands`. A flat array of blocks, so
+that every load is one vector.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg, var-annotated"
@@ -19,7 +20,9 @@ FIXED = 11
 BLOCKS = 64
 """Blocks that a thread takes at a time."""
 _f = np.float32
-_LARGE, _MOST_LOG, MARK = _f(1e15), _f(30), _f(-70)
+_LARGE = _f(1e15)
+_MOST_LOG = _f(30)
+MARK = _f(-70)
 """Coordinates beyond which a Gaussian is invalid; most of a logarithm; the logit of the invalid."""
 
 jit = cached_jit(nogil=True, fastmath={"contract", "arcp", "nsz"})
@@ -27,7 +30,8 @@ jit = cached_jit(nogil=True, fastmath={"contract", "arcp", "nsz"})
 
 @jit
 def _pack(counters, means, quaternions, log_scales, logits, harmonics, blocks):
-    count, bands = harmonics.shape[0], harmonics.shape[1]
+    count = harmonics.shape[0]
+    bands = harmonics.shape[1]
     rows = FIXED + 3 * bands
     while True:
         begin = take(counters, 0) * BLOCKS * LANES
@@ -61,21 +65,29 @@ def _pack(counters, means, quaternions, log_scales, logits, harmonics, blocks):
                     blocks[o + (FIXED + 3 * k + c) * LANES] = harmonics[i, k, c]
 
 
-def pack(means: Floats, quaternions: Floats, log_scales: Floats, logits: Floats, harmonics: Floats, blocks: Floats) -> None:
-    """Put arrays [N 3], [N 4], [N 3], [N], [N K 3] into blocks. Scales and opacities are limited to what float32 can square; a
-    Gaussian with NaN, or with another number beyond 1e15, is marked as invalid by its logit."""
+def pack(
+    means: Floats, quaternions: Floats, log_scales: Floats, logits: Floats, harmonics: Floats, blocks: Floats
+) -> None:
+    """Put arrays [N 3], [N 4], [N 3], [N], [N K 3] into blocks. Scales and opacities are limited to what
+    float32 can square; a Gaussian with NaN, or with another number beyond 1e15, is marked as invalid by its
+    logit.
+    """
     on_threads(_pack, means, quaternions, log_scales, logits, harmonics, blocks)
 
 
 def direction(mean, view):
     """Unit vectors from the camera to the means, and 1 / distance."""
-    dx, dy, dz = mean[0] - view[16], mean[1] - view[17], mean[2] - view[18]
+    dx = mean[0] - view[16]
+    dy = mean[1] - view[17]
+    dz = mean[2] - view[18]
     shrink = 1 / square_root(maximum(dx * dx + dy * dy + dz * dz, 1e-24))
     return dx * shrink, dy * shrink, dz * shrink, shrink
 
 
 def basis(x, y, z, bands):
-    """The first `bands` of the 16 real spherical harmonics at unit vectors, as in `harmonics.spherical_harmonics`."""
+    """The first `bands` of the 16 real spherical harmonics at unit vectors, as in
+    `harmonics.spherical_harmonics`.
+    """
     values = [splat(x, 0.28209479177387814)]
     if bands > 1:
         values += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
@@ -104,12 +116,16 @@ def colour(blocks, at, basis):
     """0.5 + harmonics times the basis: three vectors, before they are cut at 0."""
     colours = [splat(basis[0], 0.5)] * 3
     for k, b in enumerate(basis):
-        colours = [each + b * load(blocks, at + (FIXED + 3 * k + c) * LANES) for c, each in enumerate(colours)]
+        colours = [
+            each + b * load(blocks, at + (FIXED + 3 * k + c) * LANES) for c, each in enumerate(colours)
+        ]
     return colours
 
 
 def direction_slopes(x, y, z, bands, blocks, at, red, green, blue):
-    """The gradient of the colour in a unit direction, from that of its channels; components along the direction are left in."""
+    """The gradient of the colour in a unit direction, from that of its channels; components along the
+    direction are left in.
+    """
     gx = gy = gz = splat(x, 0)
     c1 = 0.4886025119029199
     for k in range(1, bands):
@@ -123,38 +139,56 @@ def direction_slopes(x, y, z, bands, blocks, at, red, green, blue):
             gx = gx - c1 * s
         elif k == 4:
             s = s * 1.0925484305920792
-            gx, gy = gx + s * y, gy + s * x
+            gx = gx + s * y
+            gy = gy + s * x
         elif k == 5:
             s = s * -1.0925484305920792
-            gy, gz = gy + s * z, gz + s * y
+            gy = gy + s * z
+            gz = gz + s * y
         elif k == 6:
             s = s * 0.31539156525252005
-            gx, gy, gz = gx - 2 * s * x, gy - 2 * s * y, gz + 4 * s * z
+            gx = gx - 2 * s * x
+            gy = gy - 2 * s * y
+            gz = gz + 4 * s * z
         elif k == 7:
             s = s * -1.0925484305920792
-            gx, gz = gx + s * z, gz + s * x
+            gx = gx + s * z
+            gz = gz + s * x
         elif k == 8:
             s = s * 0.5462742152960396
-            gx, gy = gx + 2 * s * x, gy - 2 * s * y
+            gx = gx + 2 * s * x
+            gy = gy - 2 * s * y
         elif k == 9:
             s = s * -0.5900435899266435
-            gx, gy = gx + s * 6 * x * y, gy + s * 3 * (x * x - y * y)
+            gx = gx + s * 6 * x * y
+            gy = gy + s * 3 * (x * x - y * y)
         elif k == 10:
             s = s * 2.890611442640554
-            gx, gy, gz = gx + s * y * z, gy + s * x * z, gz + s * x * y
+            gx = gx + s * y * z
+            gy = gy + s * x * z
+            gz = gz + s * x * y
         elif k == 11:
             s = s * -0.4570457994644658
-            gx, gy, gz = gx - 2 * s * x * y, gy + s * (4 * z * z - x * x - 3 * y * y), gz + 8 * s * y * z
+            gx = gx - 2 * s * x * y
+            gy = gy + s * (4 * z * z - x * x - 3 * y * y)
+            gz = gz + 8 * s * y * z
         elif k == 12:
             s = s * 0.3731763325901154
-            gx, gy, gz = gx - 6 * s * x * z, gy - 6 * s * y * z, gz + s * (6 * z * z - 3 * (x * x + y * y))
+            gx = gx - 6 * s * x * z
+            gy = gy - 6 * s * y * z
+            gz = gz + s * (6 * z * z - 3 * (x * x + y * y))
         elif k == 13:
             s = s * -0.4570457994644658
-            gx, gy, gz = gx + s * (4 * z * z - 3 * x * x - y * y), gy - 2 * s * x * y, gz + 8 * s * x * z
+            gx = gx + s * (4 * z * z - 3 * x * x - y * y)
+            gy = gy - 2 * s * x * y
+            gz = gz + 8 * s * x * z
         elif k == 14:
             s = s * 1.445305721320277
-            gx, gy, gz = gx + 2 * s * x * z, gy - 2 * s * y * z, gz + s * (x * x - y * y)
+            gx = gx + 2 * s * x * z
+            gy = gy - 2 * s * y * z
+            gz = gz + s * (x * x - y * y)
         else:
             s = s * -0.5900435899266435
-            gx, gy = gx + s * 3 * (x * x - y * y), gy - s * 6 * x * y
+            gx = gx + s * 3 * (x * x - y * y)
+            gy = gy - s * 6 * x * y
     return gx, gy, gz

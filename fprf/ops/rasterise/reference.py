@@ -5,9 +5,9 @@ Letters: N Gaussians, K harmonics of a colour channel (1, 4, 9 or 16), C feature
     Sigma = J W (R S)(R S)^T W^T J^T + 0.3 I      alpha_i(x) = o_i exp(-(x - m_i)^T Sigma_i^-1 (x - m_i) / 2), at most 0.99
     image = sum_i alpha_i T_i v_i + T_N background      T_i = prod_j<i (1 - alpha_j), front to back by the depth of the means
 
-alpha below 1/255 counts as 0. With `antialiased` o_i is multiplied by sqrt(det(Sigma - 0.3 I) / det Sigma): what the blur
-widens it makes fainter (Mip-Splatting). J is the projection's derivative at the mean, its tangents limited to 15 % beyond the
-image's edges, as in the published code.
+alpha below 1/255 counts as 0. With `antialiased` o_i is multiplied by sqrt(det(Sigma - 0.3 I) / det Sigma):
+what the blur widens it makes fainter (Mip-Splatting). J is the projection's derivative at the mean, its
+tangents limited to 15 % beyond the image's edges, as in the published code.
 """
 
 import math
@@ -20,7 +20,9 @@ from ..harmonics import spherical_harmonics
 from . import BLUR, MAX_ALPHA, MIN_ALPHA
 
 TILE = 16
-_MOST_LOG, _HUGE, _LARGE = 30.0, 1e16, 1e15
+_MOST_LOG = 30.0
+_HUGE = 1e16
+_LARGE = 1e15
 
 
 class Pinhole(NamedTuple):
@@ -52,12 +54,16 @@ class Projected(NamedTuple):
 def view_colours(
     means: Annotated[Tensor, "N 3"], harmonics: Annotated[Tensor, "N K 3"], camera: Pinhole
 ) -> tuple[Annotated[Tensor, "N 3"], Annotated[Tensor, "N"]]:
-    """Colours from 0 on as a camera sees them, and which of them are finite; the others are of harmonics 0."""
+    """Colours from 0 on as a camera sees them, and which of them are finite; the others are of harmonics
+    0.
+    """
     pose = camera.world_to_camera.to(means)
     fine = (means.abs() < _LARGE).all(-1) & (harmonics.abs() < _LARGE).flatten(1).all(-1)
     direction = torch.where(fine[:, None], means, torch.zeros_like(means)) + pose[:3, :3].T @ pose[:3, 3]
     harmonics = torch.where(fine[:, None, None], harmonics, torch.zeros_like(harmonics))
-    basis = spherical_harmonics(torch.nn.functional.normalize(direction, dim=-1), math.isqrt(harmonics.shape[1]))
+    basis = spherical_harmonics(
+        torch.nn.functional.normalize(direction, dim=-1), math.isqrt(harmonics.shape[1])
+    )
     return ((basis[..., None] * harmonics).sum(1) + 0.5).clamp_min(0), fine
 
 
@@ -70,20 +76,28 @@ def project_reference(
     *,
     antialiased: bool,
 ) -> Projected:
-    """Gaussians on the image plane; those with NaN, means beyond 1e15 or more than 1e8 pixels wide are not drawn."""
+    """Gaussians on the image plane; those with NaN, means beyond 1e15 or more than 1e8 pixels wide are not
+    drawn.
+    """
     world = camera.world_to_camera.to(means)
     fx, fy, cx, cy = (float(camera.intrinsics[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    # What is not finite would spoil the gradients of all others: harmless numbers take its place, and it is not drawn.
+    # What is not finite would spoil the gradients of all others: harmless numbers take its place, and it is
+    # not drawn.
     shape = torch.cat([quaternions, log_scales, logits[:, None]], -1)
     fine = (means.abs() < _LARGE).all(-1) & (quaternions.abs() < _LARGE).all(-1) & ~shape.isnan().any(-1)
     means, quaternions = (torch.where(fine[:, None], x, torch.ones_like(x)) for x in (means, quaternions))
-    log_scales = torch.where(fine[:, None], log_scales, torch.zeros_like(log_scales)).clamp(-_MOST_LOG, _MOST_LOG)
+    log_scales = torch.where(fine[:, None], log_scales, torch.zeros_like(log_scales)).clamp(
+        -_MOST_LOG, _MOST_LOG
+    )
     logits = torch.where(fine, logits, torch.zeros_like(logits)).clamp(-_MOST_LOG, _MOST_LOG)
-    # Tangents of the means. Far outside the image J would explode: its tangents alone are limited, the means are not.
+    # Tangents of the means. Far outside the image J would explode: its tangents alone are limited, the means
+    # are not.
     x, y, depth = (means @ world[:3, :3].T + world[:3, 3]).unbind(-1)
     z = torch.where(depth > camera.near, depth, torch.ones_like(depth))
-    u, v = x / z, y / z
-    beyond_u, beyond_v = 0.15 * camera.width / fx, 0.15 * camera.height / fy
+    u = x / z
+    v = y / z
+    beyond_u = 0.15 * camera.width / fx
+    beyond_v = 0.15 * camera.height / fy
     limited_u = u.clamp(-cx / fx - beyond_u, (camera.width - cx) / fx + beyond_u)
     limited_v = v.clamp(-cy / fy - beyond_v, (camera.height - cy) / fy + beyond_v)
     # Rows of J W R S: the half axes in pixels, whose products are the covariance.
@@ -98,13 +112,17 @@ def project_reference(
     down = (fy / z)[:, None] * (axes[:, 1] - limited_v[:, None] * axes[:, 2])
     fine = fine & (across.square().sum(-1) + down.square().sum(-1) < _HUGE)
     across, down = (torch.where(fine[:, None], x, torch.ones_like(x)) for x in (across, down))
-    xx, yy, xy = across.square().sum(-1), down.square().sum(-1), (across * down).sum(-1)
+    xx = across.square().sum(-1)
+    yy = down.square().sum(-1)
+    xy = (across * down).sum(-1)
     # The determinant as the square of a cross product: xx yy - xy^2 would lose the digits of thin ellipses.
     det_sharp = torch.linalg.cross(across, down).square().sum(-1)
     det_blurred = det_sharp + BLUR * (xx + yy) + BLUR**2
     opacity = torch.sigmoid(logits)
     if antialiased:
-        opacity = opacity * (det_sharp / det_blurred + 1e-8).sqrt()  # + 1e-8: the root has a finite slope at 0
+        opacity = (
+            opacity * (det_sharp / det_blurred + 1e-8).sqrt()
+        )  # + 1e-8: the root has a finite slope at 0
     covariance = torch.stack([xx + BLUR, xy, yy + BLUR], -1)
     mean = torch.stack([fx * u + cx, fy * v + cy], -1)
     # Where alpha falls to 1/255: x^T Sigma^-1 x = 2 ln(255 o).
@@ -132,12 +150,19 @@ def rasterise_reference(
     # Front to back, without those that are not drawn.
     shown = splats.extent[:, 0] > 0
     order = splats.depth.detach().masked_fill(~shown, torch.inf).argsort(stable=True)[: int(shown.sum())]
-    splats, values = Projected(*(x[order] for x in splats)), values[order]
+    splats = Projected(*(x[order] for x in splats))
+    values = values[order]
     behind = torch.cat([background, background.new_zeros(1)])
     rows = []
     for top in range(0, camera.height, TILE):
         tiles = [
-            _tile(splats, values, behind, (top, min(top + TILE, camera.height)), (left, min(left + TILE, camera.width)))
+            _tile(
+                splats,
+                values,
+                behind,
+                (top, min(top + TILE, camera.height)),
+                (left, min(left + TILE, camera.width)),
+            )
             for left in range(0, camera.width, TILE)
         ]
         rows.append(torch.cat(tiles, 1))
@@ -146,12 +171,18 @@ def rasterise_reference(
 
 
 def _tile(
-    splats: Projected, values: Tensor, background: Tensor, vertical: tuple[int, int], horizontal: tuple[int, int]
+    splats: Projected,
+    values: Tensor,
+    background: Tensor,
+    vertical: tuple[int, int],
+    horizontal: tuple[int, int],
 ) -> Annotated[Tensor, "h w C+2"]:
     """Values, depth and transmittance of the pixels between two rows and two columns."""
     # Those that reach into the tile, front to back as before.
-    (top, bottom), (left, right) = vertical, horizontal
-    (x, y), (rx, ry) = splats.mean.detach().unbind(-1), splats.extent.unbind(-1)
+    (top, bottom) = vertical
+    (left, right) = horizontal
+    (x, y) = splats.mean.detach().unbind(-1)
+    (rx, ry) = splats.extent.unbind(-1)
     here = ((y + ry > top) & (y - ry < bottom) & (x + rx > left) & (x - rx < right)).nonzero()[:, 0]
     across = torch.arange(left, right, device=x.device, dtype=x.dtype) + 0.5
     down = torch.arange(top, bottom, device=x.device, dtype=x.dtype) + 0.5
@@ -163,5 +194,7 @@ def _tile(
     alpha = splats.opacity[here, None, None] * power.exp()
     alpha = torch.where(alpha > MIN_ALPHA, alpha.clamp_max(MAX_ALPHA), torch.zeros_like(alpha))
     passing = torch.cat([alpha.new_ones(1, bottom - top, right - left), (1 - alpha).cumprod(0)])
-    image = torch.einsum("nhw,nc->hwc", alpha * passing[:-1], values[here]) + passing[-1][..., None] * background
+    image = (
+        torch.einsum("nhw,nc->hwc", alpha * passing[:-1], values[here]) + passing[-1][..., None] * background
+    )
     return torch.cat([image, passing[-1][..., None]], -1)

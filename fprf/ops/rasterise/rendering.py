@@ -1,9 +1,10 @@
 """3D Gaussians to images, forward and backward, and image features back to Gaussians.
 
-N Gaussians, K harmonics of a colour channel (1, 4, 9 or 16), C feature channels, H W pixels; H16 W16 whole tiles of them.
+N Gaussians, K harmonics of a colour channel (1, 4, 9 or 16), C feature channels, H W pixels; H16 W16 whole
+tiles of them.
 
-`rasterise_reference` defines what is computed, in plain torch, for every device and dtype. On the CPU in float32 compiled
-kernels do (`layout`, `forward_kernels`, `backward_kernels`), by the steps below; on CUDA in
+`rasterise_reference` defines what is computed, in plain torch, for every device and dtype. On the CPU in
+float32 compiled kernels do (`layout`, `forward_kernels`, `backward_kernels`), by the steps below; on CUDA in
 float32 gsplat does, where it is installed (`gsplat`).
 
     project     mean -> image position and depth, Sigma' = J W Sigma W^T J^T + 0.3 I, colour from its harmonics
@@ -11,9 +12,10 @@ float32 gsplat does, where it is installed (`gsplat`).
     composite   C = sum_i c_i alpha_i T_i + T_N background,  T_i = prod_j<i (1 - alpha_j),  front to back, tile by tile
     back        the same tiles, front to back again, with what is still behind: dL/d ln alpha and dL/dc, then back to parameters
 
-These skip and count: Gaussians whose opacity stays below 1/255, behind the camera, outside the image, or not finite (exact:
-the reference gives them nothing either), and what lies behind blocks of 4 x 4 pixels through which less than 1/1000 of the
-light passes (an error of at most 1/1000 of the largest value). Their exponential errs by 1.1e-4 of alpha.
+These skip and count: Gaussians whose opacity stays below 1/255, behind the camera, outside the image, or not
+finite (exact: the reference gives them nothing either), and what lies behind blocks of 4 x 4 pixels through
+which less than 1/1000 of the light passes (an error of at most 1/1000 of the largest value). Their
+exponential errs by 1.1e-4 of alpha.
 """
 
 # The checker takes compiled functions to have one argument.
@@ -49,7 +51,9 @@ class Rasterised(NamedTuple):
     features: Annotated[Tensor, "H W C"]
     """Composited on zeros; C = 0 where none were given."""
     counts: Mapping[str, int]
-    """Gaussians left out: faint, behind, outside, invalid; then entries (Gaussians times tiles) and saturated ones, skipped."""
+    """Gaussians left out: faint, behind, outside, invalid; then entries (Gaussians times tiles) and saturated
+    ones, skipped.
+    """
 
 
 def rasterise(
@@ -64,10 +68,11 @@ def rasterise(
     background: Annotated[Tensor, "3"] | None = None,
     antialiased: bool = False,
 ) -> Rasterised:
-    """Render Gaussians: quaternions are wxyz of any length, scales natural logarithms, opacities logits, K 1, 4, 9 or 16.
+    """Render Gaussians: quaternions are wxyz of any length, scales natural logarithms, opacities logits, K 1,
+    4, 9 or 16.
 
-    Every tensor has a gradient, through every output. Features must be finite. `antialiased` is for Gaussians trained that way;
-    the background is black by default. Raises FprfError where shapes do not fit.
+    Every tensor has a gradient, through every output. Features must be finite. `antialiased` is for Gaussians
+    trained that way; the background is black by default. Raises FprfError where shapes do not fit.
     """
     _check(means, quaternions, log_scales, logits, harmonics, features)
     features = means.new_zeros(len(means), 0) if features is None else features
@@ -87,7 +92,9 @@ def rasterise(
     elif torch.is_grad_enabled() and any(x.requires_grad for x in given):
         planes, passing, counts = _Rasterise.apply(*given, camera, antialiased)  # type: ignore[no-untyped-call]
     else:
-        planes, passing, counts, _ = _composite(_view(*shape, logits, harmonics, camera, antialiased), features, background)
+        planes, passing, counts, _ = _composite(
+            _view(*shape, logits, harmonics, camera, antialiased), features, background
+        )
     # The mean depth by weight.
     opacity = 1 - passing
     depth = planes[..., 3] / opacity.clamp_min(1e-6)  # a drawn alpha is at least 1/255
@@ -104,13 +111,16 @@ def lift(
     *,
     antialiased: bool = False,
 ) -> Annotated[Tensor, "N C"]:
-    """Carry the features of pixels back to the Gaussians that show there, by their weights in the image: the transpose of
-    rendering features. A channel of ones gives the sum of the weights. No gradients. Raises FprfError where shapes do not fit.
+    """Carry the features of pixels back to the Gaussians that show there, by their weights in the image: the
+    transpose of rendering features. A channel of ones gives the sum of the weights. No gradients. Raises
+    FprfError where shapes do not fit.
     """
     harmonics = means.new_zeros(len(means), 1, 3)
     _check(means, quaternions, log_scales, logits, harmonics, None)
     if pixels.shape[:2] != (camera.height, camera.width):
-        raise FprfError(f"pixels {tuple(pixels.shape)}: a camera of {camera.height} x {camera.width} has other ones")
+        raise FprfError(
+            f"pixels {tuple(pixels.shape)}: a camera of {camera.height} x {camera.width} has other ones"
+        )
     pixels, channels = pixels.detach(), pixels.shape[-1]
     shape = (means.detach(), quaternions.detach(), log_scales.detach(), logits.detach())
     if not compiled_for(*shape, pixels):
@@ -121,14 +131,22 @@ def lift(
             centres, turns, sizes, densities = (each.clone() for each in shape)
             values = centres.new_zeros(len(centres), channels, requires_grad=True)
             image, _ = _form(*shape, pixels)(
-                centres, turns, sizes, densities, values, camera, pixels.new_zeros(channels), antialiased=antialiased
+                centres,
+                turns,
+                sizes,
+                densities,
+                values,
+                camera,
+                pixels.new_zeros(channels),
+                antialiased=antialiased,
             )
             (lifted,) = torch.autograd.grad((image[..., :-1] * pixels).sum(), values)
         return lifted
     from . import backward_kernels as kernels
 
     tiles = _view(*shape, harmonics, camera, antialiased).tiles
-    # Sixteen channels fill the sums of an entry, and cost little more than eight: Gaussians are found, and entries read, once.
+    # Sixteen channels fill the sums of an entry, and cost little more than eight: Gaussians are found, and
+    # entries read, once.
     parts = [(first, 16 if channels - first > 8 else 8) for first in range(0, channels, 16)]
     out = np.empty((len(means), sum(parts[-1]) if parts else 0), np.float32)
     for first, size in parts:
@@ -153,7 +171,8 @@ class _Rasterise(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, dict[str, int]]:
         view = _view(means, quaternions, log_scales, logits, harmonics, camera, antialiased)
         planes, passing, counts, made = _composite(view, features, background)
-        ctx.view, ctx.made = view, made
+        ctx.view = view
+        ctx.made = made
         ctx.save_for_backward(features, passing)
         return planes, passing, counts
 
@@ -161,12 +180,17 @@ class _Rasterise(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor, grad_passing: Tensor, _: None) -> tuple[Tensor | None, ...]:
         from . import backward_kernels as kernels
 
-        (tiles, blocks, bands, camera, _), (features, passing) = ctx.view, ctx.saved_tensors
-        # Of the first group the sums of the shape, with the gradient of the transmittance, which is to be counted once.
+        (tiles, blocks, bands, camera, _) = ctx.view
+        (features, passing) = ctx.saved_tensors
+        # Of the first group the sums of the shape, with the gradient of the transmittance, which is to be
+        # counted once.
         of_left = _planes(tiles, grad_passing[..., None], 1)[0]
         of_features = np.empty((tiles.total, features.shape[1] + -features.shape[1] % _WIDE), np.float32)
-        total, begin = None, 0
-        for (channels, values, stride, first), (out, left) in zip(_groups(ctx.view, features), ctx.made, strict=True):
+        total = None
+        begin = 0
+        for (channels, values, stride, first), (out, left) in zip(
+            _groups(ctx.view, features), ctx.made, strict=True
+        ):
             slope = _planes(tiles, grad[..., begin : begin + channels], channels)
             begin += channels
             sums = kernels.composite_back(
@@ -174,23 +198,33 @@ class _Rasterise(torch.autograd.Function):
                 out.reshape(-1), left.reshape(-1), slope.reshape(-1), of_left.reshape(-1),
             )  # fmt: skip
             if total is None:
-                total, of_left = sums, np.zeros_like(of_left)
+                total = sums
+                of_left = np.zeros_like(of_left)
             else:
                 # Features move alphas as colours do; the last slot is spare.
                 total.reshape(-1, kernels.SUMS)[:-1, :6] += sums.reshape(-1, kernels.SUMS)[:-1, :6]
-                kernels.lift_values(tiles, sums, of_features.reshape(-1), of_features.shape[1], first, channels)
+                kernels.lift_values(
+                    tiles, sums, of_features.reshape(-1), of_features.shape[1], first, channels
+                )
         # From sums over pixels to the parameters, in blocks; then a row a Gaussian.
         assert total is not None
         slopes = np.empty_like(blocks)
         kernels.gradients(tiles, blocks, bands, camera, total, slopes)
-        rows = torch.from_numpy(slopes).view(-1, 11 + 3 * bands, 16).transpose(1, 2).reshape(-1, 11 + 3 * bands)[: tiles.total]
+        rows = (
+            torch.from_numpy(slopes)
+            .view(-1, 11 + 3 * bands, 16)
+            .transpose(1, 2)
+            .reshape(-1, 11 + 3 * bands)[: tiles.total]
+        )
         shape = rows[:, :3], rows[:, 6:10], rows[:, 3:6], rows[:, 10], rows[:, 11:].reshape(-1, bands, 3)
         of_background = (grad[..., :3] * passing[..., None]).sum((0, 1))
         return *shape, torch.from_numpy(of_features)[:, : features.shape[1]], of_background, None, None
 
 
 def _form(*tensors: Tensor) -> Callable[..., tuple[Tensor, Tensor]]:
-    """The rasteriser of tensors that are not the CPU kernels': gsplat for float32 where it works, else the plain form."""
+    """The rasteriser of tensors that are not the CPU kernels': gsplat for float32 where it works, else the
+    plain form.
+    """
     device = tensors[0].device
     if compiled() and device.type == "cuda" and all(x.dtype == torch.float32 for x in tensors):
         from .gsplat import rasterise_gsplat, usable
@@ -201,9 +235,15 @@ def _form(*tensors: Tensor) -> Callable[..., tuple[Tensor, Tensor]]:
 
 
 def _check(
-    means: Tensor, quaternions: Tensor, log_scales: Tensor, logits: Tensor, harmonics: Tensor, features: Tensor | None
+    means: Tensor,
+    quaternions: Tensor,
+    log_scales: Tensor,
+    logits: Tensor,
+    harmonics: Tensor,
+    features: Tensor | None,
 ) -> None:
-    count, bands = len(means), harmonics.shape[1] if harmonics.dim() == 3 else 0
+    count = len(means)
+    bands = harmonics.shape[1] if harmonics.dim() == 3 else 0
     wanted = [(count, 3), (count, 4), (count, 3), (count,), (count, bands, 3)]
     given = [tuple(x.shape) for x in (means, quaternions, log_scales, logits, harmonics)]
     fit = features is None or (features.dim() == 2 and len(features) == count)
@@ -238,44 +278,66 @@ def _view(
     from .training import camera_array
 
     # The kernels read blocks of LANES Gaussians, property by property; the last block is padded.
-    bands, seen, whole = harmonics.shape[1], camera_array(camera, antialiased), -(-len(means) // LANES) * LANES
-    blocks, splats = aligned(whole * (FIXED + 3 * bands)), aligned(whole * kernels.SLOTS)
-    pack(*(x.detach().contiguous().numpy() for x in (means, quaternions, log_scales, logits, harmonics)), blocks)
-    # Project all Gaussians, leave out what cannot be seen, and list for each tile of 16 x 16 pixels those on it by depth.
+    bands = harmonics.shape[1]
+    seen = camera_array(camera, antialiased)
+    whole = -(-len(means) // LANES) * LANES
+    blocks = aligned(whole * (FIXED + 3 * bands))
+    splats = aligned(whole * kernels.SLOTS)
+    pack(
+        *(x.detach().contiguous().numpy() for x in (means, quaternions, log_scales, logits, harmonics)),
+        blocks,
+    )
+    # Project all Gaussians, leave out what cannot be seen, and list for each tile of 16 x 16 pixels those on
+    # it by depth.
     tiles = kernels.see(blocks, len(means), bands, seen, camera.width, camera.height, splats)
-    counts = dict(zip(_SKIPPED, tiles.skipped.tolist(), strict=True)) | {"entries": len(tiles.ids), "saturated": 0}
+    counts = dict(zip(_SKIPPED, tiles.skipped.tolist(), strict=True)) | {
+        "entries": len(tiles.ids),
+        "saturated": 0,
+    }
     return _View(tiles, blocks, bands, seen, counts)
 
 
 def _groups(view: _View, features: Tensor) -> list[tuple[int, _Array, int, int]]:
-    """Channels that are composited together: how many, the array that holds them, its stride and the first one.
+    """Channels that are composited together: how many, the array that holds them, its stride and the first
+    one.
 
     Colour and depth lie in the splats; features, in groups of 8, padded with zeros.
     """
     padded = features.shape[1] + -features.shape[1] % _WIDE
-    values = torch.nn.functional.pad(features.detach(), (0, padded - features.shape[1])).contiguous().view(-1).numpy()
+    values = (
+        torch.nn.functional.pad(features.detach(), (0, padded - features.shape[1]))
+        .contiguous()
+        .view(-1)
+        .numpy()
+    )
     return [(4, view.tiles.splats, 16, 6), *((_WIDE, values, padded, c) for c in range(0, padded, _WIDE))]
 
 
 def _composite(
     view: _View, features: Tensor, background: Tensor
 ) -> tuple[Tensor, Tensor, dict[str, int], list[tuple[_Array, _Array]]]:
-    """Channels last: colour, depth, features; the transmittance left; counts; and planes and transmittance of each group."""
+    """Channels last: colour, depth, features; the transmittance left; counts; and planes and transmittance of
+    each group.
+    """
     from . import forward_kernels as kernels
 
-    # One pass over the sorted lists of Gaussians for each group of channels: a kernel composites 4 or 8 at a time, and the
-    # transmittance is the same in all.
+    # One pass over the sorted lists of Gaussians for each group of channels: a kernel composites 4 or 8 at a
+    # time, and the transmittance is the same in all.
     tiles = view.tiles
     made: list[tuple[_Array, _Array]] = []
     saturated = 0
     for channels, values, stride, first in _groups(view, features):
-        out, left = np.empty((channels, *_padded(tiles)), np.float32), np.empty(_padded(tiles), np.float32)
+        out = np.empty((channels, *_padded(tiles)), np.float32)
+        left = np.empty(_padded(tiles), np.float32)
         behind = np.zeros(channels, np.float32)
         if not made:  # colour and depth come first; only colour has a background
             behind[:3] = background.detach().numpy()
-        saturated = kernels.composite(tiles, channels, values, stride, first, behind, out.reshape(-1), left.reshape(-1))
+        saturated = kernels.composite(
+            tiles, channels, values, stride, first, behind, out.reshape(-1), left.reshape(-1)
+        )
         made.append((out, left))
-    # Off with the margin of whole tiles and the padding of the last group; the arrays in `made` keep both for gradients.
+    # Off with the margin of whole tiles and the padding of the last group; the arrays in `made` keep both for
+    # gradients.
     planes = torch.cat([torch.from_numpy(out[:, : tiles.height, : tiles.width]) for out, _ in made])
     planes = planes[: 4 + features.shape[1]].permute(1, 2, 0)
     passing = torch.from_numpy(made[0][1][: tiles.height, : tiles.width].copy())

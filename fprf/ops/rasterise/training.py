@@ -1,13 +1,15 @@
-"""3D Gaussians in training, on compiled kernels: parameters with Adam's moments, and a step of learning from a photograph.
+"""3D Gaussians in training, on compiled kernels: parameters with Adam's moments, and a step of learning from
+a photograph.
 
-What the kernels want (padded blocks of parameters, planes of whole tiles, room for projections) is known here and in the
-kernels alone. Whoever trains sees rows [N R] of parameters, one a Gaussian, in these columns:
+What the kernels want (padded blocks of parameters, planes of whole tiles, room for projections) is known here
+and in the kernels alone. Whoever trains sees rows [N R] of parameters, one a Gaussian, in these columns:
 
     MEANS 0-2 · LOG_SCALES 3-5 (natural logarithms) · QUATERNION 6-9 (w x y z) · LOGIT 10 (of the opacity)
     HARMONICS 11-R (coefficient after coefficient, red green blue; those of degree 0 first)          R = 11 + 3 K
 
-Numba keeps what it compiled in its cache. `python -m fprf.ops.rasterise.training BANDS PART` puts there what half of a step
-needs, in three seconds; a command starts these first and has its kernels when it has read its images.
+Numba keeps what it compiled in its cache. `python -m fprf.ops.rasterise.training BANDS PART` puts there what
+half of a step needs, in three seconds; a command starts these first and has its kernels when it has read its
+images.
 """
 
 import subprocess
@@ -32,7 +34,11 @@ if TYPE_CHECKING:  # it imports torch, which compilation need not wait for
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 
-MEANS, LOG_SCALES, QUATERNION, LOGIT, HARMONICS = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 11), slice(FIXED, None)
+MEANS = slice(0, 3)
+LOG_SCALES = slice(3, 6)
+QUATERNION = slice(6, 10)
+LOGIT = slice(10, 11)
+HARMONICS = slice(FIXED, None)
 _UNUSED = -20
 """Logit of the opacity in rows that hold no Gaussian: they are never drawn."""
 
@@ -64,7 +70,9 @@ class Target(NamedTuple):
         """The camera's place in the world."""
         return self.camera[16:19].astype(np.float64)
 
-    def seen_from(self, axes: Annotated[NDArray[np.float64], "3 3"], centre: Annotated[NDArray[np.float64], "3"]) -> "Target":
+    def seen_from(
+        self, axes: Annotated[NDArray[np.float64], "3 3"], centre: Annotated[NDArray[np.float64], "3"]
+    ) -> "Target":
         """The same photograph, taken with other axes from another place."""
         camera = self.camera.copy()
         camera[:9], camera[9:12], camera[16:19] = axes.reshape(-1), -axes @ centre, centre
@@ -84,8 +92,11 @@ def target_of(
     *,
     antialiased: bool = True,
 ) -> Target:
-    """A photograph in [0, 1] with its camera; pixels that are not valid do not count. None = all are, no sky is known."""
-    width, height = camera.width, camera.height
+    """A photograph in [0, 1] with its camera; pixels that are not valid do not count. None = all are, no sky
+    is known.
+    """
+    width = camera.width
+    height = camera.height
     planes = _planes(colours, photometric.slack(width + -width % SIDE))
     used = None if valid is None or valid.all() else _planes(np.repeat(valid[..., None], 3, 2), 64)
     above = None if sky is None else _planes(sky[..., None], 0)
@@ -97,8 +108,10 @@ def camera_array(camera: "Pinhole", antialiased: bool) -> Floats:
     """A camera as the kernels take it (see `forward_kernels`)."""
     fx, fy, cx, cy = (float(camera.intrinsics[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
     pose = camera.world_to_camera.double().cpu()
-    turn, shift = pose[:3, :3], pose[:3, 3]
-    # J is taken at most 15 % of the image beyond its edges: further out the linear projection stretches without bound.
+    turn = pose[:3, :3]
+    shift = pose[:3, 3]
+    # J is taken at most 15 % of the image beyond its edges: further out the linear projection stretches
+    # without bound.
     limits = [
         -cx / fx - 0.15 * camera.width / fx,
         (camera.width - cx) / fx + 0.15 * camera.width / fx,
@@ -126,24 +139,27 @@ class Learnt(NamedTuple):
     pull: Annotated[Floats, "3"]
     """Gradient of the loss by the logarithms of the factors."""
     of_camera: Annotated[NDArray[np.float64], "6"]
-    """Gradient of the loss by a turn of the camera about its own centre (radians about the camera's axes) and by a shift of
-    that centre (world axes)."""
+    """Gradient of the loss by a turn of the camera about its own centre (radians about the camera's axes) and
+    by a shift of that centre (world axes).
+    """
 
 
 class TrainableGaussians:
     """At most `room` Gaussians of K harmonics with Adam's moments; rows are those of the module's docstring.
 
-    Moments are the first [N R], the second [N R] and the weight in the second [N], 1 - 0.99^k after k steps: what is seen for
-    the first time moves as it would have in the first step (`backward_kernels.adam`).
+    Moments are the first [N R], the second [N R] and the weight in the second [N], 1 - 0.99^k after k steps:
+    what is seen for the first time moves as it would have in the first step (`backward_kernels.adam`).
     """
 
     def __init__(self, room: int, bands: int) -> None:
-        self.bands, self.rows = bands, FIXED + 3 * bands
+        self.bands = bands
+        self.rows = FIXED + 3 * bands
         self.count = 0
         self._room = -(-room // LANES) * LANES
         # One array for each of parameters, first and second moment: [blocks, R, LANES], flat.
         self._blocks, self._first, self._second = (aligned(self.rows * self._room) for _ in range(3))
-        self._weight, self._splats = aligned(self._room), aligned(self._room * SLOTS)
+        self._weight = aligned(self._room)
+        self._splats = aligned(self._room * SLOTS)
         for part in (self._blocks, self._first, self._second, self._weight):
             part[:] = 0
 
@@ -164,7 +180,9 @@ class TrainableGaussians:
                 self._put(part, np.arange(self.count), values)
         self._weight[:], self._weight[: self.count] = 0, weight
 
-    def read(self, columns: slice = slice(None), index: NDArray[np.int64] | None = None) -> Annotated[Floats, "M c"]:
+    def read(
+        self, columns: slice = slice(None), index: NDArray[np.int64] | None = None
+    ) -> Annotated[Floats, "M c"]:
         """A copy of some columns of the parameters, of all Gaussians or of some."""
         return self._read(self._blocks, columns, index)
 
@@ -182,11 +200,17 @@ class TrainableGaussians:
         scales[index // LANES, :, index % LANES] = np.minimum(self.read(LOG_SCALES, index), most[:, None])
 
     def split(
-        self, index: NDArray[np.int64], to: NDArray[np.int64], one: Annotated[Floats, "M R"], other: Annotated[Floats, "M R"]
+        self,
+        index: NDArray[np.int64],
+        to: NDArray[np.int64],
+        one: Annotated[Floats, "M R"],
+        other: Annotated[Floats, "M R"],
     ) -> None:
-        """Put `one` in the place of M Gaussians and `other` to `to`: in the place of others, or behind the last one.
+        """Put `one` in the place of M Gaussians and `other` to `to`: in the place of others, or behind the
+        last one.
 
-        Both begin without a first moment and with half of the second, as the gradients of halves are half as large.
+        Both begin without a first moment and with half of the second, as the gradients of halves are half as
+        large.
         """
         self._put(self._blocks, index, one)
         self._put(self._blocks, to, other)
@@ -198,8 +222,14 @@ class TrainableGaussians:
         self.count = max(self.count, int(to.max()) + 1)
 
     def reorder(self, order: Annotated[NDArray[np.int64], "N"]) -> None:
-        """Sort all Gaussians: the i-th becomes what the order[i]-th was. Neighbours in space should be neighbours here."""
-        for part in (self._blocks, self._first, self._second):  # one after the other: a copy takes as much again
+        """Sort all Gaussians: the i-th becomes what the order[i]-th was. Neighbours in space should be
+        neighbours here.
+        """
+        for part in (
+            self._blocks,
+            self._first,
+            self._second,
+        ):  # one after the other: a copy takes as much again
             self._put(part, np.arange(self.count), self._read(part, index=order))
         self._weight[: self.count] = self._weight[order]
 
@@ -212,14 +242,16 @@ class TrainableGaussians:
         rates: Annotated[Floats, "R"],
         factors: Annotated[Floats, "3"] | None = None,
     ) -> Learnt:
-        """Render, compare with a photograph, and move by a step of Adam. Where the loss is not finite nothing is changed.
+        """Render, compare with a photograph, and move by a step of Adam. Where the loss is not finite nothing
+        is changed.
 
-        `ssim` is the share of 1 - SSIM in the loss, `rates` a learning rate a column; renders are multiplied by `factors`, one
-        a channel, before they are compared.
+        `ssim` is the share of 1 - SSIM in the loss, `rates` a learning rate a column; renders are multiplied
+        by `factors`, one a channel, before they are compared.
         """
         width, height, camera, planes, blurred, valid, *_ = target
         # Render, expose, compare: the loss and its slope by every pixel.
-        area, pull = target.area, np.zeros(3, np.float32)
+        area = target.area
+        pull = np.zeros(3, np.float32)
         tiles, out, left = self._render(target, background)
         shown = _exposed(out, area, factors)
         l1, similar, slope = photometric.loss(shown, planes, blurred, width, height, ssim)
@@ -228,42 +260,55 @@ class TrainableGaussians:
         if valid is not None:
             slope *= valid
         if factors is not None:
-            # Of a factor e^g the slope by g is that by the render times the render; of the render it is that times the factor.
+            # Of a factor e^g the slope by g is that by the render times the render; of the render it is that
+            # times the factor.
             channels = slope[: 3 * area].reshape(3, area)
             pull[:] = np.einsum("ca,ca->c", channels, shown[: 3 * area].reshape(3, area))
             channels *= factors[:, None]
-        # Pixels to sums for each entry (Gaussian in a tile), and these to parameters, which are moved at once.
-        sums = backward.composite_back(tiles, 3, self._splats, SLOTS, 6, out, left, slope, np.zeros_like(left))
+        # Pixels to sums for each entry (Gaussian in a tile), and these to parameters, which are moved at
+        # once.
+        sums = backward.composite_back(
+            tiles, 3, self._splats, SLOTS, 6, out, left, slope, np.zeros_like(left)
+        )
         moments = self._first, self._second, self._weight
         of_camera = backward.adam(tiles, self._blocks, moments, self.bands, camera, sums, rates)
-        tall, wide = -(-height // SIDE) * SIDE, -(-width // SIDE) * SIDE
+        tall = -(-height // SIDE) * SIDE
+        wide = -(-width // SIDE) * SIDE
         apart = (shown - planes)[: 3 * area].reshape(3, tall, wide)[:, :height, :width]
         return Learnt(l1, similar, float(np.square(apart).mean()), pull, of_camera)
 
     def errors(
-        self, target: Target, background: tuple[float, float, float], factors: Annotated[Floats, "3"] | None = None
+        self,
+        target: Target,
+        background: tuple[float, float, float],
+        factors: Annotated[Floats, "3"] | None = None,
     ) -> Annotated[Floats, "N 3"]:
-        """Sums over the pixels of a view of each Gaussian's weight: times |render - photograph|, where there is sky, and of
-        all."""
+        """Sums over the pixels of a view of each Gaussian's weight: times |render - photograph|, where there
+        is sky, and of all.
+        """
         tiles, out, _ = self._render(target, background)
         area = target.area
         apart = np.abs(_exposed(out, area, factors) - target.planes)[: 3 * area]
         if target.valid is not None:
             apart *= target.valid[: 3 * area]
         # Three images to be carried back to the Gaussians, of the eight that the kernel takes at once.
-        pixels, sums = np.zeros(8 * area, np.float32), np.empty((self.count, 8), np.float32)
+        pixels = np.zeros(8 * area, np.float32)
+        sums = np.empty((self.count, 8), np.float32)
         pixels[:area], pixels[2 * area : 3 * area] = apart.reshape(3, area).sum(0), 1
         if target.sky is not None:
             pixels[area : 2 * area] = target.sky
         backward.lift_values(tiles, backward.lift(tiles, 8, pixels), sums.reshape(-1), 8, 0, 8, skipped=0)
         return sums[:, :3]
 
-    def _render(self, target: Target, background: tuple[float, float, float]) -> tuple[forward.Tiles, Floats, Floats]:
+    def _render(
+        self, target: Target, background: tuple[float, float, float]
+    ) -> tuple[forward.Tiles, Floats, Floats]:
         """The Gaussians that a view sees, its planes of colours and its transmittance."""
         tiles = forward.see(
             self._blocks, self.count, self.bands, target.camera, target.width, target.height, self._splats
         )  # fmt: skip
-        out, left = np.zeros(len(target.planes), np.float32), np.empty(len(target.planes) // 3, np.float32)
+        out = np.zeros(len(target.planes), np.float32)
+        left = np.empty(len(target.planes) // 3, np.float32)
         forward.composite(tiles, 3, self._splats, SLOTS, 6, np.array(background, np.float32), out, left)
         return tiles, out, left
 
@@ -292,7 +337,9 @@ def _exposed(image: Floats, area: int, factors: Annotated[Floats, "3"] | None) -
 
 
 def compile_beside(bands: int) -> "list[subprocess.Popen[bytes]]":
-    """Start compilation in two other processes, to be waited for before `learn`; none where they did it already."""
+    """Start compilation in two other processes, to be waited for before `learn`; none where they did it
+    already.
+    """
     quiet = subprocess.DEVNULL
     line = [sys.executable, "-m", __name__, str(bands)]
     parts = [part for part in ("forward", "backward") if not _mark(bands, part).is_file()]
@@ -305,19 +352,31 @@ def _mark(bands: int, part: str) -> Path:
 
 
 def _compile(bands: int, part: str) -> None:
-    """Run half of a step on nothing: a tile, and a block of Gaussians of which none is drawn; leave a mark."""
+    """Run half of a step on nothing: a tile, and a block of Gaussians of which none is drawn; leave a
+    mark.
+    """
     camera = np.array([1, 0, 0, 0, 1, 0, 0, 0, 1, *[0] * 10, -1, 1, -1, 1, 1, 0], np.float32)
-    planes, left = np.zeros(3 * SIDE * SIDE + photometric.slack(SIDE), np.float32), np.zeros(SIDE * SIDE, np.float32)
+    planes = np.zeros(3 * SIDE * SIDE + photometric.slack(SIDE), np.float32)
+    left = np.zeros(SIDE * SIDE, np.float32)
     blocks, first, second, splats = np.zeros((4, (FIXED + 3 * bands) * LANES), np.float32)
     if part == "forward":
         tiles = forward.see(blocks, LANES, bands, camera, SIDE, SIDE, splats)
         forward.composite(tiles, 3, splats, SLOTS, 6, camera[:3], planes, left)
     else:
-        slots, none = np.zeros(LANES + LANES + 1, np.int32), np.zeros(0, np.int32)
+        slots = np.zeros(LANES + LANES + 1, np.int32)
+        none = np.zeros(0, np.int32)
         tiles = forward.Tiles(splats, LANES, SIDE, SIDE, np.zeros(2, np.int32), none, none, none, slots, none)
         slope = photometric.loss(planes, planes, photometric.blurred(planes, SIDE, SIDE), SIDE, SIDE, 0.2)[2]
         sums = backward.composite_back(tiles, 3, splats, SLOTS, 6, planes, left, slope, left)
-        backward.adam(tiles, blocks, (first, second, splats), bands, camera, sums, np.zeros(FIXED + 3 * bands, np.float32))
+        backward.adam(
+            tiles,
+            blocks,
+            (first, second, splats),
+            bands,
+            camera,
+            sums,
+            np.zeros(FIXED + 3 * bands, np.float32),
+        )
     mark = _mark(bands, part)
     if mark.parent.is_dir():  # numba may be told to keep nothing
         for old in mark.parent.glob(f"compiled-{part}-{bands}-*"):

@@ -1,4 +1,6 @@
-"""Decoder configs, and the command line that trains the decoder of an encoder. `build` imports the implementation."""
+"""Decoder configs, and the command line that trains the decoder of an encoder. `build` imports the
+implementation.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ if TYPE_CHECKING:
 
 
 Objective = Literal["identity", "paper"]
-"""Training objective of a decoder: returning photographs alone, or the paper's content and style losses as well."""
+"""Training objective of a decoder: returning photographs alone, or the paper's content and style losses as
+well.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +31,8 @@ class DecoderConfig(PluginConfig):
     group: ClassVar[str] = "fprf.decoders"
 
     def build(self, *, encoder: str, channels: int, seed: int = 0) -> Decoder:
-        """The decoder of that encoder (its `identity`). What a scene adds starts from the seed; the rest comes frozen.
+        """The decoder of that encoder (its `identity`). What a scene adds starts from the seed; the rest
+        comes frozen.
 
         Raises WeightsError where none fits.
         """
@@ -41,8 +46,9 @@ class MlpDecoderConfig(DecoderConfig):
     weights: Path | None = None
     """A decoder made by `fprf pretrain decoder`. By default one that ships for the chosen encoder."""
     objective: Objective = "identity"
-    """Objective that the shipped decoder was trained with: returning photographs alone, or the paper's content and style losses
-    (L_c + lambda L_s) as well. Not used where `weights` names a file."""
+    """Objective that the shipped decoder was trained with: returning photographs alone, or the paper's
+    content and style losses (L_c + lambda L_s) as well. Not used where `weights` names a file.
+    """
 
     def needs(self) -> tuple[Need, ...]:
         """The file, where one is named; whether it fits the encoder is found when it is read."""
@@ -55,14 +61,18 @@ class MlpDecoderConfig(DecoderConfig):
 
 
 def pretrain_line(encoder: EncoderConfig | Missing, output: Path = Path("decoder.safetensors")) -> str:
-    """`fprf pretrain decoder ...` with the encoder's name and every field that is not its default, quoted for a shell.
+    """`fprf pretrain decoder ...` with the encoder's name and every field that is not its default, quoted for
+    a shell.
 
     DIR stands for folders of photographs, which nobody else can know.
     """
-    # A slot's path names what fills it; where that is not the default's plug-in, all of its fields are written.
-    own, default = leaves(encoder), {} if isinstance(encoder, Missing) else leaves(type(encoder)())
+    # A slot's path names what fills it; where that is not the default's plug-in, all of its fields are
+    # written.
+    own = leaves(encoder)
+    default = {} if isinstance(encoder, Missing) else leaves(type(encoder)())
     name = own.pop("", None) or name_of(EncoderConfig.group, type(encoder))
-    words, written = ["fprf", "pretrain", "decoder", "--encoder", name], tuple[str, ...]()
+    words = ["fprf", "pretrain", "decoder", "--encoder", name]
+    written = tuple[str, ...]()
     for path, value in own.items():
         if path in default and default[path] == value and not path.startswith(written):
             continue
@@ -71,5 +81,8 @@ def pretrain_line(encoder: EncoderConfig | Missing, output: Path = Path("decoder
         if isinstance(value, bool):
             words.append(f"{head}.{'' if value else 'no-'}{field}")
         else:
-            words += [f"{head}.{field}", *map(str, value if isinstance(value, list) else ["none" if value is None else value])]
+            words += [
+                f"{head}.{field}",
+                *map(str, value if isinstance(value, list) else ["none" if value is None else value]),
+            ]
     return f"{shlex.join(words)} --images DIR --output {shlex.quote(str(output))}"

@@ -18,7 +18,9 @@ NAMES = ("first.weight", "first.bias", "second.weight", "second.bias")
 
 
 class MlpDecoder(Decoder):
-    """rgb = sigmoid(W2 relu(W1 f + b1) + b2); centring and scaling of the features are folded into W1 and b1."""
+    """rgb = sigmoid(W2 relu(W1 f + b1) + b2); centring and scaling of the features are folded into W1 and
+    b1.
+    """
 
     def __init__(self, channels: int, hidden: int) -> None:
         super().__init__()
@@ -31,7 +33,9 @@ class MlpDecoder(Decoder):
         return torch.sigmoid(dense.network(content, [m.weight for m in maps], [m.bias for m in maps]))
 
 
-def load_decoder(path: Path | None, *, encoder: str, channels: int, objective: Objective = "identity") -> MlpDecoder:
+def load_decoder(
+    path: Path | None, *, encoder: str, channels: int, objective: Objective = "identity"
+) -> MlpDecoder:
     """The frozen decoder of that encoder: from a file, or the shipped one that names it and its objective.
 
     Raises WeightsError where the file belongs to another encoder, or none that ships belongs to this one.
@@ -45,17 +49,23 @@ def load_decoder(path: Path | None, *, encoder: str, channels: int, objective: O
         if metadata["encoder"] == encoder and metadata.get("objective", "identity") == objective:
             return _loaded(file, tensors, metadata, encoder=encoder, channels=channels)
         shipped.add(metadata["encoder"])
-    raise WeightsError(f"no decoder ships for the encoder {encoder}; there are those of {', '.join(sorted(shipped)) or 'none'}")
+    raise WeightsError(
+        f"no decoder ships for the encoder {encoder}; there are those of {', '.join(sorted(shipped)) or 'none'}"
+    )
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     tensors, metadata = read_weights(path)
     if metadata.get("kind") != DECODER_KIND or "encoder" not in metadata or set(tensors) != set(NAMES):
-        raise WeightsError(f"{path}: no decoder of `fprf pretrain decoder`; name one, or leave the weights out")
+        raise WeightsError(
+            f"{path}: no decoder of `fprf pretrain decoder`; name one, or leave the weights out"
+        )
     return tensors, metadata
 
 
-def _loaded(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str], *, encoder: str, channels: int) -> MlpDecoder:
+def _loaded(
+    path: Path, tensors: dict[str, Tensor], metadata: dict[str, str], *, encoder: str, channels: int
+) -> MlpDecoder:
     # Its first layer says how many features it takes.
     hidden, inputs = tensors["first.weight"].shape
     if metadata["encoder"] != encoder or inputs != channels:

@@ -1,4 +1,6 @@
-"""The encoders that ship, others distilled by `tools.distil` of the repository, and untrained convolutions."""
+"""The encoders that ship, others distilled by `tools.distil` of the repository, and untrained
+convolutions.
+"""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,9 +16,11 @@ from .frozen import FrozenEncoder, freeze, reflect_pad, replicate_to_multiple
 
 
 class ContentStudent(nn.Module):
-    """2x2 pixels to channels, two 3x3 convolutions, a projection: stride 2, the 10 pixels that VGG-19 relu2_1 sees.
+    """2x2 pixels to channels, two 3x3 convolutions, a projection: stride 2, the 10 pixels that VGG-19 relu2_1
+    sees.
 
-    Half the arithmetic of a slim VGG with its convolutions at full size, and as good after the same time of training.
+    Half the arithmetic of a slim VGG with its convolutions at full size, and as good after the same time of
+    training.
     """
 
     def __init__(self, channels: int, widths: tuple[int, int] = (80, 96)) -> None:
@@ -36,15 +40,22 @@ class ContentStudent(nn.Module):
 
 
 class SemanticStudent(nn.Module):
-    """Inverted residuals at strides 8 and 16 with wide dilations and a view of the whole image, merged at stride 8."""
+    """Inverted residuals at strides 8 and 16 with wide dilations and a view of the whole image, merged at
+    stride 8.
+    """
 
-    def __init__(self, channels: int, widths: tuple[int, int, int, int] = (24, 48, 96, 160), rounds: int = 2) -> None:
+    def __init__(
+        self, channels: int, widths: tuple[int, int, int, int] = (24, 48, 96, 160), rounds: int = 2
+    ) -> None:
         super().__init__()
         half, quarter, fine, coarse = widths
         self.stem = nn.Sequential(_ConvNorm(3, half, 3, stride=2), _ConvNorm(half, quarter, 3, stride=2))
-        self.fine = nn.Sequential(_ConvNorm(quarter, fine, 3, stride=2), _Residual(fine, 1), _Residual(fine, 2))
+        self.fine = nn.Sequential(
+            _ConvNorm(quarter, fine, 3, stride=2), _Residual(fine, 1), _Residual(fine, 2)
+        )
         self.coarse = nn.Sequential(
-            _ConvNorm(fine, coarse, 3, stride=2), *(_Residual(coarse, dilation) for dilation in rounds * (1, 2, 4))
+            _ConvNorm(fine, coarse, 3, stride=2),
+            *(_Residual(coarse, dilation) for dilation in rounds * (1, 2, 4)),
         )
         self.whole = nn.Linear(coarse, coarse)
         self.merge = nn.Sequential(_ConvNorm(fine + coarse, fine, 1), _Residual(fine, 1))
@@ -64,7 +75,9 @@ class SemanticStudent(nn.Module):
 class _ConvNorm(nn.Module):
     """Convolution, batch normalisation, ReLU."""
 
-    def __init__(self, inputs: int, outputs: int, size: int, *, stride: int = 1, dilation: int = 1, groups: int = 1) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, size: int, *, stride: int = 1, dilation: int = 1, groups: int = 1
+    ) -> None:
         super().__init__()
         padding = dilation * (size // 2)
         self.conv = nn.Conv2d(inputs, outputs, size, stride, padding, dilation, groups, bias=False)
@@ -88,12 +101,15 @@ class _Residual(nn.Module):
         return result
 
 
-CONTENT_KIND, SEMANTIC_KIND = "bundled-content", "bundled-semantic"
+CONTENT_KIND = "bundled-content"
+SEMANTIC_KIND = "bundled-semantic"
 FOLDER = Path(__file__).parent / "weights"
 
 
 class NetworkEncoder(FrozenEncoder):
-    """A student of one feature per `stride` pixels. Images are resized to multiples of these, so that cells cover them."""
+    """A student of one feature per `stride` pixels. Images are resized to multiples of these, so that cells
+    cover them.
+    """
 
     def __init__(self, name: str, network: nn.Module, *, stride: int) -> None:
         freeze(network)
@@ -101,11 +117,13 @@ class NetworkEncoder(FrozenEncoder):
             channels = int(network(torch.zeros(1, 3, stride, stride)).shape[1])
         super().__init__(f"{name}:{tensors_hash(network.state_dict())}", channels)
         self._stride = stride
-        # Once its identity is known: normalisation as part of the convolutions before it, and channels last, as they are
-        # computed on the CPU. 1.5 times as fast on two threads, and the same features up to rounding.
+        # Once its identity is known: normalisation as part of the convolutions before it, and channels last,
+        # as they are computed on the CPU. 1.5 times as fast on two threads, and the same features up to
+        # rounding.
         for module in network.modules():
             if isinstance(module, _ConvNorm) and isinstance(module.norm, nn.BatchNorm2d):
-                module.conv, module.norm = fuse_conv_bn_eval(module.conv, module.norm), nn.Identity()
+                module.conv = fuse_conv_bn_eval(module.conv, module.norm)
+                module.norm = nn.Identity()
         for parameter in network.parameters():
             if parameter.ndim == 4:
                 parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
@@ -126,7 +144,9 @@ def load_content_encoder(path: Path | None) -> NetworkEncoder:
     """Stride 2. Raises WeightsError where the file is absent or of another kind."""
     path = path or FOLDER / "content.safetensors"
     tensors, channels = _read(path, CONTENT_KIND, "content")
-    student = ContentStudent(channels, (_outputs(tensors, "first.weight"), _outputs(tensors, "second.weight")))
+    student = ContentStudent(
+        channels, (_outputs(tensors, "first.weight"), _outputs(tensors, "second.weight"))
+    )
     # Stride 1: an odd border is better mirrored than the whole image blurred by resizing it.
     return NetworkEncoder(CONTENT_KIND, _filled(student, tensors, path), stride=1)
 
@@ -163,7 +183,9 @@ def _filled(student: nn.Module, tensors: dict[str, Tensor], path: Path) -> nn.Mo
         student.load_state_dict(tensors)
     except RuntimeError as error:
         first = str(error).splitlines()[-1].strip()
-        raise WeightsError(f"{path}: does not fit this version's network ({first}); train it again") from error
+        raise WeightsError(
+            f"{path}: does not fit this version's network ({first}); train it again"
+        ) from error
     return student
 
 
@@ -179,6 +201,8 @@ class RandomEncoder(FrozenEncoder):
 
     @torch.no_grad()
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
-        """Features in (-1, 1), one per cell of stride x stride pixels (the last may reach over the border)."""
+        """Features in (-1, 1), one per cell of stride x stride pixels (the last may reach over the
+        border).
+        """
         cells = F.avg_pool2d(replicate_to_multiple(image, self._stride), self._stride)
         return torch.tanh(F.conv2d(reflect_pad(4 * cells - 2), self.get_buffer("weight").to(cells)))

@@ -1,7 +1,9 @@
-"""Several encoders side by side: what they see together, each counting by its weight whatever its units and channels.
+"""Several encoders side by side: what they see together, each counting by its weight whatever its units and
+channels.
 
-A part's unit is the root mean square length of its centred features on five views of a rendered town (`street`), so that an
-image's features depend on the image alone. On photographs the units of nine encoders were 0.7 to 1.3 of that (measured;
+A part's unit is the root mean square length of its centred features on five views of a rendered town
+(`street`), so that an image's features depend on the image alone. On photographs the units of nine encoders
+were 0.7 to 1.3 of that (measured;
 0.4 to 1.5 with noise of a photograph's spectrum in the town's place).
 """
 
@@ -24,24 +26,37 @@ class ConcatEncoder(FrozenEncoder):
     """`parts` side by side, each divided by its `unit` and multiplied by its weight."""
 
     def __init__(
-        self, parts: Sequence[Encoder], weights: Sequence[float], units: Sequence[float], *, cells: Cells = "finest"
+        self,
+        parts: Sequence[Encoder],
+        weights: Sequence[float],
+        units: Sequence[float],
+        *,
+        cells: Cells = "finest",
     ) -> None:
         # Weights and units are part of the identity.
-        names = [f"{weight!r}/{unit!r}*[{part.identity}]" for weight, unit, part in zip(weights, units, parts, strict=True)]
+        names = [
+            f"{weight!r}/{unit!r}*[{part.identity}]"
+            for weight, unit, part in zip(weights, units, parts, strict=True)
+        ]
         kind = "concat:" if cells == "finest" else f"concat:{cells}:"
         super().__init__(kind + "+".join(names), sum(part.channels for part in parts))
         self._cells = cells
-        self.parts, self._encoders = nn.ModuleList(parts), tuple(parts)
+        self.parts = nn.ModuleList(parts)
+        self._encoders = tuple(parts)
         self._factors = [weight / unit for weight, unit in zip(weights, units, strict=True)]
         freeze(self)
 
     @torch.no_grad()
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
-        """Features on the cells of the finest part, or of the first; coarser ones are interpolated, finer ones averaged."""
+        """Features on the cells of the finest part, or of the first; coarser ones are interpolated, finer
+        ones averaged.
+        """
         return self._side_by_side([part(image) for part in self._encoders])
 
     @torch.no_grad()
-    def cutout(self, image: Annotated[Tensor, "B 3 H W"], opacity: Annotated[Tensor, "B H W"]) -> Annotated[Tensor, "B C h w"]:
+    def cutout(
+        self, image: Annotated[Tensor, "B 3 H W"], opacity: Annotated[Tensor, "B H W"]
+    ) -> Annotated[Tensor, "B C h w"]:
         """Each part leaves the backdrop out as it can."""
         return self._side_by_side([part.cutout(image, opacity) for part in self._encoders])
 
@@ -54,7 +69,9 @@ class ConcatEncoder(FrozenEncoder):
             maps = [F.adaptive_avg_pool2d(each, cells) for each, cells in zip(maps, least, strict=True)]
             return torch.cat([F.interpolate(each, size, mode="bilinear") for each in maps], dim=1)
         size = torch.Size(max(each.shape[axis] for each in maps) for axis in (2, 3))
-        fine = (each if each.shape[2:] == size else F.interpolate(each, size, mode="bilinear") for each in maps)
+        fine = (
+            each if each.shape[2:] == size else F.interpolate(each, size, mode="bilinear") for each in maps
+        )
         return torch.cat(list(fine), dim=1)
 
 
@@ -72,7 +89,9 @@ def build_concat(parts: Sequence[Encoder], weights: Sequence[float], *, cells: C
 
 
 def unit_of(encoder: Encoder, images: Annotated[Tensor, "B 3 H W"]) -> float:
-    """Root mean square length of the encoder's features about their mean, rounded; 1 where they don't change at all."""
+    """Root mean square length of the encoder's features about their mean, rounded; 1 where they don't change
+    at all.
+    """
     # Over cells, of the vector of all channels.
     features: Tensor = encoder(images).double()
     length = float((features - features.mean(dim=(0, 2, 3), keepdim=True)).square().sum(dim=1).mean().sqrt())

@@ -30,7 +30,9 @@ class EncoderConfig(PluginConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class BundledContentConfig(EncoderConfig):
-    """Ships with the package: a small network that imitates the principal components of VGG-19 relu2_1, stride 2."""
+    """Ships with the package: a small network that imitates the principal components of VGG-19 relu2_1,
+    stride 2.
+    """
 
     weights: Path | None = None
     """A file made by `python -m tools.distil content`. By default the one that ships."""
@@ -46,7 +48,9 @@ class BundledContentConfig(EncoderConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class BundledSemanticConfig(EncoderConfig):
-    """Ships with the package: a small network distilled from MobileNet-class features, stride 8, steady in any light."""
+    """Ships with the package: a small network distilled from MobileNet-class features, stride 8, steady in
+    any light.
+    """
 
     weights: Path | None = None
     """A file made by `python -m tools.distil semantic`. By default the one that ships."""
@@ -62,19 +66,27 @@ class BundledSemanticConfig(EncoderConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class Vgg19Config(EncoderConfig):
-    """VGG-19 of ImageNet, the paper's content encoder. Ships up to relu2_1; torchvision's weights are downloaded for more."""
+    """VGG-19 of ImageNet, the paper's content encoder. Ships up to relu2_1; torchvision's weights are
+    downloaded for more.
+    """
 
     layer: str = "relu2_1"
     """convX_Y or reluX_Y, X in 1..5: up to where the weights reach."""
     weights: Path | None = None
-    """torchvision's vgg19-dcbb9e9d.pth, AdaIN's vgg_normalised.pth, or a safetensors file with torchvision's keys. By default
-    the file that ships up to relu2_1 (the original weights, for which decoders ship), beyond it the download cache."""
+    """torchvision's vgg19-dcbb9e9d.pth, AdaIN's vgg_normalised.pth, or a safetensors file with torchvision's
+    keys. By default the file that ships up to relu2_1 (the original weights, for which decoders ship), beyond
+    it the download cache.
+    """
     normalise: bool = True
-    """Divide every filter by its mean activation on photographs, reflect at borders (AdaIN, FPRF); else plain VGG."""
+    """Divide every filter by its mean activation on photographs, reflect at borders (AdaIN, FPRF); else plain
+    VGG.
+    """
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"(conv|relu)([12]_[12]|[345]_[1-4])", self.layer):
-            raise ConfigError(f"layer: {self.layer!r} is no layer of VGG-19; allowed are conv1_1, relu1_1 ... relu5_4")
+            raise ConfigError(
+                f"layer: {self.layer!r} is no layer of VGG-19; allowed are conv1_1, relu1_1 ... relu5_4"
+            )
 
     def needs(self) -> tuple[Need, ...]:
         from .vgg import weights_needed
@@ -104,7 +116,9 @@ def _hub_needs(model: str) -> tuple[Need, ...]:
 
 def _check_layer(layer: int) -> None:
     if layer == 0:
-        raise ConfigError("layer: 0 is no block; allowed are 1, 2 ... from the first and -1, -2 ... from the last")
+        raise ConfigError(
+            "layer: 0 is no block; allowed are 1, 2 ... from the first and -1, -2 ... from the last"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +147,9 @@ class _TransformerConfig(EncoderConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class DinoConfig(_TransformerConfig):
-    """DINO, the paper's semantic encoder: a self-supervised vision transformer. Needs the extra `encoders`."""
+    """DINO, the paper's semantic encoder: a self-supervised vision transformer. Needs the extra
+    `encoders`.
+    """
 
     family: ClassVar[str] = "dino"
 
@@ -143,25 +159,33 @@ class DinoConfig(_TransformerConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class Dinov2Config(EncoderConfig):
-    """DINOv2: a self-supervised vision transformer, DINO's successor. The small one ships; others need the extra `encoders`."""
+    """DINOv2: a self-supervised vision transformer, DINO's successor. The small one ships; others need the
+    extra `encoders`.
+    """
 
     model: str | None = None
-    """A model of the Hugging Face hub, for example facebook/dinov2-base, or a folder that holds one; none = the small one that
-    ships, blocks 1 to 11."""
+    """A model of the Hugging Face hub, for example facebook/dinov2-base, or a folder that holds one; none =
+    the small one that ships, blocks 1 to 11.
+    """
     layer: int = 9
     """Block whose features are taken, from 1; negative counts from the last."""
     features: Literal["tokens", "keys"] = "tokens"
-    """The block's output, or the keys of its attention. A model of the hub gives tokens, which pass its final norm."""
+    """The block's output, or the keys of its attention. A model of the hub gives tokens, which pass its final
+    norm.
+    """
     stride: int | None = None
-    """Pixels of the image per feature: the image is resized until one patch covers that many. none = 22 features along its
-    longer side, whatever its size."""
+    """Pixels of the image per feature: the image is resized until one patch covers that many. none = 22
+    features along its longer side, whatever its size.
+    """
 
     def __post_init__(self) -> None:
         _check_layer(self.layer)
         if self.stride is not None:
             at_least("stride", self.stride, 1)
         if self.model is not None and self.features != "tokens":
-            raise ConfigError(f"features: {self.features!r} with the model {self.model}; only the one that ships has keys")
+            raise ConfigError(
+                f"features: {self.features!r} with the model {self.model}; only the one that ships has keys"
+            )
 
     def needs(self) -> tuple[Need, ...]:
         return () if self.model is None else _hub_needs(self.model)
@@ -178,7 +202,9 @@ class Dinov2Config(EncoderConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class Dinov3Config(_TransformerConfig):
-    """DINOv3: the third of them, for dense features. Needs the extra `encoders`; its licence is accepted on the hub."""
+    """DINOv3: the third of them, for dense features. Needs the extra `encoders`; its licence is accepted on
+    the hub.
+    """
 
     family: ClassVar[str] = "dinov3"
 
@@ -219,9 +245,13 @@ class ConcatConfig(EncoderConfig):
     third: EncoderConfig | None = None
     """A third one; none = two."""
     weights: tuple[float, ...] = ()
-    """Weight of each, in their order: the root mean square length of its centred features; 1 for those left out."""
+    """Weight of each, in their order: the root mean square length of its centred features; 1 for those left
+    out.
+    """
     cells: Literal["finest", "first"] = "finest"
-    """Whose cells the features have: coarser encoders are interpolated, finer ones averaged over them, which steadies them."""
+    """Whose cells the features have: coarser encoders are interpolated, finer ones averaged over them, which
+    steadies them.
+    """
 
     def __post_init__(self) -> None:
         for weight in self.weights:
@@ -232,11 +262,14 @@ class ConcatConfig(EncoderConfig):
 
         parts = [part for part in (self.first, self.second, self.third) if part is not None]
         if len(self.weights) > len(parts):
-            raise ConfigError(f"weights: {len(self.weights)} for {len(parts)} encoders; give one each at most")
+            raise ConfigError(
+                f"weights: {len(self.weights)} for {len(parts)} encoders; give one each at most"
+            )
         weights = (*self.weights, *(1.0,) * (len(parts) - len(self.weights)))
         return build_concat([part.build() for part in parts], weights, cells=self.cells)
 
 
 SEMANTICS = ConcatConfig(first=Dinov2Config(), second=BundledSemanticConfig(), cells="first")
-"""Semantics by default: what things are, by DINOv2, beside what is steady in any light. Together they find the right region of
-more photographs than either (docs/encoders.md)."""
+"""Semantics by default: what things are, by DINOv2, beside what is steady in any light. Together they find
+the right region of more photographs than either (docs/encoders.md).
+"""

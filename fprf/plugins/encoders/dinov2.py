@@ -1,7 +1,9 @@
-"""DINOv2-small, the vision transformer ViT-S/14 (Oquab et al. 2023, arXiv:2304.07193), in plain torch with weights that ship.
+"""DINOv2-small, the vision transformer ViT-S/14 (Oquab et al. 2023, arXiv:2304.07193), in plain torch with
+weights that ship.
 
-The file holds matrices as int8 with a scale for each output row (cosine to the features of float32: 0.9996 at block 9), and
-blocks 1 to 11: whether the origin of the weights changed the last one is not known, and it tells regions apart worse.
+The file holds matrices as int8 with a scale for each output row (cosine to the features of float32: 0.9996 at
+block 9), and blocks 1 to 11: whether the origin of the weights changed the last one is not known, and it
+tells regions apart worse.
 
 Letters: B images, T = 1 + h w tokens of 384 channels, the class token first.
 """
@@ -18,17 +20,22 @@ from ...errors import WeightsError
 from ..weights import IMAGENET_MEAN, IMAGENET_STD, read_weights, tensors_hash
 from .frozen import CELLS, FrozenEncoder, freeze, patch_grid
 
-PATCH, WIDTH, HEADS = 14, 384, 6
+PATCH = 14
+WIDTH = 384
+HEADS = 6
 GRID = 37
 """Rows and columns of the learned positions."""
-HELD, BLOCKS = 11, 12
+HELD = 11
+BLOCKS = 12
 """Blocks in the file and of the network."""
 EPS = 1e-6
 """Of layer norms, as in training."""
 COVER = 0.02
 """Mean opacity of a patch from which on it is encoded."""
 GREY = 0.5
-"""Backdrop of patches that show something in part: the mean colour of what is shown hides its outline, and matches worse."""
+"""Backdrop of patches that show something in part: the mean colour of what is shown hides its outline, and
+matches worse.
+"""
 WEIGHTS = Path(__file__).parent / "weights" / "dinov2-small.safetensors"
 
 
@@ -37,10 +44,14 @@ class Block(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.norm1, self.norm2 = nn.LayerNorm(WIDTH, eps=EPS), nn.LayerNorm(WIDTH, eps=EPS)
-        self.qkv, self.proj = nn.Linear(WIDTH, 3 * WIDTH), nn.Linear(WIDTH, WIDTH)
-        self.fc1, self.fc2 = nn.Linear(WIDTH, 4 * WIDTH), nn.Linear(4 * WIDTH, WIDTH)
-        self.scale1, self.scale2 = nn.Parameter(torch.empty(WIDTH)), nn.Parameter(torch.empty(WIDTH))
+        self.norm1 = nn.LayerNorm(WIDTH, eps=EPS)
+        self.norm2 = nn.LayerNorm(WIDTH, eps=EPS)
+        self.qkv = nn.Linear(WIDTH, 3 * WIDTH)
+        self.proj = nn.Linear(WIDTH, WIDTH)
+        self.fc1 = nn.Linear(WIDTH, 4 * WIDTH)
+        self.fc2 = nn.Linear(4 * WIDTH, WIDTH)
+        self.scale1 = nn.Parameter(torch.empty(WIDTH))
+        self.scale2 = nn.Parameter(torch.empty(WIDTH))
 
     def forward(self, x: Annotated[Tensor, "B T 384"], keys: bool = False) -> Annotated[Tensor, "B T 384"]:
         """The tokens after the block, or the keys of all its heads side by side."""
@@ -49,7 +60,9 @@ class Block(nn.Module):
         if keys:
             x = key.transpose(1, 2).flatten(2)
         else:
-            x = x + self.scale1 * self.proj(F.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(2))
+            x = x + self.scale1 * self.proj(
+                F.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(2)
+            )
             x = x + self.scale2 * self.fc2(F.gelu(self.fc1(self.norm2(x))))
         return x
 
@@ -65,11 +78,15 @@ class Dinov2(nn.Module):
         self.blocks = nn.ModuleList(Block() for _ in range(blocks))
 
     def forward(
-        self, image: Annotated[Tensor, "B 3 14h 14w"], keys: bool, shown: Annotated[Tensor, "h w"] | None = None
+        self,
+        image: Annotated[Tensor, "B 3 14h 14w"],
+        keys: bool,
+        shown: Annotated[Tensor, "h w"] | None = None,
     ) -> Annotated[Tensor, "B 384 h w"]:
         """Patch tokens after the last block without a norm, or that block's keys. Colours are normalised.
 
-        Only patches that are `shown` (bool, at least one) attend to each other; the others take the features of the nearest.
+        Only patches that are `shown` (bool, at least one) attend to each other; the others take the features
+        of the nearest.
         """
         # Tokens are patches with their learned positions, interpolated to this grid.
         patches = self.patch_embed(image)
@@ -97,7 +114,8 @@ class Dinov2Encoder(FrozenEncoder):
         settings = f"block{len(network.blocks)}:{kind}:" + (f"stride{stride}" if stride else f"cells{CELLS}")
         super().__init__(f"dinov2-small:{settings}:{tensors_hash(network.state_dict())}", WIDTH)
         self.network = network
-        self._keys, self._stride = kind == "keys", stride
+        self._keys = kind == "keys"
+        self._stride = stride
         freeze(self)
 
     @torch.no_grad()
@@ -106,8 +124,12 @@ class Dinov2Encoder(FrozenEncoder):
         return self._features(image)
 
     @torch.no_grad()
-    def cutout(self, image: Annotated[Tensor, "B 3 H W"], opacity: Annotated[Tensor, "B H W"]) -> Annotated[Tensor, "B C h w"]:
-        """Features of the patches that show something, encoded without the others: cheaper, and no backdrop has a say."""
+    def cutout(
+        self, image: Annotated[Tensor, "B 3 H W"], opacity: Annotated[Tensor, "B H W"]
+    ) -> Annotated[Tensor, "B C h w"]:
+        """Features of the patches that show something, encoded without the others: cheaper, and no backdrop
+        has a say.
+        """
         # Patches with something in them; what they show only in part lies on grey.
         cover = F.adaptive_avg_pool2d(opacity[:, None], patch_grid(image.shape[-2:], self._stride))[:, 0]
         filled = image + (1 - opacity[:, None]) * GREY
@@ -119,7 +141,9 @@ class Dinov2Encoder(FrozenEncoder):
             ]
         )
 
-    def _features(self, image: Tensor, shown: Annotated[Tensor, "h w"] | None = None) -> Annotated[Tensor, "B C h w"]:
+    def _features(
+        self, image: Tensor, shown: Annotated[Tensor, "h w"] | None = None
+    ) -> Annotated[Tensor, "B C h w"]:
         # Resized to whole patches, with ImageNet's mean and deviation.
         size = [PATCH * n for n in patch_grid(image.shape[-2:], self._stride)]
         if size != list(image.shape[-2:]):
@@ -130,7 +154,9 @@ class Dinov2Encoder(FrozenEncoder):
 
 
 def load_dinov2(*, layer: int, kind: Literal["tokens", "keys"], stride: int | None) -> Dinov2Encoder:
-    """The encoder up to block `layer` (negative: from the last of 12). Raises WeightsError where the file has no such block."""
+    """The encoder up to block `layer` (negative: from the last of 12). Raises WeightsError where the file has
+    no such block.
+    """
     block = layer if layer > 0 else BLOCKS + 1 + layer
     if not 1 <= block <= HELD:
         raise WeightsError(

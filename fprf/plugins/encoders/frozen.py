@@ -1,4 +1,6 @@
-"""Parts of frozen encoders: padding that any size survives, tensors that no optimiser sees, pictures to measure them on."""
+"""Parts of frozen encoders: padding that any size survives, tensors that no optimiser sees, pictures to
+measure them on.
+"""
 
 from collections.abc import Sequence
 from functools import cache
@@ -27,7 +29,8 @@ def reflect_pad(x: Annotated[Tensor, "B C H W"]) -> Annotated[Tensor, "B C H+2 W
 
 def replicate_to_multiple(x: Annotated[Tensor, "B C H W"], stride: int) -> Tensor:
     """Repeat the last row and column until both axes are multiples of `stride`."""
-    right, below = -x.shape[-1] % stride, -x.shape[-2] % stride
+    right = -x.shape[-1] % stride
+    below = -x.shape[-2] % stride
     return F.pad(x, (0, right, 0, below), mode="replicate") if right or below else x
 
 
@@ -36,8 +39,8 @@ CELLS = 22
 
 
 def patch_grid(size: Sequence[int], stride: int | None) -> tuple[int, int]:
-    """Rows and columns of patches that cover an image of that height and width: one for `stride` pixels; None = `CELLS` along
-    its longer side.
+    """Rows and columns of patches that cover an image of that height and width: one for `stride` pixels; None
+    = `CELLS` along its longer side.
     """
     # At least one each way, however thin the image is.
     height, width = size
@@ -50,7 +53,8 @@ class FrozenEncoder(Encoder):
 
     def __init__(self, identity: str, channels: int) -> None:
         super().__init__()
-        self._identity, self._channels = identity, channels
+        self._identity = identity
+        self._channels = channels
 
     @property
     def identity(self) -> str:
@@ -64,7 +68,9 @@ class FrozenEncoder(Encoder):
 
 @cache
 def street() -> Annotated[Tensor, "5 3 128 160"]:
-    """Sky, plants, walls and a road, from day to night, in [0, 1]: five views of the town of benchmarks/town, seed 0."""
+    """Sky, plants, walls and a road, from day to night, in [0, 1]: five views of the town of benchmarks/town,
+    seed 0.
+    """
     stored = np.frombuffer((files(__package__) / "weights/street.webp").read_bytes(), np.uint8)
     strip = cv2.imdecode(stored, cv2.IMREAD_COLOR_RGB)  # lossless, one view below the other
     assert strip is not None

@@ -1,10 +1,10 @@
 """VGG-19 (Simonyan and Zisserman) up to any layer, plain or normalised as AdaIN and FPRF use it.
 
-Normalised: every filter is divided by its mean activation on photographs, borders are mirrored; features are then O(1).
-Pools round up, so that no pixel is lost: the last cell of an odd axis covers what is left.
+Normalised: every filter is divided by its mean activation on photographs, borders are mirrored; features are
+then O(1). Pools round up, so that no pixel is lost: the last cell of an odd axis covers what is left.
 
-Weights come as torchvision has them, or normalised as AdaIN has them. VGG-19 up to relu2_1, the paper's content encoder, ships
-with the package; torchvision's file is found in the caches or on the public server.
+Weights come as torchvision has them, or normalised as AdaIN has them. VGG-19 up to relu2_1, the paper's
+content encoder, ships with the package; torchvision's file is found in the caches or on the public server.
 """
 
 import hashlib
@@ -28,13 +28,19 @@ from ..config import Need, absent_file
 from ..weights import IMAGENET_MEAN, IMAGENET_STD, read_weights, tensors_hash
 from .frozen import FrozenEncoder, freeze, reflect_pad, street
 
-_NAMES = [f"{block}_{index}" for block, depth in enumerate((2, 2, 4, 4, 4), 1) for index in range(1, depth + 1)]
+_NAMES = [
+    f"{block}_{index}" for block, depth in enumerate((2, 2, 4, 4, 4), 1) for index in range(1, depth + 1)
+]
 CONVOLUTIONS: Mapping[str, int] = {name: 2 * at + int(name[0]) - 1 for at, name in enumerate(_NAMES)}
-"""Place of each convolution in torchvision's `features`: with its ReLU it takes two, a pool one after each block."""
+"""Place of each convolution in torchvision's `features`: with its ReLU it takes two, a pool one after each
+block.
+"""
 
 
 class VggEncoder(FrozenEncoder):
-    """One layer of VGG-19. `scale` [C] divides the features where they are normalised, None leaves them plain."""
+    """One layer of VGG-19. `scale` [C] divides the features where they are normalised, None leaves them
+    plain.
+    """
 
     def __init__(
         self,
@@ -70,7 +76,9 @@ class VggEncoder(FrozenEncoder):
         used["scale"] = torch.ones(channels) if scale is None else scale.float()
         kind = "plain" if scale is None else "normalised"
         super().__init__(f"vgg19:{layer}:{kind}:{tensors_hash(used)}", channels)
-        self.names, self._layer, self._normalised = names, layer, scale is not None
+        self.names = names
+        self._layer = layer
+        self._normalised = scale is not None
         for key, value in used.items():
             self.register_buffer(key, value)
         freeze(self)
@@ -112,14 +120,18 @@ ORIGIN = f"https://download.pytorch.org/models/{FILE}"
 CHUNK = 1 << 20
 TIMEOUT_SECONDS = 30
 RAREST = 0.05
-"""Mean activation of the rarest filters, as a share of the mean over all: on photographs none of VGG-19 is below that."""
+"""Mean activation of the rarest filters, as a share of the mean over all: on photographs none of VGG-19 is
+below that.
+"""
 BUNDLED = Path(__file__).parent / "weights" / "vgg19-relu2_1.safetensors"
 """VGG-19's conv1_1, conv1_2 and conv2_1 (CC BY 4.0, Simonyan and Zisserman), which decoders ship for."""
 BUNDLED_LAYERS = ("1_1", "1_2", "2_1")
 
 
 def _available(layer: str, path: Path | None) -> Path | None:
-    """The named file, else the package's where it holds the layer, else the cached one (fprf's or torch's)."""
+    """The named file, else the package's where it holds the layer, else the cached one (fprf's or
+    torch's).
+    """
     if path is not None or layer[4:] in BUNDLED_LAYERS:
         return path or BUNDLED
     caches = Path.home() / ".cache/fprf/weights", Path.home() / ".cache/torch/hub/checkpoints"
@@ -143,7 +155,10 @@ def _download() -> Path:
     partial_file = target.with_name(f"{FILE}.{os.getpid()}.partial")
     try:
         # The origin is ours, https, and what comes is hashed before it is used.
-        with urllib.request.urlopen(ORIGIN, timeout=TIMEOUT_SECONDS) as response, partial_file.open("wb") as file:  # nosec B310
+        with (
+            urllib.request.urlopen(ORIGIN, timeout=TIMEOUT_SECONDS) as response,
+            partial_file.open("wb") as file,
+        ):  # nosec B310
             while piece := response.read(CHUNK):
                 file.write(piece)
         _check_hash(partial_file, FILE)
@@ -159,7 +174,8 @@ def _download() -> Path:
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors and metadata of a safetensors file, or of a file of `torch.save` (which has no metadata), hash checked.
+    """Tensors and metadata of a safetensors file, or of a file of `torch.save` (which has no metadata), hash
+    checked.
 
     Raises WeightsError where the file is absent, damaged, or another than its name promises.
     """
@@ -172,9 +188,13 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     try:
         tensors = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # the unpickler raises whatever the bytes lead it to
-        raise WeightsError(f"{path}: not a file of tensors ({type(error).__name__}); VGG-19's is {ORIGIN}") from error
+        raise WeightsError(
+            f"{path}: not a file of tensors ({type(error).__name__}); VGG-19's is {ORIGIN}"
+        ) from error
     if not isinstance(tensors, dict):
-        raise WeightsError(f"{path}: holds a {type(tensors).__name__}, not named tensors; VGG-19's is {ORIGIN}")
+        raise WeightsError(
+            f"{path}: holds a {type(tensors).__name__}, not named tensors; VGG-19's is {ORIGIN}"
+        )
     return {name: value.float() for name, value in tensors.items() if isinstance(value, Tensor)}, {}
 
 
@@ -196,8 +216,12 @@ def _check_hash(path: Path, name: str) -> None:
         )
 
 
-def input_statistics(metadata: Mapping[str, str], path: Path) -> tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]:
-    """Mean and deviation of a network's input, as the file's metadata says; ImageNet's where it says nothing."""
+def input_statistics(
+    metadata: Mapping[str, str], path: Path
+) -> tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]:
+    """Mean and deviation of a network's input, as the file's metadata says; ImageNet's where it says
+    nothing.
+    """
     stated = []
     for key, default in (("mean", IMAGENET_MEAN), ("std", IMAGENET_STD)):
         try:
@@ -210,13 +234,17 @@ def input_statistics(metadata: Mapping[str, str], path: Path) -> tuple[Annotated
 
 
 def build_vgg(layer: str, *, weights: Path | None, normalise: bool) -> VggEncoder:
-    """The encoder from a file, the package, the cache or the download. Raises WeightsError where none of them serves."""
+    """The encoder from a file, the package, the cache or the download. Raises WeightsError where none of them
+    serves.
+    """
     path = _available(layer, weights) or _download()
     tensors, metadata = read_tensors(path)
     # Whose file it is says what its network wants of the input: AdaIN's RGB as it is.
     divided = tensors.get("0.weight", torch.empty(0)).shape == (3, 3, 1, 1)
     if divided:
-        tensors, mean, std = _from_adain(tensors), torch.zeros(3), torch.ones(3)
+        tensors = _from_adain(tensors)
+        mean = torch.zeros(3)
+        std = torch.ones(3)
     else:
         mean, std = input_statistics(metadata, path)
     encoder = partial(VggEncoder, layer, tensors, mean=mean, std=std, source=str(path))
@@ -232,16 +260,19 @@ def build_vgg(layer: str, *, weights: Path | None, normalise: bool) -> VggEncode
     scale = tensors.get(f"mean_activation.conv{layer[4:]}")
     if scale is not None:
         return encoder(scale=scale.clamp_min(1e-3 * float(scale.mean())))
-    # Few files bring their own means. On the town each filter's is within a factor of two of that on photographs (VGG-19,
-    # standard deviation of the log 0.19 at relu2_1, 0.35 at relu3_1), but for filters that find nothing there to answer to.
+    # Few files bring their own means. On the town each filter's is within a factor of two of that on
+    # photographs (VGG-19, standard deviation of the log 0.19 at relu2_1, 0.35 at relu3_1), but for filters
+    # that find nothing there to answer to.
     scale = vgg_activations(encoder(scale=torch.ones(1)), street()).float()
     return encoder(scale=scale.clamp_min(RAREST * float(scale.mean())))
 
 
 def _from_adain(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """VGG-19 from AdaIN's list of layers: padding, convolution and ReLU take three places, a pool one after each block.
+    """VGG-19 from AdaIN's list of layers: padding, convolution and ReLU take three places, a pool one after
+    each block.
 
-    The 1x1 convolution at its start turns colours; it goes into the first 3x3 one, which mirrored borders leave exact.
+    The 1x1 convolution at its start turns colours; it goes into the first 3x3 one, which mirrored borders
+    leave exact.
     """
     # Their places to torchvision's.
     renamed = {}
@@ -253,7 +284,10 @@ def _from_adain(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     # w3 * (w1 x + b1) + b3 is one convolution: (w3 w1) * x + (sum w3 b1 + b3).
     if {"features.0.weight", "features.0.bias"} <= renamed.keys() and "0.bias" in tensors:
         first = renamed["features.0.weight"].double()
-        turn, shift = tensors["0.weight"][:, :, 0, 0].double(), tensors["0.bias"].double()
+        turn = tensors["0.weight"][:, :, 0, 0].double()
+        shift = tensors["0.bias"].double()
         renamed["features.0.weight"] = torch.einsum("okyx,ki->oiyx", first, turn).float()
-        renamed["features.0.bias"] = (renamed["features.0.bias"] + torch.einsum("okyx,k->o", first, shift)).float()
+        renamed["features.0.bias"] = (
+            renamed["features.0.bias"] + torch.einsum("okyx,k->o", first, shift)
+        ).float()
     return renamed

@@ -1,7 +1,8 @@
-"""DINO, DINOv2 and DINOv3 through `transformers` (extra `encoders`): final-norm tokens of any block, at any stride.
+"""DINO, DINOv2 and DINOv3 through `transformers` (extra `encoders`): final-norm tokens of any block, at any
+stride.
 
-The stride is reached by resizing: one patch of the resized image covers `stride` pixels of the one given. Blocks after
-the chosen one are never loaded.
+The stride is reached by resizing: one patch of the resized image covers `stride` pixels of the one given.
+Blocks after the chosen one are never loaded.
 """
 
 from collections.abc import Mapping
@@ -15,8 +16,13 @@ from ...errors import WeightsError
 from ..weights import IMAGENET_MEAN, IMAGENET_STD, tensors_hash
 from .frozen import FrozenEncoder, freeze, patch_grid
 
-# ViT interpolates its position table on demand, DINOv2 always does, DINOv3 turns its tokens by where they lie.
-CALLS: Mapping[str, Mapping[str, bool]] = {"dino": {"interpolate_pos_encoding": True}, "dinov2": {}, "dinov3": {}}
+# ViT interpolates its position table on demand, DINOv2 always does, DINOv3 turns its tokens by where they
+# lie.
+CALLS: Mapping[str, Mapping[str, bool]] = {
+    "dino": {"interpolate_pos_encoding": True},
+    "dinov2": {},
+    "dinov3": {},
+}
 TYPES: Mapping[str, tuple[str, ...]] = {
     "dino": ("vit",),
     "dinov2": ("dinov2", "dinov2_with_registers"),
@@ -28,10 +34,14 @@ TYPES: Mapping[str, tuple[str, ...]] = {
 class VitEncoder(FrozenEncoder):
     """Patch tokens of a vision transformer `model` with patches of `patch` pixels."""
 
-    def __init__(self, family: str, model: nn.Module, *, name: str, patch: int, channels: int, stride: int | None) -> None:
+    def __init__(
+        self, family: str, model: nn.Module, *, name: str, patch: int, channels: int, stride: int | None
+    ) -> None:
         used = {key: value for key, value in model.state_dict().items() if not key.startswith("pooler.")}
         super().__init__(f"{family}:{name}:stride{stride}:{tensors_hash(used)}", channels)
-        self._call, self._patch, self._stride = CALLS[family], patch, stride
+        self._call = CALLS[family]
+        self._patch = patch
+        self._stride = stride
         self.model = model
         freeze(self)
 
@@ -50,7 +60,9 @@ class VitEncoder(FrozenEncoder):
 
 
 def build_vit(family: str, name: str, *, layer: int, stride: int | None) -> VitEncoder:
-    """The encoder from the hub's cache, the hub or a folder. Raises WeightsError where one of its parts is absent."""
+    """The encoder from the hub's cache, the hub or a folder. Raises WeightsError where one of its parts is
+    absent.
+    """
     try:
         from transformers import AutoConfig, AutoModel
         from transformers.utils import logging

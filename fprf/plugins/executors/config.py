@@ -20,7 +20,9 @@ class ExecutorConfig(PluginConfig):
     group: ClassVar[str] = "fprf.executors"
 
     def on(self, device: str) -> ExecutorConfig:
-        """The config for tasks that train on a kind of device (cpu, cuda, mps): another one where executors reserve devices."""
+        """The config for tasks that train on a kind of device (cpu, cuda, mps): another one where executors
+        reserve devices.
+        """
         return self
 
     def build(self) -> Executor:
@@ -43,13 +45,17 @@ class RayConfig(ExecutorConfig):
     """Tasks on many processes or machines, by Ray (`pip install "fprf[cluster]"`; docs/large-scenes.md)."""
 
     address: str = ""
-    """Address of a running cluster, HOST:PORT, or auto for the one of this machine; empty = one is started here."""
+    """Address of a running cluster, HOST:PORT, or auto for the one of this machine; empty = one is started
+    here.
+    """
     workers: int = 2
     """Tasks at a time, where the cluster is started here."""
     processors: float = 1.0
     """Processors that a task takes; the cluster runs as many tasks as have room."""
     gpus: float | None = None
-    """GPUs that a task takes, or its share of one; 0 hides them from it. None = 1 where training is on CUDA, else 0."""
+    """GPUs that a task takes, or its share of one; 0 hides them from it. None = 1 where training is on CUDA,
+    else 0.
+    """
     retries: int = 3
     """Times that a task whose worker died is started again."""
 

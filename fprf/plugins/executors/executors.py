@@ -1,7 +1,8 @@
-"""Tasks on many processes or machines, by Ray Core. A task whose worker dies is started again and finds its own checkpoint.
+"""Tasks on many processes or machines, by Ray Core. A task whose worker dies is started again and finds its
+own checkpoint.
 
-A cluster whose address is given is joined; without one a private one is started on this machine: on the loopback, with a token
-of its own, without dashboard and without telling anybody that it is used.
+A cluster whose address is given is joined; without one a private one is started on this machine: on the
+loopback, with a token of its own, without dashboard and without telling anybody that it is used.
 """
 
 import importlib
@@ -39,13 +40,16 @@ class RayExecutor(Executor):
         self.config = config
 
     def map(self, function: Callable[[Task], Result], tasks: Sequence[Task]) -> list[Result]:
-        """Results in the order of the tasks; the first error cancels the rest and reaches the caller as it was raised.
+        """Results in the order of the tasks; the first error cancels the rest and reaches the caller as it
+        was raised.
 
-        Raises PluginError where Ray is not installed, its cluster cannot be reached, or has fewer GPUs than a task takes.
+        Raises PluginError where Ray is not installed, its cluster cannot be reached, or has fewer GPUs than a
+        task takes.
         """
         ray = _ray(private=not self.config.address)
         self._join(ray)
-        wanted, there = self.config.gpus or 0.0, float(ray.cluster_resources().get("GPU", 0.0))
+        wanted = self.config.gpus or 0.0
+        there = float(ray.cluster_resources().get("GPU", 0.0))
         if wanted > there:  # Ray would wait for a machine that has them
             raise PluginError(
                 f"executor: each task takes {wanted:g} GPUs and the cluster has {there:g}; start Ray on machines with GPUs, or "
@@ -62,7 +66,8 @@ class RayExecutor(Executor):
         try:
             return [ray.get(reference) for reference in waiting]
         except BaseException as error:
-            # Ray aborts this process if it cancels a task whose completion it is just taking in (ray-project/ray#54798).
+            # Ray aborts this process if it cancels a task whose completion it is just taking in
+            # (ray-project/ray#54798).
             for reference in ray.wait(waiting, num_returns=len(waiting), timeout=0)[1]:
                 ray.cancel(reference)
             # What a task raised reaches the caller as it was raised; what Ray says is told in one line.
@@ -99,7 +104,8 @@ def _ray(*, private: bool) -> Any:
     # Nobody is told that it runs; a cluster of our own listens on the loopback, behind a token.
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     if private:
-        # No cluster means the loopback, on Linux too; an address of it given to `init` is replaced by one for others.
+        # No cluster means the loopback, on Linux too; an address of it given to `init` is replaced by one for
+        # others.
         os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     if private and not {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"} & os.environ.keys():
         os.environ.setdefault("RAY_AUTH_MODE", "token")

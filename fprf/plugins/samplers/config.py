@@ -76,7 +76,8 @@ class ProposalConfig(SamplerConfig):
         for n in (*self.samples, *self.resolutions):
             at_least("sampler.samples and resolutions", n, 2)
         if len(self.samples) != len(self.resolutions):
-            levels, resolutions = len(self.samples), len(self.resolutions)
+            levels = len(self.samples)
+            resolutions = len(self.resolutions)
             raise ConfigError(
                 f"sampler.samples: {levels} levels but {resolutions} in sampler.resolutions; name as many of each"
             )

@@ -20,7 +20,9 @@ class ProposalSampler(Sampler):
     def __init__(self, config: ProposalConfig, *, seed: int) -> None:
         super().__init__()
         self.config = config
-        self.levels = nn.ModuleList(ProposalField(r, config.channels, seed=seed + i) for i, r in enumerate(config.resolutions))
+        self.levels = nn.ModuleList(
+            ProposalField(r, config.channels, seed=seed + i) for i, r in enumerate(config.resolutions)
+        )
 
     @property
     def fields(self) -> nn.ModuleList:
@@ -37,7 +39,9 @@ class ProposalSampler(Sampler):
         """Edges for the content field, and the levels that proposed them where they learn in this step."""
         # Even steps at first; with a generator the edges within move together by up to half a step a ray.
         first, *counts = *self.config.samples, self.config.final
-        s = torch.linspace(0, 1, first + 1, dtype=rays.near.dtype, device=rays.near.device).expand(len(rays.near), -1)
+        s = torch.linspace(0, 1, first + 1, dtype=rays.near.dtype, device=rays.near.device).expand(
+            len(rays.near), -1
+        )
         if generator is not None:
             shift = torch.rand((len(s), 1), generator=generator, dtype=s.dtype, device=s.device) - 0.5
             s = torch.cat([s[:, :1], s[:, 1:-1] + shift / first, s[:, -1:]], 1)
@@ -73,7 +77,9 @@ class ProposalSampler(Sampler):
         return step % round(every) == 0
 
     def sharpness(self, step: int) -> float:
-        """Exponent of the weights: rises from 0 to 1 over the annealing, so that no early error is locked in."""
+        """Exponent of the weights: rises from 0 to 1 over the annealing, so that no early error is locked
+        in.
+        """
         x = min(1.0, (step + 1) / max(1, self.config.anneal_steps))
         slope = self.config.anneal_slope
         return slope * x / ((slope - 1) * x + 1)

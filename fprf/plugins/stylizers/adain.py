@@ -1,13 +1,13 @@
 """AdaIN of all points, towards one style or each towards its own mixture of style codes.
 
-Letters: N points, C content channels, D semantic channels, T style codes; F features [N C], mu and sigma their means and
-deviations, c of the whole scene, s of a style.
+Letters: N points, C content channels, D semantic channels, T style codes; F features [N C], mu and sigma
+their means and deviations, c of the whole scene, s of a style.
 
 Global (paper, single reference):    sigma_s (F - mu_c) / sigma_c + mu_s
 Local (paper, Eq. 5 and 6):          Sigma_w (F - mu_c) / sigma_c + M_w,      M_w = R^S M,  Sigma_w = R^S Sigma
 
-over the codes' means M and deviations Sigma. With dot products, not centred, at the absolute temperature 1, R^S is the paper's
-softmax(R).
+over the codes' means M and deviations Sigma. With dot products, not centred, at the absolute temperature 1,
+R^S is the paper's softmax(R).
 """
 
 from typing import Annotated
@@ -26,7 +26,9 @@ from .config import LocalAdainConfig
 
 
 class AdainStylizer(Stylizer):
-    """Local AdaIN; global where the config is None, and with one code or without semantics, which mix alike everywhere."""
+    """Local AdaIN; global where the config is None, and with one code or without semantics, which mix alike
+    everywhere.
+    """
 
     content_mean: Annotated[Tensor, "C"]
     odds: Annotated[Tensor, "T"]
@@ -41,10 +43,13 @@ class AdainStylizer(Stylizer):
     origin: Annotated[Tensor, "D"] | None
     """The encoder's zero, for dot products of features as it gives them."""
 
-    def __init__(self, dictionary: StyleDictionary, scene: SceneStyle, config: LocalAdainConfig | None) -> None:
+    def __init__(
+        self, dictionary: StyleDictionary, scene: SceneStyle, config: LocalAdainConfig | None
+    ) -> None:
         super().__init__()
         odds = code_odds(dictionary).to(dictionary.keys)
-        mean, covariance = double(dictionary.mean), double(dictionary.covariance)
+        mean = double(dictionary.mean)
+        covariance = double(dictionary.covariance)
         self.matched = config is not None and len(dictionary.keys) > 1 and dictionary.keys.shape[1] > 0
         if config is not None:
             check_fit(dictionary, scene)
@@ -55,10 +60,12 @@ class AdainStylizer(Stylizer):
             centre = scene.semantic_mean if config.centred else zero
             cosine = config.similarity == "cosine"
             if cosine:
-                queries, keys = unit(scene.keys, centre), unit(dictionary.keys, theirs if config.centred else zero)
+                queries = unit(scene.keys, centre)
+                keys = unit(dictionary.keys, theirs if config.centred else zero)
             else:
                 # Softmax does not see what is subtracted from all keys; the smaller numbers round less.
-                queries, keys = scene.keys if config.centred else scene.keys - zero, dictionary.keys - theirs
+                queries = scene.keys if config.centred else scene.keys - zero
+                keys = dictionary.keys - theirs
             # The only region of an undivided scene lies at its mean, where it says nothing about scores.
             spread = score_spread(queries if len(queries) > 1 else keys, keys) if config.relative else 1.0
             self.temperature = config.temperature * spread
@@ -79,7 +86,9 @@ class AdainStylizer(Stylizer):
     def needs(self) -> Want:
         return Want.CONTENT | Want.SEMANTIC if self.matched else Want.CONTENT
 
-    def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
+    def forward(
+        self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
+    ) -> Annotated[Tensor, "N C"]:
         """AdaIN; the mean is subtracted first, since a x + b loses digits where the mean is large."""
         features = content.to(self.gain)
         if self.matched:

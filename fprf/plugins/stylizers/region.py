@@ -1,14 +1,16 @@
-"""Two-sided stylizers: points belong to scene regions, regions match style codes, each region is one affine map.
+"""Two-sided stylizers: points belong to scene regions, regions match style codes, each region is one affine
+map.
 
     f'  =  sum_k a_k(point) ((f - centre) A_k + b_k)          a = membership [N K], the same for every style
 
-Letters: N points, C content channels, D semantic channels, T style codes, K regions of the scene. Tables of regions and codes
-are float64, buffers float32.
+Letters: N points, C content channels, D semantic channels, T style codes, K regions of the scene. Tables of
+regions and codes are float64, buffers float32.
 
-A_k and b_k carry region k's statistics to those of the codes that it matches, through a [K T] table that a user can read.
-The source statistics are mixed over the scene's own regions just as the target's are over the codes: a dictionary that
-equals the scene gives the identity, and a high temperature gives the global style. `region-tone` and `region-ot` differ in
-A_k: per channel sigma_s / sigma_c (AdaIN), or the optimal transport of all channels at once.
+A_k and b_k carry region k's statistics to those of the codes that it matches, through a [K T] table that a
+user can read. The source statistics are mixed over the scene's own regions just as the target's are over the
+codes: a dictionary that equals the scene gives the identity, and a high temperature gives the global style.
+`region-tone` and `region-ot` differ in A_k: per channel sigma_s / sigma_c (AdaIN), or the optimal transport
+of all channels at once.
 """
 
 from typing import Annotated
@@ -25,16 +27,24 @@ from ...style.statistics import deviation, monge
 from ...types import Want
 from .config import RegionConfig
 
-_UNMATCHED, _MATCHED = 0.1, 0.4
-"""Cosines with the nearest code, from the scene's mean: up to the first a region is unmatched, from the second on matched."""
+_UNMATCHED = 0.1
+_MATCHED = 0.4
+"""Cosines with the nearest code, from the scene's mean: up to the first a region is unmatched, from the
+second on matched.
+"""
 _SIMILAR = 0.2
-"""Squared distance of contents, in total variances of the scene, at which the weight of another region falls to 1/e."""
+"""Squared distance of contents, in total variances of the scene, at which the weight of another region falls
+to 1/e.
+"""
 
 
-def region_table(scene: SceneStyle, dictionary: StyleDictionary, config: RegionConfig) -> Annotated[Tensor, "K T"]:
+def region_table(
+    scene: SceneStyle, dictionary: StyleDictionary, config: RegionConfig
+) -> Annotated[Tensor, "K T"]:
     """Share of each style code in each region, float64; rows sum to 1.
 
-    A region that may not take from all references is matched with the codes of the others as if there were only these.
+    A region that may not take from all references is matched with the codes of the others as if there were
+    only these.
     """
     if dictionary.allowed is not None:
         table = torch.zeros(len(scene.share), len(dictionary.share), dtype=torch.float64)
@@ -53,23 +63,29 @@ def region_table(scene: SceneStyle, dictionary: StyleDictionary, config: RegionC
         centred=config.centred,
         origin=dictionary.origin,
     )
-    # Rows of regions that are not in the references become those of matched regions of similar content: the softmax gives such
-    # a region whichever code is the least unlike, sky between twigs the colour of a lamp. Whether the references show such a
-    # thing at all is asked from the scene's mean: centred on its own, each side always fits.
+    # Rows of regions that are not in the references become those of matched regions of similar content: the
+    # softmax gives such a region whichever code is the least unlike, sky between twigs the colour of a lamp.
+    # Whether the references show such a thing at all is asked from the scene's mean: centred on its own, each
+    # side always fits.
     score = (unit(scene.keys, scene.semantic_mean) @ unit(dictionary.keys, scene.semantic_mean).T).amax(1)
     trust = ((double(score) - _UNMATCHED) / (_MATCHED - _UNMATCHED)).clamp(0, 1)
     mean = double(scene.region_mean)
     distance = torch.cdist(mean, mean).square() / double(scene.covariance).trace().clamp_min(1e-12)
     weight = torch.exp(-distance / _SIMILAR) * (trust * double(scene.share))
     total = weight.sum(1, keepdim=True)
-    return torch.where(total > 0, torch.lerp(weight / total.clamp_min(1e-30) @ table, table, trust[:, None]), table)
+    return torch.where(
+        total > 0, torch.lerp(weight / total.clamp_min(1e-30) @ table, table, trust[:, None]), table
+    )
 
 
 def mixed_codes(
     d: StyleDictionary, table: Annotated[Tensor, "K T"]
 ) -> tuple[Annotated[Tensor, "K C"], Annotated[Tensor, "K C"], Annotated[Tensor, "K C C"]]:
-    """Codes mixed by the rows of a table, float64: means and deviations (paper, Eq. 6) and, for transport, covariances."""
-    mean, covariance = double(d.mean), double(d.covariance)
+    """Codes mixed by the rows of a table, float64: means and deviations (paper, Eq. 6) and, for transport,
+    covariances.
+    """
+    mean = double(d.mean)
+    covariance = double(d.covariance)
     sigma = deviation(mean, covariance.diagonal(dim1=-2, dim2=-1))
     return table @ mean, table @ sigma, torch.einsum("kt,tij->kij", table, covariance)
 
@@ -88,10 +104,12 @@ class TwoSidedStylizer(Stylizer):
         check_fit(dictionary, scene)
         # Both sides are matched, blended and smoothed alike: the scene with itself, then with the references.
         own = own_style(scene, dictionary.blend)._replace(origin=dictionary.origin)
-        same, table = region_table(scene, own, config), region_table(scene, dictionary, config)
+        same = region_table(scene, own, config)
+        table = region_table(scene, dictionary, config)
         smoothing = config.smoothing(scene, dictionary.allowed)
         if smoothing is not None:
-            same, table = smoothing @ same, smoothing @ table
+            same = smoothing @ same
+            table = smoothing @ table
         mean, sigma, covariance = mixed_codes(own, same)
         style_mean, style_sigma, style_covariance = mixed_codes(dictionary, table)
         if len(table) == 1:
@@ -99,7 +117,8 @@ class TwoSidedStylizer(Stylizer):
             left = dictionary if dictionary.allowed is None else choose(dictionary, dictionary.allowed[0])[0]
             style_mean, style_covariance = (part[None] for part in whole_style(left))
             style_sigma = deviation(style_mean, style_covariance.diagonal(dim1=-2, dim2=-1))
-        # A and b: optimal transport of all channels, or AdaIN (paper), sigma_s / sigma_c of each; nothing more than `gain`.
+        # A and b: optimal transport of all channels, or AdaIN (paper), sigma_s / sigma_c of each; nothing
+        # more than `gain`.
         away = mean - double(scene.mean)
         if config.transport:
             matrix = monge(covariance, style_covariance, gain=config.gain)
@@ -117,7 +136,9 @@ class TwoSidedStylizer(Stylizer):
     def needs(self) -> Want:
         return Want.CONTENT | Want.SEMANTIC if self.membership.divided else Want.CONTENT
 
-    def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
+    def forward(
+        self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
+    ) -> Annotated[Tensor, "N C"]:
         """Each point by the maps of the regions that it belongs to."""
         return self.shared(content, semantic)[0]
 

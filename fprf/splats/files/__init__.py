@@ -1,4 +1,6 @@
-"""Files of 3D Gaussians, read, recoloured and written in the formats that are installed (`base.CaptureFormat`)."""
+"""Files of 3D Gaussians, read, recoloured and written in the formats that are installed
+(`base.CaptureFormat`).
+"""
 
 import mmap
 from dataclasses import replace
@@ -39,7 +41,9 @@ class Written(NamedTuple):
 
 
 def read_capture(path: Path) -> Capture:
-    """Read a file of Gaussians, or a folder of SOG. Raises DataError for another ending, or a file that is not what it says."""
+    """Read a file of Gaussians, or a folder of SOG. Raises DataError for another ending, or a file that is
+    not what it says.
+    """
     if path.is_dir():
         path = path / ("lod-meta.json" if (path / "lod-meta.json").is_file() else "meta.json")
     form = format_of(path)
@@ -51,7 +55,9 @@ def read_capture(path: Path) -> Capture:
             with path.open("rb") as file:
                 data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
+        raise DataError(
+            f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
+        ) from error
     if data[:23] == b"version https://git-lfs":
         raise DataError(f"{path}: a pointer of Git LFS in the place of the file; run git lfs pull")
     with np.errstate(over="ignore", invalid="ignore"):  # damaged files hold numbers of any kind
@@ -62,8 +68,11 @@ def read_capture(path: Path) -> Capture:
     finite = capture.gaussians.finite
     if not bool(finite.any()):
         reasons = " and ".join(capture.gaussians.faults())
-        raise DataError(f"{path}: holds no Gaussian that can be drawn, but {reasons}; export the capture again")
-    # Far from 0, float32 rounds a capture to a few places along an axis; positions that were float64 have further digits.
+        raise DataError(
+            f"{path}: holds no Gaussian that can be drawn, but {reasons}; export the capture again"
+        )
+    # Far from 0, float32 rounds a capture to a few places along an axis; positions that were float64 have
+    # further digits.
     local = capture.gaussians.means[finite].numpy()
     for axis, away in zip(local.T, np.abs(capture.shift), strict=True):
         step = float(np.spacing(np.float32(away)))
@@ -89,24 +98,29 @@ def write_gaussians(
     origin: Origin = (0.0, 0.0, 0.0),
     local: bool = False,
 ) -> Written:
-    """Write a file in the format that its name ends with, whole or not at all. Raises DataError for another ending.
+    """Write a file in the format that its name ends with, whole or not at all. Raises DataError for another
+    ending.
 
-    .ply is exact; the others lose what their bits cannot hold, Gaussians that cannot be drawn, and outliers that would cost the
-    others their precision; .compressed.ply and SOG have an order of their own.
-    .splat holds neither view dependence nor whether opacities are compensated (`antialiased`): it gets the means of what
-    `views` show, or the colours over all directions where none are given. With `plain` all formats get such opacities, for
-    renderers that do not compensate. Where the Gaussians' `origin` is not 0, .ply holds float64 positions in the world; the
-    others, and .ply where `local`, hold those relative to the origin, with a file beside them that says so. Of rows that are
-    written as .ply, not `plain`, some at a time are in memory; they say themselves whether they are `antialiased`.
+    .ply is exact; the others lose what their bits cannot hold, Gaussians that cannot be drawn, and outliers
+    that would cost the others their precision; .compressed.ply and SOG have an order of their own. .splat
+    holds neither view dependence nor whether opacities are compensated (`antialiased`): it gets the means of
+    what `views` show, or the colours over all directions where none are given. With `plain` all formats get
+    such opacities, for renderers that do not compensate. Where the Gaussians' `origin` is not 0, .ply holds
+    float64 positions in the world; the others, and .ply where `local`, hold those relative to the origin,
+    with a file beside them that says so. Of rows that are written as .ply, not `plain`, some at a time are in
+    memory; they say themselves whether they are `antialiased`.
     """
-    form, faulty, far = format_of(path), False, 0
+    form = format_of(path)
+    faulty = False
+    far = 0
     added, beside = added_and_beside(origin, local or not form.exact)
     if isinstance(gaussians, GaussianRows):
         if form.exact and form.view_dependent and not plain:
             form.write(path, form.pack_rows(gaussians, added))
             write_offset(path, beside)
             return Written()
-        antialiased, gaussians = gaussians.antialiased, gaussians.part(slice(0, gaussians.count))
+        antialiased = gaussians.antialiased
+        gaussians = gaussians.part(slice(0, gaussians.count))
     # What the format cannot hold is left out first, so that it decides nothing about the rest.
     if not form.exact:
         finite = gaussians.finite
@@ -116,10 +130,16 @@ def write_gaussians(
         far = 0 if kept is None else int((~kept).sum())
         gaussians = gaussians.select(torch.from_numpy(kept)) if far else gaussians
         if far and not len(gaussians):
-            raise DataError(f"{path}: all Gaussians lie too far from the origin for this format; write a .ply")
+            raise DataError(
+                f"{path}: all Gaussians lie too far from the origin for this format; write a .ply"
+            )
     # Renderers that know less are given what views show of colours and opacities.
     bare = not form.view_dependent
-    if views is not None and len(views) and ((bare and gaussians.degree) or (antialiased and (bare or plain))):
+    if (
+        views is not None
+        and len(views)
+        and ((bare and gaussians.degree) or (antialiased and (bare or plain)))
+    ):
         seen = seen_means(gaussians, views, antialiased=antialiased)
         gaussians = seen.gaussians(gaussians) if bare else seen.plain(gaussians)
         antialiased = False
@@ -129,18 +149,26 @@ def write_gaussians(
     return Written(faulty, far, tuple(form.notes(gaussians)))
 
 
-def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N K 3"], views: Cameras | None = None) -> Written:
-    """Write a capture with new harmonics of all its Gaussians, or of all that can be drawn, in the format that the name says.
+def write_capture(
+    path: Path, capture: Capture, harmonics: Annotated[Tensor, "N K 3"], views: Cameras | None = None
+) -> Written:
+    """Write a capture with new harmonics of all its Gaussians, or of all that can be drawn, in the format
+    that the name says.
 
-    In the format that it was read from everything else stays as it was, bit for bit; where no harmonic differs from those
-    read, that is the whole file. Another format gets what `write_gaussians` gives it, and no Gaussians that cannot be drawn.
+    In the format that it was read from everything else stays as it was, bit for bit; where no harmonic
+    differs from those read, that is the whole file. Another format gets what `write_gaussians` gives it, and
+    no Gaussians that cannot be drawn.
     """
-    finite, before, form = capture.gaussians.finite, capture.gaussians.harmonics, format_of(path)
+    finite = capture.gaussians.finite
+    before = capture.gaussians.harmonics
+    form = format_of(path)
     if len(harmonics) < len(finite):
         harmonics = before.index_copy(0, finite.nonzero()[:, 0], harmonics)
     if not form.holds(capture, format_of(capture.path)):
         drawn = capture.gaussians.recoloured(harmonics).select(finite)
-        written = write_gaussians(path, drawn, antialiased=capture.antialiased, views=views, origin=capture.origin)
+        written = write_gaussians(
+            path, drawn, antialiased=capture.antialiased, views=views, origin=capture.origin
+        )
         return written._replace(faulty=not bool(finite.all()))
     changed = torch.cat([
         (harmonics[rows] != before[rows]).flatten(1).any(1) & harmonics[rows].isfinite().flatten(1).all(1)
@@ -149,6 +177,8 @@ def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N 
     if bool(changed.any()):
         form.write(path, capture.recolour(harmonics.numpy(), np.asarray(changed)))
     else:
-        form.write(path, (capture.data[start : start + _MAPPED] for start in range(0, len(capture.data), _MAPPED)))
+        form.write(
+            path, (capture.data[start : start + _MAPPED] for start in range(0, len(capture.data), _MAPPED))
+        )
     write_offset(path, capture.offset)
     return Written()

@@ -1,8 +1,9 @@
-"""The base of file formats of 3D Gaussians, what a reader returns, and what formats share: rounding, rotations, outliers.
+"""The base of file formats of 3D Gaussians, what a reader returns, and what formats share: rounding,
+rotations, outliers.
 
-To add a format: a subclass of `CaptureFormat` in a file of this folder, and its entry point in the group `fprf.captures`. The
-name of the entry point is the ending of its files: `sog` stands for *.sog; of several that fit, the longest is meant.
-N Gaussians · K harmonics a colour channel. Arrays are NumPy's.
+To add a format: a subclass of `CaptureFormat` in a file of this folder, and its entry point in the group
+`fprf.captures`. The name of the entry point is the ending of its files: `sog` stands for *.sog; of several
+that fit, the longest is meant. N Gaussians · K harmonics a colour channel. Arrays are NumPy's.
 
 A reader never allocates on a file's word: what a header claims is held against the size of the file.
 """
@@ -36,13 +37,17 @@ Bools: TypeAlias = NDArray[np.bool_]
 Recolour: TypeAlias = Callable[[Floats, Bools], Iterable[bytes]]
 
 ROWS = 1 << 17
-"""Gaussians that are decoded or encoded at a time, so that the intermediate arrays of large files stay small."""
+"""Gaussians that are decoded or encoded at a time, so that the intermediate arrays of large files stay
+small.
+"""
 UNSOUND = (LookupError, TypeError, ValueError, AttributeError, RecursionError, OverflowError, struct.error)
 """Errors that a document raises, as it is taken apart, that is no valid index of a format."""
 _EDGE = 1e-6
 """Opacities of exactly 0 and 1 have no logit: both keep this distance, far below a 16-bit step."""
 _MOST = 64.0
-"""Largest magnitude of harmonics and ln-scales that are written: far beyond what is seen, and no number spoils the others."""
+"""Largest magnitude of harmonics and ln-scales that are written: far beyond what is seen, and no number
+spoils the others.
+"""
 _APART = 4.0
 """Extents of the bulk from it, from which on Gaussians are ordered and bounded apart from it."""
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
@@ -60,7 +65,9 @@ class Capture:
     data: Data
     """The file; large ones are mapped, not in memory. Of a folder, its files as one archive."""
     recolour: Recolour
-    """The file, in pieces, with the harmonics [N K 3] of some Gaussians (bool [N]) replaced and everything else as it was."""
+    """The file, in pieces, with the harmonics [N K 3] of some Gaussians (bool [N]) replaced and everything
+    else as it was.
+    """
     up: tuple[float, float, float] | None = None
     """Direction that points up, where the file says so."""
     camera: Cameras | None = None
@@ -85,34 +92,46 @@ class CaptureFormat(PluginConfig):
     group: ClassVar[str] = CAPTURES
 
     view_dependent: ClassVar[bool] = True
-    """It holds harmonics, and whether opacities are compensated for antialiasing. Where it does not, it is given the mean
-    colours and opacities that views show."""
+    """It holds harmonics, and whether opacities are compensated for antialiasing. Where it does not, it is
+    given the mean colours and opacities that views show.
+    """
     writes: ClassVar[bool] = True
     """False = files of it are read alone, and what was read from them is written as another format."""
     reads: ClassVar[bool] = True
     """False = files of it are written alone."""
     exact: ClassVar[bool] = False
-    """It holds every number as it is, NaN too, and positions in float64. Where it does not, it is given Gaussians that can be
-    drawn, about a local origin that stands in a file beside."""
+    """It holds every number as it is, NaN too, and positions in float64. Where it does not, it is given
+    Gaussians that can be drawn, about a local origin that stands in a file beside.
+    """
 
     def recognises(self, head: bytes, size: int) -> bool:
-        """False where a file of `size` bytes that begin with `head` is certainly damaged or of another format."""
+        """False where a file of `size` bytes that begin with `head` is certainly damaged or of another
+        format.
+        """
         raise NotImplementedError
 
     def read(self, path: Path, data: Data) -> Capture:
-        """The Gaussians of a file, and how to recolour it. Raises DataError for anything else than a sound file."""
+        """The Gaussians of a file, and how to recolour it. Raises DataError for anything else than a sound
+        file.
+        """
         raise NotImplementedError
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> Iterable[bytes]:
-        """The file of these Gaussians, on the CPU, in pieces. `origin` is to be added to their positions; 0 unless `exact`."""
-        raise DataError(f"{type(self).__name__}: files of this format are read, not written; name a .ply, .spz, .sog or .glb")
+        """The file of these Gaussians, on the CPU, in pieces. `origin` is to be added to their positions; 0
+        unless `exact`.
+        """
+        raise DataError(
+            f"{type(self).__name__}: files of this format are read, not written; name a .ply, .spz, .sog or .glb"
+        )
 
     def pack_rows(self, rows: GaussianRows, origin: Origin) -> Iterable[bytes]:
         """`pack` of Gaussians that need not all be in memory."""
         return self.pack(rows.part(slice(0, rows.count)), rows.antialiased, origin)
 
     def keeps(self, gaussians: Gaussians) -> NDArray[np.bool_] | None:
-        """Gaussians [N] that a file holds: all but outliers that would cost the others their precision; None = all."""
+        """Gaussians [N] that a file holds: all but outliers that would cost the others their precision; None
+        = all.
+        """
         return None
 
     def notes(self, gaussians: Gaussians) -> list[str]:
@@ -130,7 +149,9 @@ class CaptureFormat(PluginConfig):
 
 
 def format_of(path: Path) -> CaptureFormat:
-    """The format of a file by its name. Raises DataError where it is of none, PluginError where that cannot be loaded."""
+    """The format of a file by its name. Raises DataError where it is of none, PluginError where that cannot
+    be loaded.
+    """
     name = format_name(path)
     if name is None:
         raise DataError(
@@ -142,7 +163,9 @@ def format_of(path: Path) -> CaptureFormat:
 def check_needs(form: CaptureFormat) -> None:
     """Raise DataError where a package that writes files of a format is missing."""
     for need in form.needs():
-        raise DataError(f"{type(form).__name__.lower()}: files of this format are written by {need.what}; {need.remedy}")
+        raise DataError(
+            f"{type(form).__name__.lower()}: files of this format are written by {need.what}; {need.remedy}"
+        )
 
 
 def pieces(count: int) -> Iterator[slice]:
@@ -151,13 +174,16 @@ def pieces(count: int) -> Iterator[slice]:
         yield slice(start, min(start + ROWS, count))
 
 
-def decoded(bands: int, *sections: tuple[int, Callable[[slice], tuple[Floats, ...]]]) -> tuple[Gaussians, Origin]:
+def decoded(
+    bands: int, *sections: tuple[int, Callable[[slice], tuple[Floats, ...]]]
+) -> tuple[Gaussians, Origin]:
     """Gaussians about their local origin, and that: decoded piece by piece.
 
-    Each section has a number of rows and a function that gives means [n 3], quaternions [n 4], ln-scales [n 3], logits [n] and
-    harmonics [n K 3] of some of them, of any type.
+    Each section has a number of rows and a function that gives means [n 3], quaternions [n 4], ln-scales [n
+    3], logits [n] and harmonics [n K 3] of some of them, of any type.
     """
-    count, start = sum(number for number, _ in sections), 0
+    count = sum(number for number, _ in sections)
+    start = 0
     shapes = ((count, 4), (count, 3), (count,), (count, bands, 3))
     parts: list[Floats] = [np.empty((count, 3)), *(np.empty(shape, np.float32) for shape in shapes)]
     for number, part in sections:
@@ -172,10 +198,14 @@ def decoded(bands: int, *sections: tuple[int, Callable[[slice], tuple[Floats, ..
 
 
 def in_world(table: NDArray[np.void], local: Floats, origin: Origin) -> NDArray[np.void]:
-    """Rows with local x y z [N 3] about an origin as float64 of the world; as they are where the origin is 0."""
+    """Rows with local x y z [N 3] about an origin as float64 of the world; as they are where the origin is
+    0.
+    """
     if not any(origin):
         return table
-    kinds = {name: "<f8" if name in ("x", "y", "z") else table.dtype[name] for name in table.dtype.names or ()}
+    kinds = {
+        name: "<f8" if name in ("x", "y", "z") else table.dtype[name] for name in table.dtype.names or ()
+    }
     out = table.astype([*kinds.items()])
     for name, column, of in zip("xyz", local.astype(np.float64).T, origin, strict=True):
         out[name] = column + of
@@ -183,7 +213,9 @@ def in_world(table: NDArray[np.void], local: Floats, origin: Origin) -> NDArray[
 
 
 def beside(path: Path, name: str) -> bytes:
-    """The content of a file in the folder of another one that names it, or below. Raises DataError where there is none."""
+    """The content of a file in the folder of another one that names it, or below. Raises DataError where
+    there is none.
+    """
     file = path.parent / name
     try:
         if not file.resolve().is_relative_to(path.parent.resolve()):
@@ -201,13 +233,17 @@ def release(data: Data) -> None:
 
 def arrays(gaussians: Gaussians) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Means [N 3], quaternions [N 4], ln-scales [N 3], logits [N] and harmonics [N K 3]."""
-    means, turns, scales, logits, harmonics = (part.detach().cpu().numpy() for part in vars(gaussians).values())
+    means, turns, scales, logits, harmonics = (
+        part.detach().cpu().numpy() for part in vars(gaussians).values()
+    )
     return means, turns, scales, logits, harmonics
 
 
 def short(path: Path, has: int, needs: int, what: str) -> DataError:
     """The error for a file that holds less than its header says."""
-    return DataError(f"{path}: {what} takes {needs} bytes, but the file has {has}; copy it again, it is cut off or damaged")
+    return DataError(
+        f"{path}: {what} takes {needs} bytes, but the file has {has}; copy it again, it is cut off or damaged"
+    )
 
 
 def steps(values: Floats, most: int) -> NDArray[np.int64]:
@@ -225,7 +261,8 @@ def pack_bits(shares: Floats, bits: Sequence[int]) -> NDArray[np.int64]:
 
 def unpack_bits(word: NDArray[np.uint32], bits: Sequence[int]) -> Floats:
     """The columns of `pack_bits`, in [0, 1]."""
-    columns, shift = [], 0
+    columns = []
+    shift = 0
     for width in reversed(bits):
         most = (1 << width) - 1
         columns.append((word >> shift & most) / most)
@@ -272,7 +309,8 @@ def unit_quaternions(quaternions: Floats) -> NDArray[np.float64]:
 
 
 def smallest_three(quaternions: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """Of unit quaternions [N 4], up to their sign: which component is the largest [N], and the others times sqrt 2 [N 3].
+    """Of unit quaternions [N 4], up to their sign: which component is the largest [N], and the others times
+    sqrt 2 [N 3].
 
     The others lie in [-1, 1].
     """
@@ -286,7 +324,8 @@ def smallest_three(quaternions: Floats) -> tuple[NDArray[np.int64], Floats]:
 
 def three_to_four(largest: NDArray[np.int64], three: Floats) -> Floats:
     """The quaternions [N 4] of `smallest_three`."""
-    rows, others = np.arange(len(three)), three / 2**0.5
+    rows = np.arange(len(three))
+    others = three / 2**0.5
     out = np.empty((len(three), 4))
     out[rows[:, None], _OTHERS[largest]] = others
     out[rows, largest] = np.sqrt(np.maximum(0, 1 - (others**2).sum(1)))
@@ -296,19 +335,25 @@ def three_to_four(largest: NDArray[np.int64], three: Floats) -> Floats:
 def turned_harmonics(rotation: Floats, bands: int) -> Floats:
     """The matrix [K K] that turns harmonics as a rotation [3 3], or a mirroring, turns points.
 
-    It is solved for from values at directions before and after: exact, since each degree is closed under rotations.
+    It is solved for from values at directions before and after: exact, since each degree is closed under
+    rotations.
     """
-    there = torch.nn.functional.normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(0)).double(), dim=1)
+    there = torch.nn.functional.normalize(
+        torch.randn(64, 3, generator=torch.Generator().manual_seed(0)).double(), dim=1
+    )
     before = there @ torch.from_numpy(np.asarray(rotation, np.float64))
     degree = round(bands**0.5)
-    matrix = torch.linalg.lstsq(spherical_harmonics(there, degree), spherical_harmonics(before, degree)).solution
+    matrix = torch.linalg.lstsq(
+        spherical_harmonics(there, degree), spherical_harmonics(before, degree)
+    ).solution
     whole = matrix.round()  # turns by right angles and mirrorings are whole numbers, exactly
     return np.asarray(torch.where((matrix - whole).abs() < 1e-9, whole, matrix))
 
 
 def levels_of(means: Floats) -> NDArray[np.int64]:
     """0 for the bulk of means [N 3], 1 for the bulk of those far from it, and so on."""
-    level, rest = np.zeros(len(means), np.int64), np.arange(len(means))
+    level = np.zeros(len(means), np.int64)
+    rest = np.arange(len(means))
     # What is far from the bulk of the rest may have a bulk of its own, and so on.
     while len(rest := rest[bulk_of(means[rest]).apart > _APART]):
         level[rest] += 1
@@ -316,13 +361,17 @@ def levels_of(means: Floats) -> NDArray[np.int64]:
 
 
 def spatial_order(means: Floats) -> NDArray[np.int64]:
-    """An order in which neighbours in space follow each other (Z-order curve of 1024 cells a side), outliers last."""
-    level, order = levels_of(means), []
+    """An order in which neighbours in space follow each other (Z-order curve of 1024 cells a side), outliers
+    last.
+    """
+    level = levels_of(means)
+    order = []
     for k in range(int(level.max(initial=-1)) + 1):
         at = np.flatnonzero(level == k)
         # A grid of each level: one outlier would leave all others in one cell.
         points = means[at].astype(np.float64)
-        low, high = points.min(0), points.max(0)
+        low = points.min(0)
+        high = points.max(0)
         cells = ((points - low) / np.maximum(high - low, np.finfo(np.float32).tiny) * 1023).astype(np.int64)
         order.append(at[morton_order(cells)])
     return np.concatenate(order) if order else level
@@ -331,8 +380,9 @@ def spatial_order(means: Floats) -> NDArray[np.int64]:
 def precise(means: Floats, step: Callable[[Floats, Floats], float], share: float) -> Bools:
     """Which of means [N 3] a file keeps: all, or all but outliers for which the others would lose precision.
 
-    `step` is the distance between positions that the file tells apart, of the means kept and of their bulk. It shall be at most
-    `share` of the extent of the bulk; where the bulk itself does not allow that, what it allows.
+    `step` is the distance between positions that the file tells apart, of the means kept and of their bulk.
+    It shall be at most `share` of the extent of the bulk; where the bulk itself does not allow that, what it
+    allows.
     """
     bulk = bulk_of(means)
     if bulk.side == 0:
@@ -341,4 +391,6 @@ def precise(means: Floats, step: Callable[[Floats, Floats], float], share: float
     tried = [np.inf, *(2.0**k for k in range(14, -1, -1))]
     wanted = max(share * bulk.side, step(means[bulk.apart <= tried[-1]], inner))
     # The widest reach that is precise enough: the last one is by the definition of `wanted`.
-    return next(kept for kept in (bulk.apart <= reach for reach in tried) if step(means[kept], inner) <= wanted)
+    return next(
+        kept for kept in (bulk.apart <= reach for reach in tried) if step(means[kept], inner) <= wanted
+    )

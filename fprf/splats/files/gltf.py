@@ -1,9 +1,10 @@
 """glTF 2.0 with `KHR_gaussian_splatting`: a binary .glb, or a .gltf, which is written with its buffer inside.
 
-Primitives of points with POSITION, ROTATION (x y z w), SCALE, OPACITY in [0, 1] and SH_DEGREE_l_COEF_n, beside any other nodes,
-cameras and meshes, which are kept. SCALE is a size in the final text of the extension and its logarithm in the review draft
-(`_logarithmic` tells them apart). Colours are sRGB or linear (`colorSpace`). Axes are right up back; what this module writes
-has those of PLY files, right down front, under a node that turns them by 180 degrees about x.
+Primitives of points with POSITION, ROTATION (x y z w), SCALE, OPACITY in [0, 1] and SH_DEGREE_l_COEF_n,
+beside any other nodes, cameras and meshes, which are kept. SCALE is a size in the final text of the extension
+and its logarithm in the review draft (`_logarithmic` tells them apart). Colours are sRGB or linear
+(`colorSpace`). Axes are right up back; what this module writes has those of PLY files, right down front,
+under a node that turns them by 180 degrees about x.
 """
 
 import base64
@@ -40,17 +41,23 @@ _MOST = (1 << 32) - (1 << 20)
 _LEAST = 1e-30
 """Sizes are at least this, so that their logarithm is finite."""
 _DRAFTS = ("BT.", "Display-P3", "linear")
-"""Beginnings of colour-space names of drafts before the review draft, when SCALE was a logarithm; later texts share theirs."""
+"""Beginnings of colour-space names of drafts before the review draft, when SCALE was a logarithm; later texts
+share theirs.
+"""
 _LINEAR_SINCE = (2, 7)
 """Version of splat-transform from which on its .glb has linear sizes (playcanvas/splat-transform#268)."""
 _ASKED = 64
 """Gaussians whose nearest neighbours are looked for."""
 _TYPICAL = -0.5
-"""ln of the middle axis of Gaussians over the distance to the nearest neighbour: -0.2 to -0.9 in trained captures."""
+"""ln of the middle axis of Gaussians over the distance to the nearest neighbour: -0.2 to -0.9 in trained
+captures.
+"""
 
 
 class _Part(NamedTuple):
-    """A primitive of Gaussians as a node shows it: scale * rotation @ point + translation is right down front."""
+    """A primitive of Gaussians as a node shows it: scale * rotation @ point + translation is right down
+    front.
+    """
 
     columns: dict[str, NDArray[Any]]
     """Attributes [N C] in the file's own memory."""
@@ -72,7 +79,9 @@ class _Part(NamedTuple):
         return column.astype(np.float64) if self.whole else _values(column)
 
     def decoded(self, rows: slice, names: list[str], logarithmic: bool) -> tuple[Floats, ...]:
-        """Means, quaternions, ln-scales, logits and harmonics of some rows; SCALE is those ln-scales, or sizes."""
+        """Means, quaternions, ln-scales, logits and harmonics of some rows; SCALE is those ln-scales, or
+        sizes.
+        """
         # Attributes may be whole numbers that stand for shares, except of harmonics.
         points, turns, opacity = (_values(self.columns[name][rows]) for name in (*_SHAPE[:2], _SHAPE[3]))
         scale = self.sizes(rows)
@@ -105,29 +114,37 @@ class Gltf(CaptureFormat):
             document, start = _document(data)
             parts = _parts(path, document, data, start)
             names = [name for name in _HARMONICS if parts and name in parts[0].columns]
-            if any({*names} ^ {name for name in part.columns if ":SH_" in name} for part in parts) or len(names) not in (
+            if any({*names} ^ {name for name in part.columns if ":SH_" in name} for part in parts) or len(
+                names
+            ) not in (
                 0,
                 *COUNTS,
             ):
                 raise ValueError("harmonics of degrees that are not whole, or differ")
         except base.UNSOUND as error:
-            raise DataError(f"{path}: no sound glTF ({error!r}); copy it again, it is damaged or of another kind") from error
+            raise DataError(
+                f"{path}: no sound glTF ({error!r}); copy it again, it is damaged or of another kind"
+            ) from error
         if not parts:
             raise DataError(f"{path}: a glTF without {_NAME} in its scene; it holds no 3D Gaussians")
 
         def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
             # The document stays byte for byte; columns of colours are overwritten in a copy of the buffer.
-            out, begin = bytearray(data), 0
+            out = bytearray(data)
+            begin = 0
             for part in _parts(path, document, out, start):
                 back = base.turned_harmonics(part.rotation, len(names)).T
                 for rows in base.pieces(len(part.columns["POSITION"])):
                     here = slice(begin + rows.start, begin + rows.stop)
-                    which, new = changed[here], np.matmul(back, base.finite(harmonics[here]))
+                    which = changed[here]
+                    new = np.matmul(back, base.finite(harmonics[here]))
                     new = _in_other_light(new, to_linear=True) if part.linear else new
                     for name, column in zip(names, new.transpose(1, 0, 2), strict=True):
                         part.columns[name][rows][which] = column[which]
                     colour = part.columns.get("COLOR_0")
-                    if colour is not None and colour.dtype == np.uint8:  # what programs without the extension show
+                    if (
+                        colour is not None and colour.dtype == np.uint8
+                    ):  # what programs without the extension show
                         colour[rows, :3][which] = base.steps(base.colours_of(new), 255)[which]
                 begin += len(part.columns["POSITION"])
             return [bytes(out)]
@@ -135,7 +152,8 @@ class Gltf(CaptureFormat):
         # One section a primitive: each has its own node, and so its own axes.
         logarithmic, reason = _logarithmic(document, parts)
         sections = [
-            (len(part.columns["POSITION"]), lambda rows, part=part: part.decoded(rows, names, logarithmic)) for part in parts
+            (len(part.columns["POSITION"]), lambda rows, part=part: part.decoded(rows, names, logarithmic))
+            for part in parts
         ]
         gaussians, shift = base.decoded(len(names), *sections)
         kind = "logarithms, as in the review draft" if logarithmic else "linear, as in the final text"
@@ -149,21 +167,34 @@ class Gltf(CaptureFormat):
         opacity = base.sigmoid(logits)[:, None]
         # Columns lie one after the other in the buffer; quaternions have w last.
         shape = (means, np.roll(base.unit_quaternions(turns), -1, 1), np.exp(scales.clip(-80, 80)), opacity)
-        columns: dict[str, Floats] = dict(zip((*_SHAPE, *_HARMONICS), (*shape, *harmonics.transpose(1, 0, 2)), strict=False))
+        columns: dict[str, Floats] = dict(
+            zip((*_SHAPE, *_HARMONICS), (*shape, *harmonics.transpose(1, 0, 2)), strict=False)
+        )
         columns = {name: values.astype("<f4") for name, values in columns.items()}
-        columns["COLOR_0"] = base.steps(np.concatenate([base.colours_of(harmonics), opacity], 1), 255).astype(np.uint8)
+        columns["COLOR_0"] = base.steps(np.concatenate([base.colours_of(harmonics), opacity], 1), 255).astype(
+            np.uint8
+        )
         # Each column has a view of the buffer and an accessor of that view.
-        views, accessors, size = [], [], 0
+        views = []
+        accessors = []
+        size = 0
         for k, values in enumerate(columns.values()):
-            kind, code = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]], 5126 if values.dtype == "<f4" else 5121
+            kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]]
+            code = 5126 if values.dtype == "<f4" else 5121
             views.append({"buffer": 0, "byteOffset": size, "byteLength": values.nbytes, "target": 34962})
             accessors.append({"bufferView": k, "componentType": code, "count": len(values), "type": kind})
             size += values.nbytes
         # The specification demands the bounds of positions; bytes of colours stand for shares.
         accessors[0] |= {"min": means.min(0).tolist(), "max": means.max(0).tolist()}
         accessors[-1]["normalized"] = True
-        extension: dict[str, Any] = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
-        extension |= {"sortingMethod": "cameraDistance"} | ({"extras": {"antialiased": True}} if antialiased else {})
+        extension: dict[str, Any] = {
+            "kernel": "ellipse",
+            "colorSpace": "srgb_rec709_display",
+            "projection": "perspective",
+        }
+        extension |= {"sortingMethod": "cameraDistance"} | (
+            {"extras": {"antialiased": True}} if antialiased else {}
+        )
         attributes = {name: k for k, name in enumerate(columns)}
         document = {
             "asset": {"version": "2.0", "generator": "fprf"},
@@ -171,7 +202,9 @@ class Gltf(CaptureFormat):
             "scene": 0,
             "scenes": [{"nodes": [0]}],
             "nodes": [{"mesh": 0, "rotation": [1, 0, 0, 0]}],
-            "meshes": [{"primitives": [{"attributes": attributes, "mode": 0, "extensions": {_NAME: extension}}]}],
+            "meshes": [
+                {"primitives": [{"attributes": attributes, "mode": 0, "extensions": {_NAME: extension}}]}
+            ],
             "accessors": accessors,
             "bufferViews": views,
             "buffers": [{"byteLength": size}],
@@ -192,8 +225,11 @@ class Gltf(CaptureFormat):
 def _glb(document: dict[str, Any], body: Iterable[bytes]) -> list[bytes]:
     """The pieces of a .glb: its header, its document and its one buffer."""
     if (needed := document["buffers"][0]["byteLength"]) > _MOST:
-        raise DataError(f"Gaussians of {needed} bytes, where a .glb holds {_MOST} at most; export them as .ply or .spz")
-    text, chunks = json.dumps(document, separators=(",", ":"), ensure_ascii=False).encode(), [*body]
+        raise DataError(
+            f"Gaussians of {needed} bytes, where a .glb holds {_MOST} at most; export them as .ply or .spz"
+        )
+    text = json.dumps(document, separators=(",", ":"), ensure_ascii=False).encode()
+    chunks = [*body]
     text += b" " * (-len(text) % 4)
     chunks.append(bytes(-sum(map(len, chunks)) % 4))
     size = sum(map(len, chunks))
@@ -214,11 +250,16 @@ def _document(data: Data) -> tuple[dict[str, Any], int]:
 
 def _binary(path: Path, document: dict[str, Any]) -> bytes:
     """The .glb of a .gltf: with its buffers, from base64 or from files in its folder, as one."""
-    body, starts = bytearray(), []
+    body = bytearray()
+    starts = []
     for about in document["buffers"]:
         uri = about["uri"]
         inside = uri.startswith("data:")
-        content = base64.b64decode(uri.partition(",")[2], validate=True) if inside else base.beside(path, unquote(uri))
+        content = (
+            base64.b64decode(uri.partition(",")[2], validate=True)
+            if inside
+            else base.beside(path, unquote(uri))
+        )
         starts.append(len(body))
         body += content + bytes(-len(content) % 4)
     # Views keep their order; where each begins counts from the start of the joined buffer.
@@ -231,7 +272,9 @@ def _binary(path: Path, document: dict[str, Any]) -> bytes:
 
 def _parts(path: Path, document: dict[str, Any], data: Data | bytearray, start: int) -> list[_Part]:
     """The primitives of Gaussians that nodes of the scene show; `data` has the buffer from `start` on."""
-    nodes, found, seen = document.get("nodes", []), list[_Part](), set[int]()
+    nodes = document.get("nodes", [])
+    found = list[_Part]()
+    seen = set[int]()
     scene = document.get("scenes", [{"nodes": range(len(nodes))}])[document.get("scene", 0)]
     # From right up back, in which a scene is, to right down front.
     waiting = [(index, np.diag([1.0, -1.0, -1.0, 1.0])) for index in scene.get("nodes", [])]
@@ -244,7 +287,8 @@ def _parts(path: Path, document: dict[str, Any], data: Data | bytearray, start: 
         if "matrix" in node:
             local = np.array(node["matrix"], np.float64).reshape(4, 4).T
         else:
-            local, (x, y, z, w) = np.eye(4), node.get("rotation", (0, 0, 0, 1))
+            local = np.eye(4)
+            (x, y, z, w) = node.get("rotation", (0, 0, 0, 1))
             turn = rotations(torch.tensor([[w, x, y, z]], dtype=torch.float64))[0].numpy()
             local[:3, :3] = turn * node.get("scale", (1, 1, 1))
             local[:3, 3] = node.get("translation", (0, 0, 0))
@@ -255,24 +299,40 @@ def _parts(path: Path, document: dict[str, Any], data: Data | bytearray, start: 
             if extension is None:
                 continue
             if extension.get("extensions"):
-                raise DataError(f"{path}: Gaussians packed by {', '.join(extension['extensions'])}; export them uncompressed")
-            columns = {name: _column(document, data, start, at) for name, at in primitive["attributes"].items()}
-            widths = {name: columns[name].shape[1] for name in columns if name in _SHAPE or name in _HARMONICS}
+                raise DataError(
+                    f"{path}: Gaussians packed by {', '.join(extension['extensions'])}; export them uncompressed"
+                )
+            columns = {
+                name: _column(document, data, start, at) for name, at in primitive["attributes"].items()
+            }
+            widths = {
+                name: columns[name].shape[1] for name in columns if name in _SHAPE or name in _HARMONICS
+            }
             wanted = dict.fromkeys(_HARMONICS, 3) | dict(zip(_SHAPE, (3, 4, 3, 1), strict=True))
-            sound = {*_SHAPE, _HARMONICS[0]} <= {*columns} and all(wanted[name] == width for name, width in widths.items())
+            sound = {*_SHAPE, _HARMONICS[0]} <= {*columns} and all(
+                wanted[name] == width for name, width in widths.items()
+            )
             if not sound or len({len(column) for column in columns.values()}) > 1:
-                raise DataError(f"{path}: Gaussians without one of {', '.join(_SHAPE)}, or of unequal shapes; export it again")
+                raise DataError(
+                    f"{path}: Gaussians without one of {', '.join(_SHAPE)}, or of unequal shapes; export it again"
+                )
             # Gaussians stay Gaussians of the same kind under turns, shifts and one scale for all axes.
-            linear, scale = matrix[:3, :3], float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+            linear = matrix[:3, :3]
+            scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
             if not scale > 0 or not np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() < 1e-3:
-                raise DataError(f"{path}: a node shears, mirrors or stretches its Gaussians; apply its transform first")
+                raise DataError(
+                    f"{path}: a node shears, mirrors or stretches its Gaussians; apply its transform first"
+                )
             about = document["accessors"][primitive["attributes"][_SHAPE[2]]]
             whole = about["componentType"] != 5126 and not about.get("normalized")
             found.append(_Part(columns, linear / scale, scale, matrix[:3, 3], extension, whole))
-    # Gaussians shown several times would multiply a small file, and have but one place for several new colours.
+    # Gaussians shown several times would multiply a small file, and have but one place for several new
+    # colours.
     colours = sorted((part.columns[_HARMONICS[0]] for part in found), key=lambda column: column.ctypes.data)
     if any(itertools.starmap(np.may_share_memory, itertools.pairwise(colours))):
-        raise DataError(f"{path}: several nodes or primitives show the same Gaussians; export each with its own")
+        raise DataError(
+            f"{path}: several nodes or primitives show the same Gaussians; export each with its own"
+        )
     return found
 
 
@@ -286,11 +346,15 @@ def _logarithmic(document: dict[str, Any], parts: list[_Part]) -> tuple[bool, st
     generator = str(document["asset"].get("generator"))
     version = re.match(r"splat-transform (\d+)\.(\d+)", generator)
     if version or generator == "fprf":
-        return version is not None and (int(version[1]), int(version[2])) < _LINEAR_SINCE, f"{generator[:40]} wrote it"
+        return version is not None and (
+            int(version[1]),
+            int(version[2]),
+        ) < _LINEAR_SINCE, f"{generator[:40]} wrote it"
     for part in parts:
         if str(part.extension.get("colorSpace")).startswith(_DRAFTS):
             return True, f"colorSpace {part.extension['colorSpace']} is that of a draft"
-    # Else sizes are held against the distances between neighbours: Gaussians that cover a surface are about as wide.
+    # Else sizes are held against the distances between neighbours: Gaussians that cover a surface are about
+    # as wide.
     part = max(parts, key=lambda part: len(part.columns["POSITION"]))
     points = part.columns["POSITION"]
     some = np.linspace(0, len(points) - 1, _ASKED).astype(np.int64)
@@ -301,7 +365,9 @@ def _logarithmic(document: dict[str, Any], parts: list[_Part]) -> tuple[bool, st
         here = torch.from_numpy(_values(points[rows]))
         # About the first one, so that float32 keeps the digits of places far from 0.
         apart = torch.cdist(
-            (asked - asked[:1]).float(), (here - asked[:1]).float(), compute_mode="donot_use_mm_for_euclid_dist"
+            (asked - asked[:1]).float(),
+            (here - asked[:1]).float(),
+            compute_mode="donot_use_mm_for_euclid_dist",
         )
         nearest = torch.minimum(nearest, apart.masked_fill(~(apart > 0), torch.inf).amin(1))
     nearest = nearest[nearest.isfinite()]
@@ -309,7 +375,8 @@ def _logarithmic(document: dict[str, Any], parts: list[_Part]) -> tuple[bool, st
     middle = middle[np.isfinite(middle)]
     if not len(nearest) or not len(middle):
         return False, "nothing tells otherwise"
-    spacing, number = float(nearest.median().log()), float(np.median(middle))
+    spacing = float(nearest.median().log())
+    number = float(np.median(middle))
     ratios = (math.log(max(number, _LEAST)) - spacing, number - spacing)
     logarithmic = abs(ratios[1] - _TYPICAL) < abs(ratios[0] - _TYPICAL)
     shares = [f"{math.exp(min(ratio, 99)):.2g}" for ratio in (ratios[logarithmic], ratios[not logarithmic])]
@@ -320,9 +387,18 @@ def _column(document: dict[str, Any], data: Data | bytearray, start: int, index:
     """The rows of an accessor, in the file's own memory; NumPy holds them against its size."""
     about = document["accessors"][index]
     view = document["bufferViews"][about["bufferView"]]
-    kind, width, count = np.dtype(_COMPONENTS[about["componentType"]]), _WIDTHS[about["type"]], about["count"]
-    stride, offset = view.get("byteStride") or kind.itemsize * width, view.get("byteOffset", 0) + about.get("byteOffset", 0)
-    if "sparse" in about or view.get("buffer", 0) != 0 or count < 1 or stride < kind.itemsize * width or offset < 0:
+    kind = np.dtype(_COMPONENTS[about["componentType"]])
+    width = _WIDTHS[about["type"]]
+    count = about["count"]
+    stride = view.get("byteStride") or kind.itemsize * width
+    offset = view.get("byteOffset", 0) + about.get("byteOffset", 0)
+    if (
+        "sparse" in about
+        or view.get("buffer", 0) != 0
+        or count < 1
+        or stride < kind.itemsize * width
+        or offset < 0
+    ):
         raise ValueError(f"accessor {index} is sparse, empty or in another buffer")
     return np.ndarray((count, width), kind, data, start + offset, (stride, kind.itemsize))
 
@@ -334,9 +410,13 @@ def _values(column: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def _in_other_light(harmonics: Floats, to_linear: bool) -> Floats:
-    """Harmonics of sRGB as those of linear light, or back: the mean colour by the curve, what depends on views by its slope."""
+    """Harmonics of sRGB as those of linear light, or back: the mean colour by the curve, what depends on
+    views by its slope.
+    """
     mean = np.maximum(base.colours_of(harmonics), 0)
-    shown = mean if to_linear else np.where(mean <= 0.0031308, 12.92 * mean, 1.055 * mean ** (1 / 2.4) - 0.055)
+    shown = (
+        mean if to_linear else np.where(mean <= 0.0031308, 12.92 * mean, 1.055 * mean ** (1 / 2.4) - 0.055)
+    )
     slope = np.where(shown <= 0.04045, 1 / 12.92, 2.4 / 1.055 * ((shown + 0.055) / 1.055) ** 1.4)[:, None]
     rest = harmonics[:, 1:] * slope if to_linear else harmonics[:, 1:] / slope
     return np.concatenate([base.constants_of(srgb_to_linear(shown) if to_linear else shown), rest], 1)

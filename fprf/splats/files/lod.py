@@ -1,7 +1,9 @@
-"""Streamed SOG (PlayCanvas), read alone: a lod-meta.json, and folders of SOG that it names, at the finest level.
+"""Streamed SOG (PlayCanvas), read alone: a lod-meta.json, and folders of SOG that it names, at the finest
+level.
 
-`tree` has `children`, or at its leaves `lods`: by the number of a level, 0 the finest, the rows of one of `filenames`. Files
-of coarser levels alone are not opened. `environment` is one more SOG, which is always shown.
+`tree` has `children`, or at its leaves `lods`: by the number of a level, 0 the finest, the rows of one of
+`filenames`. Files of coarser levels alone are not opened. `environment` is one more SOG, which is always
+shown.
 """
 
 import json
@@ -41,32 +43,46 @@ class StreamedSog(CaptureFormat):
                 if not node.get("lods"):
                     continue
                 level = node["lods"][min(node["lods"], key=int)]
-                first, count = level["offset"], level["count"]
-                if not all(isinstance(number, int) and number >= 0 for number in (first, count, level["file"])):
+                first = level["offset"]
+                count = level["count"]
+                if not all(
+                    isinstance(number, int) and number >= 0 for number in (first, count, level["file"])
+                ):
                     raise ValueError(f"a leaf of {count} Gaussians from {first} on")
                 name = posixpath.normpath(index["filenames"][level["file"]])
                 wanted.setdefault(name, []).append(slice(first, first + count))
             if index.get("environment"):
                 wanted[posixpath.normpath(index["environment"])] = [slice(0, None)]
         except base.UNSOUND as error:
-            raise DataError(f"{path}: no sound lod-meta.json ({error!r}); not a streamed SOG, or it is damaged") from error
+            raise DataError(
+                f"{path}: no sound lod-meta.json ({error!r}); not a streamed SOG, or it is damaged"
+            ) from error
         # Files are read one by one; the cache knows the capture by the content of all.
-        parts, archives, antialiased = [], {path.name: bytes(data)}, True
+        parts = []
+        archives = {path.name: bytes(data)}
+        antialiased = True
         for name, rows in wanted.items():
             chunk = Sog().read(path.parent / name, base.beside(path, name))
             # Leaves that share rows would multiply a small file: together they have no more than it.
             leaves = [each for each in rows if each.stop is not None]
             most = max(sum(each.stop - each.start for each in leaves), *(each.stop for each in leaves), 0)
             if most > len(chunk.gaussians):
-                raise DataError(f"{path}: {name} has {len(chunk.gaussians)} Gaussians, its leaves {most}; export it again")
+                raise DataError(
+                    f"{path}: {name} has {len(chunk.gaussians)} Gaussians, its leaves {most}; export it again"
+                )
             for each in rows:
                 means, *others = base.arrays(chunk.gaussians.select(each))
                 parts.append((means + np.array(chunk.shift), *others))
-            archives[name], antialiased = bytes(chunk.data), antialiased and chunk.antialiased
+            archives[name] = bytes(chunk.data)
+            antialiased = antialiased and chunk.antialiased
         if len({part[-1].shape[1] for part in parts}) > 1:
             raise DataError(f"{path}: files of different degrees of harmonics; export the capture again")
         if not parts:
             raise DataError(f"{path}: holds no Gaussian")
-        sections = [(len(part[0]), lambda rows, part=part: tuple(each[rows] for each in part)) for part in parts]
+        sections = [
+            (len(part[0]), lambda rows, part=part: tuple(each[rows] for each in part)) for part in parts
+        ]
         gaussians, shift = base.decoded(parts[0][-1].shape[1], *sections)
-        return Capture(path, gaussians, antialiased, bundle(archives), lambda harmonics, changed: (), shift=shift)
+        return Capture(
+            path, gaussians, antialiased, bundle(archives), lambda harmonics, changed: (), shift=shift
+        )

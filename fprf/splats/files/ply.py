@@ -1,12 +1,15 @@
-"""The PLY files of 3D Gaussian Splatting: one vertex a Gaussian (INRIA), and SuperSplat's compressed chunks of 256.
+"""The PLY files of 3D Gaussian Splatting: one vertex a Gaussian (INRIA), and SuperSplat's compressed chunks
+of 256.
 
 INRIA       float32 x y z, f_dc_0..2, f_rest_* channel by channel, opacity (logit), scale_0..2 (ln), rot_0..3 (w x y z), and
-            any other property and element, which are kept. Header comments: `SplatRenderMode: default|mip|2dgs` and
-            `Vertical axis: x|y|z|X Y Z` (Brush), `antialiased 0|1` (Postshot). Elements `extrinsic`, `intrinsic` and
-            `image_size`: the camera of the one photograph that a capture was made of (SHARP). Variants: red green blue as
-            bytes in the place of f_dc (Nerfstudio), no scale_2 (2D Gaussians), either byte order, ASCII.
-compressed  element `chunk`: bounds of positions, ln-scales and, mostly, colours; `vertex`: four 32-bit words, position and
-            scale of 11, 10 and 11 bits, rotation of 2 + 3 x 10, RGBA of 8 each; `sh`: bytes, (v + 0.5) / 256 of [-4, 4].
+            any other property and element, which are kept. Header comments: `SplatRenderMode:
+            default|mip|2dgs` and `Vertical axis: x|y|z|X Y Z` (Brush), `antialiased 0|1` (Postshot). Elements
+            `extrinsic`, `intrinsic` and `image_size`: the camera of the one photograph that a capture was
+            made of (SHARP). Variants: red green blue as bytes in the place of f_dc (Nerfstudio), no scale_2
+            (2D Gaussians), either byte order, ASCII.
+compressed  element `chunk`: bounds of positions, ln-scales and, mostly, colours; `vertex`: four 32-bit words,
+            position and scale of 11, 10 and 11 bits, rotation of 2 + 3 x 10, RGBA of 8 each; `sh`: bytes, (v
+            + 0.5) / 256 of [-4, 4].
 """
 
 import re
@@ -31,12 +34,23 @@ _TYPES = {
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
     "double": "<f8", "float64": "<f8",
 }  # fmt: skip
-_NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
+_NAMES = {
+    "i1": "char",
+    "u1": "uchar",
+    "i2": "short",
+    "u2": "ushort",
+    "i4": "int",
+    "u4": "uint",
+    "f4": "float",
+    "f8": "double",
+}
 _COMMENT = re.compile(r"(splatrendermode|antialiased|vertical axis)\b[\s:=]*(.*)", re.IGNORECASE)
 _UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, -1.0)}
 """What points up where a vertical axis is named by its letter, as Brush reads it: up is -y and -z."""
 _COLOURS = (-1.5, 2.5)
-"""Mean colours of compressed files: beyond, they are white or black from everywhere, and would spoil those of their chunk."""
+"""Mean colours of compressed files: beyond, they are white or black from everywhere, and would spoil those of
+their chunk.
+"""
 _CHUNK = 256
 _FEW = 32
 """Outliers that are left out of compressed files; more are surroundings."""
@@ -75,10 +89,14 @@ class Ply(CaptureFormat):
         return head.startswith(b"ply")
 
     def read(self, path: Path, data: Data) -> Capture:
-        """A PLY of either layout. Raises DataError for others. ASCII files become binary ones of the same elements."""
+        """A PLY of either layout. Raises DataError for others. ASCII files become binary ones of the same
+        elements.
+        """
         header = _header(data)
         if header is None:
-            raise DataError(f"{path}: no PLY header from `ply` to `end_header`; the file is damaged or of another kind")
+            raise DataError(
+                f"{path}: no PLY header from `ply` to `end_header`; the file is damaged or of another kind"
+            )
         elements = _elements(path, data, header)
         if header.form == ["ascii", "1.0"]:
             data, elements = _from_ascii(path, data, header, elements)
@@ -88,7 +106,8 @@ class Ply(CaptureFormat):
         modes = [key for key in said if key != "vertical axis"]
         mode = said[modes[-1]] if modes else ""
         read = _read_compressed if header.packed else _read_inria
-        up, camera = _up(said.get("vertical axis", "")), _camera(data, elements)
+        up = _up(said.get("vertical axis", ""))
+        camera = _camera(data, elements)
         if up is None and camera is not None:
             up = (float(camera.pose[0, 0, 1]), float(camera.pose[0, 1, 1]), float(camera.pose[0, 2, 1]))
         return replace(read(path, data, elements), antialiased=mode in ("mip", "1"), up=up, camera=camera)
@@ -117,10 +136,12 @@ class CompressedPly(Ply):
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
         """Gaussians are put in spatial order, so that the bounds of chunks are narrow.
 
-        No chunk holds both the bulk and what is far from it: before the latter transparent Gaussians fill up the last one.
+        No chunk holds both the bulk and what is far from it: before the latter transparent Gaussians fill up
+        the last one.
         """
         # Neighbours share a chunk; what is far from the bulk begins a chunk of its own.
-        order, level = base.spatial_order(gaussians.means.numpy()), base.levels_of(gaussians.means.numpy())
+        order = base.spatial_order(gaussians.means.numpy())
+        level = base.levels_of(gaussians.means.numpy())
         parts = [order[level[order] == k] for k in range(int(level.max(initial=0)) + 1)]
         parts = [np.append(part, np.full(-len(part) % _CHUNK, part[-1])) for part in parts[:-1]] + parts[-1:]
         index = np.concatenate(parts)
@@ -143,7 +164,10 @@ class CompressedPly(Ply):
         # Three tables: bounds of chunks, words of Gaussians and bytes of harmonics.
         names = [name for pair in (_POSITION, _SCALE, _COLOUR) for of in pair for name in of]
         chunk = np.concatenate(bounds, 1).astype("<f4").view([(name, "<f4") for name in names])[:, 0]
-        tables = {"chunk": chunk, "vertex": words.astype("<u4").view([(name, "<u4") for name in _PACKED])[:, 0]}
+        tables = {
+            "chunk": chunk,
+            "vertex": words.astype("<u4").view([(name, "<u4") for name in _PACKED])[:, 0],
+        }
         if harmonics.shape[1] > 1:
             rest = _rest_bytes(harmonics)
             tables["sh"] = rest.view([(f"f_rest_{i}", "u1") for i in range(rest.shape[1])])[:, 0]
@@ -166,22 +190,37 @@ def ply_rows(gaussians: Gaussians, origin: Origin) -> NDArray[np.void]:
     names = [*"xyz", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
     names += [f"f_rest_{i}" for i in range(3 * harmonics.shape[1] - 3)]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-    columns = np.concatenate([means, np.zeros_like(means), _flat(harmonics), logits[:, None], scales, turns], 1)
-    return base.in_world(np.ascontiguousarray(columns, "<f4").view([(name, "<f4") for name in names])[:, 0], means, origin)
+    columns = np.concatenate(
+        [means, np.zeros_like(means), _flat(harmonics), logits[:, None], scales, turns], 1
+    )
+    return base.in_world(
+        np.ascontiguousarray(columns, "<f4").view([(name, "<f4") for name in names])[:, 0], means, origin
+    )
 
 
-def ply_file(tables: Mapping[str, NDArray[np.void]], antialiased: bool = False, comments: Sequence[str] = ()) -> bytes:
-    """A little-endian binary PLY of elements by name, a property a field; a field of (count, values) is a list.
+def ply_file(
+    tables: Mapping[str, NDArray[np.void]], antialiased: bool = False, comments: Sequence[str] = ()
+) -> bytes:
+    """A little-endian binary PLY of elements by name, a property a field; a field of (count, values) is a
+    list.
 
     trimesh would write meshes too, but keeps neither comments nor colours without alpha.
     """
-    return ply_head(tables, antialiased, comments=comments) + b"".join(table.tobytes() for table in tables.values())
+    return ply_head(tables, antialiased, comments=comments) + b"".join(
+        table.tobytes() for table in tables.values()
+    )
 
 
 def ply_head(
-    tables: Mapping[str, NDArray[np.void]], antialiased: bool, count: int | None = None, *, comments: Sequence[str] = ()
+    tables: Mapping[str, NDArray[np.void]],
+    antialiased: bool,
+    count: int | None = None,
+    *,
+    comments: Sequence[str] = (),
 ) -> bytes:
-    """The header of `ply_file`, with lines of `comments`. `count` is the number of rows where the tables are samples."""
+    """The header of `ply_file`, with lines of `comments`. `count` is the number of rows where the tables are
+    samples.
+    """
     lines = ["ply", "format binary_little_endian 1.0", *comments]
     lines += ["comment SplatRenderMode: mip"] if antialiased else []
     for name, table in tables.items():
@@ -189,7 +228,9 @@ def ply_head(
         for field in table.dtype.names or ():
             kind = table.dtype[field]
             of = [kind] if kind.names is None else [kind[part].base for part in kind.names]
-            lines.append(f"property {'list ' * (len(of) > 1)}{' '.join(_NAMES[each.str[1:]] for each in of)} {field}")
+            lines.append(
+                f"property {'list ' * (len(of) > 1)}{' '.join(_NAMES[each.str[1:]] for each in of)} {field}"
+            )
     return "\n".join([*lines, "end_header", ""]).encode("latin-1")  # as headers are read
 
 
@@ -216,7 +257,8 @@ def _read_inria(path: Path, data: Data, elements: Mapping[str, _Element]) -> Cap
     if vertex is None:
         raise DataError(f"{path}: no element `vertex`; not a file of 3D Gaussians")
     known = set(vertex.names())
-    # Properties may stand in any order, among any others. 2D Gaussians have no third size, and lie in the plane of the others.
+    # Properties may stand in any order, among any others. 2D Gaussians have no third size, and lie in the
+    # plane of the others.
     rest = sum(bool(re.fullmatch(r"f_rest_\d+", name)) for name in known)
     byte_colours = "f_dc_0" not in known and {"red", "green", "blue"} <= known
     constants = ("red", "green", "blue") if byte_colours else ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -227,9 +269,13 @@ def _read_inria(path: Path, data: Data, elements: Mapping[str, _Element]) -> Cap
         if name not in known:
             raise DataError(f"{path}: no property {name}; not a file of 3D Gaussians")
         if byte_colours and name in constants and vertex.kind[name] != "u1":
-            raise DataError(f"{path}: property {name} is no byte; colours are bytes, or f_dc_0 to f_dc_2 of float")
+            raise DataError(
+                f"{path}: property {name} is no byte; colours are bytes, or f_dc_0 to f_dc_2 of float"
+            )
         if vertex.kind[name].kind != "f" and name not in "xyz" and not (byte_colours and name in constants):
-            raise DataError(f"{path}: property {name} is of whole numbers; 3D Gaussians have float or double there")
+            raise DataError(
+                f"{path}: property {name} is of whole numbers; 3D Gaussians have float or double there"
+            )
     if rest % 3 or count not in COUNTS:
         raise DataError(f"{path}: {rest} properties f_rest_*; 0, 9, 24, 45 or 72 belong to degrees 0 to 4")
     # The harmonic and the channel that each property of a colour is.
@@ -239,7 +285,8 @@ def _read_inria(path: Path, data: Data, elements: Mapping[str, _Element]) -> Cap
 
     def part(rows: slice) -> tuple[Floats, ...]:
         table = whole[rows]
-        harmonics, scales = np.empty((len(table), count, 3)), np.full((len(table), 3), -np.inf)
+        harmonics = np.empty((len(table), count, 3))
+        scales = np.full((len(table), 3), -np.inf)
         for name, (band, channel) in places.items():
             harmonics[:, band, channel] = table[name]
         if byte_colours:
@@ -247,14 +294,18 @@ def _read_inria(path: Path, data: Data, elements: Mapping[str, _Element]) -> Cap
         for axis, name in enumerate(sizes):
             scales[:, axis] = table[name]
         # Positions may be of any type; far from 0 they lose nothing by their local origin.
-        means, turns = (np.stack([table[name] for name in names], 1) for names in ("xyz", [f"rot_{i}" for i in range(4)]))
+        means, turns = (
+            np.stack([table[name] for name in names], 1) for names in ("xyz", [f"rot_{i}" for i in range(4)])
+        )
         return means, turns, scales, table["opacity"], harmonics
 
     def recolour(harmonics: Floats, changed: Bools) -> Iterator[bytes]:
         """The file's own bytes, with other numbers in the columns of colours of the rows that change."""
         yield data[: vertex.offset]
         for rows in base.pieces(vertex.rows):
-            table, here, new = whole[rows].copy(), changed[rows], harmonics[rows]
+            table = whole[rows].copy()
+            here = changed[rows]
+            new = harmonics[rows]
             for name, (band, channel) in places.items():
                 column = new[here, band, channel]
                 if byte_colours and band == 0:
@@ -269,22 +320,32 @@ def _read_inria(path: Path, data: Data, elements: Mapping[str, _Element]) -> Cap
 
 
 def _read_compressed(path: Path, data: Data, elements: Mapping[str, _Element]) -> Capture:
-    # All properties that SuperSplat writes must be there, of its types; only bounds of colours are missing in early files.
+    # All properties that SuperSplat writes must be there, of its types; only bounds of colours are missing in
+    # early files.
     known = {name: element.names() for name, element in elements.items()}
     tinted = _COLOUR[0][0] in known.get("chunk", ())
-    bounds = [name for pair in (_POSITION, _SCALE, *([_COLOUR] if tinted else [])) for of in pair for name in of]
+    bounds = [
+        name for pair in (_POSITION, _SCALE, *([_COLOUR] if tinted else [])) for of in pair for name in of
+    ]
     for element, names, kind in (("chunk", bounds, "<f4"), ("vertex", _PACKED, "<u4")):
         for name in names:
             if name not in known.get(element, ()) or elements[element].kind[name] != kind:
                 raise DataError(f"{path}: no property {name}; not the compressed layout of SuperSplat")
     chunk, vertex = (elements[name].table(data) for name in ("chunk", "vertex"))
     # `of` is the chunk of each Gaussian. Harmonics, where there are any, are one row of bytes a Gaussian.
-    count, of = len(vertex), np.arange(len(vertex)) // _CHUNK
+    count = len(vertex)
+    of = np.arange(len(vertex)) // _CHUNK
     sh = elements["sh"].table(data) if "sh" in elements else None
     rest = known.get("sh", ())
-    wrong = 1 + len(rest) // 3 not in COUNTS or len(rest) % 3 or [*rest] != [f"f_rest_{i}" for i in range(len(rest))]
+    wrong = (
+        1 + len(rest) // 3 not in COUNTS
+        or len(rest) % 3
+        or [*rest] != [f"f_rest_{i}" for i in range(len(rest))]
+    )
     if sh is not None and (wrong or len(sh) != count or any(sh.dtype[name] != "u1" for name in rest)):
-        raise DataError(f"{path}: element `sh` with {len(rest)} properties and {len(sh)} rows; not SuperSplat's layout")
+        raise DataError(
+            f"{path}: element `sh` with {len(rest)} properties and {len(sh)} rows; not SuperSplat's layout"
+        )
     if len(chunk) != -(-count // _CHUNK):
         raise DataError(f"{path}: {len(chunk)} chunks for {count} Gaussians; there is one for each {_CHUNK}")
 
@@ -292,7 +353,9 @@ def _read_compressed(path: Path, data: Data, elements: Mapping[str, _Element]) -
         """Some of the Gaussians as `base.decoded` wants them."""
 
         def unpacked(share: Floats, pair: tuple[tuple[str, ...], tuple[str, ...]]) -> Floats:
-            low, high = (np.stack([chunk[name][of[rows]] for name in names], 1).astype(np.float64) for names in pair)
+            low, high = (
+                np.stack([chunk[name][of[rows]] for name in names], 1).astype(np.float64) for names in pair
+            )
             return np.asarray(low * (1 - share) + high * share)
 
         position, turned, scale, colour = (vertex[name][rows] for name in _PACKED)
@@ -306,7 +369,9 @@ def _read_compressed(path: Path, data: Data, elements: Mapping[str, _Element]) -
             harmonics = np.concatenate([harmonics, bands], 1)
         return (
             unpacked(base.unpack_bits(position, (11, 10, 11)), _POSITION),
-            base.three_to_four((turned >> 30).astype(np.int64), 2 * base.unpack_bits(turned, (10, 10, 10)) - 1),
+            base.three_to_four(
+                (turned >> 30).astype(np.int64), 2 * base.unpack_bits(turned, (10, 10, 10)) - 1
+            ),
             unpacked(base.unpack_bits(scale, (11, 10, 11)), _SCALE),
             base.logit(rgba[:, 3]),
             harmonics,
@@ -315,8 +380,11 @@ def _read_compressed(path: Path, data: Data, elements: Mapping[str, _Element]) -
     def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
         out = bytearray(data)
         target = {name: element.table(out) for name, element in elements.items()}
-        share, changed_here = base.colours_of(base.finite(harmonics)), changed
-        if tinted:  # a chunk in which anything changes gets new bounds, and all of its colours are rounded again
+        share = base.colours_of(base.finite(harmonics))
+        changed_here = changed
+        if (
+            tinted
+        ):  # a chunk in which anything changes gets new bounds, and all of its colours are rounded again
             share, *limits = _in_chunks(share.clip(*_COLOURS))
             there = np.unique(of[changed])
             changed_here = np.isin(of, there)
@@ -334,7 +402,9 @@ def _read_compressed(path: Path, data: Data, elements: Mapping[str, _Element]) -
 
 
 def _header(data: Data) -> _Header | None:
-    """The header, whose lines end as the first one does: with LF, CR LF or CR. None where it has no begin or no end."""
+    """The header, whose lines end as the first one does: with LF, CR LF or CR. None where it has no begin or
+    no end.
+    """
     first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", data)
     if first is None:
         return None
@@ -348,29 +418,52 @@ def _header(data: Data) -> _Header | None:
 
 
 def _elements(path: Path, data: Data, header: _Header) -> dict[str, _Element]:
-    """Elements by name, where they lie; those with lists are passed over. Those of ASCII files lie nowhere yet."""
-    form, ascii_rows = header.form, header.form == ["ascii", "1.0"]
+    """Elements by name, where they lie; those with lists are passed over. Those of ASCII files lie nowhere
+    yet.
+    """
+    form = header.form
+    ascii_rows = header.form == ["ascii", "1.0"]
     if form not in (["binary_little_endian", "1.0"], ["binary_big_endian", "1.0"]) and not ascii_rows:
-        raise DataError(f"{path}: a PLY of format {' '.join(form) or 'unknown'}; export it again as ascii or binary 1.0")
+        raise DataError(
+            f"{path}: a PLY of format {' '.join(form) or 'unknown'}; export it again as ascii or binary 1.0"
+        )
     # Elements lie one after the other: each is passed over to find the next.
     types = {name: kind.replace("<", ">") if "big" in form[0] else kind for name, kind in _TYPES.items()}
     lines = [words for words in header.lines if words[0] in ("element", "property")]
-    starts, offset, elements = [i for i, words in enumerate(lines) if words[0] == "element"], header.size, {}
+    starts = [i for i, words in enumerate(lines) if words[0] == "element"]
+    offset = header.size
+    elements = {}
     for start, stop in zip(starts, [*starts[1:], len(lines)], strict=False):
-        words, properties = lines[start], lines[start + 1 : stop]
+        words = lines[start]
+        properties = lines[start + 1 : stop]
         kinds = [[types[kind] for kind in _kinds(each) if kind in types] for each in properties]
-        names = {each[-1] for each, of in zip(properties, kinds, strict=True) if of and len(of) == len(_kinds(each))}
-        if len(words) != 3 or not re.fullmatch(r"\d{1,12}", words[2]) or len(names) != len(properties) or not names:
-            raise DataError(f"{path}: {' '.join(words)!r} or its properties are no valid PLY; export the file again")
-        count, what = int(words[2]), f"element {words[1]} of {words[2]} rows"
+        names = {
+            each[-1]
+            for each, of in zip(properties, kinds, strict=True)
+            if of and len(of) == len(_kinds(each))
+        }
+        if (
+            len(words) != 3
+            or not re.fullmatch(r"\d{1,12}", words[2])
+            or len(names) != len(properties)
+            or not names
+        ):
+            raise DataError(
+                f"{path}: {' '.join(words)!r} or its properties are no valid PLY; export the file again"
+            )
+        count = int(words[2])
+        what = f"element {words[1]} of {words[2]} rows"
         if any(len(of) > 1 for of in kinds):
             if ascii_rows:
                 elements[words[1]] = _Element(np.dtype([]), count, offset)
                 continue
             if "vertex" in elements:
-                break  # lists that follow the Gaussians may be cut, and the million faces of a mesh take seconds
+                # lists that follow the Gaussians may be cut, and the million faces of a mesh take seconds
+                break
             if (after := _after_lists(data, offset, count, kinds)) is None:
-                raise DataError(f"{path}: {what} runs beyond the end of the file; copy it again, it is cut off or damaged")
+                raise DataError(
+                    f"{path}: {what} runs beyond the end of the file; copy it again, it is cut off or damaged"
+                )
             offset = after
             continue
         table = np.dtype([(each[-1], of[0]) for each, of in zip(properties, kinds, strict=True)])
@@ -383,7 +476,9 @@ def _elements(path: Path, data: Data, header: _Header) -> dict[str, _Element]:
     return elements
 
 
-def _from_ascii(path: Path, data: Data, header: _Header, elements: Mapping[str, _Element]) -> tuple[bytes, dict[str, _Element]]:
+def _from_ascii(
+    path: Path, data: Data, header: _Header, elements: Mapping[str, _Element]
+) -> tuple[bytes, dict[str, _Element]]:
     """A little-endian file of the elements of an ASCII one, a line a row; those with lists are left out."""
     lines = iter(data[header.size :].splitlines())
     tables: dict[str, NDArray[np.void]] = {}
@@ -402,9 +497,13 @@ def _from_ascii(path: Path, data: Data, header: _Header, elements: Mapping[str, 
                 for _ in range(element.rows):
                     next(lines)
         except (ValueError, StopIteration) as error:
-            raise DataError(f"{path}: the rows of element {name} are no numbers for its properties ({error})") from error
+            raise DataError(
+                f"{path}: the rows of element {name} are no numbers for its properties ({error})"
+            ) from error
     # Comments go along, which may say what points up.
-    whole = ply_file(tables, comments=[" ".join(words) for words in header.lines if words[0] in ("comment", "obj_info")])
+    whole = ply_file(
+        tables, comments=[" ".join(words) for words in header.lines if words[0] in ("comment", "obj_info")]
+    )
     binary = _header(whole)
     assert binary is not None
     return whole, _elements(path, whole, binary)
@@ -448,17 +547,22 @@ def _up(text: str) -> tuple[float, float, float] | None:
 
 
 def _camera(data: Data, elements: Mapping[str, _Element]) -> Cameras | None:
-    """The camera of `extrinsic` (world to camera, OpenCV axes), `intrinsic` and `image_size`; None where there is no sound one.
+    """The camera of `extrinsic` (world to camera, OpenCV axes), `intrinsic` and `image_size`; None where
+    there is no sound one.
 
-    Older files have 12 numbers of `extrinsic`, its rotation transposed, and fx, fy, width and height as `intrinsic`.
+    Older files have 12 numbers of `extrinsic`, its rotation transposed, and fx, fy, width and height as
+    `intrinsic`.
     """
     numbers = {}
     for name in ("extrinsic", "intrinsic", "image_size"):
         if name in elements:
             table = elements[name].table(data)
-            numbers[name] = np.stack([table[each].astype(np.float64) for each in elements[name].names()], 1).ravel()
+            numbers[name] = np.stack(
+                [table[each].astype(np.float64) for each in elements[name].names()], 1
+            ).ravel()
     # Without a pose the camera is at the origin and looks along z.
-    matrix, lens = numbers.get("extrinsic", np.eye(4).ravel()), numbers.get("intrinsic", np.zeros(0))
+    matrix = numbers.get("extrinsic", np.eye(4).ravel())
+    lens = numbers.get("intrinsic", np.zeros(0))
     size = numbers.get("image_size", lens[2:4] if len(lens) == 4 else np.zeros(0))
     if len(matrix) not in (12, 16) or len(lens) not in (4, 9) or len(size) != 2:
         return None
@@ -466,7 +570,9 @@ def _camera(data: Data, elements: Mapping[str, _Element]) -> Cameras | None:
     rotation = world[:, :3].T if len(matrix) == 16 else world[:, :3]  # camera to world
     focal = lens[[0, 1] if len(lens) == 4 else [0, 4]]
     centre = size / 2 if len(lens) == 4 else lens[[2, 5]]
-    sound = all(np.isfinite(each).all() for each in (world, focal, centre)) and np.abs(world[:, 3]).max() < 1e15
+    sound = (
+        all(np.isfinite(each).all() for each in (world, focal, centre)) and np.abs(world[:, 3]).max() < 1e15
+    )
     if not sound or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2 or np.linalg.det(rotation) < 0:
         return None
     if focal.min() <= 0 or size.min() < 1 or size.max() > 1 << 16:
@@ -492,6 +598,8 @@ def _rest_bytes(harmonics: Floats) -> NDArray[np.uint8]:
 def _in_chunks(values: Floats) -> tuple[Floats, Floats, Floats]:
     """Values [N C] as shares of the bounds of their chunks, and these bounds [chunks C]."""
     starts = np.arange(0, len(values), _CHUNK)
-    low, high = (what.reduceat(values, starts, axis=0).astype(np.float32) for what in (np.minimum, np.maximum))
+    low, high = (
+        what.reduceat(values, starts, axis=0).astype(np.float32) for what in (np.minimum, np.maximum)
+    )
     at = np.arange(len(values)) // _CHUNK
     return base.shares(values, low[at], high[at]), low, high

@@ -1,11 +1,12 @@
-"""SOG (PlayCanvas): a meta.json and lossless WebP images, a pixel a Gaussian, in a folder or bundled in a .sog archive.
+"""SOG (PlayCanvas): a meta.json and lossless WebP images, a pixel a Gaussian, in a folder or bundled in a
+.sog archive.
 
 means     two images, 16 bits between mins and maxs of sign(x) ln(1 + |x|)
 quats     the three smaller components times sqrt 2 as bytes; alpha - 252 says which one is missing (w x y z)
 scales    ln-scales, sh0 constants (alpha: opacity): indices into codebooks of 256 numbers
 shN       labels of 16 bits into a palette of harmonics, 64 entries a row, which are indices into a codebook
-`antialias` or `model` ("antialiased", "2dgs") say what the Gaussians are. An archive may hold all that in a folder.
-Version 1 has ranges (mins, maxs) in the place of codebooks, and logits in sh0's alpha.
+`antialias` or `model` ("antialiased", "2dgs") say what the Gaussians are. An archive may hold all that in a
+folder. Version 1 has ranges (mins, maxs) in the place of codebooks, and logits in sh0's alpha.
 
 Recoloured, a file keeps its labels: each entry of the palette becomes the mean of what its Gaussians became.
 """
@@ -40,7 +41,9 @@ _ROW = 64
 """Entries of the palette a row."""
 _PALETTE = 1 << 16
 _DENSE = 8
-"""Pixels a byte of the low image of positions at most: captures have far fewer, and it bounds what is decoded."""
+"""Pixels a byte of the low image of positions at most: captures have far fewer, and it bounds what is
+decoded.
+"""
 _SLACK = 1 << 16
 _PRECISION = 2.0**-12
 """Steps of positions in extents of the capture, to which outliers do not matter."""
@@ -64,7 +67,9 @@ class Sog(CaptureFormat):
         data = bytes(data) if data[:2] == b"PK" else bundle(_folder(path, bytes(data)))
         files = unbundle(path, data)
         folder = folder_of(path, files)
-        parts = {name.removeprefix(folder): content for name, content in files.items() if name.startswith(folder)}
+        parts = {
+            name.removeprefix(folder): content for name, content in files.items() if name.startswith(folder)
+        }
         meta = _json(path, parts["meta.json"])
         # Version 1 has no such entry.
         version = meta.get("version", 1)
@@ -74,8 +79,11 @@ class Sog(CaptureFormat):
         pictures = _Pictures(path, parts, meta)
         count = pictures.count
         low, high = (pictures.rows("means", i)[:, :3] for i in (0, 1))
-        least, most = pictures.numbers("means", "mins", 3), pictures.numbers("means", "maxs", 3)
-        turn, scale, tint = pictures.rows("quats", 0), pictures.rows("scales", 0), pictures.rows("sh0", 0)
+        least = pictures.numbers("means", "mins", 3)
+        most = pictures.numbers("means", "maxs", 3)
+        turn = pictures.rows("quats", 0)
+        scale = pictures.rows("scales", 0)
+        tint = pictures.rows("sh0", 0)
         labels, rest = pictures.palette()
 
         def part(rows: slice) -> tuple[Floats, ...]:
@@ -89,16 +97,22 @@ class Sog(CaptureFormat):
                 scales[:, 2] = -np.inf
             # The alpha of sh0: opacities as they are, or, in version 1, logits of a range of their own.
             if version == 2:
-                constants, logits = pictures.decoded("sh0", tint[rows, :3], 3), base.logit(tint[rows, 3] / 255)
+                constants = pictures.decoded("sh0", tint[rows, :3], 3)
+                logits = base.logit(tint[rows, 3] / 255)
             else:
                 constants, logits = np.split(pictures.decoded("sh0", tint[rows], 4), [3], 1)
-            harmonics = np.concatenate([constants[:, None], rest[labels[rows]]], 1) if len(rest) else constants[:, None]
+            harmonics = (
+                np.concatenate([constants[:, None], rest[labels[rows]]], 1)
+                if len(rest)
+                else constants[:, None]
+            )
             means = np.sign(bent) * np.expm1(np.minimum(np.abs(bent), 80))
             return means, quaternions, scales, logits.reshape(-1), harmonics
 
         def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
             # Constants are quantised anew, with a codebook or a range of their own.
-            new, said = {}, json.loads(parts["meta.json"])
+            new = {}
+            said = json.loads(parts["meta.json"])
             name = said["sh0"]["files"][0]
             index, said["sh0"] = _quantized(harmonics[:, 0], said["sh0"])
             picture = pictures.picture(name)
@@ -136,7 +150,8 @@ class Sog(CaptureFormat):
         width = -(-int(np.ceil(count**0.5)) // 4) * 4
         shape = (-(-count // max(width, 1)), width)
         bent = _bent(means.astype(np.float64))
-        least, most = bent.min(0), bent.max(0)
+        least = bent.min(0)
+        most = bent.max(0)
         at = base.steps(base.shares(bent, least, most), 65535)
         # Rotations and opacities take 8 bits a number; sizes and constants share codebooks of 256.
         largest, three = base.smallest_three(turns)
@@ -146,7 +161,9 @@ class Sog(CaptureFormat):
         pictures = {
             "means_l.webp": _picture(at & 255, shape),
             "means_u.webp": _picture(at >> 8, shape),
-            "quats.webp": _picture(np.concatenate([base.steps(three / 2 + 0.5, 255), largest[:, None] + 252], 1), shape),
+            "quats.webp": _picture(
+                np.concatenate([base.steps(three / 2 + 0.5, 255), largest[:, None] + 252], 1), shape
+            ),
             "scales.webp": _picture(scale, shape),
             "sh0.webp": _picture(np.concatenate([tint, opacity[:, None]], 1), shape),
         }
@@ -154,7 +171,11 @@ class Sog(CaptureFormat):
             "version": 2,
             "count": count,
             **({"antialias": True, "model": "antialiased"} if antialiased else {}),
-            "means": {"mins": least.tolist(), "maxs": most.tolist(), "files": ["means_l.webp", "means_u.webp"]},
+            "means": {
+                "mins": least.tolist(),
+                "maxs": most.tolist(),
+                "files": ["means_l.webp", "means_u.webp"],
+            },
             "scales": scales,
             "quats": {"files": ["quats.webp"]},
             "sh0": sh0,
@@ -165,14 +186,18 @@ class Sog(CaptureFormat):
             used = int(labels.max()) + 1
             entries = _means(harmonics[:, 1:].reshape(count, -1), labels, used).reshape(used, -1, 3)
             files = ["shN_centroids.webp", "shN_labels.webp"]
-            index, meta["shN"] = _quantized(entries, {"count": used, "bands": gaussians.degree, "codebook": [], "files": files})
+            index, meta["shN"] = _quantized(
+                entries, {"count": used, "bands": gaussians.degree, "codebook": [], "files": files}
+            )
             pictures[files[0]] = _palette_picture(index)
             pictures[files[1]] = _picture(np.stack([labels & 255, labels >> 8, 0 * labels], 1), shape)
         parts = {name: _webp(picture) for name, picture in pictures.items()}
         return [bundle(parts | {"meta.json": json.dumps(meta, separators=(",", ":")).encode()})]
 
     def write(self, path: Path, pieces: Iterable[bytes]) -> None:
-        """An archive; of a meta.json its files, into the same folder: while images are replaced it has no meta.json."""
+        """An archive; of a meta.json its files, into the same folder: while images are replaced it has no
+        meta.json.
+        """
         if path.name.lower() != "meta.json":
             super().write(path, pieces)
             return
@@ -183,7 +208,9 @@ class Sog(CaptureFormat):
             # Files take their names from the last to the first.
             for name in names:
                 if f"{folder}{name}" in files:
-                    stack.enter_context(atomic_path(path.with_name(name))).write_bytes(files[f"{folder}{name}"])
+                    stack.enter_context(atomic_path(path.with_name(name))).write_bytes(
+                        files[f"{folder}{name}"]
+                    )
             path.with_name("meta.json").unlink(missing_ok=True)
 
 
@@ -192,28 +219,50 @@ def _bent(means: Floats) -> Floats:
 
 
 def unbundle(path: Path, data: bytes) -> dict[str, bytes]:
-    """The files of an archive, in their order. Raises DataError where it is damaged, or claims more than it holds."""
+    """The files of an archive, in their order. Raises DataError where it is damaged, or claims more than it
+    holds.
+    """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             entries = archive.infolist()
             # WebP does not shrink: what claims more than the archive is long is damaged, but for texts.
-            if len(entries) > _MEMBERS or sum(entry.file_size for entry in entries) > 2 * len(data) + (1 << 22):
-                raise DataError(f"{path}: {len(entries)} files that claim more than the archive holds; copy it again")
+            if len(entries) > _MEMBERS or sum(entry.file_size for entry in entries) > 2 * len(data) + (
+                1 << 22
+            ):
+                raise DataError(
+                    f"{path}: {len(entries)} files that claim more than the archive holds; copy it again"
+                )
             return {entry.filename: archive.read(entry) for entry in entries}
-    except (OSError, ValueError, EOFError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        raise DataError(f"{path}: no readable .sog archive ({error}); copy it again, it is cut off or damaged") from error
+    except (
+        OSError,
+        ValueError,
+        EOFError,
+        RuntimeError,
+        NotImplementedError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
+        raise DataError(
+            f"{path}: no readable .sog archive ({error}); copy it again, it is cut off or damaged"
+        ) from error
 
 
 def folder_of(path: Path, files: Mapping[str, bytes]) -> str:
-    """The folder of an archive, with its slash, that holds the meta.json nearest to the top. Raises DataError without one."""
-    found = [name for name in files if name.rpartition("/")[2] == "meta.json" and not name.startswith("__MACOSX/")]
+    """The folder of an archive, with its slash, that holds the meta.json nearest to the top. Raises DataError
+    without one.
+    """
+    found = [
+        name for name in files if name.rpartition("/")[2] == "meta.json" and not name.startswith("__MACOSX/")
+    ]
     if not found:
         raise DataError(f"{path}: an archive without meta.json; not a SOG file")
     return min(found, key=lambda name: (name.count("/"), name)).removesuffix("meta.json")
 
 
 def bundle(parts: Mapping[str, bytes], like: bytes | None = None) -> bytes:
-    """Files as an archive, stored as they are; times are those of the archive `like`, where it has such a file."""
+    """Files as an archive, stored as they are; times are those of the archive `like`, where it has such a
+    file.
+    """
     times = {}
     if like is not None:
         with zipfile.ZipFile(io.BytesIO(like)) as archive:
@@ -229,13 +278,19 @@ class _Pictures:
     """The decoded images of a capture, and the numbers that its meta.json gives them."""
 
     def __init__(self, path: Path, parts: Mapping[str, bytes], meta: Mapping[str, Any]) -> None:
-        self.path, self.parts, self.meta = path, parts, meta
+        self.path = path
+        self.parts = parts
+        self.meta = meta
         shape = meta["means"].get("shape") if isinstance(meta.get("means"), dict) else None
         count = meta.get("count", shape[0] if isinstance(shape, list) and shape else None)
         name = self._name("means", 0)
         if count == 0:
             raise DataError(f"{path}: holds no Gaussian")
-        if not isinstance(count, int) or isinstance(count, bool) or not 0 < count <= _DENSE * len(parts[name]) + _SLACK:
+        if (
+            not isinstance(count, int)
+            or isinstance(count, bool)
+            or not 0 < count <= _DENSE * len(parts[name]) + _SLACK
+        ):
             raise self._wrong(f"{count!r} Gaussians with {len(parts[name])} bytes of positions")
         self.count: int = count
 
@@ -262,7 +317,11 @@ class _Pictures:
             header = header_of(io.BytesIO(self.parts[name]), name)
         except DataError:
             header = None
-        if header is None or header.kind not in ("WebP", "PNG") or not 0 < header.width * header.height <= most:
+        if (
+            header is None
+            or header.kind not in ("WebP", "PNG")
+            or not 0 < header.width * header.height <= most
+        ):
             raise self._wrong(f"{name} is no image of at most {most} pixels")
         try:
             image = cv2.imdecode(np.frombuffer(self.parts[name], np.uint8), cv2.IMREAD_UNCHANGED)
@@ -270,7 +329,9 @@ class _Pictures:
             image = None
         if image is None or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
             raise self._wrong(f"{name} cannot be decoded")
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGBA), np.uint8)
+        return np.asarray(
+            cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGBA), np.uint8
+        )
 
     def rows(self, group: str, which: int) -> _Bytes:
         """The pixels [N 4] of an image, one a Gaussian."""
@@ -292,7 +353,9 @@ class _Pictures:
         return self.numbers(group, "codebook", _LEVELS, int(index.max(initial=0)) + 1)
 
     def palette(self) -> tuple[NDArray[np.int64], Floats]:
-        """The label of each Gaussian, and the harmonics that labels mean [entries K-1 3]; no entries where it has none."""
+        """The label of each Gaussian, and the harmonics that labels mean [entries K-1 3]; no entries where it
+        has none.
+        """
         about = self.meta.get("shN")
         if about is None:
             return np.zeros(self.count, np.int64), np.zeros((0, 0, 3))
@@ -301,12 +364,15 @@ class _Pictures:
         coefficients = picture.shape[1] // _ROW
         entries = picture.shape[0] * _ROW
         if picture.shape[1] % _ROW or coefficients + 1 not in COUNTS or coefficients == 0:
-            raise self._wrong(f"{name} is {picture.shape[1]} pixels wide; {_ROW} entries of 3, 8 or 15 harmonics are a row")
+            raise self._wrong(
+                f"{name} is {picture.shape[1]} pixels wide; {_ROW} entries of 3, 8 or 15 harmonics are a row"
+            )
         index = picture[..., :3].reshape(entries, coefficients, 3)
         if "codebook" in about:
             rest = self.book("shN", index)[index]
         else:
-            low, high = about.get("mins"), about.get("maxs")
+            low = about.get("mins")
+            high = about.get("maxs")
             if not all(isinstance(v, (int, float)) and abs(v) < 1e6 for v in (low, high)):
                 raise self._wrong("shN.mins and shN.maxs are no numbers")
             rest = low + index / 255 * (high - low)
@@ -387,18 +453,23 @@ def _palette_picture(index: NDArray[np.integer[Any]]) -> _Bytes:
 
 def _quantized(values: Floats, about: Mapping[str, Any]) -> tuple[NDArray[np.int64], dict[str, Any]]:
     """Values [... 3] as bytes, and what meta.json says of them: a new codebook, or new ranges (version 1)."""
-    said, values = dict(about), base.finite(values)
+    said = dict(about)
+    values = base.finite(values)
     if "codebook" in said:
         book = _codebook(values.ravel())
         said["codebook"] = book.tolist()
         return np.searchsorted((book[1:] + book[:-1]) / 2, values), said
     whole = isinstance(said["mins"], (int, float))
     axes = tuple(range(values.ndim)) if whole else tuple(range(values.ndim - 1))
-    low, high = values.min(axes), values.max(axes)
+    low = values.min(axes)
+    high = values.max(axes)
     index = base.steps(base.shares(values, low, high), 255)
     if whole:
         return index, said | {"mins": float(low), "maxs": float(high)}
-    return index, said | {"mins": [*low.tolist(), *said["mins"][3:]], "maxs": [*high.tolist(), *said["maxs"][3:]]}
+    return index, said | {
+        "mins": [*low.tolist(), *said["mins"][3:]],
+        "maxs": [*high.tolist(), *said["maxs"][3:]],
+    }
 
 
 def _codebook(values: Floats) -> Floats:

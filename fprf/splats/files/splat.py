@@ -1,6 +1,7 @@
 """The .splat file (antimatter15): 32 bytes a Gaussian, without view dependence and without a header.
 
-Position and standard deviations float32, RGBA bytes (sRGB mean colour, opacity), quaternion w x y z as bytes 128 q + 128.
+Position and standard deviations float32, RGBA bytes (sRGB mean colour, opacity), quaternion w x y z as bytes
+128 q + 128.
 """
 
 from dataclasses import dataclass
@@ -31,7 +32,9 @@ class Splat(CaptureFormat):
 
     def read(self, path: Path, data: Data) -> Capture:
         if not self.recognises(b"", len(data)):
-            raise DataError(f"{path}: {len(data)} bytes; a .splat file has {_RECORD.itemsize} for each Gaussian")
+            raise DataError(
+                f"{path}: {len(data)} bytes; a .splat file has {_RECORD.itemsize} for each Gaussian"
+            )
         whole = np.frombuffer(data, _RECORD)
 
         def part(rows: slice) -> tuple[Floats, ...]:

@@ -1,7 +1,9 @@
-"""USDZ with a `ParticleField3DGaussianSplat` (OpenUSD 26.03 and later): written by usd-core, and written alone.
+"""USDZ with a `ParticleField3DGaussianSplat` (OpenUSD 26.03 and later): written by usd-core, and written
+alone.
 
-Sizes are linear, opacities shares, and all harmonics of a Gaussian lie one after the other. Axes are right up back, with the
-turn of 180 degrees about x from those of PLY files in the Gaussians themselves, so that it needs no transform of the prim.
+Sizes are linear, opacities shares, and all harmonics of a Gaussian lie one after the other. Axes are right up
+back, with the turn of 180 degrees about x from those of PLY files in the Gaussians themselves, so that it
+needs no transform of the prim.
 """
 
 import tempfile
@@ -61,7 +63,8 @@ class Usdz(CaptureFormat):
             ("RadianceSphericalHarmonicsCoefficients", Vt.Vec3fArray, harmonics.reshape(-1, 3)),
         ]
         with tempfile.TemporaryDirectory() as folder:
-            layer, package = f"{folder}/capture.usdc", f"{folder}/capture.usdz"
+            layer = f"{folder}/capture.usdc"
+            package = f"{folder}/capture.usdz"
             stage = Usd.Stage.CreateNew(layer)
             UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
             UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -76,5 +79,7 @@ class Usdz(CaptureFormat):
             field.CreateExtentAttr([Gf.Vec3f(*map(float, corner)) for corner in bounds])
             stage.GetRootLayer().Save()
             if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(layer), package):
-                raise DataError(".usdz: usd-core could not write the package; see its message, or name a .ply or .glb")
+                raise DataError(
+                    ".usdz: usd-core could not write the package; see its message, or name a .ply or .glb"
+                )
             return [Path(package).read_bytes()]

@@ -16,7 +16,13 @@ from fprf.errors import WeightsError
 from fprf.methods import fprf_lite
 from fprf.plugins.decoders.config import DecoderConfig, MlpDecoderConfig, Objective, pretrain_line
 from fprf.plugins.decoders.decoders import DECODER_KIND, MlpDecoder, load_decoder
-from fprf.plugins.encoders.config import BundledContentConfig, Dinov2Config, EncoderConfig, RandomConfig, Vgg19Config
+from fprf.plugins.encoders.config import (
+    BundledContentConfig,
+    Dinov2Config,
+    EncoderConfig,
+    RandomConfig,
+    Vgg19Config,
+)
 from fprf.plugins.weights import write_weights
 from fprf.pretraining.config import PretrainDecoderConfig
 from fprf.training.prepare import prepare
@@ -41,8 +47,12 @@ def test_another_encoder_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("config", [BundledContentConfig(), Vgg19Config()])
 def test_encoders_that_ship_have_a_decoder_of_each_objective(config: EncoderConfig) -> None:
     encoder = config.build()
-    name, channels = encoder.identity, encoder.channels
-    made = [MlpDecoderConfig(objective=objective).build(encoder=name, channels=channels) for objective in get_args(Objective)]
+    name = encoder.identity
+    channels = encoder.channels
+    made = [
+        MlpDecoderConfig(objective=objective).build(encoder=name, channels=channels)
+        for objective in get_args(Objective)
+    ]
     content = torch.randn(2, channels)
     identity, paper = (decoder(content) for decoder in made)
     assert identity.shape == paper.shape == (2, 3) and not torch.equal(identity, paper)
@@ -77,7 +87,9 @@ def test_the_line_is_one_that_the_command_line_takes(encoder: EncoderConfig) -> 
     words = shlex.split(pretrain_line(encoder, Path("my own.safetensors")))
     assert words[:3] == ["fprf", "pretrain", "decoder"]
     found = parse(PretrainDecoderConfig(), words[3:], prog="fprf pretrain decoder", description="")
-    assert found == replace(PretrainDecoderConfig(), encoder=encoder, images=(Path("DIR"),), output=Path("my own.safetensors"))
+    assert found == replace(
+        PretrainDecoderConfig(), encoder=encoder, images=(Path("DIR"),), output=Path("my own.safetensors")
+    )
 
 
 def test_an_encoder_without_a_decoder_is_refused_before_its_features_are_made(world: World) -> None:

@@ -49,8 +49,10 @@ def test_the_contract_that_strangers_sign(name: str, tmp_path: Path) -> None:
 
 
 def test_identities_differ_with_settings(tmp_path: Path) -> None:
-    file, other = vgg_file(tmp_path), vgg_file(tmp_path, normalisation=False)
-    one, two = RandomConfig(), RandomConfig(seed=1)
+    file = vgg_file(tmp_path)
+    other = vgg_file(tmp_path, normalisation=False)
+    one = RandomConfig()
+    two = RandomConfig(seed=1)
     configs = [
         one, two, ConcatConfig(),
         RandomConfig(stride=2), RandomConfig(channels=3), BundledContentConfig(), BundledSemanticConfig(),
@@ -83,11 +85,15 @@ def test_everything_that_ships_stays_small_and_says_what_it_is() -> None:
         assert "Apache-2.0" in metadata["licence"]
 
 
-@pytest.mark.parametrize(("config", "kind"), [(BundledContentConfig, CONTENT_KIND), (BundledSemanticConfig, SEMANTIC_KIND)])
+@pytest.mark.parametrize(
+    ("config", "kind"), [(BundledContentConfig, CONTENT_KIND), (BundledSemanticConfig, SEMANTIC_KIND)]
+)
 def test_other_files_are_refused_with_the_command_that_makes_the_right_one(
     config: type[BundledContentConfig], kind: str, tmp_path: Path
 ) -> None:
-    write_weights(tmp_path / "other.safetensors", {"project.weight": torch.zeros(3, 3, 1, 1)}, {"kind": "mlp-decoder"})
+    write_weights(
+        tmp_path / "other.safetensors", {"project.weight": torch.zeros(3, 3, 1, 1)}, {"kind": "mlp-decoder"}
+    )
     with pytest.raises(WeightsError, match=f"'mlp-decoder'.*tools.distil {kind.removeprefix('bundled-')}"):
         config(weights=tmp_path / "other.safetensors").build()
     write_weights(tmp_path / "shape.safetensors", {"project.weight": torch.zeros(3, 3, 1, 1)}, {"kind": kind})
@@ -123,28 +129,36 @@ def test_parts_are_their_encoders_to_a_factor() -> None:
 
 def test_finer_parts_are_averaged_over_the_cells_of_the_first() -> None:
     image = torch.rand(2, 3, 48, 64)
-    coarse, fine = RandomConfig(stride=8).build(), RandomConfig(stride=4, seed=1).build()
+    coarse = RandomConfig(stride=8).build()
+    fine = RandomConfig(stride=4, seed=1).build()
     found = ConcatEncoder([coarse, fine], (3.0, 0.5), (2.0, 4.0), cells="first")(image)
-    torch.testing.assert_close(found, torch.cat([coarse(image) * 1.5, F.avg_pool2d(fine(image), 2) * 0.125], dim=1))
+    torch.testing.assert_close(
+        found, torch.cat([coarse(image) * 1.5, F.avg_pool2d(fine(image), 2) * 0.125], dim=1)
+    )
     turned = ConcatEncoder([fine, coarse], (1.0, 1.0), (1.0, 1.0), cells="first")(image)
     torch.testing.assert_close(turned[:, 16:], F.interpolate(coarse(image), (12, 16), mode="bilinear"))
 
 
 def test_known_units_are_those_measured() -> None:
     parts = [part.build() for part in (SEMANTICS.first, SEMANTICS.second)]
-    assert [UNITS[part.identity] for part in parts] == [pytest.approx(unit_of(part, street()), rel=0.01) for part in parts]
+    assert [UNITS[part.identity] for part in parts] == [
+        pytest.approx(unit_of(part, street()), rel=0.01) for part in parts
+    ]
     assert len(UNITS) == len(parts)
 
 
 def test_cut_out_pictures_are_seen_on_white_and_black() -> None:
-    image, opacity = torch.rand(2, 3, 16, 24), torch.rand(2, 16, 24)
-    encoder, drawn = RandomConfig(stride=4).build(), image * opacity[:, None]
+    image = torch.rand(2, 3, 16, 24)
+    opacity = torch.rand(2, 16, 24)
+    encoder = RandomConfig(stride=4).build()
+    drawn = image * opacity[:, None]
     on_white = drawn + 1 - opacity[:, None]
     torch.testing.assert_close(encoder.cutout(drawn, opacity), (encoder(on_white) + encoder(drawn)) / 2)
 
 
 def test_each_part_cuts_out_as_it_can() -> None:
-    image, opacity = torch.rand(1, 3, 70, 98), torch.zeros(1, 70, 98)
+    image = torch.rand(1, 3, 70, 98)
+    opacity = torch.zeros(1, 70, 98)
     opacity[:, 20:50, 30:60] = 1
     parts = [Dinov2Config(layer=1, stride=14).build(), RandomConfig(stride=7).build()]
     found = ConcatEncoder(parts, (3.0, 0.5), (2.0, 4.0), cells="first").cutout(image * opacity, opacity)

@@ -69,7 +69,9 @@ def test_without_mean_activations_the_town_gives_them(tmp_path: Path) -> None:
 
 
 def adain_network() -> nn.Sequential:
-    """As AdaIN lists its layers, with few channels: an even one changes colour, then padding, convolution, ReLU."""
+    """As AdaIN lists its layers, with few channels: an even one changes colour, then padding, convolution,
+    ReLU.
+    """
     layers: list[nn.Module] = [nn.Conv2d(3, 3, 1)]
     inputs = 3
     for block, depth in enumerate((2, 2, 4, 4)):
@@ -96,7 +98,9 @@ def test_adains_files_give_adains_features(tmp_path: Path, layer: str, upto: int
 
 def test_adains_files_are_never_plain(tmp_path: Path) -> None:
     torch.save(adain_network().state_dict(), tmp_path / "vgg_normalised.pth")
-    with pytest.raises(WeightsError, match=r"normalised VGG-19 of AdaIN, which cannot be made plain.*normalise on"):
+    with pytest.raises(
+        WeightsError, match=r"normalised VGG-19 of AdaIN, which cannot be made plain.*normalise on"
+    ):
         Vgg19Config(weights=tmp_path / "vgg_normalised.pth", normalise=False).build()
     with pytest.raises(WeightsError, match=r"holds no conv5_1"):
         Vgg19Config(weights=tmp_path / "vgg_normalised.pth", layer="relu5_1").build()
@@ -137,7 +141,8 @@ def test_vgg19_ships_up_to_relu2_1(shared: Path) -> None:
     full = shared / "weights/vgg19_imagenet.safetensors"
     image = torch.rand(1, 3, 20, 18)
     for layer in ("relu1_1", "conv1_2", "relu2_1"):
-        found, expected = Vgg19Config(layer=layer).build(), Vgg19Config(layer=layer, weights=full).build()
+        found = Vgg19Config(layer=layer).build()
+        expected = Vgg19Config(layer=layer, weights=full).build()
         assert found.identity == expected.identity
         assert torch.equal(found(image), expected(image))
     with pytest.raises(WeightsError, match="cannot be downloaded"):

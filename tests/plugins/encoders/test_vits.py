@@ -1,4 +1,6 @@
-"""DINOv2-small as it ships, against transformers on the same weights; DINO, DINOv2 and DINOv3 on small random models."""
+"""DINOv2-small as it ships, against transformers on the same weights; DINO, DINOv2 and DINOv3 on small random
+models.
+"""
 
 import sys
 from pathlib import Path
@@ -36,18 +38,28 @@ STORED = {
 @pytest.mark.parametrize(("layer", "kind"), STORED)
 def test_features_are_those_stored(layer: int, kind: str) -> None:
     features = Dinov2Config(layer=layer, features=kind, stride=14).build()(picture(126, 168))[0]
-    found = torch.stack([features.mean(), features.std(), features[7, 0, 0], features[100, 4, 5], features[383, 8, 11]])
+    found = torch.stack(
+        [features.mean(), features.std(), features[7, 0, 0], features[100, 4, 5], features[383, 8, 11]]
+    )
     torch.testing.assert_close(found, torch.tensor(STORED[layer, kind]), rtol=1e-3, atol=1e-3)
 
 
 def test_features_are_those_of_transformers(tmp_path: Path) -> None:
     transformers = pytest.importorskip("transformers", reason="the extra `encoders` is not installed")
-    sizes = {"hidden_size": 384, "num_hidden_layers": 11, "num_attention_heads": 6, "image_size": 518, "patch_size": 14}
+    sizes = {
+        "hidden_size": 384,
+        "num_hidden_layers": 11,
+        "num_attention_heads": 6,
+        "image_size": 518,
+        "patch_size": 14,
+    }
     transformers.Dinov2Config(**sizes).save_pretrained(tmp_path)
     tensors = _renamed(dequantised(read_weights(WEIGHTS)[0]))
     write_weights(tmp_path / "model.safetensors", tensors, {"format": "pt"})
     model = transformers.Dinov2Model.from_pretrained(tmp_path)
-    key = next(each for name, each in model.named_modules() if ".10." in name and name.endswith((".k_proj", ".key")))
+    key = next(
+        each for name, each in model.named_modules() if ".10." in name and name.endswith((".k_proj", ".key"))
+    )
     keys: list[Tensor] = []
     key.register_forward_hook(lambda *call: keys.append(call[-1]))
     image = picture(70, 98)  # five by seven patches
@@ -62,13 +74,17 @@ def test_features_are_those_of_transformers(tmp_path: Path) -> None:
 
 
 def _renamed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Under the names of checkpoints of the hub. The class token holds its position, which is then 0 there."""
+    """Under the names of checkpoints of the hub. The class token holds its position, which is then 0
+    there.
+    """
     theirs = {
         "embeddings.cls_token": tensors["cls_token"].view(1, 1, -1),
         "embeddings.mask_token": torch.zeros(1, 384),
         "layernorm.weight": torch.ones(384),
         "layernorm.bias": torch.zeros(384),
-        "embeddings.position_embeddings": torch.cat([torch.zeros(1, 1, 384), tensors["pos_embed"].flatten(1).T[None]], 1),
+        "embeddings.position_embeddings": torch.cat(
+            [torch.zeros(1, 1, 384), tensors["pos_embed"].flatten(1).T[None]], 1
+        ),
     }
     names = {
         "patch_embed": "embeddings.patch_embeddings.projection",
@@ -106,10 +122,13 @@ def test_patches_that_show_nothing_are_as_if_masked_in_attention(kind: str) -> N
     attention = F.scaled_dot_product_attention
     visible = torch.cat([torch.ones(1, dtype=torch.bool), shown.flatten()])
     with pytest.MonkeyPatch.context() as patch, torch.no_grad():
-        patch.setattr(F, "scaled_dot_product_attention", lambda q, k, v: attention(q, k, v, attn_mask=visible[None]))
+        patch.setattr(
+            F, "scaled_dot_product_attention", lambda q, k, v: attention(q, k, v, attn_mask=visible[None])
+        )
         masked = network(image, kind == "keys")
         patch.undo()
-        found, plain = network(image, kind == "keys", shown), network(image, kind == "keys")
+        found = network(image, kind == "keys", shown)
+        plain = network(image, kind == "keys")
     torch.testing.assert_close(found[:, :, shown], masked[:, :, shown])
     assert (plain - masked)[:, :, shown].abs().max() > 0.01
     for row, column in (~shown).nonzero().tolist():
@@ -119,7 +138,9 @@ def test_patches_that_show_nothing_are_as_if_masked_in_attention(kind: str) -> N
 
 
 def test_what_is_cut_out_is_encoded_alone() -> None:
-    """Each image of a batch as many patches as it shows; nothing shown, and all of it, are as images on grey."""
+    """Each image of a batch as many patches as it shows; nothing shown, and all of it, are as images on
+    grey.
+    """
     encoder = Dinov2Config(layer=2, stride=14).build()
     opacity = torch.zeros(4, 70, 98)
     opacity[0, 14:42, 28:70] = 1
@@ -132,7 +153,9 @@ def test_what_is_cut_out_is_encoded_alone() -> None:
     for index, (rows, columns) in enumerate([(slice(1, 3), slice(2, 5)), (slice(0, 5), slice(0, 1))]):
         shown = torch.zeros(5, 7, dtype=torch.bool)
         shown[rows, columns] = True
-        normal = (on_grey[index, None] - torch.tensor(IMAGENET_MEAN).view(3, 1, 1)) / torch.tensor(IMAGENET_STD).view(3, 1, 1)
+        normal = (on_grey[index, None] - torch.tensor(IMAGENET_MEAN).view(3, 1, 1)) / torch.tensor(
+            IMAGENET_STD
+        ).view(3, 1, 1)
         with torch.no_grad():
             torch.testing.assert_close(found[index, None], encoder.network(normal, False, shown))
 
@@ -181,13 +204,18 @@ def test_one_token_per_stride(stride: int, height: int, width: int) -> None:
 
 def test_tokens_lie_where_their_patch_is() -> None:
     image = torch.rand(1, 3, 16, 24)
-    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+    mean = torch.tensor([0.485, 0.456, 0.406])
+    std = torch.tensor([0.229, 0.224, 0.225])
     expected = (nn.functional.avg_pool2d(image, 4) - mean.view(1, 3, 1, 1)) / std.view(1, 3, 1, 1)
     torch.testing.assert_close(stand_in(4)(image), expected)
 
 
-@pytest.mark.parametrize("config", [DinoConfig(), Dinov2Config(model="facebook/dinov2-small"), Dinov3Config()])
-def test_without_transformers_one_line_says_what_to_do(config: EncoderConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "config", [DinoConfig(), Dinov2Config(model="facebook/dinov2-small"), Dinov3Config()]
+)
+def test_without_transformers_one_line_says_what_to_do(
+    config: EncoderConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(WeightsError, match=r"pip install 'fprf\[encoders\]'.*--semantic.encoder dinov2"):
         config.build()
@@ -202,18 +230,27 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     torch.manual_seed(0)
     vit = transformers.ViTConfig(**sizes, intermediate_size=64, image_size=32, patch_size=8)
     transformers.ViTModel(vit).save_pretrained(folder / "dino")
-    transformers.Dinov2Model(transformers.Dinov2Config(**sizes, image_size=28, patch_size=14)).save_pretrained(folder / "v2")
-    third = transformers.DINOv3ViTConfig(**sizes, intermediate_size=64, image_size=32, patch_size=16, num_register_tokens=4)
+    transformers.Dinov2Model(
+        transformers.Dinov2Config(**sizes, image_size=28, patch_size=14)
+    ).save_pretrained(folder / "v2")
+    third = transformers.DINOv3ViTConfig(
+        **sizes, intermediate_size=64, image_size=32, patch_size=16, num_register_tokens=4
+    )
     transformers.DINOv3ViTModel(third).save_pretrained(folder / "v3")
     return {"dino": folder / "dino", "dinov2": folder / "v2", "dinov3": folder / "v3"}
 
 
-KINDS: dict[str, type[DinoConfig] | type[Dinov2Config]] = {"dino": DinoConfig, "dinov2": Dinov2Config, "dinov3": Dinov3Config}
+KINDS: dict[str, type[DinoConfig] | type[Dinov2Config]] = {
+    "dino": DinoConfig,
+    "dinov2": Dinov2Config,
+    "dinov3": Dinov3Config,
+}
 
 
 @pytest.mark.parametrize("family", KINDS)
 def test_real_models(models: dict[str, Path], family: str) -> None:
-    folder, kind = str(models[family]), KINDS[family]
+    folder = str(models[family])
+    kind = KINDS[family]
     image = torch.rand(2, 3, 45, 70)
     last, third, second = (kind(model=folder, layer=layer, stride=8).build() for layer in (-1, 3, 2))
     assert last(image).shape == (2, 32, 6, 9)
@@ -222,7 +259,9 @@ def test_real_models(models: dict[str, Path], family: str) -> None:
     assert not torch.allclose(last(image), second(image))
     torch.testing.assert_close(last(image[:1]), last(image)[:1], rtol=1e-4, atol=1e-4)
     norms = last(image).std(dim=1)
-    torch.testing.assert_close(norms, torch.ones_like(norms), rtol=0.1, atol=0.1)  # tokens pass the final norm
+    torch.testing.assert_close(
+        norms, torch.ones_like(norms), rtol=0.1, atol=0.1
+    )  # tokens pass the final norm
     with pytest.raises(WeightsError, match="allowed are 1 to 3"):
         kind(model=folder, layer=4).build()
 

@@ -1,4 +1,6 @@
-"""The Ray executor; all but the refusals need Ray (extra `cluster`) and seconds to start it, once for all of them."""
+"""The Ray executor; all but the refusals need Ray (extra `cluster`) and seconds to start it, once for all of
+them.
+"""
 
 import importlib.util
 import os
@@ -39,10 +41,17 @@ class Refusing:
 
 
 @pytest.mark.parametrize(("address", "joined"), [("", "local"), ("mars:7777", "mars:7777")])
-def test_only_a_cluster_that_is_named_is_joined(monkeypatch: pytest.MonkeyPatch, address: str, joined: str) -> None:
+def test_only_a_cluster_that_is_named_is_joined(
+    monkeypatch: pytest.MonkeyPatch, address: str, joined: str
+) -> None:
     ray = Refusing()
     monkeypatch.setitem(sys.modules, "ray", ray)
-    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_USAGE_STATS_ENABLED", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"):
+    for name in (
+        "RAY_AUTH_MODE",
+        "RAY_AUTH_TOKEN",
+        "RAY_USAGE_STATS_ENABLED",
+        "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER",
+    ):
         monkeypatch.setenv(name, "set before")
     with pytest.raises(PluginError, match="nobody there"):
         RayConfig(address=address).build().map(abs, [1])
@@ -68,7 +77,9 @@ def test_a_cluster_without_gpus_is_refused(monkeypatch: pytest.MonkeyPatch) -> N
             return {"CPU": 8.0}
 
     monkeypatch.setitem(sys.modules, "ray", Poor())
-    with pytest.raises(PluginError, match="each task takes 1 GPUs and the cluster has 0; start Ray on machines with GPUs"):
+    with pytest.raises(
+        PluginError, match="each task takes 1 GPUs and the cluster has 0; start Ray on machines with GPUs"
+    ):
         RayConfig().on("cuda").build().map(abs, [1])
 
 
@@ -99,7 +110,9 @@ def test_the_contract(executor: RayConfig) -> None:
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_tasks_run_elsewhere_and_a_killed_worker_is_started_again(executor: RayConfig, tmp_path: Path) -> None:
+def test_tasks_run_elsewhere_and_a_killed_worker_is_started_again(
+    executor: RayConfig, tmp_path: Path
+) -> None:
     def once_killed(name: str) -> int:
         mark = tmp_path / name
         if not mark.exists():

@@ -40,7 +40,9 @@ def test_edges_are_spaced_by_the_space(config: SamplerConfig) -> None:
 
 
 class Wall(nn.Module):
-    """Dense where the first coordinate is beyond a place, thin before; stands in for a proposal, as blocks' fields do."""
+    """Dense where the first coordinate is beyond a place, thin before; stands in for a proposal, as blocks'
+    fields do.
+    """
 
     def __init__(self, at: float) -> None:
         super().__init__()
@@ -57,9 +59,13 @@ def wall(sampler: Sampler, at: float) -> None:
 
 
 def test_samples_go_where_the_density_is() -> None:
-    """A wall at x = 1 seen from the origin: all but the padding's share of the samples land about its surface."""
+    """A wall at x = 1 seen from the origin: all but the padding's share of the samples land about its
+    surface.
+    """
     sampler = ProposalConfig(samples=(128, 64), final=32, resolutions=(4, 4)).build(seed=0)
-    rays = SPACE.rays(torch.zeros(1, 3, dtype=torch.float64), torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64))
+    rays = SPACE.rays(
+        torch.zeros(1, 3, dtype=torch.float64), torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
+    )
     wall(sampler, 0.5)
     found = sample(sampler, rays)
     near = (found.t > 0.9) & (found.t < 1.15)
@@ -93,7 +99,8 @@ def test_proposals_learn_at_every_step_then_ever_more_rarely() -> None:
 
 
 def test_the_interlevel_loss_reaches_every_level() -> None:
-    sampler, rays = SMALL.build(seed=0), rays_of(64)
+    sampler = SMALL.build(seed=0)
+    rays = rays_of(64)
     found = sample(sampler, rays, step=0)
     points = SPACE.locate((rays.origin[:, None] + rays.direction[:, None] * found.t[:, 1:, None]).view(-1, 3))
     weights = (points[:, 0].view(64, -1).abs() > 0.5).float() / 9

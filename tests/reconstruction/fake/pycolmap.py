@@ -1,9 +1,10 @@
-"""Stands in for pycolmap in tests: the same calls, a database of the same tables, a model of cameras in a row.
+"""Stands in for pycolmap in tests: the same calls, a database of the same tables, a model of cameras in a
+row.
 
-`fake.json` beside the database steers it: {"bare": images without features, "lonely": images that match nothing, "apart":
-images that end in a second model, "angle": degrees between the rays of any two images, at most, "unposed": images without a
-pose, "fail": a step that ends the process}.
-What was done is written to `calls.txt` there.
+`fake.json` beside the database steers it: {"bare": images without features, "lonely": images that match
+nothing, "apart": images that end in a second model, "angle": degrees between the rays of any two images, at
+most, "unposed": images without a pose, "fail": a step that ends the process}. What was done is written to
+`calls.txt` there.
 """
 
 import json
@@ -70,7 +71,9 @@ class Database:
         return self.base.execute("SELECT 1 FROM keypoints WHERE image_id = ?", (id_,)).fetchone() is not None
 
 
-def extract_features(database, images, *, image_names, camera_mode, reader_options, extraction_options, device):
+def extract_features(
+    database, images, *, image_names, camera_mode, reader_options, extraction_options, device
+):
     import numpy as np
 
     from fprf.datamanagers.images import read_header
@@ -87,7 +90,9 @@ def extract_features(database, images, *, image_names, camera_mode, reader_optio
                 _fail(database, "features")
             header = read_header(Path(images) / name)
             row = (name, camera, header.width, header.height)
-            id_ = base.base.execute("INSERT INTO images (name, camera_id, w, h) VALUES (?, ?, ?, ?)", row).lastrowid
+            id_ = base.base.execute(
+                "INSERT INTO images (name, camera_id, w, h) VALUES (?, ?, ?, ?)", row
+            ).lastrowid
             rows = 0 if name in bare else 50
             noise = np.random.default_rng(id_).integers(0, 255, (rows, 128), dtype=np.uint8)
             base.base.execute("INSERT INTO keypoints VALUES (?, ?, 6, ?)", (id_, rows, b""))
@@ -104,12 +109,15 @@ def match_image_pairs(database, *, matching_options, pairing_options, verificati
         for a, b in pairs:
             low, high = sorted((ids[a], ids[b]))
             count = 0 if {a, b} & lonely else 40
-            base.base.execute("INSERT OR IGNORE INTO two_view_geometries VALUES (?, ?)", (low * 2147483647 + high, count))
+            base.base.execute(
+                "INSERT OR IGNORE INTO two_view_geometries VALUES (?, ?)", (low * 2147483647 + high, count)
+            )
 
 
 class _Model:
     def __init__(self, names, sizes):
-        self.names, self.sizes = dict(enumerate(sorted(names), 1)), sizes
+        self.names = dict(enumerate(sorted(names), 1))
+        self.sizes = sizes
 
     num_reg_images = lambda self: len(self.names)  # noqa: E731
     num_points3D = lambda self: 10 * len(self.names)  # noqa: E731
@@ -121,12 +129,17 @@ class _Model:
     def write_binary(self, folder):
         folder = Path(folder)
         count = struct.pack("<Q", len(self.names))
-        lenses = [struct.pack("<IiQQ4d", k, 1, *self.sizes[name], 20, 20, 12, 8) for k, name in self.names.items()]
+        lenses = [
+            struct.pack("<IiQQ4d", k, 1, *self.sizes[name], 20, 20, 12, 8) for k, name in self.names.items()
+        ]
         (folder / "cameras.bin").write_bytes(count + b"".join(lenses))
         rows = [struct.pack("<Q", len(self.names))]
         for id_, name in self.names.items():
             rows.append(
-                struct.pack("<I7dI", id_, 1, 0, 0, 0, -float(id_), 0, 0, id_) + name.encode() + b"\0" + struct.pack("<Q", 0)
+                struct.pack("<I7dI", id_, 1, 0, 0, 0, -float(id_), 0, 0, id_)
+                + name.encode()
+                + b"\0"
+                + struct.pack("<Q", 0)
             )
         (folder / "images.bin").write_bytes(b"".join(rows))
         points = [struct.pack("<Q3d3BdQ", k, k, k, 9.0, 1, 2, 3, 0.5, 0) for k in range(12)]
@@ -148,4 +161,8 @@ def incremental_mapping(database, images, out, options, *, initial_image_pair_ca
     initial_image_pair_callback()
     for _ in main[2:]:
         next_image_callback()
-    return {0: _Model(plan["apart"], sizes), 1: _Model(main, sizes)} if plan.get("apart") else {0: _Model(main, sizes)}
+    return (
+        {0: _Model(plan["apart"], sizes), 1: _Model(main, sizes)}
+        if plan.get("apart")
+        else {0: _Model(main, sizes)}
+    )

@@ -1,4 +1,6 @@
-"""A Gabor filter bank as an encoder for fprf, a loss on opacity, and a method. Importing this imports no torch."""
+"""A Gabor filter bank as an encoder for fprf, a loss on opacity, and a method. Importing this imports no
+torch.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,9 @@ class GaborConfig(EncoderConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class OpacityConfig(LossTermConfig):
-    """Push the opacity of rays to 0 or 1: for objects before an empty background, against half-transparent haze."""
+    """Push the opacity of rays to 0 or 1: for objects before an empty background, against half-transparent
+    haze.
+    """
 
     weight: float = 0.01
     """Weight of the term, which is 1 for rays of opacity 0.5 and 0 for those of opacity 0 or 1."""

@@ -18,12 +18,16 @@ __all__ = ["GaborEncoder", "gabor_pair"]
 
 
 def gabor_pair(wavelength: float, angle: float, size: int) -> Annotated[Tensor, "2 size size"]:
-    """Even and odd filter without response to a flat image, of unit energy; `angle` in radians from the x axis."""
+    """Even and odd filter without response to a flat image, of unit energy; `angle` in radians from the x
+    axis.
+    """
     reach = torch.arange(size, dtype=torch.float64) - size // 2
     y, x = torch.meshgrid(reach, reach, indexing="ij")
     along = x * math.cos(angle) + y * math.sin(angle)
     envelope = torch.exp(-(x**2 + y**2) / (2 * (0.5 * wavelength) ** 2))
-    wave = torch.stack([torch.cos(2 * math.pi * along / wavelength), torch.sin(2 * math.pi * along / wavelength)])
+    wave = torch.stack(
+        [torch.cos(2 * math.pi * along / wavelength), torch.sin(2 * math.pi * along / wavelength)]
+    )
     mean = (envelope * wave).sum((1, 2), keepdim=True) / envelope.sum()
     pair = envelope * (wave - mean)
     return (pair / pair.square().sum((1, 2), keepdim=True).sqrt()).float()
@@ -55,7 +59,8 @@ class GaborEncoder(Encoder):
     @torch.no_grad()
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B F+3 h w"]:
         """Log energies in [-1, 1] and centred colours, one cell per stride x stride pixels."""
-        bank, (height, width) = self.get_buffer("bank").to(image), image.shape[2:]
+        bank = self.get_buffer("bank").to(image)
+        (height, width) = image.shape[2:]
         margin = bank.shape[-1] // 2
         light = F.pad(image.mean(1, keepdim=True), (margin,) * 4, mode="replicate")
         even, odd = F.conv2d(light, bank).unflatten(1, (-1, 2)).unbind(2)
