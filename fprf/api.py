@@ -124,7 +124,8 @@ class TrainedScene:
         between("fov", fov, 1e-3, 179.0)
         at_least("width", width, 1)
         at_least("height", height, 1)
-        here, there = (torch.tensor([list(place)], dtype=torch.float64) for place in (position, target))
+        here = torch.tensor([list(position)], dtype=torch.float64)
+        there = torch.tensor([list(target)], dtype=torch.float64)
         if here.shape != (1, 3) or there.shape != (1, 3) or bool(torch.equal(here, there)):
             raise UsageError(
                 f"camera_at: position {position} and target {target} must be two places of three numbers each"
@@ -221,11 +222,9 @@ class TrainedScene:
         known = self.trained.known
         styled = self.styled
         views = known.test or known.train
-        look = (
-            None
-            if styled is None
-            else (" + ".join(Path(name).stem for name in self.references) or "style", styled.restyle)
-        )
+        look = None
+        if styled is not None:
+            look = (" + ".join(Path(name).stem for name in self.references) or "style", styled.restyle)
         return notebook_html(self.trained.scene, known.name, views[len(views) // 2], look)
 
     def render(self, camera: Cameras | int | str) -> Shot:
@@ -266,7 +265,10 @@ class TrainedScene:
         return self.styled
 
     def _single(self, what: str, camera: Cameras | int | str) -> Cameras:
-        one = camera if isinstance(camera, Cameras) else self.camera(camera)
+        if isinstance(camera, Cameras):
+            one = camera
+        else:
+            one = self.camera(camera)
         if len(one) != 1:
             raise UsageError(f"{what}: {len(one)} cameras; give one, or render them all with `film`")
         return one
@@ -338,6 +340,9 @@ class FinishedCapture:
 
         In the format that was read everything but colours stays as it was, bit for bit.
         """
-        harmonics = self.capture.gaussians.harmonics if self.harmonics is None else self.harmonics
+        if self.harmonics is None:
+            harmonics = self.capture.gaussians.harmonics
+        else:
+            harmonics = self.harmonics
         views = None if self.seen is None else self.seen().scene.views
         return write_capture(Path(path), self.capture, harmonics, views).losses()

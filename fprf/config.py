@@ -305,11 +305,9 @@ class RunConfig:
         """The config with what it leaves open decided, from a scene at its own size and the device that will
         train.
         """
-        return (
-            self
-            if self.downscale is not None
-            else replace(self, downscale=self.find_downscale(scene, device.type))
-        )
+        if self.downscale is not None:
+            return self
+        return replace(self, downscale=self.find_downscale(scene, device.type))
 
     def described(self) -> str:
         """Describe the plan beyond the views and their size, for the line that is shown before training."""
@@ -425,7 +423,9 @@ class TrainConfig(RunConfig):
         from .training.field_learner import FieldLearner
         from .training.prepare import prepare
 
-        plan = make_plan(scene, self.blocks) if self.blocks.cuts else None
+        plan = None
+        if self.blocks.cuts:
+            plan = make_plan(scene, self.blocks)
         if plan is None or len(plan.cells) == 1:
             return FieldLearner(self, prepare(self, scene, saved, progress), device)
         # One basis and one unit of the losses, of all training views, so that features mean the same in each

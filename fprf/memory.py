@@ -78,7 +78,9 @@ def out_of_memory(error: BaseException) -> bool:
 def wanted(error: BaseException) -> int | None:
     """The bytes that could not be had, where the error tells."""
     match = _ASKED.search(str(error))
-    return None if match is None else int(float(match[1]) * _UNITS[match[2].lower()])
+    if match is None:
+        return None
+    return int(float(match[1]) * _UNITS[match[2].lower()])
 
 
 def in_parts(count: int, size: int, work: Callable[[slice], _Found]) -> Iterator[_Found]:
@@ -108,7 +110,9 @@ def chunk_size(size: int, device: "torch.device") -> int:
     least `size`.
     """
     free = free_memory(device)
-    return size if free is None else max(size, int(_SHARE * free) // _RAY)
+    if free is None:
+        return size
+    return max(size, int(_SHARE * free) // _RAY)
 
 
 def free_memory(device: "torch.device") -> int | None:
@@ -130,10 +134,19 @@ def shortage(what: str, error: BaseException, remedy: str) -> OutOfMemoryError:
     held = peak()
     card = _GPU.search(str(error))
     if card is not None:  # what the process and the machine have says nothing of it
-        asked = "" if more is None else f", {more / _GIB:.2f} GiB more were wanted"
+        if more is None:
+            asked = ""
+        else:
+            asked = f", {more / _GIB:.2f} GiB more were wanted"
         return OutOfMemoryError(f"{what}: not enough memory{asked} ({card[0]}); {remedy}")
-    asked = "" if more is None else f" and wanted {more / _GIB:.2f} GiB more"
-    took = "" if held is None else f"; the process held up to {held / _GIB:.2f} GiB{asked}"
+    if more is None:
+        asked = ""
+    else:
+        asked = f" and wanted {more / _GIB:.2f} GiB more"
+    if held is None:
+        took = ""
+    else:
+        took = f"; the process held up to {held / _GIB:.2f} GiB{asked}"
     # Free memory and the process's limit, as far as the system tells.
     limits = []
     try:

@@ -55,10 +55,16 @@ class Display:
 
     def count(self, done: int, total: int, what: str, *, seconds_left: float | None = None) -> None:
         """`done` of `total` of something."""
-        left = "" if seconds_left is None else f"  {_clock(seconds_left)} left"
+        if seconds_left is None:
+            left = ""
+        else:
+            left = f"  {_clock(seconds_left)} left"
         self._bar(what, done / max(1, total), f"{done}/{total}{left}")
         if not self.live and self._due(done == total):
-            ahead = {} if seconds_left is None else {"seconds_left": round(seconds_left)}
+            if seconds_left is None:
+                ahead = {}
+            else:
+                ahead = {"seconds_left": round(seconds_left)}
             self._line({"event": what, "done": done, "total": total, **ahead})
 
     def training(self, report: "Report", what: str = "training") -> None:

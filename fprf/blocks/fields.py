@@ -89,11 +89,16 @@ class BlockedField(ContentField):
         latents = []
         for group in groups:
             here = points[group.at]
-            members = [self.members.member(number) for number in group.members]
-            samples = [member.field.density(member.chart.locate(here)) for member in members]
+            members = []
+            for number in group.members:
+                members.append(self.members.member(number))
+            samples = []
+            for member in members:
+                samples.append(member.field.density(member.chart.locate(here)))
             densities.append(_blended([sample.density for sample in samples], group))
             latents.append(torch.cat([here, samples[0].latent], -1))
-        density, latent = (_joined([group.at for group in groups], parts) for parts in (densities, latents))
+        density = _joined([group.at for group in groups], densities)
+        latent = _joined([group.at for group in groups], latents)
         return FieldSample(density, latent)
 
     def content(
@@ -162,7 +167,9 @@ class BlockedSemantic(SemanticField):
 
 def _blended(densities: list[Tensor], group: Group) -> Annotated[Tensor, "n"]:
     """sum_i w_i sigma_i of a group's members."""
-    return densities[0] if group.weight is None else (torch.stack(densities, -1) * group.weight).sum(-1)
+    if group.weight is None:
+        return densities[0]
+    return (torch.stack(densities, -1) * group.weight).sum(-1)
 
 
 def _mixed(features: list[Tensor], densities: list[Tensor], group: Group) -> Annotated[Tensor, "n C"]:
@@ -204,10 +211,12 @@ class _Routed(nn.Module):
         groups = self.router(points)
         outputs = []
         for group in groups:
-            members = [self.members.member(number) for number in group.members]
-            densities = [
-                each.sampler.fields[self.level](each.chart.locate(points[group.at])) for each in members
-            ]
+            members = []
+            for number in group.members:
+                members.append(self.members.member(number))
+            densities = []
+            for each in members:
+                densities.append(each.sampler.fields[self.level](each.chart.locate(points[group.at])))
             outputs.append(_blended(densities, group))
         return _joined([group.at for group in groups], outputs)
 
@@ -249,8 +258,14 @@ def inherit(member: Member, around: Member) -> None:
             continue
         # Only parts that consist of planes, linear maps and offsets: of others nobody knows what depends on
         # the chart.
-        modules = [module for module in own.modules() if isinstance(module, Planes | nn.Linear)]
-        known = {id(parameter) for module in modules for parameter in module.parameters()}
+        modules = []
+        for module in own.modules():
+            if isinstance(module, Planes | nn.Linear):
+                modules.append(module)
+        known = set()
+        for module in modules:
+            for parameter in module.parameters():
+                known.add(id(parameter))
         planes = any(isinstance(module, Planes) for module in modules)
         if not planes or not all(
             id(parameter) in known or parameter.ndim == 1 for parameter in own.parameters()

@@ -123,7 +123,10 @@ def bounds(site: Site) -> Box:
 
 def _blocks(boxes: Sequence[Box], margin: float) -> list[Cell]:
     border = torch.full((3,), margin, dtype=torch.float64)
-    return [Cell(low=low, high=high, border=border) for low, high in boxes]
+    found: list[Cell] = []
+    for low, high in boxes:
+        found.append(Cell(low=low, high=high, border=border))
+    return found
 
 
 class GridLayout(BlockLayout):
@@ -137,15 +140,16 @@ class GridLayout(BlockLayout):
         low, high = bounds(site)
         counts = list(self.config.cells)
         if self.config.size is not None:
-            counts = [max(1, round(float(high[a] - low[a]) * site.unit / self.config.size)) for a in range(2)]
+            counts = []
+            for a in range(2):
+                counts.append(max(1, round(float(high[a] - low[a]) * site.unit / self.config.size)))
         margin = self.config.margin * min(float(high[a] - low[a]) / n for a, n in enumerate(counts))
         # what is found on the region's border lies inside its blocks
         low = low - margin
         high = high + margin
-        sides = [
-            torch.linspace(float(low[a]), float(high[a]), n + 1, dtype=low.dtype)
-            for a, n in enumerate(counts)
-        ]
+        sides = []
+        for a, n in enumerate(counts):
+            sides.append(torch.linspace(float(low[a]), float(high[a]), n + 1, dtype=low.dtype))
         lows = torch.cartesian_prod(sides[0][:-1], sides[1][:-1], low[2:])
         highs = torch.cartesian_prod(sides[0][1:], sides[1][1:], high[2:])
         # Cells that no camera stands in, and where next to nothing was found, are surroundings.
@@ -167,11 +171,10 @@ class AdaptiveLayout(BlockLayout):
     def cut(self, site: Site) -> list[Cell]:
         """The leaves that weigh anything, in the order of the tree."""
         low, high = bounds(site)
-        smallest = (
-            0.1 * float((high - low)[:2].amax())
-            if self.config.smallest is None
-            else self.config.smallest / site.unit
-        )
+        if self.config.smallest is None:
+            smallest = 0.1 * float((high - low)[:2].amax())
+        else:
+            smallest = self.config.smallest / site.unit
         # Places seen from above, and the training pixels that each stands for.
         points = site.points[((site.points >= low) & (site.points <= high)).all(1)]
         rays = site.rays.double()
@@ -207,7 +210,10 @@ class AdaptiveLayout(BlockLayout):
         ] or [(low, high)]
         # The border is that of the smallest side that may be: another budget moves no block that it does not
         # split.
-        margin = self.config.margin * smallest if len(leaves) > 1 else 0.0
+        if len(leaves) > 1:
+            margin = self.config.margin * smallest
+        else:
+            margin = 0.0
         # What is found on the region's border lies inside its blocks.
         return _blocks(
             [
@@ -259,15 +265,19 @@ def open_space(scene: ParsedScene, sightings: Sightings | None) -> Space:
         nearest = float(scene.depths[:, 0].amin())
     else:
         apart = torch.cdist(position[:: max(1, len(position) // SOME)], position)
-        unit = (
-            SPACINGS * float(apart.topk(2, largest=False).values[:, 1].median()) if len(position) > 1 else 0.0
-        )
+        if len(position) > 1:
+            unit = SPACINGS * float(apart.topk(2, largest=False).values[:, 1].median())
+        else:
+            unit = 0.0
     if unit <= ROUNDING * max(1.0, float(position.abs().amax())):
         raise DataError(
             f"{scene.name}: all cameras stand in one place and there are no points; capture from several places"
         )
     # Nothing nearer than half of the nearest point is looked at.
-    near = NEAR if nearest is None else min(NEAR, max(1e-3, 0.5 * nearest / unit))
+    if nearest is None:
+        near = NEAR
+    else:
+        near = min(NEAR, max(1e-3, 0.5 * nearest / unit))
     first, second, third = ((float(row[0]), float(row[1]), float(row[2])) for row in turn)
     middle = (float(centre[0]), float(centre[1]), float(centre[2]))
     return Space("open", middle, (first, second, third), 1 / unit, near, FAR)
@@ -278,7 +288,10 @@ def site_of(scene: ParsedScene, space: Space) -> Site:
     turn = torch.tensor(space.rotation, dtype=torch.float64)
     centre = torch.tensor(space.centre, dtype=torch.float64)
     cameras = scene.cameras.select(scene.train)
-    points = scene.points if scene.points is not None else centre.new_zeros(0, 3)
+    if scene.points is not None:
+        points = scene.points
+    else:
+        points = centre.new_zeros(0, 3)
     return Site(
         ((cameras.pose[:, :, 3] - centre) @ turn.T) * space.scale,
         cameras.size.prod(-1),
@@ -306,7 +319,9 @@ def tile_rays(
     side = size.amax(1) / TILES
     low = side[:, None] * torch.arange(TILES, dtype=torch.float64)
     # Pixel centres (+0.5) in each column and row of tiles, as `tile_of` puts them there.
-    ends = [torch.minimum(low + side[:, None], extent[:, None]) for extent in size.T]
+    ends = []
+    for extent in size.T:
+        ends.append(torch.minimum(low + side[:, None], extent[:, None]))
     columns, rows = (((end - 0.5).ceil() - (low - 0.5).ceil()).clamp_min(0).long() for end in ends)
     # The ray through the middle of each tile.
     middle = low + side[:, None] / 2
@@ -390,7 +405,10 @@ def make_plan(scene: ParsedScene, layout: LayoutConfig) -> Plan:
         parts.append((torch.stack(met, 1), pixels))
     seen, pixels = (torch.cat(column) for column in zip(*parts, strict=True))
     # A block that no pixel sees would learn nothing: it is part of the surroundings.
-    used = [block for block in range(len(cells)) if int((seen[:, block] * pixels).sum())]
+    used = []
+    for block in range(len(cells)):
+        if int((seen[:, block] * pixels).sum()):
+            used.append(block)
     if not used:
         raise ConfigError(
             f"{scene.name}: no training view sees any block of this layout; choose another --blocks"
@@ -523,18 +541,21 @@ def read_cells(file: Path) -> list[Cell]:
         if document["format"] != _FORMAT:
             raise ValueError(f"format {document['format']!r}, this fprf reads {_FORMAT}")
         frame = torch.tensor(document["frame"], dtype=torch.float64).reshape(3, 3)
-        return [
-            Cell(
-                low=_corner(each["low"], -math.inf),
-                high=_corner(each["high"], math.inf),
-                border=_corner(each["border"], 0.0),
-                frame=frame,
-                windows={
-                    v: (x, y, w, h) for v, x, y, w, h in from_json(each["windows"], _Windows, path="windows")
-                },
+        found: list[Cell] = []
+        for each in document["cells"]:
+            found.append(
+                Cell(
+                    low=_corner(each["low"], -math.inf),
+                    high=_corner(each["high"], math.inf),
+                    border=_corner(each["border"], 0.0),
+                    frame=frame,
+                    windows={
+                        v: (x, y, w, h)
+                        for v, x, y, w, h in from_json(each["windows"], _Windows, path="windows")
+                    },
+                )
             )
-            for each in document["cells"]
-        ]
+        return found
 
 
 def _corner(values: object, infinite: float) -> Annotated[Tensor, "3"]:

@@ -38,7 +38,9 @@ TABLE = 512
 
 def window(points: Annotated[Tensor, "N 3"], cell: Cell) -> Annotated[Tensor, "N"]:
     """Window of a block, in [0, 1]; without a border it is that of the bare cell."""
-    low, high, border = (each.to(points) for each in (cell.low, cell.high, cell.border))
+    low = cell.low.to(points)
+    high = cell.high.to(points)
+    border = cell.border.to(points)
     if not bool((cell.border > 0).all()):
         return ((points >= low) & (points <= high)).all(-1).to(points)
     # Distances are taken from the face before they are divided: a large scene must not lose them.
@@ -105,7 +107,8 @@ def chart_of(cell: Cell) -> Chart:
 
 def surroundings_of(cells: Sequence[Cell]) -> Chart:
     """The chart of what no block holds: contracted around the bounds of all cells."""
-    low, high = (torch.stack([getattr(cell, end) for cell in cells]) for end in ("low", "high"))
+    low = torch.stack([cell.low for cell in cells])
+    high = torch.stack([cell.high for cell in cells])
     return Chart(low.amin(0), high.amax(0), contracted=True)
 
 
@@ -161,11 +164,14 @@ class BlendRouter:
         self.columns = int(counts[0])
         self.rows = int(counts[1])
         # The middle of each square; it reaches half a diagonal around there, at any height.
-        column, row = (torch.arange(count, dtype=torch.float64) + 0.5 for count in (self.columns, self.rows))
+        column = torch.arange(self.columns, dtype=torch.float64) + 0.5
+        row = torch.arange(self.rows, dtype=torch.float64) + 0.5
         y, x = torch.meshgrid(low[1] + row * self.step, low[0] + column * self.step, indexing="ij")
         middle = torch.stack([x, y, torch.zeros_like(x)], -1).view(-1, 3)
         room = middle.new_tensor([0.75 * self.step, 0.75 * self.step, torch.inf])
-        touched = [Chart(chart.low - room, chart.high + room).inside(middle) for chart in charts]
+        touched = []
+        for chart in charts:
+            touched.append(Chart(chart.low - room, chart.high + room).inside(middle))
         # The set of blocks whose reach, seen from above, may touch each square. Rows come sorted; the empty
         # set is first, whether or not a square has it: it is what lies beyond the table.
         sets, number = torch.unique(torch.stack(touched, 1), dim=0, return_inverse=True)
@@ -188,11 +194,10 @@ class BlendRouter:
         groups = []
         present = torch.bincount(kind, minlength=len(self.sets)).nonzero()[:, 0].tolist()
         for number in present:
-            index = (
-                (kind == number).nonzero()[:, 0]
-                if len(present) > 1
-                else torch.arange(len(points), device=points.device)
-            )
+            if len(present) > 1:
+                index = (kind == number).nonzero()[:, 0]
+            else:
+                index = torch.arange(len(points), device=points.device)
             named = (*self.sets[number], len(self.cells))
             if len(named) == 1:
                 groups.append(Group(named, index, None))

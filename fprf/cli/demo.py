@@ -76,8 +76,12 @@ def run(args: list[str]) -> int:
     opened = open_gaussians(Run(root), training, "cpu", QualityConfig())
     scene = opened.scene
     views = opened.known.test
-    names = {garden / "references" / f"{name}.jpg": name for name in LOOKS}
-    chosen = [(name, StyleFile(StyleConfig(references=(path,)))) for path, name in names.items()]
+    names = {}
+    for name in LOOKS:
+        names[garden / "references" / f"{name}.jpg"] = name
+    chosen = []
+    for path, name in names.items():
+        chosen.append((name, StyleFile(StyleConfig(references=(path,)))))
     chosen.append(("all together", StyleFile(StyleConfig(references=tuple(names)))))
     with Display() as display:
         begun = time.perf_counter()

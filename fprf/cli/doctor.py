@@ -87,13 +87,12 @@ def run(args: list[str]) -> int:
     console = Console(highlight=False)
     bad = False
     for finding in findings:
-        mark = (
-            "[green]ok[/]      "
-            if not finding.remedy
-            else "[yellow]optional[/]"
-            if finding.optional
-            else "[red]problem[/] "
-        )
+        if not finding.remedy:
+            mark = "[green]ok[/]      "
+        elif finding.optional:
+            mark = "[yellow]optional[/]"
+        else:
+            mark = "[red]problem[/] "
         bad |= bool(finding.remedy) and not finding.optional
         console.print(f"{mark}  [bold]{escape(finding.what):<14}[/] {escape(finding.found)}", soft_wrap=True)
         if finding.remedy:
@@ -113,14 +112,19 @@ def machine() -> Iterator[Finding]:
         try:
             yield Finding(name, version(name))
         except PackageNotFoundError:
-            remedy = f'pip install "fprf[{extra}]"' if extra else f"pip install '{requirement}'"
+            if extra:
+                remedy = f'pip install "fprf[{extra}]"'
+            else:
+                remedy = f"pip install '{requirement}'"
             yield Finding(
                 name, f"not installed{f' (extra {extra})' if extra else ''}", remedy, optional=bool(extra)
             )
     try:
         import torch
 
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        cores = os.cpu_count()
+        if hasattr(os, "sched_getaffinity"):
+            cores = len(os.sched_getaffinity(0))
         yield Finding(
             "processor", f"{platform.machine()}, {cores} cores usable, {torch.get_num_threads()} threads"
         )
@@ -182,11 +186,10 @@ def self_test(name: str) -> Iterator[Finding]:
             remedy,
         )
         return
-    wrong = [
-        f"{each.what} is off by {each.error:.2g}, {each.allowed:g} is allowed"
-        for each in outcomes
-        if not each.right
-    ]
+    wrong = []
+    for each in outcomes:
+        if not each.right:
+            wrong.append(f"{each.what} is off by {each.error:.2g}, {each.allowed:g} is allowed")
     if wrong:
         yield Finding("self-test", f"{device} differs from the CPU: {'; '.join(wrong)}", remedy)
         return
@@ -204,7 +207,10 @@ def method_needs(name: str) -> Iterator[Finding]:
 
     config = method_config(name)
     for need in config.needs():
-        later = ", is downloaded when it is needed" if need.downloaded else " is missing"
+        if need.downloaded:
+            later = ", is downloaded when it is needed"
+        else:
+            later = " is missing"
         yield Finding("needs", need.what + later, need.remedy, optional=need.downloaded)
     filled = (
         f"{slot.path} {registry.name_of(slot.kind.group, type(slot.value))}"
@@ -248,9 +254,15 @@ def scene_folder(data: Path) -> Iterator[Finding]:
         )
     else:
         sightings = find_sightings(sparser(scene))
-        seeing = 0 if sightings is None else len({*sightings.view.tolist()})
+        if sightings is None:
+            seeing = 0
+        else:
+            seeing = len({*sightings.view.tolist()})
         found = f"{len(scene.points)} of the reconstruction, in view of {seeing} of {len(scene.train)} training views"
-        remedy = "" if seeing else "remove them, or give those of this scene: they lie elsewhere or behind"
+        if seeing:
+            remedy = ""
+        else:
+            remedy = "remove them, or give those of this scene: they lie elsewhere or behind"
         yield Finding("points", found, remedy, optional=True)
     if fault := useless_masks(scene):
         found, _, remedy = fault.partition("; ")

@@ -127,9 +127,10 @@ class _Export:
         """Depth and colours of the views."""
         from ..export.mesh import default_reach, render_maps
 
-        reach = (
-            default_reach(self.opened.known.facts.space) if self.config.reach is None else self.config.reach
-        )
+        if self.config.reach is None:
+            reach = default_reach(self.opened.known.facts.space)
+        else:
+            reach = self.config.reach
         scene = self.opened.scene.restyled(look.restyle)
         report = partial(self.display.count, what="rendering depth")
         return render_maps(scene, self.views, side=self.config.side, reach=reach, report=report)
@@ -156,9 +157,9 @@ class _Export:
         # Gaussians are written as they are, and never fitted to renders of themselves.
         if own and config.fit:
             raise UsageError("--fit: the run is of Gaussians already; leave it out")
-        rows = (
-            (scene.restyled(look.restyle).gaussian_rows() for look in self.looks) if own else self._fitted()
-        )
+        rows: Iterator[GaussianRows | None] = self._fitted()
+        if own:
+            rows = (scene.restyled(look.restyle).gaussian_rows() for look in self.looks)
         for look, gaussians in zip(self.looks, rows, strict=True):
             assert gaussians is not None
             count = gaussians.count

@@ -57,7 +57,10 @@ def run(args: list[str]) -> int:
     config, file = read_flags(
         GalleryConfig(), args, prog="fprf gallery", description=_DESCRIPTION, positional=("run",)
     )
-    output = config.output if config.output is not None else config.run / "gallery.html"
+    if config.output is not None:
+        output = config.output
+    else:
+        output = config.run / "gallery.html"
     if output.suffix.lower() != ".html":
         raise UsageError(f"--output {output}: the page is an .html file; give such a name")
     from ..datamanagers.images import load_image
@@ -133,7 +136,10 @@ def _called(paths: Sequence[Path]) -> dict[Path, str]:
     for path in paths:
         alike = sum(other.stem == path.stem for other in paths) > 1
         name = path.name if alike else path.stem
-        names[path] = f"{name} ({len(names) + 1})" if name in (CAPTURED, *names.values()) else name
+        if name in (CAPTURED, *names.values()):
+            names[path] = f"{name} ({len(names) + 1})"
+        else:
+            names[path] = name
     return names
 
 

@@ -71,7 +71,9 @@ def main(args: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return code
     except SystemExit as end:  # `fprf VERB --help` ends this way
-        return end.code if isinstance(end.code, int) else int(end.code is not None)
+        if isinstance(end.code, int):
+            return end.code
+        return int(end.code is not None)
     except BrokenPipeError:  # the reader left, as `head` does
         os.dup2(
             os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
@@ -95,7 +97,10 @@ def main(args: Sequence[str] | None = None) -> int:
             return 2
         if not debug:
             frames = traceback.extract_tb(error.__traceback__)
-            place = f" ({frames[-1].filename}:{frames[-1].lineno} in {frames[-1].name})" if frames else ""
+            if frames:
+                place = f" ({frames[-1].filename}:{frames[-1].lineno} in {frames[-1].name})"
+            else:
+                place = ""
             print(f"internal error: {type(error).__name__}: {error}{place}", file=sys.stderr)
             print(
                 "This is a fault of fprf or of a plug-in. Run it again with --debug and report the traceback.",
@@ -143,16 +148,19 @@ def _run(args: list[str]) -> int:
 
 def packaged() -> dict[str, str]:
     """Verbs of packages: name to the packages that provide it. Imports nothing."""
-    return {
-        name: " and ".join(each.package for each in entries)
-        for name, entries in installed(_GROUP).items()
-        if name not in VERBS
-    }
+    found: dict[str, str] = {}
+    for name, entries in installed(_GROUP).items():
+        if name not in VERBS:
+            found[name] = " and ".join(each.package for each in entries)
+    return found
 
 
 def _help() -> str:
     colour = sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
-    bold, dim, plain = ("\x1b[1m", "\x1b[2m", "\x1b[0m") if colour else ("", "", "")
+    if colour:
+        bold, dim, plain = ("\x1b[1m", "\x1b[2m", "\x1b[0m")
+    else:
+        bold, dim, plain = ("", "", "")
     others = packaged()
     width = max(map(len, [*VERBS, *others]))
     broad = max(len(verb.usage) for verb in VERBS.values())

@@ -90,8 +90,11 @@ def spell(args: Sequence[str], flags: dict[str, Flag]) -> list[str]:
         if flag and equals:  # --field=VALUE
             spelled.append(f"{key}={_literal(inline, flag)}")
         elif flag and bool in flag.kinds:  # --switch, --switch true
-            values = (*_TRUTHS, *_NONES) if type(None) in flag.kinds else _TRUTHS
-            spelled += [arg] if args[at + 1 : at + 2] in values else [arg, "True"]
+            truth_follows = args[at + 1 : at + 2] in _TRUTHS
+            none_follows = type(None) in flag.kinds and args[at + 1 : at + 2] in _NONES
+            spelled.append(arg)
+            if not truth_follows and not none_follows:
+                spelled.append("True")
         elif not flag and opposite and bool in opposite.kinds:  # --no-switch
             spelled += [opposite.text, "False"]
         elif before and not arg.startswith("--"):  # the value of the flag before it
@@ -196,7 +199,10 @@ def parse(
     for slot in slots(config):
         if isinstance(slot.value, Missing):
             slot.value.build()
-    flags = {text: flag for text, flag in flags_of(config).items() if flag.path not in positional}
+    flags = {}
+    for text, flag in flags_of(config).items():
+        if flag.path not in positional:
+            flags[text] = flag
     rest = spell(rest, flags)
     # What tyro says of a mistake is a box of many lines; ours is one.
     heard = io.StringIO()
@@ -210,10 +216,14 @@ def parse(
     except ConfigError as fault:
         # A range error names its field; here the flag that caused it, where the arguments tell which.
         field, _, reason = str(fault).partition(": ")
-        given = {_dashed(arg.partition("=")[0]) for arg in rest if arg.startswith("--")}
-        fits = [
-            text for text, flag in flags.items() if text in given and f".{flag.path}".endswith(f".{field}")
-        ]
+        given = set()
+        for arg in rest:
+            if arg.startswith("--"):
+                given.add(_dashed(arg.partition("=")[0]))
+        fits = []
+        for text, flag in flags.items():
+            if text in given and f".{flag.path}".endswith(f".{field}"):
+                fits.append(text)
         raise ConfigError(f"{fits[0]}: {reason}" if len(fits) == 1 and reason else str(fault)) from fault
     sys.stderr.write(heard.getvalue())
     return parsed
@@ -251,7 +261,9 @@ def _tyro(config: C, args: list[str], *, prog: str, description: str, positional
     markers = (tyro.conf.AvoidSubcommands, tyro.conf.FlagConversionOff)
     parsed = tyro.cli(main, args=args, prog=prog, description=description, config=markers)
     # Back to the config's own class, which checks the ranges.
-    values = {field.name: getattr(parsed, field.name) for field in dataclasses.fields(parsed)}
+    values = {}
+    for field in dataclasses.fields(parsed):
+        values[field.name] = getattr(parsed, field.name)
     return type(config)(**values)
 
 
@@ -267,7 +279,9 @@ def _with_positional(config: Any, names: tuple[str, ...]) -> Any:
     optional = (None, ())
     marked = []
     for name in names:
-        hint = None if getattr(config, name) in optional else "(required)"
+        hint = None
+        if getattr(config, name) not in optional:
+            hint = "(required)"
         arg = tyro.conf.arg(metavar=name.upper(), help_behavior_hint=hint)
         marked.append((name, Annotated[hints[name], tyro.conf.Positional, arg]))
     kind = dataclasses.make_dataclass(
@@ -278,7 +292,9 @@ def _with_positional(config: Any, names: tuple[str, ...]) -> Any:
         frozen=True,
         kw_only=True,
     )
-    values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    values = {}
+    for field in dataclasses.fields(config):
+        values[field.name] = getattr(config, field.name)
     return kind(**values | {name: tyro.MISSING for name in names if values[name] not in optional})
 
 
@@ -300,7 +316,9 @@ def _slot_flags(filled: list[Slot]) -> Any:
 
 def _filled_by(slot: Slot) -> str:
     """Name of what fills a slot now."""
-    return "none" if slot.value is None else registry.name_of(slot.kind.group, type(slot.value))
+    if slot.value is None:
+        return "none"
+    return registry.name_of(slot.kind.group, type(slot.value))
 
 
 def first_line(documented: object) -> str:

@@ -74,7 +74,10 @@ def run(args: list[str]) -> int:
     for step in ("choosing", "features", "matching", "mapping"):
         dropped = [drop for drop in content["dropped"] if drop["step"] == step]
         for drop in dropped if len(dropped) <= _NAMED else dropped[:1]:
-            count = "" if len(dropped) <= _NAMED else f"{len(dropped)} images, for example "
+            if len(dropped) <= _NAMED:
+                count = ""
+            else:
+                count = f"{len(dropped)} images, for example "
             print(f"lost in {step}: {count}{drop['image']}: {drop['reason']}")
     if content["dropped"]:
         print(f"all of them in {place.root / 'process.json'}")

@@ -107,23 +107,33 @@ def run(args: list[str]) -> int:
     opened = open_run(config.run, config.device, config)
     known = opened.known
     # Spirals, orbits and camera paths bring frames of their own.
-    views = known.views(config.split) if config.path in ("interpolate", "dataset") else []
+    if config.path in ("interpolate", "dataset"):
+        views = known.views(config.split)
+    else:
+        views = []
     cameras = make_path(known.cameras, views, config.path, config.frames, opened.scene.origin)
     fps = config.fps
     if fps is None:
-        fps = 24.0 if config.path in MOTIONS else read_camera_path(Path(config.path))[1]
+        if config.path in MOTIONS:
+            fps = 24.0
+        else:
+            fps = read_camera_path(Path(config.path))[1]
     # Captured views keep the stem of their image.
-    names = (
-        [known.names[view] for view in views]
-        if config.path == "dataset"
-        else [f"{i:05d}" for i in range(len(cameras))]
-    )
+    if config.path == "dataset":
+        names = [known.names[view] for view in views]
+    else:
+        names = [f"{i:05d}" for i in range(len(cameras))]
     takes = _takes(opened.scene, config, file)
     # Frames of a film wait in a folder beside it, hidden as nobody's own is, which goes when the film is
     # whole.
     whole = config.output.suffix.lower() in FILMS
-    folder = config.output.with_name(f".{config.output.stem}.frames") if whole else config.output
-    paths = [folder / f"{name}.{'png' if whole else config.format}" for name in names]
+    if whole:
+        folder = config.output.with_name(f".{config.output.stem}.frames")
+    else:
+        folder = config.output
+    paths = []
+    for name in names:
+        paths.append(folder / f"{name}.{'png' if whole else config.format}")
     key = _key(opened, config, cameras)
     todo = missing_frames(folder, key, paths)
     if len(todo) < len(paths):
@@ -134,10 +144,14 @@ def run(args: list[str]) -> int:
         if "depth" in config.show and todo:
             # One range of depths for the whole film, from a few small frames: else colours would flicker.
             some = sorted({k * (len(cameras) - 1) // (_PROBES - 1) for k in range(_PROBES)})
-            probes = [opened.scene.render(cameras, k, resolution=_PROBE_RESOLUTION) for k in some]
+            probes = []
+            for k in some:
+                probes.append(opened.scene.render(cameras, k, resolution=_PROBE_RESOLUTION))
             limits = depth_limits([view.depth for view in probes], [view.opacity for view in probes])
         for done, path in enumerate(todo):
-            left = (time.perf_counter() - start) / done * (len(todo) - done) if done else None
+            left = None
+            if done:
+                left = (time.perf_counter() - start) / done * (len(todo) - done)
             display.count(done, len(todo), "rendering", seconds_left=left)
             # Each frame is written as soon as it is done, so that an interrupted film goes on.
             write_image(
@@ -171,7 +185,10 @@ def _panels(
     from ..style.match_maps import match_map, match_picture
 
     # No style moves anything: depth and normals are those of any look that is rendered already.
-    views = [take.scene(frame).render(cameras, frame) for take in takes] if "colour" in config.show else []
+    if "colour" in config.show:
+        views = [take.scene(frame).render(cameras, frame) for take in takes]
+    else:
+        views = []
     geometry = views[0] if views else scene.render(cameras, frame)
     shown: list[Picture] = []
     for channel in config.show:
@@ -187,7 +204,10 @@ def _panels(
             )
             shown.append(to_uint8(0.5 + 0.5 * turned * cover))
         else:
-            styles = [take.styled for take in takes if take.styled is not None]
+            styles = []
+            for take in takes:
+                if take.styled is not None:
+                    styles.append(take.styled)
             shown += [
                 match_picture(match_map(scene, styled, frame, cameras), styled.codes) for styled in styles
             ]
@@ -199,9 +219,10 @@ def _key(opened: "LoadedRun[Scene]", config: RenderVerbConfig, cameras: "Cameras
     name.
     """
     digest = hashlib.sha256(f"{opened.run.root.resolve()} {opened.step} {opened.seconds}".encode())
-    settings = {
-        name: value for name, value in vars(config).items() if name not in ("output", "device", "fps", "run")
-    }
+    settings = {}
+    for name, value in vars(config).items():
+        if name not in ("output", "device", "fps", "run"):
+            settings[name] = value
     digest.update(repr(sorted(settings.items())).encode() + (opened.run.root / "config.json").read_bytes())
     for tensor in (
         cameras.pose,

@@ -131,7 +131,10 @@ def run(args: list[str]) -> int:
         for name, each in named:
             start = time.perf_counter()
             styled = apply_style(scene, each, encoders)
-            styled = light_alone(styled, gain) if config.match_light else styled
+            if config.match_light:
+                styled = light_alone(styled, gain)
+            else:
+                styled = styled
             made.append(_Restyled(name, styled, scene.restyled(styled.restyle), time.perf_counter() - start))
         # File by file, each in all styles: one of them is in memory at a time.
         left = Counter[str]()
@@ -157,7 +160,10 @@ def run(args: list[str]) -> int:
                 faulty = written.faulty
                 where = f"{output.name}: " if len(outputs) > 1 else ""
                 losses |= dict.fromkeys(f"{where}{loss}" for loss in written.losses())
-                beside = "style.json" if folder else f"{stem_of(output)}.style.json"
+                if folder:
+                    beside = "style.json"
+                else:
+                    beside = f"{stem_of(output)}.style.json"
                 write_style(output.with_name(beside), one.styled.controls.saved)
                 made[i] = one._replace(seconds=one.seconds + time.perf_counter() - start)
             for number, what in (each.split(" ", 1) for each in capture.gaussians.faults()):
@@ -181,7 +187,10 @@ def run(args: list[str]) -> int:
     missing = "".join(
         f", {each}" for each in (*(f"{number} {what}" for what, number in left.items()), *losses)
     )
-    files = f" in {len(config.captures)} files" if len(config.captures) > 1 else ""
+    if len(config.captures) > 1:
+        files = f" in {len(config.captures)} files"
+    else:
+        files = ""
     print(
         f"{seen.count} Gaussians{files}{missing}; looked at in {looked:.1f} s, {each_seconds:.2f} s for each of {len(made)} "
         f"styles, at most {(peak() or 0) / 1e9:.1f} GB"
@@ -269,7 +278,10 @@ def _with_views(config: RestyleConfig, file: StyleFile) -> StyleFile:
             continue
         if mask != NO_MASK:
             raise UsageError(f"--masks: {mask} is for one photograph, {path} gives several views; write none")
-        name = stems[i] if stems.count(stems[i]) == 1 else f"{stems[i]}-{i}"
+        if stems.count(stems[i]) == 1:
+            name = stems[i]
+        else:
+            name = f"{stems[i]}-{i}"
         pictures, covers, shares = reference_views(
             path, config, beside.parent / f"{stem_of(beside)}.references" / name
         )
@@ -292,7 +304,10 @@ def _with_views(config: RestyleConfig, file: StyleFile) -> StyleFile:
     pictures, covers, numbers = zip(*rows, strict=True)
     # A capture shows what there is, not a mood: where no photograph is among them, everything takes its
     # match.
-    bold = 1.0 if len(scenes) == len(style.references) and style.bold == StyleConfig().bold else style.bold
+    if len(scenes) == len(style.references) and style.bold == StyleConfig().bold:
+        bold = 1.0
+    else:
+        bold = style.bold
     return file._replace(
         style=replace(
             style, references=pictures, masks=covers, weights=numbers, pin=pin, forbid=forbid, bold=bold
@@ -309,7 +324,10 @@ def _styles(config: RestyleConfig, file: StyleFile) -> list[tuple[str, StyleFile
     stems = [path.stem.replace(".", "_") for path in config.references]
     for i, path in enumerate(config.references):
         style = replace(file.style, references=(path,), weights=(), masks=file.style.masks[i : i + 1])
-        name = stems[i] if stems.count(stems[i]) == 1 else f"{stems[i]}-{i}"
+        if stems.count(stems[i]) == 1:
+            name = stems[i]
+        else:
+            name = f"{stems[i]}-{i}"
         alone.append((name, file._replace(style=style)))
     return alone
 

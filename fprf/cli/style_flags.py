@@ -54,7 +54,10 @@ def read_flags(
     # own default holds.
     path = _style_flag(args)
     centred = getattr(default.stylizer, "centred", True)
-    file = read_style(path, centred=centred) if path is not None else StyleFile(StyleConfig())
+    if path is not None:
+        file = read_style(path, centred=centred)
+    else:
+        file = StyleFile(StyleConfig())
     if path is not None:
         default = replace(default, **_styles(file.style))
     kind = type(default.stylizer)
@@ -88,18 +91,20 @@ def say(text: str) -> None:
 
 
 def _styles(config: StyleConfig) -> dict[str, Any]:
-    return {field.name: getattr(config, field.name) for field in fields(StyleConfig)}
+    found: dict[str, Any] = {}
+    for field in fields(StyleConfig):
+        found[field.name] = getattr(config, field.name)
+    return found
 
 
 def _joined(args: Sequence[str], config: StyleConfig) -> list[str]:
     """The arguments with each flag of many values once, with all of its values: otherwise the last one alone
     would count.
     """
-    many = {
-        f"--{field.name.replace('_', '-')}"
-        for field in fields(config)
-        if isinstance(getattr(config, field.name), tuple)
-    }
+    many = set()
+    for field in fields(config):
+        if isinstance(getattr(config, field.name), tuple):
+            many.add(f"--{field.name.replace('_', '-')}")
     rest: list[str] = []
     values: dict[str, list[str]] = {}
     into = rest
@@ -160,9 +165,13 @@ def style_name(style: Path | None, references: Sequence[Path]) -> str:
     Cut to what every file system takes.
     """
     if style is not None:
-        return style.stem if style.name != "style.json" else style.resolve().parent.name or "style"
+        if style.name != "style.json":
+            return style.stem
+        return style.resolve().parent.name or "style"
     joined = "+".join(path.stem for path in references)
-    return joined if len(joined) <= _JOINED else f"{joined[:_JOINED]}+{len(references)}"
+    if len(joined) <= _JOINED:
+        return joined
+    return f"{joined[:_JOINED]}+{len(references)}"
 
 
 def tidy(name: str) -> str:

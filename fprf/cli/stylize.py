@@ -119,16 +119,20 @@ def _make(
                 matching += time.perf_counter() - start
                 summaries[name] = summarize(matched, styled.codes)
                 codes = styled.codes
-                pictures = (
-                    {"match": match_picture(matched, codes)} if shown else match_pictures(matched, codes)
-                )
+                if shown:
+                    pictures = {"match": match_picture(matched, codes)}
+                else:
+                    pictures = match_pictures(matched, codes)
                 for which, map_picture in pictures.items():
                     write_image(output / f"{name}-{which}.png", map_picture)
         display.count(len(views), len(views), "restyling" if shown else "matching")
     count = max(1, len(views))
     made: dict[str, Any] = {"seconds_per_view": rendering / count} if shown else {}
     made |= {"match_seconds_per_view": matching / count, "matches": summaries}
-    what, each = ("views", rendering / count) if shown else ("match maps", matching / count)
+    if shown:
+        what, each = ("views", rendering / count)
+    else:
+        what, each = ("match maps", matching / count)
     print(f"{len(views)} {what} in {output}  ({each:.2f} s each)")
     return made
 
@@ -154,10 +158,15 @@ def print_explained(output: Path, regions: "Regions", styled: "Styled | None") -
         if region.taken:
             best = [taken for taken in region.taken if taken.share >= _SHOWN][:3] or list(region.taken[:1])
             takes = ", ".join(f"{taken.name} {taken.share:.0%} (score {taken.score:.2f})" for taken in best)
-            strength = "kept" if region.strength == 0 else f"{region.strength:.2g}"
+            if region.strength == 0:
+                strength = "kept"
+            else:
+                strength = f"{region.strength:.2g}"
             cells += [strength, f"{region.confidence:.0%}", f"{region.entropy:.1f} bit", takes]
         table.append(tuple(cells))
-    widths = [max(len(cell) for cell in column) for column in zip(*table, strict=True)]
+    widths = []
+    for column in zip(*table, strict=True):
+        widths.append(max(len(cell) for cell in column))
     for row in table:
         print("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
     write_json(

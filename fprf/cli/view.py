@@ -124,7 +124,9 @@ def run(args: list[str]) -> int:
                 stack.callback(start.close)
             else:
                 opening = functools.partial(load, path)
-                session = None if config.follow else server.open(opening)
+                session = None
+                if not config.follow:
+                    session = server.open(opening)
                 if not is_capture(path):
                     from ..page.session import TrainingFollower
 

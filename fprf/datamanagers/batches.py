@@ -198,15 +198,24 @@ class RayBatches(DataManager):
                 self._pixels[filled : filled + len(rows)] = rows
                 filled += len(rows)
         # Pixels that may be drawn, those of sky, and those that show points.
-        masks, skies = (scene.masks, scene.sky_masks) if config.masks else ((), ())
+        if config.masks:
+            masks, skies = (scene.masks, scene.sky_masks)
+        else:
+            masks, skies = ((), ())
         every = PixelRuns(torch.zeros(1, dtype=torch.int64), self._ends[-1:])
-        self._chosen = self._runs(masks, unmasked=True, seen=seen) if masks or seen is not None else every
+        if masks or seen is not None:
+            self._chosen = self._runs(masks, unmasked=True, seen=seen)
+        else:
+            self._chosen = every
         if not len(self._chosen):
             raise DataError(
                 f"{scene.name}: none of {len(self._views)} training views shows what is to be learnt"
             )
         sky = self._runs(skies, unmasked=False) if skies else None
-        marked, distance = self._marked() if config.depth_share > 0 else (None, None)
+        if config.depth_share > 0:
+            marked, distance = self._marked()
+        else:
+            marked, distance = (None, None)
         self._source = _Source(
             self._pixels, scene.train, self._sizes, self._ends, self._chosen, sky, marked, distance
         )
@@ -299,7 +308,10 @@ class RayBatches(DataManager):
                 width, height = self._sizes[slot].tolist()
                 path = paths[view] if paths else None
                 mask = torch.full((height, width), unmasked)
-                mask = mask if path is None else torch.from_numpy(load_mask(path, (width, height)))
+                if path is None:
+                    mask = mask
+                else:
+                    mask = torch.from_numpy(load_mask(path, (width, height)))
                 yield int(self._ends[slot]) - width * height, mask if seen is None else mask & seen(view)
 
         return PixelRuns.of(masks())
@@ -326,4 +338,6 @@ class RayBatches(DataManager):
         width, height = self._sizes[slot].unbind(1)
         at = self._ends[slot] - width * height + pixel[:, 1] * width + pixel[:, 0]
         kept = self._chosen.holds(at)
-        return (at[kept], sightings.distance[kept].float()) if bool(kept.any()) else (None, None)
+        if bool(kept.any()):
+            return (at[kept], sightings.distance[kept].float())
+        return (None, None)

@@ -98,7 +98,9 @@ def find_kind(scene: ParsedScene) -> Kind:
         return "contraction"
     # ... and stand close together against the depth of what they see.
     offset = cameras.pose[:, :, 3] - cameras.pose[:, :, 3].mean(0)
-    return "ndc" if offset.norm(dim=-1).amax() < FORWARD_SPREAD * depth.median() else "contraction"
+    if offset.norm(dim=-1).amax() < FORWARD_SPREAD * depth.median():
+        return "ndc"
+    return "contraction"
 
 
 def _depths(scene: ParsedScene) -> Tensor | None:
@@ -131,7 +133,10 @@ def axes(cameras: Cameras) -> Tensor:
     # The direction of most spread across the vertical.
     offset = cameras.pose[:, :, 3] - cameras.pose[:, :, 3].mean(0)
     flat = offset - (offset @ up)[:, None] * up
-    along = torch.linalg.svd(flat, full_matrices=False).Vh[0] if len(flat) > 1 else cameras.pose[0, :, 0]
+    if len(flat) > 1:
+        along = torch.linalg.svd(flat, full_matrices=False).Vh[0]
+    else:
+        along = cameras.pose[0, :, 0]
     along = along - (along @ up) * up
     if along.norm() < 1e-6:
         along = torch.linalg.svd(up[None], full_matrices=True).Vh[1]
@@ -164,7 +169,10 @@ def _contraction(scene: ParsedScene) -> Space:
             f"{scene.name}: all cameras stand in one place and there are no points; capture from several places"
         )
     nearest = _nearest(scene)
-    near = NEAR if nearest is None else min(NEAR, 0.5 * nearest / radius)
+    if nearest is None:
+        near = NEAR
+    else:
+        near = min(NEAR, 0.5 * nearest / radius)
     return Space("contraction", _three(centre), _rows(rotation), 1 / radius, max(near, 1e-3), FAR)
 
 
@@ -175,7 +183,9 @@ def _nearest(scene: ParsedScene) -> float | None:
     if scene.depths is not None:
         return float(scene.depths[:, 0].amin())
     depth = _depths(scene)
-    return None if depth is None else float(depth.quantile(0.001 if len(depth) >= 1000 else 0.0))
+    if depth is None:
+        return None
+    return float(depth.quantile(0.001 if len(depth) >= 1000 else 0.0))
 
 
 def _ndc(scene: ParsedScene) -> Space:

@@ -154,7 +154,10 @@ class FeatureStore:
         variance = (weight * (variances + (means - mean).square())).sum(0) / weight.sum()
         self.std = float(variance.mean().sqrt())
         """Root mean square over the channels' standard deviations, over all pixels."""
-        self.scale = self.std if self.std > 1e-6 * float(self._centre.abs().max()) else 1.0
+        if self.std > 1e-6 * float(self._centre.abs().max()):
+            self.scale = self.std
+        else:
+            self.scale = 1.0
         """The unit of losses: `std`, or 1 where the features do not change but for rounding."""
         # Kernels read the coefficients where they lie, in mapped files.
         self._address = torch.tensor([coefs.data_ptr() for coefs in self._coefs])
@@ -198,7 +201,8 @@ class FeatureStore:
                 f"feature store: view {int(missing.min())} has no features; {len(self._coefs)} training views have"
             )
         # The kernel takes contiguous float32 on the CPU, colours about mid-grey as they are stored.
-        positions, colours = (x.detach().cpu().float().contiguous() for x in (pixel, rgb))
+        positions = pixel.detach().cpu().float().contiguous()
+        colours = rgb.detach().cpu().float().contiguous()
         out = torch.empty(len(view), self.channels)
         tensors = slot, self._address, self._shape, self._scale, self._centre, positions, colours - GREY, out
         slots, address, shape, scale, centre, places, offsets, found = (part.numpy() for part in tensors)
@@ -238,7 +242,10 @@ def extract(
     remembered: dict[int, Tensor] = {}
     if basis is None and dim is not None:
         basis = _basis(folder, prints, image, encoder, dim, remembered)
-    projection = digest(*(t.numpy().tobytes() for t in basis.tensors().values())) if basis else "raw"
+    if basis:
+        projection = digest(*(t.numpy().tobytes() for t in basis.tensors().values()))
+    else:
+        projection = "raw"
     device = _device(encoder)
     # Other devices round otherwise; files without "float32" are from when CUDA convolved in TF32.
     place = () if device.type == "cpu" else (device.type, "float32")
@@ -256,7 +263,10 @@ def extract(
         tensors = read_kept(folder, key)
         features = remembered.pop(view, None)
         if tensors is None or tensors.keys() != set(Entry._fields):
-            features = _encode(encoder, pixels, view) if features is None else features
+            if features is None:
+                features = _encode(encoder, pixels, view)
+            else:
+                features = features
             made = _make(features, pixels, basis, radius=radius, eps=config.eps, stride=stride)._asdict()
             tensorfiles.save(folder / f"{key}.safetensors", made, sealed=True)
             # Read back: what trains is what lies on disk, mapped rather than held in memory.

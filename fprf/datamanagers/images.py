@@ -210,7 +210,12 @@ def load_mask(path: Path, size: tuple[int, int] | None = None, *, upright: bool 
     grey = np.asarray(colour.convert("L"))
     if alpha is not None:
         opaque = np.asarray(alpha)
-        grey = opaque if np.ptp(opaque) else grey if np.ptp(grey) else np.minimum(grey, opaque)
+        if np.ptp(opaque):
+            grey = opaque
+        elif np.ptp(grey):
+            grey = grey
+        else:
+            grey = np.minimum(grey, opaque)
     half = 127
     if grey.max() <= half and read_header(path).kind in ("PNG", "BMP", "TIFF"):
         half = int(grey.min()) if np.ptp(grey) else 0
@@ -302,7 +307,10 @@ def photographs(paths: Sequence[Path], report: Callable[[str], None]) -> list[Pa
     # Those of folders are tried, in threads; those that are named are taken as they are.
     listed: dict[Path, None] = {}
     for path in paths:
-        images = [path / name for name in image_names(path)] if path.is_dir() else []
+        if path.is_dir():
+            images = [path / name for name in image_names(path)]
+        else:
+            images = []
         with ThreadPoolExecutor() as pool:
             faults = dict(zip(images, pool.map(fault, images), strict=True))
         for reason in filter(None, faults.values()):
@@ -326,7 +334,10 @@ def _decode(
     with opened(path) as file:
         kind, image = open_image(file, path)
         # For TIFF Pillow has a limit of its own, above which it warns.
-        most = min(MAX_PIXELS, PIL.Image.MAX_IMAGE_PIXELS or MAX_PIXELS) if kind == "TIFF" else MAX_PIXELS
+        if kind == "TIFF":
+            most = min(MAX_PIXELS, PIL.Image.MAX_IMAGE_PIXELS or MAX_PIXELS)
+        else:
+            most = MAX_PIXELS
         if image.width * image.height > most:
             raise DataError(
                 f"{path}: {image.width}x{image.height} pixels; at most {most:.0e} are read: reduce the image"
@@ -346,7 +357,10 @@ def _decode(
             if kind == "TIFF":
                 # Pillow has turned them: they are turned back. 6 and 8 are each other's inverse, the rest
                 # their own.
-                stored = 1 if upright else {6: 8, 8: 6}.get(stored, stored)
+                if upright:
+                    stored = 1
+                else:
+                    stored = {6: 8, 8: 6}.get(stored, stored)
             elif kind == "AVIF" or (upright and kind != "HEIC"):
                 stored = exif_orientation(image)
             turn = _TURNS.get(stored)
@@ -368,7 +382,10 @@ def _decode(
         grey = pixels.mode in ("1", "L", "LA")
         pixels = pixels.convert("RGBA")
         alpha = pixels.getchannel("A")
-        pixels = pixels.getchannel("R") if grey else pixels.convert("RGB")
+        if grey:
+            pixels = pixels.getchannel("R")
+        else:
+            pixels = pixels.convert("RGB")
     if pixels.mode not in ("L", "RGB", "CMYK"):
         pixels = pixels.convert("L" if pixels.mode == "1" else "RGB")
     # To sRGB, and upright.
@@ -376,7 +393,10 @@ def _decode(
         mode, transform = _transform(profile)
         if mode == "RGB" and pixels.mode == "L":
             pixels = pixels.convert("RGB")
-        pixels = pixels if transform is None or pixels.mode != mode else transform.apply(pixels)
+        if transform is None or pixels.mode != mode:
+            pixels = pixels
+        else:
+            pixels = transform.apply(pixels)
     if turn is not None:
         pixels = pixels.transpose(turn)
         alpha = alpha and alpha.transpose(turn)

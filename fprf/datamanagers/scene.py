@@ -110,13 +110,14 @@ def find_sightings(scene: ParsedScene) -> Sightings | None:
     if scene.seen is not None:
         kept = scene.seen[torch.isin(scene.seen[:, 0], scene.train)]
         kept = kept[kept[:, 0].argsort(stable=True)]
-        parts = [
-            _sighted(scene.cameras, view, scene.points[point])
-            for view, point in torch.split(kept.T, PIECE, 1)
-        ]
+        parts = []
+        for view, point in torch.split(kept.T, PIECE, 1):
+            parts.append(_sighted(scene.cameras, view, scene.points[point]))
     else:
         points = scene.points[:: max(1, len(scene.points) * len(scene.train) // PROJECTIONS)]
-        parts = [_nearest(scene.cameras, view, points) for view in scene.train.tolist()]
+        parts = []
+        for view in scene.train.tolist():
+            parts.append(_nearest(scene.cameras, view, points))
     sightings = Sightings(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
     return sightings if len(sightings.view) else None
 
@@ -185,7 +186,9 @@ def with_exposure(scene: ParsedScene, image: Callable[[int], Annotated[Tensor, "
         return scene
     # g of the training views; their mean is what nobody knows, and 0.
     sightings = find_sightings(sparser(scene))
-    gain = None if sightings is None else _gains(sightings, scene, image)
+    gain = None
+    if sightings is not None:
+        gain = _gains(sightings, scene, image)
     if gain is None:
         return scene
     train = scene.train.sort().values
@@ -232,7 +235,9 @@ def _gains(
     for _ in range(2):
         known = torch.bincount(view, minlength=len(scene.paths))[view] >= LEAST
         shared = torch.bincount(point)[point] >= 2
-        view, point, bright = (x[known & shared] for x in (view, point, bright))
+        view = view[known & shared]
+        point = point[known & shared]
+        bright = bright[known & shared]
         if not len(view):
             break
         gain, error = _solve(view, point, bright, len(scene.paths))

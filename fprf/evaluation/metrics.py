@@ -93,7 +93,9 @@ def psnr(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"]) -> float:
     """
     first, second = _pair(a, b)
     error = _finite("psnr", float((first - second).square().mean()))
-    return min(PSNR_CAP, -10 * math.log10(error)) if error > 0 else PSNR_CAP
+    if error > 0:
+        return min(PSNR_CAP, -10 * math.log10(error))
+    return PSNR_CAP
 
 
 def ssim(
@@ -137,7 +139,9 @@ def lpips(
     """
     a, b = _pair(a, b)
     # Both images as one batch; small ones are enlarged, since the second pooling would leave nothing of them.
-    weights = {name: value.to(a.device) for name, value in _weights().items()}
+    weights = {}
+    for name, value in _weights().items():
+        weights[name] = value.to(a.device)
     pair = torch.stack([a, b]).float().permute(0, 3, 1, 2)
     if min(pair.shape[2:]) < _SMALLEST:
         scale = _SMALLEST / min(pair.shape[2:])
@@ -160,7 +164,8 @@ def _activations(
     weights: Mapping[str, Tensor], images: Annotated[Tensor, "B 3 H W"]
 ) -> Iterator[Annotated[Tensor, "B C h w"]]:
     """Of AlexNet's convolutions, one after the other."""
-    shift, scale = (images.new_tensor(each).view(1, 3, 1, 1) for each in (_SHIFT, _SCALE))
+    shift = images.new_tensor(_SHIFT).view(1, 3, 1, 1)
+    scale = images.new_tensor(_SCALE).view(1, 3, 1, 1)
     x = (2 * images - 1 - shift) / scale
     for layer, (stride, padding) in enumerate(zip(_STRIDES, _PADS, strict=True), start=1):
         if layer in _POOLED:
@@ -230,7 +235,10 @@ def mean_metrics(views: Iterable[Mapping[str, float]]) -> dict[str, float]:
     rows = list(views)
     if not rows:
         raise DataError("no views to average metrics over; the split is empty")
-    return {name: math.fsum(row[name] for row in rows) / len(rows) for name in rows[0]}
+    found: dict[str, float] = {}
+    for name in rows[0]:
+        found[name] = math.fsum(row[name] for row in rows) / len(rows)
+    return found
 
 
 def warp(

@@ -100,7 +100,10 @@ class Plan(NamedTuple):
         """
         if self.single is not None:
             return [self.single]
-        return [self.folder / f"{base}{f'.{look}' if look else ''}{suffix}" for suffix in suffixes]
+        found: list[Path] = []
+        for suffix in suffixes:
+            found.append(self.folder / f"{base}{f'.{look}' if look else ''}{suffix}")
+        return found
 
 
 def plan(kinds: Sequence[str], output: Path) -> Plan:
@@ -108,7 +111,10 @@ def plan(kinds: Sequence[str], output: Path) -> Plan:
 
     Raises UsageError for what does not fit.
     """
-    formats = [ending[1:] for ending in endings() if ending[1:] not in KINDS]
+    formats = []
+    for ending in endings():
+        if ending[1:] not in KINDS:
+            formats.append(ending[1:])
     known = [*formats, *KINDS]
     for kind in kinds:
         if kind not in known:
@@ -120,7 +126,10 @@ def plan(kinds: Sequence[str], output: Path) -> Plan:
     if kind_of_file is None or output.is_dir():
         return Plan(tuple(wanted) or _DEFAULT, output, None)
     # A .ply holds Gaussians or a mesh.
-    allowed = [kind_of_file, "glb"] if kind_of_file == "ply" else [kind_of_file]
+    if kind_of_file == "ply":
+        allowed = [kind_of_file, "glb"]
+    else:
+        allowed = [kind_of_file]
     if len(wanted) > 1 or (wanted and wanted[0] not in allowed):
         raise UsageError(
             f"--output {output}: a single file of this ending holds {' or '.join(allowed)}, not {' and '.join(wanted)}; "

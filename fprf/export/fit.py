@@ -52,7 +52,10 @@ def seen_points(maps: Maps, most: int) -> Points:
     shade = torch.cat(colour)[every]
     # What sees no surface is put on a dome beyond all that there is.
     solid = at.isfinite().all(1)
-    far = _SKY * float((at[solid] - middle).norm(dim=1).max()) if bool(solid.any()) else 1.0
+    if bool(solid.any()):
+        far = _SKY * float((at[solid] - middle).norm(dim=1).max())
+    else:
+        far = 1.0
     return Points(torch.where(solid[:, None], at, middle + far * direction).numpy(), shade.float().numpy())
 
 

@@ -94,7 +94,11 @@ class Mesh(NamedTuple):
 
 def default_reach(space: Space) -> float:
     """Distance up to which surfaces are looked for, in world units: a bounded box is looked at as a whole."""
-    return math.inf if space.kind == "box" else 50 * space.near if space.kind == "ndc" else 20 / space.scale
+    if space.kind == "box":
+        return math.inf
+    if space.kind == "ndc":
+        return 50 * space.near
+    return 20 / space.scale
 
 
 def render_maps(scene: Scene, cameras: Cameras, *, side: int, reach: float, report: Report) -> Maps:
@@ -313,7 +317,8 @@ def surface_nets(
         # Round the edge the four cells run counter-clockwise seen from its far end, which is outside if its
         # start is inside.
         corner = torch.where(outwards[:, None], corner, corner.flip(1))
-        one, other = ((at[corner[:, k]] - at[corner[:, k + 2]]).norm(dim=-1) for k in (0, 1))
+        one = (at[corner[:, 0]] - at[corner[:, 0 + 2]]).norm(dim=-1)
+        other = (at[corner[:, 1]] - at[corner[:, 1 + 2]]).norm(dim=-1)
         corner = torch.where((one <= other)[:, None], corner, corner.roll(-1, 1))
         faces += [corner[:, [0, 1, 2]], corner[:, [0, 2, 3]]]
     return at, torch.cat(faces)

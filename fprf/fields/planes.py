@@ -80,7 +80,11 @@ def mlp(inputs: int, hidden: int, layers: int, outputs: int, *, generator: torch
 
 def weights(network: nn.Sequential) -> list[Tensor]:
     """Weights of each linear map, [outputs, inputs]."""
-    return [layer.weight for layer in network if isinstance(layer, nn.Linear)]
+    found: list[Tensor] = []
+    for layer in network:
+        if isinstance(layer, nn.Linear):
+            found.append(layer.weight)
+    return found
 
 
 class Planes(nn.Module):

@@ -25,7 +25,10 @@ def unwritable(path: Path, error: OSError, needed: int | None = None) -> DataErr
         free = f", {shutil.disk_usage(folder).free >> 10} KiB are free there"
     except (OSError, StopIteration):
         free = ""
-    wants = "" if needed is None else f", {-(-needed // 1024)} KiB are needed"
+    if needed is None:
+        wants = ""
+    else:
+        wants = f", {-(-needed // 1024)} KiB are needed"
     return DataError(
         f"{path}: cannot be written ({reason}{wants}{free}); make room, or choose a folder that can be written to"
     )

@@ -66,7 +66,10 @@ def data_uri(picture: Picture) -> str:
 
 def resized(picture: Picture, width: int, height: int) -> Picture:
     """The picture in another size: area-averaged where it gets smaller, bicubic where it gets larger."""
-    how = cv2.INTER_AREA if height < picture.shape[0] or width < picture.shape[1] else cv2.INTER_CUBIC
+    if height < picture.shape[0] or width < picture.shape[1]:
+        how = cv2.INTER_AREA
+    else:
+        how = cv2.INTER_CUBIC
     return np.asarray(cv2.resize(picture, (width, height), interpolation=how), dtype=np.uint8)
 
 

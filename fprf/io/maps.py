@@ -59,10 +59,9 @@ def depth_limits(
 
     (0, 1) where nothing is solid in any view.
     """
-    seen = [
-        (1 / depth[_solid(depth, opacity)]).cpu().numpy()
-        for depth, opacity in zip(depths, opacities, strict=True)
-    ]
+    seen = []
+    for depth, opacity in zip(depths, opacities, strict=True):
+        seen.append((1 / depth[_solid(depth, opacity)]).cpu().numpy())
     disparity = np.concatenate([np.zeros(0, np.float32), *seen])
     if not len(disparity):
         return 0.0, 1.0
@@ -81,13 +80,19 @@ def depth_image(
     The colour is even in disparity, which is how much a place moves between views. Inferno: perceptually
     even, legible in greyscale and to the colour-blind.
     """
-    low, high = depth_limits([depth], [opacity]) if limits is None else limits
+    if limits is None:
+        low, high = depth_limits([depth], [opacity])
+    else:
+        low, high = limits
     solid = _solid(depth, opacity, 0.0)
     disparity = torch.where(
         solid, 1 / torch.where(solid, depth, torch.ones_like(depth)), torch.zeros_like(depth)
     )
     # A plane square to the view has one disparity: shown as halfway, not as noise.
-    even = (disparity - low) / (high - low) if high > low else torch.full_like(disparity, 0.5)
+    if high > low:
+        even = (disparity - low) / (high - low)
+    else:
+        even = torch.full_like(disparity, 0.5)
     # Inferno's first steps are black: stay off them, so that far places keep some hue.
     return _over_empty(
         _mapped(even.clamp(0, 1) * 235 + 20, cv2.COLORMAP_INFERNO), torch.where(solid, opacity, 0.0)
@@ -115,7 +120,10 @@ def match_image(
     for index in range(len(names)):
         codes = (reference.cpu() == index).nonzero()[:, 0]
         for place, code in enumerate(codes.tolist()):
-            shade = 0.0 if len(codes) == 1 else 0.5 * place / (len(codes) - 1) - 0.25
+            if len(codes) == 1:
+                shade = 0.0
+            else:
+                shade = 0.5 * place / (len(codes) - 1) - 0.25
             colours[code] = torch.lerp(hues[index], torch.full((3,), float(shade > 0)), abs(shade))
     weights = attention.detach().cpu().float()
     # Doubt never hides the hue: the darkest is 45 %.
@@ -148,7 +156,10 @@ def match_summary(
     """
     _fitting(attention, reference, names)
     weights = attention.detach().cpu()
-    cover = torch.ones(weights.shape[:2]) if opacity is None else opacity.detach().cpu()
+    if opacity is None:
+        cover = torch.ones(weights.shape[:2])
+    else:
+        cover = opacity.detach().cpu()
     each = cover.double().clamp(min=0)
     # An empty view has no shares to speak of; dividing by 1 leaves them at 0.
     total = float(each.sum()) or 1.0

@@ -65,7 +65,8 @@ def open_json(path: Path, remedy: str) -> Iterator[Any]:
     try:
         yield parse_json(path.read_text("utf-8"))
     except _UNEXPECTED as error:
-        reason = error if isinstance(error, OSError | ValueError | ConfigError) else repr(error)
+        readable = isinstance(error, OSError | ValueError | ConfigError)
+        reason = str(error) if readable else repr(error)
         raise CheckpointError(f"{path}: cannot be read ({reason}); {remedy}") from error
 
 

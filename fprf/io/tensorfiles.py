@@ -34,14 +34,15 @@ def save(path: Path, tensors: Mapping[str, Tensor], *, sealed: bool = False) -> 
     Raises DataError, with what is needed and what is free, where the system refuses.
     """
     # Checksums are of the bytes that a reader will map: contiguous, on the CPU.
-    plain = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
-    entries = {
-        name: {
+    plain = {}
+    for name, t in tensors.items():
+        plain[name] = t.detach().cpu().contiguous()
+    entries = {}
+    for name, t in plain.items():
+        entries[name] = {
             "crc32": _checksum(t),
             "finite": bool(torch.isfinite(t).all()) if t.is_floating_point() else True,
         }
-        for name, t in plain.items()
-    }
     with atomic_path(path) as temporary:
         try:
             safetensors.torch.save_file(
@@ -78,7 +79,10 @@ def load(path: Path, manifest: Mapping[str, Mapping[str, Any]]) -> dict[str, Ten
         odd = ", ".join(sorted(tensors.keys() ^ manifest.keys())[:3])
         raise CheckpointError(f"{path}: its tensors differ from its manifest ({odd}); use another checkpoint")
     for name, tensor in tensors.items():
-        entry = dict(manifest[name]) if isinstance(manifest[name], Mapping) else {}
+        if isinstance(manifest[name], Mapping):
+            entry = dict(manifest[name])
+        else:
+            entry = {}
         if _checksum(tensor) != entry.get("crc32"):
             raise CheckpointError(
                 f"{path}: tensor {name} is damaged (checksum differs); use another checkpoint"

@@ -135,7 +135,9 @@ def _animated(path: Path, frames: list[Picture], fps: float) -> Codec:
     # Each duration is a whole number of milliseconds, and of GIF's hundredths: rounded so that no error adds
     # up.
     unit = 10 if kind == "gif" else 1
-    ends = [round(1000 * (k + 1) / fps / unit) * unit for k in range(len(frames))]
+    ends = []
+    for k in range(len(frames)):
+        ends.append(round(1000 * (k + 1) / fps / unit) * unit)
     film.durations = [end - start for start, end in pairwise([0, *ends])]
     done, data = cv2.imencodeanimation(ending, film, options)
     if not done:

@@ -98,7 +98,9 @@ class Restyler:
         self.scene = scene
         self._stale = True
         self._styles.clear()
-        return None if self._encoders is None else self._encoders.scene_style
+        if self._encoders is None:
+            return None
+        return self._encoders.scene_style
 
     def encode(self, path: Path, name: str) -> Photograph:
         """Encode a photograph. Raises DataError for an unreadable one."""
@@ -157,7 +159,9 @@ class Restyler:
         # The region of the pixel's strongest membership, by the features that the ray sees.
         place = torch.tensor([pixel], dtype=torch.float64)
         share, opacity = memberships(self.scene, self.encoders.scene_style, cameras, 0, place)
-        return int(share[0].argmax()) if float(opacity[0]) >= _SOLID else None
+        if float(opacity[0]) >= _SOLID:
+            return int(share[0].argmax())
+        return None
 
     def region_info(self, look: Look, region: int) -> RegionInfo:
         """Return the style that a region takes in a look."""
@@ -357,7 +361,9 @@ def cameras_of(cameras: Sequence[Camera], size: tuple[int, int] | None = None, l
         # The same vertical angle in another size; the principal point keeps its offset from the middle.
         by = size[1] / camera.size[1]
         focal.append([camera.lens[0] * by, camera.lens[1] * by])
-        offset = [(camera.lens[2 + k] - camera.size[k] / 2) * by for k in (0, 1)]
+        offset = []
+        for k in (0, 1):
+            offset.append((camera.lens[2 + k] - camera.size[k] / 2) * by)
         centre.append([size[0] / 2 + offset[0], size[1] / 2 + offset[1]])
     focals, centres = torch.tensor([focal, centre], dtype=torch.float64)
     return replace(ideal_cameras(torch.stack(poses), 1.0, size), focal=focals, centre=centres)

@@ -218,7 +218,10 @@ def fit_maps(
 def sections(packed: Packed, level: int = 9) -> dict[str, bytes]:
     """The parts of the geometry by name, deflated; bytes of the shapes lie plane by plane."""
     parts = {"shape": packed.shape.T, "chunks": packed.chunks, "palette": packed.palette}
-    return {name: zlib.compress(np.ascontiguousarray(part).tobytes(), level) for name, part in parts.items()}
+    found: dict[str, bytes] = {}
+    for name, part in parts.items():
+        found[name] = zlib.compress(np.ascontiguousarray(part).tobytes(), level)
+    return found
 
 
 def colour_section(colours: Colours, level: int = 9) -> bytes:

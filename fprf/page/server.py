@@ -183,8 +183,13 @@ class Guard:
 
         async def patient(message: Message) -> None:
             if message["type"].endswith("response.start"):
-                added = [(name.encode(), value.encode()) for name, value in _HEADERS.items()]
-                kept = [row for row in message["headers"] if row[0].decode().lower() not in _HEADERS]
+                added = []
+                for name, value in _HEADERS.items():
+                    added.append((name.encode(), value.encode()))
+                kept = []
+                for row in message["headers"]:
+                    if row[0].decode().lower() not in _HEADERS:
+                        kept.append(row)
                 message = {**message, "headers": [*kept, *added]}
             # A body goes in pieces, each of which the client must take in time.
             body = message.get("body", b"")
@@ -309,9 +314,15 @@ class ViewerServer:
     @property
     def address(self) -> str:
         """The URL to open in a browser, with the token."""
-        host = "127.0.0.1" if self.access.host in _ANY_ADDRESS else self.access.host
+        if self.access.host in _ANY_ADDRESS:
+            host = "127.0.0.1"
+        else:
+            host = self.access.host
         host = f"[{host}]" if ":" in host else host
-        token = "" if self.access.token is None else f"?token={quote(self.access.token)}"
+        if self.access.token is None:
+            token = ""
+        else:
+            token = f"?token={quote(self.access.token)}"
         return f"http://{host}:{self.port}/{token}"
 
     @property
@@ -344,9 +355,10 @@ class ViewerServer:
             try:
                 session.upload(path.read_bytes(), path.name)
             except (DataError, OSError) as error:
-                why = (
-                    error.strerror if isinstance(error, OSError) else str(error).removeprefix("photograph: ")
-                )
+                if isinstance(error, OSError):
+                    why = error.strerror
+                else:
+                    why = str(error).removeprefix("photograph: ")
                 raise DataError(f"{path}: {why}") from error
         if warm:
             session.warm_up()
@@ -370,7 +382,10 @@ class ViewerServer:
             self.post(None, kind, message)
 
     def _hello(self) -> list[tuple[str, dict[str, Any]]]:
-        start = [] if self._start is None else [("start", self._start.state())]
+        if self._start is None:
+            start = []
+        else:
+            start = [("start", self._start.state())]
         if self._session is not None:  # without a start there is none to go back to
             return [*self._session.hello(), *start]
         return start or [("scene", {"type": "loading"})]
@@ -528,9 +543,9 @@ class ViewerServer:
 
 def _line(error: Exception) -> str:
     """The text of an error for the client; of an OSError its file and reason."""
-    return (
-        f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
-    )
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
 
 
 def _integer(request: Request, name: str) -> int:

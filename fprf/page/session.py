@@ -139,8 +139,13 @@ class Session:
             "step": viewed.step,
         }
         coloured = [*self._colours.items()]  # the worker goes on changing them
-        ready = [(f"colours {name}", _colours_message(name, version)) for name, (version, _) in coloured]
-        training = [] if self._progress is None else [("training", self._progress)]
+        ready = []
+        for name, (version, _) in coloured:
+            ready.append((f"colours {name}", _colours_message(name, version)))
+        if self._progress is None:
+            training = []
+        else:
+            training = [("training", self._progress)]
         return [("scene", scene), ("state", self.state.described()), *ready, *training]
 
     def handle(self, client: Hashable, message: messages.AnyMessage) -> None:
@@ -341,7 +346,9 @@ class Session:
         self._post(None, f"colours {name}", _colours_message(name, version))
 
     def _select(self, region: int | None) -> None:
-        picked = None if region is None else self.restyler.region_info(self.state.look, region)
+        picked = None
+        if region is not None:
+            picked = self.restyler.region_info(self.state.look, region)
         self.apply(lambda state: replace(state, picked=picked))
 
     def _record(self, seconds: float) -> None:
@@ -378,7 +385,10 @@ class Session:
 
     def _on_error(self, error: Exception) -> None:
         expected = isinstance(error, FprfError)
-        text = str(error) if expected else f"this should not have happened: {type(error).__name__}: {error}"
+        if expected:
+            text = str(error)
+        else:
+            text = f"this should not have happened: {type(error).__name__}: {error}"
         self.notify(text, bad=True)
 
 

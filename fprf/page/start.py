@@ -119,10 +119,16 @@ class Start:
                 source = find_source(path)
                 whole = path.resolve()
                 if source.kind == "run":
-                    name = whole.parent.name if whole.name == _RUN else whole.name
+                    if whole.name == _RUN:
+                        name = whole.parent.name
+                    else:
+                        name = whole.name
                 else:
                     ours = whole.name in (_FILES, _SCENE) and whole.parent.parent == self._output
-                    name = whole.parent.name if ours else self._unused(path.stem)
+                    if ours:
+                        name = whole.parent.name
+                    else:
+                        name = self._unused(path.stem)
                 self._begin(source, name, asked.minutes)
             case Stop() if self._progress.error is None:
                 self._interrupt("stop")
@@ -150,7 +156,10 @@ class Start:
                 )
             # One scene is made at a time: training takes all cores.
             self._stopped = ""
-            folder = self._output / name if source.kind != "run" else source.path
+            if source.kind != "run":
+                folder = self._output / name
+            else:
+                folder = source.path
             self._progress = Progress(name=name, stage="opening", folder=str(folder))
             self._thread = threading.Thread(
                 target=self._make, args=(source, name, minutes), name="fprf-make", daemon=True
@@ -313,9 +322,14 @@ class Start:
         for folder in self._output.glob(
             "*/"
         ):  # a scene's run, and its files where training has not come to its end
-            run, files, scene = (folder / part for part in (_RUN, _FILES, _SCENE))
+            run = folder / _RUN
+            files = folder / _FILES
+            scene = folder / _SCENE
             trained = newest_step(run) >= 0
-            progress = training_progress(run) if trained else {"share": 0}
+            if trained:
+                progress = training_progress(run)
+            else:
+                progress = {"share": 0}
             if trained:
                 found.append((run, folder.name))
             if progress is not None and progress["share"] < 1:
@@ -327,7 +341,12 @@ class Start:
             if path.name in (_FILES, _SCENE):
                 some = newest_step(path.with_name(_RUN)) >= 0
                 capture = any(is_capture(each) for each in (path, *path.iterdir()))
-                kind = "train on" if some else "capture" if capture else "not trained yet"
+                if some:
+                    kind = "train on"
+                elif capture:
+                    kind = "capture"
+                else:
+                    kind = "not trained yet"
             when = time.strftime("%d %b %H:%M", time.localtime(date))
             rows.append({"path": str(path.resolve()), "name": name, "kind": kind, "when": when})
         return rows

@@ -222,9 +222,10 @@ class State:
         """
         shelf = (*self.shelf, photograph)
         together = self.together and self.look.mix
-        look = (
-            self.look.weighted(photograph, 1.0, shelf) if together else self.look.mixed([(photograph, 1.0)])
-        )
+        if together:
+            look = self.look.weighted(photograph, 1.0, shelf)
+        else:
+            look = self.look.mixed([(photograph, 1.0)])
         look = replace(
             look, style=replace(look.style, strength=look.style.strength or 1.0)
         )  # else nothing is seen of it
@@ -272,10 +273,14 @@ class State:
                 if self.picked is None:
                     raise UsageError("region: none is picked")
                 # A photograph that a region is to take, or never to take, joins the mix.
-                named = self.photograph(message.card) if message.action in ("pin", "forbid") else None
+                named = None
+                if message.action in ("pin", "forbid"):
+                    named = self.photograph(message.card)
                 if named is not None and named not in dict(look.mix):
                     look = look.weighted(named, 1.0, self.shelf)
-                action = None if message.action == "free" else message.action
+                action = None
+                if message.action != "free":
+                    action = message.action
                 return replace(self, look=look.ruled(self.picked.region, action, named))
             case messages.Keep():
                 name = " ".join(message.name.split())[:40]
@@ -308,16 +313,27 @@ class State:
         """The state as the page reads it."""
         picked = self.picked
         weights = dict(self.look.mix)
-        hues = palette(len(weights)).mul(255).round().int().tolist() if self.map == "matches" else []
-        colours = {each: "rgb({}, {}, {})".format(*hue) for each, hue in zip(weights, hues, strict=False)}
+        if self.map == "matches":
+            hues = palette(len(weights)).mul(255).round().int().tolist()
+        else:
+            hues = []
+        colours = {}
+        for each, hue in zip(weights, hues, strict=False):
+            colours[each] = "rgb({}, {}, {})".format(*hue)
         region = None
         if picked is not None:
-            rules = [
-                {"action": rule.action, "card": None if rule.photograph is None else rule.photograph.number}
-                for rule in self.look.rules
-                if rule.region == picked.region
-            ]
-            taken = [{"name": name, "share": share} for name, share in picked.taken]
+            rules = []
+            for rule in self.look.rules:
+                if rule.region == picked.region:
+                    rules.append(
+                        {
+                            "action": rule.action,
+                            "card": None if rule.photograph is None else rule.photograph.number,
+                        }
+                    )
+            taken = []
+            for name, share in picked.taken:
+                taken.append({"name": name, "share": share})
             region = {"region": picked.region, "share": picked.share, "taken": taken, "rules": rules}
         return {
             "type": "state",

@@ -228,7 +228,9 @@ def training_progress(root: Path) -> dict[str, Any] | None:
         with (root / "events.jsonl").open("rb") as file:
             file.seek(max(0, file.seek(0, 2) - _TAIL))
             # The first line of the tail may be cut off; events without a share tell nothing of progress.
-            lines = [json.loads(line) for line in file.read().decode(errors="replace").splitlines()[1:]]
+            lines = []
+            for line in file.read().decode(errors="replace").splitlines()[1:]:
+                lines.append(json.loads(line))
         last = next(line for line in reversed(lines) if "share" in line)
         # As long again for each share that is left, at the speed so far.
         left = last["seconds"] * (1 - last["share"]) / max(last["share"], 1e-3)
@@ -256,7 +258,10 @@ def find_source(path: Path) -> Source:
         raise DataError(f"{path}: no such file or folder")
     if not path.is_dir():
         raise DataError(f"{path}: no scene can be made of it; give {_kinds()}")
-    files = [each for each in path.rglob("*") if each.is_file() and not each.name.startswith(".")]
+    files = []
+    for each in path.rglob("*"):
+        if each.is_file() and not each.name.startswith("."):
+            files.append(each)
     # Photographs with poses need no `fprf process`, whatever else lies beside them.
     try:
         recognise(path)
@@ -264,7 +269,10 @@ def find_source(path: Path) -> Source:
     except DataError:
         pass  # its photographs have no poses
     # Several photographs are a scene; a single video or capture is one where no photographs say otherwise.
-    photographs = [each for each in files if each.suffix.lower() in IMAGE_SUFFIXES]
+    photographs = []
+    for each in files:
+        if each.suffix.lower() in IMAGE_SUFFIXES:
+            photographs.append(each)
     if len(photographs) >= _FEWEST:
         return Source("photographs", path)
     kinds: tuple[tuple[SourceKind, list[Path]], ...] = (
@@ -278,7 +286,10 @@ def find_source(path: Path) -> Source:
             some = ", or ".join(path.name for path in single[:3])
             raise DataError(f"{len(single)} {kind}s; a scene is made of one: give {some}")
     if photographs:
-        few = "1 photograph is" if len(photographs) == 1 else f"{len(photographs)} photographs are"
+        if len(photographs) == 1:
+            few = "1 photograph is"
+        else:
+            few = f"{len(photographs)} photographs are"
         raise DataError(f"{few} no scene: take at least {_FEWEST}, better 20 to 60, from places around it")
     raise DataError(f"{path.name}: nothing that a scene can be made of; give {_kinds()}")
 

@@ -144,7 +144,9 @@ def notebook_html(scene: Scene, name: str, view: int, styled: tuple[str, Restyle
     styles = []
     if styled is not None:
         shown = scene.restyled(styled[1])
-        harmonics = shown.shown.harmonics if isinstance(shown, SplatScene) else None
+        harmonics = None
+        if isinstance(shown, SplatScene):
+            harmonics = shown.shown.harmonics
         styles = [Style(styled[0], [to_uint8(shown.render(scene.cameras, view).rgb)], harmonics)]
     views = [PageView(scene.names[view], to_uint8(scene.render(scene.cameras, view).rgb))]
     text, _ = page_html(Page(title=name, facts={}, views=views, styles=styles, scene=gaussians, start=view))
@@ -233,7 +235,9 @@ def _depth(scene: SplatScene, view: int) -> float:
     middle = camera.intrinsics[:2, 2] + at[:, :2] / depth[:, None] * camera.intrinsics.diagonal()[:2]
     size = torch.tensor([camera.width, camera.height]).double()
     inside = (at[:, 2] > scene.near) & ((middle - size / 2).abs() < size / 3).all(1)
-    return float(depth[inside].median()) if bool(inside.any()) else 1.0
+    if bool(inside.any()):
+        return float(depth[inside].median())
+    return 1.0
 
 
 def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]) -> str:
@@ -243,7 +247,9 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
     # WebGL 2.
     most = 1 if page.scene is not None else len(page.views)
     pictures = [[view.original for view in page.views], *(style.stills for style in page.styles)]
-    stills = [[data_uri(shrink(each, _STILL)) for each in row[:most]] for row in pictures]
+    stills = []
+    for row in pictures:
+        stills.append([data_uri(shrink(each, _STILL)) for each in row[:most]])
     heads = [{}] * len(names) if head is None else head["styles"]
     data = {
         "scene": None if head is None else {key: value for key, value in head.items() if key != "styles"},
@@ -311,18 +317,19 @@ def _style(style: Style, views: Sequence[PageView], known: Mapping[str, Referenc
     maps.
     """
     rows = []
-    colours = to_uint8(palette(len(style.references))[None])[0] if style.references else []
+    if style.references:
+        colours = to_uint8(palette(len(style.references))[None])[0]
+    else:
+        colours = []
     for place, name in enumerate(style.references):
-        chip = (
-            f'<i class="chip" style="background:rgb({",".join(map(str, colours[place]))})"></i>'
-            if style.matches
-            else ""
-        )
-        share = (
-            f'<data value="{style.shares[place]:.4f}">{style.shares[place]:.0%}</data>'
-            if style.shares
-            else ""
-        )
+        if style.matches:
+            chip = f'<i class="chip" style="background:rgb({",".join(map(str, colours[place]))})"></i>'
+        else:
+            chip = ""
+        if style.shares:
+            share = f'<data value="{style.shares[place]:.4f}">{style.shares[place]:.0%}</data>'
+        else:
+            share = ""
         image = _img(known[name].image, _REFERENCE, f"Reference {name}")
         rows.append(
             f"<figure>{image}<figcaption>{chip}<span>{escape(name)}</span>{share}</figcaption></figure>"

@@ -91,7 +91,10 @@ def _encode(value: Any, hint: Any, path: str) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         # In a slot a config carries the name that it is installed under.
         kind = next(filter(is_slot, members(hint)), None)
-        tag = {"type": registry.name_of(kind.group, type(value))} if kind else {}
+        if kind:
+            tag = {"type": registry.name_of(kind.group, type(value))}
+        else:
+            tag = {}
         hints = hints_of(type(value))
         names = [f.name for f in dataclasses.fields(value)]
         if kind and "type" in names:
@@ -105,13 +108,16 @@ def _encode(value: Any, hint: Any, path: str) -> Any:
         return value.as_posix()
     if isinstance(value, tuple | list):
         hint = next((h for h in members(hint) if get_origin(h) in (tuple, list)), tuple[Any, ...])
-        return [
-            _encode(v, h, f"{path}.{i}")
-            for i, (v, h) in enumerate(zip(value, _items(hint, len(value)), strict=True))
-        ]
+        items = []
+        for i, (v, h) in enumerate(zip(value, _items(hint, len(value)), strict=True)):
+            items.append(_encode(v, h, f"{path}.{i}"))
+        return items
     if isinstance(value, Mapping):
         hint = next((h for h in members(hint) if get_origin(h) is dict), dict[str, Any])
-        return {str(k): _encode(v, get_args(hint)[1], f"{path}.{k}") for k, v in value.items()}
+        entries = {}
+        for k, v in value.items():
+            entries[str(k)] = _encode(v, get_args(hint)[1], f"{path}.{k}")
+        return entries
     if isinstance(value, float) and not math.isfinite(value):
         raise ConfigError(f"{path}: {value} is not a finite number and cannot be saved")
     if value is None or isinstance(value, bool | int | float | str):
@@ -165,11 +171,15 @@ def _read(data: Any, hint: Any, path: str, packages: Mapping[str, str]) -> Any:
             _read(v, h, f"{path}.{i}", packages) for i, (v, h) in enumerate(zip(items, hints, strict=True))
         )
     if origin is dict:
-        return {k: _read(v, args[1], f"{path}.{k}", packages) for k, v in _expect(data, dict, path).items()}
+        found = {}
+        for k, v in _expect(data, dict, path).items():
+            found[k] = _read(v, args[1], f"{path}.{k}", packages)
+        return found
     if origin is Literal or (isinstance(hint, type) and issubclass(hint, enum.Enum)):
-        allowed = (
-            {value: value for value in args} if origin is Literal else {each.value: each for each in hint}
-        )
+        if origin is Literal:
+            allowed = {value: value for value in args}
+        else:
+            allowed = {each.value: each for each in hint}
         for value, meant in allowed.items():
             if type(value) is type(data) and value == data:  # True == 1
                 return meant
@@ -222,7 +232,9 @@ def _read_fields(data: dict[str, Any], cls: type, path: str, packages: Mapping[s
 def _items(hint: Any, count: int) -> tuple[Any, ...]:
     """Types of the items of `tuple[A, B]`, `tuple[A, ...]` or `list[A]`."""
     args = get_args(hint)
-    return (args[0],) * count if get_origin(hint) is list or args[-1] is Ellipsis else args
+    if get_origin(hint) is list or args[-1] is Ellipsis:
+        return (args[0],) * count
+    return args
 
 
 def _expect(data: Any, kind: type | tuple[type, ...], path: str) -> Any:

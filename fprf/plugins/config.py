@@ -40,8 +40,6 @@ class PluginConfig:
 
 def absent_file(path: Path | None) -> tuple[Need, ...]:
     """The need for a file of weights that is named and not there; none where no file is named."""
-    return (
-        ()
-        if path is None or path.is_file()
-        else (Need(f"{path}: no such weights file", "name one that exists"),)
-    )
+    if path is None or path.is_file():
+        return ()
+    return (Need(f"{path}: no such weights file", "name one that exists"),)

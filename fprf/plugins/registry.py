@@ -43,7 +43,9 @@ def choices(group: str, kind: type = object) -> list[str]:
     """
     names = []
     for name, entries in installed(group).items():
-        known = _imported(entries[0].point) if len(entries) == 1 else None
+        known = None
+        if len(entries) == 1:
+            known = _imported(entries[0].point)
         if not isinstance(known, type) or issubclass(known, kind):
             names.append(name)
     return names
@@ -109,7 +111,10 @@ def load(group: str, name: str, kind: type[T]) -> type[T]:
     loaded = load_object(group, name, kind)
     if isinstance(loaded, type) and issubclass(loaded, kind):
         return loaded
-    shown = loaded.__name__ if isinstance(loaded, type) else repr(loaded)
+    if isinstance(loaded, type):
+        shown = loaded.__name__
+    else:
+        shown = repr(loaded)
     raise PluginError(
         f"{group}: {name!r} ({entry(group, name).origin}) is {shown}, not a {kind.__name__}; "
         f"choose one of that kind ({', '.join(choices(group, kind)) or 'none is installed'}), or correct its entry point"

@@ -36,7 +36,9 @@ class Slot(NamedTuple):
 
 def members(hint: Any) -> tuple[Any, ...]:
     """The alternatives of a union; the hint itself otherwise."""
-    return get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+    if get_origin(hint) in (Union, types.UnionType):
+        return get_args(hint)
+    return (hint,)
 
 
 def is_slot(hint: Any) -> bool:
@@ -72,7 +74,10 @@ def replace(config: C, path: str, value: object) -> C:
     """`dataclasses.replace` along a dotted path."""
     # From the inside out, each level as a copy.
     head, _, rest = path.partition(".")
-    inner = replace(getattr(config, head), rest, value) if rest else value
+    if rest:
+        inner = replace(getattr(config, head), rest, value)
+    else:
+        inner = value
     changed: C = dataclasses.replace(config, **{head: inner})  # type: ignore[type-var]  # C is a dataclass by contract
     return changed
 

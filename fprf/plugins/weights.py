@@ -25,9 +25,9 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             halves = (torch.float16, torch.bfloat16)
-            wide = {
-                name: tensor.float() if tensor.dtype in halves else tensor for name, tensor in tensors.items()
-            }
+            wide = {}
+            for name, tensor in tensors.items():
+                wide[name] = tensor.float() if tensor.dtype in halves else tensor
             return wide, dict(file.metadata() or {})
     except (SafetensorError, OSError) as error:
         raise WeightsError(

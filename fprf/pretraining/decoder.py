@@ -57,15 +57,23 @@ class StyleNetwork(nn.Module):
     def forward(self, images: Annotated[Tensor, "B 3 H W"]) -> list[Annotated[Tensor, "B C h w"]]:
         """Activations of sRGB images in [0, 1], at every layer of `layers`."""
         with float32_convolutions(images.device):
-            found = [x for place, x in enumerate(self.encoder.activations(images)) if place in self._places]
-        return [x / self.get_buffer(f"unit_{layer}") for x, layer in zip(found, self.layers, strict=True)]
+            found = []
+            for place, x in enumerate(self.encoder.activations(images)):
+                if place in self._places:
+                    found.append(x)
+        result: list[Annotated[Tensor, "B C h w"]] = []
+        for x, layer in zip(found, self.layers, strict=True):
+            result.append(x / self.get_buffer(f"unit_{layer}"))
+        return result
 
     @torch.no_grad()
     def measure(self, images: Sequence[Annotated[Tensor, "3 H W"]]) -> None:
         """Take each filter's mean deviation over the images as its unit; filters that hardly fire are not
         blown up.
         """
-        deviations = [[double(x[0]).std((1, 2), correction=0) for x in self(image[None])] for image in images]
+        deviations = []
+        for image in images:
+            deviations.append([double(x[0]).std((1, 2), correction=0) for x in self(image[None])])
         for layer, own_deviations in zip(self.layers, zip(*deviations, strict=True), strict=True):
             unit = self.get_buffer(f"unit_{layer}")
             own = torch.stack(own_deviations).mean(0).to(unit) * unit[:, 0, 0]
@@ -84,7 +92,10 @@ def load_style_network(weights: Path | None) -> StyleNetwork:
 
 def style_statistics(activations: Sequence[Annotated[Tensor, "B C h w"]]) -> list[Annotated[Tensor, "B 2C"]]:
     """Mean and standard deviation of every filter, layer by layer."""
-    return [torch.cat([x.mean((2, 3)), (x.var((2, 3), correction=0) + EPS).sqrt()], 1) for x in activations]
+    found: list[Annotated[Tensor, "B 2C"]] = []
+    for x in activations:
+        found.append(torch.cat([x.mean((2, 3)), (x.var((2, 3), correction=0) + EPS).sqrt()], 1))
+    return found
 
 
 def style_distance(
@@ -139,7 +150,9 @@ def prepare_crops(
     # Crops of one size, small enough for every photograph.
     loaded = [load_photo(path, longest).to(device) for path in photos]
     side = min(side, *(min(photo.shape[:2]) for photo in loaded))
-    made = [filtered_crop(encoder, photo, side, generator_of(seed, i)) for i, photo in enumerate(loaded)]
+    made = []
+    for i, photo in enumerate(loaded):
+        made.append(filtered_crop(encoder, photo, side, generator_of(seed, i)))
     # Units first: activations below are divided by them.
     images = [rgb.view(side, side, 3).permute(2, 0, 1) for _, rgb in made]
     if measure:
@@ -199,7 +212,9 @@ def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[
     device = device_of(config.device)
     encoder = config.encoder.build().to(device)
     measured = config.style_weights is not None or config.content > 0 or config.style > 0
-    network = load_style_network(config.style_weights).to(device) if measured else None
+    network = None
+    if measured:
+        network = load_style_network(config.style_weights).to(device)
     photos, held = split(find_photos(config.images)[: config.photos])
     say(f"{len(photos)} photographs to learn from, {len(held)} held out")
     # Pixels of all photographs, on the CPU: they may be more than an accelerator holds.
@@ -313,6 +328,8 @@ def restyling_report(crops: Crops, network: StyleNetwork, decode: Decode) -> Rep
     """Content and style loss of every crop in the style of the next one, in the units of `network`."""
     count = len(crops.mean)
     index = torch.arange(count, device=crops.mean.device)
-    losses = [restyling_losses(crops, network, decode, i[None], (i[None] + 1) % count) for i in index]
+    losses = []
+    for i in index:
+        losses.append(restyling_losses(crops, network, decode, i[None], (i[None] + 1) % count))
     content, style = (sum(float(each) for each in column) / count for column in zip(*losses, strict=True))
     return {"content_loss": round(content, 4), "style_loss": round(style, 4)}

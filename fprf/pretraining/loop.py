@@ -109,7 +109,9 @@ def train(
     # The folder is a run's, as far as the driver needs one.
     run = Run(training_folder(output))
     schedule = Schedule(config.steps, None if config.steps is not None else config.minutes, _SAVED / 60)
-    photos = [zlib.crc32(path.read_bytes()) for path in find_photos(config.images)[: config.photos]]
+    photos = []
+    for path in find_photos(config.images)[: config.photos]:
+        photos.append(zlib.crc32(path.read_bytes()))
     begin(run.root, repr((replace(config, device="auto"), photos)))
     if steps := checkpoint.steps(run.checkpoints):
         say(f"resumed at step {steps[-1]}")

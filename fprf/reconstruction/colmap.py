@@ -66,7 +66,12 @@ def descriptors(path: Path, name: str) -> NDArray[np.uint8]:
 def sequential_pairs(count: int, overlap: int) -> list[Pair]:
     """Each with the next `overlap` ones, and with those at distances 2, 4, 8, ... up to 2 ** overlap."""
     steps = sorted({*range(1, overlap + 1), *(2**k for k in range(overlap + 1))})
-    return [(a, a + step) for a in range(count) for step in steps if a + step < count]
+    found: list[Pair] = []
+    for a in range(count):
+        for step in steps:
+            if a + step < count:
+                found.append((a, a + step))
+    return found
 
 
 def similar_pairs(vectors: Annotated[NDArray[np.float32], "V X"], nearest: int) -> list[Pair]:
@@ -80,12 +85,11 @@ def similar_pairs(vectors: Annotated[NDArray[np.float32], "V X"], nearest: int) 
     np.fill_diagonal(likeness, -np.inf)
     count = min(nearest, max(0, len(vectors) - 1))
     best = np.argsort(-likeness, axis=1, kind="stable")[:, :count]
-    pairs = {
-        (min(a, b), max(a, b))
-        for a, row in enumerate(best.tolist())
-        for b in row
-        if np.isfinite(likeness[a, b])
-    }
+    pairs = set()
+    for a, row in enumerate(best.tolist()):
+        for b in row:
+            if np.isfinite(likeness[a, b]):
+                pairs.add((min(a, b), max(a, b)))
     return sorted(pairs)
 
 
@@ -100,7 +104,10 @@ def build_vocabulary(read: Reader, count: int, number: int, seed: int = 0) -> Wo
     for image in range(count):
         features = read(image)
         parts.append(features[rng.permutation(len(features))[:each]])
-    sample = np.concatenate(parts).astype(np.float32) if parts else np.zeros((0, 128), np.float32)
+    if parts:
+        sample = np.concatenate(parts).astype(np.float32)
+    else:
+        sample = np.zeros((0, 128), np.float32)
     if len(sample) <= number:
         return sample
     # cv2 draws from a generator of its own.
@@ -160,7 +167,8 @@ def find_features(place: SceneFolder, state: State, config: SfmConfig, progress:
     # Images of one size and lens share a camera, unless each is to have its own.
     groups: dict[str, list[str]] = {}
     for name, image in state.images.items():
-        alike = [image["width"], image["height"], image["lens"]] if config.cameras == "shared" else name
+        shared = config.cameras == "shared"
+        alike = [image["width"], image["height"], image["lens"]] if shared else name
         groups.setdefault(json.dumps(alike), []).append(name)
     job = {
         "step": "features",
@@ -222,9 +230,10 @@ def find_poses(
 
     def registered() -> int:
         """Images with a pose so far: a line for each but the first."""
-        lines = [
-            line for line in place.progress.read_text(encoding="utf-8").splitlines() if line.startswith("{")
-        ]
+        lines = []
+        for line in place.progress.read_text(encoding="utf-8").splitlines():
+            if line.startswith("{"):
+                lines.append(line)
         return len(lines) + 1 if lines else 0
 
     job = {"step": "mapping", "models": str(described.parent)}
@@ -284,23 +293,26 @@ def _run(
     if code == NO_MODEL:
         # What the decoders lost comes first: it may be all that is wrong.
         unread = sorted(set(state.images) - set(MatchTables(place.database).features))
-        missed = (
-            f"COLMAP cannot decode {len(unread)} of {len(state.images)} images, for example {unread[0]}"
-            if unread
-            else ""
-        )
+        if unread:
+            missed = (
+                f"COLMAP cannot decode {len(unread)} of {len(state.images)} images, for example {unread[0]}"
+            )
+        else:
+            missed = ""
         lost = "; ".join(filter(None, [lost_files(state), missed]))
-        rest = "no two of the other images fit together" if lost else "no two images fit together"
+        if lost:
+            rest = "no two of the other images fit together"
+        else:
+            rest = "no two images fit together"
         raise DataError(
             f"{place.root}: {f'{lost}; ' if lost else ''}{rest}; take more views with more overlap, of places with texture "
             f"({place.log} has COLMAP's words)"
         )
     if code:
-        lines = [
-            line
-            for line in place.log.read_text(encoding="utf-8", errors="replace").splitlines()
-            if line.strip()
-        ]
+        lines = []
+        for line in place.log.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.strip():
+                lines.append(line)
         last = lines[-1].strip()[-200:] if lines else "nothing was said"
         raise DataError(f"{place.root}: COLMAP's {name} ended with {code}: {last}; {place.log} has the rest")
     progress(total, total, what)

@@ -68,7 +68,10 @@ def choose_frames(scores: Sequence[float], count: int, least: float) -> tuple[li
     """
     # Windows of equal length, but for rounding, and the sharpest frame of each.
     windows = min(count, len(scores))
-    edges = [round(k * len(scores) / windows) for k in range(windows + 1)] if windows else [0]
+    if windows:
+        edges = [round(k * len(scores) / windows) for k in range(windows + 1)]
+    else:
+        edges = [0]
     best = [max(range(low, high), key=lambda i: (scores[i], -i)) for low, high in pairwise(edges)]
     dropped = {}
     for (low, high), top in zip(pairwise(edges), best, strict=True):
@@ -78,11 +81,10 @@ def choose_frames(scores: Sequence[float], count: int, least: float) -> tuple[li
     # The best frames of the windows around say how sharp images are there.
     chosen = []
     for k, top in enumerate(best):
-        around = [
-            scores[best[j]]
-            for j in range(max(0, k - _NEIGHBOURS), min(windows, k + _NEIGHBOURS + 1))
-            if j != k
-        ]
+        around = []
+        for j in range(max(0, k - _NEIGHBOURS), min(windows, k + _NEIGHBOURS + 1)):
+            if j != k:
+                around.append(scores[best[j]])
         usual = float(np.median(around)) if around else 0.0
         if scores[top] < least * usual:
             dropped[top] = (
@@ -216,7 +218,10 @@ def gather_images(
             endings = sorted(
                 {path.suffix.lower() for path in source.rglob("*") if path.is_file() and path.suffix}
             )
-            there = f"it holds {' '.join(endings)} files" if endings else "it holds no files"
+            if endings:
+                there = f"it holds {' '.join(endings)} files"
+            else:
+                there = "it holds no files"
             why = (
                 f"{there}, and what is read is {' '.join(sorted(IMAGE_SUFFIXES))}: convert the images to JPEG"
             )
@@ -247,7 +252,10 @@ def lost_files(state: State) -> str:
 
 def _some(words: list[str]) -> str:
     """The first ones of a list, and how many there are beside."""
-    beside = [f"{len(words) - _NAMED} more"] if len(words) > _NAMED else []
+    if len(words) > _NAMED:
+        beside = [f"{len(words) - _NAMED} more"]
+    else:
+        beside = []
     return ", ".join(words[:_NAMED] + beside)
 
 
@@ -255,8 +263,13 @@ def natural_order(names: Iterable[str]) -> list[str]:
     """Names as people number them: 2 before 10, and numbers before words."""
 
     def rank(name: str) -> list[tuple[bool, int, str]]:
-        numbers = [("0" <= part[0] <= "9", part) for part in re.findall(r"[0-9]+|[^0-9]+", name)]
-        return [(not number, int(part) if number else 0, part) for number, part in numbers]
+        numbers = []
+        for part in re.findall(r"[0-9]+|[^0-9]+", name):
+            numbers.append(("0" <= part[0] <= "9", part))
+        found: list[tuple[bool, int, str]] = []
+        for number, part in numbers:
+            found.append((not number, int(part) if number else 0, part))
+        return found
 
     return sorted(names, key=rank)
 

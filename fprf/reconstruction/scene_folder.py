@@ -68,7 +68,10 @@ class State:
         path = place.work / "state.json"
         # Only a folder that is new, or holds no more than images, is begun in.
         if not path.is_file():
-            here = [entry.name for entry in place.root.iterdir()] if place.root.is_dir() else []
+            if place.root.is_dir():
+                here = [entry.name for entry in place.root.iterdir()]
+            else:
+                here = []
             if (place.root.exists() and not place.root.is_dir()) or set(here) - _IGNORED:
                 raise UsageError(
                     f"--output {place.root}: holds something else; name a folder that is new or empty"
@@ -151,7 +154,10 @@ def report(
     """
     images = state["images"]
     unused = state["dropped"]
-    main = models[0] if models else {"images": [], "points": 0, "error_pixels": None, "track_length": None}
+    if models:
+        main = models[0]
+    else:
+        main = {"images": [], "points": 0, "error_pixels": None, "track_length": None}
     posed = set(main["images"])
     size = [len(model["images"]) for model in models]
     part_of: dict[str, int] = {}  # the largest part that has it

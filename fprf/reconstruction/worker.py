@@ -115,15 +115,16 @@ def _mapping(pycolmap: Any, job: dict[str, Any]) -> int:
         if mapped:
             break
     models = sorted(mapped.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
-    described = [
-        {
-            "images": sorted(model.image(id_).name for id_ in model.reg_image_ids()),
-            "points": model.num_points3D(),
-            "error_pixels": model.compute_mean_reprojection_error(),
-            "track_length": model.compute_mean_track_length(),
-        }
-        for model in models
-    ]
+    described = []
+    for model in models:
+        described.append(
+            {
+                "images": sorted(model.image(id_).name for id_ in model.reg_image_ids()),
+                "points": model.num_points3D(),
+                "error_pixels": model.compute_mean_reprojection_error(),
+                "track_length": model.compute_mean_track_length(),
+            }
+        )
     if models:
         best = out / "best"
         best.mkdir(exist_ok=True)

@@ -258,9 +258,9 @@ class Intrinsics(NamedTuple):
 
 def intrinsics_of(cameras: Cameras, view: int) -> Intrinsics:
     """Intrinsics of a view."""
-    focal, centre, distortion = (
-        tuple(each[view].tolist()) for each in (cameras.focal, cameras.centre, cameras.distortion)
-    )
+    focal = tuple(cameras.focal[view].tolist())
+    centre = tuple(cameras.centre[view].tolist())
+    distortion = tuple(cameras.distortion[view].tolist())
     return Intrinsics(focal, centre, distortion, tuple(cameras.size[view].tolist()), int(cameras.lens[view]))
 
 

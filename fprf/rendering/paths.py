@@ -84,7 +84,10 @@ def spiral(cameras: Cameras, frames: int) -> Cameras:
     loop = (torch.stack([angle.cos(), angle.sin(), (angle / _TURNS).sin()], dim=-1) * radii) @ rotation.T
     # The distance from a camera to the nearest other one, such that nine in ten are closer.
     others = apart + torch.diag(torch.full_like(apart[0], torch.inf))
-    reach = 1.0 if len(cameras) == 1 else float(others.amin(dim=-1).quantile(0.9))
+    if len(cameras) == 1:
+        reach = 1.0
+    else:
+        reach = float(others.amin(dim=-1).quantile(0.9))
     for step in range(_SHRINKS):
         position = start + loop * (1 - step / _SHRINKS)
         if float(torch.cdist(position, centres).amin(dim=-1).amax()) <= reach:
@@ -230,7 +233,10 @@ def _focus_depth(cameras: Cameras, view: int) -> float:
     """Depth along the axis of a view at which what it shows lies: where the optical axes meet."""
     pose = cameras.pose[view]
     target = _meeting(cameras.pose)
-    ahead = 0.0 if target is None else float((pose[:, 3] - target) @ pose[:, 2])
+    if target is None:
+        ahead = 0.0
+    else:
+        ahead = float((pose[:, 3] - target) @ pose[:, 2])
     spread = float((cameras.pose[:, :, 3] - pose[:, 3]).norm(dim=-1).max())
     # Parallel axes show something far away compared with the baseline, as in any capture that can be
     # reconstructed.
@@ -276,7 +282,9 @@ def upwards(cameras: Cameras) -> Annotated[Tensor, "3"]:
     unit length.
     """
     up = cameras.pose[:, :, 1].mean(dim=0)
-    return cameras.pose[:, :, 2].mean(dim=0) if float(up.norm()) < 0.3 else up
+    if float(up.norm()) < 0.3:
+        return cameras.pose[:, :, 2].mean(dim=0)
+    return up
 
 
 class _Frame(Struct):
@@ -304,10 +312,9 @@ def read_camera_path(path: Path, origin: Origin = (0.0, 0.0, 0.0)) -> tuple[Came
     """
     try:
         content = msgspec.json.decode(path.read_bytes(), type=_CameraPath)
-        poses = [
-            _orthonormal(f"$.camera_path[{k}]", frame.camera_to_world)
-            for k, frame in enumerate(content.camera_path)
-        ]
+        poses = []
+        for k, frame in enumerate(content.camera_path):
+            poses.append(_orthonormal(f"$.camera_path[{k}]", frame.camera_to_world))
     except FileNotFoundError as error:
         raise DataError(
             f"{path}: no such camera path; give spiral, interpolate, dataset or a JSON file"
@@ -317,7 +324,9 @@ def read_camera_path(path: Path, origin: Origin = (0.0, 0.0, 0.0)) -> tuple[Came
     width = int(content.render_width)
     height = int(content.render_height)
     # Pixels are square: the vertical field of view decides both focal lengths.
-    focals = [height / 2 / math.tan(math.radians(frame.fov) / 2) for frame in content.camera_path]
+    focals = []
+    for frame in content.camera_path:
+        focals.append(height / 2 / math.tan(math.radians(frame.fov) / 2))
     frames = ideal_cameras(torch.stack(poses), torch.tensor(focals, dtype=torch.float64), (width, height))
     return frames.shifted([-x for x in origin]), content.fps
 
@@ -390,5 +399,7 @@ def transforms(
         rows = [*cameras.pose[view].tolist(), [0.0, 0.0, 0.0, 1.0]]
         frames.append({"file_path": file, **({} if shared else lenses[view]), "transform_matrix": rows})
     splits = {"train": train, "test": test, "val": test}
-    named = {f"{name}_filenames": [files[view] for view in views] for name, views in splits.items()}
+    named = {}
+    for name, views in splits.items():
+        named[f"{name}_filenames"] = [files[view] for view in views]
     return {**(lenses[0] if shared else {}), "frames": frames, **named}

@@ -95,7 +95,9 @@ def march(
     located = space.locate(points.view(-1, 3))
     sample = parts.field.density(located)
     density = sample.density.view(middle.shape)
-    scale = (middle / (_NEAR_CAMERA * rays.near[:, None])).square().clamp(max=1) if scaled else None
+    scale = None
+    if scaled:
+        scale = (middle / (_NEAR_CAMERA * rays.near[:, None])).square().clamp(max=1)
     if scale is not None:
         density = scale_gradient(density, scale)
     # Weights and transmittance of Eq. 2; what is only shown needs no gradient.
@@ -208,13 +210,18 @@ def render_rays(
         if kept.gradient_scale is not None:
             features = scale_gradient(features, kept.gradient_scale[:, None])
         if Want.CONTENT in want:
-            fixed = kept if content_moves_density else kept._replace(weight=kept.weight.detach())
+            if content_moves_density:
+                fixed = kept
+            else:
+                fixed = kept._replace(weight=kept.weight.detach())
             content = composite(fixed, features, count)
         if Want.COLOUR in want:
             # Semantics are evaluated only where the style tells places apart by them.
             backdrop = 0.0 if background is None else marched.transmittance[:, None] * background
             styled = restyle is not None and not restyle.idle and Want.SEMANTIC in restyle.needs
-            semantics = parts.semantic(kept.point) if styled and parts.semantic is not None else None
+            semantics = None
+            if styled and parts.semantic is not None:
+                semantics = parts.semantic(kept.point)
             rgb = composite(kept, shade(parts.decoder, features, semantics, restyle), count) + backdrop
     if Want.SEMANTIC in want and parts.semantic is not None:
         # Semantics follow the geometry and never move it (paper, semantic field).

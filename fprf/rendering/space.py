@@ -156,7 +156,10 @@ class Space:
 
     def __getstate__(self) -> dict[str, object]:
         """The fields alone: a copy in another process makes its tensors itself."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        found: dict[str, object] = {}
+        for field in fields(self):
+            found[field.name] = getattr(self, field.name)
+        return found
 
     @cached_property
     def _tensors(self) -> dict[tuple[str, torch.dtype, torch.device], Tensor]:

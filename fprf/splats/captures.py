@@ -171,10 +171,15 @@ def open_capture(
 
     def found() -> Semantics:
         semantics = scene.found()
-        views = {f"camera.{field.name}": getattr(scene.views, field.name) for field in fields(Cameras)}
+        views = {}
+        for field in fields(Cameras):
+            views[f"camera.{field.name}"] = getattr(scene.views, field.name)
         save(path, {**views, **semantics_tensors(semantics)}, sealed=True)
         with suppress(OSError):  # another process removes files, too: what is left the next one finds
-            files = [each for each in folder.glob("*.safetensors") if each.is_file()]
+            files = []
+            for each in folder.glob("*.safetensors"):
+                if each.is_file():
+                    files.append(each)
             for old in sorted(files, key=lambda each: each.stat().st_mtime)[:-_CACHED]:
                 old.unlink(missing_ok=True)
         return semantics
@@ -202,9 +207,15 @@ class Captures:
         gaussians = capture.gaussians
         rows = self.rows[index]
         finite = gaussians.finite
-        gaussians = gaussians if bool(finite.all()) else gaussians.select(finite)
+        if bool(finite.all()):
+            gaussians = gaussians
+        else:
+            gaussians = gaussians.select(finite)
         here = tuple(a - b for a, b in zip(capture.origin, self.scene.origin, strict=True))
-        means = gaussians.means + torch.tensor(here) if any(here) else gaussians.means
+        if any(here):
+            means = gaussians.means + torch.tensor(here)
+        else:
+            means = gaussians.means
         features = self.scene.found().features[rows]
         if len(features) == len(gaussians):
             return restyled_harmonics(gaussians.harmonics, means, features, look)
@@ -337,8 +348,12 @@ def neighbouring_light(captures: Captures, references: Sequence[Path]) -> Annota
     for rows, by in zip(captures.rows, captures.moved, strict=True):
         means[rows] -= by
     others = [read_capture(path) for path in references]
-    parts = [sampled(other.gaussians.drawable(), SAMPLE // len(others)) for other in others]
-    shifts = [[a - b for a, b in zip(other.origin, captures.scene.origin, strict=True)] for other in others]
+    parts = []
+    for other in others:
+        parts.append(sampled(other.gaussians.drawable(), SAMPLE // len(others)))
+    shifts = []
+    for other in others:
+        shifts.append([a - b for a, b in zip(other.origin, captures.scene.origin, strict=True)])
     theirs = torch.cat([part.means + torch.tensor(shift) for part, shift in zip(parts, shifts, strict=True)])
     places = torch.cat([means, theirs])
     colours = (

@@ -80,7 +80,9 @@ sum to.
 
 def folder_of(root: Path, cell: int) -> Path:
     """Folder of a cell, or of the whole scene, in a run."""
-    return root / "overview" if cell == WHOLE else root / "cells" / f"{cell:02d}"
+    if cell == WHOLE:
+        return root / "overview"
+    return root / "cells" / f"{cell:02d}"
 
 
 def load_cells(root: Path) -> list[Cell]:
@@ -97,7 +99,10 @@ class Cells(Partition):
         self.config = config
         self.scene = scene
         self.device = device
-        self.compiling = [] if usable(device) else compile_beside((config.degree + 1) ** 2)
+        if usable(device):
+            self.compiling = []
+        else:
+            self.compiling = compile_beside((config.degree + 1) ** 2)
         self._facts = saved or light_and_poses(
             config, scene, lambda view: load_images(scene, config.background, [view])[0]
         )
@@ -115,7 +120,9 @@ class Cells(Partition):
         for process in self.compiling:
             process.wait()
         cells = self.write(run)
-        pixels = [sum(width * height for _, _, width, height in cell.windows.values()) for cell in cells]
+        pixels = []
+        for cell in cells:
+            pixels.append(sum(width * height for _, _, width, height in cell.windows.values()))
         share = sum(pixels) / int(size[self.scene.train].prod(1).sum())
         display.say(
             f"{len(cells)} cells, whose windows are {share:.2f} times the photographs{left_out(self.device)}"
@@ -171,7 +178,10 @@ class Overview(Part):
         scene = read_scene(self.config, self.facts)
         facts = self.facts
         scene = replace(scene, train=scene.train[:: self.every])
-        held = other_views(scene, scene.train.tolist()) if facts.exposure or facts.centres else ()
+        if facts.exposure or facts.centres:
+            held = other_views(scene, scene.train.tolist())
+        else:
+            held = ()
         return build(self.config, scene, replace(facts, held=held), device=device_of(self.config.device))
 
     def is_intact(self) -> bool:
@@ -234,7 +244,9 @@ class CellPart(Part):
         # Their moments go on, and their number grows as if it had from the beginning of the schedule.
         passed = min(config.overview / config.grow, 0.99)
         begun = max(1, round((len(gaussians) / cap**passed) ** (1 / (1 - passed))))
-        moments = {name: start.optimizer[name][shown] for name in _MOMENTS}
+        moments = {}
+        for name in _MOMENTS:
+            moments[name] = start.optimizer[name][shown]
         learner.load(State(vars(gaussians), {**moments, "begun": torch.tensor(begun)}))
         return learner
 
@@ -352,9 +364,9 @@ def shown_in_windows(
     # most windows show few of them.
     order = torch.from_numpy(curve_order(gaussians.means.double().numpy()))
     order = torch.nn.functional.pad(order[None], (0, -len(order) % _RUN), mode="replicate").view(-1, _RUN)
-    means, quaternions, log_scales = (
-        x[order] for x in (gaussians.means, gaussians.quaternions, gaussians.log_scales)
-    )
+    means = gaussians.means[order]
+    quaternions = gaussians.quaternions[order]
+    log_scales = gaussians.log_scales[order]
     centre = (means.double().amin(1) + means.double().amax(1)) / 2
     reach = _DEVIATIONS * log_scales.amax(2).double().exp()
     radius = ((means.double() - centre[:, None]).norm(dim=2) + reach).amax(1)
@@ -366,7 +378,9 @@ def shown_in_windows(
     for view in views[:: -(-len(views) // _LOOKED)]:
         camera = covering(cameras.select(torch.tensor([view])).scaled(_COARSER), 0, near)
         runs = torch.from_numpy(in_view(camera, centre.numpy(), radius.numpy())[1]).nonzero()[:, 0]
-        mean, quaternion, log_scale = (x[runs].flatten(0, 1) for x in (means, quaternions, log_scales))
+        mean = means[runs].flatten(0, 1)
+        quaternion = quaternions[runs].flatten(0, 1)
+        log_scale = log_scales[runs].flatten(0, 1)
         ones = torch.ones(camera.height, camera.width, 1)
         weights = lift(mean, quaternion, log_scale, logits[runs].flatten(), camera, ones, antialiased=True)
         shown[runs] |= weights.view(-1, _RUN) > _WEIGHT
@@ -378,7 +392,8 @@ def overview_tones(facts: Facts, start: checkpoint.Saved) -> Tones | None:
     """The exposures that cells go on from; None where none are learnt."""
     if "tones.gain.value" not in start.optimizer:
         return None
-    gain, exponent = (start.optimizer[f"tones.{name}.value"] for name in ("gain", "exponent"))
+    gain = start.optimizer[f"tones.{'gain'}.value"]
+    exponent = start.optimizer[f"tones.{'exponent'}.value"]
     never = (gain == 0).all(1).nonzero()[:, 0]  # views that only cells learn from
     tones = Tones(torch.tensor(facts.exposure), tuple(never.tolist()))
     tones.load_state_dict({"gain": gain, "exponent": exponent})
@@ -424,7 +439,10 @@ def unite(root: Path, cells: Sequence[Cell]) -> int:
             count[used] += 1
     # Poses were refined in the whole scene alone.
     gaussians = Gaussians(*(torch.cat(column) for column in zip(*parts, strict=True)))
-    corrections = {name: each for name, each in start.optimizer.items() if name == MOVES}
+    corrections = {}
+    for name, each in start.optimizer.items():
+        if name == MOVES:
+            corrections[name] = each
     if tones is not None:
         gain = torch.where(count > 0, gain / count.clamp_min(1), tones.gains().detach())
         corrections |= {"tones.gain.value": gain, "tones.exponent.value": tones.exponent.detach()}

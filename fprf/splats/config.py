@@ -213,7 +213,11 @@ class GaussiansConfig(RunConfig):
     @property
     def most_steps(self) -> int:
         """`steps`; where they are not given, 10 000, or 100 000 where minutes are."""
-        return self.steps if self.steps is not None else _STEPS if self.minutes is None else _NO_END
+        if self.steps is not None:
+            return self.steps
+        if self.minutes is None:
+            return _STEPS
+        return _NO_END
 
     @property
     def trained_on(self) -> str:
@@ -250,7 +254,10 @@ def format_name(path: Path) -> str | None:
     if name == "meta.json":
         return "sog"
     installed = registry.installed(CAPTURES)
-    fits = [each for each in installed if name.endswith(f".{each}") or (name == each and "." in each)]
+    fits = []
+    for each in installed:
+        if name.endswith(f".{each}") or (name == each and "." in each):
+            fits.append(each)
     return max(fits, key=len, default=None)
 
 

@@ -114,7 +114,11 @@ class Gaussians:
         """How many Gaussians cannot be drawn, for each reason: "3 that are not finite"."""
         bounded, turned = self._sound()
         counts = {"that are not finite": ~bounded, "without a rotation": bounded & ~turned}
-        return [f"{int(each.sum())} {what}" for what, each in counts.items() if bool(each.any())]
+        found: list[str] = []
+        for what, each in counts.items():
+            if bool(each.any()):
+                found.append(f"{int(each.sum())} {what}")
+        return found
 
     def drawable(self) -> "Gaussians":
         """The Gaussians that can be drawn, with finite ln-scales: flat ones get the smallest that makes a

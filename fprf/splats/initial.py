@@ -208,7 +208,9 @@ def _matched(scene: ParsedScene, images: Mapping[int, Image]) -> Points:
             if not len(p):
                 continue
             # Points of both, in the colours of the first.
-            rays = [(cameras[v].intrinsics @ cameras[v].world_to_camera[:3]).numpy() for v in (i, j)]
+            rays = []
+            for v in (i, j):
+                rays.append((cameras[v].intrinsics @ cameras[v].world_to_camera[:3]).numpy())
             a = places[i][p]
             b = places[j][q]
             position = _triangulated(rays, (a, b), (centre[i], centre[j]))
@@ -232,7 +234,8 @@ def _pairs(
     best = alike.argmax(1)
     likeness = alike[rows, best]
     alike[rows, best] = -np.inf
-    near, next_ = (np.sqrt(np.maximum(2 - 2 * each, 0)) for each in (likeness, alike.max(1)))
+    near = np.sqrt(np.maximum(2 - 2 * likeness, 0))
+    next_ = np.sqrt(np.maximum(2 - 2 * alike.max(1), 0))
     kept = (near < 0.85 * next_) & (backwards[best] == rows)
     return rows[kept], best[kept]
 

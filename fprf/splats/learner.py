@@ -186,7 +186,9 @@ class GaussianLearner(SceneLearner):
     @property
     def device(self) -> torch.device:
         """Where the Gaussians are."""
-        return self.model.device if isinstance(self.model, GsplatGaussians) else CPU
+        if isinstance(self.model, GsplatGaussians):
+            return self.model.device
+        return CPU
 
     @property
     def facts(self) -> Facts:
@@ -277,7 +279,11 @@ class GaussianLearner(SceneLearner):
 
     def _sharp(self, level: Level) -> list[int]:
         """Views that are not blurred at a scale; all where only poses or colours are learnt."""
-        return [view for view in level if self.only is not None or view not in level.blurred]
+        found: list[int] = []
+        for view in level:
+            if self.only is not None or view not in level.blurred:
+                found.append(view)
+        return found
 
     def _target(self, level: Level, view: int) -> Target:
         """A photograph, taken from where its pose is now."""
@@ -417,9 +423,15 @@ class GaussianLearner(SceneLearner):
         few = ", ".join(Path(names[view]).name for view in dull[:_NAMED]) + (
             ", ..." if len(dull) > _NAMED else ""
         )
-        blur = f"; blurred, and so shown rarely: {len(dull)} of {len(self.levels[0])} ({few})" if dull else ""
+        if dull:
+            blur = f"; blurred, and so shown rarely: {len(dull)} of {len(self.levels[0])} ({few})"
+        else:
+            blur = ""
         light = ", tones" if self.tones is not None else ""
-        where = "" if self.device == CPU else f", on {self.device} by gsplat"
+        if self.device == CPU:
+            where = ""
+        else:
+            where = f", on {self.device} by gsplat"
         limit = passes if most < self.config.most_steps else ""
         line = f", {self.model.count} Gaussians at {self.origin}{light}{where}{blur}{limit}"
         return line + left_out(self.asked)
@@ -428,7 +440,9 @@ class GaussianLearner(SceneLearner):
 def left_out(device: torch.device) -> str:
     """A line that says why Gaussians are not trained on a CUDA device; empty where they are."""
     why = obstacle(device) if device.type == "cuda" else None
-    return "" if why is None else f"\nnote: Gaussians are trained on the CPU, not on {device}: {why}"
+    if why is None:
+        return ""
+    return f"\nnote: Gaussians are trained on the CPU, not on {device}: {why}"
 
 
 def halves(

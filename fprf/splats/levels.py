@@ -304,7 +304,9 @@ def _chunks(
     curve.
     """
     if len(index) <= _CHUNK:
-        return [index[curve_order(position[index])]] if len(index) else []
+        if len(index):
+            return [index[curve_order(position[index])]]
+        return []
     own = position[index]
     axis = int((np.quantile(own, 1 - _TAIL, axis=0) - np.quantile(own, _TAIL, axis=0)).argmax())
     half = max(1, len(index) // (2 * _CHUNK)) * _CHUNK

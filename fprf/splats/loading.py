@@ -49,7 +49,9 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
     if quality.max_memory:
         raise UsageError("--max-memory: is for runs of fields; leave it out")
     root = run.root
-    preset = None if quality.quality is None else PRESETS[quality.quality]
+    preset = None
+    if quality.quality is not None:
+        preset = PRESETS[quality.quality]
     merged = None if preset is None else preset.merged
     # Levels of detail were written from what was verified.
     key = "" if merged is None else checkpoint.digest(run.checkpoints)
@@ -73,7 +75,10 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
     near = float(saved.model.get("near", torch.tensor(0.01)))
     training = in_training(root)
     # What a training has learnt so far is looked at quickly, in few, small views, and not kept.
-    count, side = (_VIEWS // 4, config.semantic_size // 2) if training else (_VIEWS, config.semantic_size)
+    if training:
+        count, side = (_VIEWS // 4, config.semantic_size // 2)
+    else:
+        count, side = (_VIEWS, config.semantic_size)
     encoder = functools.cache(config.semantic.encoder.build)
 
     def found() -> Semantics:
@@ -94,7 +99,9 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
         views = views.scaled(max(1.0, float(views.size.amax()) / side))
         semantics = find_semantics(gaussians, True, encoder(), views, config.regions, near=near)
         if not training:
-            marks = {name: torch.tensor(of) for name, of in wanted.items()}
+            marks = {}
+            for name, of in wanted.items():
+                marks[name] = torch.tensor(of)
             run.save_tensors("style", {**semantics_tensors(semantics), **marks})
         return semantics
 

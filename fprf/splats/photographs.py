@@ -263,12 +263,15 @@ def load_photographs(
     images = dict(zip(views, load_images(scene, config.background, views), strict=True))
 
     def load_masks(paths: tuple[Path | None, ...]) -> Masks:
-        named = {view: paths[view] for view in views} if paths and config.masks else {}
-        return {
-            view: load_mask(path, images[view].shape[1::-1])
-            for view, path in named.items()
-            if path is not None
-        }
+        if paths and config.masks:
+            named = {view: paths[view] for view in views}
+        else:
+            named = {}
+        found = {}
+        for view, path in named.items():
+            if path is not None:
+                found[view] = load_mask(path, images[view].shape[1::-1])
+        return found
 
     # Without surroundings nothing could show the sky but what floats before it.
     return images, load_masks(scene.masks), load_masks(scene.sky_masks if config.surroundings else ())
@@ -318,7 +321,10 @@ def make_levels(
     else:
         kept = _Kept(int(_KEPT_THERE * (free_memory(device) or 0)))
         make = partial(target_on, device)
-    return [_Scaled(pixels, k, kept, blurred[k], make) for k in range(count)]
+    found: list[Level] = []
+    for k in range(count):
+        found.append(_Scaled(pixels, k, kept, blurred[k], make))
+    return found
 
 
 def detail(image: Image, scales: int) -> Annotated[NDArray[np.float64], "K"]:

@@ -70,7 +70,9 @@ def plan(config: "GaussiansConfig", scene: "ParsedScene", device: torch.device) 
     pixels = float(sizes.double().prod(1).mean())
     longest = int(sizes.max())
     speed = device_speed(device)
-    budget = None if config.minutes is None else max(1.0, 60 * config.minutes - _START)
+    budget = None
+    if config.minutes is not None:
+        budget = max(1.0, 60 * config.minutes - _START)
     # The largest size at which the time is enough for some passes over the photographs.
     size = config.downscale or max(1, longest / config.longest)
     while True:
@@ -79,17 +81,19 @@ def plan(config: "GaussiansConfig", scene: "ParsedScene", device: torch.device) 
         each = _seconds(found, small, _FEWEST)
         steps = found.limited(views)
         times = speed(_share(found) * small)
-        enough = (
-            steps * each <= _PATIENCE * times
-            if budget is None
-            else budget * times / each >= max(_STEPS, _PASSES * views)
-        )
+        if budget is None:
+            enough = steps * each <= _PATIENCE * times
+        else:
+            enough = budget * times / each >= max(_STEPS, _PASSES * views)
         smaller = math.floor(size) + 1
         if enough or config.downscale is not None or pixels / smaller**2 < _LEAST:
             break
         size = smaller
     # On the machine of the constants, so that a faster one has more Gaussians.
-    seconds = steps * each if budget is None else min(budget * times, steps * each)
+    if budget is None:
+        seconds = steps * each
+    else:
+        seconds = min(budget * times, steps * each)
     cap = config.cap
     if cap is None:
         cap = min(_MOST, max(_FEWEST, 10_000 * round(_FEWEST / 10_000 * (seconds / 60) ** _GROWTH)))
@@ -158,7 +162,10 @@ def _card_speed(device: torch.device) -> Callable[[float], float]:
         for step in range(_FIRST + _TIMED):
             start = time.perf_counter()
             model.learn(target, background=(0.0, 0.0, 0.0), ssim=0.2, rates=np.full(59, 1e-5, np.float32))
-            best = min(best, time.perf_counter() - start) if step >= _FIRST else best
+            if step >= _FIRST:
+                best = min(best, time.perf_counter() - start)
+            else:
+                best = best
         pixels.append(width * height)
         seconds.append(_BESIDES * best)
     slope = max(0.0, (seconds[1] - seconds[0]) / (pixels[1] - pixels[0]))

@@ -65,7 +65,10 @@ def restyled_harmonics(
         for part in look.parts:
             if part.share == 0 or part.strength == 0:
                 continue
-            regions = features.new_ones(len(features), 1) if part.regions is None else part.regions(features)
+            if part.regions is None:
+                regions = features.new_ones(len(features), 1)
+            else:
+                regions = part.regions(features)
             acts = part.share * part.strength * regions
             added = _added(part, features)
             for place, other in part.places:  # a later place lies over those before it
@@ -97,7 +100,9 @@ def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tenso
     it.
     """
     # Light and paint are of one scene, and so are the regions that they ask about.
-    belongs = None if part.light is None else part.light.membership(semantic)
+    belongs = None
+    if part.light is not None:
+        belongs = part.light.membership(semantic)
     if part.colours is not None:
         maps = part.colours
         share: Tensor = maps.membership(semantic) if belongs is None else belongs
@@ -105,9 +110,9 @@ def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tenso
     else:
         # An affine stylizer is known by what it makes of black and of each channel alone.
         black = part.stylizer(semantic.new_zeros(len(semantic), 3), semantic)
-        rows = [
-            part.stylizer(axis.expand(len(semantic), 3), semantic) - black - axis for axis in torch.eye(3)
-        ]
+        rows = []
+        for axis in torch.eye(3):
+            rows.append(part.stylizer(axis.expand(len(semantic), 3), semantic) - black - axis)
         painted = part.features * torch.stack([*rows, black], 1)
     if part.light is None:
         return painted

@@ -116,7 +116,10 @@ class SplatScene(Scene):
 
     def part(self, rows: slice) -> Gaussians:
         """Some of the Gaussians in the scene's look."""
-        gaussians = self.gaussians if rows == slice(0, len(self.gaussians)) else self.gaussians.select(rows)
+        if rows == slice(0, len(self.gaussians)):
+            gaussians = self.gaussians
+        else:
+            gaussians = self.gaussians.select(rows)
         if self.look is None:
             return gaussians
         features = self.found().features[rows]
@@ -158,9 +161,10 @@ class SplatScene(Scene):
             return enlarged(self.render(small, 0, resolution=1.0), cameras.size[view].tolist())
         # A lens is drawn through a pinhole that covers it, and brought to its pixels in the end.
         camera, place = cover(cameras, view, self.near)
-        shown = (
-            self._there if self.merged is None else self._detail.select(camera, self.merged).to(self.drawn_on)
-        )
+        if self.merged is None:
+            shown = self._there
+        else:
+            shown = self._detail.select(camera, self.merged).to(self.drawn_on)
         drawn = draw(shown, camera, antialiased=self.antialiased, background=self.background)
         colour = drawn.image.cpu()
         along = drawn.depth.cpu()
@@ -224,11 +228,9 @@ class SplatScene(Scene):
         self, captured: ParsedScene, views: Sequence[int], progress: Callable[[int, int, str], None]
     ) -> Annotated[Tensor, "V 6"]:
         progress(0, 1, "fitting poses")
-        return (
-            super().fit_poses(captured, views, progress)
-            if self.poses is None
-            else self.poses(captured, views)
-        )
+        if self.poses is None:
+            return super().fit_poses(captured, views, progress)
+        return self.poses(captured, views)
 
     @property
     def counts(self) -> dict[str, int]:

@@ -144,9 +144,8 @@ def find_semantics(
         radius = round(guided.radius * math.sqrt(width * height))
         fine = upsample(low, filled, radius=radius, eps=guided.eps, stride=guided.stride)
         # Colours are those of single pixels of the whole picture: averages would have less contrast.
-        colour, seen = (
-            each[::_COARSER, ::_COARSER][:height, :width].flatten(0, 1) for each in (image, opacity)
-        )
+        colour = image[::_COARSER, ::_COARSER][:height, :width].flatten(0, 1)
+        seen = opacity[::_COARSER, ::_COARSER][:height, :width].flatten(0, 1)
         at = (seen[::every] > _SOLID).nonzero()[:, 0] * every
         sample = (colour[at] / seen[at, None]).clamp(0, 1), fine.flatten(0, 1)[at], seen[at]
         # Neighbours along rows: where both are solid, with their colours without what is behind them.
@@ -270,9 +269,10 @@ def _spread(
 def semantics_tensors(found: Semantics) -> dict[str, Tensor]:
     """Return semantics for a file of tensors."""
     parts = {"style": style_tensors(found.style), "basis": found.basis.tensors()}
-    named = {
-        f"{group}.{name}": tensor for group, tensors in parts.items() for name, tensor in tensors.items()
-    }
+    named = {}
+    for group, tensors in parts.items():
+        for name, tensor in tensors.items():
+            named[f"{group}.{name}"] = tensor
     return {
         **named,
         "semantic": found.features,
@@ -299,4 +299,8 @@ def load_semantics(tensors: dict[str, Tensor], count: int) -> Semantics:
 
 def tensor_group(tensors: Mapping[str, Tensor], name: str) -> dict[str, Tensor]:
     """Tensors whose names begin with `name` and a dot, without these."""
-    return {key.partition(".")[2]: tensor for key, tensor in tensors.items() if key.startswith(f"{name}.")}
+    found: dict[str, Tensor] = {}
+    for key, tensor in tensors.items():
+        if key.startswith(f"{name}."):
+            found[key.partition(".")[2]] = tensor
+    return found

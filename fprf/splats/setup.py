@@ -144,7 +144,10 @@ def limit_widths(
     `near` is drawn.
     """
     centres = scene.cameras.pose[scene.train][:, :, 3].float().contiguous()
-    share, every = (_WIDTH_IN_CELLS, _EVERY_IN_CELLS) if cells else (_WIDTH, _EVERY)
+    if cells:
+        share, every = (_WIDTH_IN_CELLS, _EVERY_IN_CELLS)
+    else:
+        share, every = (_WIDTH, _EVERY)
 
     def nearest_camera(points: Annotated[Tensor, "P 3"]) -> Annotated[Tensor, "P"]:
         # Points lie within a ball, so the camera nearest to one of them is among those nearest to its centre.
@@ -184,7 +187,9 @@ def scene_scale(scene: ParsedScene) -> float:
     around = scene.cameras.pose[scene.train][:, :, 3]
     radius = 1.1 * float((around - around.mean(0)).norm(dim=1).max()) or 1.0
     sightings = find_sightings(sparser(scene))
-    return radius if sightings is None else min(radius, float(sightings.distance.median()))
+    if sightings is None:
+        return radius
+    return min(radius, float(sightings.distance.median()))
 
 
 def find_near(scene: ParsedScene, points: Points) -> float:

@@ -115,7 +115,9 @@ def draw(
 def clip_distance(gaussians: Gaussians) -> float:
     """Nothing of a capture is drawn nearer to a camera than this, along z, in whatever units it is."""
     extent = extent_of(gaussians.means)[1]
-    return min(max(_CLIP, _CLIPPED[0] * extent), _CLIPPED[1] * extent) if extent > 0 else _CLIP
+    if extent > 0:
+        return min(max(_CLIP, _CLIPPED[0] * extent), _CLIPPED[1] * extent)
+    return _CLIP
 
 
 class SeenMeans(NamedTuple):
@@ -150,7 +152,9 @@ def seen_means(gaussians: Gaussians, cameras: Cameras, *, antialiased: bool) -> 
     """
     bands = min(gaussians.degree, 3) + 1
     shape = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)
-    functions, opacities, weights = (torch.zeros(len(gaussians), n) for n in (bands**2, 1, 1))
+    functions = torch.zeros(len(gaussians), bands**2)
+    opacities = torch.zeros(len(gaussians), 1)
+    weights = torch.zeros(len(gaussians), 1)
     near = clip_distance(gaussians)
     # Sums over views, each by the Gaussian's weight in its pixels; what none shows weighs the same in all of
     # them.
@@ -187,7 +191,10 @@ def find_views(
     the others play no part. Raises DataError where nothing can be seen from anywhere.
     """
     near = torch.from_numpy(bulk_of(gaussians.means.numpy()).apart <= OUTLYING)
-    gaussians = gaussians if bool(near.all()) else gaussians.select(near)
+    if bool(near.all()):
+        gaussians = gaussians
+    else:
+        gaussians = gaussians.select(near)
     search = _Search(gaussians, size, up.double() / up.double().norm(), antialiased)
     within = search.made_from_within() if inside is None else inside
     # About where sizes say that photographs were taken; else within what surrounds a free place; else around
@@ -195,10 +202,14 @@ def find_views(
     chosen = None
     others = count - (camera is not None)
     if inside is not False:
-        place = None if camera is None else camera.pose[0, :, 3].double()
+        place = None
+        if camera is not None:
+            place = camera.pose[0, :, 3].double()
         chosen = search.around_place(others, _SIZED_WITHIN if within else _SIZED, place)
     if chosen is None:
-        candidates = search.from_free_places(0.0 if inside else _ENCLOSED) if within else None
+        candidates = None
+        if within:
+            candidates = search.from_free_places(0.0 if inside else _ENCLOSED)
         cameras, worth = candidates or search.rings(others)
         # The best ones, in the order in which they were tried: the nearer ones first.
         best = worth.topk(min(others, len(worth))).indices.sort().values
@@ -255,7 +266,9 @@ class _Search:
         size = self.gaussians.log_scales[seen].topk(2, dim=1).values.mean(1)
         away = torch.linalg.vector_norm(means - means.median(0).values, dim=1)
         order = away.argsort()
-        half, fifth, last = (order[round(share * (len(order) - 1))] for share in (0.5, 0.8, 0.999))
+        half = order[round(0.5 * (len(order) - 1))]
+        fifth = order[round(0.8 * (len(order) - 1))]
+        last = order[round(0.999 * (len(order) - 1))]
         if away[half] == 0:
             return False
         coarser = size[away > away[fifth]].median() - size[away < away[half]].median()
@@ -274,7 +287,10 @@ class _Search:
         some = solid[:: max(1, len(solid) // _SAMPLE)]
         points = gaussians.means.double()
         extent = gaussians.log_scales.double().topk(2, dim=1).values.mean(1)
-        place, share = _size_centre(points[some], extent[some], self.ends) if known is None else (known, 0.0)
+        if known is None:
+            place, share = _size_centre(points[some], extent[some], self.ends)
+        else:
+            place, share = (known, 0.0)
         if share > sized:
             return None
         away = torch.linalg.vector_norm(points[some] - place, dim=1)
@@ -343,7 +359,10 @@ class _Search:
         picked: list[int] = []
         apart = torch.full((len(places),), math.inf, dtype=torch.float64)
         for _ in range(min(_PLACES, len(places))):
-            nearest = int(apart.argmax()) if picked else int((places - ends.mean(1)).norm(dim=1).argmin())
+            if picked:
+                nearest = int(apart.argmax())
+            else:
+                nearest = int((places - ends.mean(1)).norm(dim=1).argmin())
             picked.append(nearest)
             apart = apart.minimum((places - places[nearest]).norm(dim=1))
         places = places[picked]

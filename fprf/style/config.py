@@ -75,7 +75,8 @@ def parse_place(field: str, text: str) -> Place | None:
         math.isnan(x) for point in points for x in point
     )
     if kind == "box" and given and len(points) == 2 and len(sizes) <= 1 and len(size) == len(sizes):
-        low, high = (tuple(map(choose, *points)) for choose in (min, max))
+        low = tuple(map(min, *points))
+        high = tuple(map(max, *points))
         return Place((low, high), None, *(size or (0.0,)))
     if kind == "path" and given and len(points) >= 2 and size and all(map(math.isfinite, sum(points, ()))):
         return Place(tuple(points), size[0], size[1] if len(size) > 1 else 0.0)
@@ -119,7 +120,9 @@ def labels(paths: Sequence[Path]) -> tuple[str, ...]:
     agree.
     """
     for folders in range(3):
-        names = ["/".join([*(f.name for f in p.parents[:folders][::-1] if f.name), p.name]) for p in paths]
+        names = []
+        for p in paths:
+            names.append("/".join([*(f.name for f in p.parents[:folders][::-1] if f.name), p.name]))
         if len(set(names)) == len(names):
             return tuple(names)
     plain = [p.name for p in paths]

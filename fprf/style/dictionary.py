@@ -277,10 +277,13 @@ def concatenate(
 ) -> StyleDictionary:
     """Join dictionaries of one reference each, under new names and weights."""
     counts = torch.tensor([len(part.keys) for part in parts])
-    fields = [
-        name for name in (*_TABLES, *_OPTIONAL) if all(getattr(part, name) is not None for part in parts)
-    ]
-    tables = {name: torch.cat([getattr(part, name) for part in parts]) for name in fields}
+    fields = []
+    for name in (*_TABLES, *_OPTIONAL):
+        if all(getattr(part, name) is not None for part in parts):
+            fields.append(name)
+    tables = {}
+    for name in fields:
+        tables[name] = torch.cat([getattr(part, name) for part in parts])
     tables["weight"] = torch.tensor(weights, dtype=torch.float32).repeat_interleave(counts)
     reference = torch.arange(len(parts)).repeat_interleave(counts)
     return StyleDictionary(**tables, reference=reference, names=tuple(names), blend=parts[0].blend)
@@ -389,6 +392,11 @@ def save_dictionary(path: Path, d: StyleDictionary) -> None:
     """Write the dictionary as safetensors, for people and other programs; a crash leaves the old file or the
     new one.
     """
-    fields = [name for name in (*_TABLES, "reference", *_OPTIONAL) if getattr(d, name) is not None]
-    tensors = {name: getattr(d, name).detach().cpu().contiguous() for name in fields}
+    fields = []
+    for name in (*_TABLES, "reference", *_OPTIONAL):
+        if getattr(d, name) is not None:
+            fields.append(name)
+    tensors = {}
+    for name in fields:
+        tensors[name] = getattr(d, name).detach().cpu().contiguous()
     write_bytes(path, save(tensors, metadata={"names": json.dumps(d.names), "blend": repr(d.blend)}))

@@ -132,7 +132,10 @@ def check_photographs(path: Path, file: StyleFile) -> None:
     for photo in (*file.style.references, *file.style.masks):
         then = file.sha256.get(photo)
         if then is not None and photo.is_file() and (now := _hash(photo)) != then:
-            flag = "--masks" if photo in file.style.masks else "--references"
+            if photo in file.style.masks:
+                flag = "--masks"
+            else:
+                flag = "--references"
             raise DataError(
                 f"{path}: {photo} has changed since the style was saved (sha256 {then[:12]}…, now {now[:12]}…); "
                 f"restore it, or name all with {flag} to take them as they are"
@@ -162,9 +165,10 @@ def with_folders(style: S, report: Callable[[str], None] = warnings.warn) -> S:
             raise ConfigError(
                 f"masks: {mask} is for one photograph, {path} is a folder; write none, or name the photographs"
             )
-        files = (
-            [file for file in photographs([path], report) if file not in known] if path in folders else [path]
-        )
+        if path in folders:
+            files = [file for file in photographs([path], report) if file not in known]
+        else:
+            files = [path]
         known |= {*files}
         rows += [(file, weight, mask) for file in files]
     references, weights, masks = zip(*rows, strict=True)
@@ -198,7 +202,9 @@ def _portable(file: Path, path: Path) -> Path:
     """
     here = Path(os.path.abspath(file.parent))
     there = Path(os.path.abspath(path))
-    return there.relative_to(here) if there.is_relative_to(here) else there
+    if there.is_relative_to(here):
+        return there.relative_to(here)
+    return there
 
 
 def _hash(path: Path) -> str:

@@ -168,7 +168,9 @@ class Light(nn.Module):
         """Share of paint at points, in [0, 1]: the confidence at `bold` 0.5, none at 0, all at 1."""
         # Linear in `bold` on either side of 0.5, where paint is the confidence itself.
         sure = self.confidence(semantic, belongs)
-        return 2 * self.bold * sure if self.bold <= 0.5 else sure + (2 * self.bold - 1) * (1 - sure)
+        if self.bold <= 0.5:
+            return 2 * self.bold * sure
+        return sure + (2 * self.bold - 1) * (1 - sure)
 
     def change(
         self,
@@ -219,7 +221,10 @@ def light_of(
     if bold == 1 or len(scene.share) == 1 or dictionary.colour_mean is None:
         return None
     count = len(scene.share)
-    every = torch.ones(count, len(dictionary.names), dtype=torch.bool) if allowed is None else allowed.cpu()
+    if allowed is None:
+        every = torch.ones(count, len(dictionary.names), dtype=torch.bool)
+    else:
+        every = allowed.cpu()
     mean, covariance = (double(part).cpu() for part in colours)
     likeness = mean.new_zeros(count)
     claim = mean.new_zeros(count)
@@ -277,7 +282,9 @@ def cosines(
 
 
 def _beyond(dictionary: StyleDictionary) -> Annotated[Tensor, "T"]:
-    return torch.zeros_like(dictionary.share) if dictionary.beyond is None else dictionary.beyond
+    if dictionary.beyond is None:
+        return torch.zeros_like(dictionary.share)
+    return dictionary.beyond
 
 
 def _middles(scene: SceneStyle, dictionary: StyleDictionary) -> Annotated[Tensor, "references D"]:
@@ -349,7 +356,8 @@ def light_maps(
     # White balance g, from the logarithms of colours: the cast of the references less that of the scene, axis
     # by axis.
     axes = torch.tensor(_AXES, dtype=torch.float64)
-    here, there = ((part.clamp_min(0) + _BLACK).log() @ axes.T for part in (mean, codes))
+    here = (mean.clamp_min(0) + _BLACK).log() @ axes.T
+    there = (codes.clamp_min(0) + _BLACK).log() @ axes.T
     bright = odds * (luma(codes)[:, 0] / _BRIGHT).clamp(0.05, 1)
     cast = []
     for a in range(len(axes)):

@@ -114,7 +114,9 @@ class ColourMaps(nn.Module):
     @property
     def needs(self) -> Want:
         """Semantics only where there is more than one region."""
-        return Want.CONTENT | Want.SEMANTIC if self.membership.divided else Want.CONTENT
+        if self.membership.divided:
+            return Want.CONTENT | Want.SEMANTIC
+        return Want.CONTENT
 
     def forward(
         self,
@@ -267,8 +269,12 @@ def regional(
     # One stylizer for each different choice of references.
     rows = [tuple(row) for row in allowed.tolist()]
     choices = sorted(set(rows))
-    chosen = [choose(dictionary, torch.tensor(choice)) for choice in choices]
-    stylizers = [config.build(dictionary=part, scene=scene) for part, _ in chosen]
+    chosen = []
+    for choice in choices:
+        chosen.append(choose(dictionary, torch.tensor(choice)))
+    stylizers = []
+    for part, _ in chosen:
+        stylizers.append(config.build(dictionary=part, scene=scene))
     choice_of_region = torch.tensor([choices.index(row) for row in rows])
     return RegionStylizer(scene, stylizers, torch.stack([codes for _, codes in chosen]), choice_of_region)
 
@@ -294,7 +300,9 @@ class RegionStylizer(Stylizer):
 
     @property
     def needs(self) -> Want:
-        return self._stylizer(0).needs if self.alone else Want.CONTENT | Want.SEMANTIC
+        if self.alone:
+            return self._stylizer(0).needs
+        return Want.CONTENT | Want.SEMANTIC
 
     def forward(
         self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
@@ -317,7 +325,10 @@ class RegionStylizer(Stylizer):
 
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
         """The stylizers' own matches, each in its place among the codes of all references."""
-        share = semantic.new_ones(len(semantic), 1) if self.alone else self.weight(semantic)
+        if self.alone:
+            share = semantic.new_ones(len(semantic), 1)
+        else:
+            share = self.weight(semantic)
         out = share.new_zeros(len(semantic), self.codes.shape[1])
         for p in range(len(self.stylizers)):
             out[:, self.codes[p]] += share[:, p, None] * self._stylizer(p).match(semantic)
@@ -447,7 +458,9 @@ class Restyle:
                 changes.append(part.share * strength * part.light(own, semantic, paint, belongs))
         if changes:
             colour = (colour + torch.stack(changes).sum(0)).clamp(0, 1)
-        return keep_luminance(colour, own, luminance) if luminance > 0 else colour
+        if luminance > 0:
+            return keep_luminance(colour, own, luminance)
+        return colour
 
     def match(
         self, semantic: Annotated[Tensor, "N D"], points: Annotated[Tensor, "N 3"] | None = None
@@ -477,7 +490,9 @@ class Restyle:
 
         def own_confidence(part: "Restyle") -> Annotated[Tensor, "N 1"]:
             ones = semantic.new_ones(len(semantic), 1)
-            return ones if part.light is None else part.light.confidence(semantic).to(semantic)
+            if part.light is None:
+                return ones
+            return part.light.confidence(semantic).to(semantic)
 
         total = semantic.new_zeros(len(semantic), 1)
         for part in self.parts:

@@ -80,7 +80,10 @@ def match_map(scene: Scene, styled: Styled, view: int, cameras: Cameras | None =
     def values(semantic: Tensor, points: Tensor | None) -> Tensor:
         # The score is weighted by what is taken, so that its composite is the mean over that.
         taken = look.match(semantic, points)
-        near = unit(semantic, centre) @ units.T if belongs.divided else taken.new_zeros(taken.shape)
+        if belongs.divided:
+            near = unit(semantic, centre) @ units.T
+        else:
+            near = taken.new_zeros(taken.shape)
         sure = look.confidence(semantic, points).to(taken)
         return torch.cat([taken, (taken * near).sum(1, keepdim=True), sure, belongs(semantic)], 1)
 
@@ -196,7 +199,9 @@ def explain(regions: Regions, styled: Styled | None = None) -> list[ExplainedReg
     for view in looked:
         share, opacity = membership_view(regions, view, _COARSE)
         mass.append((share * opacity[..., None]).mean((0, 1)))
-    best = [looked[int(column.argmax())] for column in torch.stack(mass).T]
+    best = []
+    for column in torch.stack(mass).T:
+        best.append(looked[int(column.argmax())])
     # Those views are rendered small, as they are, with the places of the regions in them.
     seen = {}
     for view in sorted(set(best)):
@@ -227,14 +232,15 @@ def explain(regions: Regions, styled: Styled | None = None) -> list[ExplainedReg
     attention = styled.restyle.stylizer.match(keys).cpu().double()
     sure = styled.restyle.confidence(keys).cpu()
     for k, row in enumerate(rows):
-        taken = [
-            ReferenceShare(
-                name,
-                float(attention[k][reference == i].sum()),
-                float(controls.score[k][reference == i].max()),
+        taken = []
+        for i, name in enumerate(styled.dictionary.names):
+            taken.append(
+                ReferenceShare(
+                    name,
+                    float(attention[k][reference == i].sum()),
+                    float(controls.score[k][reference == i].max()),
+                )
             )
-            for i, name in enumerate(styled.dictionary.names)
-        ]
         rows[k] = row._replace(
             taken=tuple(sorted(taken, key=lambda each: (-each.share, -each.score))),
             entropy=float(torch.special.entr(attention[k]).sum()) / math.log(2),
@@ -275,5 +281,7 @@ def region_tile(region: ExplainedRegion, names: tuple[str, ...]) -> Tile:
     best = region.taken[0]
     matched = f"{best.name} {best.share:.0%}, score {best.score:.2f}, sure {region.confidence:.0%}"
     lines.append("kept as it is" if region.strength == 0 else matched)
-    by_name = {taken.name: taken.share * region.strength for taken in region.taken}
+    by_name = {}
+    for taken in region.taken:
+        by_name[taken.name] = taken.share * region.strength
     return Tile(region.picture, tuple(lines), tuple(by_name[name] for name in names))

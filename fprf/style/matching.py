@@ -67,8 +67,13 @@ def score_spread(queries: Annotated[Tensor, "N D"], keys: Annotated[Tensor, "T D
     encoders.
     """
     r = scores(double(queries), double(keys))
-    spread = float((r - r.mean(1, keepdim=True)).square().mean().sqrt()) if r.numel() else 0.0
-    return spread if spread > _FLAT * float(r.abs().max() if r.numel() else 0.0) else 1.0
+    if r.numel():
+        spread = float((r - r.mean(1, keepdim=True)).square().mean().sqrt())
+    else:
+        spread = 0.0
+    if spread > _FLAT * float(r.abs().max() if r.numel() else 0.0):
+        return spread
+    return 1.0
 
 
 def attention(
@@ -148,7 +153,10 @@ def match_keys(
 
     # Plain cosines, for single things: both sides are seen from the encoder's zero.
     if not centred:
-        zero = torch.zeros_like(regions[0]) if origin is None else double(origin)
+        if origin is None:
+            zero = torch.zeros_like(regions[0])
+        else:
+            zero = double(origin)
         return matched(unit(regions, zero), unit(codes, zero))
 
     def directions(x: Tensor, centre: Tensor, white: Tensor) -> Annotated[Tensor, "N D"]:

@@ -106,7 +106,10 @@ def find_regions(regions: Regions, text: str) -> list[RegionMatch]:
     longest_first = sorted(range(len(names)), key=lambda v: -len(names[v]))
     view = next((v for v in longest_first if text.startswith(f"{names[v]}:")), None)
     if view is None:
-        named = f", a name in the style file ({', '.join(regions.keys)})" if regions.keys else ""
+        if regions.keys:
+            named = f", a name in the style file ({', '.join(regions.keys)})"
+        else:
+            named = ""
         raise UsageError(
             f"region {text!r}: neither a number{named}, nor VIEW:X,Y or VIEW:MASK.png with a view of the run "
             f"({names[0]} … {names[-1]})"
@@ -162,7 +165,10 @@ def _alike(regions: Regions, name: str) -> list[RegionMatch]:
     there = regions.basis.project(torch.tensor(list(regions.keys.values())))
     alike, nearest = scores(unit(style.keys, style.semantic_mean), unit(there, style.semantic_mean)).max(1)
     mine = (nearest == list(regions.keys).index(name)) & (alike >= ALIKE)
-    return [RegionMatch(k, name, float(alike[k])) for k in mine.nonzero().flatten().tolist()]
+    found: list[RegionMatch] = []
+    for k in mine.nonzero().flatten().tolist():
+        found.append(RegionMatch(k, name, float(alike[k])))
+    return found
 
 
 def memberships(
@@ -258,11 +264,10 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
         poor = (best < style.keep_below).nonzero().flatten().tolist()
         strength[[k for k in poor if k not in pinned]] = 0.0
         if poor and not bool(strength.any()):
-            scored = (
-                "a scene of one region has no scores"
-                if len(score) == 1
-                else f"the best score is {float(best.max()):.2f}"
-            )
+            if len(score) == 1:
+                scored = "a scene of one region has no scores"
+            else:
+                scored = f"the best score is {float(best.max()):.2f}"
             names.notes.append(f"keep_below {style.keep_below:g}: every region stays as it is; {scored}")
     # Places: what regions may take of these references; all of them where that is none.
     references_of: dict[str, set[int]] = {}
@@ -308,11 +313,10 @@ class _StyleNames:
         self.order = [dictionary.names.index(label) for label in self.labels]
         # All regions, not only those that are named: on another scene each must find its like among all of
         # them.
-        every = {
-            f"region{k}": key_of(regions, k)
-            for k in range(len(regions.scene_style.share))
-            if regions.basis is not None
-        }
+        every = {}
+        for k in range(len(regions.scene_style.share)):
+            if regions.basis is not None:
+                every[f"region{k}"] = key_of(regions, k)
         self.keys = dict(regions.keys) if regions.keys_fit else every
         self.notes: list[str] = []
 
@@ -332,16 +336,18 @@ class _StyleNames:
 
     def find_pairs(self, texts: Sequence[tuple[str, str]]) -> list[tuple[RegionMatch, int]]:
         """Find regions and references of REGION=REFERENCE; a mask may mean several regions."""
-        return [
-            (match, find_reference(value, self.references))
-            for region, value in texts
-            for match in self.find(region)
-        ]
+        found: list[tuple[RegionMatch, int]] = []
+        for region, value in texts:
+            for match in self.find(region):
+                found.append((match, find_reference(value, self.references)))
+        return found
 
     def reference(self, number: int) -> str:
         """A reference as a style file names it, wherever its photographs are moved to."""
         name = self.references[number].name
-        return name if self.labels[number] == name and "=" not in name else str(number)
+        if self.labels[number] == name and "=" not in name:
+            return name
+        return str(number)
 
     def region(self, region: RegionMatch) -> str:
         """Name of a region in a style file, which holds its key under that name."""
@@ -349,7 +355,10 @@ class _StyleNames:
             return region.name
         key = key_of(self.regions, region.number)
         name = f"region{region.number}"
-        same_key = [other for other, its in self.keys.items() if its == key]
+        same_key = []
+        for other, its in self.keys.items():
+            if its == key:
+                same_key.append(other)
         if same_key:
             return same_key[0]
         while name in self.keys:

@@ -114,7 +114,9 @@ def apply_dictionary(
     config = style.stylizer
     device = scene.device
     partly = bool((controls.strength != 1).any())
-    weight = RegionWeight(scene_style, controls.strength[:, None]).to(device) if partly else None
+    weight = None
+    if partly:
+        weight = RegionWeight(scene_style, controls.strength[:, None]).to(device)
 
     def look(allowed: Annotated[Tensor, "K references"]) -> Restyle:
         """The look of one choice of references: stylizer, colours behind the decoder, and light where matches
@@ -192,7 +194,9 @@ def keyed_looks(scene: Scene, keys: Sequence[Keyframe]) -> Callable[[int], Resty
         if way == 0 or second is first:
             return first
         if first is None:
-            return None if second is None else second.faded.mixed(second, way)
+            if second is None:
+                return None
+            return second.faded.mixed(second, way)
         return first.mixed(first.faded if second is None else second, way)
 
     return look

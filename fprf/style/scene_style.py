@@ -80,7 +80,10 @@ def scene_style(
     keep = weights > 0
     content = content[keep]
     weights = weights[keep]
-    semantic = content.new_zeros(len(content), 0) if semantic is None else semantic[keep]
+    if semantic is None:
+        semantic = content.new_zeros(len(content), 0)
+    else:
+        semantic = semantic[keep]
     keys = semantic.new_zeros(1, 0)
     if semantic.shape[1] > 0:
         keys = kmeans(semantic, regions, seed=seed, weights=weights).centres
@@ -180,7 +183,9 @@ def region_contacts(
     pairs whose colours differ count less. Symmetric, at least 0, with 0 on the diagonal.
     """
     belongs = Membership(scene.keys, scene.semantic_mean)
-    ends = [double(belongs(part.contiguous())) for part in semantic.unbind(1)]
+    ends = []
+    for part in semantic.unbind(1):
+        ends.append(double(belongs(part.contiguous())))
     # What one region loses between the ends of a pair, another gains; across an edge of colour it counts
     # little.
     change = ends[0] - ends[1]
@@ -244,7 +249,10 @@ def check_fit(dictionary: StyleDictionary, scene: SceneStyle) -> None:
 
 def to_tensors(scene: SceneStyle) -> dict[str, Tensor]:
     """The fields by name, for a checkpoint."""
-    return {name: t.detach().contiguous() for name, t in scene._asdict().items()}
+    found: dict[str, Tensor] = {}
+    for name, t in scene._asdict().items():
+        found[name] = t.detach().contiguous()
+    return found
 
 
 def from_tensors(tensors: Mapping[str, Tensor]) -> SceneStyle:

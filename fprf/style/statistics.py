@@ -115,10 +115,9 @@ def group_moments(
     Membership is the weight >= 0 of each row in each group; only rows that belong to a group are visited for
     it, so sharp memberships cost one group. An empty group has the mean and covariance of nothing: zero.
     """
-    groups = [
-        moments(features[inside.to(features.device)], membership[inside, k])
-        for k, inside in enumerate((column > 0).nonzero().squeeze(1) for column in membership.T)
-    ]
+    groups = []
+    for k, inside in enumerate((column > 0).nonzero().squeeze(1) for column in membership.T):
+        groups.append(moments(features[inside.to(features.device)], membership[inside, k]))
     # Shares of all weight; where there is none at all they are 0, not NaN.
     weight = torch.stack([g.weight for g in groups])
     mean = torch.stack([g.mean for g in groups])
@@ -234,7 +233,10 @@ def kmeans(
     finite.
     """
     points = double(x)
-    mass = points.new_ones(len(points)) if weights is None else double(weights)
+    if weights is None:
+        mass = points.new_ones(len(points))
+    else:
+        mass = double(weights)
     if not bool(points.isfinite().all() & mass.isfinite().all() & (mass >= 0).all()):
         raise NumericsError("k-means: a feature or a weight is not finite, or a weight is negative")
     if len(points) == 0 or k < 1:

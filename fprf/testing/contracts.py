@@ -246,7 +246,9 @@ def check_sampler(config: SamplerConfig) -> None:
     sampler, name = _built(config, Sampler, lambda: config.build(seed=0))
 
     def sample(rays: Rays, seed: int | None) -> Sampled:
-        generator = None if seed is None else torch.Generator().manual_seed(seed)
+        generator = None
+        if seed is not None:
+            generator = torch.Generator().manual_seed(seed)
         found: Sampled = sampler(
             rays, space=cases.space(), step=None if seed is None else 10, generator=generator
         )
@@ -339,7 +341,9 @@ def check_layout(config: LayoutConfig) -> None:
         again = layout.cut(site)
         require(len(cells) > 0, f"{name}: at least one block is needed")
         for cell, other in zip(cells, again, strict=True):
-            shapes = {tuple(each.shape) for each in (cell.low, cell.high, cell.border)}
+            shapes = set()
+            for each in (cell.low, cell.high, cell.border):
+                shapes.add(tuple(each.shape))
             require(shapes == {(3,)}, f"{name}: low, high and border must be [3], found {shapes}")
             require(
                 bool((cell.low < cell.high).all()),
@@ -518,7 +522,9 @@ def check_loss_term(config: LossTermConfig) -> None:
     bare = cases.batch(count)._replace(content=None, semantic=None)
 
     def value(rendered: Rendered, batch: Batch, seed: int | None = None) -> torch.Tensor:
-        generator = None if seed is None else torch.Generator().manual_seed(seed)
+        generator = None
+        if seed is not None:
+            generator = torch.Generator().manual_seed(seed)
         return term(rendered, batch, parts, step=10, generator=generator)
 
     for batch, render in ((cases.batch(count), rendered), (bare, rendered._replace(semantic=None))):
@@ -547,7 +553,9 @@ def check_loss_term(config: LossTermConfig) -> None:
         weights.requires_grad_()
         loss = value(rendered._replace(weights=weights, opacity=weights.detach().sum(1)), cases.batch(count))
         tensor(loss, (), f"{name} of rays {kind}")
-        moved = torch.autograd.grad(loss, weights, allow_unused=True)[0] if loss.requires_grad else None
+        moved = None
+        if loss.requires_grad:
+            moved = torch.autograd.grad(loss, weights, allow_unused=True)[0]
         require(
             moved is None or bool(moved.isfinite().all()),
             f"{name}: its gradient for rays {kind} is not finite",

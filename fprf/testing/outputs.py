@@ -140,7 +140,10 @@ def trainable(module: nn.Module, loss: Tensor, name: str) -> None:
     """Require a finite gradient for every parameter that wants one."""
     named = {key: value for key, value in module.named_parameters() if value.requires_grad}
     require(loss.requires_grad or not named, f"{name}: no gradient goes through its answer")
-    gradients = torch.autograd.grad(loss, list(named.values()), allow_unused=True) if named else ()
+    if named:
+        gradients = torch.autograd.grad(loss, list(named.values()), allow_unused=True)
+    else:
+        gradients = ()
     for key, gradient in zip(named, gradients, strict=True):
         require(gradient is not None, f"{name}: no gradient reaches {key}")
         require(bool(gradient.isfinite().all()), f"{name}: the gradient of {key} is not finite")
@@ -231,7 +234,10 @@ def check_parts(config: "TrainConfig", parts: "Parts", channels: int, dim: int) 
         with naming_plugin(config.semantic.field):
             tensor(asked("semantics", parts.semantic, points), (POINTS, dim), "semantics")
     # In NDC near is a depth in the world, and rays go from 0 to 1.
-    near, far = (0.0, 1.0) if parts.space.kind == "ndc" else (parts.space.near, parts.space.far)
+    if parts.space.kind == "ndc":
+        near, far = (0.0, 1.0)
+    else:
+        near, far = (parts.space.near, parts.space.far)
     rays = Rays(torch.zeros(POINTS, 3), view, view, torch.full((POINTS,), near), torch.full((POINTS,), far))
     with naming_plugin(config.sampler):
         sampler = parts.sampler
@@ -241,7 +247,10 @@ def check_parts(config: "TrainConfig", parts: "Parts", channels: int, dim: int) 
             lambda origin: sampler(rays._replace(origin=origin), space=space, step=None, generator=None),
             rays.origin,
         )
-        count = sampled.t.shape[-1] if isinstance(sampled.t, Tensor) and sampled.t.ndim else 0
+        if isinstance(sampled.t, Tensor) and sampled.t.ndim:
+            count = sampled.t.shape[-1]
+        else:
+            count = 0
         for name, edges in (("edges s", sampled.s), ("edges t", sampled.t)):
             tensor(edges, (POINTS, count), name)
             rising = count >= 2 and bool((edges.diff(dim=1) >= 0).all())

@@ -80,7 +80,11 @@ class Built(NamedTuple):
             "tones": self.model.tones,
             "poses": self.model.poses,
         }
-        return {kind: part for kind, part in parts.items() if part is not None}
+        found: dict[str, nn.Module] = {}
+        for kind, part in parts.items():
+            if part is not None:
+                found[kind] = part
+        return found
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Take what is kept from the tensors of a finished block, which are not copied."""
@@ -167,7 +171,10 @@ def restore(module: nn.Module, kind: str, tensors: dict[str, Tensor]) -> None:
     """Give a `member`, `decoder`, `tones` or `poses` its tensors of a finished block: mapped from the file,
     not copied.
     """
-    own = {name.removeprefix(f"{kind}."): t for name, t in tensors.items() if name.startswith(f"{kind}.")}
+    own = {}
+    for name, t in tensors.items():
+        if name.startswith(f"{kind}."):
+            own[name.removeprefix(f"{kind}.")] = t
     wrong = misfit(module, own)
     if wrong is not None:
         raise CheckpointError(
@@ -241,7 +248,9 @@ def load_blocked(
         config, facts, cache, BlendRouter(cells), around.model.decoder, around.model.tones, around.model.poses
     )
     model.requires_grad_(False)
-    done = [load_finished(folder_of(root, block), verify=False)[0] for block in range(len(cells))]
+    done = []
+    for block in range(len(cells)):
+        done.append(load_finished(folder_of(root, block), verify=False)[0])
     return (
         model.to(device).eval(),
         min(each.step for each in done),
@@ -295,17 +304,22 @@ class Blocks(Partition):
         # everything.
         rays = {}
         for block in (WHOLE, *range(len(plan.cells))):
-            views = plan.views if block == WHOLE else plan.views_of(block)
+            if block == WHOLE:
+                views = plan.views
+            else:
+                views = plan.views_of(block)
             at = torch.isin(plan.views, views)
-            seen = torch.ones_like(plan.seen[at, 0]) if block == WHOLE else plan.seen[at, block]
+            if block == WHOLE:
+                seen = torch.ones_like(plan.seen[at, 0])
+            else:
+                seen = plan.seen[at, block]
             rays[block] = {"views": views, "seen": seen.to(torch.uint8)}
         folder = folder_of(run.root, 0).parent
         if any(task_of(part) for part in folder.glob("*")):  # digests read all images
             blocks = range(len(plan.cells))
-            asked = {
-                z: block_task(self.config, self.facts, self.scene, plan.cells, z, rays[z])["task"]
-                for z in blocks
-            }
+            asked = {}
+            for z in blocks:
+                asked[z] = block_task(self.config, self.facts, self.scene, plan.cells, z, rays[z])["task"]
             renumber(folder, asked)
         for block, own in rays.items():
             folder_of(run.root, block).mkdir(parents=True, exist_ok=True)
@@ -327,7 +341,10 @@ def block_task(
     surroundings: they are only its frame.
     """
     # What the surroundings span follows from all blocks together, not from how they are cut.
-    chart = surroundings_of(cells) if block == WHOLE else chart_of(cells[block])
+    if block == WHOLE:
+        chart = surroundings_of(cells)
+    else:
+        chart = chart_of(cells[block])
     views = rays["views"].tolist()
     space = facts.space
     parts = {
@@ -389,7 +406,9 @@ class Block(Part):
             width, height = scene.cameras.size[view].tolist()
             return pixel_mask(self.rays["seen"][slots[view]].bool(), (width, height))
 
-        basis = Basis.from_tensors(self.run.load_tensors("basis")) if facts.dim else None
+        basis = None
+        if facts.dim:
+            basis = Basis.from_tensors(self.run.load_tensors("basis"))
         prepared = prepare(config, scene, facts, space=facts.space, basis=basis, seen=seen)._replace(
             facts=facts
         )
@@ -401,11 +420,10 @@ class Block(Part):
             learner.model.field, BlockedField
         )  # it is that of `build`
         built = Built(learner.model, learner.model.field.members.held[0])
-        tensors = {
-            f"{kind}.{name}": t
-            for kind, part in built.kept().items()
-            for name, t in part.state_dict().items()
-        }
+        tensors = {}
+        for kind, part in built.kept().items():
+            for name, t in part.state_dict().items():
+                tensors[f"{kind}.{name}"] = t
         return tensorfiles.save(self.folder / FILE, tensors)
 
 

@@ -101,7 +101,9 @@ class Poses(nn.Module):
 def moved_cameras(cameras: Cameras, moves: Annotated[Tensor, "V 6"]) -> Cameras:
     """Cameras, each turned about its own centre and shifted."""
     moves = moves.to(cameras.pose.device).to(cameras.pose.dtype)
-    axes = [rotated(cameras.pose[:, :, axis], moves[:, :3]) for axis in range(3)]
+    axes = []
+    for axis in range(3):
+        axes.append(rotated(cameras.pose[:, :, axis], moves[:, :3]))
     return replace(cameras, pose=torch.stack([*axes, cameras.pose[:, :, 3] + moves[:, 3:]], -1))
 
 
@@ -130,7 +132,9 @@ def _gauge(centres: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "6M G"]:
     place = centres - centres.mean(0) if len(centres) else centres
     none = torch.zeros_like(place)
     axes = torch.eye(3, dtype=place.dtype)
-    columns = [torch.cat([none, axis.expand_as(place)], -1) for axis in axes]
+    columns = []
+    for axis in axes:
+        columns.append(torch.cat([none, axis.expand_as(place)], -1))
     columns += [
         torch.cat([axis.expand_as(place), torch.linalg.cross(axis.expand_as(place), place)], -1)
         for axis in axes

@@ -102,11 +102,11 @@ def load(root: Path, step: int, *, verify: bool = True) -> Saved:
     """
     folder = _folder(root, step)
     manifest = _read(root, step)
-    files = {name: (folder / f"{name}.safetensors", entries) for name, entries in manifest.files.items()}
-    model, optimizer = (
-        tensorfiles.load(*files[name]) if verify else tensorfiles.read(files[name][0])
-        for name in ("model", "optimizer")
-    )
+    files = {}
+    for name, entries in manifest.files.items():
+        files[name] = (folder / f"{name}.safetensors", entries)
+    model = tensorfiles.load(*files["model"]) if verify else tensorfiles.read(files["model"][0])
+    optimizer = tensorfiles.load(*files["optimizer"]) if verify else tensorfiles.read(files["optimizer"][0])
     return Saved(step, manifest.seconds, model, optimizer)
 
 
@@ -136,7 +136,9 @@ def _read(root: Path, step: int) -> _Manifest:
             raise ValueError("its checksum differs")
         at = int(manifest["step"])
         seconds = float(manifest["seconds"])
-        files = {name: dict(manifest["files"][name]) for name in ("model", "optimizer")}
+        files = {}
+        for name in ("model", "optimizer"):
+            files[name] = dict(manifest["files"][name])
         if at != step or not math.isfinite(seconds):
             raise ValueError(f"it speaks of step {at} after {seconds} s")
         return _Manifest(seconds, files, checksum)
@@ -163,7 +165,10 @@ def misfit(module: nn.Module, tensors: Mapping[str, Tensor]) -> str | None:
     state.
     """
     own = module.state_dict()
-    wrong = [name for name in own if name not in tensors or own[name].shape != tensors[name].shape]
+    wrong = []
+    for name in own:
+        if name not in tensors or own[name].shape != tensors[name].shape:
+            wrong.append(name)
     wrong += [name for name in tensors if name not in own]
     return wrong[0] if wrong else None
 
@@ -188,9 +193,9 @@ def moments_of(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
     """The tensors of an optimiser by the number of their parameter and their own name, as `restore` reads
     them.
     """
-    return {
-        f"{index}.{key}": value
-        for index, values in optimizer.state_dict()["state"].items()
-        for key, value in values.items()
-        if isinstance(value, Tensor)
-    }
+    found: dict[str, Tensor] = {}
+    for index, values in optimizer.state_dict()["state"].items():
+        for key, value in values.items():
+            if isinstance(value, Tensor):
+                found[f"{index}.{key}"] = value
+    return found

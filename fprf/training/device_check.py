@@ -78,7 +78,10 @@ def fast_paths(device: torch.device) -> Iterator[tuple[str, str]]:
     else:
         yield "kernels", "none: everything by torch"
     if device.type == "cuda":
-        products = "float32" if torch.get_float32_matmul_precision() == "highest" else "TF32"
+        if torch.get_float32_matmul_precision() == "highest":
+            products = "float32"
+        else:
+            products = "TF32"
         yield "precision", f"matrix products in {products}, convolutions of encoders in float32"
     free = free_memory(device)
     if free is not None:
@@ -104,9 +107,9 @@ def _computed(device: torch.device) -> dict[str, Tensor]:
     space = Space(kind="contraction", centre=(0.0, 0.0, 0.0), rotation=axes, scale=1.0, near=0.1, far=100.0)
     facts = Facts(space=space, channels=encoder.channels, dim=_DIM, content_encoder=encoder.identity)
     model = build_model(config, facts).to(device)
-    place, target, up = (
-        torch.tensor([x], dtype=torch.float64) for x in ((0.0, -0.4, 0.1), (0.1, 0.5, 0.0), (0.0, 0.0, 1.0))
-    )
+    place = torch.tensor([(0.0, -0.4, 0.1)], dtype=torch.float64)
+    target = torch.tensor([(0.1, 0.5, 0.0)], dtype=torch.float64)
+    up = torch.tensor([(0.0, 0.0, 1.0)], dtype=torch.float64)
     cameras = pinhole(look_at(place, target, up[0]), width=32, height=24, fov=60.0)
     # Features of a picture, a step of training, and the view as it is and in the picture's style.
     encoder = encoder.to(device)

@@ -66,7 +66,12 @@ class Schedule(NamedTuple):
 
     def share(self, step: int, seconds: float) -> float:
         """Share of the way, 0 to 1: by steps or by minutes, whichever is further."""
-        share = 0.0 if self.steps is None else step / self.steps if self.steps else 1.0
+        if self.steps is None:
+            share = 0.0
+        elif self.steps:
+            share = step / self.steps
+        else:
+            share = 1.0
         if self.minutes is not None:
             share = max(share, seconds / (60 * self.minutes))
         return min(1.0, share)
@@ -176,7 +181,10 @@ def learn(
     """
     # All draws are functions of (seed, step): a resumed training is bit for bit the one that never stopped.
     saved = None if run is None else _resume(learner, run)
-    step, seconds_before = (saved.step, saved.seconds) if saved is not None else (0, spent)
+    if saved is not None:
+        step, seconds_before = (saved.step, saved.seconds)
+    else:
+        step, seconds_before = (0, spent)
     # `step` steps are made, `clock` seconds used.
     first = step
     clock = seconds_before
@@ -232,7 +240,10 @@ def learn(
                     report(measured(figures, schedule.share(step, clock)))
                     # Who looks gets checkpoints as often as a twentieth of the time allows.
                     often = run is not None and is_watched(run.root)
-                    pause = min(longest, max(_MIN_PAUSE, cost / _SAVING_SHARE)) if often else longest
+                    if often:
+                        pause = min(longest, max(_MIN_PAUSE, cost / _SAVING_SHARE))
+                    else:
+                        pause = longest
                 if now - last_saved > pause:
                     save()
             if signals.asked:
@@ -245,8 +256,14 @@ def learn(
             if not out_of_memory(error):
                 raise
             # The step is lost, the last checkpoint is not.
-            steps = [] if run is None else checkpoint.steps(run.checkpoints)
-            kept = f"the checkpoint of step {steps[-1]} is kept" if steps else "there is no checkpoint yet"
+            if run is None:
+                steps = []
+            else:
+                steps = checkpoint.steps(run.checkpoints)
+            if steps:
+                kept = f"the checkpoint of step {steps[-1]} is kept"
+            else:
+                kept = "there is no checkpoint yet"
             remedy = f"lower --datamanager.rays (of fields), or begin anew with a larger --downscale ({kept})"
             raise shortage(f"training step {step}", error, remedy) from error
     # A run without steps is saved as well: it can be opened.
@@ -278,7 +295,9 @@ def _go_back(learner: Learner, run: Run | None, figures: Figures, step: int, bef
     """
     why = f"step {step}: {figures.fault or 'the loss'} is not finite for {PATIENCE} steps in a row"
     remedy = "lower the learning rate, or check the images"
-    saved = None if run is None else checkpoint.load_latest(run.checkpoints)[0]
+    saved = None
+    if run is not None:
+        saved = checkpoint.load_latest(run.checkpoints)[0]
     if run is None or saved is None:
         raise NumericsError(f"{why}; {remedy}")
     if saved.step == before:
@@ -409,21 +428,24 @@ def _sized(run: Run, config: RunConfig, display: Display) -> RunConfig:
     # Else a run would change its size with the machine or the minutes.
     if run.exists:
         old = run.load_config()[0]
-        decided = {name: getattr(old, name, None) for name in config.open if getattr(config, name) is None}
+        decided = {}
+        for name in config.open:
+            if getattr(config, name) is None:
+                decided[name] = getattr(old, name, None)
         config = replace(config, **{name: value for name, value in decided.items() if value is not None})
     if any(getattr(config, name) is None for name in config.open):
         scene = read_scene(replace(config, downscale=1))
         config = planned(config, scene)
         sizes = scene.cameras.scaled(config.downscale or 1).size
         width, height = sizes[scene.train[0] if len(scene.train) else 0].tolist()
-        ends = (
-            f"{config.minutes:g} minutes"
-            if config.minutes is not None
-            else f"{config.limited(len(scene.train)):,} steps"
-        )
-        reduced = (
-            f" (1/{config.downscale:.3g}; --downscale 1 keeps them whole)" if config.downscale != 1 else ""
-        )
+        if config.minutes is not None:
+            ends = f"{config.minutes:g} minutes"
+        else:
+            ends = f"{config.limited(len(scene.train)):,} steps"
+        if config.downscale != 1:
+            reduced = f" (1/{config.downscale:.3g}; --downscale 1 keeps them whole)"
+        else:
+            reduced = ""
         display.say(
             f"plan: {len(scene.train)} views at {width}x{height}{reduced}{config.described()}, {ends}"
         )
@@ -448,10 +470,13 @@ def _check_same(run: Run, config: RunConfig) -> None:
         if path.partition(".")[0] not in free and mine.get(path) != theirs.get(path)
     ]
     if changed:
-        shown = [
-            f"{name} {theirs.get(name, '-')} ({mine.get(name, '-')} is asked)" for name in changed[:_SHOWN]
-        ]
-        more = f" and {len(changed) - _SHOWN} others" if len(changed) > _SHOWN else ""
+        shown = []
+        for name in changed[:_SHOWN]:
+            shown.append(f"{name} {theirs.get(name, '-')} ({mine.get(name, '-')} is asked)")
+        if len(changed) > _SHOWN:
+            more = f" and {len(changed) - _SHOWN} others"
+        else:
+            more = ""
         # The first free name after this one, so that the line can be copied.
         other = next(
             path for k in range(2, 1000) if not (path := run.root.with_name(f"{run.root.name}-{k}")).exists()

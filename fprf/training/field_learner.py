@@ -87,7 +87,9 @@ class FieldLearner(SceneLearner):
         self.manager = prepared.manager
         if device.type != "cpu":
             # Data lie on the device where they fit: then batches are drawn there, without copies.
-            free = free_memory(device) if device.type == "cuda" else None
+            free = None
+            if device.type == "cuda":
+                free = free_memory(device)
             self.manager = prepared.manager.to(device, room=int(config.device_memory * (free or 0)))
         self.batches = Batches(self.manager, device)
         self.through = PixelRays(prepared.scene.cameras)
@@ -182,7 +184,10 @@ class FieldLearner(SceneLearner):
         """
         before = self.skipped
         (means, self.skipped, failed, names) = self.statistics.read()
-        fault = (names or "the loss or a gradient") if self.skipped > before else ""
+        if self.skipped > before:
+            fault = names or "the loss or a gradient"
+        else:
+            fault = ""
         return Figures(means, self.rays, self.skipped, failed, fault, means.pop("kept", 0.0))
 
     def state(self) -> State:
@@ -197,7 +202,10 @@ class FieldLearner(SceneLearner):
         if self.prepared.basis is not None:
             run.save_tensors("basis", self.prepared.basis.tensors())
         facts = self.facts
-        semantics = f", {facts.dim} semantic" if facts.dim else ", no semantic"
+        if facts.dim:
+            semantics = f", {facts.dim} semantic"
+        else:
+            semantics = ", no semantic"
         return f", space {facts.space.kind}, {facts.channels} content{semantics} channels{', tones' * bool(facts.exposure)}"
 
     def finish(self, run: Run, display: Display) -> None:
@@ -253,7 +261,10 @@ class Batches:
 
 def rate(config: OptimizerConfig, step: int, share: float) -> float:
     """Linear warm-up, then a cosine from `rate` to `final * rate`, and 1 / sqrt(step) from `hold` on."""
-    late = 1.0 if config.hold is None else math.sqrt(config.hold / max(config.hold, step))
+    if config.hold is None:
+        late = 1.0
+    else:
+        late = math.sqrt(config.hold / max(config.hold, step))
     warm = min(1.0, (step + 1) / max(1, config.warm_up))
     cosine = 0.5 * (1 + math.cos(math.pi * share))
     return config.rate * warm * late * (config.final + (1 - config.final) * cosine)
@@ -290,7 +301,9 @@ class StepStatistics:
         given = tuple(values)
         if given not in self._present:
             # Filled on the device: a term that comes every few steps must not have the host wait for a copy.
-            marks = [torch.full_like(self.none, float(name in values)) for name in self.names]
+            marks = []
+            for name in self.names:
+                marks.append(torch.full_like(self.none, float(name in values)))
             self._present[given] = torch.stack(marks).to(self.rows.dtype)
         row = torch.stack([values.get(name, self.none) for name in self.names]).to(self.rows.dtype)
         # Where a value is not finite neither its sum nor its weight moves: the mean stays what it was.
@@ -311,7 +324,10 @@ class StepStatistics:
         self.rows[2].zero_()
         # Both sums began at 0: their quotient is the mean over what was seen.
         value, weight, bad = (numbers[k * len(self.names) : (k + 1) * len(self.names)] for k in range(3))
-        means = {name: v / w for name, v, w in zip(self.names, value, weight, strict=True) if w > 0}
+        means = {}
+        for name, v, w in zip(self.names, value, weight, strict=True):
+            if w > 0:
+                means[name] = v / w
         return (
             means,
             int(skipped),
@@ -345,11 +361,10 @@ def training_summary(run: Run, config: TrainConfig, scene: ParsedScene) -> str:
     raises it.
     """
     try:
-        trained = [
-            history
-            for history in read_history(run.root)
-            if history.values.get("psnr", [None])[-1] is not None
-        ]
+        trained = []
+        for history in read_history(run.root):
+            if history.values.get("psnr", [None])[-1] is not None:
+                trained.append(history)
     except CheckpointError:
         trained = []
     if not trained:
@@ -365,17 +380,15 @@ def training_summary(run: Run, config: TrainConfig, scene: ParsedScene) -> str:
     # The next try is advised in the unit that ended this one.
     timed = config.minutes is not None and steps < config.steps
     again = f"fprf train {shlex.quote(str(run.root / 'config.json'))}"
-    longer = (
-        f"--minutes {2 * (config.minutes or 0):g}"
-        if timed
-        else f"--steps {max(2 * config.steps, _FEW_STEPS)}"
-    )
+    if timed:
+        longer = f"--minutes {2 * (config.minutes or 0):g}"
+    else:
+        longer = f"--steps {max(2 * config.steps, _FEW_STEPS)}"
     if steps < _FEW_STEPS:
         return f"warning: too few steps to judge the scene by: {reached}; go on: {again} {longer}"
     size = config.downscale or 1
-    finer = (
-        f"; for more detail: --downscale {max(size - 1, 1):g} and another --output"
-        if size > 1 and passes > PASSES
-        else ""
-    )
+    if size > 1 and passes > PASSES:
+        finer = f"; for more detail: --downscale {max(size - 1, 1):g} and another --output"
+    else:
+        finer = ""
     return f"{reached}; to raise it: {again} {longer}{finer}"

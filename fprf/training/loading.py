@@ -89,9 +89,10 @@ class Trained(Scene):
         return self.known.facts.semantic_encoder
 
     def render(self, cameras: Cameras, view: int, *, resolution: float | None = None) -> View:
-        config = (
-            self.config.render if resolution is None else replace(self.config.render, resolution=resolution)
-        )
+        if resolution is None:
+            config = self.config.render
+        else:
+            config = replace(self.config.render, resolution=resolution)
         return render_view(self.model, self.known.facts, cameras, view, config, self.look)
 
     def paint(
@@ -124,7 +125,10 @@ class Trained(Scene):
         facts = self.known.facts
         moves = torch.zeros(len(self.names), 6, dtype=torch.float64)
         # Shifts are counted in what views commonly see, as in training, where poses are learnt.
-        reach = facts.reach if facts.centres else reach_of(captured, facts.space)
+        if facts.centres:
+            reach = facts.reach
+        else:
+            reach = reach_of(captured, facts.space)
         for done, view in enumerate(views):
             progress(done, len(views), "fitting poses")
             truth, where = self.known.photograph(captured, view, masks=self.config.masked)

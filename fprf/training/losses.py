@@ -31,7 +31,9 @@ NEARBY = 0.04
 
 def extra_term(config: LossConfig) -> LossTerm | None:
     """Build the term of `loss.extra`; None where there is none, or where its weight is 0."""
-    return config.extra.build() if config.extra is not None and config.extra.weight > 0 else None
+    if config.extra is not None and config.extra.weight > 0:
+        return config.extra.build()
+    return None
 
 
 def check_penalties(config: LossConfig, model: Model) -> None:
@@ -98,14 +100,19 @@ def terms(
     weights = rendered.weights
     assert sampled is not None and weights is not None
     if config.interlevel > 0 and sampled.levels:
-        parts = [interlevel(sampled.s, weights, level.s, level.weights) for level in sampled.levels]
+        parts = []
+        for level in sampled.levels:
+            parts.append(interlevel(sampled.s, weights, level.s, level.weights))
         result["interlevel"] = torch.stack(parts).sum()
     if config.distortion > 0:
         result["distortion"] = distortion(sampled.s, weights)
     if config.depth > 0 and ends is not None:
         result["depth"] = ending(sampled.t, weights, ends, ndc=facts.space.kind == "ndc")
     if config.sky > 0 and batch.sky is not None:
-        within = math.inf if facts.space.kind in ("box", "ndc") else SHELL
+        if facts.space.kind in ("box", "ndc"):
+            within = math.inf
+        else:
+            within = SHELL
         result["sky"] = emptiness(sampled.t, weights, batch.sky, within=within)
     if config.extra is not None and extra is not None:
         # A term of a plug-in: what it returns is checked each time, since it depends on the batch.
@@ -136,7 +143,8 @@ def ending(
     known = torch.isfinite(ends)
     ends = torch.where(known, ends, 0.5)
     # In NDC 1 - t is in proportion to 1 / depth.
-    low, high = (1 - (1 - ends) / near if ndc else ends * near for near in (1 - NEARBY, 1 + NEARBY))
+    low = 1 - (1 - ends) / (1 - NEARBY) if ndc else ends * (1 - NEARBY)
+    high = 1 - (1 - ends) / (1 + NEARBY) if ndc else ends * (1 + NEARBY)
     start = t[:, :-1]
     stop = t[:, 1:]
     # Weight before the point would hide it; what lies behind it is not known.

@@ -117,7 +117,9 @@ class Model(nn.Module):
 
     def refined(self, cameras: Cameras) -> Cameras:
         """The cameras of a capture where training has put them."""
-        return cameras if self.poses is None else self.poses.refined(cameras)
+        if self.poses is None:
+            return cameras
+        return self.poses.refined(cameras)
 
     @cached_property
     def penalty_names(self) -> frozenset[str]:
@@ -128,12 +130,16 @@ class Model(nn.Module):
 
 def background_of(facts: Facts, device: torch.device) -> Annotated[Tensor, "3"] | None:
     """The background as a tensor."""
-    return None if facts.background is None else torch.tensor(facts.background, device=device)
+    if facts.background is None:
+        return None
+    return torch.tensor(facts.background, device=device)
 
 
 def tones_of(facts: Facts) -> Tones | None:
     """Tones at their start; None where they are not learnt."""
-    return Tones(torch.tensor(facts.exposure), facts.held) if facts.exposure else None
+    if facts.exposure:
+        return Tones(torch.tensor(facts.exposure), facts.held)
+    return None
 
 
 def poses_of(facts: Facts, pace: float) -> Poses | None:

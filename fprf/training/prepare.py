@@ -48,11 +48,10 @@ def device_of(name: str) -> torch.device:
         return torch.empty(0, device=name).device
     except (RuntimeError, AssertionError) as e:
         known = ", ".join(["auto", "cpu", *(f"cuda:{k}" for k in range(torch.cuda.device_count()))])
-        ray = (
-            "; a worker of Ray counts the GPUs that it was given from 0: take cuda"
-            if name.startswith("cuda:")
-            else ""
-        )
+        if name.startswith("cuda:"):
+            ray = "; a worker of Ray counts the GPUs that it was given from 0: take cuda"
+        else:
+            ray = ""
         raise PluginError(f"device: {name!r} is not available here; there is {known}{ray}") from e
 
 

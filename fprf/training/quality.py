@@ -86,7 +86,12 @@ def tone_of(tones: "Tones | None", known: "Known", text: str) -> tuple[float, fl
             "tone: this run has learnt no tones; train it with --tones true, or leave --tone out"
         )
     # Names of views may be numbers themselves: a name comes before a number.
-    view = known.names.index(text) if text in known.names else int(text) if text.isdecimal() else -1
+    if text in known.names:
+        view = known.names.index(text)
+    elif text.isdecimal():
+        view = int(text)
+    else:
+        view = -1
     if view not in known.train:
         few = ", ".join(known.names[k] for k in known.train[:3])
         raise UsageError(

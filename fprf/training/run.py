@@ -99,7 +99,9 @@ class Known:
             torch.from_numpy(load_image(captured.paths[view], (width, height), self.facts.background)).float()
             / 255
         )
-        mask = captured.masks[view] if captured.masks and masks else None
+        mask = None
+        if captured.masks and masks:
+            mask = captured.masks[view]
         return image, None if mask is None else torch.from_numpy(load_mask(mask, (width, height)))
 
 
@@ -134,7 +136,9 @@ class Run:
     def save_known(self, scene: ParsedScene, data: Path | None, facts: Facts) -> None:
         """Write scene.json."""
         known = known_of(scene, data, facts)
-        cameras = {key: getattr(scene.cameras, key).tolist() for key in _CAMERA}
+        cameras = {}
+        for key in _CAMERA:
+            cameras[key] = getattr(scene.cameras, key).tolist()
         document = {"format": FORMAT, **vars(known), "cameras": cameras, "facts": dataclasses.asdict(facts)}
         write_json(self.root / "scene.json", document)
 
@@ -146,7 +150,8 @@ class Run:
             if document["format"] != FORMAT:
                 raise ValueError(f"format {document['format']!r}, this fprf reads {FORMAT}")
             names = from_json(document["names"], tuple[str, ...], path="names")
-            train, test = (from_json(document[key], tuple[int, ...], path=key) for key in ("train", "test"))
+            train = from_json(document["train"], tuple[int, ...], path="train")
+            test = from_json(document["test"], tuple[int, ...], path="test")
             # A file that somebody sent may hold anything.
             if not all(0 <= view < len(names) for view in (*train, *test)):
                 raise ValueError(f"train or test numbers a view beyond its {len(names)}")
@@ -169,7 +174,9 @@ class Run:
 
     def saved_facts(self) -> Facts | None:
         """Facts of the run's scene; None before it wrote scene.json. Raises CheckpointError."""
-        return self.load_known().facts if (self.root / "scene.json").is_file() else None
+        if (self.root / "scene.json").is_file():
+            return self.load_known().facts
+        return None
 
     def save_tensors(self, name: str, tensors: dict[str, Tensor]) -> None:
         """Write NAME.safetensors, with a checksum for each tensor."""
@@ -213,7 +220,9 @@ def view_names(paths: Sequence[Path]) -> list[str]:
     """
     # As few folders as tell all images apart: names are shown and typed.
     for folders in range(3):
-        names = ["-".join([*(f.name for f in p.parents[:folders][::-1]), p.stem]) for p in paths]
+        names = []
+        for p in paths:
+            names.append("-".join([*(f.name for f in p.parents[:folders][::-1]), p.stem]))
         if len(set(names)) == len(names):
             return names
     return [f"{i:05d}-{p.stem}" for i, p in enumerate(paths)]
@@ -262,7 +271,10 @@ def _locked(folder: Path) -> int | None:
                 except OSError as error:
                     if error.errno in (errno.EAGAIN, errno.EACCES):
                         note = os.pread(handle, _NOTE, 0).decode(errors="replace").strip()
-                        who = note if note.isprintable() and note else "another process"
+                        if note.isprintable() and note:
+                            who = note
+                        else:
+                            who = "another process"
                         line = f"{folder}: {who} is training here; wait for it, end it, or choose another --output"
                         raise DataError(line) from error
                 else:
@@ -332,13 +344,17 @@ def check_images(root: Path, scene: ParsedScene, hashes: Mapping[str, str]) -> N
         before = from_json(document["images"], dict[str, str], path="images")
     # By name, not by order: an image that was added moves all numbers behind it.
     files = dict(zip(view_names(scene.paths), scene.paths, strict=True))
-    changed = [
-        f"{files[name]} is another" for name in hashes if name in before and before[name] != hashes[name]
-    ]
+    changed = []
+    for name in hashes:
+        if name in before and before[name] != hashes[name]:
+            changed.append(f"{files[name]} is another")
     changed += [f"{files[name]} is new" for name in hashes if name not in before]
     changed += [f"{name} is gone" for name in before if name not in hashes]
     if changed:
-        more = f" and {len(changed) - _NAMED} more" if len(changed) > _NAMED else ""
+        if len(changed) > _NAMED:
+            more = f" and {len(changed) - _NAMED} more"
+        else:
+            more = ""
         raise UsageError(
             f"{root}: its images have changed since it was begun: {', '.join(changed[:_NAMED])}{more}; put them back, "
             f"choose another --output, or go on with these by {CHANGED_IMAGES}"
@@ -371,9 +387,10 @@ def read_history(run: Path) -> list[History]:
         run / "events.jsonl",
         *(file for part in parts for file in sorted(run.glob(f"{part}/events.jsonl"))),
     ]
-    histories = [
-        _history("" if file.parent == run else file.parent.name, file) for file in files if file.is_file()
-    ]
+    histories = []
+    for file in files:
+        if file.is_file():
+            histories.append(_history("" if file.parent == run else file.parent.name, file))
     histories = [history for history in histories if history.step]
     if not histories:
         raise CheckpointError(
@@ -406,7 +423,9 @@ def _history(name: str, file: Path) -> History:
         {**event, **(event["losses"] if isinstance(event.get("losses"), dict) else {})} for event in lines
     ]
     known = dict.fromkeys(key for event in flat for key in event if key not in ("step", "seconds", "losses"))
-    values = {key: [_number(event.get(key)) for event in flat] for key in known}
+    values = {}
+    for key in known:
+        values[key] = [_number(event.get(key)) for event in flat]
     return History(name, [e["step"] for e in lines], [float(e["seconds"]) for e in lines], values, notes)
 
 

@@ -81,7 +81,9 @@ def measure_style(
         own = Moments(*(x.cpu() for x in moments(content, kept.weight)))
         # Regions are found and measured on an even share of the points; whole moments above see every one.
         every = max(1, -(-len(content) * config.statistics.rays // (len(rays.near) * POINTS)))
-        semantic = model.semantic(kept.point[::every]).cpu() if model.semantic is not None else None
+        semantic = None
+        if model.semantic is not None:
+            semantic = model.semantic(kept.point[::every]).cpu()
         return own, content[::every].cpu(), kept.weight[::every].cpu(), semantic
 
     contents = []

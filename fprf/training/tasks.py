@@ -218,7 +218,9 @@ def read_done(folder: Path) -> Done | None:
     if not file.is_file():
         return None
     with open_json(file, "remove it and train again") as document:
-        return from_json(document, Done, path="done") if document["format"] == _FORMAT else None
+        if document["format"] == _FORMAT:
+            return from_json(document, Done, path="done")
+        return None
 
 
 def renumber(folder: Path, asked: Mapping[int, str]) -> None:
@@ -226,7 +228,9 @@ def renumber(folder: Path, asked: Mapping[int, str]) -> None:
 
     One in the way that nobody asks for is removed. Where it is cut off, the next call finishes it.
     """
-    tasks = {mark.parent: task_of(mark.parent) for mark in sorted(folder.glob(f"*/{_TASK}"))}
+    tasks = {}
+    for mark in sorted(folder.glob(f"*/{_TASK}")):
+        tasks[mark.parent] = task_of(mark.parent)
     known = {part: task for part, task in tasks.items() if task is not None}
     targets = {number: folder / f"{number:02d}" for number in asked}
     # Those that are where they belong stay; of the others each number takes the first that was begun as what

@@ -194,9 +194,9 @@ class CachedView(SceneView):
     @torch.inference_mode()
     def paint(self, values: Values) -> Annotated[Tensor, "N X"]:
         # Where the scene has no semantics all points are alike: features without channels.
-        semantics = [
-            chunk.content[:, :0] if chunk.semantic is None else chunk.semantic for chunk in self.chunks
-        ]
+        semantics = []
+        for chunk in self.chunks:
+            semantics.append(chunk.content[:, :0] if chunk.semantic is None else chunk.semantic)
         return torch.cat(
             [chunk.mean(values(at, None)).cpu() for chunk, at in zip(self.chunks, semantics, strict=True)]
         )
@@ -277,10 +277,15 @@ def fit_pose(
     through = PixelRays(cameras.select(torch.tensor([view])))
     background = background_of(facts, device)
     # Photographs are compared as the view took them: a held-out view by what its exposure says.
-    factor = torch.ones(3) if tones is None else tones(torch.tensor([view]))[0].detach().cpu()
+    if tones is None:
+        factor = torch.ones(3)
+    else:
+        factor = tones(torch.tensor([view]))[0].detach().cpu()
     pixels = truth.reshape(-1, 3)
     generator = torch.Generator().manual_seed(view)
-    used = None if where is None or not bool(where.any()) else where.reshape(-1).nonzero()[:, 0]
+    used = None
+    if not (where is None or not bool(where.any())):
+        used = where.reshape(-1).nonzero()[:, 0]
     move = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     optimizer = torch.optim.Adam([move], lr=_FIT_RATE, betas=(0.9, 0.95))
     # A few random pixels a step are enough for six numbers.

@@ -273,7 +273,9 @@ class BlockNerfParser(DataParser):
         if not files:
             raise DataError(f"{data}: no *.tfrecord files here or below; name the folder that they lie in")
         # By what tells files apart without reading hundreds of gigabytes: place, size and time.
-        facts = [(str(f.relative_to(data)), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
+        facts = []
+        for f in files:
+            facts.append((str(f.relative_to(data)), f.stat().st_size, f.stat().st_mtime_ns))
         key = hashlib.sha256(json.dumps([str(data.resolve()), facts]).encode()).hexdigest()[:12]
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         folder = cache / "fprf" / f"blocknerf-{key}"
@@ -287,7 +289,10 @@ class BlockNerfParser(DataParser):
                 entries += [_entry(example, folder, held) for example in read_examples(file)]
             write_json(folder / "views.json", {"format": _FORMAT, "views": entries})
         # Of the cameras that are asked for, if they are cameras.
-        chosen = [e for e in entries if not self.config.cameras or e["camera"] in self.config.cameras]
+        chosen = []
+        for e in entries:
+            if not self.config.cameras or e["camera"] in self.config.cameras:
+                chosen.append(e)
         if not chosen:
             present = sorted({e["camera"] for e in entries})
             raise DataError(
@@ -327,10 +332,8 @@ def _entry(example: Example, folder: Path, held: bool) -> dict[str, Any]:
     width = example.integer("width")
     if not (4 <= height <= 10**5 and 4 <= width <= 10**5):
         raise DataError(f"{example.where}: an image of {width}x{height} pixels; download the file again")
-    origin, direction = (
-        example.numbers(name, 3 * height * width).reshape(height, width, 3)
-        for name in ("ray_origins", "ray_dirs")
-    )
+    origin = example.numbers("ray_origins", 3 * height * width).reshape(height, width, 3)
+    direction = example.numbers("ray_dirs", 3 * height * width).reshape(height, width, 3)
     try:
         camera = fit_camera(origin, direction)
     except ValueError as error:

@@ -265,7 +265,9 @@ def _images_txt(path: Path) -> Iterator[ColmapImage]:
     for place, line in lines:
         # The name is the rest of the line; as bytes only ASCII's blanks part words, of which a name may begin
         # with others.
-        words = [word.decode() for word in line.encode().split(maxsplit=9)]
+        words = []
+        for word in line.encode().split(maxsplit=9):
+            words.append(word.decode())
         if not words:
             continue
         if len(words) != 10:
@@ -349,7 +351,10 @@ def cloud_of_model(
     # as tell them apart?
     names = [PurePosixPath(view.name).parts for view in views]
     depth = next(n for n in itertools.count(1) if len({name[-n:] for name in names}) == len(names))
-    images = {PurePosixPath(image.name).parts[-depth:]: image for image in model.images} if model else {}
+    if model:
+        images = {PurePosixPath(image.name).parts[-depth:]: image for image in model.images}
+    else:
+        images = {}
     if model is None or not len(model.points) or not {name[-depth:] for name in names} <= images.keys():
         return None, None, []
     ordered = [images[name[-depth:]] for name in names]
@@ -463,7 +468,9 @@ class ColmapParser(DataParser):
             # Parameters by name; what is left after those that every lens has are terms that few have.
             given = dict(zip(dict(MODELS)[camera.model].split(), camera.params, strict=True))
             focal = given.pop("f", 0.0)
-            k = [given.pop(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
+            k = []
+            for key in ("k1", "k2", "k3", "k4", "p1", "p2"):
+                k.append(given.pop(key, 0.0))
             fx = given.pop("fx", focal)
             fy = given.pop("fy", focal)
             cx = given.pop("cx", 0.0)
@@ -491,9 +498,10 @@ class ColmapParser(DataParser):
             # 3DGS keeps the points of a model, or those that it was begun with, beside it.
             beside = (folder / "points3D.ply", folder / "input.ply", data / "input.ply")
             file = next((path for path in beside if path.is_file()), None)
-            extra, said = (None, []) if file is None else read_ply_points(file)
-            points = points if extra is None else extra
-            notes = notes + said
+            if file is not None:
+                extra, said = read_ply_points(file)
+                points = points if extra is None else extra
+                notes = notes + said
         split = None
         if roles is not None:
             learned = [roles[PurePosixPath(image.name).name] == "train" for _, _, image, _ in kept]
@@ -518,5 +526,8 @@ def _depths(points: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[flo
     with np.errstate(over="ignore", invalid="ignore"):
         depth = (points - pose[:, 3]) @ -pose[:, 2]
     depth = depth[np.isfinite(depth) & (depth > 0)]
-    near, far = np.percentile(depth, (0.1, 99.9)) if len(depth) >= 8 else (0.0, 0.0)
+    if len(depth) >= 8:
+        near, far = np.percentile(depth, (0.1, 99.9))
+    else:
+        near, far = (0.0, 0.0)
     return (float(near), float(far)) if 0 < near < far else None

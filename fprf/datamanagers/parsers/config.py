@@ -40,9 +40,15 @@ def model_folders(data: Path) -> list[Path]:
     """Folders of COLMAP's models in a scene folder: sparse/0, sparse/1, ... sparse, the folder itself,
     colmap/sparse/0, ...
     """
-    numbered = [sorted(path for path in (data / place).glob("*")) for place in ("sparse", "colmap/sparse")]
+    numbered = []
+    for place in ("sparse", "colmap/sparse"):
+        numbered.append(sorted(path for path in (data / place).glob("*")))
     folders = [*numbered[0], data / "sparse", data, *numbered[1]]
-    return [each for each in folders if (each / "cameras.bin").is_file() or (each / "cameras.txt").is_file()]
+    found: list[Path] = []
+    for each in folders:
+        if (each / "cameras.bin").is_file() or (each / "cameras.txt").is_file():
+            found.append(each)
+    return found
 
 
 def is_record(name: str) -> bool:
@@ -55,12 +61,13 @@ def keyframes(data: Path) -> list[tuple[Path, Path]]:
     may be.
     """
     for root in (data / "keyframes", data):
-        pairs = [(root / f"{kind}images", root / f"{kind}cameras") for kind in ("corrected_", "")]
-        there = [
-            (images, cameras)
-            for images, cameras in pairs
-            if images.is_dir() and next(cameras.glob("[!.]*.json"), None)
-        ]
+        pairs = []
+        for kind in ("corrected_", ""):
+            pairs.append((root / f"{kind}images", root / f"{kind}cameras"))
+        there = []
+        for images, cameras in pairs:
+            if images.is_dir() and next(cameras.glob("[!.]*.json"), None):
+                there.append((images, cameras))
         if there:
             return there
     return []
@@ -106,7 +113,9 @@ class LlffConfig(DataParserConfig):
     """Image folder; empty = `images`, else the `images_N` that is reduced least."""
 
     def recognises(self, data: Path) -> Recognised | None:
-        return Recognised(0.8, "poses_bounds.npy") if (data / "poses_bounds.npy").is_file() else None
+        if (data / "poses_bounds.npy").is_file():
+            return Recognised(0.8, "poses_bounds.npy")
+        return None
 
     def build(self) -> DataParser:
         from .llff import LlffParser
@@ -130,7 +139,10 @@ class TransformsConfig(DataParserConfig):
         transforms*.json.
         """
         names = sorted(path.name for path in data.glob("transforms*.json"))
-        known = [name for name in names if name in ("transforms.json", "transforms_train.json")]
+        known = []
+        for name in names:
+            if name in ("transforms.json", "transforms_train.json"):
+                known.append(name)
         if known:
             return Recognised(0.9, known[0])
         return Recognised(0.4, names[0]) if len(names) == 1 else None
@@ -154,7 +166,9 @@ class ColmapConfig(DataParserConfig):
 
     def recognises(self, data: Path) -> Recognised | None:
         folder = next(iter(model_folders(data)), None)
-        return Recognised(0.5, f"a model in {folder}") if folder is not None else None
+        if folder is not None:
+            return Recognised(0.5, f"a model in {folder}")
+        return None
 
     def build(self) -> DataParser:
         from .colmap import ColmapParser
@@ -172,7 +186,9 @@ class GardenConfig(DataParserConfig):
             (data / "config.json").is_file() or all(each.name.startswith(".") for each in data.iterdir())
         )
         mine = data == Path("garden") and (left or not data.exists())
-        return Recognised(0.1 if left else 1.0, "the embedded scene") if mine else None
+        if mine:
+            return Recognised(0.1 if left else 1.0, "the embedded scene")
+        return None
 
     def build(self) -> DataParser:
         from .transforms import GardenParser
@@ -217,7 +233,9 @@ class MegaNerfConfig(DataParserConfig):
     """Mega-NeRF's layout: `train` and `val`, each with `metadata/*.pt` and `rgbs`."""
 
     def recognises(self, data: Path) -> Recognised | None:
-        return Recognised(0.7, "train/metadata") if (data / "train/metadata").is_dir() else None
+        if (data / "train/metadata").is_dir():
+            return Recognised(0.7, "train/metadata")
+        return None
 
     def build(self) -> DataParser:
         from .meganerf import MegaNerfParser
@@ -236,7 +254,9 @@ class PhotoTourismConfig(DataParserConfig):
         """By the only *.tsv beside a model, or beside `dense` with a model."""
         tables = [path.name for path in data.glob("[!.]*.tsv")]
         modelled = model_folders(data) or model_folders(data / "dense")
-        return Recognised(0.6, tables[0]) if len(tables) == 1 and modelled else None
+        if len(tables) == 1 and modelled:
+            return Recognised(0.6, tables[0])
+        return None
 
     def build(self) -> DataParser:
         from .phototourism import PhotoTourismParser
@@ -250,7 +270,9 @@ class PolycamConfig(DataParserConfig):
 
     def recognises(self, data: Path) -> Recognised | None:
         folders = keyframes(data)
-        return Recognised(0.3, str(folders[0][1])) if folders else None
+        if folders:
+            return Recognised(0.3, str(folders[0][1]))
+        return None
 
     def build(self) -> DataParser:
         from .polycam import PolycamParser
@@ -270,7 +292,9 @@ class Record3DConfig(DataParserConfig):
 
     def recognises(self, data: Path) -> Recognised | None:
         record = recording(data)
-        return Recognised(0.3, record[0].name) if record is not None else None
+        if record is not None:
+            return Recognised(0.3, record[0].name)
+        return None
 
     def build(self) -> DataParser:
         from .record3d import Record3DParser
@@ -289,7 +313,9 @@ class OdmConfig(DataParserConfig):
 
     def recognises(self, data: Path) -> Recognised | None:
         record = project_file(data)
-        return Recognised(0.3, record.name) if record is not None else None
+        if record is not None:
+            return Recognised(0.3, record.name)
+        return None
 
     def build(self) -> DataParser:
         from .odm import OdmParser
@@ -320,7 +346,10 @@ def recognise(data: Path) -> DataParserConfig:
             print(f"warning: data parser {name!r} ({origin}) is skipped: {reason}", file=sys.stderr)
             continue
         if answer and confidence >= best:
-            surest = {name: (config, reason)} if confidence > best else {**surest, name: (config, reason)}
+            if confidence > best:
+                surest = {name: (config, reason)}
+            else:
+                surest = {**surest, name: (config, reason)}
             best = confidence
     if len(surest) > 1:
         claims = " and by ".join(f"{name!r} ({reason})" for name, (_, reason) in surest.items())
@@ -335,11 +364,10 @@ def recognise(data: Path) -> DataParserConfig:
             f"{data}: a file; give the scene folder that it lies in, and name it with the parser's own field"
         )
     names = sorted(path.name + "/" * path.is_dir() for path in data.iterdir())
-    content = (
-        f"{len(names)} entries ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})"
-        if names
-        else "nothing"
-    )
+    if names:
+        content = f"{len(names)} entries ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})"
+    else:
+        content = "nothing"
     raise DataError(
         f"{data}: no transforms.json, sparse/0/cameras.bin or other file that a parser knows, but {content}; "
         "choose a parser with --datamanager.parser NAME, for Gaussians --parser NAME "

@@ -87,7 +87,10 @@ def path_inside(root: Path, where: str, text: str) -> tuple[str, Path]:
             f"{where}: the path {text!r} has the control character {control[0]!r} in it; rename the file"
         )
     # A backslash is Windows' slash, except where a file is called so.
-    name = text if "\\" in text and os.path.lexists(os.path.join(root, text)) else text.replace("\\", "/")
+    if "\\" in text and os.path.lexists(os.path.join(root, text)):
+        name = text
+    else:
+        name = text.replace("\\", "/")
     foreign = os.name != "nt" and PureWindowsPath(text).is_absolute()
     for top in (os.path.abspath(root), os.path.realpath(root)):
         whole = Path(os.path.normpath(os.path.join(top, name)))
@@ -121,7 +124,10 @@ class NamedFiles:
         # A folder is listed once: its files by their spelling, and by that without a suffix.
         if path.parent not in self._listed:
             listed: dict[str, str] = {}
-            names = os.listdir(path.parent) if path.parent.is_dir() else []
+            if path.parent.is_dir():
+                names = os.listdir(path.parent)
+            else:
+                names = []
             for entry in sorted(
                 names, key=lambda entry: (not entry.lower().endswith(".png"), entry)
             ):  # PNG before JPEG
@@ -135,7 +141,10 @@ class NamedFiles:
         found = self._listed[path.parent].get(_spelling(path.name))
         if not found:
             return name, path
-        missing = os.path.splitext(found)[1] if _spelling(found) != _spelling(path.name) else ""
+        if _spelling(found) != _spelling(path.name):
+            missing = os.path.splitext(found)[1]
+        else:
+            missing = ""
         return name + missing, path.with_name(found)
 
 
@@ -159,7 +168,9 @@ def read_ply_points(path: Path) -> tuple[NDArray[np.float64] | None, list[str]]:
             f"points are not read: {path}: no PLY file with points ({' '.join(str(error).split())[:80]})"
         ]
     points = points[np.isfinite(points).all(1)]
-    return (points, []) if len(points) else (None, [f"points are not read: {path}: holds none"])
+    if len(points):
+        return (points, [])
+    return (None, [f"points are not read: {path}: holds none"])
 
 
 def name_of(data: Path) -> str:
@@ -174,7 +185,10 @@ def read_npy(where: str, data: bytes) -> NDArray[np.float64]:
     stream = io.BytesIO(data)
     try:
         version = npy.read_magic(stream)
-        read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        if version == (1, 0):
+            read_header = npy.read_array_header_1_0
+        else:
+            read_header = npy.read_array_header_2_0
         shape, fortran, dtype = read_header(stream)
     except Exception as error:  # the header is a literal of Python, and says so in many ways
         raise DataError(
@@ -268,7 +282,10 @@ class Record:
         value = self.get(key)
         if value is None:
             return None
-        strings = [item for item in value if isinstance(item, str)] if isinstance(value, list) else []
+        if isinstance(value, list):
+            strings = [item for item in value if isinstance(item, str)]
+        else:
+            strings = []
         if not isinstance(value, list) or len(strings) != len(value):
             raise self._wrong(key, "of strings alone" if isinstance(value, list) else "a list of strings")
         return strings
@@ -283,7 +300,10 @@ class Record:
     def table(self, key: str, width: int) -> NDArray[np.float64]:
         """A list of one or more rows of `width` numbers, finite or not."""
         value = self.get(key)
-        rows = [_numbers(row, width) for row in value] if isinstance(value, list) else []
+        if isinstance(value, list):
+            rows = [_numbers(row, width) for row in value]
+        else:
+            rows = []
         if not rows or None in rows:
             raise self._wrong(key, f"rows of {width} numbers")
         return np.array(rows, dtype=np.float64)
@@ -307,7 +327,10 @@ class Record:
             raise DataError(
                 f"{self.where}: no list of {key}, or an empty one; an entry for each image is needed"
             )
-        return [as_record(f"{self.where}: {key}[{k}]", item, self.own) for k, item in enumerate(value)]
+        found = []
+        for k, item in enumerate(value):
+            found.append(as_record(f"{self.where}: {key}[{k}]", item, self.own))
+        return found
 
 
 def _number(value: Json) -> float | None:
@@ -322,7 +345,10 @@ def _number(value: Json) -> float | None:
 def _numbers(value: Json, count: int) -> list[float] | None:
     """The numbers, finite or not, of a list of `count`; None for anything else."""
     cells = value if isinstance(value, list) else []
-    numbers = [number for number in map(_number, cells) if number is not None]
+    numbers = []
+    for number in map(_number, cells):
+        if number is not None:
+            numbers.append(number)
     return numbers if len(numbers) == len(cells) == count else None
 
 
@@ -336,11 +362,10 @@ def as_record(where: str | Path, value: Json, common: dict[str, Json] | None = N
 def _short(value: Json) -> str:
     if value is None:
         return "missing"
-    text = (
-        repr(value)
-        if not isinstance(value, dict | list)
-        else "a list"
-        if isinstance(value, list)
-        else "an object"
-    )
+    if not isinstance(value, dict | list):
+        text = repr(value)
+    elif isinstance(value, list):
+        text = "a list"
+    else:
+        text = "an object"
     return text if len(text) <= 60 else text[:57] + "..."

@@ -38,11 +38,10 @@ class LlffParser(DataParser):
             )
         # The folder that is named, else the images as they were delivered, else the copies that are reduced
         # least.
-        reduced = [
-            path
-            for path in data.glob("images_*")
-            if re.fullmatch(r"images_[0-9]{1,4}", path.name) and path.is_dir()
-        ]
+        reduced = []
+        for path in data.glob("images_*"):
+            if re.fullmatch(r"images_[0-9]{1,4}", path.name) and path.is_dir():
+                reduced.append(path)
         if self.config.images:
             folder = path_inside(data, "parser.images", self.config.images)[1]
         elif (data / "images").is_dir():

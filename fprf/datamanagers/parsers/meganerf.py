@@ -76,13 +76,17 @@ def _load(path: Path) -> dict[str, Any]:
 
 
 def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
+    if str(error):
+        return str(error).splitlines()[0]
+    return type(error).__name__
 
 
 def _view(file: Path, images: Path, unit: float) -> View:
     # The image may have any ending.
     metadata = _load(file)
-    paths = [images / f"{file.stem}{suffix}" for suffix in sorted(IMAGE_SUFFIXES)]
+    paths = []
+    for suffix in sorted(IMAGE_SUFFIXES):
+        paths.append(images / f"{file.stem}{suffix}")
     path = next((path for path in paths if path.is_file()), images / f"{file.stem}.jpg")
     try:
         width, height = (None if key not in metadata else float(metadata[key]) for key in "WH")

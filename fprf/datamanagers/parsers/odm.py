@@ -55,9 +55,10 @@ class OdmParser(DataParser):
         if file is None:
             raise DataError(f"{data}: neither {' nor '.join(ODM_FILES)}; give the folder of an ODM project")
         # A whole project brings points; a report has poses alone.
-        shots, points = (
-            _reconstruction(file) if file.name == "reconstruction.json" else (_shots(data, file), None)
-        )
+        if file.name == "reconstruction.json":
+            shots, points = _reconstruction(file)
+        else:
+            shots, points = (_shots(data, file), None)
         folder = path_inside(data, "parser.images", self.config.images)[1]
         files = NamedFiles(folder)
         named = sorted(
@@ -70,9 +71,10 @@ class OdmParser(DataParser):
 def _reconstruction(file: Path) -> tuple[list[_Shot], NDArray[np.float64]]:
     """Shots and points of the largest part."""
     whole = read_json(file)
-    parts = (
-        [as_record(f"{file}: [{k}]", part) for k, part in enumerate(whole)] if isinstance(whole, list) else []
-    )
+    if isinstance(whole, list):
+        parts = [as_record(f"{file}: [{k}]", part) for k, part in enumerate(whole)]
+    else:
+        parts = []
     largest = max(parts, key=lambda part: len(_objects(part, "shots")), default=None)
     if largest is None or not _objects(largest, "shots"):
         raise DataError(f"{file}: no list of reconstructions with shots; run ODM again")
@@ -86,7 +88,9 @@ def _reconstruction(file: Path) -> tuple[list[_Shot], NDArray[np.float64]]:
         turn = _turn(record)
         offset = record.numbers("translation", 3)
         shots.append(_Shot(name, cameras[key], turn, -turn.T @ offset))
-    points = [point.numbers("coordinates", 3) for point in _objects(largest, "points").values()]
+    points = []
+    for point in _objects(largest, "points").values():
+        points.append(point.numbers("coordinates", 3))
     cloud = np.array(points).reshape(-1, 3)
     return shots, cloud[np.isfinite(cloud).all(1)]
 
@@ -127,9 +131,12 @@ def _view(where: str, name: str, path: Path, shot: _Shot) -> View:
         raise DataError(
             f"{camera.where}: projection_type {kind!r} is not read; known are {', '.join(_LENSES)}"
         )
-    k = [camera.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
+    k = []
+    for key in ("k1", "k2", "k3", "k4", "p1", "p2"):
+        k.append(camera.number(key) or 0.0)
     distortion, lens = lens_of(camera.where, _LENSES[kind], k)
-    fx, fy = (camera.number(key) or camera.number("focal") for key in ("focal_x", "focal_y"))
+    fx = camera.number("focal_x") or camera.number("focal")
+    fy = camera.number("focal_y") or camera.number("focal")
     if fx is None:
         raise DataError(f"{camera.where}: neither focal nor focal_x; run ODM again")
     turned = np.concatenate([shot.turn.T * _FLIP, shot.place[:, None]], 1)
@@ -164,4 +171,7 @@ def _objects(record: Record, key: str) -> Mapping[str, Record]:
     if value is None:
         return {}
     whole = as_record(f"{record.where}: {key}", value)
-    return {name: as_record(f"{whole.where}[{name!r}]", each) for name, each in whole.own.items()}
+    found = {}
+    for name, each in whole.own.items():
+        found[name] = as_record(f"{whole.where}[{name!r}]", each)
+    return found

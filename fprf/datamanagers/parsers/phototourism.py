@@ -26,7 +26,10 @@ class PhotoTourismParser(DataParser):
     def parse(self, data: Path, downscale: float) -> ParsedScene:
         """The listed photographs. Raises DataError where the table names none of the model's."""
         # The table says which photographs are used; their poses are those of the model beside it.
-        tables = [data / self.config.list] if self.config.list else sorted(data.glob("[!.]*.tsv"))
+        if self.config.list:
+            tables = [data / self.config.list]
+        else:
+            tables = sorted(data.glob("[!.]*.tsv"))
         if len(tables) != 1:
             raise DataError(
                 f"{data}: {len(tables)} tables *.tsv; exactly one is needed, or its name in parser.list"
@@ -34,7 +37,10 @@ class PhotoTourismParser(DataParser):
         table = tables[0]
         if not table.is_file():
             raise DataError(f"{table}: no such table; name one of the folder's with parser.list")
-        inner = data / "dense" if not model_folders(data) and (data / "dense").is_dir() else data
+        if not model_folders(data) and (data / "dense").is_dir():
+            inner = data / "dense"
+        else:
+            inner = data
         scene = ColmapParser(ColmapConfig()).parse(inner, downscale, read_list(table))
         if not len(scene.train):
             raise DataError(

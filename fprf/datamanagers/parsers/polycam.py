@@ -36,9 +36,10 @@ class PolycamParser(DataParser):
         alone: set[str] = set()
         for images, cameras in folders:
             known = {path.stem for path in cameras.glob("[!.]*.json")}
-            paths = {
-                path.stem: path for path in images.glob("[!.]*") if path.suffix.lower() in IMAGE_SUFFIXES
-            }
+            paths = {}
+            for path in images.glob("[!.]*"):
+                if path.suffix.lower() in IMAGE_SUFFIXES:
+                    paths[path.stem] = path
             frames = {
                 stem: (path, cameras / f"{stem}.json") for stem, path in paths.items() if stem in known
             } | frames
@@ -65,7 +66,9 @@ def _view(frame: tuple[Path, Path]) -> View:
     image, file = frame
     # t_RC is row R and column C of the pose; everything else has its plain name.
     record = as_record(file, read_json(file))
-    rows = [[record.needed(f"t_{row}{column}") for column in range(4)] for row in range(3)]
+    rows = []
+    for row in range(3):
+        rows.append([record.needed(f"t_{row}{column}") for column in range(4)])
     fx, fy, cx, cy = (record.needed(key) for key in ("fx", "fy", "cx", "cy"))
     return View(
         name=image.name,

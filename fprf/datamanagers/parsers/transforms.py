@@ -66,8 +66,13 @@ class TransformsParser(DataParser):
                 entries.append(_Entry(record, *inside.find(record.where, text, IMAGE_SUFFIXES), role))
         entries.sort(key=lambda entry: entry.name)
         # A frame that is written twice over says nothing new; where the two differ `read_views` refuses them.
-        same = [k > 0 and entries[k - 1].record.own == entry.record.own for k, entry in enumerate(entries)]
-        once = [entry for entry, again in zip(entries, same, strict=True) if not again]
+        same = []
+        for k, entry in enumerate(entries):
+            same.append(k > 0 and entries[k - 1].record.own == entry.record.own)
+        once = []
+        for entry, again in zip(entries, same, strict=True):
+            if not again:
+                once.append(entry)
         views, kept, notes = read_views(data, once, lambda entry: _view(entry, inside))
         if any(same):
             notes.append(f"frames that are written twice are read once: {sum(same)}")
@@ -91,7 +96,9 @@ class TransformsParser(DataParser):
         if single.is_file():
             return [(single, "")]
         if train.is_file():
-            return [(train, "train"), (test, "test")] if test.is_file() else [(train, "")]
+            if test.is_file():
+                return [(train, "train"), (test, "test")]
+            return [(train, "")]
         others = list(data.glob("transforms*.json"))
         if len(others) == 1:
             return [(others[0], "")]
@@ -119,7 +126,10 @@ def _cloud(
     """
     cloud = inside.root / "points.npz"
     ply = top.text("ply_file_path")
-    points, seen = read_cloud(cloud, len(entries)) if cloud.is_file() else (None, None)
+    if cloud.is_file():
+        points, seen = read_cloud(cloud, len(entries))
+    else:
+        points, seen = (None, None)
     notes: list[str] = []
     if seen is not None and len(views) < len(entries):
         # Pairs count the frames, some of which may be left out.
@@ -132,9 +142,14 @@ def _cloud(
     # A model also says which views see its points.
     if seen is not None:
         return points, seen, notes
-    applied = _APPLIED if top.get("applied_transform") is None else top.matrix("applied_transform")[:3]
+    if top.get("applied_transform") is None:
+        applied = _APPLIED
+    else:
+        applied = top.matrix("applied_transform")[:3]
     sparse, seen, said = cloud_of_model(inside.root, views, applied)
-    return (points, None, notes + said) if sparse is None else (sparse, seen, [])
+    if sparse is None:
+        return (points, None, notes + said)
+    return (sparse, seen, [])
 
 
 def _view(entry: _Entry, inside: NamedFiles) -> View:
@@ -194,13 +209,18 @@ def _lens(record: Record) -> tuple[tuple[float, float, float, float, float, floa
     # Nerfstudio's list in this order counts before single terms.
     # Terms beyond six are those of lenses that cannot be represented: `lens_of` refuses them unless they are
     # 0.
-    k = [record.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
+    k = []
+    for key in ("k1", "k2", "k3", "k4", "p1", "p2"):
+        k.append(record.number(key) or 0.0)
     if record.get("distortion_params") is not None:
         k = record.numbers("distortion_params", 6).tolist()
     others = [record.number(key) or 0.0 for key in ("k5", "k6")]
     model = record.text("camera_model")
     if model is None:
-        model = "OPENCV_FISHEYE" if record.get("is_fisheye") is True else "OPENCV"
+        if record.get("is_fisheye") is True:
+            model = "OPENCV_FISHEYE"
+        else:
+            model = "OPENCV"
     if model not in _LENSES:
         raise DataError(
             f"{record.where}: camera_model {model!r} is none of {', '.join(sorted(_LENSES))}; {UNDISTORT}"
@@ -228,7 +248,9 @@ def _split(
     names = {entry.name for entry in entries}
     listed = []
     for key, texts in (("train_filenames", train), ("test_filenames", test)):
-        members = {inside.find(f"{top.where}: {key}", text, IMAGE_SUFFIXES)[0] for text in texts or ()}
+        members = set()
+        for text in texts or ():
+            members.add(inside.find(f"{top.where}: {key}", text, IMAGE_SUFFIXES)[0])
         if not members <= names:
             raise DataError(
                 f"{top.where}: {key} has {min(members - names)!r}, which no frame is; remove it there"

@@ -35,7 +35,9 @@ def index_tensor(members: Sequence[bool]) -> Tensor:
 
 def split_by(held: Sequence[bool]) -> tuple[Tensor, Tensor] | None:
     """Indices (train, test), int64, of views of which some are held out; None where all or none are."""
-    return (index_tensor([not each for each in held]), index_tensor(held)) if len({*held}) > 1 else None
+    if len({*held}) > 1:
+        return (index_tensor([not each for each in held]), index_tensor(held))
+    return None
 
 
 _LOOSE = 1e-3
@@ -132,9 +134,10 @@ def read_views(
             f"{data}: {len(missing)} of {count} images are missing, the first is {missing[0]}; "
             "copy them there or remove their entries"
         )
-    notes = (
-        [f"{len(lost)} of {count} images are left out, whose camera is not finite: {lost[0]}"] if lost else []
-    )
+    if lost:
+        notes = [f"{len(lost)} of {count} images are left out, whose camera is not finite: {lost[0]}"]
+    else:
+        notes = []
     if not views:
         raise DataError(f"{data}: no view is left: {'; '.join(notes)}; run the reconstruction again")
     return list(views.values()), kept, notes
@@ -193,13 +196,12 @@ def lens_of(
     # it.
     fisheye = "FISHEYE" in model
     if any(others) or (fisheye and (p1 or p2)) or (model.endswith("PINHOLE") and any(distortion)):
-        known = (
-            "no terms"
-            if model.endswith("PINHOLE")
-            else "k1 k2 k3 k4"
-            if fisheye
-            else "k1 k2 k3 k4 p1 p2 in a polynomial"
-        )
+        if model.endswith("PINHOLE"):
+            known = "no terms"
+        elif fisheye:
+            known = "k1 k2 k3 k4"
+        else:
+            known = "k1 k2 k3 k4 p1 p2 in a polynomial"
         raise DataError(f"{where}: the lens {model} has more terms than are represented ({known}); {remedy}")
     return (k1, k2, k3, k4, p1, p2), FISHEYE if fisheye else OPENCV if any(distortion) else PINHOLE
 
@@ -239,11 +241,10 @@ def rigid_pose(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     with np.errstate(over="ignore", invalid="ignore"):
         deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if not deviation <= _LOOSE or np.linalg.det(rotation) < 0:
-        kind = (
-            f"off by {deviation:.2g}, at most {_LOOSE} is repaired"
-            if not deviation <= _LOOSE
-            else "a reflection"
-        )
+        if not deviation <= _LOOSE:
+            kind = f"off by {deviation:.2g}, at most {_LOOSE} is repaired"
+        else:
+            kind = "a reflection"
         raise DataError(
             f"{where}: the pose holds no rotation ({kind}); remove scale and shear from the capture's poses"
         )
@@ -325,7 +326,10 @@ def _masks(
     images.
     """
     if any(named):
-        missing = [path for path in named if path is not None and not os.path.isfile(path)]
+        missing = []
+        for path in named:
+            if path is not None and not os.path.isfile(path):
+                missing.append(path)
         if missing:
             told = f"{len(missing)} masks are missing, the first is {missing[0]}"
             raise DataError(f"{data}: {told}; copy them there or unname them")

@@ -69,7 +69,10 @@ def pretrain_line(encoder: EncoderConfig | Missing, output: Path = Path("decoder
     # A slot's path names what fills it; where that is not the default's plug-in, all of its fields are
     # written.
     own = leaves(encoder)
-    default = {} if isinstance(encoder, Missing) else leaves(type(encoder)())
+    if isinstance(encoder, Missing):
+        default = {}
+    else:
+        default = leaves(type(encoder)())
     name = own.pop("", None) or name_of(EncoderConfig.group, type(encoder))
     words = ["fprf", "pretrain", "decoder", "--encoder", name]
     written = tuple[str, ...]()

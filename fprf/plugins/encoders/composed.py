@@ -34,10 +34,9 @@ class ConcatEncoder(FrozenEncoder):
         cells: Cells = "finest",
     ) -> None:
         # Weights and units are part of the identity.
-        names = [
-            f"{weight!r}/{unit!r}*[{part.identity}]"
-            for weight, unit, part in zip(weights, units, parts, strict=True)
-        ]
+        names = []
+        for weight, unit, part in zip(weights, units, parts, strict=True):
+            names.append(f"{weight!r}/{unit!r}*[{part.identity}]")
         kind = "concat:" if cells == "finest" else f"concat:{cells}:"
         super().__init__(kind + "+".join(names), sum(part.channels for part in parts))
         self._cells = cells
@@ -65,7 +64,9 @@ class ConcatEncoder(FrozenEncoder):
         if self._cells == "first":
             size = maps[0].shape[2:]
             # Finer maps are averaged over the cells of the first, coarser ones interpolated.
-            least = [(min(each.shape[2], size[0]), min(each.shape[3], size[1])) for each in maps]
+            least = []
+            for each in maps:
+                least.append((min(each.shape[2], size[0]), min(each.shape[3], size[1])))
             maps = [F.adaptive_avg_pool2d(each, cells) for each, cells in zip(maps, least, strict=True)]
             return torch.cat([F.interpolate(each, size, mode="bilinear") for each in maps], dim=1)
         size = torch.Size(max(each.shape[axis] for each in maps) for axis in (2, 3))
@@ -84,7 +85,9 @@ UNITS: Mapping[str, float] = {
 
 def build_concat(parts: Sequence[Encoder], weights: Sequence[float], *, cells: Cells) -> ConcatEncoder:
     """The encoder, the parts' units measured where they are not known."""
-    units = [UNITS[part.identity] if part.identity in UNITS else unit_of(part, street()) for part in parts]
+    units = []
+    for part in parts:
+        units.append(UNITS[part.identity] if part.identity in UNITS else unit_of(part, street()))
     return ConcatEncoder(parts, weights, units, cells=cells)
 
 

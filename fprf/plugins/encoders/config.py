@@ -260,7 +260,10 @@ class ConcatConfig(EncoderConfig):
     def build(self) -> Encoder:
         from .composed import build_concat
 
-        parts = [part for part in (self.first, self.second, self.third) if part is not None]
+        parts = []
+        for part in (self.first, self.second, self.third):
+            if part is not None:
+                parts.append(part)
         if len(self.weights) > len(parts):
             raise ConfigError(
                 f"weights: {len(self.weights)} for {len(parts)} encoders; give one each at most"

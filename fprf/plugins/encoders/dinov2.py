@@ -145,10 +145,13 @@ class Dinov2Encoder(FrozenEncoder):
         self, image: Tensor, shown: Annotated[Tensor, "h w"] | None = None
     ) -> Annotated[Tensor, "B C h w"]:
         # Resized to whole patches, with ImageNet's mean and deviation.
-        size = [PATCH * n for n in patch_grid(image.shape[-2:], self._stride)]
+        size = []
+        for n in patch_grid(image.shape[-2:], self._stride):
+            size.append(PATCH * n)
         if size != list(image.shape[-2:]):
             image = F.interpolate(image, size, mode="bicubic", align_corners=False, antialias=True)
-        mean, std = (image.new_tensor(each).view(1, 3, 1, 1) for each in (IMAGENET_MEAN, IMAGENET_STD))
+        mean = image.new_tensor(IMAGENET_MEAN).view(1, 3, 1, 1)
+        std = image.new_tensor(IMAGENET_STD).view(1, 3, 1, 1)
         features: Tensor = self.network((image - mean) / std, self._keys, shown)
         return features
 

@@ -31,7 +31,9 @@ def replicate_to_multiple(x: Annotated[Tensor, "B C H W"], stride: int) -> Tenso
     """Repeat the last row and column until both axes are multiples of `stride`."""
     right = -x.shape[-1] % stride
     below = -x.shape[-2] % stride
-    return F.pad(x, (0, right, 0, below), mode="replicate") if right or below else x
+    if right or below:
+        return F.pad(x, (0, right, 0, below), mode="replicate")
+    return x
 
 
 CELLS = 22

@@ -73,7 +73,10 @@ class VggEncoder(FrozenEncoder):
                 used[f"{part}{index}"] = value
         # What divides the features is part of the identity, as the tensors are.
         channels = len(used[f"bias{len(names) - 1}"])
-        used["scale"] = torch.ones(channels) if scale is None else scale.float()
+        if scale is None:
+            used["scale"] = torch.ones(channels)
+        else:
+            used["scale"] = scale.float()
         kind = "plain" if scale is None else "normalised"
         super().__init__(f"vgg19:{layer}:{kind}:{tensors_hash(used)}", channels)
         self.names = names
@@ -98,7 +101,10 @@ class VggEncoder(FrozenEncoder):
         for index, name in enumerate(self.names):
             if index and name.endswith("_1"):
                 x = F.max_pool2d(x, 2, ceil_mode=True)
-            x = reflect_pad(x) if self._normalised else F.pad(x, (1, 1, 1, 1))
+            if self._normalised:
+                x = reflect_pad(x)
+            else:
+                x = F.pad(x, (1, 1, 1, 1))
             x = F.conv2d(x, self.get_buffer(f"weight{index}").to(x), self.get_buffer(f"bias{index}").to(x))
             if index < len(self.names) - 1 or self._layer.startswith("relu"):
                 x = F.relu(x)
@@ -225,7 +231,10 @@ def input_statistics(
     stated = []
     for key, default in (("mean", IMAGENET_MEAN), ("std", IMAGENET_STD)):
         try:
-            numbers = json.loads(metadata[key]) if key in metadata else default
+            if key in metadata:
+                numbers = json.loads(metadata[key])
+            else:
+                numbers = default
             stated.append(torch.tensor(numbers, dtype=torch.float32).view(3))
         except (ValueError, RuntimeError, TypeError) as error:
             found = f"metadata {key!r} is {metadata[key]!r}"

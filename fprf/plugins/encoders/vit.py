@@ -37,7 +37,10 @@ class VitEncoder(FrozenEncoder):
     def __init__(
         self, family: str, model: nn.Module, *, name: str, patch: int, channels: int, stride: int | None
     ) -> None:
-        used = {key: value for key, value in model.state_dict().items() if not key.startswith("pooler.")}
+        used = {}
+        for key, value in model.state_dict().items():
+            if not key.startswith("pooler."):
+                used[key] = value
         super().__init__(f"{family}:{name}:stride{stride}:{tensors_hash(used)}", channels)
         self._call = CALLS[family]
         self._patch = patch
@@ -53,7 +56,8 @@ class VitEncoder(FrozenEncoder):
         # A patch of the model for every cell.
         if size != tuple(image.shape[-2:]):
             image = F.interpolate(image, size, mode="bilinear", align_corners=False, antialias=True)
-        mean, std = (image.new_tensor(each).view(1, 3, 1, 1) for each in (IMAGENET_MEAN, IMAGENET_STD))
+        mean = image.new_tensor(IMAGENET_MEAN).view(1, 3, 1, 1)
+        std = image.new_tensor(IMAGENET_STD).view(1, 3, 1, 1)
         tokens: Tensor = self.model(pixel_values=(image - mean) / std, **self._call).last_hidden_state
         # Class and register tokens come first.
         return tokens[:, -height * width :].transpose(1, 2).reshape(len(image), self._channels, height, width)

@@ -73,7 +73,9 @@ class RayConfig(ExecutorConfig):
 
     def on(self, device: str) -> RayConfig:
         """With the GPUs that tasks on this device take."""
-        return self if self.gpus is not None else replace(self, gpus=float(device == "cuda"))
+        if self.gpus is not None:
+            return self
+        return replace(self, gpus=float(device == "cuda"))
 
     def build(self) -> Executor:
         from .executors import RayExecutor

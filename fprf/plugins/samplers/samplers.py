@@ -59,7 +59,10 @@ class ProposalSampler(Sampler):
             if learns:
                 levels.append(Level(s, w))
             # Early proposals are trusted less: weights to a power that rises to 1.
-            trusted = w.detach() if sharpness == 1 else w.detach().clamp_min(1e-7) ** sharpness
+            if sharpness == 1:
+                trusted = w.detach()
+            else:
+                trusted = w.detach().clamp_min(1e-7) ** sharpness
             s = resample(s, trusted, count, padding=self.config.padding, generator=generator)
         return Sampled(s, space.distance(s, rays.near, rays.far), tuple(levels))
 
@@ -69,7 +72,9 @@ class ProposalSampler(Sampler):
         for field in self.levels:
             assert isinstance(field, ProposalField)
             parts.append(field.planes.variation())
-        return {"proposal_variation": torch.stack(parts).sum()} if parts else {}
+        if parts:
+            return {"proposal_variation": torch.stack(parts).sum()}
+        return {}
 
     def learns(self, step: int) -> bool:
         """Every step at first, every `update_every` steps after the warm-up, evenly rarer between."""

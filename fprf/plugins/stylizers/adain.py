@@ -56,7 +56,10 @@ class AdainStylizer(Stylizer):
         if config is not None and self.matched:
             # Both sides, such that their inner products are the scores R (paper, Eq. 5).
             theirs = share_mean(dictionary.keys, odds)
-            zero = torch.zeros_like(scene.semantic_mean) if dictionary.origin is None else dictionary.origin
+            if dictionary.origin is None:
+                zero = torch.zeros_like(scene.semantic_mean)
+            else:
+                zero = dictionary.origin
             centre = scene.semantic_mean if config.centred else zero
             cosine = config.similarity == "cosine"
             if cosine:
@@ -64,10 +67,16 @@ class AdainStylizer(Stylizer):
                 keys = unit(dictionary.keys, theirs if config.centred else zero)
             else:
                 # Softmax does not see what is subtracted from all keys; the smaller numbers round less.
-                queries = scene.keys if config.centred else scene.keys - zero
+                if config.centred:
+                    queries = scene.keys
+                else:
+                    queries = scene.keys - zero
                 keys = dictionary.keys - theirs
             # The only region of an undivided scene lies at its mean, where it says nothing about scores.
-            spread = score_spread(queries if len(queries) > 1 else keys, keys) if config.relative else 1.0
+            if config.relative:
+                spread = score_spread(queries if len(queries) > 1 else keys, keys)
+            else:
+                spread = 1.0
             self.temperature = config.temperature * spread
             self.register_buffer("keys", keys.float())
             self.register_buffer("prior", (dictionary.weight / dictionary.weight.amax()).float())
@@ -84,7 +93,9 @@ class AdainStylizer(Stylizer):
 
     @property
     def needs(self) -> Want:
-        return Want.CONTENT | Want.SEMANTIC if self.matched else Want.CONTENT
+        if self.matched:
+            return Want.CONTENT | Want.SEMANTIC
+        return Want.CONTENT
 
     def forward(
         self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None

@@ -114,7 +114,10 @@ class TwoSidedStylizer(Stylizer):
         style_mean, style_sigma, style_covariance = mixed_codes(dictionary, table)
         if len(table) == 1:
             # An undivided scene gets the global style: codes taken together, with what lies between them.
-            left = dictionary if dictionary.allowed is None else choose(dictionary, dictionary.allowed[0])[0]
+            if dictionary.allowed is None:
+                left = dictionary
+            else:
+                left = choose(dictionary, dictionary.allowed[0])[0]
             style_mean, style_covariance = (part[None] for part in whole_style(left))
             style_sigma = deviation(style_mean, style_covariance.diagonal(dim1=-2, dim2=-1))
         # A and b: optimal transport of all channels, or AdaIN (paper), sigma_s / sigma_c of each; nothing
@@ -134,7 +137,9 @@ class TwoSidedStylizer(Stylizer):
 
     @property
     def needs(self) -> Want:
-        return Want.CONTENT | Want.SEMANTIC if self.membership.divided else Want.CONTENT
+        if self.membership.divided:
+            return Want.CONTENT | Want.SEMANTIC
+        return Want.CONTENT
 
     def forward(
         self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None

@@ -84,7 +84,9 @@ def read_capture(path: Path) -> Capture:
                 "export it closer to the origin, or with float64 positions"
             )
     x, y, z = capture.shift
-    camera = None if capture.camera is None else capture.camera.shifted((-x, -y, -z))
+    camera = None
+    if capture.camera is not None:
+        camera = capture.camera.shifted((-x, -y, -z))
     return replace(capture, camera=camera, offset=read_offset(path))
 
 
@@ -128,7 +130,10 @@ def write_gaussians(
         gaussians = gaussians.select(finite) if faulty else gaussians
         kept = form.keeps(gaussians)
         far = 0 if kept is None else int((~kept).sum())
-        gaussians = gaussians.select(torch.from_numpy(kept)) if far else gaussians
+        if far:
+            gaussians = gaussians.select(torch.from_numpy(kept))
+        else:
+            gaussians = gaussians
         if far and not len(gaussians):
             raise DataError(
                 f"{path}: all Gaussians lie too far from the origin for this format; write a .ply"
@@ -141,7 +146,10 @@ def write_gaussians(
         and ((bare and gaussians.degree) or (antialiased and (bare or plain)))
     ):
         seen = seen_means(gaussians, views, antialiased=antialiased)
-        gaussians = seen.gaussians(gaussians) if bare else seen.plain(gaussians)
+        if bare:
+            gaussians = seen.gaussians(gaussians)
+        else:
+            gaussians = seen.plain(gaussians)
         antialiased = False
     # The offset comes last, so that a file that cannot be written leaves the one before it in its place.
     form.write(path, form.pack(gaussians, antialiased, added))

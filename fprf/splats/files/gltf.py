@@ -76,7 +76,9 @@ class _Part(NamedTuple):
     def sizes(self, rows: slice | NDArray[np.int64]) -> Floats:
         """SCALE of some rows, as it stands in the file."""
         column = self.columns[_SHAPE[2]][rows]
-        return column.astype(np.float64) if self.whole else _values(column)
+        if self.whole:
+            return column.astype(np.float64)
+        return _values(column)
 
     def decoded(self, rows: slice, names: list[str], logarithmic: bool) -> tuple[Floats, ...]:
         """Means, quaternions, ln-scales, logits and harmonics of some rows; SCALE is those ln-scales, or
@@ -89,7 +91,10 @@ class _Part(NamedTuple):
         a, b, c, d = quaternions(torch.from_numpy(self.rotation)[None])[0].tolist()
         product = np.array([[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]])
         harmonics = np.stack([_values(self.columns[name][rows]) for name in names], 1)
-        harmonics = _in_other_light(harmonics, to_linear=False) if self.linear else harmonics
+        if self.linear:
+            harmonics = _in_other_light(harmonics, to_linear=False)
+        else:
+            harmonics = harmonics
         return (
             self.scale * points @ self.rotation.T + self.translation,
             np.roll(turns, 1, 1) @ product.T,
@@ -110,7 +115,10 @@ class Gltf(CaptureFormat):
         """All primitives of Gaussians of the file's scene. Raises DataError where there is none."""
         try:
             # Both kinds are handled as a .glb: a .gltf is packed into one first.
-            data = data if data[:4] == b"glTF" else _binary(path, json.loads(bytes(data)))
+            if data[:4] == b"glTF":
+                data = data
+            else:
+                data = _binary(path, json.loads(bytes(data)))
             document, start = _document(data)
             parts = _parts(path, document, data, start)
             names = [name for name in _HARMONICS if parts and name in parts[0].columns]
@@ -138,7 +146,10 @@ class Gltf(CaptureFormat):
                     here = slice(begin + rows.start, begin + rows.stop)
                     which = changed[here]
                     new = np.matmul(back, base.finite(harmonics[here]))
-                    new = _in_other_light(new, to_linear=True) if part.linear else new
+                    if part.linear:
+                        new = _in_other_light(new, to_linear=True)
+                    else:
+                        new = new
                     for name, column in zip(names, new.transpose(1, 0, 2), strict=True):
                         part.columns[name][rows][which] = column[which]
                     colour = part.columns.get("COLOR_0")
@@ -156,7 +167,10 @@ class Gltf(CaptureFormat):
             for part in parts
         ]
         gaussians, shift = base.decoded(len(names), *sections)
-        kind = "logarithms, as in the review draft" if logarithmic else "linear, as in the final text"
+        if logarithmic:
+            kind = "logarithms, as in the review draft"
+        else:
+            kind = "linear, as in the final text"
         compensated = parts[0].extension.get("extras") == {"antialiased": True}
         notes = (f"sizes are {kind} of {_NAME}: {reason}",)
         return Capture(path, gaussians, compensated, data, recolour, shift=shift, notes=notes)
@@ -255,11 +269,10 @@ def _binary(path: Path, document: dict[str, Any]) -> bytes:
     for about in document["buffers"]:
         uri = about["uri"]
         inside = uri.startswith("data:")
-        content = (
-            base64.b64decode(uri.partition(",")[2], validate=True)
-            if inside
-            else base.beside(path, unquote(uri))
-        )
+        if inside:
+            content = base64.b64decode(uri.partition(",")[2], validate=True)
+        else:
+            content = base.beside(path, unquote(uri))
         starts.append(len(body))
         body += content + bytes(-len(content) % 4)
     # Views keep their order; where each begins counts from the start of the joined buffer.
@@ -302,12 +315,13 @@ def _parts(path: Path, document: dict[str, Any], data: Data | bytearray, start: 
                 raise DataError(
                     f"{path}: Gaussians packed by {', '.join(extension['extensions'])}; export them uncompressed"
                 )
-            columns = {
-                name: _column(document, data, start, at) for name, at in primitive["attributes"].items()
-            }
-            widths = {
-                name: columns[name].shape[1] for name in columns if name in _SHAPE or name in _HARMONICS
-            }
+            columns = {}
+            for name, at in primitive["attributes"].items():
+                columns[name] = _column(document, data, start, at)
+            widths = {}
+            for name in columns:
+                if name in _SHAPE or name in _HARMONICS:
+                    widths[name] = columns[name].shape[1]
             wanted = dict.fromkeys(_HARMONICS, 3) | dict(zip(_SHAPE, (3, 4, 3, 1), strict=True))
             sound = {*_SHAPE, _HARMONICS[0]} <= {*columns} and all(
                 wanted[name] == width for name, width in widths.items()
@@ -379,7 +393,9 @@ def _logarithmic(document: dict[str, Any], parts: list[_Part]) -> tuple[bool, st
     number = float(np.median(middle))
     ratios = (math.log(max(number, _LEAST)) - spacing, number - spacing)
     logarithmic = abs(ratios[1] - _TYPICAL) < abs(ratios[0] - _TYPICAL)
-    shares = [f"{math.exp(min(ratio, 99)):.2g}" for ratio in (ratios[logarithmic], ratios[not logarithmic])]
+    shares = []
+    for ratio in (ratios[logarithmic], ratios[not logarithmic]):
+        shares.append(f"{math.exp(min(ratio, 99)):.2g}")
     return logarithmic, f"so they are {shares[0]} of the distance between neighbours, not {shares[1]}"
 
 
@@ -405,8 +421,13 @@ def _column(document: dict[str, Any], data: Data | bytearray, start: int, index:
 
 def _values(column: NDArray[Any]) -> NDArray[np.float64]:
     """Numbers of an attribute; whole numbers stand for shares of the largest."""
-    most = 1.0 if column.dtype.kind == "f" else float(np.iinfo(column.dtype).max)
-    return np.maximum(column / most, -1.0) if most > 1 else column.astype(np.float64)
+    if column.dtype.kind == "f":
+        most = 1.0
+    else:
+        most = float(np.iinfo(column.dtype).max)
+    if most > 1:
+        return np.maximum(column / most, -1.0)
+    return column.astype(np.float64)
 
 
 def _in_other_light(harmonics: Floats, to_linear: bool) -> Floats:
@@ -414,9 +435,13 @@ def _in_other_light(harmonics: Floats, to_linear: bool) -> Floats:
     views by its slope.
     """
     mean = np.maximum(base.colours_of(harmonics), 0)
-    shown = (
-        mean if to_linear else np.where(mean <= 0.0031308, 12.92 * mean, 1.055 * mean ** (1 / 2.4) - 0.055)
-    )
+    if to_linear:
+        shown = mean
+    else:
+        shown = np.where(mean <= 0.0031308, 12.92 * mean, 1.055 * mean ** (1 / 2.4) - 0.055)
     slope = np.where(shown <= 0.04045, 1 / 12.92, 2.4 / 1.055 * ((shown + 0.055) / 1.055) ** 1.4)[:, None]
-    rest = harmonics[:, 1:] * slope if to_linear else harmonics[:, 1:] / slope
+    if to_linear:
+        rest = harmonics[:, 1:] * slope
+    else:
+        rest = harmonics[:, 1:] / slope
     return np.concatenate([base.constants_of(srgb_to_linear(shown) if to_linear else shown), rest], 1)

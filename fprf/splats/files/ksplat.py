@@ -64,7 +64,10 @@ class Ksplat(CaptureFormat):
                 )
             # A body: sizes of buckets that are not full, centres of all buckets, Gaussians.
             body = start + 4 * others + stored * buckets
-            first, half = ("<f4", "<f4") if compression == 0 else ("<u2", "<f2")
+            if compression == 0:
+                first, half = ("<f4", "<f4")
+            else:
+                first, half = ("<u2", "<f2")
             shape = [("mean", first, 3), ("deviation", half, 3), ("turn", half, 4), ("rgba", "u1", 4)]
             record = np.dtype(
                 [*shape, ("rest", "u1" if compression == 2 else half, 3 * (COUNTS[degree] - 1))]
@@ -110,16 +113,18 @@ def _decoded(
     """Means, quaternions, ln-scales, logits and harmonics of some Gaussians of a section."""
     some = table[rows]
     share = some["rgba"] / 255
-    means = some["mean"] if centres is None else some["mean"] * factor + centres[rows]
+    if centres is None:
+        means = some["mean"]
+    else:
+        means = some["mean"] * factor + centres[rows]
     rest = some["rest"].astype(np.float64)
     if some["rest"].dtype == np.uint8:
         rest = limits[0] + rest / 255 * (limits[1] - limits[0])
     # Degree by degree, in each channel by channel.
-    bands = [
-        each.reshape(len(some), 3, -1).transpose(0, 2, 1)
-        for each in (rest[:, :9], rest[:, 9:])
-        if each.shape[1]
-    ]
+    bands = []
+    for each in (rest[:, :9], rest[:, 9:]):
+        if each.shape[1]:
+            bands.append(each.reshape(len(some), 3, -1).transpose(0, 2, 1))
     harmonics = np.concatenate([base.constants_of(share[:, :3]), *bands], 1)
     scales = np.log(np.maximum(some["deviation"].astype(np.float64), _LEAST))
     return means, some["turn"], scales, base.logit(share[:, 3]), harmonics

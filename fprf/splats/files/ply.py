@@ -142,7 +142,9 @@ class CompressedPly(Ply):
         # Neighbours share a chunk; what is far from the bulk begins a chunk of its own.
         order = base.spatial_order(gaussians.means.numpy())
         level = base.levels_of(gaussians.means.numpy())
-        parts = [order[level[order] == k] for k in range(int(level.max(initial=0)) + 1)]
+        parts = []
+        for k in range(int(level.max(initial=0)) + 1):
+            parts.append(order[level[order] == k])
         parts = [np.append(part, np.full(-len(part) % _CHUNK, part[-1])) for part in parts[:-1]] + parts[-1:]
         index = np.concatenate(parts)
         filled = index[1:] == index[:-1]
@@ -162,7 +164,11 @@ class CompressedPly(Ply):
         words[:, 3] = base.pack_bits(np.concatenate([share, opacity[:, None]], 1), (8, 8, 8, 8))
         bounds += [low, high]
         # Three tables: bounds of chunks, words of Gaussians and bytes of harmonics.
-        names = [name for pair in (_POSITION, _SCALE, _COLOUR) for of in pair for name in of]
+        names = []
+        for pair in (_POSITION, _SCALE, _COLOUR):
+            for of in pair:
+                for name in of:
+                    names.append(name)
         chunk = np.concatenate(bounds, 1).astype("<f4").view([(name, "<f4") for name in names])[:, 0]
         tables = {
             "chunk": chunk,
@@ -180,7 +186,9 @@ class CompressedPly(Ply):
         return level <= int((beyond <= _FEW).argmax())
 
     def holds(self, capture: Capture, read_as: CaptureFormat) -> bool:
-        header = _header(capture.data) if isinstance(read_as, Ply) else None
+        header = None
+        if isinstance(read_as, Ply):
+            header = _header(capture.data)
         return header is not None and header.packed
 
 
@@ -227,7 +235,10 @@ def ply_head(
         lines.append(f"element {name} {len(table) if count is None else count}")
         for field in table.dtype.names or ():
             kind = table.dtype[field]
-            of = [kind] if kind.names is None else [kind[part].base for part in kind.names]
+            if kind.names is None:
+                of = [kind]
+            else:
+                of = [kind[part].base for part in kind.names]
             lines.append(
                 f"property {'list ' * (len(of) > 1)}{' '.join(_NAMES[each.str[1:]] for each in of)} {field}"
             )
@@ -261,7 +272,10 @@ def _read_inria(path: Path, data: Data, elements: Mapping[str, _Element]) -> Cap
     # plane of the others.
     rest = sum(bool(re.fullmatch(r"f_rest_\d+", name)) for name in known)
     byte_colours = "f_dc_0" not in known and {"red", "green", "blue"} <= known
-    constants = ("red", "green", "blue") if byte_colours else ("f_dc_0", "f_dc_1", "f_dc_2")
+    if byte_colours:
+        constants = ("red", "green", "blue")
+    else:
+        constants = ("f_dc_0", "f_dc_1", "f_dc_2")
     colours = [*constants, *(f"f_rest_{i}" for i in range(rest))]
     sizes = ["scale_0", "scale_1", *(["scale_2"] if "scale_2" in known or "scale_1" not in known else [])]
     count = 1 + rest // 3
@@ -294,9 +308,8 @@ def _read_inria(path: Path, data: Data, elements: Mapping[str, _Element]) -> Cap
         for axis, name in enumerate(sizes):
             scales[:, axis] = table[name]
         # Positions may be of any type; far from 0 they lose nothing by their local origin.
-        means, turns = (
-            np.stack([table[name] for name in names], 1) for names in ("xyz", [f"rot_{i}" for i in range(4)])
-        )
+        means = np.stack([table[name] for name in "xyz"], 1)
+        turns = np.stack([table[name] for name in [f"rot_{i}" for i in range(4)]], 1)
         return means, turns, scales, table["opacity"], harmonics
 
     def recolour(harmonics: Floats, changed: Bools) -> Iterator[bytes]:
@@ -331,7 +344,8 @@ def _read_compressed(path: Path, data: Data, elements: Mapping[str, _Element]) -
         for name in names:
             if name not in known.get(element, ()) or elements[element].kind[name] != kind:
                 raise DataError(f"{path}: no property {name}; not the compressed layout of SuperSplat")
-    chunk, vertex = (elements[name].table(data) for name in ("chunk", "vertex"))
+    chunk = elements["chunk"].table(data)
+    vertex = elements["vertex"].table(data)
     # `of` is the chunk of each Gaussian. Harmonics, where there are any, are one row of bytes a Gaussian.
     count = len(vertex)
     of = np.arange(len(vertex)) // _CHUNK
@@ -413,7 +427,9 @@ def _header(data: Data) -> _Header | None:
     if end is None:
         return None
     lines = re.split(newline, data[first.end() : max(first.end(), end.start())])
-    words = [re.split(r"[ \t]+", line.decode("latin-1").strip(" \t")) for line in lines]
+    words = []
+    for line in lines:
+        words.append(re.split(r"[ \t]+", line.decode("latin-1").strip(" \t")))
     return _Header([each for each in words if each[0]], end.end())
 
 
@@ -428,7 +444,9 @@ def _elements(path: Path, data: Data, header: _Header) -> dict[str, _Element]:
             f"{path}: a PLY of format {' '.join(form) or 'unknown'}; export it again as ascii or binary 1.0"
         )
     # Elements lie one after the other: each is passed over to find the next.
-    types = {name: kind.replace("<", ">") if "big" in form[0] else kind for name, kind in _TYPES.items()}
+    types = {}
+    for name, kind in _TYPES.items():
+        types[name] = kind.replace("<", ">") if "big" in form[0] else kind
     lines = [words for words in header.lines if words[0] in ("element", "property")]
     starts = [i for i, words in enumerate(lines) if words[0] == "element"]
     offset = header.size
@@ -436,12 +454,13 @@ def _elements(path: Path, data: Data, header: _Header) -> dict[str, _Element]:
     for start, stop in zip(starts, [*starts[1:], len(lines)], strict=False):
         words = lines[start]
         properties = lines[start + 1 : stop]
-        kinds = [[types[kind] for kind in _kinds(each) if kind in types] for each in properties]
-        names = {
-            each[-1]
-            for each, of in zip(properties, kinds, strict=True)
-            if of and len(of) == len(_kinds(each))
-        }
+        kinds = []
+        for each in properties:
+            kinds.append([types[kind] for kind in _kinds(each) if kind in types])
+        names = set()
+        for each, of in zip(properties, kinds, strict=True):
+            if of and len(of) == len(_kinds(each)):
+                names.add(each[-1])
         if (
             len(words) != 3
             or not re.fullmatch(r"\d{1,12}", words[2])
@@ -523,7 +542,10 @@ def _after_lists(data: Data, offset: int, count: int, fields: Sequence[Sequence[
             kind = np.dtype(first)
             if offset + kind.itemsize > len(data):
                 return None
-            length = int(np.frombuffer(data, kind, 1, offset)[0]) if values else 0
+            if values:
+                length = int(np.frombuffer(data, kind, 1, offset)[0])
+            else:
+                length = 0
             offset += kind.itemsize + max(length, 0) * (np.dtype(values[0]).itemsize if values else 0)
         if offset > len(data):
             return None
@@ -598,8 +620,7 @@ def _rest_bytes(harmonics: Floats) -> NDArray[np.uint8]:
 def _in_chunks(values: Floats) -> tuple[Floats, Floats, Floats]:
     """Values [N C] as shares of the bounds of their chunks, and these bounds [chunks C]."""
     starts = np.arange(0, len(values), _CHUNK)
-    low, high = (
-        what.reduceat(values, starts, axis=0).astype(np.float32) for what in (np.minimum, np.maximum)
-    )
+    low = np.minimum.reduceat(values, starts, axis=0).astype(np.float32)
+    high = np.maximum.reduceat(values, starts, axis=0).astype(np.float32)
     at = np.arange(len(values)) // _CHUNK
     return base.shares(values, low[at], high[at]), low, high

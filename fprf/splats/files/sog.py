@@ -64,7 +64,10 @@ class Sog(CaptureFormat):
 
     def read(self, path: Path, data: Data) -> Capture:
         """A .sog archive, or the meta.json of a folder. Raises DataError for what is neither."""
-        data = bytes(data) if data[:2] == b"PK" else bundle(_folder(path, bytes(data)))
+        if data[:2] == b"PK":
+            data = bytes(data)
+        else:
+            data = bundle(_folder(path, bytes(data)))
         files = unbundle(path, data)
         folder = folder_of(path, files)
         parts = {
@@ -78,7 +81,8 @@ class Sog(CaptureFormat):
         flat = meta.get("model") == "2dgs"
         pictures = _Pictures(path, parts, meta)
         count = pictures.count
-        low, high = (pictures.rows("means", i)[:, :3] for i in (0, 1))
+        low = pictures.rows("means", 0)[:, :3]
+        high = pictures.rows("means", 1)[:, :3]
         least = pictures.numbers("means", "mins", 3)
         most = pictures.numbers("means", "maxs", 3)
         turn = pictures.rows("quats", 0)
@@ -101,11 +105,10 @@ class Sog(CaptureFormat):
                 logits = base.logit(tint[rows, 3] / 255)
             else:
                 constants, logits = np.split(pictures.decoded("sh0", tint[rows], 4), [3], 1)
-            harmonics = (
-                np.concatenate([constants[:, None], rest[labels[rows]]], 1)
-                if len(rest)
-                else constants[:, None]
-            )
+            if len(rest):
+                harmonics = np.concatenate([constants[:, None], rest[labels[rows]]], 1)
+            else:
+                harmonics = constants[:, None]
             means = np.sign(bent) * np.expm1(np.minimum(np.abs(bent), 80))
             return means, quaternions, scales, logits.reshape(-1), harmonics
 
@@ -191,7 +194,9 @@ class Sog(CaptureFormat):
             )
             pictures[files[0]] = _palette_picture(index)
             pictures[files[1]] = _picture(np.stack([labels & 255, labels >> 8, 0 * labels], 1), shape)
-        parts = {name: _webp(picture) for name, picture in pictures.items()}
+        parts = {}
+        for name, picture in pictures.items():
+            parts[name] = _webp(picture)
         return [bundle(parts | {"meta.json": json.dumps(meta, separators=(",", ":")).encode()})]
 
     def write(self, path: Path, pieces: Iterable[bytes]) -> None:
@@ -232,7 +237,10 @@ def unbundle(path: Path, data: bytes) -> dict[str, bytes]:
                 raise DataError(
                     f"{path}: {len(entries)} files that claim more than the archive holds; copy it again"
                 )
-            return {entry.filename: archive.read(entry) for entry in entries}
+            found: dict[str, bytes] = {}
+            for entry in entries:
+                found[entry.filename] = archive.read(entry)
+            return found
     except (
         OSError,
         ValueError,
@@ -251,9 +259,10 @@ def folder_of(path: Path, files: Mapping[str, bytes]) -> str:
     """The folder of an archive, with its slash, that holds the meta.json nearest to the top. Raises DataError
     without one.
     """
-    found = [
-        name for name in files if name.rpartition("/")[2] == "meta.json" and not name.startswith("__MACOSX/")
-    ]
+    found = []
+    for name in files:
+        if name.rpartition("/")[2] == "meta.json" and not name.startswith("__MACOSX/"):
+            found.append(name)
     if not found:
         raise DataError(f"{path}: an archive without meta.json; not a SOG file")
     return min(found, key=lambda name: (name.count("/"), name)).removesuffix("meta.json")
@@ -263,10 +272,11 @@ def bundle(parts: Mapping[str, bytes], like: bytes | None = None) -> bytes:
     """Files as an archive, stored as they are; times are those of the archive `like`, where it has such a
     file.
     """
-    times = {}
+    times: dict[str, tuple[int, int, int, int, int, int]] = {}
     if like is not None:
         with zipfile.ZipFile(io.BytesIO(like)) as archive:
-            times = {entry.filename: entry.date_time for entry in archive.infolist()}
+            for entry in archive.infolist():
+                times[entry.filename] = entry.date_time
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_STORED) as archive:
         for name, content in parts.items():
@@ -281,7 +291,9 @@ class _Pictures:
         self.path = path
         self.parts = parts
         self.meta = meta
-        shape = meta["means"].get("shape") if isinstance(meta.get("means"), dict) else None
+        shape = None
+        if isinstance(meta.get("means"), dict):
+            shape = meta["means"].get("shape")
         count = meta.get("count", shape[0] if isinstance(shape, list) and shape else None)
         name = self._name("means", 0)
         if count == 0:
@@ -345,7 +357,8 @@ class _Pictures:
         """Bytes as the numbers that they stand for: by the codebook, or between mins and maxs."""
         if isinstance(self.meta[group], dict) and "codebook" in self.meta[group]:
             return np.asarray(self.book(group, index)[index])
-        low, high = (self.numbers(group, name, channels) for name in ("mins", "maxs"))
+        low = self.numbers(group, "mins", channels)
+        high = self.numbers(group, "maxs", channels)
         return np.asarray(low + index / 255 * (high - low))
 
     def book(self, group: str, index: NDArray[np.integer[Any]]) -> Floats:
@@ -404,12 +417,17 @@ def _folder(path: Path, data: bytes) -> dict[str, bytes]:
             parts[name] = (path.parent / name).read_bytes()
         except (OSError, ValueError) as error:
             raise DataError(f"{path}: {name} beside it cannot be read; copy the whole folder") from error
-    return {**parts, path.name: data} if path.name == "meta.json" else {**parts, "meta.json": data}
+    if path.name == "meta.json":
+        return {**parts, path.name: data}
+    return {**parts, "meta.json": data}
 
 
 def _images(path: Path, meta: Mapping[str, Any]) -> list[str]:
     """Names of the images of a meta.json. Raises DataError for one that may be any other file's."""
-    lists = [group.get("files") for group in meta.values() if isinstance(group, dict)]
+    lists = []
+    for group in meta.values():
+        if isinstance(group, dict):
+            lists.append(group.get("files"))
     names = [name for files in lists if isinstance(files, list) for name in files]
     for name in names:
         if not isinstance(name, str) or not _NAME.fullmatch(name) or len(names) > _MEMBERS:
@@ -460,7 +478,10 @@ def _quantized(values: Floats, about: Mapping[str, Any]) -> tuple[NDArray[np.int
         said["codebook"] = book.tolist()
         return np.searchsorted((book[1:] + book[:-1]) / 2, values), said
     whole = isinstance(said["mins"], (int, float))
-    axes = tuple(range(values.ndim)) if whole else tuple(range(values.ndim - 1))
+    if whole:
+        axes = tuple(range(values.ndim))
+    else:
+        axes = tuple(range(values.ndim - 1))
     low = values.min(axes)
     high = values.max(axes)
     index = base.steps(base.shares(values, low, high), 255)

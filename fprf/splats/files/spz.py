@@ -68,7 +68,10 @@ class _Header(NamedTuple):
         """Bytes of each stream: positions, opacities, colours, scales, rotations, harmonics."""
         position = 6 if self.version == 1 else 9
         turn = 4 if self.version >= 3 else 3
-        return [self.number * each for each in (position, 1, 3, 3, turn, 3 * (COUNTS[self.degree] - 1))]
+        found: list[int] = []
+        for each in (position, 1, 3, 3, turn, 3 * (COUNTS[self.degree] - 1)):
+            found.append(self.number * each)
+        return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +95,9 @@ class Spz(CaptureFormat):
                 raise base.short(
                     path, len(unpacked), ends[-1], f"{header.number} Gaussians{' unpacked' * packed}"
                 )
-            streams = [unpacked[start:stop] for start, stop in itertools.pairwise(ends)]
+            streams = []
+            for start, stop in itertools.pairwise(ends):
+                streams.append(unpacked[start:stop])
             extensions = unpacked[ends[-1] :]
         else:
             streams, frames, table = _frames(path, data, header)
@@ -144,15 +149,19 @@ class Spz(CaptureFormat):
                 import zstandard
 
                 pack = zstandard.ZstdCompressor().compress
-                again = [pack(new[k]) if k in new else frame for k, frame in enumerate(frames)]
-                entries = [
-                    _ENTRY.pack(len(frame), len(each)) for frame, each in zip(again, streams, strict=False)
-                ]
+                again = []
+                for k, frame in enumerate(frames):
+                    again.append(pack(new[k]) if k in new else frame)
+                entries = []
+                for frame, each in zip(again, streams, strict=False):
+                    entries.append(_ENTRY.pack(len(frame), len(each)))
                 end = table + sum(map(len, frames)) + len(b"".join(entries))
                 return [data[:table], *entries, *again, data[end:]]
             parts = [new.get(i, each) for i, each in enumerate(streams)]
             whole = b"".join([unpacked[: header.size], *parts, extensions])
-            return [zlib.compress(whole, 6, wbits=31), after] if packed else [whole]
+            if packed:
+                return [zlib.compress(whole, 6, wbits=31), after]
+            return [whole]
 
         gaussians, shift = base.decoded(bands, (count, part))
         return Capture(path, gaussians, bool(header.flags & 1), data, recolour, shift=shift)
@@ -280,7 +289,9 @@ def _axes(path: Path, extensions: bytes, degree: int) -> _Axes:
     down = 1 - 2.0 * up
     ahead = 2.0 * front - 1
     # Turned, a point of right front up is (x, z, -y), and of right down front (x, -z, y).
-    return _Axes(True, (x, down, -ahead)) if turned else _Axes(False, (x, down, ahead))
+    if turned:
+        return _Axes(True, (x, down, -ahead))
+    return _Axes(False, (x, down, ahead))
 
 
 def _colour_bytes(harmonics: Floats) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
@@ -340,7 +351,10 @@ def _unzip(path: Path, data: Data) -> tuple[bytes, bytes]:
                     f"{path}: more than {_TRAILER} bytes behind the Gaussians; it is damaged or of another kind"
                 )
     except zlib.error as error:
-        reason = "its checksum is another" if "data check" in str(error) else str(error)
+        if "data check" in str(error):
+            reason = "its checksum is another"
+        else:
+            reason = str(error)
         raise DataError(f"{path}: damaged gzip ({reason}); copy the file again") from error
     return bytes(content), data[at:]
 
