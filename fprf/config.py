@@ -272,6 +272,12 @@ class RunConfig:
             f"{type(self).__name__} does not say how it is trained; its method has to give a config that does"
         )
 
+    def compile_kernels(self, device: "torch.device", say: Callable[[str], None]) -> None:
+        """Compile what training needs compiled once after installation, before its time is counted.
+
+        `say` is told one line where that takes long. Here there is nothing to compile.
+        """
+
     @property
     def trained_on(self) -> str:
         """Device of the training: cpu, cuda, mps or auto."""

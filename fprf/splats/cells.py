@@ -29,7 +29,6 @@ from ..errors import CheckpointError
 from ..interfaces import Partition, State
 from ..ops.rasterise.gsplat import usable
 from ..ops.rasterise.rendering import lift
-from ..ops.rasterise.training import compile_beside
 from ..progress import Display
 from ..rendering.cameras import Cameras
 from ..training import checkpoint
@@ -99,10 +98,6 @@ class Cells(Partition):
         self.config = config
         self.scene = scene
         self.device = device
-        if usable(device):
-            self.compiling = []
-        else:
-            self.compiling = compile_beside((config.degree + 1) ** 2)
         self._facts = saved or light_and_poses(
             config, scene, lambda view: load_images(scene, config.background, [view])[0]
         )
@@ -117,8 +112,6 @@ class Cells(Partition):
         """
         config = self.config
         size = self.scene.cameras.size
-        for process in self.compiling:
-            process.wait()
         cells = self.write(run)
         pixels = []
         for cell in cells:

@@ -192,7 +192,13 @@ class GaussiansConfig(RunConfig):
             return Cells(self, scene, saved, device=device)
         from .setup import build
 
-        return build(self, scene, saved, progress, device=device)
+        return build(self, scene, saved, device=device)
+
+    def compile_kernels(self, device: "torch.device", say: Callable[[str], None]) -> None:
+        """gsplat's kernels for a CUDA device, or those of the CPU."""
+        from .setup import compile_kernels
+
+        compile_kernels(device, (self.degree + 1) ** 2, say)
 
     def planned(self, scene: "ParsedScene", device: "torch.device") -> "GaussiansConfig":
         """Size and number of Gaussians, as `splats.plan` finds them."""

@@ -10,6 +10,7 @@ points:
 """
 
 import math
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated, NamedTuple
@@ -44,6 +45,8 @@ _EVERY = 20
 _EVERY_IN_CELLS = 100
 _SPHERE_EVERY = 10
 """Steps between cuts of widths; in scenes of cells; of the surroundings."""
+_NOTICE_SECONDS = 3.0
+"""Preparing kernels for longer than this means that they are compiled; by eye, as it takes a minute."""
 _TOGETHER = 256
 _PAIRS = 1 << 16
 """Gaussians whose distances to cameras are taken together, at least, and pairs of both, where cameras are
@@ -63,14 +66,12 @@ def build(
     config: GaussiansConfig,
     scene: ParsedScene,
     saved: Facts | None = None,
-    progress: Callable[[int, int, str], None] | None = None,
     *,
     device: torch.device = CPU,
 ) -> GaussianLearner:
     """Load photographs, find the first points, and put a Gaussian at each; arguments as of
     `RunConfig.build`.
     """
-    compiling = [] if usable(device) else compile_beside((config.degree + 1) ** 2)  # while images are read
     # Few photographs get few Gaussians, which they would else learn by heart; cells bound theirs by the whole
     # scene.
     if config.cells == 1:
@@ -106,11 +107,23 @@ def build(
         device=device,
     )
     learner.begin_at(points, draw, far)
-    if compiling and progress is not None:
-        progress(0, 1, "compiling kernels, once after installation")
-    for process in compiling:
-        process.wait()
     return learner
+
+
+def compile_kernels(device: torch.device, bands: int, say: Callable[[str], None]) -> None:
+    """Compile what draws Gaussians in training with so many harmonics, where that was not done before.
+
+    gsplat does not tell in advance whether it has to, so `say` is told after some seconds.
+    """
+    line = "compiling kernels, once after installation: this does not count towards --minutes"
+    notice = threading.Timer(_NOTICE_SECONDS, say, [line])
+    notice.start()
+    try:
+        if not usable(device):
+            for process in compile_beside(bands):
+                process.wait()
+    finally:
+        notice.cancel()
 
 
 def light_and_poses(config: GaussiansConfig, scene: ParsedScene, image: Callable[[int], Image]) -> Facts:

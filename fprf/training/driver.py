@@ -107,13 +107,14 @@ def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images
     With `changed_images` they may be others than those that the run was begun with. Raises UsageError where
     packages, weights or the scene are missing, DataError where another process is training there.
     """
-    start = time.perf_counter()
     output = config.output or default_output(config, method)
     config = replace(config, output=output)
     run = Run(output)
     # What is missing is said before there is a folder.
     with Display(quiet=quiet) as display:
         _check_needs(config, method, display)
+        config.compile_kernels(device_of(config.trained_on), display.say)
+    start = time.perf_counter()  # of the minutes
     with lock_folder(output), Display(quiet=quiet) as display:
         display.say(f"{method} on {config.data}, run folder {output}")
         # An existing run goes on with its own config and images; what was cut short there is removed.

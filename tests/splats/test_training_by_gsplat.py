@@ -4,12 +4,16 @@
 
 import json
 import sys
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
-from gsplat_stand_in import stand_in
+from gsplat_stand_in import rasterization, stand_in
 from learning import quality, stepped
 from pretend_cuda import CUDA, pretend_cuda
 from splat_ball import equal
@@ -17,10 +21,11 @@ from splat_ball import equal
 from fprf.cli.main import main
 from fprf.datamanagers.scene import ParsedScene
 from fprf.ops.rasterise.gsplat import GsplatGaussians
-from fprf.splats import plan
+from fprf.splats import plan, setup
 from fprf.splats.config import GaussiansConfig
 from fprf.splats.learner import GaussianLearner
 from fprf.splats.setup import build
+from fprf.training.checkpoint import load_latest
 from fprf.training.loading import open_run
 
 
@@ -80,6 +85,46 @@ def test_the_device_gives_what_the_cpu_gives_with_one_wait_a_step(
     plain = [step for step in range(*part) if step % 10 and (step + 1) % 20]
     assert {waits[step] for step in plain} == {1}
     assert {uploads[step] for step in plain} == {1}, "all numbers of a step at once"
+
+
+def test_compiling_kernels_takes_no_minute(
+    config: GaussiansConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """gsplat compiles when it first draws; an hour of that leaves all of the minute's steps."""
+    real = time.perf_counter
+    passed = [0.0]
+
+    def slow(*args: Any, **flags: Any) -> Any:
+        passed[0] = passed[0] or 3600.0
+        return rasterization(*args, **flags)
+
+    monkeypatch.setattr(time, "perf_counter", lambda: real() + passed[0])
+    monkeypatch.setattr(plan, "_FEWEST", 50)
+    monkeypatch.setattr(plan, "_SIZES", ((16, 12), (24, 20)))
+    run = tmp_path / "run"
+    flags = ["--initial", "100", "--cap", "120", "--steps", "5", "--minutes", "1", "--output", str(run)]
+    with pretend_cuda(), stand_in(slow):
+        assert main(["train", "fprf-splats", "--data", str(config.data), *flags]) == 0
+    saved, _ = load_latest(run / "checkpoints")
+    assert passed[0] and saved is not None and saved.step == 5 and saved.seconds < 60
+
+
+@pytest.mark.parametrize("slow", [True, False])
+def test_one_line_says_that_the_kernels_of_the_cpu_are_compiled(
+    monkeypatch: pytest.MonkeyPatch, slow: bool
+) -> None:
+    said: list[str] = []
+    heard = threading.Event()
+
+    def say(line: str) -> None:
+        said.append(line)
+        heard.set()
+
+    compiler = SimpleNamespace(wait=lambda: heard.wait(60) if slow else None)
+    monkeypatch.setattr(setup, "_NOTICE_SECONDS", 0.0 if slow else 60.0)
+    monkeypatch.setattr(setup, "compile_beside", lambda bands: [compiler])
+    GaussiansConfig().compile_kernels(torch.device("cpu"), say)
+    assert len(said) == slow
 
 
 @pytest.mark.parametrize("installed", [True, False])
