@@ -78,10 +78,12 @@ FLOWS = {
                     "content features of the kept samples",
                     "content [M C]",
                 ),
+                Step("rendering.renderer:composite", "sums them along each ray (Eq. 2)", "content [R C]"),
                 Step(
-                    "rendering.renderer:shade", "the frozen decoder D_VGG, sample by sample", "colours [M 3]"
+                    "rendering.renderer:shade",
+                    "the frozen decoder D_VGG, sample by sample; then summed alike",
+                    "colours [M 3], rgb [R 3], semantic [Q D]",
                 ),
-                Step("rendering.renderer:composite", "sums along each ray", "rgb, content, semantic [R ...]"),
                 Step(
                     "training.losses:terms",
                     "Eq. 3 and 4, and the regularisers",
@@ -149,13 +151,13 @@ FLOWS = {
                     "allowed [K references]",
                 ),
                 Step(
-                    "style.matching:match_keys",
-                    "whitened cosines of regions and codes",
-                    "scores [K T]",
+                    "plugins.stylizers.region:region_table",
+                    "what each region takes: softmax of their match",
+                    "keys [K D], [T D]",
                 ),
                 Step(
-                    "plugins.stylizers.region:region_table",
-                    "softmax: what each region takes",
+                    "style.matching:match_keys",
+                    "whitened cosines of regions and codes",
                     "shares [K T]",
                 ),
                 Step(
@@ -185,7 +187,7 @@ FLOWS = {
         Lane(
             "From a slider to a picture (fprf view)",
             (
-                Step("page/web/live.js:send", "a message of JSON over the WebSocket", "{type: look, ...}"),
+                Step("page/web/live.js:tell", "a message of JSON over the WebSocket", "{type: look, ...}"),
                 Step("page.messages:read_message", "checks and decodes it", "a message, typed"),
                 Step("page.session:Session.handle", "decides what it asks for", "a change of the state"),
                 Step("page.state:State.changed", "a pure function: the new state", "State"),
@@ -195,13 +197,15 @@ FLOWS = {
                     "one thread, newest request first",
                     "steps of a few ms",
                 ),
-                Step("page.drawing:Restyler.styled", "the look, from a cache", "Restyle"),
+                Step(
+                    "page.session:Session._colour", "makes the colours that the route /colours gives", "name"
+                ),
                 Step(
                     "page.drawing:gaussian_colours",
                     "Gaussians: colours alone are sent",
                     "harmonics, packed",
                 ),
-                Step("page.session:Session._colour", "keeps them for the route /colours", "version"),
+                Step("page.drawing:Restyler.styled", "the look, from a cache", "Restyle"),
                 Step("page.server:ViewerServer.post", "tells every client", "{type: colours, version}"),
                 Step("page/web/splats.js:draw", "sorts and draws with WebGL 2", "a frame"),
             ),
