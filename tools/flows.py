@@ -46,6 +46,8 @@ class Lane(NamedTuple):
 
     title: str
     steps: tuple[Step, ...]
+    alternatives: bool = False
+    """True where each stands for itself."""
 
 
 FLOWS = {
@@ -181,6 +183,7 @@ FLOWS = {
                     "harmonics [N B 3]",
                 ),
             ),
+            alternatives=True,
         ),
     ),
     "click": (
@@ -250,7 +253,12 @@ def drawing(lanes: tuple[Lane, ...]) -> str:
             f'<text x="{left}" y="22" font-size="14" font-weight="600" fill="#202124">{escape(lane.title)}</text>'
         )
         for row, step in enumerate(lane.steps):
-            parts += box(step, left, TITLE_HEIGHT + row * (BOX_HEIGHT + GAP), last=row == len(lane.steps) - 1)
+            parts += box(
+                step,
+                left,
+                TITLE_HEIGHT + row * (BOX_HEIGHT + GAP),
+                last=lane.alternatives or row == len(lane.steps) - 1,
+            )
     return "\n".join([*parts, "</svg>"]) + "\n"
 
 
