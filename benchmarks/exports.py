@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from fprf.cli.parsing import parse
 from fprf.errors import UsageError
-from fprf.interfaces import Scene
 from fprf.io.images import write_image
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import pinhole
+from fprf.scenes import Scene
 from fprf.splats.files import read_capture
 from fprf.splats.photographs import camera_of
 from fprf.splats.views import draw

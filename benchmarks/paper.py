@@ -29,17 +29,18 @@ from fprf.io.images import shrink, to_uint8, write_image
 from fprf.plugins.decoders.config import DecoderConfig, MlpDecoderConfig
 from fprf.plugins.encoders.config import Vgg19Config
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionToneConfig, StylizerConfig
-from fprf.progress import Display
+from fprf.progress import Display, Report
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import Encoders
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
 from fprf.style.restyle import apply_style
 from fprf.style.scene_style import to_tensors
-from fprf.training.driver import Report, learn, schedule_of
+from fprf.training.driver import learn, schedule_of
 from fprf.training.field_learner import FieldLearner
-from fprf.training.loading import Trained
-from fprf.training.prepare import device_of, prepare, read_scene
+from fprf.training.field_scene import Trained
+from fprf.training.field_setup import prepare
+from fprf.training.prepare import device_of, read_scene
 from fprf.training.run import Run
 from fprf.training.style_pass import measure_style
 from fprf.training.views import cache_view, render_view

@@ -19,7 +19,7 @@ from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
 from fprf.style.restyle import apply_style
-from fprf.training.loading import Trained
+from fprf.training.field_scene import Trained
 from fprf.training.quality import PRESETS, QualityConfig, at_quality
 from fprf.training.views import render_view
 

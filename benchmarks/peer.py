@@ -17,7 +17,7 @@ from fprf.errors import DataError
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig
 from fprf.progress import Display
 from fprf.rendering.cameras import Cameras, grid_rays
-from fprf.training.loading import load_run
+from fprf.training.field_scene import load_run
 from fprf.training.views import render_view
 
 from .common import ReportConfig, write_report

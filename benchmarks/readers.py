@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import torch
 
+from fprf.config_files import load_config
 from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers.blocknerf import crc32c, masked, read_examples
 from fprf.datamanagers.parsers.colmap import read_model
@@ -33,7 +34,6 @@ from fprf.datamanagers.parsers.files import read_npz
 from fprf.datamanagers.parsers.phototourism import read_list
 from fprf.errors import FprfError
 from fprf.io import tensorfiles
-from fprf.methods import load_config
 from fprf.rendering.paths import read_camera_path
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.gaussians import Gaussians
@@ -307,7 +307,8 @@ def _style(folder: Path) -> Target:
 
 
 def _config(folder: Path) -> Target:
-    from fprf.methods import fprf_lite, save_config
+    from fprf.config_files import save_config
+    from fprf.methods import fprf_lite
 
     folder.mkdir()
     save_config(folder / "config.json", fprf_lite(), "fprf-lite")

@@ -15,7 +15,6 @@ from torch import Tensor
 from fprf.checks import at_least, between, positive
 from fprf.cli.parsing import parse
 from fprf.errors import ConfigError, UsageError
-from fprf.interfaces import Scene, SceneView
 from fprf.io.images import Picture, to_uint8, write_image
 from fprf.methods import fprf_lite
 from fprf.plugins import registry
@@ -27,6 +26,7 @@ from fprf.plugins.stylizers.config import (
     StylizerConfig,
 )
 from fprf.progress import Display
+from fprf.scenes import Scene, SceneView
 from fprf.style.config import StyleConfig, labels
 from fprf.style.dictionary import Encoders, StyleDictionary, build_dictionary, encode_photograph
 from fprf.style.files import StyleFile

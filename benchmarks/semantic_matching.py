@@ -27,10 +27,10 @@ from torch import Tensor
 
 from fprf.cli.parsing import parse
 from fprf.datamanagers.basis import Basis, fit_basis
-from fprf.datamanagers.config import GuidedConfig
 from fprf.datamanagers.images import load_image
 from fprf.errors import DataError
 from fprf.interfaces import Encoder
+from fprf.ops.config import GuidedConfig
 from fprf.plugins.encoders.config import SEMANTICS, EncoderConfig
 from fprf.plugins.stylizers.config import RegionToneConfig
 from fprf.style.dictionary import Reference, build_dictionary, semantic_samples

@@ -12,9 +12,9 @@ from kornia.color import lab_to_rgb, rgb_to_lab
 from torch import Tensor
 
 from fprf.datamanagers.basis import Basis
-from fprf.datamanagers.config import GuidedConfig
 from fprf.errors import DataError
 from fprf.interfaces import Decoder, Encoder
+from fprf.ops.config import GuidedConfig
 from fprf.ops.guided import upsample
 from fprf.plugins.stylizers.config import StylizerConfig
 from fprf.style.config import StyleConfig

@@ -26,9 +26,10 @@ from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
 from fprf.style.restyle import apply_style
-from fprf.training.loading import Trained
-from fprf.training.model import Facts, Model
-from fprf.training.prepare import Prepared
+from fprf.training.facts import Facts
+from fprf.training.field_scene import Trained
+from fprf.training.field_setup import Prepared
+from fprf.training.model import Model
 from fprf.training.views import cache_view, render_view
 
 from .common import BenchConfig, bench_run

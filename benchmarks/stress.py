@@ -23,8 +23,9 @@ from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
 from fprf.style.restyle import apply_style
 from fprf.testing import cases
-from fprf.training.loading import Trained
-from fprf.training.model import Facts, Model, background_of
+from fprf.training.facts import Facts
+from fprf.training.field_scene import Trained
+from fprf.training.model import Model, background_of
 from fprf.types import Rays, Want
 
 from .common import BenchConfig, bench_run

@@ -31,12 +31,12 @@ from torch import Tensor
 from fprf.checks import at_least
 from fprf.cli.parsing import parse
 from fprf.datamanagers.basis import fit_basis
-from fprf.datamanagers.config import GuidedConfig
 from fprf.datamanagers.images import load_image
 from fprf.errors import DataError
 from fprf.evaluation.metrics import WarpError, ssim
 from fprf.interfaces import Decoder, Encoder
 from fprf.io.images import shrink, to_uint8, write_image
+from fprf.ops.config import GuidedConfig
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import (
     SEMANTICS,
@@ -52,7 +52,7 @@ from fprf.style.files import StyleFile
 from fprf.style.light import luma
 from fprf.style.look import Restyle
 from fprf.style.restyle import apply_style
-from fprf.training.loading import Trained, load_run
+from fprf.training.field_scene import Trained, load_run
 from fprf.training.views import cache_view
 
 from .common import SHARED, console, report, train_run

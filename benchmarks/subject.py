@@ -15,15 +15,18 @@ from torch import Tensor, nn
 
 from fprf.config import RenderConfig, TrainConfig
 from fprf.errors import FprfError, UsageError, WeightsError
+from fprf.interfaces import Parts
 from fprf.io.images import write_image
 from fprf.ops import backend
 from fprf.rendering.cameras import Cameras, PixelRays
-from fprf.rendering.renderer import Parts, march, render_rays
+from fprf.rendering.renderer import march, render_rays
 from fprf.style.look import Restyle
+from fprf.training.facts import Facts
 from fprf.training.field_learner import FieldLearner
-from fprf.training.loading import Trained, load_run
-from fprf.training.model import Facts, Model, background_of, build_model
-from fprf.training.prepare import Prepared, prepare, read_scene
+from fprf.training.field_scene import Trained, load_run
+from fprf.training.field_setup import Prepared, prepare
+from fprf.training.model import Model, background_of, build_model
+from fprf.training.prepare import read_scene
 from fprf.training.run import view_names
 from fprf.training.views import view_rays as world_rays
 from fprf.types import Batch, Rays, Want

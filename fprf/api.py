@@ -21,12 +21,12 @@ from torch import Tensor
 
 from .checks import at_least, between
 from .errors import UsageError
-from .interfaces import Scene
 from .io.images import Picture, to_uint8, write_image
 from .plugins.registry import nearest
 from .plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from .rendering.cameras import Cameras
 from .rendering.paths import look_at, make_path, pinhole, upwards
+from .scenes import Scene
 from .splats.captures import Captures, light_alone, open_captures
 from .splats.config import LookConfig
 from .splats.files import Capture, write_capture

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
 
@@ -10,7 +10,7 @@ from .blocks.config import LayoutConfig, SingleConfig
 from .checks import at_least, between, positive
 from .datamanagers.config import DataManagerConfig, RayBatchesConfig
 from .datamanagers.parsers.config import DataParserConfig
-from .errors import ConfigError, PluginError, UsageError, WeightsError
+from .errors import ConfigError, UsageError, WeightsError
 from .fields.config import ContentFieldConfig, PlanesConfig, SemanticFieldConfig, SemanticPlanesConfig
 from .plugins.config import Need
 from .plugins.decoders.config import DecoderConfig, MlpDecoderConfig, pretrain_line
@@ -18,14 +18,14 @@ from .plugins.encoders.config import SEMANTICS, EncoderConfig, Vgg19Config
 from .plugins.executors.config import ExecutorConfig, SerialConfig
 from .plugins.losses.config import LossTermConfig
 from .plugins.samplers.config import ProposalConfig, SamplerConfig
-from .plugins.slots import slots
+from .run_config import RESUMABLE, RunConfig
 
 if TYPE_CHECKING:
     import torch
 
     from .datamanagers.scene import ParsedScene
-    from .interfaces import Partition, SceneLearner
-    from .training.model import Facts
+    from .scenes import Partition, SceneLearner
+    from .training.facts import Facts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,151 +194,8 @@ class StatisticsConfig:
         at_least("statistics.regions", self.regions, 1)
 
 
-RESUMABLE = (
-    "steps",
-    "minutes",
-    "output",
-    "data",
-    "device",
-    "device_memory",
-    "precision",
-    "checkpoint_minutes",
-)
-"""Fields of a run's config that may differ when a run is resumed."""
 FREE_IN_BLOCKS = (*RESUMABLE, "blocks", "executor", "statistics", "render")
 """Fields of a config that do not decide what a block of given bounds and rays learns."""
-_WHOLE_PIXELS = 640 * 360
-"""Of an image, where nobody says how far to reduce them and each step sees a whole one."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunConfig:
-    """Fields of every run, whatever its scene is made of.
-
-    A kind of scene is a subclass with `build`, returned by a method (entry point in `fprf.methods`), and a
-    function that opens its runs, by the name `kind` in the group `fprf.scenes` (`training.loading.open_run`).
-    """
-
-    kind: ClassVar[str] = ""
-    """Entry point in `fprf.scenes` of the function that opens such a run."""
-    untrained: ClassVar[tuple[str, ...]] = ()
-    """Fields that may differ when a run is resumed, beside RESUMABLE: nothing that is trained depends on
-    them.
-    """
-    open: ClassVar[tuple[str, ...]] = ("downscale",)
-    """Fields whose value may be None, which `planned` decides before a run begins."""
-
-    data: Path | None = None
-    """Scene folder, which must be named; `garden` is the embedded one."""
-    output: Path | None = None
-    """Run folder; by default runs/SCENE-METHOD. A folder with a run in it is resumed."""
-    downscale: int | float | None = None
-    """Factor, at least 1, by which the delivered images are reduced; none = found from their size and number,
-    the rays of the training and the device (docs/formats.md), and saved with the run.
-    """
-    steps: int | None = 30_000
-    """Optimiser steps; none only where a kind of scene says for itself how many."""
-    minutes: float | None = None
-    """Wall-clock limit, features included; the schedule ends with whichever comes first, steps or minutes."""
-    seed: int = 0
-    """Every draw is a function of it."""
-    checkpoint_minutes: float = 5.0
-    """Time between checkpoints."""
-
-    def __post_init__(self) -> None:
-        if self.downscale is not None:
-            at_least("downscale", self.downscale, 1)
-        if self.steps is not None:
-            at_least("steps", self.steps, 0)
-        between("seed", self.seed, 0, 2**31 - 1)
-        if self.minutes is not None:
-            positive("minutes", self.minutes)
-        positive("checkpoint_minutes", self.checkpoint_minutes)
-
-    def build(
-        self,
-        scene: "ParsedScene",
-        device: "torch.device",
-        *,
-        saved: "Facts | None" = None,
-        progress: Callable[[int, int, str], None] | None = None,
-    ) -> "SceneLearner | Partition":
-        """Build what learns a scene, with its images read; imports its implementation.
-
-        `saved` are the facts of a run that goes on: nothing that was measured for them is measured again.
-        `progress` is told `(done, total, what)` of what takes long.
-        """
-        raise ConfigError(
-            f"{type(self).__name__} does not say how it is trained; its method has to give a config that does"
-        )
-
-    def compile_kernels(self, device: "torch.device", say: Callable[[str], None]) -> None:
-        """Compile what training needs compiled once after installation, before its time is counted.
-
-        `say` is told one line where that takes long. Here there is nothing to compile.
-        """
-
-    @property
-    def trained_on(self) -> str:
-        """Device of the training: cpu, cuda, mps or auto."""
-        return "cpu"
-
-    @property
-    def scene_parser(self) -> DataParserConfig | None:
-        """Format of the scene folder; None = recognised from what lies in it."""
-        return None
-
-    @property
-    def masked(self) -> bool:
-        """True where training and metrics leave out what the capture's masks name."""
-        return True
-
-    def limited(self, views: int) -> int:
-        """Optimiser steps on so many training views."""
-        assert self.steps is not None
-        return self.steps
-
-    def find_downscale(self, scene: "ParsedScene", device: str) -> int:
-        """Factor, at least 1, by which the images of a scene, at their own size, are reduced where none is
-        said.
-
-        `device` is a kind of device: cpu, cuda, mps. Here the smallest at which no image has more pixels than
-        640 x 360.
-        """
-        return max(1, math.ceil(math.sqrt(int(scene.cameras.size.prod(1).max()) / _WHOLE_PIXELS)))
-
-    def planned(self, scene: "ParsedScene", device: "torch.device") -> "RunConfig":
-        """The config with what it leaves open decided, from a scene at its own size and the device that will
-        train.
-        """
-        if self.downscale is not None:
-            return self
-        return replace(self, downscale=self.find_downscale(scene, device.type))
-
-    def described(self) -> str:
-        """Describe the plan beyond the views and their size, for the line that is shown before training."""
-        return ""
-
-    def changeable(self, before: "RunConfig") -> tuple[str, ...]:
-        """Fields that may differ from those that a run was begun with when it goes on."""
-        return *RESUMABLE, *self.untrained
-
-    def needs(self) -> list[Need]:
-        """Packages and weights that training needs and that are not here, each opened by the path of its
-        slot.
-
-        Raises PluginError where a plug-in cannot say what it needs.
-        """
-        missing = []
-        for slot in slots(self):
-            try:
-                needs = () if slot.value is None else tuple(slot.value.needs())
-            except Exception as error:  # a stranger's
-                raise PluginError(
-                    f"{slot.path}: cannot say what it needs ({type(error).__name__}: {error})"
-                ) from error
-            missing += [need._replace(what=f"{slot.path}: {need.what}") for need in needs]
-        return missing
 
 
 class _Pace(NamedTuple):
@@ -427,7 +284,7 @@ class TrainConfig(RunConfig):
         from .blocks.partition import make_plan
         from .training.blocks import Blocks
         from .training.field_learner import FieldLearner
-        from .training.prepare import prepare
+        from .training.field_setup import prepare
 
         plan = None
         if self.blocks.cuts:

@@ -4,16 +4,31 @@ import json
 import sys
 import time
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import NamedTuple, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
-if TYPE_CHECKING:
-    from .training.driver import Report
-
 LINE_SECONDS = 5.0
 """Time between JSON lines where standard error is no terminal, and in events.jsonl."""
+
+
+class Report(NamedTuple):
+    """Progress of training."""
+
+    step: int
+    share: float
+    """Share of the way, 0 to 1."""
+    seconds: float
+    """Training time, that of earlier starts included."""
+    psnr: float
+    """PSNR of the training rays in dB, smoothed."""
+    rays_per_second: float
+    kept: float
+    """Share of the samples that met the content network."""
+    losses: dict[str, float]
+    skipped: int
+    """Steps skipped because their loss or a gradient was not finite."""
 
 
 class Display:
@@ -67,7 +82,7 @@ class Display:
                 ahead = {"seconds_left": round(seconds_left)}
             self._line({"event": what, "done": done, "total": total, **ahead})
 
-    def training(self, report: "Report", what: str = "training") -> None:
+    def training(self, report: Report, what: str = "training") -> None:
         """Progress of training."""
         left = report.seconds * (1 - report.share) / max(report.share, 1e-3)
         detail = f"step {report.step}  {report.psnr:.2f} dB  {report.rays_per_second:,.0f} rays/s  {_clock(left)} left"

@@ -8,9 +8,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from fprf.interfaces import Scene
 from fprf.page.messages import Camera
 from fprf.page.state import Key, Look
+from fprf.scenes import Scene
 from fprf.splats.photographs import camera_of as pinhole_of
 
 

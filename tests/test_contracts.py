@@ -23,6 +23,7 @@ from fprf.interfaces import (
     Encoder,
     Executor,
     LossTerm,
+    Parts,
     Sampler,
     Stylizer,
 )
@@ -33,7 +34,6 @@ from fprf.plugins.executors.config import ExecutorConfig, SerialConfig
 from fprf.plugins.losses.config import LossTermConfig
 from fprf.plugins.samplers.config import ProposalConfig, SamplerConfig, UniformConfig
 from fprf.plugins.stylizers.config import StylizerConfig
-from fprf.rendering.renderer import Parts
 from fprf.types import Batch, Cell, FieldSample, Rendered, Sampled, Site, Want
 
 BUILT_IN: list[tuple[Callable[[Any], None], Any]] = [

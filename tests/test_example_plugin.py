@@ -16,8 +16,8 @@ from fprf.plugins import registry
 from fprf.plugins.codec import Missing
 from fprf.plugins.encoders.config import EncoderConfig
 from fprf.plugins.losses.config import LossTermConfig
+from fprf.progress import Report
 from fprf.testing import check_encoder, check_loss_term
-from fprf.training.driver import Report
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "plugin"
 

@@ -23,14 +23,14 @@ from fprf.plugins.stylizers.config import (
     RegionToneConfig,
     StylizerConfig,
 )
+from fprf.progress import Report
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.restyle import apply_style
 from fprf.style.scene_style import to_tensors
 from fprf.training import driver
 from fprf.training import field_learner as learner
-from fprf.training.driver import Report
-from fprf.training.loading import load_run
+from fprf.training.field_scene import load_run
 from fprf.training.run import Run
 from fprf.training.style_pass import measure_style
 from fprf.training.views import render_view

@@ -5,8 +5,7 @@ import pytest
 from rich.console import Console
 
 from fprf import progress
-from fprf.progress import Display
-from fprf.training.driver import Report
+from fprf.progress import Display, Report
 
 
 def report(step: int, share: float) -> Report:

@@ -10,8 +10,9 @@ import pytest
 from fprf import __version__
 from fprf.cli.parsing import flags_of, load_method, parse
 from fprf.cli.plugins import KINDS
+from fprf.config_files import load_config, save_config
 from fprf.fields.config import PlanesConfig
-from fprf.methods import fprf, load_config, save_config
+from fprf.methods import fprf
 from fprf.plugins import registry
 from fprf.plugins.codec import from_json, to_json
 from fprf.plugins.encoders.config import SEMANTICS, Vgg19Config

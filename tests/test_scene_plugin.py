@@ -26,12 +26,13 @@ from dataclasses import dataclass, replace
 import torch
 import torch.nn.functional as F
 
-from fprf.config import RunConfig
+from fprf.run_config import RunConfig
 from fprf.datamanagers.basis import Basis
 from fprf.datamanagers.images import load_images
-from fprf.interfaces import Figures, Scene, SceneLearner, SceneView, State
+from fprf.interfaces import Figures, State
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.rendering.cameras import grid_rays
+from fprf.scenes import Scene, SceneLearner, SceneView
 from fprf.splats.restyle import Colours
 from fprf.style.dictionary import Encoders
 from fprf.style.scene_style import scene_style

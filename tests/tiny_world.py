@@ -21,14 +21,16 @@ from fprf.io.images import write_image
 from fprf.methods import fprf_lite
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.plugins.samplers.config import ProposalConfig
+from fprf.progress import Report
 from fprf.rendering.cameras import PixelRays
 from fprf.training import checkpoint
-from fprf.training.driver import Report, learn, schedule_of
+from fprf.training.driver import learn, schedule_of
 from fprf.training.driver import train as train_scene
 from fprf.training.field_learner import FieldLearner
-from fprf.training.loading import Trained, load_run
+from fprf.training.field_scene import Trained, load_run
+from fprf.training.field_setup import Prepared, prepare
 from fprf.training.model import Model, build_model
-from fprf.training.prepare import Prepared, device_of, prepare, read_scene
+from fprf.training.prepare import device_of, read_scene
 from fprf.training.run import Run
 from fprf.types import Batch, Rays
 

@@ -27,11 +27,11 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fprf.config import RunConfig
-from fprf.datamanagers.config import GuidedConfig
 from fprf.errors import DataError, UsageError
-from fprf.interfaces import Scene, SceneView
+from fprf.ops.config import GuidedConfig
 from fprf.rendering.cameras import Cameras
+from fprf.run_config import RunConfig
+from fprf.scenes import Scene, SceneView
 from fprf.style.dictionary import Encoders, StyleDictionary
 from fprf.style.statistics import monge
 from fprf.training.prepare import read_scene

@@ -203,7 +203,7 @@ def method_needs(name: str) -> Iterator[Finding]:
     """Packages and weights that training by a method needs. Raises PluginError for a method that cannot be
     loaded.
     """
-    from ..methods import method_config
+    from ..config_files import method_config
 
     config = method_config(name)
     for need in config.needs():

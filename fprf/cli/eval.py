@@ -17,7 +17,7 @@ from .parsing import parse
 
 if TYPE_CHECKING:
     from ..datamanagers.images import Image
-    from ..training.run import History
+    from ..training.history import History
 
 
 _LONGEST = 1600
@@ -61,7 +61,7 @@ def run(args: list[str]) -> int:
     config = parse(EvalConfig(), args, prog="fprf eval", description=description, positional=("run",))
     # First, since views take long to judge: where this is refused nothing is lost.
     if config.tensorboard is not None:
-        from ..training.run import read_history
+        from ..training.history import read_history
 
         write_scalars(config.tensorboard, read_history(config.run))
     _print(evaluate(config))

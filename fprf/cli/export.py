@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import UsageError
 from ..export.config import FIT_MINUTES, KINDS, ExportConfig, Plan, plan
+from ..plugins.captures import endings
 from ..progress import Display
-from ..splats.config import endings
 from .style_flags import named_styles, read_flags, style_name, tidy
 
 if TYPE_CHECKING:
     from ..export.mesh import Maps
-    from ..interfaces import Scene
     from ..rendering.cameras import Cameras
+    from ..scenes import Scene
     from ..splats.gaussians import GaussianRows
     from ..style.look import Restyle
     from ..training.loading import LoadedRun

@@ -14,9 +14,9 @@ from ..style.files import StyleFile, check_photographs, read_style, with_folders
 from .style_flags import StyledRunConfig, read_flags, say, style_name
 
 if TYPE_CHECKING:
-    from ..interfaces import Scene
     from ..io.images import Picture
     from ..page.writer import PageView, Style
+    from ..scenes import Scene
     from ..style.dictionary import Reference
     from ..training.loading import LoadedRun
 

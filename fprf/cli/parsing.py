@@ -13,14 +13,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_origin
 
+from ..config_files import load_config, method_config
 from ..errors import ConfigError, UsageError
-from ..methods import load_config, method_config
 from ..plugins import registry
 from ..plugins.codec import Missing
 from ..plugins.slots import Slot, hints_of, is_slot, members, resolve, slots
 
 if TYPE_CHECKING:
-    from ..config import RunConfig
+    from ..run_config import RunConfig
 
 
 C = TypeVar("C")

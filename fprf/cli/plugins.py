@@ -16,6 +16,7 @@ from ..datamanagers.parsers.config import DataParserConfig
 from ..errors import PluginError
 from ..fields.config import ContentFieldConfig, SemanticFieldConfig
 from ..plugins import registry
+from ..plugins.captures import CAPTURES
 from ..plugins.config import PluginConfig
 from ..plugins.decoders.config import DecoderConfig
 from ..plugins.encoders.config import EncoderConfig
@@ -23,7 +24,6 @@ from ..plugins.executors.config import ExecutorConfig
 from ..plugins.losses.config import LossTermConfig
 from ..plugins.samplers.config import SamplerConfig
 from ..plugins.stylizers.config import StylizerConfig
-from ..splats.config import CAPTURES
 from .config import CommandConfig
 from .parsing import load_method, parse
 

@@ -49,7 +49,7 @@ def pretrain(
     if config.output.is_dir():
         raise UsageError(f"{prog}: --output {config.output} is a folder; name the weights file to write")
     from ..pretraining.loop import training_folder
-    from ..training.run import lock_folder
+    from ..training.locks import lock_folder
 
     begun = time.monotonic()
     folder = training_folder(config.output)

@@ -16,9 +16,9 @@ from ..style.files import read_keyframes
 from .style_flags import StyledRunConfig, named_styles, read_flags
 
 if TYPE_CHECKING:
-    from ..interfaces import Scene
     from ..io.images import Picture
     from ..rendering.cameras import Cameras
+    from ..scenes import Scene
     from ..style.files import StyleFile
     from ..style.restyle import Styled
     from ..training.loading import LoadedRun

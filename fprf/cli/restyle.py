@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ..checks import positive
 from ..errors import DataError, UsageError
+from ..plugins.captures import endings, format_name, is_scene, stem_of
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from ..progress import Display
-from ..splats.config import LookConfig, endings, format_name, is_scene, stem_of
+from ..splats.config import LookConfig
 from ..style.config import NO_MASK, StyleConfig, find_reference, labels, parse_region_value
 from ..style.files import StyleFile, write_style
 from .style_flags import read_flags

@@ -10,7 +10,7 @@ from ..style.files import write_style
 from .style_flags import StyledRunConfig, read_flags, style_name
 
 if TYPE_CHECKING:
-    from ..interfaces import Scene
+    from ..scenes import Scene
     from ..style.regions import Regions
     from ..style.restyle import Styled
 

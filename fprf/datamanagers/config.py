@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from ..checks import at_least, between
+from ..ops.config import GuidedConfig
 from ..plugins.config import PluginConfig
 from .parsers.config import DataParserConfig
 
@@ -17,25 +18,6 @@ if TYPE_CHECKING:
     from ..interfaces import DataManager, Encoder
     from .basis import Basis
     from .scene import ParsedScene
-
-
-@dataclass(frozen=True, kw_only=True)
-class GuidedConfig:
-    """Guided upsampling of feature maps: F(p) = A(p) I(p) + b(p), with A and b kept at a stride."""
-
-    radius: float = 0.08
-    """Window radius as a share of the image's shorter side (0.08 of 378 pixels is the paper's code's 30)."""
-    eps: float = 1e-3
-    """Regularisation in squared colour units, colours in [0, 1]; at least 1e-6."""
-    stride: int = 8
-    """Pixels between stored coefficients; at most a fifth of the window is used, so small images keep their
-    accuracy.
-    """
-
-    def __post_init__(self) -> None:
-        between("guided.radius", self.radius, 0.0, 1.0)
-        at_least("guided.eps", self.eps, 1e-6)
-        at_least("guided.stride", self.stride, 1)
 
 
 @dataclass(frozen=True, kw_only=True)

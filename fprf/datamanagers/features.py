@@ -35,8 +35,8 @@ from ..interfaces import Encoder
 from ..io import tensorfiles
 from ..ops import guided
 from ..ops.backend import float32_convolutions
+from ..ops.config import GuidedConfig
 from .basis import Basis, fit_basis
-from .config import GuidedConfig
 
 GREY = 0.5
 LANES = 8

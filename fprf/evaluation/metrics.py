@@ -35,11 +35,11 @@ from torch import Tensor
 from ..datamanagers.images import Image
 from ..datamanagers.scene import ParsedScene
 from ..errors import DataError, NumericsError
-from ..interfaces import Scene
 from ..io.images import to_uint8
 from ..memory import peak
 from ..plugins.weights import read_weights
 from ..rendering.cameras import Cameras, grid_rays, look_up, project
+from ..scenes import Scene
 from ..training.run import Known
 from ..types import View
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from ..checks import at_least, positive
 from ..errors import UsageError
+from ..plugins.captures import endings, format_name
 from ..plugins.registry import nearest
-from ..splats.config import endings, format_name
 from ..style.config import StyleConfig
 
 

@@ -12,9 +12,10 @@ import numpy as np
 import torch
 
 from ..datamanagers.scene import ParsedScene
-from ..interfaces import Scene
 from ..io.images import to_uint8
+from ..progress import Report
 from ..rendering.cameras import Cameras, grid_rays
+from ..scenes import Scene
 from ..splats.config import GaussiansConfig
 from ..splats.gaussians import Gaussians
 from ..splats.initial import Points
@@ -22,7 +23,7 @@ from ..splats.learner import GaussianLearner
 from ..splats.photographs import make_levels
 from ..splats.setup import find_near, scene_scale
 from ..style.look import Restyle
-from ..training.driver import Report, Schedule, learn
+from ..training.driver import Schedule, learn
 from .mesh import Maps
 
 _ALIKE = 0.7

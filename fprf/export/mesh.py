@@ -24,12 +24,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import DataError
-from ..interfaces import Scene
 from ..io.atomic import write_bytes
 from ..io.images import srgb_to_linear
 from ..rendering.cameras import Cameras, grid_rays, look_up, normals, project
 from ..rendering.local_frame import added_and_beside, write_offset
 from ..rendering.space import Space
+from ..scenes import Scene
 from ..splats.files.base import in_world
 from ..splats.files.ply import ply_file
 from ..types import Origin

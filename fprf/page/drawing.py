@@ -23,13 +23,13 @@ from torch import Tensor
 
 from ..datamanagers.images import load_image
 from ..errors import UsageError
-from ..interfaces import Scene, SceneView
 from ..io.atomic import write_json
 from ..io.images import Picture, shrink, to_uint8
 from ..io.maps import match_image, palette
 from ..ops.harmonics import HARMONIC
 from ..rendering.cameras import Cameras, ideal_cameras
 from ..rendering.paths import interpolate, read_camera_path, write_camera_path
+from ..scenes import Scene, SceneView
 from ..splats.scene import SplatScene
 from ..style.config import labels
 from ..style.dictionary import Encoders, StyleDictionary, build_dictionary, concatenate, encode_photograph

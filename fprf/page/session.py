@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from ..errors import FprfError, UsageError
-from ..interfaces import Scene
 from ..io.images import Picture, encode
 from ..io.video import write_video
+from ..scenes import Scene
 from ..splats.files import Capture, write_capture, write_gaussians
 from ..splats.scene import SplatScene
 from ..style.config import StyleConfig

@@ -25,8 +25,8 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 from ..datamanagers.images import IMAGE_SUFFIXES, kind_of
 from ..datamanagers.parsers.config import recognise
 from ..errors import DataError, FprfError, UsageError
+from ..plugins.captures import endings, format_name
 from ..reconstruction.images import VIDEO_SUFFIXES
-from ..splats.config import endings, format_name
 
 MAX_BYTES = 20 << 20
 """Bytes of a photograph."""

@@ -17,12 +17,12 @@ import torch
 from torch import Tensor
 
 from ..errors import DataError, UsageError
-from ..interfaces import Scene
 from ..io.atomic import write_text
 from ..io.images import Picture, data_uri, shrink, to_uint8
 from ..io.maps import palette
 from ..rendering.cameras import Cameras
 from ..rendering.paths import upwards
+from ..scenes import Scene
 from ..splats.photographs import camera_of
 from ..splats.scene import SplatScene
 from ..style.look import Restyle

@@ -15,8 +15,9 @@ import torch
 from torch import Tensor, nn
 
 from ..interfaces import Figures, Learner, State
+from ..progress import Report
 from ..training import checkpoint
-from ..training.driver import Report, Schedule, learn
+from ..training.driver import Schedule, learn
 from ..training.run import Run
 from ..training.tasks import begin
 from .config import PretrainConfig

@@ -13,11 +13,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..datamanagers.config import GuidedConfig
 from ..datamanagers.images import load_image
 from ..errors import DataError
 from ..interfaces import Encoder
 from ..ops.backend import float32_convolutions
+from ..ops.config import GuidedConfig
 from ..ops.guided import apply, coefficients, upsample
 
 SUFFIXES = (".jpg", ".jpeg", ".png")

@@ -21,9 +21,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..interfaces import ContentField, Decoder, Sampler, SemanticField
+from ..interfaces import Decoder, Parts
 from ..types import Rays, Rendered, Sampled, View, Want
-from .space import Space
 from .stepfun import keep_heaviest, midpoints, scale_gradient, transmittance_weights
 
 if TYPE_CHECKING:
@@ -32,16 +31,6 @@ if TYPE_CHECKING:
 
 _NEAR_CAMERA = 4.0
 """Within this multiple of a ray's nearest distance gradients are scaled down in training."""
-
-
-class Parts(NamedTuple):
-    """Modules that a scene is rendered with."""
-
-    space: Space
-    sampler: Sampler
-    field: ContentField
-    semantic: SemanticField | None
-    decoder: Decoder
 
 
 class PackedSamples(NamedTuple):

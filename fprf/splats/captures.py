@@ -22,11 +22,12 @@ import torch
 from torch import Tensor
 
 from ..errors import CheckpointError, DataError, UsageError
-from ..interfaces import Encoder, Scene
+from ..interfaces import Encoder
 from ..io.images import to_uint8, write_image
 from ..io.tensorfiles import load_sealed, save
 from ..ops.rasterise import MIN_ALPHA
 from ..rendering.cameras import Cameras
+from ..scenes import Scene
 from ..style.dictionary import code_odds
 from ..style.look import ColourMaps, Restyle
 from ..style.restyle import Styled

@@ -22,19 +22,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..blocks.partition import bisect_sightings, read_cells, write_cells
-from ..config import RESUMABLE
 from ..datamanagers.images import load_images
 from ..datamanagers.scene import ParsedScene
 from ..errors import CheckpointError
-from ..interfaces import Partition, State
+from ..interfaces import State
 from ..ops.rasterise.gsplat import usable
 from ..ops.rasterise.rendering import lift
 from ..progress import Display
 from ..rendering.cameras import Cameras
+from ..run_config import RESUMABLE
+from ..scenes import Partition
 from ..training import checkpoint
 from ..training.camera_optimizers import Tones
 from ..training.driver import Schedule
-from ..training.model import Facts
+from ..training.facts import Facts
 from ..training.prepare import device_of, read_scene
 from ..training.run import Run, known_of
 from ..training.tasks import WHOLE, Part, Task, digest_of, read_done, train_all
@@ -42,9 +43,8 @@ from ..types import Cell
 from .config import GaussiansConfig
 from .gaussians import Gaussians, from_tensors, tensors_of
 from .initial import curve_order
-from .learner import CPU, MOVES, GaussianLearner, Stage, left_out
+from .learner import CPU, MOVES, GaussianLearner, Stage, left_out, refined
 from .levels import in_view
-from .loading import refined
 from .photographs import covering, load_photographs, make_levels
 from .setup import build, light_and_poses, limit_widths, scene_scale
 

@@ -4,28 +4,22 @@ torch.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from ..checks import at_least, between, positive
-from ..config import RunConfig
 from ..datamanagers.parsers.config import DataParserConfig
 from ..errors import ConfigError
-from ..plugins import registry
 from ..plugins.encoders.config import SEMANTICS, EncoderConfig
 from ..plugins.executors.config import ExecutorConfig, SerialConfig
+from ..run_config import RunConfig
 
 if TYPE_CHECKING:
     import torch
 
     from ..datamanagers.scene import ParsedScene
-    from ..interfaces import Partition, SceneLearner
-    from ..training.model import Facts
+    from ..scenes import Partition, SceneLearner
+    from ..training.facts import Facts
 
-CAPTURES = "fprf.captures"
-"""Entry points of file formats of Gaussians (`splats.files.base.CaptureFormat`), by the ending of their
-files.
-"""
 _CAP = 60_000
 _PASSES = 280
 _STEPS = 10_000
@@ -243,44 +237,3 @@ class GaussiansConfig(RunConfig):
 
     def described(self) -> str:
         return f", up to {self.most:,} Gaussians"
-
-
-def endings() -> tuple[str, ...]:
-    """Endings of the files of installed formats, with their dot; an index of a folder (lod-meta.json) has
-    none of its own.
-    """
-    return tuple(f".{name}" for name in registry.installed(CAPTURES) if not name.endswith(".json"))
-
-
-def format_name(path: Path) -> str | None:
-    """The installed format that a file is of by its name; None where it is of none. A meta.json is that of a
-    SOG folder.
-    """
-    name = path.name.lower()
-    if name == "meta.json":
-        return "sog"
-    installed = registry.installed(CAPTURES)
-    fits = []
-    for each in installed:
-        if name.endswith(f".{each}") or (name == each and "." in each):
-            fits.append(each)
-    return max(fits, key=len, default=None)
-
-
-def stem_of(path: Path) -> str:
-    """The name of a capture without the ending that says its format; of an index that of its folder, of a
-    page its stem.
-    """
-    if path.is_dir():
-        return path.resolve().name
-    name = format_name(path)
-    if path.name.lower() in ("meta.json", name):
-        return path.resolve().parent.name
-    return path.stem if name is None else path.name[: -len(name) - 1]
-
-
-def is_scene(path: Path) -> bool:
-    """True for the path of a capture or of a run, which is no photograph."""
-    if path.is_dir():
-        return any((path / name).is_file() for name in ("meta.json", "lod-meta.json", "config.json"))
-    return format_name(path) is not None

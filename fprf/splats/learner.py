@@ -31,7 +31,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..interfaces import Figures, SceneLearner, State
+from ..interfaces import Figures, State
 from ..ops.harmonics import HARMONIC
 from ..ops.rasterise.gsplat import GsplatGaussians, Trainable, obstacle, trainable
 from ..ops.rasterise.training import (
@@ -44,9 +44,12 @@ from ..ops.rasterise.training import (
     Learnt,
     Target,
 )
+from ..rendering.cameras import Cameras
 from ..rendering.splines import rotations
-from ..training.camera_optimizers import Poses, Tones, rotated
-from ..training.model import Facts
+from ..scenes import SceneLearner
+from ..training import checkpoint
+from ..training.camera_optimizers import Poses, Tones, moved_cameras, rotated
+from ..training.facts import Facts
 from ..training.run import Known, Run
 from .config import GaussiansConfig
 from .gaussians import Gaussians, from_arrays, from_rows, from_tensors, tensors_of
@@ -435,6 +438,12 @@ class GaussianLearner(SceneLearner):
         limit = passes if most < self.config.most_steps else ""
         line = f", {self.model.count} Gaussians at {self.origin}{light}{where}{blur}{limit}"
         return line + left_out(self.asked)
+
+
+def refined(cameras: Cameras, saved: checkpoint.Saved) -> Cameras:
+    """The cameras of all views where training put them."""
+    moves = saved.optimizer.get(MOVES)
+    return cameras if moves is None else moved_cameras(cameras, moves)
 
 
 def left_out(device: torch.device) -> str:

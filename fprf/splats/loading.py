@@ -8,21 +8,21 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from ..config import RunConfig
 from ..datamanagers.scene import ParsedScene
 from ..errors import CheckpointError, UsageError
-from ..rendering.cameras import Cameras
+from ..run_config import RunConfig
 from ..training import checkpoint
-from ..training.camera_optimizers import Poses, Tones, moved_cameras
+from ..training.camera_optimizers import Poses, Tones, tones_of
 from ..training.driver import Schedule, learn
+from ..training.facts import Facts
 from ..training.loading import LoadedRun
-from ..training.model import Facts, tones_of
+from ..training.locks import in_training
 from ..training.prepare import device_of, reach_of
 from ..training.quality import PRESETS, QualityConfig, tone_of
-from ..training.run import Run, in_training
+from ..training.run import Run
 from .config import GaussiansConfig
 from .gaussians import Gaussians, from_tensors
-from .learner import MOVES, GaussianLearner
+from .learner import GaussianLearner, refined
 from .levels import Levels, make_levels_of_detail, open_levels, write_levels
 from .photographs import load_photographs, make_levels
 from .scene import SplatScene
@@ -144,12 +144,6 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
         asked=device_of(device),
     )
     return LoadedRun(run, run.load_config()[1], known, saved.step, saved.seconds, shown)
-
-
-def refined(cameras: Cameras, saved: checkpoint.Saved) -> Cameras:
-    """The cameras of all views where training put them."""
-    moves = saved.optimizer.get(MOVES)
-    return cameras if moves is None else moved_cameras(cameras, moves)
 
 
 def fit_poses(

@@ -16,10 +16,11 @@ from torch import Tensor
 
 from ..datamanagers.basis import Basis
 from ..datamanagers.scene import ParsedScene
-from ..interfaces import Encoder, Scene, SceneView, Values
+from ..interfaces import Encoder
 from ..ops.rasterise.gsplat import usable
 from ..rendering.cameras import Cameras, pixel_grid
 from ..rendering.renderer import enlarged
+from ..scenes import Scene, SceneView, Values
 from ..style.dictionary import Encoders
 from ..style.look import Restyle
 from ..style.scene_style import SceneStyle

@@ -23,10 +23,10 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from ..datamanagers.basis import Basis, fit_basis
-from ..datamanagers.config import GuidedConfig
 from ..errors import CheckpointError, DataError
 from ..interfaces import Encoder
 from ..ops.backend import compiled
+from ..ops.config import GuidedConfig
 from ..ops.guided import upsample
 from ..ops.rasterise.rendering import lift
 from ..rendering.cameras import Cameras

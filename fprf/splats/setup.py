@@ -23,7 +23,8 @@ from ..datamanagers.images import Image
 from ..datamanagers.scene import ParsedScene, find_sightings, sparser
 from ..ops.rasterise.gsplat import Trainable, usable
 from ..ops.rasterise.training import LOG_SCALES, MEANS, compile_beside
-from ..training.model import Facts, poses_of, tones_of
+from ..training.camera_optimizers import poses_of, tones_of
+from ..training.facts import Facts
 from ..training.prepare import exposure_of, facts_of
 from ..training.run import known_of
 from .config import GaussiansConfig

@@ -24,12 +24,12 @@ from safetensors.torch import save
 from torch import Tensor
 
 from ..checks import at_least, between
-from ..datamanagers.config import GuidedConfig
 from ..datamanagers.images import Image, load_image, load_mask
 from ..errors import DataError
 from ..interfaces import Encoder
 from ..io.atomic import write_bytes
 from ..ops.backend import double, float32_convolutions
+from ..ops.config import GuidedConfig
 from ..ops.guided import apply, coefficients
 from .statistics import covariance, group_moments, kmeans, mix, moments
 

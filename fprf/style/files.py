@@ -30,9 +30,9 @@ from ..checks import at_least
 from ..errors import ConfigError, DataError
 from ..io.atomic import write_json
 from ..plugins import slots
+from ..plugins.captures import is_scene
 from ..plugins.codec import from_json, packages_of, read_json, to_json
 from ..plugins.registry import nearest
-from ..splats.config import is_scene
 from .config import NO_MASK, StyleConfig
 
 _FORMAT = 1

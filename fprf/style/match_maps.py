@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..interfaces import Scene
 from ..io.images import Picture, to_uint8
 from ..io.maps import Tile, highlight, match_image, match_summary, scale_image, weighted_sum
 from ..rendering.cameras import Cameras, pixel_grid
+from ..scenes import Scene
 from .matching import unit
 from .regions import Regions, membership_view, shrunk
 from .restyle import Codes, Styled

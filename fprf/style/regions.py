@@ -19,8 +19,8 @@ from torch import Tensor
 from ..datamanagers.basis import Basis
 from ..datamanagers.images import load_mask
 from ..errors import UsageError
-from ..interfaces import Scene
 from ..rendering.cameras import Cameras, pixel_grid
+from ..scenes import Scene
 from .config import (
     Place,
     StyleConfig,

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..errors import ConfigError, UsageError
-from ..interfaces import Scene
+from ..scenes import Scene
 from ..testing.outputs import check_stylizer
 from .config import NO_MASK, labels
 from .dictionary import Encoders, Reference, StyleDictionary, build_dictionary, encode_photograph

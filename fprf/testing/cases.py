@@ -8,11 +8,10 @@ from torch import Tensor
 
 from ..datamanagers.scene import ParsedScene
 from ..fields.config import PlanesConfig, SemanticPlanesConfig
-from ..interfaces import Decoder
+from ..interfaces import Decoder, Parts
 from ..io.images import write_image
 from ..plugins.samplers.config import UniformConfig
 from ..rendering.cameras import Cameras
-from ..rendering.renderer import Parts
 from ..rendering.space import Space
 from ..style.dictionary import StyleDictionary
 from ..style.scene_style import SceneStyle

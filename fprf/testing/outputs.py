@@ -25,7 +25,7 @@ from ..types import Rays, Want
 
 if TYPE_CHECKING:
     from ..config import TrainConfig
-    from ..rendering.renderer import Parts
+    from ..interfaces import Parts
     from ..style.dictionary import StyleDictionary
     from ..style.scene_style import SceneStyle
 

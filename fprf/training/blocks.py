@@ -40,18 +40,20 @@ from ..config import FREE_IN_BLOCKS, TrainConfig, fields_only
 from ..datamanagers.basis import Basis
 from ..datamanagers.scene import ParsedScene
 from ..errors import CheckpointError, ConfigError
-from ..interfaces import Decoder, Learner, Partition
+from ..interfaces import Decoder, Learner, Parts
 from ..io import tensorfiles
 from ..progress import Display
-from ..rendering.renderer import Parts
+from ..scenes import Partition
 from ..testing.outputs import check_parts
 from ..types import Cell
-from .camera_optimizers import Poses, Tones
+from .camera_optimizers import Poses, Tones, poses_of, tones_of
 from .checkpoint import misfit
 from .driver import Schedule
+from .facts import Facts
 from .field_learner import FieldLearner, finish
-from .model import Facts, Model, build_decoder, build_fields, poses_of, tones_of
-from .prepare import device_of, prepare, read_scene
+from .field_setup import prepare
+from .model import Model, build_decoder, build_fields
+from .prepare import device_of, read_scene
 from .run import Run
 from .tasks import WHOLE, Done, Part, Task, digest_of, read_done, renumber, task_of, train_all
 

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from ..datamanagers.scene import GAMMA
 from ..rendering.cameras import Cameras
 from ..types import Rays
+from .facts import Facts
 
 _TINY = 1e-24
 """Square of an angle that float64 cannot tell from none: the root of nothing has no slope."""
@@ -191,3 +192,17 @@ class Tones(nn.Module):
             tones.known.copy_(self.gains())
             tones.exponent.copy_(self.exponent).requires_grad_(False)
         return tones
+
+
+def tones_of(facts: Facts) -> Tones | None:
+    """Tones at their start; None where they are not learnt."""
+    if facts.exposure:
+        return Tones(torch.tensor(facts.exposure), facts.held)
+    return None
+
+
+def poses_of(facts: Facts, pace: float) -> Poses | None:
+    """Poses as the capture says, to be learnt at a `pace`; None where they are not refined."""
+    if not facts.centres:
+        return None
+    return Poses(torch.tensor(facts.centres, dtype=torch.float64), facts.held, reach=facts.reach, pace=pace)

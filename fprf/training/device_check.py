@@ -27,7 +27,8 @@ from ..style.dictionary import Reference, build_dictionary
 from ..style.look import Restyle, colour_maps
 from ..style.scene_style import scene_style
 from ..types import Want
-from .model import Facts, Model, build_model
+from .facts import Facts
+from .model import Model, build_model
 from .views import render_view, view_rays
 
 _DIM = 8

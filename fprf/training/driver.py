@@ -21,19 +21,22 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple
 
-from ..config import RunConfig
 from ..datamanagers.images import useless_masks
 from ..datamanagers.parsers.config import recognise
 from ..errors import CheckpointError, DataError, NumericsError, UsageError
-from ..interfaces import Figures, Learner, Partition
+from ..interfaces import Figures, Learner
 from ..io.atomic import remove_unfinished
 from ..memory import out_of_memory, shortage
 from ..plugins.codec import leaves
 from ..plugins.config import Need
-from ..progress import LINE_SECONDS, Display
+from ..progress import LINE_SECONDS, Display, Report
+from ..run_config import RunConfig
+from ..scenes import Partition
 from . import checkpoint
+from .image_hashes import check_images, image_hashes, save_image_hashes
+from .locks import lock_folder
 from .prepare import device_of, planned, read_scene
-from .run import Run, check_images, image_hashes, lock_folder, save_image_hashes
+from .run import Run
 
 REPORT_SECONDS = 0.5
 """Time between reports."""
@@ -80,24 +83,6 @@ class Schedule(NamedTuple):
 def schedule_of(config: RunConfig, views: int) -> Schedule:
     """The schedule of a config on so many training views."""
     return Schedule(config.limited(views), config.minutes, config.checkpoint_minutes)
-
-
-class Report(NamedTuple):
-    """Progress of training."""
-
-    step: int
-    share: float
-    """Share of the way, 0 to 1."""
-    seconds: float
-    """Training time, that of earlier starts included."""
-    psnr: float
-    """PSNR of the training rays in dB, smoothed."""
-    rays_per_second: float
-    kept: float
-    """Share of the samples that met the content network."""
-    losses: dict[str, float]
-    skipped: int
-    """Steps skipped because their loss or a gradient was not finite."""
 
 
 def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images: bool = False) -> Path:

@@ -20,20 +20,23 @@ from ..config import PASSES, OptimizerConfig, TrainConfig
 from ..datamanagers.batches import generator_of
 from ..datamanagers.scene import ParsedScene
 from ..errors import CheckpointError
-from ..interfaces import DataManager, Figures, SceneLearner, State
+from ..interfaces import DataManager, Figures, State
 from ..memory import free_memory
 from ..ops.backend import tf32
 from ..progress import Display
 from ..rendering.cameras import PixelRays
 from ..rendering.renderer import render_rays
+from ..scenes import SceneLearner
 from ..style.scene_style import to_tensors
 from ..types import Batch, Rays
 from . import checkpoint
 from .camera_optimizers import rays_of_moving_cameras
+from .facts import Facts
+from .field_setup import Prepared
+from .history import read_history
 from .losses import check_penalties, extra_term, terms, total, wanted
-from .model import Facts, Model, background_of, build_model
-from .prepare import Prepared
-from .run import Run, read_history
+from .model import Model, background_of, build_model
+from .run import Run
 from .style_pass import measure_style
 
 SMOOTHING = 0.95

@@ -17,7 +17,8 @@ from ..plugins.registry import nearest
 from ..rendering.stepfun import distortion, interlevel, midpoints
 from ..testing.outputs import check_term
 from ..types import Batch, Rendered, Want
-from .model import Facts, Model
+from .facts import Facts
+from .model import Model
 
 FADE = 0.01
 """Share of `loss.depth` that is left at the end: points say where things are, pixels what they look like in

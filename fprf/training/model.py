@@ -2,7 +2,6 @@
 losses, no files.
 """
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated
 
@@ -10,17 +9,14 @@ import torch
 from torch import Tensor, nn
 
 from ..blocks.fields import add_penalties
-from ..checks import between
 from ..config import TrainConfig
 from ..errors import WeightsError
-from ..interfaces import ContentField, Decoder, Sampler, SemanticField
+from ..interfaces import ContentField, Decoder, Parts, Sampler, SemanticField
 from ..plugins.decoders.config import pretrain_line
 from ..rendering.cameras import Cameras
-from ..rendering.renderer import Parts
-from ..rendering.space import Space
 from ..testing.outputs import check_parts
-from ..types import Origin
-from .camera_optimizers import Poses, Tones
+from .camera_optimizers import Poses, Tones, poses_of, tones_of
+from .facts import Facts
 
 
 def build_decoder(config: TrainConfig, *, encoder: str, channels: int) -> Decoder:
@@ -36,50 +32,6 @@ def build_decoder(config: TrainConfig, *, encoder: str, channels: int) -> Decode
         raise WeightsError(
             f"{error}; `{line}` makes its decoder, --content.decoder.weights FILE names it"
         ) from error
-
-
-_MOST_CHANNELS = 2**16
-_FARTHEST = 1e30
-"""Bounds of what a spoilt file may ask for: memory, and distances that float32 holds."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Facts:
-    """Facts of a trained scene: enough to rebuild its model without images or encoders."""
-
-    space: Space
-    channels: int = 0
-    """Content channels; 0 = the scene is not of fields."""
-    dim: int = 0
-    """Semantic channels of the field; 0 = no semantics."""
-    content_encoder: str = ""
-    """Identity of the content encoder, to which the decoder belongs."""
-    semantic_encoder: str = ""
-    """Identity of the semantic encoder; empty without one."""
-    content_scale: float = 1.0
-    """RMS standard deviation of the content targets: the unit of the content loss."""
-    semantic_scale: float = 1.0
-    """RMS standard deviation of the semantic targets: the unit of the semantic loss."""
-    background: tuple[float, float, float] | None = None
-    """Colour behind everything, if anything can be seen through."""
-    exposure: tuple[float, ...] = ()
-    """Logarithm of each view's exposure over their mean (see `prepare.exposure_of`); empty where tones are
-    not learnt.
-    """
-    held: tuple[int, ...] = ()
-    """Views that neither tones nor poses are learnt from."""
-    centres: tuple[tuple[float, float, float], ...] = ()
-    """Centres of the cameras, in the world, as the capture says; empty where poses are not refined."""
-    reach: float = 1.0
-    """World distance that views commonly see: the unit in which cameras are shifted."""
-    origin: Origin = (0.0, 0.0, 0.0)
-    """Origin of the local frame that all of the run is in (see `rendering.local_frame`)."""
-
-    def __post_init__(self) -> None:
-        for name in ("channels", "dim"):
-            between(name, getattr(self, name), 0, _MOST_CHANNELS)
-        for name in ("near", "far"):
-            between(f"space.{name}", getattr(self.space, name), 0, _FARTHEST)
 
 
 class Model(nn.Module):
@@ -133,20 +85,6 @@ def background_of(facts: Facts, device: torch.device) -> Annotated[Tensor, "3"] 
     if facts.background is None:
         return None
     return torch.tensor(facts.background, device=device)
-
-
-def tones_of(facts: Facts) -> Tones | None:
-    """Tones at their start; None where they are not learnt."""
-    if facts.exposure:
-        return Tones(torch.tensor(facts.exposure), facts.held)
-    return None
-
-
-def poses_of(facts: Facts, pace: float) -> Poses | None:
-    """Poses as the capture says, to be learnt at a `pace`; None where they are not refined."""
-    if not facts.centres:
-        return None
-    return Poses(torch.tensor(facts.centres, dtype=torch.float64), facts.held, reach=facts.reach, pace=pace)
 
 
 def build_fields(config: TrainConfig, facts: Facts) -> tuple[Sampler, ContentField, SemanticField | None]:

@@ -13,7 +13,7 @@ from ..errors import UsageError
 
 if TYPE_CHECKING:
     from .camera_optimizers import Tones
-    from .loading import Trained
+    from .field_scene import Trained
     from .run import Known
 
 Name: TypeAlias = Literal["draft", "standard", "best"]

@@ -14,33 +14,28 @@ render.
 """
 
 import dataclasses
-import errno
-import hashlib
 import json
 import os
-import socket
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
-from ..config import RunConfig
+from ..config_files import load_config, save_config
 from ..datamanagers.images import load_image, load_mask
 from ..datamanagers.scene import ParsedScene
-from ..errors import CheckpointError, DataError, UsageError
+from ..errors import CheckpointError, UsageError
 from ..io import tensorfiles
-from ..io.atomic import unwritable, write_json
-from ..io.strict_json import open_json, parse_json
-from ..methods import load_config, save_config
+from ..io.atomic import write_json
+from ..io.strict_json import open_json
 from ..plugins.codec import from_json
 from ..plugins.registry import nearest
 from ..rendering.cameras import Cameras
-from .model import Facts
+from ..run_config import RunConfig
+from .facts import Facts
 
 FORMAT = 1
 _SHOWN = 8
@@ -232,212 +227,3 @@ try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
-LOCK = ".lock"
-_NOTE = 200
-"""Bytes of the holder's note that are repeated to others."""
-
-
-@contextmanager
-def lock_folder(folder: Path) -> Iterator[None]:
-    """Hold a folder for the length of the block; it is made if need be, and removed again if it stays empty.
-
-    Raises DataError where another process holds it, naming that, and where nothing can be written: before any
-    work is done.
-    """
-    # The holder before may remove the file between opening and locking it: then a new one is opened.
-    while (handle := _locked(folder)) is None:
-        pass
-    try:
-        yield
-    finally:
-        with suppress(OSError):  # while it is held: who opened it before finds out in `_locked`
-            (folder / LOCK).unlink()
-        os.close(handle)
-        with suppress(OSError):
-            folder.rmdir()
-
-
-def _locked(folder: Path) -> int | None:
-    """Take the lock of a folder; None where its holder removed the file in between."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with ExitStack() as opened:
-            handle = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
-            opened.callback(os.close, handle)
-            # The kernel releases the lock of a process that dies; file systems without locks hold nothing.
-            if fcntl is not None:
-                try:
-                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except OSError as error:
-                    if error.errno in (errno.EAGAIN, errno.EACCES):
-                        note = os.pread(handle, _NOTE, 0).decode(errors="replace").strip()
-                        if note.isprintable() and note:
-                            who = note
-                        else:
-                            who = "another process"
-                        line = f"{folder}: {who} is training here; wait for it, end it, or choose another --output"
-                        raise DataError(line) from error
-                else:
-                    os.ftruncate(handle, 0)
-                    os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
-            # Somebody may hold a file of this name that is not this one any more.
-            with suppress(FileNotFoundError):
-                if os.fstat(handle).st_ino == os.stat(folder / LOCK).st_ino:
-                    opened.pop_all()  # it stays open
-                    return handle
-    except FileExistsError as error:
-        raise DataError(f"{folder}: is a file, not a folder; choose another --output") from error
-    except OSError as error:
-        raise unwritable(folder, error) from error
-    return None
-
-
-def in_training(folder: Path) -> bool:
-    """True while a process holds a folder: what it has learnt so far will change soon."""
-    if fcntl is None or not (folder / LOCK).is_file():
-        return False
-    try:
-        with (folder / LOCK).open() as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError as error:
-        return error.errno in (errno.EAGAIN, errno.EACCES)
-    return False
-
-
-IMAGES = "images.json"
-CHANGED_IMAGES = "--changed-images"
-"""Flag of `fprf train` that goes on with images that have changed."""
-_IMAGES_FORMAT = 1
-_NAMED = 3
-
-
-def image_hashes(scene: ParsedScene) -> dict[str, str]:
-    """SHA-256 of each image's file, by the view's name. Raises DataError where one cannot be read."""
-
-    def of(path: Path) -> str:
-        try:
-            with path.open("rb") as file:
-                return hashlib.file_digest(file, "sha256").hexdigest()
-        except OSError as error:
-            raise DataError(
-                f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
-            ) from error
-
-    # Hashing waits for the disk, so files are read side by side.
-    with ThreadPoolExecutor() as pool:
-        return dict(zip(view_names(scene.paths), pool.map(of, scene.paths), strict=True))
-
-
-def save_image_hashes(root: Path, hashes: Mapping[str, str]) -> None:
-    """Write images.json."""
-    write_json(root / IMAGES, {"format": _IMAGES_FORMAT, "images": dict(hashes)})
-
-
-def check_images(root: Path, scene: ParsedScene, hashes: Mapping[str, str]) -> None:
-    """Raise UsageError where images differ from those that the run in a folder was begun with; no run, or one
-    of before there was a list, has none.
-    """
-    path = root / IMAGES
-    if not path.exists():
-        return
-    with open_json(path, "remove it, and the images are taken as they are") as document:
-        before = from_json(document["images"], dict[str, str], path="images")
-    # By name, not by order: an image that was added moves all numbers behind it.
-    files = dict(zip(view_names(scene.paths), scene.paths, strict=True))
-    changed = []
-    for name in hashes:
-        if name in before and before[name] != hashes[name]:
-            changed.append(f"{files[name]} is another")
-    changed += [f"{files[name]} is new" for name in hashes if name not in before]
-    changed += [f"{name} is gone" for name in before if name not in hashes]
-    if changed:
-        if len(changed) > _NAMED:
-            more = f" and {len(changed) - _NAMED} more"
-        else:
-            more = ""
-        raise UsageError(
-            f"{root}: its images have changed since it was begun: {', '.join(changed[:_NAMED])}{more}; put them back, "
-            f"choose another --output, or go on with these by {CHANGED_IMAGES}"
-        )
-
-
-class History(NamedTuple):
-    """One training: of the run, or of one of its parts."""
-
-    name: str
-    """Empty for the run itself."""
-    step: list[int]
-    seconds: list[float]
-    """Training time at each step, over all resumes."""
-    values: dict[str, list[float | None]]
-    """psnr, rays_per_second, kept and each loss by its name, at each step; None where a line does not say."""
-    notes: list[str]
-    """Faults of the training: skipped steps, damaged checkpoints, returns to an earlier one."""
-
-
-def read_history(run: Path) -> list[History]:
-    """The histories of a run and of its parts: blocks, or the overview and cells; those without any line are
-    left out.
-
-    Where a run was resumed from an earlier step, the later steps of the first try are dropped. Raises
-    CheckpointError where there is no line at all.
-    """
-    parts = ("overview", "blocks/*", "cells/*")
-    files = [
-        run / "events.jsonl",
-        *(file for part in parts for file in sorted(run.glob(f"{part}/events.jsonl"))),
-    ]
-    histories = []
-    for file in files:
-        if file.is_file():
-            histories.append(_history("" if file.parent == run else file.parent.name, file))
-    histories = [history for history in histories if history.step]
-    if not histories:
-        raise CheckpointError(
-            f"{run}: no events.jsonl with a line of training; `fprf train` writes it as it goes"
-        )
-    return histories
-
-
-def _history(name: str, file: Path) -> History:
-    """The lines of a file, which a killed process may have cut short, and which may come from anywhere."""
-    lines: list[dict[str, Any]] = []
-    notes: list[str] = []
-    for text in file.read_text("utf-8", errors="replace").splitlines():
-        try:
-            event = parse_json(text, nan=True)
-        except ValueError:
-            continue
-        if not isinstance(event, dict):
-            continue
-        step = event.get("step")
-        if type(step) is int and abs(step) < _LAST and _number(event.get("seconds")) is not None:
-            # After a resume the steps come again.
-            while lines and lines[-1]["step"] >= step:
-                lines.pop()
-            lines.append(event)
-        else:
-            notes.append(", ".join(f"{key.replace('_', ' ')}: {value}" for key, value in event.items()))
-    # Losses stand beside the other figures of their line; what a line does not say is None.
-    flat = [
-        {**event, **(event["losses"] if isinstance(event.get("losses"), dict) else {})} for event in lines
-    ]
-    known = dict.fromkeys(key for event in flat for key in event if key not in ("step", "seconds", "losses"))
-    values = {}
-    for key in known:
-        values[key] = [_number(event.get(key)) for event in flat]
-    return History(name, [e["step"] for e in lines], [float(e["seconds"]) for e in lines], values, notes)
-
-
-_LARGEST = 3.4e38
-_LAST = 2**63
-"""Bounds of figures (training computes in float32) and of steps: with those beyond, sums and charts would
-overflow.
-"""
-
-
-def _number(value: object) -> float | None:
-    """A figure as training writes it; None for anything else."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _LARGEST:
-        return None
-    return float(value)

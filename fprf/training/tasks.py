@@ -24,16 +24,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ..config import RunConfig
 from ..datamanagers.scene import ParsedScene
 from ..errors import CheckpointError
 from ..interfaces import Executor, Learner
 from ..io.atomic import write_json
 from ..io.strict_json import open_json
 from ..plugins.codec import from_json, to_json
-from ..progress import Display
-from .driver import Report, Schedule, learn, reporter
-from .run import Run, lock_folder
+from ..progress import Display, Report
+from ..run_config import RunConfig
+from .driver import Schedule, learn, reporter
+from .locks import lock_folder
+from .run import Run
 
 WHOLE = -1
 """The number of the whole scene among the parts."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..config import RenderConfig
-from ..interfaces import Decoder, SceneView, Values
+from ..interfaces import Decoder
 from ..memory import chunk_size, in_parts
 from ..ops.backend import float64_device
 from ..rendering.cameras import Cameras, PixelRays, grid_rays, rays_through
@@ -23,10 +23,12 @@ from ..rendering.renderer import (
     render_rays,
     shade,
 )
+from ..scenes import SceneView, Values
 from ..style.look import Restyle
 from ..types import Rays, View, Want
 from .camera_optimizers import rays_of_moving_cameras, rotated
-from .model import Facts, Model, background_of
+from .facts import Facts
+from .model import Model, background_of
 
 
 def view_rays(

@@ -23,8 +23,9 @@ from fprf.cli.parsing import load_method, parse
 from fprf.cli.plugins import faults, run
 from fprf.cli.train import methods
 from fprf.config import TrainConfig
+from fprf.config_files import load_config, save_config
 from fprf.errors import DataError, FprfError, PluginError, UsageError
-from fprf.methods import fprf, fprf_lite, load_config, save_config
+from fprf.methods import fprf, fprf_lite
 from fprf.plugins.encoders.config import BundledSemanticConfig, Vgg19Config
 from fprf.plugins.samplers.config import UniformConfig
 from fprf.plugins.slots import replace

@@ -28,7 +28,7 @@ from fprf.rendering.paths import make_path, write_camera_path
 from fprf.splats.files import read_capture
 from fprf.splats.photographs import camera_of
 from fprf.splats.views import draw
-from fprf.training.run import History
+from fprf.training.history import History
 
 CAPTURED = ["--path", "dataset", "--split", "test"]
 ORBIT = ["--path", "orbit", "--frames"]

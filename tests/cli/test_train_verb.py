@@ -34,7 +34,7 @@ def test_a_config_json_goes_on_with_its_run_wherever_that_lies(world: World, tmp
 def test_another_config_in_an_existing_run_is_refused_before_any_work(
     world: World, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fprf.training.prepare.prepare", None)
+    monkeypatch.setattr("fprf.training.field_setup.prepare", None)
     before = (world.run / "config.json").read_bytes()
     assert (
         cli.main(["train", "fprf-lite", *flags(world, world.run), "--render.chunk", "77", "--seed", "5"]) == 2

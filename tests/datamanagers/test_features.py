@@ -13,12 +13,12 @@ from torch import Tensor
 
 from fprf.datamanagers import features as store_files
 from fprf.datamanagers.basis import Basis, fit_basis
-from fprf.datamanagers.config import GuidedConfig
 from fprf.datamanagers.features import FeatureStore, extract
 from fprf.errors import DataError, NumericsError, PluginError
 from fprf.interfaces import Encoder
 from fprf.io import tensorfiles
 from fprf.ops import guided
+from fprf.ops.config import GuidedConfig
 
 
 def test_what_was_used_longest_ago_goes_first_and_what_is_in_use_stays(tmp_path: Path) -> None:

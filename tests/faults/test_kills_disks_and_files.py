@@ -25,8 +25,9 @@ from fprf.cli import main as cli
 from fprf.errors import CheckpointError, DataError
 from fprf.io.video import write_video
 from fprf.training import checkpoint
+from fprf.training.locks import lock_folder
 from fprf.training.model import Model
-from fprf.training.run import Run, lock_folder
+from fprf.training.run import Run
 
 Trainer = tuple[Model, torch.optim.Optimizer]
 
@@ -160,7 +161,7 @@ def test_a_film_that_the_system_cuts_off_is_no_film(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_cannot_be_written_to_is_told_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fprf.training.prepare.prepare", None)
+    monkeypatch.setattr("fprf.training.field_setup.prepare", None)
     place = Path("/proc/fprf-run")
     if not place.parent.is_dir():
         pytest.skip("no folder that refuses everybody")
@@ -223,7 +224,7 @@ if sys.argv[3] == "8m":
 from benchmarks.kills import tiny
 from dataclasses import replace
 from fprf.cli import main as cli
-from fprf.methods import save_config
+from fprf.config_files import save_config
 config = Path(sys.argv[2]).parent / "config.json"
 save_config(config, replace(tiny(town, 40), output=folder / "run"), "fprf-lite")
 code = cli.main(["train", str(config)])

@@ -13,8 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.cli.parsing import load_method, parse
+from fprf.config_files import load_config, save_config
 from fprf.errors import ConfigError, PluginError
-from fprf.methods import fprf, load_config, save_config
+from fprf.methods import fprf
 from fprf.plugins import registry
 from fprf.plugins.codec import Missing, from_json, to_json
 from fprf.plugins.encoders.config import EncoderConfig, RandomConfig

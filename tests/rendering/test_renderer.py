@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
-from fprf.interfaces import ContentField, Decoder, SemanticField, Stylizer
+from fprf.interfaces import ContentField, Decoder, Parts, SemanticField, Stylizer
 from fprf.plugins.samplers.config import ProposalConfig, UniformConfig
-from fprf.rendering.renderer import Parts, march, render_rays
+from fprf.rendering.renderer import march, render_rays
 from fprf.rendering.space import Kind, Space
 from fprf.rendering.stepfun import midpoints
 from fprf.style.look import Restyle

@@ -14,7 +14,7 @@ from fprf.cli import main as cli
 from fprf.errors import DataError
 from fprf.page.uploads import check_file, find_source
 from fprf.plugins import registry
-from fprf.splats.config import endings
+from fprf.plugins.captures import endings
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.files.base import CaptureFormat, format_of
 

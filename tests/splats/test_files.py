@@ -15,9 +15,9 @@ import pytest
 import torch
 
 from fprf.errors import DataError
+from fprf.plugins.captures import endings
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import look_at, pinhole
-from fprf.splats.config import endings
 from fprf.splats.files import Capture, read_capture, write_capture, write_gaussians
 from fprf.splats.files.base import format_of, spatial_order
 from fprf.splats.files.sog import bundle, unbundle

@@ -31,7 +31,7 @@ from fprf.style.regions import (
 )
 from fprf.style.restyle import Styled, apply_style
 from fprf.style.scene_style import Membership, from_tensors, region_smoothing, scene_style, to_tensors
-from fprf.training.loading import load_style
+from fprf.training.field_scene import load_style
 
 
 def regions_of(world: World, keys: dict[str, RegionKey] | None = None) -> Regions:

@@ -20,7 +20,7 @@ from fprf.style.dictionary import Encoders
 from fprf.style.files import StyleFile, write_style
 from fprf.style.match_maps import MatchMap, match_map, summarize
 from fprf.style.restyle import Codes, Styled, apply_style
-from fprf.training.loading import Trained
+from fprf.training.field_scene import Trained
 from fprf.training.views import paint_pixels, render_view
 
 SECOND: dict[str, object] = {

@@ -12,8 +12,9 @@ from tiny_world import tiny
 
 from benchmarks.town.write import write_town
 from fprf.blocks.config import GridConfig, LayoutConfig
-from fprf.config import RunConfig, StatisticsConfig, TrainConfig
+from fprf.config import StatisticsConfig, TrainConfig
 from fprf.io import tensorfiles
+from fprf.run_config import RunConfig
 from fprf.splats import cells
 from fprf.splats.config import GaussiansConfig
 from fprf.training import blocks, checkpoint

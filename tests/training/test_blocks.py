@@ -27,7 +27,7 @@ from fprf.training.blocks import (
     surroundings,
 )
 from fprf.training.driver import train
-from fprf.training.loading import load_run
+from fprf.training.field_scene import load_run
 from fprf.training.prepare import read_scene
 from fprf.training.run import Run
 from fprf.training.tasks import WHOLE

@@ -12,10 +12,9 @@ from tiny_world import World, parameters, trained_for
 from torch import Tensor
 
 from fprf.rendering.cameras import rays_through
-from fprf.training.camera_optimizers import Poses, Tones, rotated
+from fprf.training.camera_optimizers import Poses, Tones, poses_of, rotated
 from fprf.training.driver import train
-from fprf.training.loading import load_run
-from fprf.training.model import poses_of
+from fprf.training.field_scene import load_run
 from fprf.types import Batch
 
 SEEDS = st.integers(0, 2**31 - 1)

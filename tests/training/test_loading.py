@@ -16,9 +16,10 @@ from fprf.errors import CheckpointError, PluginError, UsageError, WeightsError
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig
 from fprf.training.camera_optimizers import Tones
 from fprf.training.driver import train
-from fprf.training.loading import Trained, load_run
+from fprf.training.field_scene import Trained, load_run
+from fprf.training.field_setup import prepare
 from fprf.training.model import Model
-from fprf.training.prepare import prepare, read_scene
+from fprf.training.prepare import read_scene
 from fprf.training.quality import PRESETS, QualityConfig, at_quality
 
 

@@ -29,7 +29,8 @@ from fprf.splats.files import read_capture
 from fprf.splats.photographs import camera_of
 from fprf.splats.scene import SplatScene
 from fprf.training.driver import train
-from fprf.training.loading import load_run, open_run
+from fprf.training.field_scene import load_run
+from fprf.training.loading import open_run
 from fprf.training.run import Run
 
 SPLATS = ["--downscale", "1", "--initial", "300", "--cap", "400", "--steps", "40"]

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from fprf.config import LossConfig
 from fprf.errors import ConfigError, PluginError
-from fprf.interfaces import LossTerm
+from fprf.interfaces import LossTerm, Parts
 from fprf.plugins.losses.config import LossTermConfig
-from fprf.rendering.renderer import Parts, render_rays
+from fprf.rendering.renderer import render_rays
 from fprf.training.losses import check_penalties, emptiness, ending, extra_term, terms, total, wanted
 from fprf.training.model import Model, build_model
 from fprf.types import Batch, Rendered, Want

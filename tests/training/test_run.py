@@ -18,17 +18,10 @@ from tiny_world import World
 
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import CheckpointError, DataError, UsageError
-from fprf.training.run import (
-    IMAGES,
-    LOCK,
-    Run,
-    check_images,
-    image_hashes,
-    lock_folder,
-    read_history,
-    save_image_hashes,
-    view_names,
-)
+from fprf.training.history import read_history
+from fprf.training.image_hashes import IMAGES, check_images, image_hashes, save_image_hashes
+from fprf.training.locks import LOCK, lock_folder
+from fprf.training.run import Run, view_names
 
 
 @pytest.fixture
@@ -70,7 +63,7 @@ def test_names_are_never_alike(paths: list[list[str]]) -> None:
 HOLDER = """
 import sys, time
 from pathlib import Path
-from fprf.training.run import lock_folder
+from fprf.training.locks import lock_folder
 with lock_folder(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(60)

@@ -15,21 +15,24 @@ from hypothesis import strategies as st
 
 from benchmarks.town.write import write_town
 from fprf.blocks.partition import write_cells
+from fprf.config_files import save_config
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import ParsedScene
 from fprf.errors import CheckpointError, FprfError
 from fprf.io import tensorfiles
 from fprf.io.atomic import write_json
-from fprf.methods import fprf_lite, save_config
+from fprf.methods import fprf_lite
 from fprf.rendering.space import Space
 from fprf.splats import cells
 from fprf.splats.cells import Cells, load_cells
 from fprf.splats.config import GaussiansConfig
 from fprf.training import blocks, checkpoint
 from fprf.training.blocks import load_blocks, load_finished
+from fprf.training.facts import Facts
 from fprf.training.field_learner import training_summary
-from fprf.training.model import Facts
-from fprf.training.run import Run, check_images, image_hashes, read_history, save_image_hashes
+from fprf.training.history import read_history
+from fprf.training.image_hashes import check_images, image_hashes, save_image_hashes
+from fprf.training.run import Run
 from fprf.training.tasks import WHOLE, begin, read_done, renumber, task_of
 from fprf.types import Cell
 

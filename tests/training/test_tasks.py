@@ -24,9 +24,10 @@ from tiny_world import events, same
 
 from fprf.errors import CheckpointError, DataError
 from fprf.interfaces import Executor
+from fprf.progress import Report
 from fprf.splats.config import GaussiansConfig
 from fprf.training import driver
-from fprf.training.driver import Report, train
+from fprf.training.driver import train
 from fprf.training.loading import open_run
 from fprf.training.run import Run
 from fprf.training.tasks import WHOLE, Task, renumber, task_of, train_all

@@ -14,8 +14,8 @@ from torch import nn
 
 from fprf.config import TrainConfig
 from fprf.errors import CheckpointError, NumericsError
+from fprf.progress import Report
 from fprf.training import checkpoint
-from fprf.training.driver import Report
 from fprf.training.field_learner import CLEAR_EVERY, clear_denormals
 from fprf.training.model import build_model
 from fprf.training.run import Run

@@ -27,13 +27,13 @@ from fprf.plugins.stylizers.config import (
     RegionToneConfig,
     StylizerConfig,
 )
+from fprf.progress import Report
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.restyle import apply_style
 from fprf.training import checkpoint, driver
 from fprf.training import field_learner as learner
-from fprf.training.driver import Report
-from fprf.training.loading import load_run
+from fprf.training.field_scene import load_run
 from fprf.training.model import build_model
 from fprf.training.prepare import device_of
 from fprf.training.run import Run

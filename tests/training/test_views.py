@@ -19,7 +19,7 @@ from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
 from fprf.style.restyle import apply_style
 from fprf.style.scene_style import SceneStyle, from_tensors, own_style
-from fprf.training.loading import Trained, load_style
+from fprf.training.field_scene import Trained, load_style
 from fprf.training.run import Run
 from fprf.training.style_pass import lattice, measure_style
 from fprf.training.views import view_chunks

@@ -23,11 +23,11 @@ from ...errors import DataError
 from ...io.atomic import atomic_path
 from ...ops.harmonics import HARMONIC, spherical_harmonics
 from ...plugins import registry
+from ...plugins.captures import CAPTURES, endings, format_name
 from ...plugins.config import PluginConfig
 from ...rendering.cameras import Cameras
 from ...rendering.local_frame import local_origin
 from ...types import Origin
-from ..config import CAPTURES, endings, format_name
 from ..gaussians import GaussianRows, Gaussians, bulk_of, from_arrays, morton_order
 
 Data: TypeAlias = bytes | mmap.mmap

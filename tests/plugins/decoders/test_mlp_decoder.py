@@ -25,7 +25,7 @@ from fprf.plugins.encoders.config import (
 )
 from fprf.plugins.weights import write_weights
 from fprf.pretraining.config import PretrainDecoderConfig
-from fprf.training.prepare import prepare
+from fprf.training.field_setup import prepare
 
 
 def file_of(path: Path, encoder: str, channels: int = 6, hidden: int = 4) -> Path:

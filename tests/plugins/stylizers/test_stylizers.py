@@ -35,7 +35,7 @@ from fprf.style.look import Restyle
 from fprf.style.matching import score_spread, share_mean, unit
 from fprf.style.scene_style import Membership, SceneStyle, own_style, scene_style
 from fprf.style.statistics import deviation, monge
-from fprf.training.loading import load_style
+from fprf.training.field_scene import load_style
 from fprf.training.views import render_view
 from fprf.types import Want
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fprf.interfaces import LossTerm
-from fprf.rendering.renderer import Parts
+from fprf.interfaces import LossTerm, Parts
 from fprf.types import Batch, Rendered, Want
 
 __all__ = ["OpacityTerm"]

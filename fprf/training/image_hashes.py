@@ -1,0 +1,72 @@
+"""Hashes of a run's images, so that another start does not go on with others (images.json)."""
+
+import hashlib
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from ..datamanagers.scene import ParsedScene
+from ..errors import DataError, UsageError
+from ..io.atomic import write_json
+from ..io.strict_json import open_json
+from ..plugins.codec import from_json
+from .run import view_names
+
+IMAGES = "images.json"
+"""File of a run folder."""
+CHANGED_IMAGES = "--changed-images"
+"""Flag of `fprf train` that goes on with images that have changed."""
+_IMAGES_FORMAT = 1
+"""Version of images.json."""
+_NAMED = 3
+"""Images that a message names, at most."""
+
+
+def image_hashes(scene: ParsedScene) -> dict[str, str]:
+    """SHA-256 of each image's file, by the view's name. Raises DataError where one cannot be read."""
+
+    def of(path: Path) -> str:
+        try:
+            with path.open("rb") as file:
+                return hashlib.file_digest(file, "sha256").hexdigest()
+        except OSError as error:
+            raise DataError(
+                f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
+            ) from error
+
+    # Hashing waits for the disk, so files are read side by side.
+    with ThreadPoolExecutor() as pool:
+        return dict(zip(view_names(scene.paths), pool.map(of, scene.paths), strict=True))
+
+
+def save_image_hashes(root: Path, hashes: Mapping[str, str]) -> None:
+    """Write images.json."""
+    write_json(root / IMAGES, {"format": _IMAGES_FORMAT, "images": dict(hashes)})
+
+
+def check_images(root: Path, scene: ParsedScene, hashes: Mapping[str, str]) -> None:
+    """Raise UsageError where images differ from those that the run in a folder was begun with; no run, or one
+    of before there was a list, has none.
+    """
+    path = root / IMAGES
+    if not path.exists():
+        return
+    with open_json(path, "remove it, and the images are taken as they are") as document:
+        before = from_json(document["images"], dict[str, str], path="images")
+    # By name, not by order: an image that was added moves all numbers behind it.
+    files = dict(zip(view_names(scene.paths), scene.paths, strict=True))
+    changed = []
+    for name in hashes:
+        if name in before and before[name] != hashes[name]:
+            changed.append(f"{files[name]} is another")
+    changed += [f"{files[name]} is new" for name in hashes if name not in before]
+    changed += [f"{name} is gone" for name in before if name not in hashes]
+    if changed:
+        if len(changed) > _NAMED:
+            more = f" and {len(changed) - _NAMED} more"
+        else:
+            more = ""
+        raise UsageError(
+            f"{root}: its images have changed since it was begun: {', '.join(changed[:_NAMED])}{more}; put them back, "
+            f"choose another --output, or go on with these by {CHANGED_IMAGES}"
+        )
