@@ -190,7 +190,7 @@ class GaussiansConfig(RunConfig):
 
     def compile_kernels(self, device: "torch.device", say: Callable[[str], None]) -> None:
         """gsplat's kernels for a CUDA device, or those of the CPU."""
-        from .setup import compile_kernels
+        from .plan import compile_kernels
 
         compile_kernels(device, (self.degree + 1) ** 2, say)
 

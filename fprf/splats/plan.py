@@ -9,6 +9,7 @@ with 160 000 Gaussians, 27.9 with 120 000 (benchmarks/results/splat_training.jso
 """
 
 import math
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,6 +20,7 @@ import torch
 
 from ..ops.rasterise.gsplat import target_on, trainable, usable
 from ..ops.rasterise.reference import Pinhole
+from ..ops.rasterise.training import compile_beside
 
 if TYPE_CHECKING:
     from ..datamanagers.scene import ParsedScene
@@ -55,6 +57,8 @@ _BESIDES = 1.4
 """Images of the steps that are made on a CUDA device, steps before any is timed, those of which the fastest
 counts, and what a step of training takes in units of these, with all that is done between steps.
 """
+_NOTICE_SECONDS = 3.0
+"""Preparing kernels for longer than this means that they are compiled; by eye, as it takes a minute."""
 
 
 def plan(config: "GaussiansConfig", scene: "ParsedScene", device: torch.device) -> "GaussiansConfig":
@@ -183,3 +187,19 @@ def _share(config: "GaussiansConfig") -> float:
     """Share of the full size's pixels that a step sees on average."""
     coarse = config.coarse
     return (1 - coarse) + coarse * 2 / 3 / 4 + coarse / 3 / 16
+
+
+def compile_kernels(device: torch.device, bands: int, say: Callable[[str], None]) -> None:
+    """Compile what draws Gaussians in training with so many harmonics, where that was not done before.
+
+    gsplat does not tell in advance whether it has to, so `say` is told after some seconds.
+    """
+    line = "compiling kernels, once after installation: this does not count towards --minutes"
+    notice = threading.Timer(_NOTICE_SECONDS, say, [line])
+    notice.start()
+    try:
+        if not usable(device):
+            for process in compile_beside(bands):
+                process.wait()
+    finally:
+        notice.cancel()

@@ -10,7 +10,6 @@ points:
 """
 
 import math
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated, NamedTuple
@@ -21,8 +20,8 @@ from torch import Tensor
 
 from ..datamanagers.images import Image
 from ..datamanagers.scene import ParsedScene, find_sightings, sparser
-from ..ops.rasterise.gsplat import Trainable, usable
-from ..ops.rasterise.training import LOG_SCALES, MEANS, compile_beside
+from ..ops.rasterise.gsplat import Trainable
+from ..ops.rasterise.training import LOG_SCALES, MEANS
 from ..training.camera_optimizers import poses_of, tones_of
 from ..training.facts import Facts
 from ..training.prepare import exposure_of, facts_of
@@ -46,8 +45,6 @@ _EVERY = 20
 _EVERY_IN_CELLS = 100
 _SPHERE_EVERY = 10
 """Steps between cuts of widths; in scenes of cells; of the surroundings."""
-_NOTICE_SECONDS = 3.0
-"""Preparing kernels for longer than this means that they are compiled; by eye, as it takes a minute."""
 _TOGETHER = 256
 _PAIRS = 1 << 16
 """Gaussians whose distances to cameras are taken together, at least, and pairs of both, where cameras are
@@ -109,22 +106,6 @@ def build(
     )
     learner.begin_at(points, draw, far)
     return learner
-
-
-def compile_kernels(device: torch.device, bands: int, say: Callable[[str], None]) -> None:
-    """Compile what draws Gaussians in training with so many harmonics, where that was not done before.
-
-    gsplat does not tell in advance whether it has to, so `say` is told after some seconds.
-    """
-    line = "compiling kernels, once after installation: this does not count towards --minutes"
-    notice = threading.Timer(_NOTICE_SECONDS, say, [line])
-    notice.start()
-    try:
-        if not usable(device):
-            for process in compile_beside(bands):
-                process.wait()
-    finally:
-        notice.cancel()
 
 
 def light_and_poses(config: GaussiansConfig, scene: ParsedScene, image: Callable[[int], Image]) -> Facts:

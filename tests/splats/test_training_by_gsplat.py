@@ -21,7 +21,7 @@ from splat_ball import equal
 from fprf.cli.main import main
 from fprf.datamanagers.scene import ParsedScene
 from fprf.ops.rasterise.gsplat import GsplatGaussians
-from fprf.splats import plan, setup
+from fprf.splats import plan
 from fprf.splats.config import GaussiansConfig
 from fprf.splats.learner import GaussianLearner
 from fprf.splats.setup import build
@@ -121,8 +121,8 @@ def test_one_line_says_that_the_kernels_of_the_cpu_are_compiled(
         heard.set()
 
     compiler = SimpleNamespace(wait=lambda: heard.wait(60) if slow else None)
-    monkeypatch.setattr(setup, "_NOTICE_SECONDS", 0.0 if slow else 60.0)
-    monkeypatch.setattr(setup, "compile_beside", lambda bands: [compiler])
+    monkeypatch.setattr(plan, "_NOTICE_SECONDS", 0.0 if slow else 60.0)
+    monkeypatch.setattr(plan, "compile_beside", lambda bands: [compiler])
     GaussiansConfig().compile_kernels(torch.device("cpu"), say)
     assert len(said) == slow
 
