@@ -24,9 +24,9 @@ from fprf.io.images import write_image
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import pinhole
 from fprf.scenes import Scene
+from fprf.splats.drawing import draw
 from fprf.splats.files import read_capture
 from fprf.splats.photographs import camera_of
-from fprf.splats.views import draw
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle

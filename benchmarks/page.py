@@ -39,10 +39,10 @@ from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.rendering.cameras import Cameras
 from fprf.splats.captures import look_at_capture
 from fprf.splats.config import LookConfig
+from fprf.splats.drawing import draw
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.photographs import camera_of
 from fprf.splats.scene import SplatScene
-from fprf.splats.views import draw
 from fprf.training.loading import open_run
 
 from .common import ROOT, arguments, report

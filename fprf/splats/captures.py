@@ -34,13 +34,14 @@ from ..style.restyle import Styled
 from ..training.loading import open_run
 from ..training.prepare import cache_folder
 from .config import LookConfig
+from .drawing import clip_distance
 from .files import Capture, read_capture, release
 from .files.base import pieces
 from .gaussians import Gaussians, bulk_of, cells_of
 from .restyle import restyled_harmonics
 from .scene import SplatScene
 from .semantics import Semantics, find_semantics, load_semantics, semantics_tensors, tensor_group
-from .views import clip_distance, find_views
+from .views import find_views
 
 _UP = (0.0, -1.0, 0.0)
 """Direction that points up where nothing says so."""

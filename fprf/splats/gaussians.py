@@ -28,6 +28,8 @@ finite in float32, and the smallest that drawing tells from 0.
 """
 _SAMPLE = 100_000
 """Points, about, of which quantiles are taken."""
+MAX_BULK_DISTANCE = 128.0
+"""Distance from the bulk (`Bulk.apart`) beyond which Gaussians are stray; by eye."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,12 +26,12 @@ from ..style.look import Restyle
 from ..style.scene_style import SceneStyle
 from ..training.camera_optimizers import Tones
 from ..types import Origin, View
+from .drawing import SeenMeans, draw, seen_means
 from .gaussians import GaussianRows, Gaussians
 from .levels import Levels, StyledLevels
 from .photographs import cover, distorted
 from .restyle import Colours, restyled_harmonics
 from .semantics import Semantics
-from .views import SeenMeans, draw, seen_means
 
 CPU = torch.device("cpu")
 _ROWS = 1 << 14

@@ -33,10 +33,10 @@ from ..rendering.cameras import Cameras
 from ..style.scene_style import SceneStyle, region_contacts, scene_style
 from ..style.scene_style import from_tensors as style_from
 from ..style.scene_style import to_tensors as style_tensors
-from .gaussians import Gaussians, bulk_of, cells_of
+from .drawing import draw
+from .gaussians import MAX_BULK_DISTANCE, Gaussians, bulk_of, cells_of
 from .levels import seen_by
 from .photographs import camera_of
-from .views import OUTLYING, draw
 
 _CHANNELS = 31
 """Principal components of the semantics that are kept; with the weight they are carried back in four vectors
@@ -241,7 +241,7 @@ def _spread(
     levels = []
     # Neither stray Gaussians nor the distance from the origin decide how large neighbourhoods are, nor where
     # they begin.
-    near = points[torch.from_numpy(bulk_of(points.numpy()).apart <= OUTLYING)].double()
+    near = points[torch.from_numpy(bulk_of(points.numpy()).apart <= MAX_BULK_DISTANCE)].double()
     edge = _EDGE * float(near.var(0, correction=0).mean().sqrt())
     # Each level divides space into boxes twice as wide; a box counts for at most so many pixels, however much
     # was seen there.

@@ -25,9 +25,9 @@ from fprf.export.fit import seen_points
 from fprf.export.mesh import render_maps
 from fprf.io import images
 from fprf.rendering.paths import make_path, write_camera_path
+from fprf.splats.drawing import draw
 from fprf.splats.files import read_capture
 from fprf.splats.photographs import camera_of
-from fprf.splats.views import draw
 from fprf.training.history import History
 
 CAPTURED = ["--path", "dataset", "--split", "test"]

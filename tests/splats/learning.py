@@ -6,10 +6,10 @@ import torch
 from fprf.datamanagers.images import load_images
 from fprf.datamanagers.scene import ParsedScene
 from fprf.evaluation.metrics import psnr
+from fprf.splats.drawing import draw
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.learner import GaussianLearner
 from fprf.splats.photographs import camera_of
-from fprf.splats.views import draw
 
 STEPS = 260
 

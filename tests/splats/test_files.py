@@ -18,12 +18,12 @@ from fprf.errors import DataError
 from fprf.plugins.captures import endings
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import look_at, pinhole
+from fprf.splats.drawing import draw
 from fprf.splats.files import Capture, read_capture, write_capture, write_gaussians
 from fprf.splats.files.base import format_of, spatial_order
 from fprf.splats.files.sog import bundle, unbundle
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.photographs import camera_of
-from fprf.splats.views import draw
 
 FORMATS = {ending: format_of(Path(f"x{ending}")) for ending in endings()}
 WRITTEN = [ending for ending, form in FORMATS.items() if form.writes and form.reads]

@@ -21,10 +21,11 @@ from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.rendering.local_frame import offset_file, read_offset
 from fprf.splats.captures import look_at_capture
 from fprf.splats.config import LookConfig
+from fprf.splats.drawing import clip_distance, draw, seen_means
 from fprf.splats.files import Capture, Written, read_capture, write_capture, write_gaussians
 from fprf.splats.gaussians import GaussianRows, Gaussians
 from fprf.splats.photographs import camera_of
-from fprf.splats.views import clip_distance, draw, find_views, seen_means
+from fprf.splats.views import find_views
 
 # How far positions in a unit ball and ln-scales from -6 to -1 may move.
 STEPS = {

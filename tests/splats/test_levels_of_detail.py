@@ -8,9 +8,9 @@ import torch
 from splat_ball import ball, equal
 
 from fprf.ops.rasterise.rendering import Pinhole
+from fprf.splats.drawing import draw
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.levels import StyledLevels, make_levels_of_detail, open_levels, write_levels
-from fprf.splats.views import draw
 
 
 def _scattered(count: int) -> Gaussians:

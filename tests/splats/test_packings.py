@@ -23,11 +23,11 @@ from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.rendering.splines import rotations
 from fprf.splats.captures import look_at_capture
 from fprf.splats.config import LookConfig
+from fprf.splats.drawing import draw
 from fprf.splats.files import Capture, read_capture, write_capture, write_gaussians
 from fprf.splats.files.sog import _picture, _webp, bundle, unbundle
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.photographs import camera_of
-from fprf.splats.views import draw
 
 
 def headed(data: bytes, change: Callable[[bytes], bytes]) -> bytes:

@@ -28,12 +28,13 @@ from fprf.plugins.stylizers.config import (
 from fprf.rendering.cameras import pixel_grid
 from fprf.splats.captures import light_alone, look_at_capture, open_capture
 from fprf.splats.config import LookConfig
+from fprf.splats.drawing import draw
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.gaussians import HARMONIC, Gaussians
 from fprf.splats.photographs import camera_of
 from fprf.splats.restyle import all_around
 from fprf.splats.scene import SplatScene
-from fprf.splats.views import draw, find_views
+from fprf.splats.views import find_views
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile, write_style
 from fprf.style.light import luma

@@ -14,11 +14,11 @@ from fprf.rendering.cameras import Cameras, ideal_cameras, project
 from fprf.rendering.paths import pinhole
 from fprf.splats import initial, photographs
 from fprf.splats.config import GaussiansConfig
+from fprf.splats.drawing import draw
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.initial import initial_points
 from fprf.splats.photographs import camera_of, load_photographs, make_levels
 from fprf.splats.setup import scene_scale
-from fprf.splats.views import draw
 from fprf.training.prepare import read_scene
 
 

@@ -15,8 +15,8 @@ from ...errors import DataError
 from ...rendering.cameras import Cameras
 from ...rendering.local_frame import added_and_beside, read_offset, write_offset
 from ...types import Origin
+from ..drawing import seen_means
 from ..gaussians import GaussianRows, Gaussians, bulk_of
-from ..views import seen_means
 from .base import Capture, Data, format_of, pieces, release
 
 __all__ = ["Capture", "Written", "read_capture", "release", "write_capture", "write_gaussians"]
