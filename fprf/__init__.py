@@ -1,6 +1,7 @@
 """Feed-forward photorealistic style transfer of large-scale 3D radiance fields."""
 
-from pathlib import Path
+import os
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
@@ -11,7 +12,10 @@ __all__ = ["__version__", "load", "read"]
 
 
 def load(
-    run: str | Path, *, device: str = "auto", quality: Literal["draft", "standard", "best"] | None = None
+    run: str | os.PathLike[str],
+    *,
+    device: str = "auto",
+    quality: Literal["draft", "standard", "best"] | None = None,
 ) -> "TrainedScene":
     """A trained run, ready to restyle and render; needs neither its images nor, before `stylize`, its
     encoders.
@@ -23,18 +27,19 @@ def load(
     from functools import cache
 
     from .api import TrainedScene
+    from .io.paths import as_path
     from .training.loading import open_run
     from .training.quality import QualityConfig
 
-    trained = open_run(Path(run), device, QualityConfig(quality=quality))
+    trained = open_run(as_path(run), device, QualityConfig(quality=quality))
     return TrainedScene(trained, encoders=cache(trained.scene.encoders))
 
 
 def read(
-    path: str | Path,
+    path: str | os.PathLike[str],
     *,
     views: int = 32,
-    up: tuple[float, float, float] | None = None,
+    up: Sequence[float] | None = None,
     inside: bool | None = None,
 ) -> "FinishedCapture":
     """A finished capture of 3D Gaussians, ready to restyle and write: a file of any format that is installed.
@@ -43,7 +48,11 @@ def read(
     cannot be read.
     """
     from .api import FinishedCapture
+    from .io.paths import as_path
+    from .plugins.conversion import three_numbers
     from .splats.config import LookConfig
     from .splats.files import read_capture
 
-    return FinishedCapture(read_capture(Path(path)), LookConfig(views=views, up=up, inside=inside))
+    direction = None if up is None else three_numbers("up", up)
+    look = LookConfig(views=views, up=direction, inside=inside)
+    return FinishedCapture(read_capture(as_path(path)), look)

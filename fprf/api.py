@@ -10,6 +10,7 @@ Scenes never change: what restyles one returns another, and both share the train
 CPU.
 """
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -22,16 +23,20 @@ from torch import Tensor
 from .checks import at_least, between
 from .errors import UsageError
 from .io.images import Picture, to_uint8, write_image
+from .io.overwriting import Origin
+from .io.paths import PathLike, as_path, as_paths
+from .plugins.conversion import three_numbers
 from .plugins.registry import nearest
 from .plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from .rendering.cameras import Cameras
+from .rendering.local_frame import offset_file
 from .rendering.paths import look_at, make_path, pinhole, upwards
 from .scenes import Scene
 from .splats.captures import Captures, light_alone, open_captures
 from .splats.config import LookConfig
 from .splats.files import Capture, write_capture
 from .splats.gaussians import Gaussians
-from .style.config import StyleConfig, with_preset
+from .style.config import NO_MASK, StyleConfig, with_preset
 from .style.dictionary import Encoders
 from .style.files import StyleFile, check_photographs, read_style, write_style
 from .style.look import Restyle
@@ -39,8 +44,20 @@ from .style.match_maps import MatchMap, match_map
 from .style.restyle import Styled, apply_style, mixed
 from .training.loading import LoadedRun
 
-PathLike = str | Path
 Split = Literal["train", "test", "all"]
+_BY = "python"
+"""The verb of what Python writes (`io.overwriting`)."""
+_REMEDY = "give another path, or replace it with overwrite=True"
+
+
+def _origin(*reads: Path) -> Origin:
+    """Origin of what is made of files."""
+    return Origin(by=_BY, reads=reads, remedy=_REMEDY)
+
+
+def _texts(values: str | Sequence[str]) -> tuple[str, ...]:
+    """One text, or several."""
+    return (values,) if isinstance(values, str) else tuple(values)
 
 
 @dataclass(frozen=True)
@@ -53,15 +70,21 @@ class Shot:
     """Distance along the unit ray, in the capture's units."""
     opacity: Annotated[Tensor, "H W"]
     """Opacity of the ray, in [0, 1]."""
+    origin: Origin = Origin(by=_BY, remedy=_REMEDY)
+    """The run and the photographs that it was made of."""
 
     @property
     def pixels(self) -> Picture:
         """The colours as uint8 RGB, a numpy array [H W 3]."""
         return to_uint8(self.rgb)
 
-    def save(self, path: PathLike) -> None:
-        """Write the colours: .png, .jpg or .webp. Raises DataError for another ending."""
-        write_image(Path(path), self.pixels)
+    def save(self, path: PathLike, *, overwrite: bool = False) -> None:
+        """Write the colours: .png, .jpg or .webp. Raises DataError for another ending, UsageError where something
+        else is there already, unless `overwrite` is true.
+        """
+        file = as_path(path)
+        with replace(self.origin, overwrite=overwrite).writing([file]):
+            write_image(file, self.pixels)
 
 
 @dataclass(frozen=True)
@@ -72,6 +95,8 @@ class TrainedScene:
     """Scene, cameras and run folder, for what this class does not offer."""
     styled: Styled | None = None
     """The style with its dictionary and codes; None = as it was captured."""
+    style_files: tuple[Path, ...] = ()
+    """The style file that the style was read from."""
     encoders: Callable[[], Encoders] = field(kw_only=True, repr=False)
     """Encoders of the run, loaded at the first style and kept for the next; one function for all styles of a
     loaded scene.
@@ -104,7 +129,7 @@ class TrainedScene:
             view = self.names.index(view)
         if not 0 <= view < len(self.names):
             raise UsageError(f"camera {view}: no such view; numbers go from 0 to {len(self.names) - 1}")
-        return self.cameras.select(torch.tensor([view]))
+        return self.cameras.select(torch.tensor([int(view)]))
 
     def camera_at(
         self,
@@ -124,24 +149,22 @@ class TrainedScene:
         between("fov", fov, 1e-3, 179.0)
         at_least("width", width, 1)
         at_least("height", height, 1)
-        here = torch.tensor([list(position)], dtype=torch.float64)
-        there = torch.tensor([list(target)], dtype=torch.float64)
-        if here.shape != (1, 3) or there.shape != (1, 3) or bool(torch.equal(here, there)):
-            raise UsageError(
-                f"camera_at: position {position} and target {target} must be two places of three numbers each"
-            )
+        here = torch.tensor([three_numbers("position", position)], dtype=torch.float64)
+        there = torch.tensor([three_numbers("target", target)], dtype=torch.float64)
+        if bool(torch.equal(here, there)):
+            raise UsageError(f"camera_at: position and target are both {position}; give two places")
         pose = look_at(here, there, upwards(self.cameras))
         return pinhole(pose, width=width, height=height, fov=fov)
 
-    def path(self, motion: str, frames: int = 120, split: Split = "all") -> Cameras:
+    def path(self, motion: PathLike, frames: int = 120, split: Split = "all") -> Cameras:
         """Cameras of a flight: spiral, orbit, interpolate, dataset, or a camera-path JSON file. Raises
         UsageError.
         """
-        return make_path(self.cameras, self.trained.known.split(split), motion, frames)
+        return make_path(self.cameras, self.trained.known.split(split), os.fspath(motion), frames)
 
     def stylize(
         self,
-        references: Sequence[PathLike],
+        references: PathLike | Sequence[PathLike],
         *,
         weights: Sequence[float] = (),
         strength: float = 1.0,
@@ -149,13 +172,13 @@ class TrainedScene:
         clusters: int = 20,
         blend: float = 0.1,
         stylizer: StylizerConfig | None = None,
-        pin: Sequence[str] = (),
-        forbid: Sequence[str] = (),
-        keep: Sequence[str] = (),
+        pin: str | Sequence[str] = (),
+        forbid: str | Sequence[str] = (),
+        keep: str | Sequence[str] = (),
         preset: str | None = None,
     ) -> "TrainedScene":
-        """The scene in the style of photographs, or of all in a folder; all arguments but `preset` are fields
-        of `StyleConfig`.
+        """The scene in the style of one photograph or several, or of all in a folder; all arguments but `preset`
+        are fields of `StyleConfig`.
 
         A preset, such as "gentle", replaces what it sets (`fprf.style.config.PRESETS`).
 
@@ -163,16 +186,16 @@ class TrainedScene:
         DataError for unreadable photographs, WeightsError where the encoders at hand are not the scene's.
         """
         style = StyleConfig(
-            references=tuple(Path(path) for path in references),
+            references=as_paths(references),
             weights=tuple(weights),
             strength=strength,
             luminance=luminance,
             clusters=clusters,
             blend=blend,
             stylizer=RegionToneConfig() if stylizer is None else stylizer,
-            pin=tuple(pin),
-            forbid=tuple(forbid),
-            keep=tuple(keep),
+            pin=_texts(pin),
+            forbid=_texts(forbid),
+            keep=_texts(keep),
         )
         return self.apply(style if preset is None else with_preset(style, preset))
 
@@ -181,11 +204,13 @@ class TrainedScene:
         `stylize`.
         """
         if isinstance(style, StyleConfig):
-            return replace(self, styled=apply_style(self.trained.scene, StyleFile(style), self.encoders()))
-        path = Path(style)
+            styled = apply_style(self.trained.scene, StyleFile(style), self.encoders())
+            return replace(self, styled=styled, style_files=())
+        path = as_path(style)
         file = read_style(path)
         check_photographs(path, file)
-        return replace(self, styled=apply_style(self.trained.scene, file, self.encoders(), (path.resolve(),)))
+        styled = apply_style(self.trained.scene, file, self.encoders(), (path.resolve(),))
+        return replace(self, styled=styled, style_files=(path,))
 
     def towards(self, other: "TrainedScene", at: float) -> "TrainedScene":
         """On the way from this style (0) to that of `other` (1), point by point. Raises UsageError without
@@ -206,14 +231,18 @@ class TrainedScene:
         """The scene as it was captured."""
         return replace(self, styled=None)
 
-    def save_style(self, path: PathLike) -> None:
-        """Write the style as a style.json. Raises UsageError without one, or for a mix made by `towards`."""
+    def save_style(self, path: PathLike, *, overwrite: bool = False) -> None:
+        """Write the style as a style.json. Raises UsageError without one, for a mix made by `towards`, and where
+        something else is there already, unless `overwrite` is true.
+        """
         styled = self._style("save_style")
         if len(styled.restyle.parts) > 1 and styled.controls.saved.style.between is None:
             raise UsageError(
                 "save_style: a mix has no file of its own; save both styles, and give one `between` and `at`"
             )
-        write_style(Path(path), styled.controls.saved)
+        file = as_path(path)
+        with replace(self.origin, overwrite=overwrite).writing([file]):
+            write_style(file, styled.controls.saved)
 
     def _repr_html_(self) -> str:
         """The scene in a notebook: a page to walk through, of Gaussians; a picture of a field."""
@@ -240,7 +269,7 @@ class TrainedScene:
         cameras = self._local(cameras)
         for view in range(len(cameras)):
             made = scene.render(cameras, view)
-            yield Shot(made.rgb, made.depth, made.opacity)
+            yield Shot(made.rgb, made.depth, made.opacity, self.origin)
 
     def matches(self, camera: Cameras | int | str) -> MatchMap:
         """Style codes that each pixel of a view takes; `styled.codes` names them. Raises UsageError without a
@@ -249,6 +278,15 @@ class TrainedScene:
         styled = self._style("matches")
         one = self._single("matches", camera)
         return match_map(self.trained.scene, styled, 0, self._local(one))
+
+    @property
+    def origin(self) -> Origin:
+        """The run and the files that the style is made of."""
+        reads = [self.trained.run.root, *self.style_files]
+        if self.styled is not None:
+            style = self.styled.controls.saved.style
+            reads += [path for path in (*style.references, *style.masks) if path != NO_MASK]
+        return _origin(*reads)
 
     @property
     def restyle(self) -> Restyle | None:
@@ -286,6 +324,8 @@ class FinishedCapture:
     """New ones of all Gaussians that can be drawn, or of all; None = as they were read."""
     seen: Callable[[], Captures] | None = field(default=None, repr=False)
     """Views and semantics, found at the first style and kept for the next."""
+    references: tuple[Path, ...] = ()
+    """Photographs of the style that it is in."""
 
     @property
     def gaussians(self) -> Gaussians:
@@ -303,7 +343,7 @@ class FinishedCapture:
 
     def restyled(
         self,
-        references: Sequence[PathLike],
+        references: PathLike | Sequence[PathLike],
         *,
         weights: Sequence[float] = (),
         strength: float = 1.0,
@@ -318,7 +358,7 @@ class FinishedCapture:
         """
         seen = self.seen or cache(lambda: open_captures([self.capture.path], self.look, first=self.capture))
         style = StyleConfig(
-            references=tuple(Path(path) for path in references),
+            references=as_paths(references),
             weights=tuple(weights),
             strength=strength,
             luminance=luminance,
@@ -326,23 +366,28 @@ class FinishedCapture:
         )
         styled = apply_style(seen().scene, StyleFile(style))
         styled = light_alone(styled) if match_light else styled
-        return replace(self, harmonics=seen().harmonics(0, self.capture, styled.restyle), seen=seen)
+        harmonics = seen().harmonics(0, self.capture, styled.restyle)
+        return replace(self, harmonics=harmonics, seen=seen, references=style.references)
 
     def recoloured(self, harmonics: Annotated[Tensor, "N K 3"]) -> "FinishedCapture":
         """The capture with harmonics of your own for all Gaussians. Raises DataError where they are of other
         shapes.
         """
-        return replace(self, harmonics=self.capture.gaussians.recoloured(harmonics).harmonics)
+        return replace(self, harmonics=self.capture.gaussians.recoloured(harmonics).harmonics, references=())
 
-    def write(self, path: PathLike) -> list[str]:
+    def write(self, path: PathLike, *, overwrite: bool = False) -> list[str]:
         """Write a file, whole or not at all; its ending says the format. Returns what the format does not
         hold, as phrases.
 
-        In the format that was read everything but colours stays as it was, bit for bit.
+        In the format that was read everything but colours stays as it was, bit for bit. Raises UsageError where
+        something else is there already, the file that was read among it, unless `overwrite` is true.
         """
+        file = as_path(path)
+        origin = replace(_origin(self.capture.path, *self.references), overwrite=overwrite)
         if self.harmonics is None:
             harmonics = self.capture.gaussians.harmonics
         else:
             harmonics = self.harmonics
         views = None if self.seen is None else self.seen().scene.views
-        return write_capture(Path(path), self.capture, harmonics, views).losses()
+        with origin.writing([file, offset_file(file)]):
+            return write_capture(file, self.capture, harmonics, views).losses()

@@ -10,6 +10,7 @@ from .checks import at_least, between, positive
 from .datamanagers.parsers.config import DataParserConfig
 from .errors import ConfigError, PluginError
 from .plugins.config import Need
+from .plugins.conversion import convert_fields
 from .plugins.slots import slots
 
 if TYPE_CHECKING:
@@ -69,6 +70,7 @@ class RunConfig:
     """Time between checkpoints."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.downscale is not None:
             at_least("downscale", self.downscale, 1)
         if self.steps is not None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from statistics import fmean
 
 from ..checks import at_least, positive
+from ..io.overwriting import Origin, OverwriteConfig
 from ..progress import Display
 from ..style.config import StyleConfig
 from ..style.files import StyleFile
@@ -20,6 +21,8 @@ LEAD = (
 )
 LOOKS = ("winter", "night", "sunset", "autumn")
 """References, in the order in which they are shown."""
+_TOGETHER = "all together"
+"""Name of the style of all references."""
 CREDITS = (
     "Photographs of the garden: The SfM Tool Authors (sfmtool/sfmtool, test-data), Apache-2.0; reduced and re-encoded.",
     "Autumn and sunset: Aitzol Berasategi, CC BY 4.0; reduced. Winter and night: pictures of fprf's own towns.",
@@ -27,7 +30,7 @@ CREDITS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemoConfig:
+class DemoConfig(OverwriteConfig):
     """A garden in Seattle: train, measure, restyle, and one page that shows it."""
 
     output: Path = Path("demo")
@@ -58,6 +61,7 @@ def run(args: list[str]) -> int:
     from ..io.atomic import write_json
     from ..methods import fprf_splats
     from ..page.writer import Page, Reference, write_page
+    from ..rendering.local_frame import offset_file
     from ..splats.files import write_gaussians
     from ..splats.loading import open_gaussians
     from ..splats.scene import SplatScene
@@ -68,6 +72,12 @@ def run(args: list[str]) -> int:
 
     garden = Path(str(files("fprf") / "garden"))
     output = config.output / "run"
+    captures = {name: config.output / f"{name.replace(' ', '-')}.ply" for name in (*LOOKS, _TOGETHER)}
+    page = config.output / "garden.html"
+    table = config.output / "metrics.json"
+    origin = Origin(by="demo", overwrite=config.overwrite)
+    outputs = [page, table, *captures.values(), *map(offset_file, captures.values())]
+    origin.check(outputs)
     training = replace(
         fprf_splats(), data=garden, downscale=config.downscale, output=output, minutes=config.minutes
     )
@@ -82,8 +92,8 @@ def run(args: list[str]) -> int:
     chosen = []
     for path, name in names.items():
         chosen.append((name, StyleFile(StyleConfig(references=(path,)))))
-    chosen.append(("all together", StyleFile(StyleConfig(references=tuple(names)))))
-    with Display() as display:
+    chosen.append((_TOGETHER, StyleFile(StyleConfig(references=tuple(names)))))
+    with origin.writing(outputs), Display() as display:
         begun = time.perf_counter()
         scene.measured()
         looked = time.perf_counter() - begun
@@ -93,36 +103,35 @@ def run(args: list[str]) -> int:
             # For viewers that do not compensate opacities; these depend on no colour, so that the views are
             # looked at once.
             plain = scene.seen.plain(look.shown)
-            write_gaussians(config.output / f"{style.name.replace(' ', '-')}.ply", plain, origin=scene.origin)
+            write_gaussians(captures[style.name], plain, origin=scene.origin)
         shown_views = page_views(opened, views, display)
-    # Of the single styles: the one of all together encodes nothing anew.
-    metrics |= {
-        "looked_seconds": looked,
-        "new_style_seconds": fmean(seconds for *_, seconds in styles[: len(LOOKS)]),
-        "total_seconds": time.perf_counter() - start,
-    }
-    write_json(config.output / "metrics.json", metrics)
-    width, height = (int(v) for v in scene.cameras.size[0])
-    page = config.output / "garden.html"
-    content = Page(
-        title=TITLE,
-        lead=LEAD,
-        facts={
-            "Photographs": len(scene.names),
-            "Size": f"{width} × {height}",
-            "3D Gaussians": len(scene.gaussians),
-            "Trained for": f"{opened.seconds:.0f} s",
-            "Unseen views": f"{metrics['psnr']:.1f} dB",
-            "A new style": f"{metrics['new_style_seconds']:.1f} s",
-        },
-        views=shown_views,
-        styles=[style for style, *_ in styles],
-        references=[Reference(name, load_image(path, upright=True)) for path, name in names.items()],
-        scene=scene,
-        start=views[0],
-        credits=CREDITS,
-    )
-    write_page(page, content, megabytes=config.megabytes)
+        # Of the single styles: the one of all together encodes nothing anew.
+        metrics |= {
+            "looked_seconds": looked,
+            "new_style_seconds": fmean(seconds for *_, seconds in styles[: len(LOOKS)]),
+            "total_seconds": time.perf_counter() - start,
+        }
+        write_json(table, metrics)
+        width, height = (int(v) for v in scene.cameras.size[0])
+        content = Page(
+            title=TITLE,
+            lead=LEAD,
+            facts={
+                "Photographs": len(scene.names),
+                "Size": f"{width} × {height}",
+                "3D Gaussians": len(scene.gaussians),
+                "Trained for": f"{opened.seconds:.0f} s",
+                "Unseen views": f"{metrics['psnr']:.1f} dB",
+                "A new style": f"{metrics['new_style_seconds']:.1f} s",
+            },
+            views=shown_views,
+            styles=[style for style, *_ in styles],
+            references=[Reference(name, load_image(path, upright=True)) for path, name in names.items()],
+            scene=scene,
+            start=views[0],
+            credits=CREDITS,
+        )
+        write_page(page, content, megabytes=config.megabytes)
     print(
         f"PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.3f}; a new style in {metrics['new_style_seconds']:.2f} s; "
         f"all in {metrics['total_seconds']:.0f} s\n"

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from ..checks import at_least
 from ..errors import UsageError
+from ..io.overwriting import Origin, OverwriteConfig
 from ..progress import Display
 from ..training.quality import QualityConfig
 from .parsing import parse
@@ -20,12 +21,17 @@ if TYPE_CHECKING:
     from ..training.history import History
 
 
-_LONGEST = 1600
-"""Longest side of views as they are judged, where neither the user nor the training says another."""
+_MAX_SIDE_PIXELS = 1600
+"""Longest side of views as they are judged, where neither the user nor the training says another: that of the
+usual reports.
+"""
+_TENSORBOARD_REMEDY = "name another --tensorboard, or replace it with --overwrite true"
+_EVENTS = "events.out.tfevents.*"
+"""Names of TensorBoard's event files."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvalConfig(QualityConfig):
+class EvalConfig(QualityConfig, OverwriteConfig):
     """The run and the measurements."""
 
     run: Path = Path()
@@ -63,7 +69,10 @@ def run(args: list[str]) -> int:
     if config.tensorboard is not None:
         from ..training.history import read_history
 
-        write_scalars(config.tensorboard, read_history(config.run))
+        origin = Origin(
+            by="eval", reads=(config.run,), overwrite=config.overwrite, remedy=_TENSORBOARD_REMEDY
+        )
+        write_scalars(config.tensorboard, read_history(config.run), origin)
     _print(evaluate(config))
     return 0
 
@@ -95,19 +104,30 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
     # What a person looks at are the photographs, whatever size they were trained at.
     longest = captured.cameras.size.amax(1, keepdim=True)
     before = known.cameras.size
-    wanted = config.size or max(_LONGEST, int(before.max()))
+    wanted = config.size or max(_MAX_SIDE_PIXELS, int(before.max()))
     captured = replace(captured, cameras=captured.cameras.scaled((longest.double() / wanted).clamp_min(1)))
     known = replace(known, cameras=known.cameras.resized(captured.cameras.size))
     views = known.views(config.split)
     fitted = {}
+    renders = {view: config.run / "renders" / config.split / f"{known.names[view]}.png" for view in views}
+    table = config.run / "metrics.json"
+    origin = Origin(
+        by="eval",
+        reads=(config.run,),
+        beside=(*captured.paths, *(captured.masks or ())),
+        overwrite=config.overwrite,
+        remedy="move it away, or replace it with --overwrite true",
+    )
 
     def save(view: int, image: "Image") -> None:
         if config.images:
-            write_image(config.run / "renders" / config.split / f"{known.names[view]}.png", image)
+            write_image(renders[view], image)
 
+    outputs = [table, *(renders.values() if config.images else ())]
+    origin.check(outputs)
     # Poses of held-out views were never refined with the scene: they may be fitted to it, which changes no
     # colour of it.
-    with Display() as display:
+    with origin.writing(outputs), Display() as display:
         if config.fit_poses:
             moves = scene.fit_poses(captured, views, display.count)
             known = replace(known, cameras=moved_cameras(known.cameras, moves))
@@ -118,29 +138,29 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
                 poses[known.names[view]] = {"turn_degrees": math.degrees(turn), "shift": shift}
             fitted = {"fitted_poses": poses}
         found = judge(scene, known, captured, views, display.count, save, masks=trained.masked)
-    metrics = {
-        "method": opened.method,
-        "scene": known.name,
-        "split": config.split,
-        "quality": config.quality,
-        "size": "{}x{}".format(*captured.cameras.size[views[0]].tolist()),
-        "trained_size": "{}x{}".format(*before[views[0]].tolist()),
-        **found,
-        "train_seconds": opened.seconds,
-        "train_steps": opened.step,
-        **scene.counts,
-        **fitted,
-    }
-    write_json(config.run / "metrics.json", metrics)
+        metrics = {
+            "method": opened.method,
+            "scene": known.name,
+            "split": config.split,
+            "quality": config.quality,
+            "size": "{}x{}".format(*captured.cameras.size[views[0]].tolist()),
+            "trained_size": "{}x{}".format(*before[views[0]].tolist()),
+            **found,
+            "train_seconds": opened.seconds,
+            "train_steps": opened.step,
+            **scene.counts,
+            **fitted,
+        }
+        write_json(table, metrics)
     return metrics
 
 
-def write_scalars(folder: Path, histories: "Sequence[History]") -> int:
+def write_scalars(folder: Path, histories: "Sequence[History]", origin: Origin) -> int:
     """One run of TensorBoard for the training and each of its parts; how many values were written. Event
-    files that lie there are replaced, nothing else.
+    files that lie there are replaced where they have the same origin, nothing else.
 
     Times are those of training, so that a resumed run has no gap. Raises UsageError without the package
-    `tensorboard`.
+    `tensorboard`, and where event files of another origin lie there.
     """
     try:
         from torch.utils.tensorboard.writer import SummaryWriter
@@ -149,9 +169,11 @@ def write_scalars(folder: Path, histories: "Sequence[History]") -> int:
             "--tensorboard: the package tensorboard is not installed; pip install 'fprf[tensorboard]'"
         ) from fault
     written = 0
-    for history in histories:
-        place = folder / (history.name or "training")
-        for old in place.glob("events.out.tfevents.*"):
+    places = [folder / (history.name or "training") for history in histories]
+    for place in places:
+        origin.check(place.glob(_EVENTS))
+    for place, history in zip(places, histories, strict=True):
+        for old in place.glob(_EVENTS):
             old.unlink()
         writer = SummaryWriter(str(place))
         # A figure that a step did not measure leaves a gap in its curve.
@@ -163,6 +185,7 @@ def write_scalars(folder: Path, histories: "Sequence[History]") -> int:
                         written += 1
         finally:
             writer.close()
+        origin.record(place.glob(_EVENTS))
     return written
 
 

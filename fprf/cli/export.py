@@ -2,18 +2,22 @@
 open.
 """
 
+import contextlib
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import UsageError
 from ..export.config import FIT_MINUTES, KINDS, ExportConfig, Plan, plan
+from ..io.overwriting import Origin
 from ..plugins.captures import endings
 from ..progress import Display
-from .style_flags import named_styles, read_flags, style_name, tidy
+from ..style.files import StyleFile
+from .parsing import read_paths
+from .style_flags import named_styles, origin_of, read_flags, style_name, tidy
 
 if TYPE_CHECKING:
     from ..export.mesh import Maps
@@ -40,12 +44,64 @@ def run(args: list[str]) -> int:
     # What is to be written, and under which names, is settled before the run is opened: mistakes cost no
     # time.
     what = plan(config.kinds, config.output or config.run / "exports")
+    _check_formats(what)
+    styles = _styles(config, what, file)
+    origins = _origins(config, file, styles)
+    for name, origin in origins.items():
+        origin.check(_files(what, name, last=name == [*origins][-1]))
+    from ..io.atomic import write_json
+    from ..training.loading import open_run
+
+    start = time.perf_counter()
+    opened = open_run(config.run, config.device)
+    looks = _looks(opened.scene, styles)
+    looks = looks[-1 if what.single else 0 :]
+    made: dict[str, Any] = {
+        "run": opened.known.name,
+        "step": opened.step,
+        "styles": [name for name, _ in styles],
+        "origin": list(opened.scene.origin),
+    }
+    with contextlib.ExitStack() as stack:
+        for look in looks:
+            files = _files(what, look.name, last=look is looks[-1])
+            pictures = _pictures(config, what, opened.scene.names) if look is looks[-1] else []
+            stack.enter_context(origins[look.name].writing([*files, *pictures]))
+        display = stack.enter_context(Display())
+        export = _Export(config, what, opened, looks, display)
+        made |= {**export.gaussians(), **export.meshes(), **export.cameras()}
+        made["seconds"] = time.perf_counter() - start
+        if what.single is None:
+            write_json(what.folder / "export.json", made)
+    if "gaussians" in made:
+        print(f"{made['gaussians']} Gaussians{''.join(f', {loss}' for loss in made['losses'])}")
+    if "vertices" in made:
+        print(f"mesh: {made['vertices']} vertices, {made['triangles']} triangles")
+    print(f"{', '.join(what.kinds)} in {what.single or what.folder}  ({made['seconds']:.1f} s)")
+    return 0
+
+
+def _check_formats(what: Plan) -> None:
+    """Raise UsageError for a format that is read alone, DataError where a package is missing."""
+    from ..splats.files.base import check_needs, format_of
+
+    for kind in what.formats:
+        form = format_of(Path(f"splats.{kind}"))
+        if not form.writes:
+            raise UsageError(f"fprf export: {kind} is read, not written; name ply, splat, spz, sog or glb")
+        check_needs(form)
+
+
+def _styles(config: ExportConfig, what: Plan, file: StyleFile) -> list[tuple[str, StyleFile]]:
+    """The styles with their names in those of files, that of the flags first. Raises UsageError for names that
+    do not do.
+    """
     styles = named_styles(config.styles, file)
-    if config.references:  # the style of the flags
+    if config.references:
         styles.insert(0, (tidy(style_name(config.style, config.references)) or "style", file))
-    names = [name for name, _ in styles]
-    for name in names:
-        if names.count(name) > 1:
+    names = [name.casefold() for name, _ in styles]
+    for name, _ in styles:
+        if names.count(name.casefold()) > 1:
             raise UsageError(f"--styles {name}: two styles of this name; give each its own")
         if any(ending.startswith(f".{name.lower()}.") for ending in endings()):
             raise UsageError(
@@ -55,42 +111,56 @@ def run(args: list[str]) -> int:
         raise UsageError(
             f"--output {what.single}: one file holds one style, {len(styles)} are asked for; name a folder"
         )
-    from ..io.atomic import write_json
-    from ..splats.files.base import check_needs, format_of
-    from ..style.restyle import apply_style
-    from ..training.loading import open_run
+    return styles
 
-    for kind in what.formats:
-        if not (form := format_of(Path(f"splats.{kind}"))).writes:
-            raise UsageError(f"fprf export: {kind} is read, not written; name ply, splat, spz, sog or glb")
-        check_needs(form)
-    start = time.perf_counter()
-    opened = open_run(config.run, config.device)
-    # All looks share one geometry; a single file holds the last of them.
-    encoders = opened.scene.encoders() if styles else None
-    looks = [
-        _Look("", None),
-        *(_Look(name, apply_style(opened.scene, each, encoders).restyle) for name, each in styles),
-    ]
-    looks = looks[-1 if what.single else 0 :]
-    made: dict[str, Any] = {"run": opened.known.name, "step": opened.step, "styles": names}
-    with Display() as display:
-        export = _Export(config, what, opened, looks, display)
-        made |= {
-            "origin": list(opened.scene.origin),
-            **export.gaussians(),
-            **export.meshes(),
-            **export.cameras(),
-        }
-    made["seconds"] = time.perf_counter() - start
-    if what.single is None:
-        write_json(what.folder / "export.json", made)
-    if "gaussians" in made:
-        print(f"{made['gaussians']} Gaussians{''.join(f', {loss}' for loss in made['losses'])}")
-    if "vertices" in made:
-        print(f"mesh: {made['vertices']} vertices, {made['triangles']} triangles")
-    print(f"{', '.join(what.kinds)} in {what.single or what.folder}  ({made['seconds']:.1f} s)")
-    return 0
+
+def _origins(
+    config: ExportConfig, file: StyleFile, styles: Sequence[tuple[str, StyleFile]]
+) -> dict[str, Origin]:
+    """Origin of the files of each look, the scene as it is first: each is made of the run and its own style."""
+    whole = origin_of("export", config, file, [path for _, each in styles for path in read_paths(each.style)])
+    origins = {"": replace(whole, reads=(config.run,), beside=whole.reads)}
+    for name, style in styles:
+        own = read_paths(style.style)
+        if config.style is not None and style is file:
+            own = (*own, config.style)
+        origins[name] = replace(whole, reads=(config.run, *own), beside=whole.reads)
+    return origins
+
+
+def _files(what: Plan, look: str, *, last: bool) -> list[Path]:
+    """The files of a look, but pictures of views. What holds for all looks belongs to the scene as it is."""
+    from ..rendering.local_frame import offset_file  # imports torch
+
+    if what.single is not None:
+        return [what.single, offset_file(what.single)] if last else []
+    files: list[Path] = []
+    if what.formats:
+        files += what.paths("splats", look, *(f".{each}" for each in what.formats))
+    if "glb" in what.kinds:
+        files += what.paths("mesh", look, ".ply", ".glb")
+    if "cameras" in what.kinds and not look:
+        files.append(what.folder / "transforms.json")
+    offsets = [offset_file(path) for path in files]
+    return [*files, *offsets, *([] if look else [what.folder / "export.json"])]
+
+
+def _pictures(config: ExportConfig, what: Plan, views: Sequence[str]) -> list[Path]:
+    """Pictures of views, which show the last look."""
+    if not (config.images and "cameras" in what.kinds):
+        return []
+    return [what.folder / f"images/{name}.png" for name in views]
+
+
+def _looks(scene: "Scene", styles: Sequence[tuple[str, StyleFile]]) -> "list[_Look]":
+    """The scene as it is and in each style; encoders are loaded once."""
+    from ..style.restyle import apply_style
+
+    looks = [_Look("", None)]
+    encoders = scene.encoders() if styles else None
+    for name, file in styles:
+        looks.append(_Look(name, apply_style(scene, file, encoders).restyle))
+    return looks
 
 
 class _Look(NamedTuple):

@@ -11,7 +11,7 @@ from ..checks import at_least, positive
 from ..errors import FprfError, UsageError
 from ..progress import Display
 from ..style.files import StyleFile, check_photographs, read_style, with_folders
-from .style_flags import StyledRunConfig, read_flags, say, style_name
+from .style_flags import StyledRunConfig, origin_of, read_flags, say, style_name
 
 if TYPE_CHECKING:
     from ..io.images import Picture
@@ -57,12 +57,11 @@ def run(args: list[str]) -> int:
     config, file = read_flags(
         GalleryConfig(), args, prog="fprf gallery", description=_DESCRIPTION, positional=("run",)
     )
-    if config.output is not None:
-        output = config.output
-    else:
-        output = config.run / "gallery.html"
+    output = config.run / "gallery.html" if config.output is None else config.output
     if output.suffix.lower() != ".html":
         raise UsageError(f"--output {output}: the page is an .html file; give such a name")
+    origin = origin_of("gallery", config, file)
+    origin.check([output])
     from ..datamanagers.images import load_image
     from ..page.writer import Page, Reference, write_page
     from ..splats.scene import SplatScene
@@ -97,7 +96,8 @@ def run(args: list[str]) -> int:
         scene=scene if isinstance(scene, SplatScene) else None,
         start=views[0],
     )
-    write_page(output, page, megabytes=config.megabytes)
+    with origin.writing([output]):
+        write_page(output, page, megabytes=config.megabytes)
     print(f"{len(views)} views in {len(styles)} styles: {output} ({output.stat().st_size / 2**20:.1f} MiB)")
     return 0
 

@@ -5,6 +5,7 @@ import dataclasses
 import difflib
 import enum
 import io
+import math
 import os
 import re
 import shutil
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeVar, 
 
 from ..config_files import load_config, method_config
 from ..errors import ConfigError, UsageError
+from ..io.paths import as_path, expanded, has_wildcards
 from ..plugins import registry
 from ..plugins.codec import Missing
 from ..plugins.slots import Slot, hints_of, is_slot, members, resolve, slots
@@ -53,6 +55,18 @@ class Flag(NamedTuple):
     def text(self) -> str:
         """As it is written on the command line."""
         return f"--{_dashed(self.path)}"
+
+    @property
+    def most(self) -> float:
+        """How many values it takes, at most."""
+        most = 1.0
+        for kind in self.kinds:
+            args = get_args(kind)
+            if get_origin(kind) is list or Ellipsis in args:
+                return math.inf
+            if get_origin(kind) is tuple:
+                most = float(len(args))
+        return most
 
     @property
     def takes(self) -> str:
@@ -102,6 +116,73 @@ def spell(args: Sequence[str], flags: dict[str, Flag]) -> list[str]:
         else:
             spelled.append(arg)
     return spelled
+
+
+_WRITTEN = ("output", "page", "cache", "tensorboard")
+"""Fields of verbs that name what is written; every other path is read."""
+
+
+def read_paths(config: Any) -> tuple[Path, ...]:
+    """All files and folders that a config names to be read."""
+    paths: list[Path] = []
+    for flag in flags_of(config).values():
+        name = flag.path.rpartition(".")[2]
+        value = getattr(flag.owner, name)
+        if name in _WRITTEN:
+            continue
+        values = value if isinstance(value, tuple) else (value,)
+        paths.extend(each for each in values if isinstance(each, Path))
+    return tuple(paths)
+
+
+def spell_paths(args: Sequence[str], flags: dict[str, Flag], positional: Sequence[Flag]) -> list[str]:
+    """The arguments, as `spell` returns them, with the home folder for `~` and files for wildcards, wherever
+    paths are taken.
+
+    Raises UsageError where nothing matches, and where several files match that are to be one.
+    """
+    spelled: list[str] = []
+    current: Flag | None = None
+    room = 0.0  # values that the flag still takes
+    places = list(positional)
+    for arg in args:
+        key, equals, inline = arg.partition("=")
+        if key.startswith("--"):
+            current = flags.get(_dashed(key))
+            room = 0.0 if current is None else current.most
+            values = [arg]
+            if current is not None and equals:
+                found = _paths(inline, current)
+                values = [f"{key}={found[0]}"] if len(found) == 1 else [key, *found]
+                room = 0.0
+            spelled += values
+            continue
+        if room > 0:
+            room -= 1
+            spelled += [arg] if current is None else _paths(arg, current)
+            continue
+        spelled += _paths(arg, places[0]) if places else [arg]
+        if places and places[0].most == 1:
+            places.pop(0)
+    return spelled
+
+
+def _paths(word: str, flag: Flag) -> list[str]:
+    """The words for one word among the values of a flag."""
+    several = any(Path in get_args(kind) for kind in flag.kinds)
+    if word == "none" or not (several or Path in flag.kinds):
+        return [word]
+    path = as_path(word)
+    if word.startswith("~"):
+        word = str(path)
+    if flag.path.rpartition(".")[2] in _WRITTEN or not has_wildcards(path):
+        return [word]
+    found = [str(each) for each in expanded([path])]
+    if len(found) > 1 and not several:
+        raise UsageError(
+            f"{word}: {len(found)} files match, such as {found[0]} and {found[1]}; name one of them"
+        )
+    return [f".{os.sep}{each}" if each.startswith("-") else each for each in found]
 
 
 def explain(refusal: str, config: Any, args: Sequence[str], *, positional: Sequence[str], prog: str) -> str:
@@ -204,6 +285,8 @@ def parse(
         if flag.path not in positional:
             flags[text] = flag
     rest = spell(rest, flags)
+    every = flags_of(config)
+    rest = spell_paths(rest, flags, [every[f"--{_dashed(name)}"] for name in positional])
     # What tyro says of a mistake is a box of many lines; ours is one.
     heard = io.StringIO()
     try:
@@ -234,7 +317,7 @@ def load_method(name: str) -> "tuple[RunConfig, str]":
     from.
     """
     if name.endswith(".json"):
-        return load_config(Path(name))
+        return load_config(as_path(name))
     if (Path(name) / "config.json").is_file() and name not in registry.installed("fprf.methods"):
         raise UsageError(
             f"{name}: is a folder, not a method; to train with its config name {Path(name) / 'config.json'}"

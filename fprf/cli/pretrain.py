@@ -9,8 +9,9 @@ from typing import TypeVar
 
 from ..errors import UsageError
 from ..io.atomic import write_json
+from ..io.overwriting import Origin
 from ..pretraining.config import PretrainConfig, PretrainDecoderConfig
-from .parsing import parse
+from .parsing import parse, read_paths
 from .style_flags import say
 
 Report = dict[str, float | int | str]
@@ -48,13 +49,16 @@ def pretrain(
         raise UsageError(f"{prog}: nowhere to write; name the weights file with --output FILE")
     if config.output.is_dir():
         raise UsageError(f"{prog}: --output {config.output} is a folder; name the weights file to write")
+    report_file = config.output.with_name(config.output.stem + ".report.json")
+    origin = Origin(by=prog, reads=read_paths(config), overwrite=config.overwrite)
+    origin.check([config.output, report_file])
     from ..pretraining.loop import training_folder
     from ..training.locks import lock_folder
 
     begun = time.monotonic()
     folder = training_folder(config.output)
     # Checkpoints stay until everything is written: a full disk costs no training.
-    with lock_folder(folder):
+    with lock_folder(folder), origin.writing([config.output, report_file]):
         measured = train(config, config.output, say)
         report = {
             "weights": str(config.output),
@@ -64,7 +68,7 @@ def pretrain(
         }
         # The weights by their bare name, since both may be moved.
         told = {"kind": prog.split()[-1], **report, "weights": config.output.name}
-        write_json(config.output.with_name(config.output.stem + ".report.json"), told)
+        write_json(report_file, told)
         shutil.rmtree(folder, ignore_errors=True)
     print(json.dumps(report, indent=2))
     return 0

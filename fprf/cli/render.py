@@ -4,16 +4,17 @@ import functools
 import hashlib
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from ..checks import at_least
 from ..errors import ConfigError, UsageError
+from ..io.paths import as_path
 from ..progress import Display
 from ..style.files import read_keyframes
-from .style_flags import StyledRunConfig, named_styles, read_flags
+from .style_flags import StyledRunConfig, named_files, named_styles, origin_of, read_flags
 
 if TYPE_CHECKING:
     from ..io.images import Picture
@@ -28,8 +29,11 @@ _NO_FOLDERS = frozenset(
 )
 """Endings that nobody gives a folder."""
 _PROBES = 4
+"""Frames that the range of depths is taken from, one range for a whole film: by eye."""
 _PROBE_RESOLUTION = 0.25
-"""Frames, and their size, that the range of depths is taken from: one range for a whole film."""
+"""Share of their width and height at which these are rendered: percentiles need no more."""
+_FPS = 24.0
+"""Frames per second where neither flag nor path says: that of cinema."""
 
 
 class Take(NamedTuple):
@@ -85,18 +89,59 @@ class RenderVerbConfig(StyledRunConfig):
             )
 
 
+class _Flight(NamedTuple):
+    """Cameras of a film, and the names of its frames."""
+
+    cameras: "Cameras"
+    names: list[str]
+    fps: float
+
+
 def run(args: list[str]) -> int:
     """Make the path, render it, write the film or the frames."""
     description = "Fly through a trained scene, plain or restyled, to a film or frames."
     config, file = read_flags(
         RenderVerbConfig(), args, prog="fprf render", description=description, positional=("run",)
     )
-    from ..datamanagers.images import load_image
-    from ..io.images import write_image
-    from ..io.maps import depth_limits, side_by_side
-    from ..io.video import FILMS, MAX_FPS, missing_frames, write_video
-    from ..rendering.paths import MOTIONS, make_path, read_camera_path
+    from ..io.video import FILMS, missing_frames
     from ..training.loading import open_run
+
+    film = config.output.suffix.lower() in FILMS
+    _check_output(config)
+    origin = origin_of("render", config, file, _named(config))
+    if film:
+        origin.check([config.output])
+    opened = open_run(config.run, config.device, config)
+    flight = _flight(opened, config)
+    paths = _frame_paths(config, flight.names, film=film)
+    outputs = [config.output] if film else paths
+    origin.check(outputs)
+    takes = _takes(opened.scene, config, file)
+    start = time.perf_counter()
+    with origin.writing(outputs):
+        todo = missing_frames(paths[0].parent, _key(opened, config, flight.cameras), paths)
+        if len(todo) < len(paths):
+            print(f"{len(paths) - len(todo)} of {len(paths)} frames are there already")
+        with Display() as display:
+            _render_frames(opened.scene, flight.cameras, paths, todo, takes, config, display)
+        made = _write_film(config.output, paths, flight.fps) if film else str(config.output)
+    seconds = time.perf_counter() - start
+    print(f"{len(paths)} frames in {made}, {seconds / max(1, len(todo)):.2f} s each")
+    return 0
+
+
+def _named(config: RenderVerbConfig) -> list[Path]:
+    """Files that texts among the flags name: of further styles, and a camera path."""
+    named = [path for path in [as_path(config.path)] if path.is_file()]
+    for text in config.styles:
+        if text != "plain":
+            named += named_files(text.partition("=")[2])
+    return named
+
+
+def _check_output(config: RenderVerbConfig) -> None:
+    """Raise UsageError for an output that is neither a film nor a folder, and for frames that no film shows."""
+    from ..io.video import FILMS, MAX_FPS
 
     if config.output.suffix.lower() in _NO_FOLDERS:
         raise UsageError(
@@ -104,68 +149,82 @@ def run(args: list[str]) -> int:
         )
     if config.fps is not None and config.fps > MAX_FPS:
         raise UsageError(f"--fps {config.fps:g}: a film has at most {MAX_FPS} frames a second")
-    opened = open_run(config.run, config.device, config)
+
+
+def _flight(opened: "LoadedRun[Scene]", config: RenderVerbConfig) -> _Flight:
+    """The cameras of the path that is asked for."""
+    from ..rendering.paths import MOTIONS, make_path, read_camera_path
+
     known = opened.known
     # Spirals, orbits and camera paths bring frames of their own.
-    if config.path in ("interpolate", "dataset"):
-        views = known.views(config.split)
-    else:
-        views = []
+    views = known.views(config.split) if config.path in ("interpolate", "dataset") else []
     cameras = make_path(known.cameras, views, config.path, config.frames, opened.scene.origin)
-    fps = config.fps
-    if fps is None:
-        if config.path in MOTIONS:
-            fps = 24.0
-        else:
-            fps = read_camera_path(Path(config.path))[1]
+    if config.fps is not None:
+        fps = config.fps
+    elif config.path in MOTIONS:
+        fps = _FPS
+    else:
+        fps = read_camera_path(as_path(config.path))[1]
     # Captured views keep the stem of their image.
     if config.path == "dataset":
         names = [known.names[view] for view in views]
     else:
         names = [f"{i:05d}" for i in range(len(cameras))]
-    takes = _takes(opened.scene, config, file)
-    # Frames of a film wait in a folder beside it, hidden as nobody's own is, which goes when the film is
-    # whole.
-    whole = config.output.suffix.lower() in FILMS
-    if whole:
+    return _Flight(cameras, names, fps)
+
+
+def _frame_paths(config: RenderVerbConfig, names: Sequence[str], *, film: bool) -> list[Path]:
+    """The frames' files. Those of a film wait in a folder beside it, hidden as nobody's own is, which goes when
+    the film is whole.
+    """
+    folder = config.output
+    ending: str = config.format
+    if film:
         folder = config.output.with_name(f".{config.output.stem}.frames")
-    else:
-        folder = config.output
-    paths = []
-    for name in names:
-        paths.append(folder / f"{name}.{'png' if whole else config.format}")
-    key = _key(opened, config, cameras)
-    todo = missing_frames(folder, key, paths)
-    if len(todo) < len(paths):
-        print(f"{len(paths) - len(todo)} of {len(paths)} frames are there already")
+        ending = "png"
+    return [folder / f"{name}.{ending}" for name in names]
+
+
+def _render_frames(
+    scene: "Scene",
+    cameras: "Cameras",
+    paths: Sequence[Path],
+    todo: Sequence[Path],
+    takes: "list[Take]",
+    config: RenderVerbConfig,
+    display: Display,
+) -> None:
+    """Render and write the frames that are not there yet."""
+    from ..io.images import write_image
+    from ..io.maps import depth_limits, side_by_side
+
     start = time.perf_counter()
-    with Display() as display:
-        limits = None
-        if "depth" in config.show and todo:
-            # One range of depths for the whole film, from a few small frames: else colours would flicker.
-            some = sorted({k * (len(cameras) - 1) // (_PROBES - 1) for k in range(_PROBES)})
-            probes = []
-            for k in some:
-                probes.append(opened.scene.render(cameras, k, resolution=_PROBE_RESOLUTION))
-            limits = depth_limits([view.depth for view in probes], [view.opacity for view in probes])
-        for done, path in enumerate(todo):
-            left = None
-            if done:
-                left = (time.perf_counter() - start) / done * (len(todo) - done)
-            display.count(done, len(todo), "rendering", seconds_left=left)
-            # Each frame is written as soon as it is done, so that an interrupted film goes on.
-            write_image(
-                path, side_by_side(_panels(opened.scene, cameras, paths.index(path), takes, config, limits))
-            )
-        display.count(len(todo), len(todo), "rendering")
-        made = str(config.output)
-        if whole:
-            codec = write_video(config.output, (load_image(path) for path in paths), fps)
-            made = f"{config.output} ({codec})"
-            shutil.rmtree(folder)
-    seconds = time.perf_counter() - start
-    print(f"{len(cameras)} frames in {made}, {seconds / max(1, len(todo)):.2f} s each")
-    return 0
+    limits = None
+    if "depth" in config.show and todo:
+        # One range of depths for the whole film, from a few small frames: else colours would flicker.
+        some = sorted({k * (len(cameras) - 1) // (_PROBES - 1) for k in range(_PROBES)})
+        probes = [scene.render(cameras, k, resolution=_PROBE_RESOLUTION) for k in some]
+        limits = depth_limits([view.depth for view in probes], [view.opacity for view in probes])
+    numbers = {path: number for number, path in enumerate(paths)}
+    for done, path in enumerate(todo):
+        left = None
+        if done:
+            left = (time.perf_counter() - start) / done * (len(todo) - done)
+        display.count(done, len(todo), "rendering", seconds_left=left)
+        # Each frame is written as soon as it is done, so that an interrupted film goes on.
+        panels = _panels(scene, cameras, numbers[path], takes, config, limits)
+        write_image(path, side_by_side(panels))
+    display.count(len(todo), len(todo), "rendering")
+
+
+def _write_film(output: Path, frames: Sequence[Path], fps: float) -> str:
+    """Write the film of frames, remove their folder, and return what was made in words."""
+    from ..datamanagers.images import load_image
+    from ..io.video import write_video
+
+    codec = write_video(output, (load_image(path) for path in frames), fps)
+    shutil.rmtree(frames[0].parent)
+    return f"{output} ({codec})"
 
 
 def _panels(
@@ -221,7 +280,7 @@ def _key(opened: "LoadedRun[Scene]", config: RenderVerbConfig, cameras: "Cameras
     digest = hashlib.sha256(f"{opened.run.root.resolve()} {opened.step} {opened.seconds}".encode())
     settings = {}
     for name, value in vars(config).items():
-        if name not in ("output", "device", "fps", "run"):
+        if name not in ("output", "overwrite", "device", "fps", "run"):
             settings[name] = value
     digest.update(repr(sorted(settings.items())).encode() + (opened.run.root / "config.json").read_bytes())
     for tensor in (
@@ -237,9 +296,7 @@ def _key(opened: "LoadedRun[Scene]", config: RenderVerbConfig, cameras: "Cameras
     named = [*config.references, *config.masks, config.style, config.between, config.keyframes]
     if config.keyframes is not None:
         named += [key.style for key in read_keyframes(config.keyframes)]
-    for text in config.styles:
-        named += [Path(part) for part in text.partition("=")[2].split(",")]
-    for path in named:
+    for path in [*named, *_named(config)]:
         if path is not None and path.is_file():
             digest.update(path.read_bytes())
     return digest.hexdigest()

@@ -2,26 +2,32 @@
 Gaussians.
 """
 
+import contextlib
 import functools
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..checks import positive
 from ..errors import DataError, UsageError
-from ..plugins.captures import endings, format_name, is_scene, stem_of
+from ..io.overwriting import Origin, OverwriteConfig, same_file, unused_name
+from ..plugins.captures import captures_in, endings, format_name, is_scene, stem_of
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from ..progress import Display
 from ..splats.config import LookConfig
 from ..style.config import NO_MASK, StyleConfig, find_reference, labels, parse_region_value
 from ..style.files import StyleFile, write_style
-from .style_flags import read_flags
+from .parsing import read_paths
+from .style_flags import origin_of, read_flags, say
 from .stylize import print_explained
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ..splats.captures import Captures
     from ..splats.scene import SplatScene
     from ..style.restyle import Styled
 
@@ -38,12 +44,12 @@ given."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RestyleConfig(StyleConfig, LookConfig):
+class RestyleConfig(StyleConfig, LookConfig, OverwriteConfig):
     """Flags of `fprf restyle`: the capture, the style and the files to write."""
 
     captures: tuple[Path, ...] = ()
-    """The captures: files of Gaussians, or SOG folders. Several take one style together, so that neighbours
-    stay alike.
+    """The captures: files of Gaussians, SOG folders, or folders of them. Several take one style together, so that
+    neighbours stay alike.
     """
     output: Path | None = None
     """The restyled capture; its ending says the format. A folder for several captures, or where it is one
@@ -80,6 +86,14 @@ class RestyleConfig(StyleConfig, LookConfig):
         positive("megabytes", self.megabytes)
 
 
+class _CaptureFile(NamedTuple):
+    """Files that are written for one capture in one style."""
+
+    capture: Path
+    style: Path
+    """The style file beside it."""
+
+
 class _Restyled(NamedTuple):
     """The captures in one style."""
 
@@ -90,117 +104,184 @@ class _Restyled(NamedTuple):
     seconds: float
 
 
+class _Written(NamedTuple):
+    """What came of writing all captures."""
+
+    left: Counter[str]
+    """Gaussians that cannot be drawn, by what is wrong with them and what became of them."""
+    losses: list[str]
+    """What formats do not hold, each as a phrase."""
+    seconds: float
+
+
 def run(args: list[str]) -> int:
     """Look at the captures, or take what the cache knows of them; build each style; write files and page."""
     config, file = read_flags(
         RestyleConfig(), args, prog="fprf restyle", description=_DESCRIPTION, positional=("captures",)
     )
-    outputs = _outputs(config)
-    from ..memory import peak
-    from ..splats.captures import light_alone, neighbouring_light, open_captures
-    from ..splats.files import read_capture, write_capture
-    from ..style.regions import Regions
-    from ..style.restyle import apply_style
-
-    for path in (*file.style.references, *file.style.masks):
-        if path != NO_MASK and not path.exists():
-            raise DataError(f"{path}: no such file; check what --references and --masks name")
-    begun = time.perf_counter()
+    config, outputs = _outputs(config)
+    origin = origin_of("restyle", config, file)
+    _check_references(file.style)
+    styles = _styles(config, file)
+    files = _files(config, outputs, styles, origin)
+    for made_of, paths in _written(config, files, styles, origin):
+        made_of.check(paths)
     photographed = file.style.references
-    file = _with_views(config, file)
+    file = _with_views(config, file, origin)
     config = replace(config, references=file.style.references, weights=(), masks=())
-    with Display() as display:
-        report = functools.partial(display.count, what="looking")
-        seen = open_captures(config.captures, config, cache=config.cache, progress=report, say=display.say)
-        scene = seen.scene
-        # views are encoded now, or read from the cache: the time is reported apart from that of styles
-        scene.found()
-        looked = time.perf_counter() - begun
-        gain = None
-        if (
-            config.match_light
-            and photographed
-            and all(format_name(path) is not None for path in photographed)
-        ):
-            gain = neighbouring_light(seen, photographed)
-            display.say(
-                f"--match-light: {'where the captures meet' if gain is not None else 'by the means of all colours'}"
-            )
-        named = _styles(config, file)
-        made = list[_Restyled]()
-        encoders = scene.encoders()
-        for name, each in named:
-            start = time.perf_counter()
-            styled = apply_style(scene, each, encoders)
-            if config.match_light:
-                styled = light_alone(styled, gain)
-            else:
-                styled = styled
-            made.append(_Restyled(name, styled, scene.restyled(styled.restyle), time.perf_counter() - start))
-        # File by file, each in all styles: one of them is in memory at a time.
-        left = Counter[str]()
-        losses = dict[str, None]()
-        steps = len(config.captures) * len(named)
-        for k, path in enumerate(config.captures if outputs or len(config.captures) == 1 else ()):
-            capture = seen.first if k == 0 else read_capture(path)
-            faulty = False
-            for i, one in enumerate(made if outputs else ()):
-                display.count(k * len(named) + i, steps, "restyling")
-                start = time.perf_counter()
-                # The style's name goes before the ending; a SOG folder gets a folder of that name, and holds
-                # its style.json.
-                output = outputs[k]
-                stem = stem_of(outputs[k])
-                folder = output.name.lower() == "meta.json"
-                if one.name and folder:
-                    output = output.parent / one.name / output.name
-                elif one.name:
-                    output = output.with_name(f"{stem}-{one.name}{output.name[len(stem) :]}")
-                harmonics = seen.harmonics(k, capture, one.styled.restyle)
-                written = write_capture(output, capture, harmonics, scene.views)
-                faulty = written.faulty
-                where = f"{output.name}: " if len(outputs) > 1 else ""
-                losses |= dict.fromkeys(f"{where}{loss}" for loss in written.losses())
-                if folder:
-                    beside = "style.json"
-                else:
-                    beside = f"{stem_of(output)}.style.json"
-                write_style(output.with_name(beside), one.styled.controls.saved)
-                made[i] = one._replace(seconds=one.seconds + time.perf_counter() - start)
-            for number, what in (each.split(" ", 1) for each in capture.gaussians.faults()):
-                left[f"{what} left {'out' if faulty else 'as they are'}"] += int(number)
-        display.count(steps, steps, "restyling")
-    for note in dict.fromkeys(note for each in made for note in each.styled.controls.notes):
-        print(note)
-    if outputs and not made:
-        print(f"--output {config.output}: no capture is written, since no --references are named")
-    if config.explain:
-        parent = (config.output or config.page or Path("x")).parent
-        for one in made:
-            print_explained(parent / one.name, one.styled.controls.regions, one.styled)
-        if not made:
-            print_explained(
-                parent, Regions(scene, *scene.measured(), file.regions, file.semantic_encoder), None
-            )
-    if config.page is not None:
-        _write_page(config.page, config, scene, made)
-    each_seconds = sum(each.seconds for each in made) / max(1, len(made))
-    missing = "".join(
-        f", {each}" for each in (*(f"{number} {what}" for what, number in left.items()), *losses)
-    )
-    if len(config.captures) > 1:
-        files = f" in {len(config.captures)} files"
-    else:
-        files = ""
-    print(
-        f"{seen.count} Gaussians{files}{missing}; looked at in {looked:.1f} s, {each_seconds:.2f} s for each of {len(made)} "
-        f"styles, at most {(peak() or 0) / 1e9:.1f} GB"
-    )
+    with contextlib.ExitStack() as stack:
+        for made_of, paths in _written(config, files, styles, origin):
+            stack.enter_context(made_of.writing(paths))
+        display = stack.enter_context(Display())
+        seen, looked = _look(config, display)
+        gain = _neighbours_gain(config, photographed, seen, display)
+        made = _apply(_styles(config, file), seen.scene, gain, config)
+        written = _write_captures(config, files, made, seen, display)
+        _say_notes(config, made)
+        if config.explain:
+            _explain(config, file, seen.scene, made)
+        if config.page is not None:
+            _write_page(config.page, config, seen.scene, made)
+    _report(config, seen, looked, made, written)
     return 0
 
 
-def _outputs(config: RestyleConfig) -> list[Path]:
-    """The file for each capture; none where none is to be written.
+def _check_references(style: StyleConfig) -> None:
+    """Raise DataError for a photograph or mask that is not there, before anything takes time."""
+    for path in (*style.references, *style.masks):
+        if path != NO_MASK and not path.exists():
+            raise DataError(f"{path}: no such file; check what --references and --masks name")
+
+
+def _look(config: RestyleConfig, display: Display) -> "tuple[Captures, float]":
+    """The captures as one scene, with their features, and the seconds that it took to find them."""
+    from ..splats.captures import open_captures
+
+    begun = time.perf_counter()
+    report = functools.partial(display.count, what="looking")
+    seen = open_captures(config.captures, config, cache=config.cache, progress=report, say=display.say)
+    # Views are encoded now, or read from the cache: the time is reported apart from that of styles.
+    seen.scene.found()
+    return seen, time.perf_counter() - begun
+
+
+def _neighbours_gain(
+    config: RestyleConfig, photographed: Sequence[Path], seen: "Captures", display: Display
+) -> "Tensor | None":
+    """Gains of colours that `--match-light` takes from captures that lie beside; None where it takes means."""
+    from ..splats.captures import neighbouring_light
+
+    captures = [path for path in photographed if format_name(path) is not None]
+    if not config.match_light or not captures or len(captures) < len(photographed):
+        return None
+    gain = neighbouring_light(seen, photographed)
+    how = "by the means of all colours" if gain is None else "where the captures meet"
+    display.say(f"--match-light: {how}")
+    return gain
+
+
+def _apply(
+    styles: Sequence[tuple[str, StyleFile]], scene: "SplatScene", gain: "Tensor | None", config: RestyleConfig
+) -> list[_Restyled]:
+    """The scene in each style; encoders are loaded once."""
+    from ..splats.captures import light_alone
+    from ..style.restyle import apply_style
+
+    made = []
+    encoders = scene.encoders()
+    for name, file in styles:
+        start = time.perf_counter()
+        styled = apply_style(scene, file, encoders)
+        if config.match_light:
+            styled = light_alone(styled, gain)
+        restyled = scene.restyled(styled.restyle)
+        made.append(_Restyled(name, styled, restyled, time.perf_counter() - start))
+    return made
+
+
+def _write_captures(
+    config: RestyleConfig,
+    files: Sequence[Sequence[_CaptureFile]],
+    made: Sequence[_Restyled],
+    seen: "Captures",
+    display: Display,
+) -> _Written:
+    """Write file by file, each in all styles: one of the captures is in memory at a time."""
+    from ..splats.files import read_capture, write_capture
+
+    left = Counter[str]()
+    losses = dict[str, None]()
+    begun = time.perf_counter()
+    steps = len(files) * len(made)
+    done = 0
+    # Of a single capture that is not written the faults are told all the same.
+    for number, path in enumerate(config.captures if files or len(config.captures) == 1 else ()):
+        capture = seen.first if number == 0 else read_capture(path)
+        faulty = False
+        for one, out in zip(made, files[number] if files else (), strict=False):
+            display.count(done, steps, "restyling")
+            harmonics = seen.harmonics(number, capture, one.styled.restyle)
+            written = write_capture(out.capture, capture, harmonics, seen.scene.views)
+            write_style(out.style, one.styled.controls.saved)
+            faulty = written.faulty
+            where = f"{out.capture.name}: " if len(files) > 1 else ""
+            for loss in written.losses():
+                losses[f"{where}{loss}"] = None
+            done += 1
+        for fault in capture.gaussians.faults():
+            count, what = fault.split(" ", 1)
+            left[f"{what} left {'out' if faulty else 'as they are'}"] += int(count)
+    display.count(steps, steps, "restyling")
+    return _Written(left, list(losses), time.perf_counter() - begun)
+
+
+def _say_notes(config: RestyleConfig, made: Sequence[_Restyled]) -> None:
+    """Print what the styles have to say, each line once."""
+    notes = dict[str, None]()
+    for each in made:
+        notes |= dict.fromkeys(each.styled.controls.notes)
+    for note in notes:
+        print(note)
+    if config.output is not None and not made:
+        print(f"--output {config.output}: no capture is written, since no --references are named")
+
+
+def _explain(config: RestyleConfig, file: StyleFile, scene: "SplatScene", made: Sequence[_Restyled]) -> None:
+    """List the regions of the scene with what they take in each style; alone where there is none."""
+    from ..style.regions import Regions
+
+    folder = _beside(config).parent
+    for one in made:
+        print_explained(folder / one.name, one.styled.controls.regions, one.styled)
+    if not made:
+        regions = Regions(scene, *scene.measured(), file.regions, file.semantic_encoder)
+        print_explained(folder, regions, None)
+
+
+def _report(
+    config: RestyleConfig, seen: "Captures", looked: float, made: Sequence[_Restyled], written: _Written
+) -> None:
+    """Print how many Gaussians there are, what was left out, and the times."""
+    from ..memory import peak
+
+    seconds = written.seconds + sum(each.seconds for each in made)
+    missing = [f"{number} {what}" for what, number in written.left.items()]
+    told = "".join(f", {each}" for each in (*missing, *written.losses))
+    files = f" in {len(config.captures)} files" if len(config.captures) > 1 else ""
+    print(
+        f"{seen.count} Gaussians{files}{told}; looked at in {looked:.1f} s, "
+        f"{seconds / max(1, len(made)):.2f} s for each of {len(made)} styles, at most {(peak() or 0) / 1e9:.1f} GB"
+    )
+
+
+def _beside(config: RestyleConfig) -> Path:
+    """The output that everything else lies beside."""
+    return config.output or config.page or Path("x")
+
+
+def _outputs(config: RestyleConfig) -> tuple[RestyleConfig, list[Path]]:
+    """The config with the captures of folders in the place of these, and the file for each capture; none where
+    none is to be written.
 
     Raises UsageError for what cannot be written, before anything takes time.
     """
@@ -217,44 +298,164 @@ def _outputs(config: RestyleConfig) -> list[Path]:
         raise UsageError(
             "--references: at least one photograph is needed, for example --references autumn.jpg night.jpg"
         )
+    captures = _with_folders(config.captures)
+    several = len(captures) > 1 or captures != config.captures
+    config = replace(config, captures=captures)
     if config.output is None:
-        return []
+        return config, []
+    # A folder holds a file for each capture.
+    if config.output.is_dir() or (several and format_name(config.output) is None):
+        return config, _outputs_in_folder(config, config.output)
+    if len(captures) > 1:
+        raise UsageError(f"--output {config.output}: {len(captures)} captures need a folder; name one")
+    _check_format(config.output)
+    return config, [config.output]
+
+
+def _with_folders(captures: Sequence[Path]) -> tuple[Path, ...]:
+    """The captures, with those in a folder of captures in its place. Raises UsageError for a folder without."""
+    found: list[Path] = []
+    for path in captures:
+        if not path.is_dir() or is_scene(path):
+            found.append(path)
+            continue
+        held = captures_in(path)
+        if not held:
+            raise UsageError(
+                f"{path}: a folder without captures; name a file ({' '.join(endings())}), a SOG folder, or a folder of them"
+            )
+        found += held
+    return tuple(found)
+
+
+def _outputs_in_folder(config: RestyleConfig, folder: Path) -> list[Path]:
+    """The files in a folder for each capture: under its own name, or a .ply where its format is read alone."""
+    from ..splats.files.base import format_of
+
+    outputs: list[Path] = []
+    for path in config.captures:
+        index = path.name.lower() in ("meta.json", "lod-meta.json")
+        inside = folder / (path.parent.name if index else path.name)
+        known = format_name(path)
+        if index or path.is_dir():
+            outputs.append(inside / "meta.json")
+        elif known is not None and not format_of(path).writes:
+            outputs.append(inside.with_suffix(".ply"))
+        else:
+            outputs.append(inside)
+    names = Counter(str(path).casefold() for path in outputs)
+    for path in outputs:
+        if names[str(path).casefold()] > 1:
+            raise UsageError(
+                f"--output {folder}: several captures would be written as {path}; give them other names"
+            )
+    return outputs
+
+
+def _check_format(output: Path) -> None:
+    """Raise UsageError for a file of Gaussians that cannot be written, DataError where a package is missing."""
     from ..splats.files.base import check_needs, format_of
 
-    # A folder holds a file for each capture under its own name, or a .ply where its format is read alone.
-    if config.output.is_dir() or (len(config.captures) > 1 and format_name(config.output) is None):
-        outputs = []
-        for path in config.captures:
-            index = path.name.lower() in ("meta.json", "lod-meta.json")
-            inside = config.output / (path.parent.name if index else path.name)
-            known = format_name(path)
-            outputs.append(inside / "meta.json" if index or path.is_dir() else inside)
-            if known is not None and not index and not format_of(path).writes:
-                outputs[-1] = inside.with_suffix(".ply")
-        same = [path for path in outputs if outputs.count(path) > 1]
-        if same:
-            raise UsageError(
-                f"--output {config.output}: several captures would be written as {same[0]}; give them other names"
-            )
-        if any(path.resolve() in [each.resolve() for each in config.captures] for path in outputs):
-            raise UsageError(f"--output {config.output}: the captures lie there; name another folder")
-        return outputs
-    if len(config.captures) > 1:
-        raise UsageError(f"--output {config.output}: {len(config.captures)} captures need a folder; name one")
-    if format_name(config.output) is None:
+    if format_name(output) is None:
         known_endings = ", ".join(endings())
         raise UsageError(
-            f"--output {config.output}: no file of Gaussians by its name; known endings are {known_endings}"
+            f"--output {output}: no file of Gaussians by its name; known endings are {known_endings}"
         )
-    if not (form := format_of(config.output)).writes:
+    form = format_of(output)
+    if not form.writes:
         raise UsageError(
-            f"--output {config.output}: files of this format are read, not written; name a .ply, .spz, .sog or .glb"
+            f"--output {output}: files of this format are read, not written; name a .ply, .spz, .sog or .glb"
         )
     check_needs(form)
-    return [config.output]
 
 
-def _with_views(config: RestyleConfig, file: StyleFile) -> StyleFile:
+def _files(
+    config: RestyleConfig, outputs: Sequence[Path], styles: Sequence[tuple[str, StyleFile]], origin: Origin
+) -> list[list[_CaptureFile]]:
+    """The files of each capture in each style."""
+    files = []
+    for output in outputs:
+        row = []
+        for name, style in styles:
+            row.append(_file_in_style(config, output, name, _origin_of_style(config, style, origin)))
+        files.append(row)
+    return files
+
+
+def _file_in_style(config: RestyleConfig, output: Path, name: str, origin: Origin) -> _CaptureFile:
+    """The file of a capture in one style, with its style file beside it.
+
+    The style's name goes before the ending; a SOG folder gets a folder of that name, and holds its style.json.
+    The style file that is read is never the one that is written, unless the user asked for that.
+    """
+    stem = stem_of(output)
+    folder = output.name.lower() == "meta.json"
+    if name and folder:
+        output = output.parent / name / output.name
+    elif name:
+        output = output.with_name(f"{stem}-{name}{output.name[len(stem) :]}")
+    usual = "style" if folder else f"{stem_of(output)}.style"
+    saved = output.with_name(f"{usual}.json")
+    if config.style is None or config.overwrite or not same_file(saved, config.style):
+        return _CaptureFile(output, saved)
+    base = "" if folder else stem_of(output)
+    taken = [base]
+    while origin.refusal(saved) is not None:
+        taken.append(unused_name(base, taken))
+        saved = output.with_name(f"{taken[-1].lstrip('-')}.style.json")
+    say(f"{config.style} is read and stays as it is; the new style is {saved}")
+    return _CaptureFile(output, saved)
+
+
+def _origin_of_style(config: RestyleConfig, style: StyleFile, origin: Origin) -> Origin:
+    """Origin of the files in one style: of a style of its own (`--each`) only its photograph counts."""
+    if not config.each:
+        return origin
+    made_of = (*config.captures, *read_paths(style.style))
+    if config.style is not None:
+        made_of = (*made_of, config.style)
+    return replace(origin, reads=made_of, beside=origin.reads)
+
+
+def _written(
+    config: RestyleConfig,
+    files: Sequence[Sequence[_CaptureFile]],
+    styles: Sequence[tuple[str, StyleFile]],
+    origin: Origin,
+) -> list[tuple[Origin, list[Path]]]:
+    """Every file that is written, with its origin; views in the place of captures among the references are not
+    among them.
+    """
+    found: list[tuple[Origin, list[Path]]] = []
+    for number, (name, style) in enumerate(styles):
+        paths = _explained(config, name)
+        for row in files:
+            paths += _capture_files(row[number])
+        found.append((_origin_of_style(config, style, origin), paths))
+    if not styles:
+        found.append((origin, _explained(config, "")))
+    if config.page is not None:
+        found.append((origin, [config.page]))
+    return found
+
+
+def _explained(config: RestyleConfig, name: str) -> list[Path]:
+    """The files of `--explain` in a style."""
+    folder = _beside(config).parent / name
+    return [folder / "explain.json", folder / "explain.png"] if config.explain else []
+
+
+def _capture_files(file: _CaptureFile) -> list[Path]:
+    """The files of a capture: with its style, its offset, and what lies in a SOG folder already."""
+    from ..rendering.local_frame import offset_file
+
+    paths = [file.capture, offset_file(file.capture), file.style]
+    if file.capture.name.lower() == "meta.json":  # its pictures have names of their own
+        paths += [*file.capture.parent.glob("*.webp"), *file.capture.parent.glob("*.png")]
+    return paths
+
+
+def _with_views(config: RestyleConfig, file: StyleFile, origin: Origin) -> StyleFile:
     """The style with rendered views in the place of captures and runs among its references."""
     style = file.style
     scenes = [path for path in style.references if is_scene(path)]
@@ -262,46 +463,33 @@ def _with_views(config: RestyleConfig, file: StyleFile) -> StyleFile:
         return file
     if config.each:
         raise UsageError(f"--each: {scenes[0]} gives several views, which are one style; leave --each out")
-    from ..splats.captures import reference_views
-
     # Photographs stay; in the place of a capture or run stand its views, with masks of what they show.
     rows: list[tuple[Path, Path, float]] = []
     numbers_of = list[range]()
-    stems = [stem_of(path) for path in style.references]
-    beside = config.output or config.page or Path("x")
+    names = _names_of(stem_of(path) for path in style.references)
     weights = style.weights or (1.0,) * len(style.references)
     masks = style.masks or (NO_MASK,) * len(style.references)
-    for i, (path, mask, weight) in enumerate(zip(style.references, masks, weights, strict=True)):
+    for path, name, mask, weight in zip(style.references, names, masks, weights, strict=True):
         before = len(rows)
         if path not in scenes:
             rows.append((path, mask, weight))
-            numbers_of.append(range(before, len(rows)))
-            continue
-        if mask != NO_MASK:
+        elif mask != NO_MASK:
             raise UsageError(f"--masks: {mask} is for one photograph, {path} gives several views; write none")
-        if stems.count(stems[i]) == 1:
-            name = stems[i]
         else:
-            name = f"{stems[i]}-{i}"
-        pictures, covers, shares = reference_views(
-            path, config, beside.parent / f"{stem_of(beside)}.references" / name
-        )
-        # All views of a scene weigh as much as one photograph.
-        rows += [
-            (picture, cover, weight * share / sum(shares))
-            for picture, cover, share in zip(pictures, covers, shares, strict=True)
-        ]
+            rows += _view_rows(path, weight, config, origin, name)
         numbers_of.append(range(before, len(rows)))
 
-    def expanded(field: str, texts: Sequence[str]) -> tuple[str, ...]:
+    def for_each_view(field: str, texts: Sequence[str]) -> tuple[str, ...]:
         # What is said of a capture holds for each of its views.
-        pairs = [parse_region_value(field, text) for text in texts]
-        return tuple(
-            f"{region}={k}" for region, of in pairs for k in numbers_of[find_reference(of, style.references)]
-        )
+        found = []
+        for text in texts:
+            region, of = parse_region_value(field, text)
+            for number in numbers_of[find_reference(of, style.references)]:
+                found.append(f"{region}={number}")
+        return tuple(found)
 
-    pin = expanded("pin", style.pin)
-    forbid = expanded("forbid", style.forbid)
+    pin = for_each_view("pin", style.pin)
+    forbid = for_each_view("forbid", style.forbid)
     pictures, covers, numbers = zip(*rows, strict=True)
     # A capture shows what there is, not a mood: where no photograph is among them, everything takes its
     # match.
@@ -316,20 +504,48 @@ def _with_views(config: RestyleConfig, file: StyleFile) -> StyleFile:
     )
 
 
+def _view_rows(
+    path: Path, weight: float, config: RestyleConfig, origin: Origin, name: str
+) -> list[tuple[Path, Path, float]]:
+    """Views of a capture or run beside the output, each with its mask and weight: together as much as one
+    photograph.
+    """
+    from ..splats.captures import MAX_REFERENCE_VIEWS, reference_views
+
+    beside = _beside(config)
+    folder = beside.parent / f"{stem_of(beside)}.references" / name
+    files = []
+    for view in range(MAX_REFERENCE_VIEWS):
+        files += [folder / f"{view:02d}.png", folder / f"{view:02d}.mask.png"]
+    with origin.writing(files):
+        pictures, covers, shares = reference_views(path, config, folder)
+    rows = []
+    for picture, cover, share in zip(pictures, covers, shares, strict=True):
+        rows.append((picture, cover, weight * share / sum(shares)))
+    return rows
+
+
+def _names_of(stems: Iterable[str]) -> list[str]:
+    """A name for each stem, all different: of stems that agree with their number behind them."""
+    stems = list(stems)
+    counts = Counter(stem.casefold() for stem in stems)
+    names: list[str] = []
+    for number, stem in enumerate(stems):
+        name = stem if counts[stem.casefold()] == 1 else f"{stem}-{number}"
+        names.append(unused_name(name, names))
+    return names
+
+
 def _styles(config: RestyleConfig, file: StyleFile) -> list[tuple[str, StyleFile]]:
     """The styles with what is added to the names of their files."""
     if not config.each:
         return [("", file)] if config.references else []
-    # Without dots: x.compressed would make another format of a .ply.
     alone = []
-    stems = [path.stem.replace(".", "_") for path in config.references]
+    # Without dots: x.compressed would make another format of a .ply.
+    names = _names_of(path.stem.replace(".", "_") for path in config.references)
     for i, path in enumerate(config.references):
         style = replace(file.style, references=(path,), weights=(), masks=file.style.masks[i : i + 1])
-        if stems.count(stems[i]) == 1:
-            name = stems[i]
-        else:
-            name = f"{stems[i]}-{i}"
-        alone.append((name, file._replace(style=style)))
+        alone.append((names[i], file._replace(style=style)))
     return alone
 
 

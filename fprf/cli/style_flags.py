@@ -10,23 +10,24 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..errors import UsageError
+from ..io.overwriting import Origin, OverwriteConfig
+from ..io.paths import as_path, expanded
 from ..plugins import slots
-from ..style.config import PRESETS, StyleConfig, preset_flags, with_preset
+from ..style.config import NO_MASK, PRESETS, StyleConfig, preset_flags, with_preset
 from ..style.files import StyleFile, check_photographs, read_style, with_folders
 from ..training.quality import QualityConfig
-from .parsing import parse
+from .parsing import parse, read_paths
 
 C = TypeVar("C", bound=StyleConfig)
 
-_LONGEST = 60
-_JOINED = 80
-"""Characters of a style's name that users choose, and of one that is made of those of its photographs: file
-names carry it.
-"""
+_MAX_CHOSEN_CHARACTERS = 60
+"""Of a style's name that users choose: by eye, file names carry it beside others."""
+_MAX_JOINED_CHARACTERS = 80
+"""Of a style's name that is made of those of its photographs: by eye, it names a folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class StyledRunConfig(StyleConfig, QualityConfig):
+class StyledRunConfig(StyleConfig, QualityConfig, OverwriteConfig):
     """A run and its style, for the verbs that render it."""
 
     run: Path = Path()
@@ -128,7 +129,7 @@ def _style_flag(args: Sequence[str]) -> Path | None:
         key, equals, inline = arg.partition("=")
         value = inline if equals else "".join(args[at + 1 : at + 2])
         if key == "--style" and value and not value.startswith("-") and value != "none":
-            path = Path(value)
+            (path,) = expanded([as_path(value)])[:1]
     return path
 
 
@@ -147,15 +148,32 @@ def named_styles(texts: Sequence[str], base: StyleFile) -> list[tuple[str, Style
                 f"--styles {text}: write NAME=PHOTO,PHOTO or NAME=STYLE.json, with a name of letters, digits, + - and _"
             )
         if what.lower().endswith(".json"):
-            file = read_style(Path(what))
-            check_photographs(Path(what), file)
+            file = read_style(as_path(what))
+            check_photographs(as_path(what), file)
         else:
             # What names photographs one by one does not carry over to others.
-            photographs = tuple(Path(part) for part in what.split(","))
+            photographs = named_files(what)
             style = replace(base.style, references=photographs, weights=(), masks=(), pin=(), forbid=())
             file = StyleFile(style)
         styles.append((name, file._replace(style=with_folders(file.style, say))))
     return styles
+
+
+def named_files(texts: str) -> tuple[Path, ...]:
+    """Files that stand in a flag's text, with commas between them."""
+    return expanded([as_path(part) for part in texts.split(",")])
+
+
+def origin_of(by: str, config: StyleConfig, file: StyleFile, more: Sequence[Path] = ()) -> Origin:
+    """Origin of what a verb makes in a style: every file that its flags and its style name, and those of `more`."""
+    reads = [*read_paths(config), *read_paths(file.style), *more]
+    # A region may be given by a mask over a view: VIEW:MASK.png.
+    for text in (*config.pin, *config.forbid, *config.keep, *config.region_strength):
+        mask = Path(text.rpartition("=")[0].rpartition(":")[2] or text.rpartition(":")[2])
+        if mask.is_file():
+            reads.append(mask)
+    overwrite = isinstance(config, OverwriteConfig) and config.overwrite
+    return Origin(by=by, reads=tuple(path for path in reads if path != NO_MASK), overwrite=overwrite)
 
 
 def style_name(style: Path | None, references: Sequence[Path]) -> str:
@@ -169,11 +187,11 @@ def style_name(style: Path | None, references: Sequence[Path]) -> str:
             return style.stem
         return style.resolve().parent.name or "style"
     joined = "+".join(path.stem for path in references)
-    if len(joined) <= _JOINED:
+    if len(joined) <= _MAX_JOINED_CHARACTERS:
         return joined
-    return f"{joined[:_JOINED]}+{len(references)}"
+    return f"{joined[:_MAX_JOINED_CHARACTERS]}+{len(references)}"
 
 
 def tidy(name: str) -> str:
     """A name as file names carry it: letters, digits, + - and _, at most 60."""
-    return re.sub(r"[^\w+-]+", "_", name, flags=re.ASCII).strip("_")[:_LONGEST]
+    return re.sub(r"[^\w+-]+", "_", name, flags=re.ASCII).strip("_")[:_MAX_CHOSEN_CHARACTERS]

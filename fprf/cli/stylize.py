@@ -1,21 +1,23 @@
 """`fprf stylize RUN --references A.jpg B.jpg`: captured views in the style of photographs."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from ..io.overwriting import Origin, unused_name
 from ..progress import Display
-from ..style.files import write_style
-from .style_flags import StyledRunConfig, read_flags, style_name
+from ..style.files import style_key, write_style
+from .style_flags import StyledRunConfig, origin_of, read_flags, style_name
 
 if TYPE_CHECKING:
     from ..scenes import Scene
     from ..style.regions import Regions
     from ..style.restyle import Styled
 
-_SHOWN = 0.1
-"""References that a region takes less of are not in the table."""
+_MIN_TABLE_SHARE = 0.1
+"""References that a region takes less of are not in the table: by eye, three fit on a line."""
 
 _HEAD: tuple[str, ...] = ("region", "share", "seen best at", "strength", "sure", "entropy", "takes")
 
@@ -36,7 +38,7 @@ class StylizeConfig(StyledRunConfig):
     """
     output: Path | None = None
     """Folder for what is made; by default RUN/styles/NAME, with the name of the style file's folder or of the
-    references.
+    references, and a number behind it where that folder belongs to another style.
     """
     split: Literal["some", "test", "train", "all"] = "some"
     """Views to restyle. some: at most 8 training views, spread evenly; test: those held out from training."""
@@ -65,30 +67,74 @@ def run(args: list[str]) -> int:
     opened = open_run(config.run, config.device, config)
     scene = opened.scene
     views = opened.known.views(config.split, config.views)
-    output = config.output or config.run / "styles" / (
-        style_name(config.style, config.references) or "regions"
-    )
+    names = _names(config, [scene.names[view] for view in views])
+    explained = ["explain.json", "explain.png"] if config.explain else []
+    origin = origin_of("stylize", config, file)
+    output = _folder(config, origin, [*explained, *names])
+    tables = [output / name for name in explained]
     if config.explain and not config.references:  # regions alone: no style is built
-        print_explained(output, Regions(scene, *scene.measured()), None)
+        with origin.writing(tables):
+            print_explained(output, Regions(scene, *scene.measured()), None)
         return 0
     # The whole style: references encoded and clustered, matched with the scene's regions. Views come after,
     # each on its own.
     start = time.perf_counter()
     styled = apply_style(scene, file)
-    seconds = time.perf_counter() - start
     made: dict[str, Any] = {
-        "dictionary_seconds": seconds,
+        "dictionary_seconds": time.perf_counter() - start,
         "codes": len(styled.codes.reference),
     }
     for note in styled.controls.notes:
         print(note)
-    if config.explain:
-        print_explained(output, styled.controls.regions, styled)
-    if config.match_only or not config.explain:
-        made |= _make(scene, output, styled, views, config)
-    save_dictionary(output / "dictionary.safetensors", styled.dictionary)
-    write_style(output / "style.json", styled.controls.saved, made)
+    saved = styled.controls.saved
+    files = [output / name for name in names]
+    with origin.writing(tables), origin.writing(files, style_key(saved)) as removed:
+        if removed:
+            print(f"{output}: {removed} files of the style that was there before are removed")
+        if config.explain:
+            print_explained(output, styled.controls.regions, styled)
+        if config.match_only or not config.explain:
+            made |= _make(scene, output, styled, views, config)
+        save_dictionary(output / "dictionary.safetensors", styled.dictionary)
+        write_style(output / "style.json", saved, made)
     return 0
+
+
+def _names(config: StylizeConfig, views: Sequence[str]) -> list[str]:
+    """Names of the files of the style that are written into its folder."""
+    names: list[str] = []
+    if config.explain and not config.references:
+        return names
+    if config.match_only:
+        kinds = ["-match.png", "-score.png", "-confidence.png", "-entropy.png"]
+    elif config.explain:
+        kinds = []
+    else:
+        kinds = [".png", "-match.png"] if config.matches else [".png"]
+    for view in views:
+        names += [f"{view}{kind}" for kind in kinds]
+    return [*names, "dictionary.safetensors", "style.json"]
+
+
+def _folder(config: StylizeConfig, origin: Origin, names: Sequence[str]) -> Path:
+    """The folder that is asked for, else one in the run that belongs to this style alone, said where its name is
+    not the usual one.
+
+    Raises UsageError where files of the folder may not be replaced.
+    """
+    if config.output is not None:
+        origin.check(config.output / name for name in names)
+        return config.output
+    styles = config.run / "styles"
+    usual = style_name(config.style, config.references) or "regions"
+    taken: list[str] = []
+    name = usual
+    while not origin.permits(styles / name / each for each in names):
+        taken.append(name)
+        name = unused_name(usual, taken)
+    if taken:
+        print(f"{styles / usual} belongs to another style or is read; this one goes to {styles / name}")
+    return styles / name
 
 
 def _make(
@@ -156,7 +202,9 @@ def print_explained(output: Path, regions: "Regions", styled: "Styled | None") -
             f"{region.view}:{region.pixel[0]},{region.pixel[1]}",
         ]
         if region.taken:
-            best = [taken for taken in region.taken if taken.share >= _SHOWN][:3] or list(region.taken[:1])
+            best = [taken for taken in region.taken if taken.share >= _MIN_TABLE_SHARE][:3] or list(
+                region.taken[:1]
+            )
             takes = ", ".join(f"{taken.name} {taken.share:.0%} (score {taken.score:.2f})" for taken in best)
             if region.strength == 0:
                 strength = "kept"

@@ -1,16 +1,18 @@
 """`fprf train [METHOD|CONFIG.json]`: train a scene, or go on where a run stopped."""
 
+import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from ..errors import PluginError
+from ..errors import PluginError, UsageError
+from ..io.paths import as_path
 from ..plugins import registry
-from .parsing import first_line, load_method, parse
+from .parsing import first_line, load_method, parse, read_paths
 
 DEFAULT_METHOD = "fprf-splats"
 """Where none is named: the best quality for the time on every capture that was measured
@@ -18,6 +20,20 @@ DEFAULT_METHOD = "fprf-splats"
 """
 VIEW = "--view"
 CHANGED = "--changed-images"
+OVERWRITE = "--overwrite"
+_RUN_FILES = (
+    "config.json",
+    "scene.json",
+    "images.json",
+    "basis.safetensors",
+    "style.safetensors",
+    "events.jsonl",
+    "checkpoints",
+    "blocks",
+    "cells",
+    "overview",
+)
+"""What training writes into a run folder (docs/design.md)."""
 
 
 def run(args: list[str]) -> int:
@@ -29,19 +45,21 @@ def run(args: list[str]) -> int:
         args = [DEFAULT_METHOD, *args]
     config, method = load_method(args[0])
     # A saved config goes on with its run, wherever that lies now.
-    source = Path(args[0])
+    source = as_path(args[0])
     if source.suffix == ".json" and config.output is None:
         config = replace(config, output=source.parent)
-    flags = [arg for arg in args[1:] if arg not in (VIEW, CHANGED)]
+    flags, overwrite = _take_overwrite([arg for arg in args[1:] if arg not in (VIEW, CHANGED)])
     changed = CHANGED in args
     about = (
         f"Train a scene with {method}.\n"
         f"{VIEW} shows training live in the browser, as `fprf view RUN --follow` does, which takes another address;\n"
-        f"{CHANGED} goes on with a run although its images are no longer those that it was begun with."
+        f"{CHANGED} goes on with a run although its images are no longer those that it was begun with;\n"
+        f"{OVERWRITE} true begins anew where another run, or files of other programs, are in its place."
     )
     config = parse(config, flags, prog=f"fprf train {args[0]}", description=about)
     from ..training.driver import default_output, train
 
+    _make_room(config.output or default_output(config, method), read_paths(config), overwrite)
     if VIEW not in args:
         train(config, method, changed_images=changed)
         return 0
@@ -49,6 +67,56 @@ def run(args: list[str]) -> int:
     with viewed(config.output or default_output(config, method)):
         train(config, method, changed_images=changed)
     return 0
+
+
+def _take_overwrite(args: list[str]) -> tuple[list[str], bool]:
+    """The other flags, and whether `--overwrite`, alone or with a truth, is among them."""
+    rest: list[str] = []
+    overwrite = False
+    after = False
+    for arg in args:
+        key, equals, value = arg.partition("=")
+        if key == OVERWRITE:
+            overwrite = not equals or value.lower() == "true"
+            after = not equals
+        elif after and arg.lower() in ("true", "false"):
+            overwrite = arg.lower() == "true"
+            after = False
+        else:
+            rest.append(arg)
+            after = False
+    return rest, overwrite
+
+
+def _make_room(run: Path, reads: Sequence[Path], overwrite: bool) -> None:
+    """Remove the run that is to be overwritten; nothing that the new one reads.
+
+    Raises UsageError where files lie in the place of a run's that no run has written, unless they may be
+    overwritten. Whether a run that is there goes on, training itself says.
+    """
+    from ..training.run import Run, lock_folder
+
+    there = [run / name for name in _RUN_FILES if (run / name).exists()]
+    if not there or (Run(run).exists and not overwrite):
+        return
+    if not overwrite:
+        raise UsageError(
+            f"{there[0]}: is there already, and no run has written it; name another --output, or replace it with "
+            f"{OVERWRITE} true"
+        )
+    for path in there:
+        for read in reads:
+            if read.exists() and read.resolve().is_relative_to(path.resolve()):
+                raise UsageError(
+                    f"{read}: is read, and lies in what is to be overwritten; name another --output"
+                )
+    with lock_folder(run):
+        ours = (run / "scene.json").is_file() and Run(run).exists
+        for path in there:
+            if path.is_file():
+                path.unlink()
+            elif ours:
+                shutil.rmtree(path)
 
 
 @contextmanager

@@ -7,13 +7,14 @@ from typing import NamedTuple
 
 from ..checks import at_least, positive
 from ..errors import UsageError
+from ..io.overwriting import OverwriteConfig
 from ..plugins.captures import endings, format_name
 from ..plugins.registry import nearest
 from ..style.config import StyleConfig
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportConfig(StyleConfig):
+class ExportConfig(StyleConfig, OverwriteConfig):
     """Kinds of files, their resolution, and the styles."""
 
     run: Path = Path()

@@ -1,5 +1,6 @@
 """Files that are whole or absent: written beside their final name, flushed to disk, then renamed over it."""
 
+import errno
 import json
 import os
 import re
@@ -60,12 +61,17 @@ def atomic_path(final: Path) -> Iterator[Path]:
     """A hidden name beside `final` to write to; it becomes `final` when the block ends, and is removed if it
     fails.
 
-    Keeps the ending of the name, which encoders choose their format by. Creates the folder. A reader sees the
-    old file or the new one, whenever the process dies. Raises DataError where `final` is a folder, its folder
+    Keeps the ending of the name, which encoders choose their format by. Creates the folder. Of a symbolic link
+    the file that it leads to is written, and the link stays. A reader sees the old file or the new one,
+    whenever the process dies. Raises DataError where `final` is a folder, its folder
     is a file, or the system refuses: a full disk, a folder without permission, a name that is too long.
     Errors of the block about other files are passed on.
     """
     try:
+        if final.is_symlink():
+            final = Path(os.path.realpath(final))
+        if final.is_symlink():
+            raise OSError(errno.ELOOP, "links that lead to each other")
         if final.is_dir():
             raise DataError(
                 f"{final}: a folder is in the place of a file to be written; remove it or choose another name"
@@ -99,9 +105,8 @@ def atomic_path(final: Path) -> Iterator[Path]:
         if block_ended or refused:
             raise unwritable(final, error) from error
         raise
-    if (
-        os.name != "posix"
-    ):  # a folder cannot be opened there; the rename is then as durable as the system makes it
+    # A folder cannot be opened elsewhere: the rename is then as durable as the system makes it.
+    if os.name != "posix":
         return
     try:
         _flush(final.parent, os.O_RDONLY)

@@ -59,7 +59,7 @@ def _alike(frames: Iterable[Picture], path: Path) -> Iterator[Picture]:
 def _with_av(
     av: "ModuleType", path: Path, frames: Iterator[Picture], size: tuple[int, int], fps: Fraction
 ) -> None:
-    with av.open(str(path), "w", options={"movflags": "+faststart"}) as container:
+    with av.open(str(path.absolute()), "w", options={"movflags": "+faststart"}) as container:
         stream = container.add_stream("libx264", rate=fps, options={"crf": "17", "preset": "medium"})
         stream.width, stream.height = size
         stream.pix_fmt = "yuv420p"
@@ -108,7 +108,9 @@ def write_video(path: Path, frames: Iterable[Picture], fps: float, *, h264: bool
         if av is not None and "libx264" in av.codecs_available:
             _with_av(av, temporary, chain([first], even), size, rate)
             return "h264"
-        writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), float(rate), size)
+        writer = cv2.VideoWriter(
+            str(temporary.absolute()), cv2.VideoWriter.fourcc(*"mp4v"), float(rate), size
+        )
         if not writer.isOpened():
             raise DataError(
                 f"{path}: no video encoder here; install one with pip install 'fprf[video]', or write a folder"
@@ -121,7 +123,7 @@ def write_video(path: Path, frames: Iterable[Picture], fps: float, *, h264: bool
         finally:
             writer.release()
         # The writer says nothing of a full disk, which leaves a film without its index.
-        found = max(0, int(cv2.VideoCapture(str(temporary)).get(cv2.CAP_PROP_FRAME_COUNT)))
+        found = max(0, int(cv2.VideoCapture(str(temporary.absolute())).get(cv2.CAP_PROP_FRAME_COUNT)))
         if found < count:
             raise unwritable(path, OSError(f"{found} of {count} frames are in it"))
         return "mp4v"

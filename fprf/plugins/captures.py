@@ -44,6 +44,22 @@ def stem_of(path: Path) -> str:
     return path.stem if name is None else path.name[: -len(name) - 1]
 
 
+def captures_in(folder: Path) -> list[Path]:
+    """Captures that lie directly in a folder, in the order of their names: files that can be read, and folders of
+    SOG. None in a folder that is a capture or a run itself.
+    """
+    if is_scene(folder):
+        return []
+    found = []
+    for path in sorted(folder.iterdir()):
+        index = path.is_dir() and any((path / name).is_file() for name in ("meta.json", "lod-meta.json"))
+        name = format_name(path) if path.is_file() else None
+        readable = name is not None and getattr(registry.load_object(CAPTURES, name), "reads", True)
+        if not path.name.startswith(".") and (index or readable):
+            found.append(path)
+    return found
+
+
 def is_scene(path: Path) -> bool:
     """True for the path of a capture or of a run, which is no photograph."""
     if path.is_dir():

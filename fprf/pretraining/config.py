@@ -6,11 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..checks import at_least, positive
+from ..io.overwriting import OverwriteConfig
+from ..plugins.conversion import convert_fields
 from ..plugins.encoders.config import BundledContentConfig, EncoderConfig
 
 
 @dataclass(frozen=True, kw_only=True)
-class PretrainConfig:
+class PretrainConfig(OverwriteConfig):
     """Fields of every pretraining."""
 
     images: tuple[Path, ...] = ()
@@ -33,6 +35,7 @@ class PretrainConfig:
     """cpu, cuda, mps, or auto. Draws are the same on each."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.photos is not None:
             at_least("photos", self.photos, 2)
         positive("minutes", self.minutes)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ..checks import at_least, between
+from ..plugins.conversion import convert_fields
 
 Lens = Literal["simple-pinhole", "pinhole", "simple-radial", "radial", "opencv", "opencv-fisheye"]
 
@@ -43,6 +44,7 @@ class SfmConfig:
     """Seed of COLMAP's random choices."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         at_least("frames", self.frames, 3)
         between("blurred", self.blurred, 0.0, 0.99)
         at_least("features", self.features, 100)

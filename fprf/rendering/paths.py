@@ -26,6 +26,7 @@ from torch import Tensor
 from ..checks import at_least
 from ..errors import DataError, UsageError
 from ..io.atomic import write_json
+from ..io.paths import as_path
 from ..types import Origin
 from .cameras import Cameras, ideal_cameras
 from .lens import FISHEYE, OPENCV, PINHOLE
@@ -271,7 +272,7 @@ def make_path(
             order = order[torch.linspace(0, len(order) - 1, frames).round().long()]
         between = max(0, round((frames - 1) / max(1, len(order) - 1)) - 1)
         return interpolate(cameras, order, between)
-    file = Path(motion)
+    file = as_path(motion)
     if not file.is_file():
         raise UsageError(f"--path {motion}: neither a file nor one of {', '.join(MOTIONS)}")
     return read_camera_path(file, origin)[0]

@@ -63,7 +63,7 @@ _BLACK = 0.055
 _VIEW = (480, 360)
 _SOLID = 0.95
 """Size of views in the place of photographs; opacity from which on their pixels count."""
-_REFERENCES = 16
+MAX_REFERENCE_VIEWS = 16
 """Views of a capture that are references, at most."""
 _GAP = 0.1
 """Distance between captures that would overlap, as a share of their width, where they are put in a row."""
@@ -434,7 +434,9 @@ def reference_views(
         # shares.
         look = replace(look, size=_VIEW, up=look.up or capture.up)
         scene = look_at_capture(gaussians, capture.antialiased, encoder, look, camera=capture.camera)
-    chosen = torch.linspace(0, len(scene.names) - 1, min(_REFERENCES, len(scene.names))).round().long()
+    chosen = (
+        torch.linspace(0, len(scene.names) - 1, min(MAX_REFERENCE_VIEWS, len(scene.names))).round().long()
+    )
     cameras = scene.cameras.select(chosen)
     pictures = list[Path]()
     masks = list[Path]()

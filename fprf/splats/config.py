@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 from ..checks import at_least, between, positive
 from ..datamanagers.parsers.config import DataParserConfig
 from ..errors import ConfigError
+from ..plugins.conversion import convert_fields
 from ..plugins.encoders.config import SEMANTICS, EncoderConfig
 from ..plugins.executors.config import ExecutorConfig, SerialConfig
 from ..run_config import RunConfig
@@ -56,6 +57,7 @@ class LookConfig:
     """Semantics."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         at_least("views", self.views, 1)
         at_least("regions", self.regions, 1)
         at_least("size", min(self.size), 32)

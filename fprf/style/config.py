@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 from ..checks import at_least, between
 from ..errors import ConfigError, UsageError
 from ..plugins import slots
+from ..plugins.conversion import convert_fields
 from ..plugins.registry import nearest
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 
@@ -204,6 +205,7 @@ class StyleConfig:
     """Place between the two styles, in [0, 1]: 0 = this one, 1 = the other."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         for name in ("blend", "strength", "luminance", "bold", "at"):
             between(name, getattr(self, name), 0.0, 1.0)
         at_least("clusters", self.clusters, 1)

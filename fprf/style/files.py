@@ -17,6 +17,7 @@ starts and ends without a jerk; before the first key and after the last, their s
 """
 
 import hashlib
+import json
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -29,8 +30,9 @@ from typing import Any, NamedTuple, TypeVar
 from ..checks import at_least
 from ..errors import ConfigError, DataError
 from ..io.atomic import write_json
+from ..io.paths import as_path
 from ..plugins import slots
-from ..plugins.captures import is_scene
+from ..plugins.captures import captures_in, is_scene
 from ..plugins.codec import from_json, packages_of, read_json, to_json
 from ..plugins.registry import nearest
 from .config import NO_MASK, StyleConfig
@@ -125,6 +127,17 @@ def write_style(path: Path, file: StyleFile, made: Mapping[str, Any] | None = No
     write_json(path, whole if made is None else whole | {"made": made})
 
 
+def style_key(file: StyleFile) -> str:
+    """A hash of a style with the content of its photographs and masks: two styles have one key if they are alike."""
+    style = file.style
+    whole = {
+        "style": to_json(_with_paths(style, Path.resolve)),
+        "sha256": [_hash(path) for path in (*style.references, *style.masks) if path != NO_MASK],
+        "regions": {name: list(key) for name, key in file.regions.items()},
+    }
+    return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()[:16]
+
+
 def check_photographs(path: Path, file: StyleFile) -> None:
     """Raise DataError where a photograph or mask of a style file is not the one that the style was saved
     with.
@@ -151,7 +164,13 @@ def with_folders(style: S, report: Callable[[str], None] = warnings.warn) -> S:
     folders = {path for path in style.references if path.is_dir() and not is_scene(path)}
     if not folders:
         return style
-    from ..datamanagers.images import photographs
+    from ..datamanagers.images import IMAGE_SUFFIXES, photographs
+
+    def within(folder: Path) -> list[Path]:
+        # A folder of captures stands for these, where no photograph is among them.
+        pictures = any(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.iterdir())
+        captures = [] if pictures else captures_in(folder)
+        return captures or photographs([folder], report)
 
     # Of folders each image once, and none that is also named itself: that has a weight, and may have masks,
     # of its own.
@@ -166,7 +185,7 @@ def with_folders(style: S, report: Callable[[str], None] = warnings.warn) -> S:
                 f"masks: {mask} is for one photograph, {path} is a folder; write none, or name the photographs"
             )
         if path in folders:
-            files = [file for file in photographs([path], report) if file not in known]
+            files = [file for file in within(path) if file not in known]
         else:
             files = [path]
         known |= {*files}
@@ -191,6 +210,7 @@ def _with_paths(style: StyleConfig, change: Callable[[Path], Path]) -> StyleConf
 
 def _resolved(file: Path, path: Path) -> Path:
     """Resolve a path of the file: relative to the file, else beside it, where a shared style has it."""
+    path = as_path(path)
     whole = file.parent / path
     beside = file.parent / path.name
     return beside if not whole.exists() and beside.exists() else whole

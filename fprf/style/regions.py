@@ -19,6 +19,7 @@ from torch import Tensor
 from ..datamanagers.basis import Basis
 from ..datamanagers.images import load_mask
 from ..errors import UsageError
+from ..io.paths import as_path
 from ..rendering.cameras import Cameras, pixel_grid
 from ..scenes import Scene
 from .config import (
@@ -132,7 +133,7 @@ def find_regions(regions: Regions, text: str) -> list[RegionMatch]:
         # Regions of which the mask covers more than half of what the view shows, and the one that fills most
         # of the mask: by their mass in the view and under the mask, on a small copy of both.
         share, opacity = membership_view(regions, view, _SIDE)
-        painted = load_mask(Path(rest), upright=True).astype(np.float32)
+        painted = load_mask(as_path(rest), upright=True).astype(np.float32)
         white = torch.from_numpy(
             np.asarray(cv2.resize(painted, opacity.shape[::-1], interpolation=cv2.INTER_AREA))
         )

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 from ..checks import between, positive
 from ..errors import UsageError
+from ..plugins.conversion import convert_fields
 
 if TYPE_CHECKING:
     from .camera_optimizers import Tones
@@ -55,6 +56,7 @@ class QualityConfig:
     """
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.max_memory is not None:
             positive("max_memory", self.max_memory)
         if self.resolution is not None:

@@ -24,6 +24,7 @@ from fprf.evaluation.metrics import psnr
 from fprf.export.fit import seen_points
 from fprf.export.mesh import render_maps
 from fprf.io import images
+from fprf.io.overwriting import Origin
 from fprf.rendering.paths import make_path, write_camera_path
 from fprf.splats.drawing import draw
 from fprf.splats.files import read_capture
@@ -55,7 +56,7 @@ def test_a_gif_is_a_file(run: Path, world: World, tmp_path: Path) -> None:
     render(
         run, tmp_path / "a.gif", "--path", "spiral", "--frames", "2", "--references", str(world.references[0])
     )
-    assert (tmp_path / "a.gif").read_bytes().startswith(b"GIF89a") and len(list(tmp_path.iterdir())) == 2
+    assert (tmp_path / "a.gif").read_bytes().startswith(b"GIF89a") and len(list(tmp_path.glob("[!.]*"))) == 2
 
 
 def test_several_looks_and_channels_lie_beside_each_other(run: Path, world: World, tmp_path: Path) -> None:
@@ -103,7 +104,13 @@ def test_an_interrupted_film_goes_on(
     assert [call.args[0].name for call in write.call_args_list] == [f"0000{k}.png" for k in (0, 1, 2, 2, 3)]
     assert mine.read_text() == "stays" and not (tmp_path / ".x.frames").exists()
     write_camera_path(tmp_path / "path.json", make_path(world.load().cameras, [0], "dataset", 1), 5)
-    assert cli.main(["render", str(run), "--path", str(tmp_path / "path.json"), "--output", str(film)]) == 0
+    assert cli.main(["render", str(run), "--path", str(tmp_path / "path.json"), "--output", str(film)]) == 2
+    assert (
+        cli.main(
+            ["render", str(run), "--path", str(tmp_path / "path.json"), "--output", str(film), "--overwrite"]
+        )
+        == 0
+    )
     assert cv2.VideoCapture(str(film)).get(cv2.CAP_PROP_FPS) == 5
 
 
@@ -161,9 +168,11 @@ def test_style_files_are_styles_of_the_page(run: Path, world: World) -> None:
     page = gallery(run, "--styles", str(style), "--views", "0000")
     assert [style["name"] for style in data_of(page)["styles"]] == ["Captured", "mine"]
     captured = shutil.copy(references[0], run.parent / "Captured.jpg")
-    page = gallery(run, "--references", str(captured), "--views", "0000")
+    page = gallery(run, "--references", str(captured), "--views", "0000", "--overwrite")
     assert [style["name"] for style in data_of(page)["styles"]] == ["Captured", "Captured (1)"]
-    page = gallery(run, "--references", references[0], "--between", str(style), "--views", "0000")
+    page = gallery(
+        run, "--references", references[0], "--between", str(style), "--views", "0000", "--overwrite"
+    )
     assert [style["name"] for style in data_of(page)["styles"]] == ["Captured", "dusk"], (
         "on the way to another style"
     )
@@ -180,7 +189,7 @@ def test_metrics_table_and_pictures(run: Path, capsys: pytest.CaptureFixture[str
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics.keys() >= KEYS and "fitted_poses" not in metrics
     assert (metrics["method"], metrics["split"]) == ("fprf-lite", "test")
-    assert sorted(p.name for p in (run / "renders" / "test").iterdir()) == ["0000.png", "0008.png"]
+    assert sorted(p.name for p in (run / "renders" / "test").glob("[!.]*")) == ["0000.png", "0008.png"]
     assert cv2.imread(str(run / "renders" / "test" / "0000.png")).shape == (24, 32, 3)
     table = capsys.readouterr().out
     assert "psnr" in table and f"{metrics['psnr']:.3f}" in table and "rays/s" in table
@@ -227,7 +236,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     (tmp_path / "training").mkdir()
     (tmp_path / "training" / "mine.jpg").touch()
     for _ in range(2):  # again, in place of the first
-        assert write_scalars(tmp_path, [HISTORY, block]) == 6
+        assert write_scalars(tmp_path, [HISTORY, block], Origin(by="eval")) == 6
     assert {path.name for path in tmp_path.iterdir()} == {"training", "02"}
     assert len(list(tmp_path.glob("*/events.out*"))) == 2 and (tmp_path / "training" / "mine.jpg").exists()
     found = read(tmp_path / "training")

@@ -144,7 +144,7 @@ def test_explain_lists_regions_and_renders_nothing(
     assert cli.main(["stylize", str(run), "--references", *map(str, world.references), *words]) == 0
     folder = run / "styles" / "dusk+snow"
     out = capsys.readouterr().out
-    assert {p.name for p in folder.iterdir()} == {
+    assert {p.name for p in folder.glob("[!.]*")} == {
         "explain.json",
         "explain.png",
         "dictionary.safetensors",
@@ -175,11 +175,14 @@ def test_match_maps_alone(
     made = stylize(run, world, tmp_path / "m", *words)["made"]
     kinds = ("match.png", "score.png", "confidence.png", "entropy.png")
     expected = {f"{view}-{kind}" for view in ("0001", "0003") for kind in kinds}
-    assert {p.name for p in (tmp_path / "m").iterdir()} == expected | {"dictionary.safetensors", "style.json"}
+    assert {p.name for p in (tmp_path / "m").glob("[!.]*")} == expected | {
+        "dictionary.safetensors",
+        "style.json",
+    }
     assert made.keys() == MADE - {"seconds_per_view"} and made["matches"].keys() == {"0003", "0001"}
     assert "2 match maps in" in capsys.readouterr().out
     stylize(run, world, tmp_path / "both", "--match-only", "--explain")
-    assert {"explain.json", "0000-score.png"} < {p.name for p in (tmp_path / "both").iterdir()}
+    assert {"explain.json", "0000-score.png"} < {p.name for p in (tmp_path / "both").glob("[!.]*")}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -70,7 +70,7 @@ MISTAKES = """
     restyle in.ply --references A.png --page out.png | --page
     restyle in.ply in.ply --references A.png --output out | several captures
     restyle in.ply other.spz --references A.png --output out.ply | need a folder
-    restyle in.ply other.spz --references A.png --output . | the captures lie there
+    restyle in.ply other.spz --references A.png --output . | is read by this command
     stylize run | --references
     stylize run --references A.png --forbid 0=0 | region 0
     stylize run --references A.png --keep 0000:99,1 | 0000:99,1

@@ -50,8 +50,8 @@ def timeless(value: Any) -> Any:
 
 
 def same(here: Path, there: Path) -> None:
-    names = {p.relative_to(here) for p in here.rglob("*") if p.is_file()}
-    assert names and names == {p.relative_to(there) for p in there.rglob("*") if p.is_file()}
+    names = {p.relative_to(here) for p in here.rglob("[!.]*") if p.is_file()}
+    assert names and names == {p.relative_to(there) for p in there.rglob("[!.]*") if p.is_file()}
     for name in sorted(names):
         assert content(here / name) == content(there / name), name
 

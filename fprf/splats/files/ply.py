@@ -86,7 +86,7 @@ class Ply(CaptureFormat):
     exact: ClassVar[bool] = True
 
     def recognises(self, head: bytes, size: int) -> bool:
-        return head.startswith(b"ply")
+        return head.removeprefix(b"\xef\xbb\xbf").startswith(b"ply")
 
     def read(self, path: Path, data: Data) -> Capture:
         """A PLY of either layout. Raises DataError for others. ASCII files become binary ones of the same
@@ -419,7 +419,7 @@ def _header(data: Data) -> _Header | None:
     """The header, whose lines end as the first one does: with LF, CR LF or CR. None where it has no begin or
     no end.
     """
-    first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", data)
+    first = re.match(rb"(?:\xef\xbb\xbf)?ply[ \t]*(\r\n|\n|\r)", data)
     if first is None:
         return None
     newline = rb"\r" if first[1] == b"\r" else rb"\r?\n"
