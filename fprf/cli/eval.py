@@ -114,7 +114,7 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
     origin = Origin(
         by="eval",
         reads=(config.run,),
-        beside=(*captured.paths, *(captured.masks or ())),
+        beside=(*captured.paths, *(mask for mask in captured.masks if mask is not None)),
         overwrite=config.overwrite,
         remedy="move it away, or replace it with --overwrite true",
     )

@@ -1,7 +1,7 @@
 """`fprf process IMAGES|VIDEO --output SCENE`: poses for images that have none, by COLMAP's Python package."""
 
 import shlex
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,7 @@ def run(args: list[str]) -> int:
         raise UsageError(
             "fprf process: pycolmap is not installed; install it with: pip install 'pycolmap>=4'"
         )
+    config = replace(config, source=_source(config.source))
     from ..io.atomic import write_json
     from ..reconstruction.colmap import find_features, find_matches, find_poses
     from ..reconstruction.images import gather_images, lost_files
@@ -83,6 +84,26 @@ def run(args: list[str]) -> int:
         print(f"all of them in {place.root / 'process.json'}")
     _check(place.root)
     return 0
+
+
+def _source(given: Path) -> Path:
+    """The folder or video that is given; of a folder that holds a video and no images that video.
+
+    Raises UsageError where it holds several: a scene is made of one.
+    """
+    from ..datamanagers.images import IMAGE_SUFFIXES
+    from ..reconstruction.images import VIDEO_SUFFIXES
+
+    if not given.is_dir():
+        return given
+    files = [path for path in sorted(given.iterdir()) if path.is_file() and not path.name.startswith(".")]
+    videos = [path for path in files if path.suffix.lower() in VIDEO_SUFFIXES]
+    if not videos or any(path.suffix.lower() in IMAGE_SUFFIXES for path in given.rglob("*")):
+        return given
+    if len(videos) > 1:
+        names = ", or ".join(str(path) for path in videos[:3])
+        raise UsageError(f"{given}: {len(videos)} videos and no images; a scene is made of one: give {names}")
+    return videos[0]
 
 
 def _check(root: Path) -> None:

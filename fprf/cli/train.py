@@ -94,7 +94,8 @@ def _make_room(run: Path, reads: Sequence[Path], overwrite: bool) -> None:
     Raises UsageError where files lie in the place of a run's that no run has written, unless they may be
     overwritten. Whether a run that is there goes on, training itself says.
     """
-    from ..training.run import Run, lock_folder
+    from ..training.locks import lock_folder
+    from ..training.run import Run
 
     there = [run / name for name in _RUN_FILES if (run / name).exists()]
     if not there or (Run(run).exists and not overwrite):

@@ -218,3 +218,12 @@ def test_a_capture_behind_a_byte_order_mark(yard: Path) -> None:
 def test_films_with_a_colon_in_their_names(run: Path, yard: Path) -> None:
     assert cli.main(["render", str(run), "--path", "orbit", "--frames", "3", "--output", "10:30.mp4"]) == 0
     assert cv2.VideoCapture(str(yard / "10:30.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 3
+
+
+def test_a_folder_of_videos_is_one_video_or_asks(yard: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (yard / "clips").mkdir()
+    for name in ("a.mp4", "b.MP4"):
+        (yard / "clips" / name).write_bytes(b"no video")
+        assert cli.main(["process", "clips", "--output", "scene"]) == 2
+        told = capsys.readouterr().err.splitlines()[-1]
+        assert ("a scene is made of one" in told) == (name == "b.MP4") and "a.mp4" in told
