@@ -250,7 +250,7 @@ def _of_one_scale(stated: NDArray[np.float64], found: NDArray[np.float64]) -> ND
     usable = low <= high
     begins = np.sort(low[usable])
     count = np.searchsorted(begins, begins, side="right") - np.searchsorted(np.sort(high[usable]), begins)
-    exact = (stated == found).all(1)
+    exact: NDArray[np.bool_] = (stated == found).all(1)
     if not len(begins) or exact.sum() >= count.max():
         return exact
     factor = begins[count.argmax()]
