@@ -58,7 +58,7 @@ def match_masks(
     known = _Photographs(photographs)
     best: list[tuple[int, bool, str, int] | None] = [None] * len(photographs)
     for number, file in enumerate(files):
-        name = spelling(file.name)
+        name = _plain(file.name)
         folder = _folder_of(file)
         rank, owners = known.owners(name, folder, words)
         # Of several files for one photograph: the likeliest name, PNG before what is lossy, the first by name.
@@ -79,7 +79,7 @@ class _Photographs:
         self.by_stem = defaultdict[str, list[int]](list)
         self.by_number = defaultdict[str, list[int]](list)
         for k, path in enumerate(paths):
-            name = spelling(path.name)
+            name = _plain(path.name)
             self.by_name[name].append(k)
             stem = name
             for stem in without_suffixes(name):
@@ -115,7 +115,7 @@ class _Photographs:
 
 
 def _folder_of(path: Path) -> tuple[str, ...]:
-    return tuple(spelling(part) for part in path.parts[:-1])
+    return tuple(_plain(part) for part in path.parts[:-1])
 
 
 def _ends_with(folder: tuple[str, ...], end: tuple[str, ...]) -> bool:
@@ -256,4 +256,11 @@ def _folders_about(
 
 
 def _relative(path: Path, folder: Path) -> Path:
-    return path.relative_to(folder) if path.is_relative_to(folder) else Path(path.name)
+    if path.is_relative_to(folder):
+        return path.relative_to(folder)
+    return Path(path.name) if path.is_absolute() else path
+
+
+def _plain(name: str) -> str:
+    """A name as it is compared: `fprf process` writes blanks as _."""
+    return re.sub(r"\s", "_", spelling(name))

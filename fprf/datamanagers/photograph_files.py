@@ -49,7 +49,7 @@ _MAP_ADJECTIVES = frozenset(
 _SAMPLES = 3
 """Pairs of pictures that are looked at before a folder counts as reduced copies of another: by eye."""
 _THUMBNAIL_PIXELS = 32
-"""Side at which two pictures are compared by their look: by eye."""
+"""Side at which two pictures are compared by their look, at most: by eye."""
 _MAX_DIFFERENCE = 4.0
 """Mean difference of levels in 0 to 255 up to which two such pictures are one: rounding and JPEG stay below 2, two
 views of one place are 10 and more apart (by eye).
@@ -74,6 +74,11 @@ def left_out_note(kind: str, names: Sequence[str]) -> str:
     return f"left out: {len(names)} {kind}, like {names[0]}"
 
 
+def shown_name(path: PurePath) -> str:
+    """A path with slashes, as it can be printed: what is not UTF-8 as \\udce9."""
+    return path.as_posix().encode(errors="backslashreplace").decode()
+
+
 def find_photographs(folder: Path, *, below: bool = True, without: Path | None = None) -> Photographs:
     """The photographs in a folder and, unless `below` is false, in those below it but `without`.
 
@@ -90,7 +95,7 @@ def find_photographs(folder: Path, *, below: bool = True, without: Path | None =
         inner = path.relative_to(folder)
         kind = _kind_of_path(inner)
         if kind:
-            left_out[kind].append(inner.as_posix())
+            left_out[kind].append(shown_name(inner))
         else:
             files.append(path)
     files = _without(files, folder, left_out, _companions(files))
@@ -103,7 +108,7 @@ def _without(
 ) -> list[Path]:
     """The files that have no kind; the others are added to what is left out."""
     for path, kind in kinds.items():
-        left_out[kind].append(path.relative_to(folder).as_posix())
+        left_out[kind].append(shown_name(path.relative_to(folder)))
     return [path for path in files if path not in kinds]
 
 
@@ -196,12 +201,13 @@ def _is_smaller(small: Path, large: Path) -> bool:
     return abs(width * whole_height - height * whole_width) <= whole_width + whole_height
 
 
-def _look_alike(a: Path, b: Path) -> bool:
+def _look_alike(small: Path, large: Path) -> bool:
     """True where two pictures at one small size have about the same levels of grey; JPEG moves colours further."""
-    size = (_THUMBNAIL_PIXELS, _THUMBNAIL_PIXELS)
+    width, height = _size_of(small)
+    size = (min(_THUMBNAIL_PIXELS, width), min(_THUMBNAIL_PIXELS, height))
     try:
-        first = load_image(a, size).mean(2)
-        second = load_image(b, size).mean(2)
+        first = load_image(small, size).mean(2)
+        second = load_image(large, size).mean(2)
     except DataError:
         return False
     return float(np.abs(first - second).mean()) <= _MAX_DIFFERENCE
