@@ -205,6 +205,10 @@ def _print(metrics: dict[str, object]) -> None:
         value = metrics[key]
         assert isinstance(value, float)
         table.add_row(key, f"{value:,.3f}" if value < 1000 else f"{value:,.0f}", unit)
+    used = metrics["used_share"]
+    assert isinstance(used, float)
+    if used < 1:
+        table.add_row("used_share", f"{used:.3f}", "of the pixels are judged: masks leave out the rest")
     warped = metrics["consistency"]
     assert isinstance(warped, dict)
     if warped["rmse"] is not None:

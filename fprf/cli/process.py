@@ -57,6 +57,8 @@ def run(args: list[str]) -> int:
         gather_images(config.source, place, state, config, display.count)
         if lost := lost_files(state):
             display.say(lost)
+        for note in state.notes.get("left out", []):
+            display.say(note)
         # Each step is skipped where `state` says that it was done for the same files and settings.
         find_features(place, state, config, display.count)
         matching = find_matches(place, state, config, display.count)

@@ -350,8 +350,9 @@ def judge(
     """Metrics of views of a scene: means, and each by name. Their images, in the light that they were taken
     in, go to `save`.
 
-    `captured` has the photographs; pixels that its `masks` leave out do not count. Seconds are those of
-    rendering alone. Consistency warps each view into the next one of the list by the rendered depth.
+    `captured` has the photographs; pixels that its `masks` leave out do not count, neither here nor in
+    consistency; `used_share` says how many do. Seconds are those of rendering alone. Consistency warps each
+    view into the next one of the list by the rendered depth.
     """
     cameras = known.cameras
     before: View | None = None
@@ -369,13 +370,17 @@ def judge(
         seconds += time.perf_counter() - start
         save(view, to_uint8(render.rgb))
         kept += render.kept
-        # Two renders are held at a time, whatever the number of views.
+        truth, where = known.photograph(captured, view, masks=masks)
+        pixels += truth.shape[0] * truth.shape[1]
+        row = image_metrics(render.rgb, truth, where)
+        row["used_share"] = 1.0 if where is None else float(where.double().mean())
+        rows[known.names[view]] = row
+        # Two renders are held at a time, whatever the number of views. What is left out has no depth there.
+        if where is not None:
+            render = render._replace(depth=torch.where(where.to(render.depth.device), render.depth, 0.0))
         if before is not None:
             warped.add(i - 1, i, before.rgb, render.rgb, before.depth, render.depth)
         before = render
-        truth, where = known.photograph(captured, view, masks=masks)
-        pixels += truth.shape[0] * truth.shape[1]
-        rows[known.names[view]] = image_metrics(render.rgb, truth, where)
     progress(len(views), len(views), "rendering")
     means = mean_metrics(rows.values())
     return {

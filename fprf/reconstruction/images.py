@@ -21,6 +21,13 @@ from PIL.ExifTags import IFD
 from PIL.ExifTags import Base as Tag
 
 from ..datamanagers.images import IMAGE_SUFFIXES, Image, load_image, open_image, read_header, silent
+from ..datamanagers.photograph_files import (
+    COPIES,
+    digest_of_pixels,
+    find_photographs,
+    original_first,
+    shown_name,
+)
 from ..errors import DataError, UsageError
 from ..io.atomic import write_bytes
 from .config import SfmConfig
@@ -222,9 +229,8 @@ def gather_images(
                 there = f"it holds {' '.join(endings)} files"
             else:
                 there = "it holds no files"
-            why = (
-                f"{there}, and what is read is {' '.join(sorted(IMAGE_SUFFIXES))}: convert the images to JPEG"
-            )
+            left_out = "".join(f"{note}; " for note in state.notes.get("left out", []))
+            why = f"{left_out}{there}, and what is read is {' '.join(sorted(IMAGE_SUFFIXES))}: convert the images to JPEG"
         raise DataError(f"{source}: {why}; {len(gathered)} usable images, at least {_FEWEST} are needed")
     # Images that are no longer used go, but never from the source itself.
     for name in set(state.images) - set(gathered):
@@ -283,20 +289,18 @@ def _from_folder(
     Formats that COLMAP does not read become JPEGs, whatever the name says: IMG_1.heic is IMG_1.heic.jpg in
     the scene. All others are copied: COLMAP and `load_image` see the same pixels in them.
     """
-    # Images may lie in the scene already. A scene inside of the source is left out; hidden folders are those
-    # of other programs.
+    # Images may lie in the scene already. A scene inside of the source is left out.
     inplace = place.images.resolve() == source.resolve()
     scene = place.root.resolve()
-    files = sorted(
-        path for path in source.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()
-    )
+    inner = None
     if source.resolve() in scene.parents:
         inner = source / scene.relative_to(source.resolve())
-        files = [path for path in files if not path.is_relative_to(inner)]
-    files = [
-        path for path in files if not any(part.startswith(".") for part in path.relative_to(source).parts)
-    ]
+    found = find_photographs(source, without=inner)
+    files = original_first(found.files)
     entries: dict[str, dict[str, Any]] = {}
+    # Names of the pictures so far, by the hashes of their files and of their pixels.
+    pictures: dict[str, str] = {}
+    copies: list[str] = []
     state.dropped = {}
     for i, path in enumerate(files):
         progress(i, len(files), "reading images")
@@ -304,14 +308,17 @@ def _from_folder(
         name = re.sub(
             r"\s|^#", "_", given
         )  # in COLMAP's lists of pairs a blank ends a name, and # begins a comment
+        data = path.read_bytes()
+        digest = hashlib.sha256(data).hexdigest()
+        shown = shown_name(path.relative_to(source))
+        if digest in pictures and shown == given:
+            copies.append(f"{given}, which is {pictures[digest]}")
+            continue
         if name in entries or (inplace and name != given):
             raise UsageError(
                 f"{path}: COLMAP takes no blanks or leading # in names; rename it so that none else is {name}"
             )
         # What was gathered before, and has not changed, is not read again.
-        data = path.read_bytes()
-        digest = hashlib.sha256(data).hexdigest()
-        shown = given.encode(errors="backslashreplace").decode()
         try:
             if shown != given:
                 raise DataError("its name is not UTF-8: rename it")
@@ -328,13 +335,25 @@ def _from_folder(
                 _write_image(place, state, name, _jpeg(path))
             if fresh:
                 known = _described(place.images / name if foreign else path, digest)
+            pixels = known.get("pixels", digest)  # which scenes of before do not tell
+            if pixels in pictures:
+                copies.append(f"{given}, which is {pictures[pixels]}")
+                if fresh and foreign:
+                    (place.images / name).unlink()
+                continue
             if fresh and not (inplace or foreign):
                 _write_image(place, state, name, data)
+            pictures |= {digest: given, pixels: given}
         except DataError as fault:
             state.dropped[shown] = str(fault).removeprefix(f"{path}: ").partition(";")[0]
             continue
         entries[name] = known
     progress(len(files), len(files), "reading images")
+    order = [shown_name(path.relative_to(source)) for path in found.files]
+    state.dropped = {name: state.dropped[name] for name in order if name in state.dropped}
+    if copies:
+        found.left_out[COPIES] = copies
+    state.notes["left out"] = found.notes()
     return entries
 
 
@@ -401,6 +420,13 @@ def _jpeg(path: Path) -> bytes:
 
 
 def _described(path: Path, digest: str) -> dict[str, Any]:
-    """Size and lens of an image. Raises DataError where it cannot be decoded."""
-    height, width = load_image(path).shape[:2]
-    return {"sha256": digest, "width": width, "height": height, "lens": list(read_lens(path))}
+    """Size, pixels and lens of an image. Raises DataError where it cannot be decoded."""
+    image = load_image(path)
+    height, width = image.shape[:2]
+    return {
+        "sha256": digest,
+        "pixels": digest_of_pixels(image),
+        "width": width,
+        "height": height,
+        "lens": list(read_lens(path)),
+    }

@@ -52,13 +52,15 @@ class State:
     source: str = ""
     """Source of the images."""
     images: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Used images by name, each with sha256, width, height and lens."""
+    """Used images by name, each with hashes of file and pixels, width, height and lens."""
     dropped: dict[str, str] = field(default_factory=dict)
     """Files or frames that were not used, with the reason."""
     done: dict[str, str] = field(default_factory=dict)
     """Key of each finished step by its name."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time of each finished step."""
+    notes: dict[str, list[str]] = field(default_factory=dict)
+    """What was decided, by the step that decided it."""
 
     @classmethod
     def load(cls, place: SceneFolder) -> "State":

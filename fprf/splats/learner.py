@@ -262,6 +262,8 @@ class GaussianLearner(SceneLearner):
             self._relocate_and_grow(step, level, share)
         # Running means, which start at the first value.
         self.pixels += target.width * target.height
+        if not math.isfinite(measured.squared):  # no pixel of the view counts
+            return
         for name, value in (("rgb", measured.squared), ("l1", measured.l1), ("ssim", measured.ssim)):
             self.means[name] = _SMOOTHING * self.means.get(name, value) + (1 - _SMOOTHING) * value
 

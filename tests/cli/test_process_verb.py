@@ -5,6 +5,7 @@ real one.
 import json
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -93,6 +94,41 @@ def test_what_is_done_is_not_done_again(photos: Path) -> None:
     assert calls(photos) == ["matches 9", "mapping"]
     assert process(photos, "--matching", "sequential", "--overlap", "1", "--lens", "opencv") == 0
     assert calls(photos)[0].startswith("features OPENCV 1600 0.png 1.png")
+
+
+def test_copies_and_derived_pictures_are_left_out_and_named(
+    photos: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for k in range(5):
+        source = photos / f"{k}.png"
+        shutil.copy(source, photos / f"{k} (1).png")
+        for inner in ("@eaDir", "images_2", "depth"):
+            (photos / inner).mkdir(exist_ok=True)
+            pixels = cv2.resize(cv2.imread(str(source)), (12, 8), interpolation=cv2.INTER_AREA)
+            assert cv2.imwrite(str(photos / inner / f"{k}.png"), pixels)
+    assert cv2.imwrite(str(photos / "3 copy.bmp"), cv2.imread(str(photos / "3.png")))
+    assert process(photos) == 0
+    scene = parse_scene(photos.parent / "scene", 1, None)
+    assert [path.name for path in scene.paths] == [f"{k}.png" for k in range(5)]
+    assert sorted(path.name for path in (photos.parent / "scene/images").iterdir()) == [
+        f"{k}.png" for k in range(5)
+    ]
+    said = [line for line in capsys.readouterr().err.splitlines() if "left out" in line]
+    assert len(said) == 4
+    for line, counted, example in zip(
+        said, (5, 5, 5, 6), ("@eaDir/0.png", "depth/0.png", "images_2/0.png", "0 (1).png"), strict=True
+    ):
+        assert f"left out: {counted} " in line and example in line
+    assert process(photos) == 0 and report(photos)["images"] == {"given": 5, "used": 5, "posed": 5}
+
+
+def test_nothing_but_thumbnails_is_told(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    photos.rename(photos.parent / "thumbs")
+    photos.mkdir()
+    (photos.parent / "thumbs").rename(photos / "thumbs")
+    assert process(photos) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "left out: 5 thumbnails, like thumbs/0.png" in error
 
 
 @pytest.mark.parametrize("step", ["features", "matches", "mapping"])

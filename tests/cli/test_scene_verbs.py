@@ -181,6 +181,7 @@ def test_style_files_are_styles_of_the_page(run: Path, world: World) -> None:
 KEYS = {
     "method", "scene", "split", "psnr", "cc_psnr", "ssim", "lpips", "views", "render_seconds", "seconds_per_view",
     "rays_per_second", "kept_samples_share", "peak_rss_mib", "train_seconds", "train_steps", "consistency", "per_view",
+    "used_share",
 }  # fmt: skip
 
 

@@ -168,14 +168,17 @@ def test_models_are_found_in_three_places_and_need_no_points(tmp_path: Path) -> 
     assert model_folders(tmp_path) == []
 
 
-def test_reduced_images_must_be_named(tmp_path: Path) -> None:
+def test_reduced_images_scale_the_cameras_of_a_model(tmp_path: Path) -> None:
     write_colmap(tmp_path, Capture.make(2, size=(12, 8)), images="images_2")
     path = tmp_path / "sparse" / "0" / "cameras.bin"
     path.write_bytes(struct.pack("<QIiQQ4d", 1, 7, 1, 24, 16, 20.0, 20.0, 12.0, 8.0))
-    cameras = parse(tmp_path, ColmapConfig(images="images_2")).cameras
-    assert cameras.size[0].tolist() == [12, 8] and cameras.focal[0].tolist() == [10.0, 10.0]
+    for config in (ColmapConfig(images="images_2"), ColmapConfig()):
+        cameras = parse(tmp_path, config).cameras
+        assert cameras.size[0].tolist() == [12, 8] and cameras.focal[0].tolist() == [10.0, 10.0]
     (tmp_path / "images_2").rename(tmp_path / "images")
-    with pytest.raises(DataError, match="12x8 pixels, but its camera has 24x16"):
+    assert parse(tmp_path).cameras.focal[1].tolist() == [10.0, 10.0]
+    write_image(tmp_path / "images" / "0001.png", (24, 16))
+    with pytest.raises(DataError, match=r"0000\.png: 12x8 pixels, but its camera has 24x16"):
         parse(tmp_path)
 
 
@@ -322,7 +325,7 @@ def test_what_transforms_leave_out_follows_from_the_image(tmp_path: Path) -> Non
 def test_blender_s_two_files(tmp_path: Path) -> None:
     for part, count in (("train", 4), ("test", 2)):
         for k in range(count):
-            write_image(tmp_path / part / f"r_{k}.png", (10, 10), channels=4, seed=k)
+            write_image(tmp_path / part / f"r_{k}.png", (10, 10), channels=4, seed=count + 10 * k)
         frames = [
             {"file_path": f"./{part}/r_{k}", "transform_matrix": np.eye(4).tolist()} for k in range(count)
         ]

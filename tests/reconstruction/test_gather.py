@@ -151,9 +151,12 @@ def test_heic_becomes_jpeg_with_its_lens_or_says_what_is_missing(
         ):
             gathered(source, SceneFolder(tmp_path / "without"))
     pytest.importorskip("pillow_heif")
+    for k in (1, 2):
+        (source / f"IMG {k}.HEIC").unlink()
+        photo(source / f"{k}.png", k)
     place = SceneFolder(tmp_path / "scene")
     state = gathered(source, place)
-    assert names(place) == list(state.images) == [f"IMG_{k}.HEIC.jpg" for k in range(3)]
+    assert names(place) == list(state.images) == ["1.png", "2.png", "IMG_0.HEIC.jpg"]
     told = state.images["IMG_0.HEIC.jpg"]
     assert (told["width"], told["height"], told["lens"]) == (48, 64, ["Phone 9", 0.0, 0])
     jpeg = place.images / "IMG_0.HEIC.jpg"
@@ -163,11 +166,12 @@ def test_heic_becomes_jpeg_with_its_lens_or_says_what_is_missing(
 
 def test_what_colmap_does_not_read_becomes_jpeg_whatever_it_is_called(tmp_path: Path) -> None:
     source = tmp_path / "in"
-    image = Image.fromarray(cv2.resize(NOISE, (48, 32), interpolation=cv2.INTER_CUBIC))
+    smooth = cv2.resize(NOISE, (48, 32), interpolation=cv2.INTER_CUBIC)
     source.mkdir()
     foreign = {"a.webp": "WEBP", "b.JPG": "WEBP", "c.avif": "AVIF", "d.png": "AVIF"}
     kinds = foreign | {"e.webp": "JPEG", "f.jpg": "PNG", "g.tif": "TIFF"}
-    for name, form in kinds.items():
+    for k, (name, form) in enumerate(kinds.items()):
+        image = Image.fromarray(np.roll(smooth, 8 * k, 1))
         (source / name).write_bytes(oriented(image, form, 6))
     place = SceneFolder(tmp_path / "scene")
     state = gathered(source, place)
@@ -216,7 +220,7 @@ def test_images_may_lie_in_the_scene_already(tmp_path: Path) -> None:
     copied = gathered(tmp_path / "photos", SceneFolder(tmp_path / "copy"))
     assert list(copied.images) == ["_0.png", "_1.png", "_2.png"], "# begins a comment in lists of pairs"
     for name in ("a b.png", "#1.png"):
-        photo(place.images / name)
+        photo(place.images / name, 7)
         with pytest.raises(UsageError, match="no blanks or leading #"):
             gathered(place.images, place)
         (place.images / name).unlink()

@@ -22,13 +22,11 @@ import os
 import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import torch
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, text_format
 from google.protobuf.message import DecodeError, Message
 from numpy.typing import NDArray
@@ -39,8 +37,9 @@ from ...io.atomic import atomic_path, write_json
 from ...rendering.lens import OPENCV
 from ..images import opened
 from ..scene import ParsedScene
+from .assembly import CaptureContents, assemble_scene, split_by
 from .config import BlockNerfConfig, is_record
-from .views import View, assemble_scene, read_views, rigid_pose, split_by
+from .views import View, read_views, rigid_pose
 
 
 @functools.cache
@@ -78,7 +77,7 @@ def masked(checksum: int) -> int:
 
 
 LONGEST = 1 << 30
-"""Bytes that one record may claim."""
+"""Bytes that one record may claim: by eye, ten times what the largest have."""
 _SCHEMA = """
 name: "example.proto" package: "fprf" syntax: "proto3"
 message_type { name: "bytes" field { name: "value" number: 1 label: LABEL_REPEATED type: TYPE_BYTES } }
@@ -193,8 +192,8 @@ def _message_class() -> type[Message]:
     return message
 
 
-_LATTICE = 24
-"""Rays along each side that are looked at."""
+_LATTICE_RAYS = 24
+"""Rays along each side of an image that a camera is fitted to: by eye."""
 
 
 class RayCamera(NamedTuple):
@@ -216,8 +215,8 @@ def fit_camera(origin: NDArray[np.float32], direction: NDArray[np.float32]) -> R
     """
     # Unit directions of a lattice of the rays, and their pixels.
     height, width = origin.shape[:2]
-    lines = np.unique(np.linspace(0, height - 1, min(_LATTICE, height)).round().astype(np.int64))
-    columns = np.unique(np.linspace(0, width - 1, min(_LATTICE, width)).round().astype(np.int64))
+    lines = np.unique(np.linspace(0, height - 1, min(_LATTICE_RAYS, height)).round().astype(np.int64))
+    columns = np.unique(np.linspace(0, width - 1, min(_LATTICE_RAYS, width)).round().astype(np.int64))
     grid = np.stack(np.meshgrid(columns, lines), -1).reshape(-1, 2)
     ray = direction[grid[:, 1], grid[:, 0]].astype(np.float64)
     long = np.linalg.norm(ray, axis=1, keepdims=True)
@@ -258,7 +257,8 @@ def fit_camera(origin: NDArray[np.float32], direction: NDArray[np.float32]) -> R
     )
 
 
-_FORMAT = 1
+_VIEWS_FORMAT = 1
+"""Number of the form of views.json: raise it when the same files give other entries."""
 
 
 class BlockNerfParser(DataParser):
@@ -287,7 +287,7 @@ class BlockNerfParser(DataParser):
             for file in files:
                 held = re.search("val|test", str(file.relative_to(data)).lower()) is not None
                 entries += [_entry(example, folder, held) for example in read_examples(file)]
-            write_json(folder / "views.json", {"format": _FORMAT, "views": entries})
+            write_json(folder / "views.json", {"format": _VIEWS_FORMAT, "views": entries})
         # Of the cameras that are asked for, if they are cameras.
         chosen = []
         for e in entries:
@@ -307,10 +307,8 @@ class BlockNerfParser(DataParser):
             )
         views, kept, notes = read_views(data, chosen, lambda entry: _view(folder, entry))
         split = split_by([entry["held"] for entry in kept])
-        scene = assemble_scene(data, views, downscale=downscale, split=split, notes=notes)
-        return replace(
-            scene, exposure=torch.tensor([entry["exposure"] for entry in kept], dtype=torch.float64)
-        )
+        contents = CaptureContents(views=views, split=split, notes=notes)
+        return assemble_scene(data, contents, downscale=downscale)
 
 
 def _unpacked(folder: Path) -> list[dict[str, Any]]:
@@ -318,7 +316,7 @@ def _unpacked(folder: Path) -> list[dict[str, Any]]:
     try:
         document = json.loads((folder / "views.json").read_text())
         entries: list[dict[str, Any]] = document["views"]
-        complete = document["format"] == _FORMAT and all(
+        complete = document["format"] == _VIEWS_FORMAT and all(
             (folder / "images" / f"{e['name']}.png").is_file() for e in entries
         )
     except (OSError, ValueError, KeyError, TypeError):
@@ -372,4 +370,5 @@ def _view(folder: Path, entry: dict[str, Any]) -> View:
         centre=tuple(entry["centre"]),
         distortion=tuple(entry["distortion"]),
         lens=OPENCV,
+        exposure=entry["exposure"],
     )

@@ -16,6 +16,7 @@ import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -25,18 +26,10 @@ from ...errors import DataError
 from ...interfaces import DataParser
 from ...rendering.splines import rotations
 from ..scene import ParsedScene
+from .assembly import CaptureContents, assemble_scene, index_tensor
 from .config import ColmapConfig, model_folders
-from .files import NamedFiles, path_inside, read_bytes, read_float, read_npz, read_ply_points
-from .views import (
-    View,
-    assemble_scene,
-    index_tensor,
-    lens_of,
-    pixel_size,
-    quaternion_rotation,
-    read_views,
-    rigid_pose,
-)
+from .files import NamedFiles, image_folder, path_inside, read_bytes, read_float, read_npz, read_ply_points
+from .views import View, lens_of, pixel_size, quaternion_rotation, read_views, rigid_pose
 
 MODELS = (
     ("SIMPLE_PINHOLE", "f cx cy"),
@@ -159,17 +152,18 @@ class _Bytes:
 
 
 _COUNT = struct.Struct("<Q")
-_CAMERA = struct.Struct("<IiQQ")
-_IMAGE = struct.Struct("<I7dI")
-_POINT = struct.Struct("<Q3d3Bd")
+_CAMERA_LAYOUT = struct.Struct("<IiQQ")
+_IMAGE_LAYOUT = struct.Struct("<I7dI")
+_POINT_LAYOUT = struct.Struct("<Q3d3Bd")
+# A feature's place in pixels, and the id of its point, -1 for none.
 _FEATURE = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 
 
 def _cameras_bin(path: Path) -> Iterator[tuple[str, int, ColmapCamera]]:
     file = _Bytes(path)
-    for _ in range(file.count(_CAMERA.size, "cameras")):
+    for _ in range(file.count(_CAMERA_LAYOUT.size, "cameras")):
         # Models are numbers in these files, and their count of parameters follows from them.
-        id_, model, width, height = file.take(_CAMERA, "a camera")
+        id_, model, width, height = file.take(_CAMERA_LAYOUT, "a camera")
         if not 0 <= model < len(MODELS):
             raise file.error(
                 f"camera model {model} is unknown, 0 to {len(MODELS) - 1} are known; {_undistort(path.parent)}"
@@ -182,8 +176,8 @@ def _cameras_bin(path: Path) -> Iterator[tuple[str, int, ColmapCamera]]:
 
 def _images_bin(path: Path) -> Iterator[ColmapImage]:
     file = _Bytes(path)
-    for _ in range(file.count(_IMAGE.size + 1 + _COUNT.size, "images")):
-        _, qw, qx, qy, qz, tx, ty, tz, camera = file.take(_IMAGE, "an image")
+    for _ in range(file.count(_IMAGE_LAYOUT.size + 1 + _COUNT.size, "images")):
+        _, qw, qx, qy, qz, tx, ty, tz, camera = file.take(_IMAGE_LAYOUT, "an image")
         # A name that ends with a zero byte, then the features, of which the points are kept.
         stop = file.data.find(b"\0", file.at)
         if stop < 0:
@@ -204,8 +198,8 @@ def _images_bin(path: Path) -> Iterator[ColmapImage]:
 
 def _points_bin(path: Path) -> Iterator[tuple[int, tuple[float, ...]]]:
     file = _Bytes(path)
-    for _ in range(file.count(_POINT.size + _COUNT.size, "points")):
-        id_, *xyz, _, _, _, _ = file.take(_POINT, "a point")
+    for _ in range(file.count(_POINT_LAYOUT.size + _COUNT.size, "points")):
+        id_, *xyz, _, _, _, _ = file.take(_POINT_LAYOUT, "a point")
         track = file.count(8, "track elements")
         file.at += 8 * track
         yield min(int(id_), np.iinfo(np.int64).max), tuple(xyz)
@@ -293,8 +287,12 @@ def _points_txt(path: Path) -> Iterator[tuple[int, tuple[float, ...]]]:
         yield _ints(path, place, words[:1])[0], _floats(path, place, words[1:4])
 
 
-_APART = 1e-3
-"""Share of the cameras' extent by which the two sets of camera centres may differ."""
+_MAX_CENTRE_OFFSET = 1e-3
+"""Share of the cameras' extent by which the two sets of camera centres may differ: text of four digits (by eye)."""
+_MIN_DEPTHS = 8
+"""Points that an image observes below which percentiles of their depths say nothing: by eye."""
+_DEPTH_PERCENTILES = (0.1, 99.9)
+"""LLFF's bounds of depths, in percent."""
 
 Cloud = tuple[NDArray[np.float64], NDArray[np.int64] | None]
 """Finite points [P 3], and pairs [O 2] where known."""
@@ -367,7 +365,7 @@ def cloud_of_model(
         with np.errstate(over="ignore", invalid="ignore"):
             centres = -np.einsum("vji,vj->vi", turn, offset) @ move[:, :3].T + move[:, 3]
             points = model.points @ move[:, :3].T + move[:, 3]
-        if np.abs(centres - here).max() <= _APART * extent:
+        if np.abs(centres - here).max() <= _MAX_CENTRE_OFFSET * extent:
             return *cloud_of_images(replace(model, points=points), observed_points(model, ordered)), []
     return None, None, []
 
@@ -416,6 +414,22 @@ def largest_model(data: Path) -> tuple[Path | None, list[str]]:
     return largest, [f"of the models {told} that of the most images is read: {largest.relative_to(data)}"]
 
 
+class _PosedImage(NamedTuple):
+    """An image of a model and its file."""
+
+    name: str
+    """Path inside the image folder, as a view's."""
+    path: Path
+    image: ColmapImage
+    rows: NDArray[np.int64]
+    """Rows of the model's points that it observes."""
+
+    @property
+    def file_name(self) -> str:
+        """Name without folders, as the model has it."""
+        return PurePosixPath(self.image.name).name
+
+
 class ColmapParser(DataParser):
     """A sparse model and the folder of its images."""
 
@@ -437,85 +451,95 @@ class ColmapParser(DataParser):
         model = read_model(folder)
         if not model.images:
             raise DataError(f"{folder}: the model has no images; run COLMAP's mapper again")
-        name, root = path_inside(data, "parser.images", self.config.images)
-        files = NamedFiles(root)
-        named = [
-            (*files.find(f"{folder}: image {image.name!r}", image.name), image, rows)
-            for image, rows in zip(model.images, observed_points(model, model.images), strict=True)
-            if roles is None or PurePosixPath(image.name).name in roles
-        ]
-        if not named:
-            raise DataError(
-                f"{folder}: the model has none of the images that are asked for; are they another scene's?"
-            )
-
-        def view(each: tuple[str, Path, ColmapImage, NDArray[np.int64]]) -> View:
-            inner, path, image, rows = each
-            where = f"{folder}: image {image.name!r}"
-            camera = model.cameras.get(image.camera)
-            if camera is None:
-                raise DataError(
-                    f"{where}: its camera {image.camera} is not in the model; export the model again"
-                )
-            # World to camera in OpenCV's axes becomes camera to world in OpenGL's: y and z turn round.
-            back = quaternion_rotation(where, image.quaternion).T
-            # A damaged translation may overflow; `rigid_pose` leaves out what is not finite.
-            with np.errstate(over="ignore", invalid="ignore"):
-                centre = -back @ np.array(image.translation)
-            pose = rigid_pose(where, np.stack([back[:, 0], -back[:, 1], -back[:, 2], centre], 1))
-            own = f"{folder}: camera {image.camera}"
-            size = pixel_size(own, camera.width, camera.height)
-            # Parameters by name; what is left after those that every lens has are terms that few have.
-            given = dict(zip(dict(MODELS)[camera.model].split(), camera.params, strict=True))
-            focal = given.pop("f", 0.0)
-            k = []
-            for key in ("k1", "k2", "k3", "k4", "p1", "p2"):
-                k.append(given.pop(key, 0.0))
-            fx = given.pop("fx", focal)
-            fy = given.pop("fy", focal)
-            cx = given.pop("cx", 0.0)
-            cy = given.pop("cy", 0.0)
-            distortion, lens = lens_of(
-                own, camera.model, k, list(given.values()), _undistort(folder, str(root))
-            )
-            return View(
-                name=inner,
-                path=path,
-                pose=pose,
-                size=size,
-                focal=(fx, fy),
-                centre=(cx, cy),
-                distortion=distortion,
-                lens=lens,
-                depths=_depths(model.points[rows], pose),
-            )
-
+        root, said = image_folder(path_inside(data, "parser.images", self.config.images)[1])
+        posed = _posed_images(folder, model, root, roles)
+        undistort = _undistort(folder, str(root))
+        views, kept, lost = read_views(data, posed, lambda each: _view(folder, model, each, undistort))
         # The points, and which of the views that are left see them.
-        views, kept, lost = read_views(data, sorted(named, key=lambda each: each[0]), view)
-        points, seen = cloud_of_images(model, [rows for _, _, _, rows in kept])
-        notes += lost
+        points, seen = cloud_of_images(model, [each.rows for each in kept])
+        beside: list[str] = []
         if not len(points):
-            # 3DGS keeps the points of a model, or those that it was begun with, beside it.
-            beside = (folder / "points3D.ply", folder / "input.ply", data / "input.ply")
-            file = next((path for path in beside if path.is_file()), None)
-            if file is not None:
-                extra, said = read_ply_points(file)
-                points = points if extra is None else extra
-                notes = notes + said
+            extra, beside = _points_beside(data, folder)
+            points = points if extra is None else extra
         split = None
         if roles is not None:
-            learned = [roles[PurePosixPath(image.name).name] == "train" for _, _, image, _ in kept]
+            learned = [roles[each.file_name] == "train" for each in kept]
             split = index_tensor(learned), index_tensor([not each for each in learned])
-        return assemble_scene(
-            data,
-            views,
-            downscale=downscale,
+        contents = CaptureContents(
+            views=views,
             split=split,
             points=points,
             seen=seen,
-            reduced=name != "images",
-            notes=notes,
+            reduced=root != data / "images",
+            notes=(*notes, *said, *lost, *beside),
         )
+        return assemble_scene(data, contents, downscale=downscale)
+
+
+def _posed_images(
+    folder: Path, model: ColmapModel, root: Path, roles: Mapping[str, str] | None
+) -> list[_PosedImage]:
+    """The images of a model in the order of their names. Raises DataError where `roles` name none of them."""
+    files = NamedFiles(root)
+    posed = []
+    for image, rows in zip(model.images, observed_points(model, model.images), strict=True):
+        name, path = files.find(f"{folder}: image {image.name!r}", image.name)
+        each = _PosedImage(name, path, image, rows)
+        if roles is None or each.file_name in roles:
+            posed.append(each)
+    if not posed:
+        raise DataError(
+            f"{folder}: the model has none of the images that are asked for; are they another scene's?"
+        )
+    return sorted(posed, key=lambda each: each.name)
+
+
+def _points_beside(data: Path, folder: Path) -> tuple[NDArray[np.float64] | None, list[str]]:
+    """Points of a PLY file: 3DGS keeps those of a model, or those that it was begun with, beside it."""
+    for file in (folder / "points3D.ply", folder / "input.ply", data / "input.ply"):
+        if file.is_file():
+            return read_ply_points(file)
+    return None, []
+
+
+def _view(folder: Path, model: ColmapModel, posed: _PosedImage, undistort: str) -> View:
+    """A view of a model; `undistort` is the remedy for a lens that cannot be represented."""
+    where = f"{folder}: image {posed.image.name!r}"
+    camera = model.cameras.get(posed.image.camera)
+    if camera is None:
+        raise DataError(
+            f"{where}: its camera {posed.image.camera} is not in the model; export the model again"
+        )
+    # World to camera in OpenCV's axes becomes camera to world in OpenGL's: y and z turn round.
+    back = quaternion_rotation(where, posed.image.quaternion).T
+    # A damaged translation may overflow; `rigid_pose` leaves out what is not finite.
+    with np.errstate(over="ignore", invalid="ignore"):
+        centre = -back @ np.array(posed.image.translation)
+    pose = rigid_pose(where, np.stack([back[:, 0], -back[:, 1], -back[:, 2], centre], 1))
+    own = f"{folder}: camera {posed.image.camera}"
+    size = pixel_size(own, camera.width, camera.height)
+    # Parameters by name; what is left after those that every lens has are terms that few have.
+    given = dict(zip(dict(MODELS)[camera.model].split(), camera.params, strict=True))
+    focal = given.pop("f", 0.0)
+    k = []
+    for key in ("k1", "k2", "k3", "k4", "p1", "p2"):
+        k.append(given.pop(key, 0.0))
+    fx = given.pop("fx", focal)
+    fy = given.pop("fy", focal)
+    cx = given.pop("cx", 0.0)
+    cy = given.pop("cy", 0.0)
+    distortion, lens = lens_of(own, camera.model, k, list(given.values()), undistort)
+    return View(
+        name=posed.name,
+        path=posed.path,
+        pose=pose,
+        size=size,
+        focal=(fx, fy),
+        centre=(cx, cy),
+        distortion=distortion,
+        lens=lens,
+        depths=_depths(model.points[posed.rows], pose),
+    )
 
 
 def _depths(points: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[float, float] | None:
@@ -526,8 +550,7 @@ def _depths(points: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[flo
     with np.errstate(over="ignore", invalid="ignore"):
         depth = (points - pose[:, 3]) @ -pose[:, 2]
     depth = depth[np.isfinite(depth) & (depth > 0)]
-    if len(depth) >= 8:
-        near, far = np.percentile(depth, (0.1, 99.9))
-    else:
-        near, far = (0.0, 0.0)
+    if len(depth) < _MIN_DEPTHS:
+        return None
+    near, far = np.percentile(depth, _DEPTH_PERCENTILES)
     return (float(near), float(far)) if 0 < near < far else None

@@ -5,11 +5,11 @@ Whatever the bytes, the outcome is a value or a DataError of one line; nothing i
 alone. Links inside the folder are followed: only what a file *says* must stay inside.
 """
 
+import glob
 import io
 import math
 import os
 import re
-import unicodedata
 import zipfile
 import zlib
 from dataclasses import dataclass
@@ -22,13 +22,19 @@ from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...io.strict_json import parse_json
+from ..images import IMAGE_SUFFIXES
+from ..picture_names import spelling
 
 Json: TypeAlias = "dict[str, Json] | list[Json] | str | int | float | bool | None"
 
 _MAX_ARRAY = 1 << 32
-"""Bytes that an array inside an archive may unpack to."""
-_RATIO = 1032
-"""Times its size that deflated data may unpack to at most."""
+"""Bytes that an array inside an archive may unpack to: by eye, as many as a machine of today holds."""
+_MAX_DEFLATE_RATIO = 1032
+"""Times its size that deflated data may unpack to: the format's limit."""
+_MAX_NUMBER = 1e300
+"""Numbers of JSON beyond it are refused: their products would overflow."""
+_MAX_SHOWN = 60
+"""Characters of a wrong value that a message repeats: by eye."""
 
 
 def read_bytes(path: Path) -> bytes:
@@ -104,13 +110,45 @@ def path_inside(root: Path, where: str, text: str) -> tuple[str, Path]:
     raise DataError(f"{where}: the path {text!r} leaves {root}; give paths inside, like images/0001.png")
 
 
+def reduced_copies(folder: Path) -> Path | None:
+    """The folder of the copies of a folder's images that are reduced least, such as images_2; None where there is
+    none with images in it.
+    """
+    pattern = re.compile(re.escape(folder.name) + "_([0-9]{1,4})")
+    factors: dict[int, Path] = {}
+    for path in folder.parent.glob(f"{glob.escape(folder.name)}_*"):
+        match = pattern.fullmatch(path.name)
+        if match and holds_images(path):
+            factors[int(match[1])] = path
+    return factors[min(factors)] if factors else None
+
+
+def holds_images(folder: Path) -> bool:
+    """True for a folder with an image in it or below."""
+    return any(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.rglob("*"))
+
+
+def image_folder(folder: Path) -> tuple[Path, list[str]]:
+    """A folder of images, and no note; where it is not there or holds none, the copies that are reduced least, and
+    a note that says so.
+    """
+    copies = None if holds_images(folder) else reduced_copies(folder)
+    if copies is None:
+        return folder, []
+    return copies, [f"{folder} is not there: {copies} is read"]
+
+
 class NamedFiles:
     """Files inside a folder by the names that a capture gives them, which other systems may have spelt
-    another way.
+    another way, or whose folder may be there as reduced copies alone (images_4).
     """
 
     def __init__(self, root: Path) -> None:
         self.root = root
+        self.notes: list[str] = []
+        """A line for each folder that is read instead of another."""
+        self._factors: dict[Path, int] = {}
+        self._folders: dict[Path, Path] = {}
         self._listed: dict[Path, dict[str, str]] = {}
 
     def find(self, where: str, text: str, suffixes: frozenset[str] = frozenset()) -> tuple[str, Path]:
@@ -121,35 +159,53 @@ class NamedFiles:
         name, path = path_inside(self.root, where, text)
         if os.path.lexists(path):
             return name, path
-        # A folder is listed once: its files by their spelling, and by that without a suffix.
-        if path.parent not in self._listed:
-            listed: dict[str, str] = {}
-            if path.parent.is_dir():
-                names = os.listdir(path.parent)
-            else:
-                names = []
-            for entry in sorted(
-                names, key=lambda entry: (not entry.lower().endswith(".png"), entry)
-            ):  # PNG before JPEG
-                whole = _spelling(entry)
-                suffix = os.path.splitext(entry)[1]
-                # Two files of one spelling are told apart by nothing: neither is found.
-                listed[whole] = "" if whole in listed else entry
-                if suffix.lower() in suffixes:
-                    listed.setdefault(_spelling(entry[: -len(suffix)]), entry)
-            self._listed[path.parent] = listed
-        found = self._listed[path.parent].get(_spelling(path.name))
+        if path.parent not in self._folders:
+            self._folders[path.parent] = self._folder(path.parent)
+        folder = self._folders[path.parent]
+        if folder not in self._listed:
+            self._listed[folder] = _names_in(folder)
+        listed = self._listed[folder]
+        found = listed.get(spelling(path.name))
+        if found is None and folder != path.parent:  # copies may be of another format
+            found = listed.get(spelling(path.stem))
+            return name, path if not found else folder / found
         if not found:
             return name, path
-        if _spelling(found) != _spelling(path.name):
+        missing = ""
+        if spelling(found) != spelling(path.name):
             missing = os.path.splitext(found)[1]
-        else:
-            missing = ""
-        return name + missing, path.with_name(found)
+            if missing.lower() not in suffixes:
+                return name, path
+        return name + missing, folder / found
+
+    def _folder(self, folder: Path) -> Path:
+        """The folder, or where it or one above is not there, what is below its reduced copies."""
+        current = self.root
+        for part in folder.relative_to(self.root).parts:
+            wanted = current / part
+            current, said = image_folder(wanted)
+            self.notes += said
+            if current != wanted:
+                self._factors[current] = int(current.name.rpartition("_")[2])
+        return current
+
+    def factor(self, path: Path) -> int:
+        """How many times smaller the copy is that is read instead of an image; 1 for an image itself."""
+        return next((self._factors[folder] for folder in path.parents if folder in self._factors), 1)
 
 
-def _spelling(name: str) -> str:
-    return unicodedata.normalize("NFC", name).casefold().strip()
+def _names_in(folder: Path) -> dict[str, str]:
+    """The files of a folder by their spelling, and images by that without the suffix."""
+    listed: dict[str, str] = {}
+    names = os.listdir(folder) if folder.is_dir() else []
+    for entry in sorted(names, key=lambda name: (not name.lower().endswith(".png"), name)):  # PNG before JPEG
+        whole = spelling(entry)
+        suffix = os.path.splitext(entry)[1]
+        # Two files of one spelling are told apart by nothing: neither is found.
+        listed[whole] = "" if whole in listed else entry
+        if suffix.lower() in IMAGE_SUFFIXES:
+            listed.setdefault(spelling(entry[: -len(suffix)]), entry)
+    return listed
 
 
 def read_ply_points(path: Path) -> tuple[NDArray[np.float64] | None, list[str]]:
@@ -217,7 +273,7 @@ def read_npz(path: Path, key: str) -> NDArray[np.float64]:
                 )
             # What is claimed is allocated before it is read.
             held = path.stat().st_size
-            if entry.compress_size > held or entry.file_size > _RATIO * held:
+            if entry.compress_size > held or entry.file_size > _MAX_DEFLATE_RATIO * held:
                 raise DataError(
                     f"{path}: {key} claims {entry.file_size} bytes, but the file has {held}; copy it again"
                 )
@@ -337,7 +393,7 @@ def _number(value: Json) -> float | None:
     """A number of JSON as float64, finite or not; None for anything else, and beyond 1e300, where products
     overflow.
     """
-    if isinstance(value, bool) or not isinstance(value, int | float) or 1e300 < abs(value) < math.inf:
+    if isinstance(value, bool) or not isinstance(value, int | float) or _MAX_NUMBER < abs(value) < math.inf:
         return None
     return float(value)
 
@@ -368,4 +424,4 @@ def _short(value: Json) -> str:
         text = "a list"
     else:
         text = "an object"
-    return text if len(text) <= 60 else text[:57] + "..."
+    return text if len(text) <= _MAX_SHOWN else text[: _MAX_SHOWN - 3] + "..."

@@ -15,10 +15,14 @@ from ...errors import DataError
 from ...interfaces import DataParser
 from ..images import IMAGE_SUFFIXES
 from ..scene import ParsedScene
-from .views import View, assemble_scene, read_views, rigid_pose, split_by, stated_size
+from .assembly import CaptureContents, assemble_scene, split_by
+from .files import image_folder
+from .views import View, read_views, rigid_pose, stated_size
 
-_LARGEST = 1 << 24
-"""Bytes of a file of metadata."""
+_MAX_METADATA_BYTES = 1 << 24
+"""Bytes of a file of metadata, which takes a few thousand: by eye."""
+_MAX_UNIT = 1e9
+"""Metres of a unit of the poses that are believed: by eye."""
 
 
 class MegaNerfParser(DataParser):
@@ -28,40 +32,49 @@ class MegaNerfParser(DataParser):
         """The scene at 1/downscale of the delivered size; `val` is held out. Lengths are metres where the
         capture says.
         """
-        # Metres of a unit of the poses; 1 where nothing is said.
-        unit = 1.0
-        path = data / "coordinates.pt"
-        if path.is_file():
-            try:
-                unit = float(_load(path).get("pose_scale_factor", 1.0))
-            except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-                raise DataError(
-                    f"{path}: pose_scale_factor is no number ({_first_line(error)}); write it again"
-                ) from error
-            if not 0 < unit < 1e9:
-                raise DataError(f"{path}: pose_scale_factor is {unit}; it must be above 0: write it again")
+        unit = _metres(data)
         # Both parts in one order by name.
-        files: list[tuple[Path, str]] = []
-        for split in ("train", "val"):
-            folder = data / split / "metadata"
-            files += [(file, split) for file in folder.glob("[!.]*.pt")]
+        files: list[tuple[Path, Path]] = []
+        said: list[str] = []
+        for part in ("train", "val"):
+            folder = data / part / "metadata"
+            images, notes = image_folder(data / part / "rgbs")
+            files += [(file, images) for file in folder.glob("[!.]*.pt")]
+            said += notes
             if not files:
                 raise DataError(
                     f"{folder}: no *.pt files; name the folder of a scene, with train/metadata and train/rgbs in it"
                 )
         files.sort(key=lambda each: each[0].stem)
-        views, kept, notes = read_views(
-            data, files, lambda each: _view(each[0], data / each[1] / "rgbs", unit)
-        )
-        parts = split_by([split == "val" for _, split in kept])
-        return assemble_scene(data, views, downscale=downscale, split=parts, reduced=True, notes=notes)
+        views, kept, lost = read_views(data, files, lambda each: _view(*each, unit))
+        split = split_by([file.parents[1].name == "val" for file, _ in kept])
+        contents = CaptureContents(views=views, split=split, reduced=True, notes=(*said, *lost))
+        return assemble_scene(data, contents, downscale=downscale)
+
+
+def _metres(data: Path) -> float:
+    """Metres of a unit of the poses; 1 where nothing is said."""
+    path = data / "coordinates.pt"
+    if not path.is_file():
+        return 1.0
+    try:
+        unit = float(_load(path).get("pose_scale_factor", 1.0))
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise DataError(
+            f"{path}: pose_scale_factor is no number ({_first_line(error)}); write it again"
+        ) from error
+    if not 0 < unit < _MAX_UNIT:
+        raise DataError(f"{path}: pose_scale_factor is {unit}; it must be above 0: write it again")
+    return unit
 
 
 def _load(path: Path) -> dict[str, Any]:
     """Tensors and numbers by name; nothing else is let in."""
     # Unpickling may take many times the memory of its file.
-    if path.is_file() and path.stat().st_size > _LARGEST:
-        raise DataError(f"{path}: larger than {_LARGEST} bytes, so no metadata of one image; copy it again")
+    if path.is_file() and path.stat().st_size > _MAX_METADATA_BYTES:
+        raise DataError(
+            f"{path}: larger than {_MAX_METADATA_BYTES} bytes, so no metadata of one image; copy it again"
+        )
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # the unpickler raises whatever the bytes lead it to

@@ -19,16 +19,18 @@ from numpy.typing import NDArray
 from ...errors import DataError
 from ...interfaces import DataParser
 from ..scene import ParsedScene
+from .assembly import CaptureContents, assemble_scene
 from .config import ODM_FILES, OdmConfig, project_file
-from .files import NamedFiles, Record, as_record, path_inside, read_json
-from .views import View, assemble_scene, image_size, lens_of, read_views, rigid_pose
+from .files import NamedFiles, Record, as_record, image_folder, path_inside, read_json
+from .views import View, image_size, lens_of, read_views, rigid_pose
 
-_LENSES = dict.fromkeys(("perspective", "simple_radial", "radial", "brown"), "OPENCV")
-_LENSES |= {"fisheye": "FISHEYE", "fisheye_opencv": "OPENCV_FISHEYE", "spherical": "EQUIRECTANGULAR"}
-"""COLMAP's names of OpenSfM's."""
-_FLIP = np.array([1.0, -1.0, -1.0])
-_TURN = 1e3
-"""Largest angle of a rotation in radians that is taken for one."""
+_COLMAP_MODELS = dict.fromkeys(("perspective", "simple_radial", "radial", "brown"), "OPENCV")
+_COLMAP_MODELS |= {"fisheye": "FISHEYE", "fisheye_opencv": "OPENCV_FISHEYE", "spherical": "EQUIRECTANGULAR"}
+"""COLMAP's names of OpenSfM's lenses."""
+_OPENCV_TO_OPENGL = np.array([1.0, -1.0, -1.0])
+"""Factors of a camera's axes: y and z turn round."""
+_MAX_ANGLE = 1e3
+"""Radians of a rotation that are taken for one: by eye."""
 
 
 class _Shot(NamedTuple):
@@ -55,26 +57,27 @@ class OdmParser(DataParser):
         if file is None:
             raise DataError(f"{data}: neither {' nor '.join(ODM_FILES)}; give the folder of an ODM project")
         # A whole project brings points; a report has poses alone.
+        points = None
         if file.name == "reconstruction.json":
             shots, points = _reconstruction(file)
         else:
-            shots, points = (_shots(data, file), None)
-        folder = path_inside(data, "parser.images", self.config.images)[1]
+            shots = _shots(data, file)
+        folder, said = image_folder(path_inside(data, "parser.images", self.config.images)[1])
         files = NamedFiles(folder)
         named = sorted(
             ((*files.find(str(file), shot.name), shot) for shot in shots), key=lambda each: each[0]
         )
-        views, _, notes = read_views(data, named, lambda each: _view(str(file), *each))
-        return assemble_scene(data, views, downscale=downscale, points=points, notes=notes)
+        views, _, lost = read_views(data, named, lambda each: _view(str(file), *each))
+        contents = CaptureContents(views=views, points=points, notes=(*said, *lost))
+        return assemble_scene(data, contents, downscale=downscale)
 
 
 def _reconstruction(file: Path) -> tuple[list[_Shot], NDArray[np.float64]]:
     """Shots and points of the largest part."""
     whole = read_json(file)
+    parts = []
     if isinstance(whole, list):
         parts = [as_record(f"{file}: [{k}]", part) for k, part in enumerate(whole)]
-    else:
-        parts = []
     largest = max(parts, key=lambda part: len(_objects(part, "shots")), default=None)
     if largest is None or not _objects(largest, "shots"):
         raise DataError(f"{file}: no list of reconstructions with shots; run ODM again")
@@ -127,19 +130,19 @@ def _view(where: str, name: str, path: Path, shot: _Shot) -> View:
         raise DataError(f"{path}: {width}x{height} pixels is not the shape of its camera; restore the image")
     # The lens, and the focal lengths in pixels: OpenSfM's unit is the longer side.
     kind = camera.text("projection_type") or "perspective"
-    if kind not in _LENSES:
+    if kind not in _COLMAP_MODELS:
         raise DataError(
-            f"{camera.where}: projection_type {kind!r} is not read; known are {', '.join(_LENSES)}"
+            f"{camera.where}: projection_type {kind!r} is not read; known are {', '.join(_COLMAP_MODELS)}"
         )
     k = []
     for key in ("k1", "k2", "k3", "k4", "p1", "p2"):
         k.append(camera.number(key) or 0.0)
-    distortion, lens = lens_of(camera.where, _LENSES[kind], k)
+    distortion, lens = lens_of(camera.where, _COLMAP_MODELS[kind], k)
     fx = camera.number("focal_x") or camera.number("focal")
     fy = camera.number("focal_y") or camera.number("focal")
     if fx is None:
         raise DataError(f"{camera.where}: neither focal nor focal_x; run ODM again")
-    turned = np.concatenate([shot.turn.T * _FLIP, shot.place[:, None]], 1)
+    turned = np.concatenate([shot.turn.T * _OPENCV_TO_OPENGL, shot.place[:, None]], 1)
     return View(
         name=name,
         path=path,
@@ -158,7 +161,7 @@ def _view(where: str, name: str, path: Path, shot: _Shot) -> View:
 
 def _turn(record: Record) -> NDArray[np.float64]:
     vector = record.numbers("rotation", 3)
-    if np.abs(vector).max() > _TURN:
+    if np.abs(vector).max() > _MAX_ANGLE:
         raise DataError(
             f"{record.where}: rotation is {vector.tolist()}, not an axis times an angle; run ODM again"
         )

@@ -16,9 +16,10 @@ from ...errors import DataError
 from ...interfaces import DataParser
 from ..images import IMAGE_SUFFIXES
 from ..scene import ParsedScene
+from .assembly import CaptureContents, assemble_scene
 from .config import keyframes
 from .files import as_record, read_json
-from .views import View, assemble_scene, read_views, rigid_pose, stated_size
+from .views import View, read_views, rigid_pose, stated_size
 
 
 class PolycamParser(DataParser):
@@ -35,15 +36,10 @@ class PolycamParser(DataParser):
         frames: dict[str, tuple[Path, Path]] = {}
         alone: set[str] = set()
         for images, cameras in folders:
-            known = {path.stem for path in cameras.glob("[!.]*.json")}
-            paths = {}
-            for path in images.glob("[!.]*"):
-                if path.suffix.lower() in IMAGE_SUFFIXES:
-                    paths[path.stem] = path
-            frames = {
-                stem: (path, cameras / f"{stem}.json") for stem, path in paths.items() if stem in known
-            } | frames
-            alone |= paths.keys()
+            posed, every = _frames(images, cameras)
+            frames = posed | frames
+            alone |= every
+        alone -= frames.keys()
         if not frames:
             images, cameras = folders[0]
             raise DataError(
@@ -55,11 +51,24 @@ class PolycamParser(DataParser):
             notes.append(
                 f"{corrected} of {len(kept)} frames are in {folders[0][0].name}; the others are taken as recorded"
             )
-        if alone := alone - frames.keys():
+        if alone:
             notes.append(
                 f"{len(alone)} of {len(alone) + len(frames)} images have no camera and are left out, like {min(alone)}"
             )
-        return assemble_scene(data, views, downscale=downscale, notes=notes)
+        return assemble_scene(data, CaptureContents(views=views, notes=notes), downscale=downscale)
+
+
+def _frames(images: Path, cameras: Path) -> tuple[dict[str, tuple[Path, Path]], set[str]]:
+    """Images with their cameras' files by their common stem, and the stems of all images."""
+    known = {path.stem for path in cameras.glob("[!.]*.json")}
+    posed = {}
+    every = set()
+    for path in images.glob("[!.]*"):
+        if path.suffix.lower() in IMAGE_SUFFIXES:
+            every.add(path.stem)
+            if path.stem in known:
+                posed[path.stem] = (path, cameras / f"{path.stem}.json")
+    return posed, every
 
 
 def _view(frame: tuple[Path, Path]) -> View:

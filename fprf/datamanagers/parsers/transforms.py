@@ -22,12 +22,13 @@ from ...errors import DataError
 from ...interfaces import DataParser
 from ..images import IMAGE_SUFFIXES
 from ..scene import ParsedScene
+from .assembly import CaptureContents, assemble_scene, index_tensor
 from .colmap import cloud_of_model, read_cloud
 from .config import TransformsConfig
 from .files import NamedFiles, Record, as_record, path_inside, read_json, read_ply_points
-from .views import UNDISTORT, View, assemble_scene, index_tensor, lens_of, read_views, rigid_pose, stated_size
+from .views import UNDISTORT, View, lens_of, read_views, rigid_pose, stated_size
 
-_LENSES = frozenset(
+_CAMERA_MODELS = frozenset(
     {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "EQUIRECTANGULAR"}
     | {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 )
@@ -45,6 +46,18 @@ class _Entry(NamedTuple):
     """train, test, or nothing: then the file's lists or the rule decide."""
 
 
+def _frames(top: Record, inside: NamedFiles, role: str) -> list[_Entry]:
+    """The frames of one file, with their images."""
+    entries = []
+    for record in top.records("frames"):
+        text = record.text("file_path")
+        if text is None:
+            raise DataError(f"{record.where}: file_path is missing; each frame names its image")
+        name, path = inside.find(record.where, text, IMAGE_SUFFIXES)
+        entries.append(_Entry(record, name, path, role))
+    return entries
+
+
 class TransformsParser(DataParser):
     """One JSON file with all frames, or Blender's pair."""
 
@@ -52,39 +65,36 @@ class TransformsParser(DataParser):
         self.config = config
 
     def parse(self, data: Path, downscale: float) -> ParsedScene:
-        """The scene at 1/downscale of the size that the file's intrinsics belong to."""
-        # The frames of all files, by name.
+        """The scene at 1/downscale of the size of its images."""
         files = self._files(data)
         tops = [as_record(file, read_json(file)) for file, _ in files]
-        entries = []
         inside = NamedFiles(data)
+        entries = []
         for top, (_, role) in zip(tops, files, strict=True):
-            for record in top.records("frames"):
-                text = record.text("file_path")
-                if text is None:
-                    raise DataError(f"{record.where}: file_path is missing; each frame names its image")
-                entries.append(_Entry(record, *inside.find(record.where, text, IMAGE_SUFFIXES), role))
+            entries += _frames(top, inside, role)
         entries.sort(key=lambda entry: entry.name)
         # A frame that is written twice over says nothing new; where the two differ `read_views` refuses them.
-        same = []
-        for k, entry in enumerate(entries):
-            same.append(k > 0 and entries[k - 1].record.own == entry.record.own)
-        once = []
-        for entry, again in zip(entries, same, strict=True):
-            if not again:
+        once: list[_Entry] = []
+        for entry in entries:
+            if not once or once[-1].record.own != entry.record.own:
                 once.append(entry)
         views, kept, notes = read_views(data, once, lambda entry: _view(entry, inside))
-        if any(same):
-            notes.append(f"frames that are written twice are read once: {sum(same)}")
+        if len(once) < len(entries):
+            notes.append(f"frames that are written twice are read once: {len(entries) - len(once)}")
         if tops[0].get("fisheye_crop_radius") is not None:
             notes.append(
                 "fisheye_crop_radius is not applied: leave out what lies outside of the circle with masks/"
             )
         points, seen, said = _cloud(inside, tops[0], once, views)
-        split = _split(inside, tops, once, kept)
-        return assemble_scene(
-            data, views, downscale=downscale, split=split, points=points, seen=seen, notes=notes + said
+        contents = CaptureContents(
+            views=views,
+            split=_split(inside, tops, once, kept),
+            points=points,
+            seen=seen,
+            reduced=bool(inside.notes),
+            notes=(*inside.notes, *notes, *said),
         )
+        return assemble_scene(data, contents, downscale=downscale)
 
     def _files(self, data: Path) -> list[tuple[Path, str]]:
         if self.config.file:
@@ -126,40 +136,42 @@ def _cloud(
     """
     cloud = inside.root / "points.npz"
     ply = top.text("ply_file_path")
+    points = None
+    notes: list[str] = []
     if cloud.is_file():
         points, seen = read_cloud(cloud, len(entries))
-    else:
-        points, seen = (None, None)
-    notes: list[str] = []
-    if seen is not None and len(views) < len(entries):
-        # Pairs count the frames, some of which may be left out.
-        place = {view.name: k for k, view in enumerate(views)}
-        row = np.array([place.get(entry.name, -1) for entry in entries])
-        seen = np.stack([row[seen[:, 0]], seen[:, 1]], 1)
-        seen = seen[seen[:, 0] >= 0]
-    if points is None and ply:
+        if seen is not None:
+            return points, _seen_by(views, entries, seen), []
+    elif ply:
         points, notes = read_ply_points(inside.find(f"{top.where}: ply_file_path", ply)[1])
     # A model also says which views see its points.
-    if seen is not None:
-        return points, seen, notes
     if top.get("applied_transform") is None:
         applied = _APPLIED
     else:
         applied = top.matrix("applied_transform")[:3]
     sparse, seen, said = cloud_of_model(inside.root, views, applied)
     if sparse is None:
-        return (points, None, notes + said)
-    return (sparse, seen, [])
+        return points, None, notes + said
+    return sparse, seen, []
+
+
+def _seen_by(views: list[View], entries: list[_Entry], seen: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Pairs of a view and a point, of pairs that count the frames, some of which may be left out."""
+    place = {view.name: k for k, view in enumerate(views)}
+    row = np.array([place.get(entry.name, -1) for entry in entries])
+    pairs = np.stack([row[seen[:, 0]], seen[:, 1]], 1)
+    return pairs[pairs[:, 0] >= 0]
 
 
 def _view(entry: _Entry, inside: NamedFiles) -> View:
     record = entry.record
-    # Without a size the intrinsics belong to the image as it is, and the principal point is its middle.
-    size = stated_size(record.where, entry.path, record.number("w"), record.number("h"))
+    # Without a size the intrinsics belong to the image as it is named, and the principal point is its middle.
+    factor = inside.factor(entry.path)
+    size = stated_size(record.where, entry.path, record.number("w"), record.number("h"), factor)
     near = record.number("near")
     far = record.number("far")
-    cx = record.number("cx")
-    cy = record.number("cy")
+    cx = _or_half(record.number("cx"), size[0])
+    cy = _or_half(record.number("cy"), size[1])
     distortion, lens = _lens(record)
     return View(
         name=entry.name,
@@ -167,13 +179,17 @@ def _view(entry: _Entry, inside: NamedFiles) -> View:
         pose=rigid_pose(f"{record.where} ({entry.name})", record.matrix("transform_matrix")),
         size=size,
         focal=_focal(record, size),
-        centre=(size[0] / 2 if cx is None else cx, size[1] / 2 if cy is None else cy),
+        centre=(cx, cy),
         distortion=distortion,
         lens=lens,
         depths=None if near is None or far is None else (near, far),
         mask=_named(entry, inside, "mask_path"),
         sky_mask=_named(entry, inside, "sky_mask_path"),
     )
+
+
+def _or_half(value: float | None, pixels: int) -> float:
+    return pixels / 2 if value is None else value
 
 
 def _named(entry: _Entry, inside: NamedFiles, key: str) -> Path | None:
@@ -183,26 +199,28 @@ def _named(entry: _Entry, inside: NamedFiles, key: str) -> Path | None:
 
 
 def _focal(record: Record, size: tuple[int, int]) -> tuple[float, float]:
-    def one(key: str, angle_key: str, pixels: int) -> float | None:
-        focal = record.number(key)
-        angle = record.number(angle_key)
-        if focal is not None or angle is None:
-            return focal
-        if math.isnan(angle):
-            return angle
-        if not 0 < angle < math.pi:
-            raise DataError(f"{record.where}: {angle_key} is {angle}; it must lie between 0 and pi")
-        return pixels / 2 / math.tan(angle / 2)
-
     # Either one serves for both.
-    fx = one("fl_x", "camera_angle_x", size[0])
-    fy = one("fl_y", "camera_angle_y", size[1])
+    fx = _focal_along(record, "fl_x", "camera_angle_x", size[0])
+    fy = _focal_along(record, "fl_y", "camera_angle_y", size[1])
     first = fy if fx is None else fx
     if first is None:
         raise DataError(
             f"{record.where}: neither fl_x nor camera_angle_x; give the focal length in pixels as fl_x"
         )
     return first, first if fy is None else fy
+
+
+def _focal_along(record: Record, key: str, angle_key: str, pixels: int) -> float | None:
+    """Focal length along one side, in pixels, as it is given or by the angle of view; None without either."""
+    focal = record.number(key)
+    angle = record.number(angle_key)
+    if focal is not None or angle is None:
+        return focal
+    if math.isnan(angle):
+        return angle
+    if not 0 < angle < math.pi:
+        raise DataError(f"{record.where}: {angle_key} is {angle}; it must lie between 0 and pi")
+    return pixels / 2 / math.tan(angle / 2)
 
 
 def _lens(record: Record) -> tuple[tuple[float, float, float, float, float, float], int]:
@@ -217,13 +235,10 @@ def _lens(record: Record) -> tuple[tuple[float, float, float, float, float, floa
     others = [record.number(key) or 0.0 for key in ("k5", "k6")]
     model = record.text("camera_model")
     if model is None:
-        if record.get("is_fisheye") is True:
-            model = "OPENCV_FISHEYE"
-        else:
-            model = "OPENCV"
-    if model not in _LENSES:
+        model = "OPENCV_FISHEYE" if record.get("is_fisheye") is True else "OPENCV"
+    if model not in _CAMERA_MODELS:
         raise DataError(
-            f"{record.where}: camera_model {model!r} is none of {', '.join(sorted(_LENSES))}; {UNDISTORT}"
+            f"{record.where}: camera_model {model!r} is none of {', '.join(sorted(_CAMERA_MODELS))}; {UNDISTORT}"
         )
     if model == "FULL_OPENCV":  # whose k4 is a denominator's; nerfstudio's OPENCV has a polynomial of four
         others = [k[3], *others]
@@ -246,29 +261,30 @@ def _split(
         return None
     # What is listed must be there, and on one side.
     names = {entry.name for entry in entries}
-    listed = []
-    for key, texts in (("train_filenames", train), ("test_filenames", test)):
-        members = set()
-        for text in texts or ():
-            members.add(inside.find(f"{top.where}: {key}", text, IMAGE_SUFFIXES)[0])
+    learned = _listed(inside, top, "train_filenames")
+    held = _listed(inside, top, "test_filenames")
+    for key, members in (("train_filenames", learned), ("test_filenames", held)):
         if not members <= names:
             raise DataError(
                 f"{top.where}: {key} has {min(members - names)!r}, which no frame is; remove it there"
             )
-        listed.append(members)
-    both = listed[0] & listed[1]
+    both = learned & held
     if both:
         raise DataError(
             f"{top.where}: {min(both)!r} is in train_filenames and in test_filenames; remove it from one"
         )
     # A side without a list has the rest; where nothing is left for testing, the views for validation serve.
-    learned = names - listed[1] if train is None else listed[0]
-    held = listed[1]
     if test is None:
-        where = top.where
-        key = "val_filenames"
-        val = {
-            inside.find(f"{where}: {key}", text, IMAGE_SUFFIXES)[0] for text in top.texts(key) or ()
-        } - listed[0]
-        held = names - listed[0] - val or val
+        val = _listed(inside, top, "val_filenames") - learned
+        held = names - learned - val or val
+    if train is None:
+        learned = names - _listed(inside, top, "test_filenames")
     return index_tensor([e.name in learned for e in kept]), index_tensor([e.name in held for e in kept])
+
+
+def _listed(inside: NamedFiles, top: Record, key: str) -> set[str]:
+    """Names of the frames in a list of file names; none where there is no list."""
+    members = set()
+    for text in top.texts(key) or ():
+        members.add(inside.find(f"{top.where}: {key}", text, IMAGE_SUFFIXES)[0])
+    return members

@@ -1,10 +1,6 @@
-"""From what a capture says of each view to a `ParsedScene`: exact poses, sizes and images checked against
-files, masks.
+"""What a capture says of each view, checked: poses, sizes, lenses, and that images are there.
 
-`masks/` says what is used (black is left out: people, cars, the capture's own shadow), `sky_masks/` what is
-sky (white). A mask of images/a/0001.jpg is masks/a/0001.jpg.png (as COLMAP has it), masks/a/0001.png or
-masks/a/0001.jpg. Images without one are used whole; a folder in which no mask carries an image's name is
-none.
+`assembly` makes a scene of views.
 """
 
 import math
@@ -17,35 +13,22 @@ from typing import TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from ...errors import DataError
-from ...rendering.cameras import Cameras
 from ...rendering.lens import FISHEYE, OPENCV, PINHOLE
 from ...rendering.splines import rotations
-from ..images import has_transparency, read_header
-from ..scene import ParsedScene
-from .files import name_of
+from ..images import read_header
 
-
-def index_tensor(members: Sequence[bool]) -> Tensor:
-    """The int64 positions of the members."""
-    return torch.tensor([k for k, member in enumerate(members) if member], dtype=torch.int64)
-
-
-def split_by(held: Sequence[bool]) -> tuple[Tensor, Tensor] | None:
-    """Indices (train, test), int64, of views of which some are held out; None where all or none are."""
-    if len({*held}) > 1:
-        return (index_tensor([not each for each in held]), index_tensor(held))
-    return None
-
-
-_LOOSE = 1e-3
+_MAX_SKEW = 1e-3
 """Largest deviation of RᵀR from 1 that counts as rounding and is repaired."""
-_FAR = 1e12
+_MAX_POSITION = 1e12
 """Largest coordinate of a camera: beyond it float64 has no millimetres left."""
-_LOOKED_AT = 4
-"""Images with an alpha channel that are decoded, at most, to see whether it says anything."""
+_MAX_INTRINSIC = 1e9
+"""Largest number of a lens, in pixels: no camera's, and its products stay within float64 (by eye)."""
+_MAX_SIDE = 10**6
+"""Largest side of an image in pixels that is believed: by eye."""
+_MAX_LENGTH_ERROR = 0.1
+"""Deviation from 1 of a quaternion's length that text of two digits may have: by eye."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +50,8 @@ class View:
     mask: Path | None = None
     """File that the capture names; else one beside the image."""
     sky_mask: Path | None = None
+    exposure: float | None = None
+    """Where the capture says it: light is in proportion to it. Above 0."""
 
 
 class UnusableView(DataError):
@@ -99,8 +84,7 @@ def read_views(
     for entry in entries:
         try:
             one = view(entry)
-            numbers = (*one.focal, *one.centre, *one.distortion)
-            if not np.isfinite((*numbers, *(one.depths or ()))).all():
+            if not np.isfinite((*_intrinsics(one), *(one.depths or ()))).all():
                 raise UnusableView(str(one.path))
             if not os.path.isfile(one.path):
                 raise _MissingImage(str(one.path))
@@ -110,18 +94,7 @@ def read_views(
         except _MissingImage as fault:
             missing.append(str(fault))
             continue
-        # What is finite may still be no camera: nothing that would follow from it is worth having.
-        if max(map(abs, numbers)) > 1e9:
-            raise DataError(f"{one.path}: the camera's numbers {numbers} go beyond 1e9; calibrate again")
-        if min(one.focal) <= 0:
-            raise DataError(
-                f"{one.path}: the focal length is {min(one.focal)}, it must be above 0; calibrate again"
-            )
-        if one.depths is not None and not 0 < one.depths[0] < one.depths[1]:
-            raise DataError(
-                f"{one.path}: nearest and farthest depth are {one.depths[0]} and {one.depths[1]}, "
-                "0 < near < far is needed; remove or correct them"
-            )
+        _check_numbers(one)
         if one.name in views:
             raise DataError(f"{data}: the image {one.name} occurs twice; remove one of its cameras")
         views[one.name] = one
@@ -134,13 +107,34 @@ def read_views(
             f"{data}: {len(missing)} of {count} images are missing, the first is {missing[0]}; "
             "copy them there or remove their entries"
         )
+    notes = []
     if lost:
-        notes = [f"{len(lost)} of {count} images are left out, whose camera is not finite: {lost[0]}"]
-    else:
-        notes = []
+        notes.append(f"{len(lost)} of {count} images are left out, whose camera is not finite: {lost[0]}")
     if not views:
         raise DataError(f"{data}: no view is left: {'; '.join(notes)}; run the reconstruction again")
     return list(views.values()), kept, notes
+
+
+def _intrinsics(view: View) -> tuple[float, ...]:
+    return (*view.focal, *view.centre, *view.distortion)
+
+
+def _check_numbers(view: View) -> None:
+    """Raise DataError where finite numbers are no camera's: nothing that would follow from it is worth having."""
+    numbers = _intrinsics(view)
+    if max(map(abs, numbers)) > _MAX_INTRINSIC:
+        raise DataError(
+            f"{view.path}: the camera's numbers {numbers} go beyond {_MAX_INTRINSIC:g}; calibrate again"
+        )
+    if min(view.focal) <= 0:
+        raise DataError(
+            f"{view.path}: the focal length is {min(view.focal)}, it must be above 0; calibrate again"
+        )
+    if view.depths is not None and not 0 < view.depths[0] < view.depths[1]:
+        raise DataError(
+            f"{view.path}: nearest and farthest depth are {view.depths[0]} and {view.depths[1]}, "
+            "0 < near < far is needed; remove or correct them"
+        )
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -156,19 +150,23 @@ def pixel_size(where: str, width: float, height: float) -> tuple[int, int]:
     if not math.isfinite(width + height):
         raise UnusableView(where)
     size = round(float(width)), round(float(height))
-    if min(size) < 1 or max(size) > 10**6:
+    if min(size) < 1 or max(size) > _MAX_SIDE:
         raise DataError(
-            f"{where}: {width:g}x{height:g} pixels; a side has 1 to 1000000: correct it, or export it again"
+            f"{where}: {width:g}x{height:g} pixels; a side has 1 to {_MAX_SIDE}: correct it, or export it again"
         )
     return size
 
 
-def stated_size(where: str, path: Path, width: float | None, height: float | None) -> tuple[int, int]:
-    """Width and height that a capture says of an image, and the image's own where it says none. Raises as the
-    two above.
+def stated_size(
+    where: str, path: Path, width: float | None, height: float | None, factor: int = 1
+) -> tuple[int, int]:
+    """Width and height that a capture says of an image, and the image's own, times `factor`, where it says none.
+    Raises as the two above.
     """
     own = image_size(path)
-    return pixel_size(where, own[0] if width is None else width, own[1] if height is None else height)
+    wide = factor * own[0] if width is None else width
+    tall = factor * own[1] if height is None else height
+    return pixel_size(where, wide, tall)
 
 
 UNDISTORT = "undistort the images (`colmap image_undistorter` does) and write the cameras of those"
@@ -203,7 +201,11 @@ def lens_of(
         else:
             known = "k1 k2 k3 k4 p1 p2 in a polynomial"
         raise DataError(f"{where}: the lens {model} has more terms than are represented ({known}); {remedy}")
-    return (k1, k2, k3, k4, p1, p2), FISHEYE if fisheye else OPENCV if any(distortion) else PINHOLE
+    if fisheye:
+        lens = FISHEYE
+    else:
+        lens = OPENCV if any(distortion) else PINHOLE
+    return (k1, k2, k3, k4, p1, p2), lens
 
 
 def quaternion_rotation(where: str, quaternion: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
@@ -213,7 +215,7 @@ def quaternion_rotation(where: str, quaternion: Sequence[float] | NDArray[np.flo
     length = math.hypot(*quaternion)
     if not math.isfinite(length):
         raise UnusableView(where)
-    if not 0.9 < length < 1.1:
+    if not abs(length - 1) < _MAX_LENGTH_ERROR:
         raise DataError(
             f"{where}: a quaternion of length {length:.3g} is no rotation; export the capture again"
         )
@@ -240,112 +242,18 @@ def rigid_pose(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     rotation = matrix[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if not deviation <= _LOOSE or np.linalg.det(rotation) < 0:
-        if not deviation <= _LOOSE:
-            kind = f"off by {deviation:.2g}, at most {_LOOSE} is repaired"
+    if not deviation <= _MAX_SKEW or np.linalg.det(rotation) < 0:
+        if not deviation <= _MAX_SKEW:
+            kind = f"off by {deviation:.2g}, at most {_MAX_SKEW} is repaired"
         else:
             kind = "a reflection"
         raise DataError(
             f"{where}: the pose holds no rotation ({kind}); remove scale and shear from the capture's poses"
         )
-    if np.abs(matrix[:3, 3]).max() > _FAR:
+    if np.abs(matrix[:3, 3]).max() > _MAX_POSITION:
         raise DataError(
-            f"{where}: the position {matrix[:3, 3].tolist()} lies beyond {_FAR:g}; run the reconstruction again"
+            f"{where}: the position {matrix[:3, 3].tolist()} lies beyond {_MAX_POSITION:g}; run the reconstruction again"
         )
     # The nearest rotation: what is left of R = U S V^T without its stretching S.
     left, _, right = np.linalg.svd(rotation)
     return np.concatenate([left @ right, matrix[:3, 3:]], 1)
-
-
-def assemble_scene(
-    data: Path,
-    views: Sequence[View],
-    *,
-    downscale: float,
-    split: tuple[Tensor, Tensor] | None = None,
-    points: NDArray[np.float64] | None = None,
-    seen: NDArray[np.int64] | None = None,
-    reduced: bool = False,
-    notes: Sequence[str] = (),
-) -> ParsedScene:
-    """The scene of at least one view, in the given order; without a split every 8th view is held out.
-
-    The files' headers are read: their size must be the camera's, unless `reduced` says that the image folder
-    holds smaller copies of the same shape, which the cameras are then scaled to.
-    """
-    # Sizes as the files have them, from headers alone.
-    clear: list[Path] = []
-    sizes = []
-    for view in views:
-        header = read_header(view.path)
-        size = header.width, header.height
-        # Reducing rounds each side to a whole pixel.
-        same_shape = abs(view.size[0] * size[1] - view.size[1] * size[0]) <= sum(view.size)
-        if not (view.size == size or (reduced and same_shape)):
-            raise DataError(
-                f"{view.path}: {size[0]}x{size[1]} pixels, but its camera has {view.size[0]}x{view.size[1]}; "
-                "restore the image (was it resized, rotated or cropped?) or calibrate again"
-            )
-        clear += [view.path] * header.alpha
-        sizes.append(size)
-    # Cameras at the size that the capture states, brought to that of the files.
-    delivered = Cameras(
-        pose=torch.from_numpy(np.stack([view.pose for view in views])),
-        focal=torch.tensor([view.focal for view in views], dtype=torch.float64),
-        centre=torch.tensor([view.centre for view in views], dtype=torch.float64),
-        size=torch.tensor([view.size for view in views], dtype=torch.int64),
-        distortion=torch.tensor([view.distortion for view in views], dtype=torch.float64),
-        lens=torch.tensor([view.lens for view in views], dtype=torch.int64),
-    ).resized(torch.tensor(sizes))
-    depths = [view.depths for view in views if view.depths is not None]
-    # Every 8th, from the first on, is for testing (LLFF); but a single view is for training: there must be
-    # something to learn.
-    held = [k % 8 == 0 and len(views) > 1 for k in range(len(views))]
-    train, test = split or (index_tensor([not each for each in held]), index_tensor(held))
-    return ParsedScene(
-        name=name_of(data),
-        paths=tuple(view.path for view in views),
-        cameras=delivered.scaled(downscale) if downscale != 1 else delivered,
-        train=train,
-        test=test,
-        points=None if points is None or not len(points) else torch.from_numpy(points),
-        seen=None if seen is None or not len(seen) else torch.from_numpy(seen),
-        depths=torch.tensor(depths, dtype=torch.float64) if len(depths) == len(views) else None,
-        masks=_masks(data, views, [view.mask for view in views], "masks"),
-        sky_masks=_masks(data, views, [view.sky_mask for view in views], "sky_masks"),
-        # Game engines and screenshots write alpha that is opaque everywhere: a few files tell.
-        alpha=any(map(has_transparency, clear[:: -(-len(clear) // _LOOKED_AT) or 1])),
-        notes=tuple(notes),
-    )
-
-
-def _masks(
-    data: Path, views: Sequence[View], named: Sequence[Path | None], folder: str
-) -> tuple[Path | None, ...]:
-    """Masks of the views: those that the capture names, or where it names none, those that lie beside the
-    images.
-    """
-    if any(named):
-        missing = []
-        for path in named:
-            if path is not None and not os.path.isfile(path):
-                missing.append(path)
-        if missing:
-            told = f"{len(missing)} masks are missing, the first is {missing[0]}"
-            raise DataError(f"{data}: {told}; copy them there or unname them")
-        return tuple(named)
-    found: list[Path | None] = []
-    for view in views:
-        mask = None
-        # Beside the image's folder, or beside a folder around that, up to the scene's; images may lie in that
-        # itself.
-        start = int(view.path.parent != data)
-        for above in view.path.parents[start:]:
-            if mask is None and (above / folder).is_dir():
-                inner = (above / folder).joinpath(*view.path.relative_to(above).parts[start:])
-                spellings = (inner.with_name(inner.name + ".png"), inner.with_suffix(".png"), inner)
-                mask = next((path for path in spellings if path.is_file()), None)
-            if above == data or not above.is_relative_to(data):
-                break
-        found.append(mask)
-    return tuple(found) if any(found) else ()

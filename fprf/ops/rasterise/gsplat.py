@@ -342,7 +342,15 @@ class GsplatGaussians:
             [moment[1, 2] - moment[2, 1], moment[2, 0] - moment[0, 2], moment[0, 1] - moment[1, 0]]
         )
         of_shift = -pose.detach()[:3, :3].T @ of_pose[:3, 3]
-        measured = torch.stack([l1, similar, (shown - photograph.colours).square().mean()])
+        apart = shown - photograph.colours
+        squared = apart.square().mean()
+        if photograph.valid is not None:
+            # Pixels that do not count are neither learnt from nor told.
+            apart = apart * photograph.valid
+            count = len(apart) * photograph.valid.sum()
+            l1 = apart.abs().sum() / count.clamp_min(1)
+            squared = apart.square().sum() / count
+        measured = torch.stack([l1, similar, squared])
         found = _here(torch.cat([measured, pull, of_turn, of_shift]))  # the step's one wait
         if not np.isfinite(found[:2]).all():
             return Learnt(float(found[0]), float(found[1]), np.nan, np.zeros(3, np.float32), np.zeros(6))

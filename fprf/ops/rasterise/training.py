@@ -133,9 +133,11 @@ class Learnt(NamedTuple):
     """Measurements of a step, taken before it moved anything."""
 
     l1: float
+    """Mean absolute error of the pixels that count."""
     ssim: float
+    """Mean over all windows, also over pixels that do not count."""
     squared: float
-    """Mean squared error."""
+    """Mean squared error of the pixels that count; NaN where none does."""
     pull: Annotated[Floats, "3"]
     """Gradient of the loss by the logarithms of the factors."""
     of_camera: Annotated[NDArray[np.float64], "6"]
@@ -272,10 +274,13 @@ class TrainableGaussians:
         )
         moments = self._first, self._second, self._weight
         of_camera = backward.adam(tiles, self._blocks, moments, self.bands, camera, sums, rates)
-        tall = -(-height // SIDE) * SIDE
-        wide = -(-width // SIDE) * SIDE
-        apart = (shown - planes)[: 3 * area].reshape(3, tall, wide)[:, :height, :width]
-        return Learnt(l1, similar, float(np.square(apart).mean()), pull, of_camera)
+        if valid is None:
+            tall = -(-height // SIDE) * SIDE
+            wide = -(-width // SIDE) * SIDE
+            apart = (shown - planes)[: 3 * area].reshape(3, tall, wide)[:, :height, :width]
+            return Learnt(l1, similar, float(np.square(apart).mean()), pull, of_camera)
+        l1, squared = _errors_where(shown[: 3 * area] - planes[: 3 * area], valid[: 3 * area])
+        return Learnt(l1, similar, squared, pull, of_camera)
 
     def errors(
         self,
@@ -325,6 +330,20 @@ class TrainableGaussians:
 
     def _put(self, part: Floats, index: NDArray[np.int64], values: Annotated[Floats, "M R"]) -> None:
         self._by_block(part)[index // LANES, :, index % LANES] = values
+
+
+def _errors_where(apart: Floats, valid: Floats) -> tuple[float, float]:
+    """Mean absolute and mean squared difference of the pixels that count, flat planes; 0 and NaN where none does.
+
+    `apart` is used up. Padding does not count.
+    """
+    count = float(valid.sum())
+    if count == 0:
+        return 0.0, np.nan
+    apart *= valid
+    squared = float(np.vdot(apart, apart)) / count
+    np.abs(apart, out=apart)
+    return float(apart.sum()) / count, squared
 
 
 def _exposed(image: Floats, area: int, factors: Annotated[Floats, "3"] | None) -> Floats:
