@@ -21,7 +21,7 @@ LEAD = (
 )
 LOOKS = ("winter", "night", "sunset", "autumn")
 """References, in the order in which they are shown."""
-_TOGETHER = "all together"
+ALL_TOGETHER = "all together"
 """Name of the style of all references."""
 CREDITS = (
     "Photographs of the garden: The SfM Tool Authors (sfmtool/sfmtool, test-data), Apache-2.0; reduced and re-encoded.",
@@ -72,7 +72,7 @@ def run(args: list[str]) -> int:
 
     garden = Path(str(files("fprf") / "garden"))
     output = config.output / "run"
-    captures = {name: config.output / f"{name.replace(' ', '-')}.ply" for name in (*LOOKS, _TOGETHER)}
+    captures = {name: config.output / f"{name.replace(' ', '-')}.ply" for name in (*LOOKS, ALL_TOGETHER)}
     page = config.output / "garden.html"
     table = config.output / "metrics.json"
     origin = Origin(by="demo", overwrite=config.overwrite)
@@ -92,7 +92,7 @@ def run(args: list[str]) -> int:
     chosen = []
     for path, name in names.items():
         chosen.append((name, StyleFile(StyleConfig(references=(path,)))))
-    chosen.append((_TOGETHER, StyleFile(StyleConfig(references=tuple(names)))))
+    chosen.append((ALL_TOGETHER, StyleFile(StyleConfig(references=tuple(names)))))
     with origin.writing(outputs), Display() as display:
         begun = time.perf_counter()
         scene.measured()

@@ -24,11 +24,12 @@ from ..plugins import registry
 from ..plugins.slots import slots
 from .parsing import parse
 
-_MIB = 1 << 20
-_LEAST_DISK = 1 << 30
-"""Bytes below which a training may fail for want of room."""
-_LOOKED = 48
-"""Views of a scene folder whose files are opened, evenly through the scene."""
+_BYTES_PER_MIB = 1 << 20
+"""For sizes in messages."""
+_MIN_DISK_BYTES = 1 << 30
+"""Free bytes below which a training may fail for want of room: features and checkpoints of a small scene. By eye."""
+_MAX_OPENED_VIEWS = 48
+"""Views of a scene folder whose files are opened, evenly through the scene: by eye, some seconds."""
 
 
 class Finding(NamedTuple):
@@ -77,7 +78,9 @@ def run(args: list[str]) -> int:
         folder = cache_folder() / "features"
         size = _size(folder)
         shutil.rmtree(folder, ignore_errors=True)
-        findings = iter([Finding("features", f"{(size - _size(folder)) / _MIB:.0f} MiB deleted in {folder}")])
+        findings = iter(
+            [Finding("features", f"{(size - _size(folder)) / _BYTES_PER_MIB:.0f} MiB deleted in {folder}")]
+        )
     elif target is None:
         findings = chain(machine(), self_test(config.device))
     elif str(target) in registry.installed("fprf.methods"):
@@ -148,12 +151,13 @@ def machine() -> Iterator[Finding]:
 
     free = shutil.disk_usage(Path.cwd()).free
     clean = "fprf doctor --clean    # deletes feature targets, which are made again when needed"
-    yield Finding("disk", f"{free / 1024**3:.1f} GiB free here", clean if free < _LEAST_DISK else "")
+    yield Finding("disk", f"{free / 1024**3:.1f} GiB free here", clean if free < _MIN_DISK_BYTES else "")
     # content and semantics
     folder = cache_folder() / "features"
-    most = 2 * CACHED_BYTES / _MIB
+    most = 2 * CACHED_BYTES / _BYTES_PER_MIB
     yield Finding(
-        "features", f"{_size(folder) / _MIB:.0f} MiB of at most {most:.0f} in {folder}; --clean deletes them"
+        "features",
+        f"{_size(folder) / _BYTES_PER_MIB:.0f} MiB of at most {most:.0f} in {folder}; --clean deletes them",
     )
     count = sum(len(registry.installed(group)) for group in registry.groups())
     yield Finding("plug-ins", f"{count} installed; `fprf plugins --check` loads each")
@@ -269,7 +273,7 @@ def scene_folder(data: Path) -> Iterator[Finding]:
         yield Finding("masks", found, remedy, optional="are white" in found)
     # Decoding all of a large capture takes minutes: views evenly through it stand for the others.
     broken = []
-    for view in range(0, count, -(-count // _LOOKED)):
+    for view in range(0, count, -(-count // _MAX_OPENED_VIEWS)):
         try:
             load_images(scene, views=[view])
         except DataError as fault:

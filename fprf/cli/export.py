@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ..style.look import Restyle
     from ..training.loading import LoadedRun
 
-_DESCRIPTION = f"""A scene as files that other programs open, in the capture's own frame.
+_EXPORT_HELP = f"""A scene as files that other programs open, in the capture's own frame.
 
 Kinds may follow the run: {
     ", ".join(ending[1:] for ending in endings() if ending[1:] not in KINDS)
@@ -39,7 +39,7 @@ def run(args: list[str]) -> int:
     """Render views, fit Gaussians to them or mesh them where that is wanted, write the files."""
     words = ("run", "kinds")
     config, file = read_flags(
-        ExportConfig(), args, prog="fprf export", description=_DESCRIPTION, positional=words
+        ExportConfig(), args, prog="fprf export", description=_EXPORT_HELP, positional=words
     )
     # What is to be written, and under which names, is settled before the run is opened: mistakes cost no
     # time.

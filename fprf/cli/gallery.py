@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ..style.dictionary import Reference
     from ..training.loading import LoadedRun
 
-_DESCRIPTION = """A run in every style, as one page to walk through, with match maps. It loads nothing.
+_GALLERY_HELP = """A run in every style, as one page to walk through, with match maps. It loads nothing.
 
 Each reference is a style of its own; with several of them all together are one more."""
 
@@ -55,7 +55,7 @@ class GalleryConfig(StyledRunConfig):
 def run(args: list[str]) -> int:
     """Render the views in every style, write the page."""
     config, file = read_flags(
-        GalleryConfig(), args, prog="fprf gallery", description=_DESCRIPTION, positional=("run",)
+        GalleryConfig(), args, prog="fprf gallery", description=_GALLERY_HELP, positional=("run",)
     )
     output = config.run / "gallery.html" if config.output is None else config.output
     if output.suffix.lower() != ".html":

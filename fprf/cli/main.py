@@ -22,15 +22,14 @@ from ..errors import FprfError, UsageError
 from ..memory import keep_memory, out_of_memory, shortage
 from ..plugins.registry import installed, make, nearest
 
-_GROUP = "fprf.commands"
-
+_VERB_GROUP = "fprf.commands"
+"""Entry points of verbs of packages."""
 _PIPE_CLOSED = 141
 """Exit status of a program that SIGPIPE ended."""
-_SPINS = "1000"
-_BLOCK_MS = "0"
-"""Spinning of a thread that waits for others: rounds of GNU's OpenMP, some 20 microseconds; milliseconds of
-LLVM's.
-"""
+_SPIN_ROUNDS = "1000"
+"""Of a thread of GNU's OpenMP that waits for others: some 20 microseconds (the times are told in `_run`)."""
+_SPIN_MILLISECONDS = "0"
+"""Of a thread of LLVM's OpenMP that waits for others."""
 
 
 class Verb(NamedTuple):
@@ -123,8 +122,8 @@ def _run(args: list[str]) -> int:
     # for milliseconds: where 20 other programs used the two cores a training step took 2304 ms, and 236 ms
     # with this; alone it costs a twentieth.
     if "OMP_WAIT_POLICY" not in os.environ:
-        os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)
-        os.environ.setdefault("KMP_BLOCKTIME", _BLOCK_MS)
+        os.environ.setdefault("GOMP_SPINCOUNT", _SPIN_ROUNDS)
+        os.environ.setdefault("KMP_BLOCKTIME", _SPIN_MILLISECONDS)
     keep_memory()
     # Each verb's module is imported when it is asked for: help and mistakes cost no torch.
     verb = args[0]
@@ -139,7 +138,7 @@ def _run(args: list[str]) -> int:
     from .config import CommandConfig
     from .parsing import parse
 
-    config = make(_GROUP, verb, CommandConfig)
+    config = make(_VERB_GROUP, verb, CommandConfig)
     about = inspect.getdoc(type(config)) or ""
     return (
         parse(config, rest, prog=f"fprf {verb}", description=about, positional=config.positional).run() or 0
@@ -149,7 +148,7 @@ def _run(args: list[str]) -> int:
 def packaged() -> dict[str, str]:
     """Verbs of packages: name to the packages that provide it. Imports nothing."""
     found: dict[str, str] = {}
-    for name, entries in installed(_GROUP).items():
+    for name, entries in installed(_VERB_GROUP).items():
         if name not in VERBS:
             found[name] = " and ".join(each.package for each in entries)
     return found
@@ -158,9 +157,13 @@ def packaged() -> dict[str, str]:
 def _help() -> str:
     colour = sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
     if colour:
-        bold, dim, plain = ("\x1b[1m", "\x1b[2m", "\x1b[0m")
+        bold = "\x1b[1m"
+        dim = "\x1b[2m"
+        plain = "\x1b[0m"
     else:
-        bold, dim, plain = ("", "", "")
+        bold = ""
+        dim = ""
+        plain = ""
     others = packaged()
     width = max(map(len, [*VERBS, *others]))
     broad = max(len(verb.usage) for verb in VERBS.values())

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 C = TypeVar("C")
 
-_COLUMNS = 100
+_MAX_HELP_COLUMNS = 100
 """Widest help text: a page, not a wide screen."""
 _TRUTHS = (["True"], ["False"], ["true"], ["false"])
 _NONES = (["none"], ["None"])
@@ -233,7 +233,8 @@ def _given(flag: Flag, args: Sequence[str]) -> list[str]:
         key, equals, inline = arg.partition("=")
         if arg.startswith("--"):
             inside = _dashed(key) == flag.text
-            values = ([inline] if equals else []) if inside else values
+            if inside:
+                values = [inline] if equals else []
         elif inside:
             values.append(arg)
     several = any(get_origin(kind) in (tuple, list, dict) for kind in flag.kinds)
@@ -413,7 +414,9 @@ def first_line(documented: object) -> str:
 def _page_width() -> Iterator[None]:
     """Help is set for a page, not for a wide screen; tyro asks the environment for the width."""
     before = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = str(min(_COLUMNS, shutil.get_terminal_size((_COLUMNS, 24)).columns))
+    os.environ["COLUMNS"] = str(
+        min(_MAX_HELP_COLUMNS, shutil.get_terminal_size((_MAX_HELP_COLUMNS, 24)).columns)
+    )
     try:
         yield
     finally:

@@ -14,10 +14,10 @@ from .parsing import parse
 
 MINUTES = 3
 """Minutes of the printed training command."""
-_NAMED = 12
-"""Images that a step lost that are named one by one, at most."""
+_MAX_NAMED_IMAGES = 12
+"""Images that a step lost that are named one by one, at most: by eye, half a screen."""
 
-_DESCRIPTION = """Find poses for a folder of images or for a video, and make a scene folder that `fprf train` reads.
+_PROCESS_HELP = """Find poses for a folder of images or for a video, and make a scene folder that `fprf train` reads.
 
 Needs no other program. Run again, it goes on where it stopped."""
 
@@ -35,7 +35,7 @@ class ProcessConfig(SfmConfig):
 def run(args: list[str]) -> int:
     """Choose, match, reconstruct; report what was dropped; check that the scene can be read."""
     config = parse(
-        ProcessConfig(), args, prog="fprf process", description=_DESCRIPTION, positional=("source",)
+        ProcessConfig(), args, prog="fprf process", description=_PROCESS_HELP, positional=("source",)
     )
     if find_spec("pycolmap") is None:
         raise UsageError(
@@ -76,8 +76,8 @@ def run(args: list[str]) -> int:
     # A step that lost many images is one line, with an example.
     for step in ("choosing", "features", "matching", "mapping"):
         dropped = [drop for drop in content["dropped"] if drop["step"] == step]
-        for drop in dropped if len(dropped) <= _NAMED else dropped[:1]:
-            if len(dropped) <= _NAMED:
+        for drop in dropped if len(dropped) <= _MAX_NAMED_IMAGES else dropped[:1]:
+            if len(dropped) <= _MAX_NAMED_IMAGES:
                 count = ""
             else:
                 count = f"{len(dropped)} images, for example "

@@ -31,9 +31,10 @@ if TYPE_CHECKING:
     from ..splats.scene import SplatScene
     from ..style.restyle import Styled
 
-_SHOWN = 4
-"""Views on the page."""
-_DESCRIPTION = f"""Restyle finished captures of 3D Gaussians with photographs; their own photographs and cameras are not needed.
+_MAX_PAGE_VIEWS = 4
+"""Views on the page: by eye, they stand in one row."""
+_RESTYLE_HELP = f"""Restyle finished captures of 3D Gaussians with photographs; their own photographs and cameras are not
+needed.
 
 Takes {", ".join(endings())} (.ksplat is read alone, .usdz written alone) and SOG folders (meta.json,
 lod-meta.json); the output's ending says which is written. A reference may also be a capture or a run: views of it stand for
@@ -117,7 +118,7 @@ class _Written(NamedTuple):
 def run(args: list[str]) -> int:
     """Look at the captures, or take what the cache knows of them; build each style; write files and page."""
     config, file = read_flags(
-        RestyleConfig(), args, prog="fprf restyle", description=_DESCRIPTION, positional=("captures",)
+        RestyleConfig(), args, prog="fprf restyle", description=_RESTYLE_HELP, positional=("captures",)
     )
     config, outputs = _outputs(config)
     origin = origin_of("restyle", config, file)
@@ -557,8 +558,8 @@ def _write_page(path: Path, config: RestyleConfig, scene: "SplatScene", made: Se
 
     # Views lie on rings around the scene or within it, the nearer ones first: from these the things can be
     # told.
-    nearer = max(min(_SHOWN, len(scene.names)), len(scene.names) // 2)
-    most = min(_SHOWN, nearer)
+    nearer = max(min(_MAX_PAGE_VIEWS, len(scene.names)), len(scene.names) // 2)
+    most = min(_MAX_PAGE_VIEWS, nearer)
     views = sorted({round((k + 0.5) * nearer / most - 0.5) for k in range(most)})
     cameras = scene.cameras.scaled(0.5)
     before = [to_uint8(scene.render(cameras, view).rgb) for view in views]

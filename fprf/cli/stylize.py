@@ -21,7 +21,7 @@ _MIN_TABLE_SHARE = 0.1
 
 _HEAD: tuple[str, ...] = ("region", "share", "seen best at", "strength", "sure", "entropy", "takes")
 
-_DESCRIPTION = """Restyle captured views with photographs; no training, the same look from every viewpoint.
+_STYLIZE_HELP = """Restyle captured views with photographs; no training, the same look from every viewpoint.
 
 REGION is a region's number (--explain lists them), its name in a style file, VIEW:X,Y (a pixel of a view) or VIEW:MASK.png
 (what a mask over a view covers); in --pin of Gaussians also a place: box:X,Y,Z:X,Y,Z:BORDER, path:X,Y,Z:X,Y,Z:WIDTH,BORDER or
@@ -57,7 +57,7 @@ class StylizeConfig(StyledRunConfig):
 def run(args: list[str]) -> int:
     """Build the style; explain it, map it, or render the views; write style.json."""
     config, file = read_flags(
-        StylizeConfig(), args, prog="fprf stylize", description=_DESCRIPTION, positional=("run",)
+        StylizeConfig(), args, prog="fprf stylize", description=_STYLIZE_HELP, positional=("run",)
     )
     from ..style.dictionary import save_dictionary
     from ..style.regions import Regions
@@ -176,9 +176,11 @@ def _make(
     made: dict[str, Any] = {"seconds_per_view": rendering / count} if shown else {}
     made |= {"match_seconds_per_view": matching / count, "matches": summaries}
     if shown:
-        what, each = ("views", rendering / count)
+        what = "views"
+        each = rendering / count
     else:
-        what, each = ("match maps", matching / count)
+        what = "match maps"
+        each = matching / count
     print(f"{len(views)} {what} in {output}  ({each:.2f} s each)")
     return made
 

@@ -24,8 +24,8 @@ from .style_flags import say
 if TYPE_CHECKING:
     from ..page.session import Viewed
 
-_EXIT_TIMEOUT = 15.0
-"""Seconds after an interrupt within which all must have ended."""
+_MAX_EXIT_SECONDS = 15.0
+"""After an interrupt, within which all must have ended: longer than what the start page waits for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +135,7 @@ def run(args: list[str]) -> int:
             threading.Event().wait()
         except KeyboardInterrupt:
             # Whatever a thread is in the middle of, the terminal comes back.
-            last = threading.Timer(_EXIT_TIMEOUT, os._exit, (130,))
+            last = threading.Timer(_MAX_EXIT_SECONDS, os._exit, (130,))
             last.daemon = True
             last.start()
             raise

@@ -181,16 +181,24 @@ def weighted_sum(
     return torch.bmm(weight.to(values.dtype)[:, None], values)[:, 0].double().sum(0)
 
 
-_SIDE = 240
-"""Width of a tile in pixels; pictures are enlarged or reduced to it."""
-_LINE = 17
-_GAP = 8
-_BAR = 6
+_TILE_PIXELS = 240
+"""Width of a tile; pictures are enlarged or reduced to it. By eye, as all of these."""
+_LINE_PIXELS = 17
+"""Height of a line of text."""
+_GAP_PIXELS = 8
+"""Between tiles."""
+_BAR_PIXELS = 6
+"""Height of the bar of shares."""
 _INK = (30, 32, 36)
+"""Colour of texts."""
 _PAPER = (250, 250, 248)
+"""Colour behind them."""
 _FAINT = (215, 216, 218)
+"""Colour of the rest of a bar."""
 _OUTLINE = (255, 214, 10)
-_COLUMNS = 4
+"""Colour of the border of a region: a yellow that few photographs have."""
+_MAX_TILES_PER_ROW = 4
+"""Tiles side by side: about as wide as a page."""
 
 
 class Tile(NamedTuple):
@@ -225,44 +233,48 @@ def highlight(picture: Picture, inside: Annotated[Tensor, "H W"]) -> Picture:
 def contact_sheet(tiles: Sequence[Tile]) -> Picture:
     """The tiles in rows of four, in their order. Letters beyond ASCII are shown as '?'."""
     if not tiles:
-        return np.full((_GAP, _GAP, 3), _PAPER, dtype=np.uint8)
+        return np.full((_GAP_PIXELS, _GAP_PIXELS, 3), _PAPER, dtype=np.uint8)
     drawn = [_tile(tile) for tile in tiles]
-    columns = min(_COLUMNS, len(drawn))
+    columns = min(_MAX_TILES_PER_ROW, len(drawn))
     height = max(len(each) for each in drawn)
     rows = math.ceil(len(drawn) / columns)
-    page = np.full((rows * (height + _GAP) + _GAP, columns * (_SIDE + _GAP) + _GAP, 3), _PAPER, np.uint8)
+    page_height = rows * (height + _GAP_PIXELS) + _GAP_PIXELS
+    page_width = columns * (_TILE_PIXELS + _GAP_PIXELS) + _GAP_PIXELS
+    page = np.full((page_height, page_width, 3), _PAPER, np.uint8)
     for i, each in enumerate(drawn):
-        top = _GAP + (i // columns) * (height + _GAP)
-        left = _GAP + (i % columns) * (_SIDE + _GAP)
-        page[top : top + len(each), left : left + _SIDE] = each
+        top = _GAP_PIXELS + (i // columns) * (height + _GAP_PIXELS)
+        left = _GAP_PIXELS + (i % columns) * (_TILE_PIXELS + _GAP_PIXELS)
+        page[top : top + len(each), left : left + _TILE_PIXELS] = each
     return page
 
 
 def _tile(tile: Tile) -> Picture:
     height, width = checked(tile.picture).shape[:2]
-    picture = resized(tile.picture, _SIDE, max(1, round(height * _SIDE / width)))
-    below = np.full((_BAR + _LINE * len(tile.lines) + _GAP, _SIDE, 3), _PAPER, dtype=np.uint8)
+    picture = resized(tile.picture, _TILE_PIXELS, max(1, round(height * _TILE_PIXELS / width)))
+    below = np.full(
+        (_BAR_PIXELS + _LINE_PIXELS * len(tile.lines) + _GAP_PIXELS, _TILE_PIXELS, 3), _PAPER, dtype=np.uint8
+    )
     # A bar of the references' shares, one after the other; what is missing to 1 stays pale.
     if tile.shares:
-        below[:_BAR] = _FAINT
+        below[:_BAR_PIXELS] = _FAINT
         edge = 0.0
         colours = (palette(len(tile.shares)) * 255).round().int().tolist()
         for share, colour in zip(tile.shares, colours, strict=True):
-            below[:_BAR, round(edge * _SIDE) : round((edge + share) * _SIDE)] = colour
+            below[:_BAR_PIXELS, round(edge * _TILE_PIXELS) : round((edge + share) * _TILE_PIXELS)] = colour
             edge += share
     # As much of each line as the tile is wide.
     for i, line in enumerate(tile.lines):
         text = line.encode("ascii", "replace").decode()
         scale = 0.42
         font = cv2.FONT_HERSHEY_SIMPLEX
-        while text and cv2.getTextSize(text, font, scale, 1)[0][0] > _SIDE - 2:
+        while text and cv2.getTextSize(text, font, scale, 1)[0][0] > _TILE_PIXELS - 2:
             text = text[:-1]
-        cv2.putText(below, text, (1, _BAR + _LINE * i + 14), font, scale, _INK, 1, cv2.LINE_AA)
+        cv2.putText(below, text, (1, _BAR_PIXELS + _LINE_PIXELS * i + 14), font, scale, _INK, 1, cv2.LINE_AA)
     return np.concatenate([picture, below])
 
 
-_SEAM = 2
-"""Pixels of the line between pictures."""
+_SEAM_PIXELS = 2
+"""Width of the line between pictures: by eye."""
 
 
 def side_by_side(pictures: Sequence[Picture]) -> Picture:
@@ -273,7 +285,7 @@ def side_by_side(pictures: Sequence[Picture]) -> Picture:
         raise DataError(
             f"pictures of heights {[picture.shape[0] for picture in pictures]} cannot lie beside each other"
         )
-    line = np.full((pictures[0].shape[0], _SEAM, 3), 255, np.uint8)
+    line = np.full((pictures[0].shape[0], _SEAM_PIXELS, 3), 255, np.uint8)
     parts = [part for picture in pictures for part in (line, picture)][1:]
     return np.concatenate(parts, axis=1)
 

@@ -20,7 +20,9 @@ from ..errors import CheckpointError
 from .atomic import atomic_path, unwritable
 
 _MANIFEST = "manifest"
+"""Entry of a sealed file's metadata that holds its manifest."""
 _SYSTEM = re.compile(r"os error (\d+)")
+"""Number of the system's error in a message of safetensors."""
 
 
 def _checksum(tensor: Tensor) -> int:

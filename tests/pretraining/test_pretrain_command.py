@@ -48,7 +48,7 @@ def test_content(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     encoder = BundledContentConfig(weights=output).build()
     assert encoder.channels == report["channels"]
     assert encoder(torch.rand(1, 3, 20, 21)).shape == (1, encoder.channels, 10, 11)
-    beside = {"content.safetensors", "content.report.json", "vgg.safetensors"}
+    beside = {".fprf.json", "content.safetensors", "content.report.json", "vgg.safetensors"}
     assert {file.name for file in tmp_path.iterdir()} <= beside
     assert "2 steps" in read_weights(output)[1]["made_by"]
 
