@@ -22,7 +22,8 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, NamedTuple, TypeAlias
 
-from ..datamanagers.images import IMAGE_SUFFIXES, kind_of
+from ..datamanagers.image_files import kind_of
+from ..datamanagers.images import IMAGE_SUFFIXES
 from ..datamanagers.parsers.config import recognise
 from ..errors import DataError, FprfError, UsageError
 from ..plugins.captures import endings, format_name

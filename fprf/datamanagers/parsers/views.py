@@ -23,7 +23,8 @@ from ...errors import DataError
 from ...rendering.cameras import Cameras
 from ...rendering.lens import FISHEYE, OPENCV, PINHOLE
 from ...rendering.splines import rotations
-from ..images import has_transparency, read_header
+from ..image_files import read_header
+from ..images import has_transparency
 from ..scene import ParsedScene
 from .files import name_of
 
