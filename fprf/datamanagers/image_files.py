@@ -385,9 +385,7 @@ def _heif_levels(file: IO[bytes], bits: int) -> tuple[NDArray[np.uint16], int] |
     return levels, 2**bits - 1
 
 
-def _by_opencv(
-    file: IO[bytes], image: PIL.Image.Image, largest: int = 65535
-) -> NDArray[np.uint16] | None:
+def _by_opencv(file: IO[bytes], image: PIL.Image.Image, largest: int = 65535) -> NDArray[np.uint16] | None:
     """Colours of 16 bits of a file by OpenCV [H W 3 or 4], RGB: Pillow keeps the upper 8 of 16 bits only. None where the
     two disagree.
     """
