@@ -26,8 +26,8 @@ _ENDINGS: dict[str, Format] = {".png": "png", ".jpg": "jpg", ".jpeg": "jpg", ".w
 
 
 def to_uint8(image: Annotated[Tensor, "H W 3"]) -> Picture:
-    """A float image as a picture, of any number of channels: clipped to [0, 1] and rounded. Raises NumericsError where a value is not
-    finite.
+    """A float image as a picture, of any number of channels: clipped to [0, 1] and rounded. Raises
+    NumericsError where a value is not finite.
     """
     pixels = image.detach().to("cpu", torch.float32)
     if not bool(torch.isfinite(pixels).all()):
@@ -54,6 +54,7 @@ def encode(picture: Picture, form: Format) -> bytes:
     and WebP (84) are for the eye.
     """
     if form != "jpg" and picture.shape[2:] == (4,):
+        checked(picture[:, :, :3])
         swapped = cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA)
     else:
         swapped = cv2.cvtColor(checked(picture), cv2.COLOR_RGB2BGR)
