@@ -13,6 +13,7 @@
 import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -22,12 +23,50 @@ import PIL.Image
 from numpy.typing import NDArray
 
 from ..errors import DataError
-from .image_files import Image as Image
-from .image_files import decode, read_header
+from .image_files import (
+    Image,
+    ImageHeader,
+    colour_note,
+    decode,
+    header_of,
+    kind_of,
+    open_image,
+    opened,
+    read_header,
+    silent,
+)
 from .raw import RAW_SUFFIXES
 
 if TYPE_CHECKING:
     from .scene import ParsedScene
+
+__all__ = [
+    "IMAGE_SUFFIXES",
+    "WHITE",
+    "Cutout",
+    "Image",
+    "ImageHeader",
+    "colour_notes",
+    "covered_mean",
+    "filled",
+    "has_transparency",
+    "header_of",
+    "image_names",
+    "kind_of",
+    "load_cutout",
+    "load_image",
+    "load_images",
+    "load_mask",
+    "load_preview",
+    "open_image",
+    "opened",
+    "photographs",
+    "raw_twins",
+    "read_header",
+    "silent",
+    "transparent_fault",
+    "useless_masks",
+]
 
 IMAGE_SUFFIXES = RAW_SUFFIXES | frozenset(
     {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif", ".hif", ".avif"}
@@ -157,6 +196,36 @@ def has_transparency(path: Path) -> bool:
     except DataError:
         return True
     return alpha is not None and np.asarray(alpha).min() < 255
+
+
+def transparent_fault(path: Path) -> str:
+    """What is wrong with an image that is transparent all over, or nearly; empty for others. Raises DataError
+    as `load_image` does.
+    """
+    if not read_header(path).alpha:
+        return ""
+    alpha = decode(path, upright=False).alpha
+    try:
+        check_opaque(path, 1.0 if alpha is None else float((np.asarray(alpha) >= _HALF_OPAQUE).mean()))
+    except DataError as error:
+        return str(error)
+    return ""
+
+
+def colour_notes(paths: Sequence[Path]) -> list[str]:
+    """What is decided about the colours of photographs, a line for each kind; those that cannot be read are left
+    to who reads them.
+    """
+    alike: dict[str, list[str]] = {}
+    for path in paths:
+        with suppress(DataError):
+            alike.setdefault(colour_note(path), []).append(path.name)
+    lines = []
+    for note, names in alike.items():
+        if note:
+            count = "" if len(names) == 1 else f" and {len(names) - 1} more"
+            lines.append(f"{names[0]}{count}: {note}")
+    return lines
 
 
 def load_mask(path: Path, size: tuple[int, int] | None = None, *, upright: bool = False) -> NDArray[np.bool_]:

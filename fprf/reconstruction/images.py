@@ -20,8 +20,7 @@ import PIL.Image
 from PIL.ExifTags import IFD
 from PIL.ExifTags import Base as Tag
 
-from ..datamanagers.image_files import Image, open_image, read_header, silent
-from ..datamanagers.images import IMAGE_SUFFIXES, load_image
+from ..datamanagers.images import IMAGE_SUFFIXES, Image, load_image, open_image, read_header, silent
 from ..errors import DataError, UsageError
 from ..io.atomic import write_bytes
 from .config import SfmConfig

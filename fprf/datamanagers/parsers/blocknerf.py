@@ -37,7 +37,7 @@ from ...errors import DataError
 from ...interfaces import DataParser
 from ...io.atomic import atomic_path, write_json
 from ...rendering.lens import OPENCV
-from ..image_files import opened
+from ..images import opened
 from ..scene import ParsedScene
 from .config import BlockNerfConfig, is_record
 from .views import View, assemble_scene, read_views, rigid_pose, split_by

@@ -23,8 +23,7 @@ from ...errors import DataError
 from ...rendering.cameras import Cameras
 from ...rendering.lens import FISHEYE, OPENCV, PINHOLE
 from ...rendering.splines import rotations
-from ..image_files import read_header
-from ..images import has_transparency
+from ..images import has_transparency, read_header
 from ..scene import ParsedScene
 from .files import name_of
 

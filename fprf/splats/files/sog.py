@@ -27,7 +27,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...datamanagers.image_files import header_of
+from ...datamanagers.images import header_of
 from ...errors import DataError
 from ...io.atomic import atomic_path
 from ...types import Origin

@@ -76,7 +76,7 @@ def extract_features(
 ):
     import numpy as np
 
-    from fprf.datamanagers.image_files import read_header
+    from fprf.datamanagers.images import read_header
 
     assert camera_mode is CameraMode.SINGLE and isinstance(device, Device)
     _told(database, "features", reader_options.camera_model, extraction_options.max_image_size, *image_names)
