@@ -76,7 +76,7 @@ _HEAD_BYTES = 64
 """Bytes that tell every kind: the longest list of brands of HEIC files fits."""
 _CAMERA_FORMATS = frozenset({"JPEG", "TIFF", "WebP"})
 """Formats without colour tags of their own, where a camera's EXIF block may say Adobe RGB."""
-_TURNS = {
+_UPRIGHT_TURNS = {
     2: PIL.Image.Transpose.FLIP_LEFT_RIGHT,
     3: PIL.Image.Transpose.ROTATE_180,
     4: PIL.Image.Transpose.FLIP_TOP_BOTTOM,
@@ -219,7 +219,7 @@ def decode(path: Path, *, upright: bool, rounded: Rounding = np.rint, convert: b
             deep = ";16" in str(image.tile)
             stored = exif_orientation(image) if kind == "TIFF" else 1
             image.load()
-            turn = _TURNS.get(_left_to_turn(kind, image, stored, upright))
+            turn = _UPRIGHT_TURNS.get(_left_to_turn(kind, image, stored, upright))
         pixels = _colours(path, file, image, deep, rounded)
         pixels, alpha = _split(pixels, image)
         profile = b"" if tag.over_profile else image.info.get("icc_profile", b"")
@@ -409,7 +409,7 @@ def exif_orientation(image: ImageFile) -> int:
             found = image.getexif().get(Tag.Orientation, 1)
     except Exception:  # whatever is wrong with the block, the pixels are whole
         return 1
-    return int(found) if found in _TURNS else 1
+    return int(found) if found in _UPRIGHT_TURNS else 1
 
 
 @lru_cache(maxsize=16)

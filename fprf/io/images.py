@@ -17,12 +17,12 @@ _Float = TypeVar("_Float", bound=np.floating)
 Picture: TypeAlias = NDArray[np.uint8]
 Format: TypeAlias = Literal["png", "jpg", "webp"]
 
-_OPTIONS: dict[Format, list[int]] = {
+_ENCODER_OPTIONS: dict[Format, list[int]] = {
     "png": [cv2.IMWRITE_PNG_COMPRESSION, 4],
     "jpg": [cv2.IMWRITE_JPEG_QUALITY, 92],
     "webp": [cv2.IMWRITE_WEBP_QUALITY, 84],
 }
-_ENDINGS: dict[str, Format] = {".png": "png", ".jpg": "jpg", ".jpeg": "jpg", ".webp": "webp"}
+_PICTURE_ENDINGS: dict[str, Format] = {".png": "png", ".jpg": "jpg", ".jpeg": "jpg", ".webp": "webp"}
 
 
 def to_uint8(image: Annotated[Tensor, "H W 3"]) -> Picture:
@@ -58,7 +58,7 @@ def encode(picture: Picture, form: Format) -> bytes:
         swapped = cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA)
     else:
         swapped = cv2.cvtColor(checked(picture), cv2.COLOR_RGB2BGR)
-    done, data = cv2.imencode(f".{form}", swapped, _OPTIONS[form])
+    done, data = cv2.imencode(f".{form}", swapped, _ENCODER_OPTIONS[form])
     if not done:
         raise DataError(
             f"{form} cannot hold a picture of {picture.shape[1]}x{picture.shape[0]} pixels; use png"
@@ -93,9 +93,11 @@ def write_image(path: Path, picture: Picture) -> None:
     """Write a picture, whole or not at all, in the format that the name ends with: .png .jpg .jpeg .webp. It
     may have alpha as that of `encode`.
     """
-    form = _ENDINGS.get(path.suffix.lower())
+    form = _PICTURE_ENDINGS.get(path.suffix.lower())
     if form is None:
-        raise DataError(f"{path}: '{path.suffix}' is no picture format; allowed are {' '.join(_ENDINGS)}")
+        raise DataError(
+            f"{path}: '{path.suffix}' is no picture format; allowed are {' '.join(_PICTURE_ENDINGS)}"
+        )
     write_bytes(path, encode(picture, form))
 
 

@@ -24,7 +24,7 @@ from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 if TYPE_CHECKING:
     from ..types import Origin
 
-_PIXEL = re.compile(r"(-?\d+(?:\.\d+)?),(-?\d+(?:\.\d+)?)")
+_PIXEL_PATTERN = re.compile(r"(-?\d+(?:\.\d+)?),(-?\d+(?:\.\d+)?)")
 
 
 class RegionValue(NamedTuple):
@@ -111,7 +111,7 @@ def parse_pixel(text: str) -> tuple[float, float] | None:
     """`X,Y`, x to the right and y down in pixels of the rendered view; None for something else, such as the
     name of a mask.
     """
-    match = _PIXEL.fullmatch(text)
+    match = _PIXEL_PATTERN.fullmatch(text)
     return (float(match[1]), float(match[2])) if match else None
 
 

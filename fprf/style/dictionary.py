@@ -45,23 +45,23 @@ code 0.3, which ends further from the truth where that is known (docs/evidence).
 CLUSTERS = 20
 """Local codes a reference: with ten, as the paper suggests, trees and houses share some (docs/evidence)."""
 
-_FEW_MEMBERS = 32
+_MIN_SURE_MEMBERS = 32
 """Pixels of a code below which its own statistics say little."""
-_SAMPLES = 20_000
+_SAMPLED_PIXELS = 20_000
 """Pixels of a photograph that are looked at, about, on a regular grid."""
-_SHORTEST_LONG_SIDE = 128
+_MIN_LONG_SIDE_PIXELS = 128
 """References are encoded at the scene's size, but not below this: clusters would have too few pixels."""
-_SHORTEST = 64
+_MIN_SIDE_PIXELS = 64
 """No side is encoded smaller: deep encoders have nothing to pad with on a photograph of a few pixels."""
-_CELL = 16
+_FILTER_CELL_PIXELS = 16
 """Pixels between guided-filter coefficients."""
-_ROWS = 4096
+_FILTERED_ROWS = 4096
 """Pixels filtered at a time: bounds the memory."""
 
-_TABLES = ("keys", "mean", "covariance", "share", "weight")
+_CODE_TABLES = ("keys", "mean", "covariance", "share", "weight")
 """Fields of a dictionary with a row a code."""
-_COLOURS = ("colour_mean", "colour_covariance")
-_OPTIONAL = (*_COLOURS, "beyond")
+_COLOUR_TABLES = ("colour_mean", "colour_covariance")
+_OPTIONAL_TABLES = (*_COLOUR_TABLES, "beyond")
 """Fields with a row a code that may be None."""
 
 
@@ -127,8 +127,8 @@ def _encoded_size(photo: Image, longest: int) -> tuple[int, int]:
     shape allows, and enlarged only where an encoder could not take it.
     """
     height, width = photo.shape[:2]
-    scale = min(1.0, max(longest, _SHORTEST_LONG_SIDE) / max(height, width))
-    return max(_SHORTEST, round(width * scale)), max(_SHORTEST, round(height * scale))
+    scale = min(1.0, max(longest, _MIN_LONG_SIDE_PIXELS) / max(height, width))
+    return max(_MIN_SIDE_PIXELS, round(width * scale)), max(_MIN_SIDE_PIXELS, round(height * scale))
 
 
 def _reduced(cutout: Cutout, size: tuple[int, int]) -> tuple[Image, Annotated[Tensor, "H W"] | None]:
@@ -154,7 +154,7 @@ def _mostly_covered(cover: Annotated[Tensor, "H W"]) -> Annotated[Tensor, "H W"]
 def _grid_pixels(size: tuple[int, int]) -> Annotated[Tensor, "N 2"]:
     """Pixels (x, y, int64) of a regular grid over a picture of a size (width, height)."""
     width, height = size
-    step = max(1, round((height * width / _SAMPLES) ** 0.5))
+    step = max(1, round((height * width / _SAMPLED_PIXELS) ** 0.5))
     rows = torch.arange(step // 2, height, step)
     columns = torch.arange(step // 2, width, step)
     y, x = torch.meshgrid(rows, columns, indexing="ij")
@@ -164,7 +164,7 @@ def _grid_pixels(size: tuple[int, int]) -> Annotated[Tensor, "N 2"]:
 def _every_nth_pixel(chosen: Annotated[Tensor, "H W"]) -> Annotated[Tensor, "N 2"]:
     """Every n-th of the chosen pixels (x, y, int64), so that a small part is looked at closely."""
     pixel = chosen.nonzero().flip(1)
-    step = max(1, round(len(pixel) / _SAMPLES))
+    step = max(1, round(len(pixel) / _SAMPLED_PIXELS))
     return pixel[step // 2 :: step]
 
 
@@ -202,8 +202,8 @@ def _filtered(
     """Apply the guided filter at pixels (x, y, int64)."""
     height, width = image.shape[:2]
     radius = round(guided.radius * min(height, width))
-    cells = coefficients(maps, image, radius=radius, eps=guided.eps, stride=_CELL)
-    parts = torch.split(pixel, _ROWS)
+    cells = coefficients(maps, image, radius=radius, eps=guided.eps, stride=_FILTER_CELL_PIXELS)
+    parts = torch.split(pixel, _FILTERED_ROWS)
     return torch.cat([apply(cells, at + 0.5, image[at[:, 1], at[:, 0]], (height, width)) for at in parts])
 
 
@@ -319,7 +319,7 @@ def concatenate(
     """Join dictionaries of one reference each, under new names and weights."""
     counts = torch.tensor([len(part.keys) for part in parts])
     fields = []
-    for name in (*_TABLES, *_OPTIONAL):
+    for name in (*_CODE_TABLES, *_OPTIONAL_TABLES):
         if all(getattr(part, name) is not None for part in parts):
             fields.append(name)
     tables = {}
@@ -338,10 +338,10 @@ def _codes_of(r: Reference, clusters: int, blend: float, seed: int) -> StyleDict
     if r.semantic.shape[1] > 0:
         keys, label = kmeans(r.semantic, clusters, seed=seed)
     # Codes with few members say little: the fewer, the more of the whole image they take. `whole_share` [T]
-    # is that: `blend` for codes of _FEW_MEMBERS or more, rising to 1 for a code without any.
+    # is that: `blend` for codes of _MIN_SURE_MEMBERS or more, rising to 1 for a code without any.
     member = double(torch.nn.functional.one_hot(label, len(keys)))
     share = member.sum(0) / len(label)
-    whole_share = 1 - (1 - blend) * (share * len(label) / _FEW_MEMBERS).clamp_max(1.0)
+    whole_share = 1 - (1 - blend) * (share * len(label) / _MIN_SURE_MEMBERS).clamp_max(1.0)
 
     def statistics(
         features: Annotated[Tensor, "N C"],
@@ -354,7 +354,7 @@ def _codes_of(r: Reference, clusters: int, blend: float, seed: int) -> StyleDict
     # Of content features always; of colours, and of what lies beyond, where the reference brings them.
     tables = dict(zip(("mean", "covariance"), statistics(r.content), strict=True))
     if r.colour is not None:
-        tables |= dict(zip(_COLOURS, statistics(r.colour), strict=True))
+        tables |= dict(zip(_COLOUR_TABLES, statistics(r.colour), strict=True))
     if r.beyond is not None:
         tables["beyond"] = member.T @ double(r.beyond) / member.sum(0)
     tables |= {"keys": keys, "share": share, "weight": torch.full_like(share, r.weight)}
@@ -421,7 +421,11 @@ def choose(
     codes = references[d.reference]
     renumbered = references.cumsum(0) - 1
     part = d._replace(
-        **{name: getattr(d, name)[codes] for name in (*_TABLES, *_OPTIONAL) if getattr(d, name) is not None},
+        **{
+            name: getattr(d, name)[codes]
+            for name in (*_CODE_TABLES, *_OPTIONAL_TABLES)
+            if getattr(d, name) is not None
+        },
         reference=renumbered[d.reference[codes]],
         names=tuple(name for name, taken in zip(d.names, references.tolist(), strict=True) if taken),
         allowed=None,
@@ -434,7 +438,7 @@ def save_dictionary(path: Path, d: StyleDictionary) -> None:
     new one.
     """
     fields = []
-    for name in (*_TABLES, "reference", *_OPTIONAL):
+    for name in (*_CODE_TABLES, "reference", *_OPTIONAL_TABLES):
         if getattr(d, name) is not None:
             fields.append(name)
     tensors = {}

@@ -38,11 +38,11 @@ from .statistics import mix, monge, symmetric_root
 if TYPE_CHECKING:
     from ..plugins.stylizers.config import StylizerConfig
 
-_DRAWS = 512
+_REGION_DRAWS = 512
 """Points drawn of each region: means of colours are known to a fiftieth of their deviation."""
-_GAIN = 3.0
+_MAX_COLOUR_GAIN = 3.0
 """No direction of colour is amplified more: a flat region's noise must stay unseen."""
-_QUIET = 2e-4
+_COLOUR_RIDGE_VARIANCE = 2e-4
 """Variance added on both sides: a deviation of four 8-bit steps, below which colours have no shape worth
 carrying over.
 """
@@ -213,8 +213,8 @@ def carried_colours(
     else:
         target = table @ there
         wide = torch.einsum("kt,tij->kij", table, spread)
-    floor = _QUIET * torch.eye(3).to(mean)
-    matrix = monge(covariances + floor, wide + floor, gain=_GAIN)
+    floor = _COLOUR_RIDGE_VARIANCE * torch.eye(3).to(mean)
+    matrix = monge(covariances + floor, wide + floor, gain=_MAX_COLOUR_GAIN)
     return matrix, target - torch.einsum("kc,kcd->kd", mean, matrix)
 
 
@@ -231,7 +231,10 @@ def decoded_colours(
         return double(scene.region_mean), double(scene.region_covariance)
     device = next(stylizer.buffers(), scene.mean).device
     draw = torch.randn(
-        _DRAWS // 2, scene.mean.numel(), generator=torch.Generator().manual_seed(0), dtype=torch.float64
+        _REGION_DRAWS // 2,
+        scene.mean.numel(),
+        generator=torch.Generator().manual_seed(0),
+        dtype=torch.float64,
     )
     draw = torch.cat([draw, -draw])  # in pairs: the features' mean is met exactly
     means = []

@@ -22,13 +22,14 @@ from .regions import Regions, membership_view, shrunk
 from .restyle import Codes, Styled
 from .scene_style import Membership
 
-_LISTED = 0.005
+_MIN_LISTED_SHARE = 0.005
 """Codes that less than this share of a view takes are not listed."""
-_VIEWS = 24
+_MAX_LOOKED_VIEWS = 24
 """Views that are looked through for where each region is largest, evenly over all."""
-_COARSE = 32
-_FINE = 160
-"""Longest side of the views that are looked through, and of the thumbnails."""
+_LOOKED_SIDE_PIXELS = 32
+"""Longest side of the views that are looked through: enough to tell the largest region."""
+_REGION_THUMBNAIL_PIXELS = 160
+"""Longest side of the thumbnails of regions: a dozen fit a sheet. By eye."""
 
 
 class MatchMap(NamedTuple):
@@ -131,7 +132,7 @@ def summarize(matched: MatchMap, codes: Codes) -> dict[str, Any]:
     # Codes are numbered within their reference, and listed from the most used on.
     listed = []
     for t in of_code.argsort(descending=True).tolist():
-        if float(of_code[t]) >= _LISTED:
+        if float(of_code[t]) >= _MIN_LISTED_SHARE:
             cluster = int((codes.reference[:t] == codes.reference[t]).sum())
             listed.append(
                 {
@@ -149,7 +150,7 @@ def summarize(matched: MatchMap, codes: Codes) -> dict[str, Any]:
         "regions": [
             {"region": k, "share": float(share)}
             for k, share in enumerate(of_region)
-            if float(share) >= _LISTED
+            if float(share) >= _MIN_LISTED_SHARE
         ],
     }
 
@@ -194,10 +195,12 @@ def explain(regions: Regions, styled: Styled | None = None) -> list[ExplainedReg
     scene = regions.scene
     style = regions.scene_style
     # Views evenly over all are looked through, coarsely, for where each region is largest.
-    looked = sorted({round(i * (len(scene.names) - 1) / max(1, _VIEWS - 1)) for i in range(_VIEWS)})
+    looked = sorted(
+        {round(i * (len(scene.names) - 1) / max(1, _MAX_LOOKED_VIEWS - 1)) for i in range(_MAX_LOOKED_VIEWS)}
+    )
     mass = []
     for view in looked:
-        share, opacity = membership_view(regions, view, _COARSE)
+        share, opacity = membership_view(regions, view, _LOOKED_SIDE_PIXELS)
         mass.append((share * opacity[..., None]).mean((0, 1)))
     best = []
     for column in torch.stack(mass).T:
@@ -205,8 +208,8 @@ def explain(regions: Regions, styled: Styled | None = None) -> list[ExplainedReg
     # Those views are rendered small, as they are, with the places of the regions in them.
     seen = {}
     for view in sorted(set(best)):
-        share, opacity = membership_view(regions, view, _FINE)
-        picture = to_uint8(scene.render(shrunk(scene.cameras, view, _FINE), 0).rgb)
+        share, opacity = membership_view(regions, view, _REGION_THUMBNAIL_PIXELS)
+        picture = to_uint8(scene.render(shrunk(scene.cameras, view, _REGION_THUMBNAIL_PIXELS), 0).rgb)
         seen[view] = picture, share * opacity[..., None]
     rows = []
     for k, view in enumerate(best):

@@ -44,10 +44,10 @@ Between the embedded towns in all lights and a photographed street, right matche
 below.
 """
 
-_SIDE = 128
+_MASK_SIDE_PIXELS = 128
 """Longest side in pixels at which a mask over a view is looked at."""
 
-_SOLID = 0.01
+_MIN_POINTED_OPACITY = 0.01
 """Less opacity is nothing to point at."""
 
 
@@ -125,13 +125,13 @@ def find_regions(regions: Regions, text: str) -> list[RegionMatch]:
             )
         centre = torch.tensor([[int(x) + 0.5, int(y) + 0.5]], dtype=torch.float64)
         share, opacity = memberships(regions.scene, regions.scene_style, regions.scene.cameras, view, centre)
-        if float(opacity[0]) < _SOLID:
+        if float(opacity[0]) < _MIN_POINTED_OPACITY:
             raise UsageError(f"{text}: there is nothing at that pixel; choose another")
         found = {int(share[0].argmax())}
     else:
         # Regions of which the mask covers more than half of what the view shows, and the one that fills most
         # of the mask: by their mass in the view and under the mask, on a small copy of both.
-        share, opacity = membership_view(regions, view, _SIDE)
+        share, opacity = membership_view(regions, view, _MASK_SIDE_PIXELS)
         painted = load_mask(Path(rest), upright=True).astype(np.float32)
         white = torch.from_numpy(
             np.asarray(cv2.resize(painted, opacity.shape[::-1], interpolation=cv2.INTER_AREA))
@@ -139,7 +139,7 @@ def find_regions(regions: Regions, text: str) -> list[RegionMatch]:
         mass = (share * opacity[..., None]).flatten(0, 1)
         inside = white.flatten() @ mass
         total = mass.sum(0)
-        if float(inside.sum()) < _SOLID:
+        if float(inside.sum()) < _MIN_POINTED_OPACITY:
             raise UsageError(
                 f"{rest}: the mask selects nothing of view {names[view]}; paint white what counts"
             )
