@@ -88,10 +88,10 @@ exposure, too.
 """
 _MIN_THING_SHARE = 1e-3
 """Share of things below which all of a scene, nothing but sky, votes on the exposure. By eye."""
-_MIN_CONTRAST_SHARE = 1 / 3
-"""Share of the contrast that is kept, however near to white it lies. By eye."""
-_COMMON_SHARE = 0.8
-"""Share of the weight that must agree on a cast before it is one: by eye."""
+_MAX_CONTRAST_LOSS = 3.0
+"""Factor by which contrast is reduced at most, however near to white it lies. By eye."""
+_MAX_DISSENT_SHARE = 0.2
+"""Share of the weight that may have less of a cast, or none, before there is no common one. By eye."""
 _RIVAL_LIKENESS_POWER = 4
 """Power of the cosine by which a rival counts as one of the region's kind. By eye."""
 _CLAIM_POWER = 0.4
@@ -377,7 +377,7 @@ def light_maps(
     towards = (saturation * torch.eye(3).to(grey) + (1 - saturation) * grey.expand(3, 3)) * balance
     # Contrast q: two deviations above the mean stay below white, with at least a third of the contrast.
     below_white = (1 - gain * own) / (2 * deviation).clamp_min(_BLACK_OFFSET)
-    contrast = gain.minimum(below_white.clamp_min(gain.clamp_max(1) * _MIN_CONTRAST_SHARE))
+    contrast = gain.minimum(below_white.clamp_min(gain.clamp_max(1) / _MAX_CONTRAST_LOSS))
     bias = torch.einsum("kc,kcd->kd", (gain - contrast)[:, None] * mean, towards)
     lit_mean = torch.einsum("kc,kcd->kd", gain[:, None] * mean, towards)
     maps = torch.cat([contrast[:, None, None] * towards, bias[:, None]], 1)
@@ -442,8 +442,8 @@ def _between(
 
 def shared(value: Annotated[Tensor, "N"], weight: Annotated[Tensor, "N"]) -> float:
     """What four fifths of the weight have at least, with its sign; 0 where signs differ."""
-    low = _quantile(value, weight, 1 - _COMMON_SHARE)
-    high = _quantile(value, weight, _COMMON_SHARE)
+    low = _quantile(value, weight, _MAX_DISSENT_SHARE)
+    high = _quantile(value, weight, 1 - _MAX_DISSENT_SHARE)
     if low > 0:
         return low
     return min(high, 0.0)
