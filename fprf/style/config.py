@@ -70,10 +70,11 @@ def parse_place(field: str, text: str) -> Place | None:
     count = next((k for k, each in enumerate(numbers) if len(each) != 3), len(numbers))
     points = numbers[:count]
     sizes = numbers[count:]
-    size = sizes[0] if len(sizes) == 1 else ()
-    given = all(0 <= value < math.inf for value in size) and not any(
-        math.isnan(x) for point in points for x in point
-    )
+    size: tuple[float, ...] = ()
+    if len(sizes) == 1:
+        size = sizes[0]
+    known = not any(map(math.isnan, sum(points, ())))
+    given = known and all(0 <= value < math.inf for value in size)
     if kind == "box" and given and len(points) == 2 and len(sizes) <= 1 and len(size) == len(sizes):
         low = tuple(map(min, *points))
         high = tuple(map(max, *points))

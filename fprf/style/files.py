@@ -122,7 +122,9 @@ def write_style(path: Path, file: StyleFile, made: Mapping[str, Any] | None = No
         "semantic_encoder": file.semantic_encoder,
         "regions": {name: list(key) for name, key in file.regions.items()},
     }
-    write_json(path, whole if made is None else whole | {"made": made})
+    if made is not None:
+        whole["made"] = made
+    write_json(path, whole)
 
 
 def check_photographs(path: Path, file: StyleFile) -> None:
@@ -193,7 +195,9 @@ def _resolved(file: Path, path: Path) -> Path:
     """Resolve a path of the file: relative to the file, else beside it, where a shared style has it."""
     whole = file.parent / path
     beside = file.parent / path.name
-    return beside if not whole.exists() and beside.exists() else whole
+    if not whole.exists() and beside.exists():
+        return beside
+    return whole
 
 
 def _portable(file: Path, path: Path) -> Path:

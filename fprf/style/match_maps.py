@@ -69,7 +69,8 @@ def match_map(scene: Scene, styled: Styled, view: int, cameras: Cameras | None =
     """Matches of one of the scene's scene_style views, or of `cameras`: geometry and semantics alone are
     computed.
     """
-    cameras = scene.cameras if cameras is None else cameras
+    if cameras is None:
+        cameras = scene.cameras
     scene_style = styled.scene_style
     look = styled.restyle
     device = scene.device
@@ -287,7 +288,9 @@ def region_tile(region: ExplainedRegion, names: tuple[str, ...]) -> Tile:
         return Tile(region.picture, tuple(lines))
     best = region.taken[0]
     matched = f"{best.name} {best.share:.0%}, score {best.score:.2f}, sure {region.confidence:.0%}"
-    lines.append("kept as it is" if region.strength == 0 else matched)
+    if region.strength == 0:
+        matched = "kept as it is"
+    lines.append(matched)
     by_name = {}
     for taken in region.taken:
         by_name[taken.name] = taken.share * region.strength

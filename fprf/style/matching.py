@@ -67,13 +67,10 @@ def score_spread(queries: Annotated[Tensor, "N D"], keys: Annotated[Tensor, "T D
     encoders.
     """
     r = scores(double(queries), double(keys))
-    if r.numel():
-        spread = float((r - r.mean(1, keepdim=True)).square().mean().sqrt())
-    else:
-        spread = 0.0
-    if spread > _ROUNDING_SHARE * float(r.abs().max() if r.numel() else 0.0):
-        return spread
-    return 1.0
+    if not r.numel():
+        return 1.0
+    spread = float((r - r.mean(1, keepdim=True)).square().mean().sqrt())
+    return spread if spread > _ROUNDING_SHARE * float(r.abs().max()) else 1.0
 
 
 def attention(
@@ -90,7 +87,9 @@ def attention(
     # The best score is subtracted before dividing: tiny temperatures then give -inf beside it, never inf -
     # inf.
     logits = (r - r.amax(1, keepdim=True)) / max(temperature, torch.finfo(r.dtype).tiny)
-    return torch.softmax(logits if prior is None else logits + prior.log(), 1)
+    if prior is not None:
+        logits = logits + prior.log()
+    return torch.softmax(logits, 1)
 
 
 def point_shares(
@@ -108,7 +107,9 @@ def point_shares(
     Shares below `faint` of a point's largest become 0. Rows sum to 1. Rounding errors are at most
     4 (D + 4) u / temperature, u the unit roundoff of the points' type.
     """
-    share = attention(x if centre is None else unit(x, centre), keys, temperature, prior)
+    if centre is not None:
+        x = unit(x, centre)
+    share = attention(x, keys, temperature, prior)
     if faint > 0:
         share = torch.where(share < faint * share.amax(1, keepdim=True), 0.0, share)
         share = share / share.sum(1, keepdim=True)

@@ -171,8 +171,9 @@ class RegionWeight(nn.Module):
         """The values, mixed by membership (`belongs`, where it is known): exactly 0 where all of a point's
         regions have 0.
         """
-        share: Tensor = self.membership(semantic) if belongs is None else belongs
-        return share.to(self.values) @ self.values
+        if belongs is None:
+            belongs = self.membership(semantic)
+        return belongs.to(self.values) @ self.values
 
 
 def region_contacts(

@@ -268,7 +268,9 @@ def _sample(mass: Tensor, rows: int, generator: torch.Generator) -> Tensor | sli
     if len(mass) <= rows:
         return slice(None)
     some = torch.randperm(len(mass), generator=generator)[:rows].to(mass.device)
-    return some if bool(mass[some].any()) else mass.topk(rows).indices
+    if bool(mass[some].any()):
+        return some
+    return mass.topk(rows).indices
 
 
 def _lloyd(points: Tensor, mass: Tensor, centres: Tensor, steps: int) -> tuple[Tensor, Tensor]:
@@ -297,7 +299,9 @@ def _seed(points: Tensor, mass: Tensor, k: int, generator: torch.Generator) -> T
         # Rounding of the sum cannot land on odds of 0.
         edges = odds.cumsum(0)
         index = torch.searchsorted(edges, draw * edges[-1], right=True).clamp_max(len(odds) - 1)
-        centres.append(points[index if bool(odds[index] > 0) else odds.argmax()])
+        if not bool(odds[index] > 0):
+            index = odds.argmax()
+        centres.append(points[index])
         distance = distance.minimum((points - centres[-1]).square().sum(1))
         odds = mass * distance
         if not bool(odds.any()):
