@@ -57,10 +57,10 @@ def run(args: list[str]) -> int:
         description="Train, restyle and show a garden that ships with fprf.",
     )
     start = time.perf_counter()
-    from ..datamanagers.images import load_image
+    from ..datamanagers.images import load_preview
     from ..io.atomic import write_json
     from ..methods import fprf_splats
-    from ..page.writer import Page, Reference, write_page
+    from ..page.writer import REFERENCE_PIXELS, Page, Reference, write_page
     from ..rendering.local_frame import offset_file
     from ..splats.files import write_gaussians
     from ..splats.loading import open_gaussians
@@ -126,7 +126,9 @@ def run(args: list[str]) -> int:
             },
             views=shown_views,
             styles=[style for style, *_ in styles],
-            references=[Reference(name, load_image(path, upright=True)) for path, name in names.items()],
+            references=[
+                Reference(name, load_preview(path, REFERENCE_PIXELS)) for path, name in names.items()
+            ],
             scene=scene,
             start=views[0],
             credits=CREDITS,

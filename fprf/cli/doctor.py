@@ -233,7 +233,7 @@ def scene_folder(data: Path) -> Iterator[Finding]:
     """Format, views, split, points and readable images of a scene. Raises DataError where it cannot be
     parsed.
     """
-    from ..datamanagers.images import load_images, useless_masks
+    from ..datamanagers.images import colour_notes, load_images, transparent_fault, useless_masks
     from ..datamanagers.parsers.config import DataParserConfig, parse_scene, recognise
     from ..datamanagers.scene import find_sightings, sparser
 
@@ -276,8 +276,13 @@ def scene_folder(data: Path) -> Iterator[Finding]:
     for view in range(0, count, -(-count // _MAX_OPENED_VIEWS)):
         try:
             load_images(scene, views=[view])
+            clear = transparent_fault(scene.paths[view])
         except DataError as fault:
             broken.append(str(fault))
+        else:
+            broken += [clear] if clear else []
+    for note in colour_notes(scene.paths):
+        yield Finding("colours", note)
     if broken:
         more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
         yield Finding("images", f"{broken[0]}{more}", "replace them, or remove their poses")

@@ -62,8 +62,8 @@ def run(args: list[str]) -> int:
         raise UsageError(f"--output {output}: the page is an .html file; give such a name")
     origin = origin_of("gallery", config, file)
     origin.check([output])
-    from ..datamanagers.images import load_image
-    from ..page.writer import Page, Reference, write_page
+    from ..datamanagers.images import load_preview
+    from ..page.writer import REFERENCE_PIXELS, Page, Reference, write_page
     from ..splats.scene import SplatScene
     from ..training.loading import open_run
 
@@ -92,7 +92,7 @@ def run(args: list[str]) -> int:
         },
         views=originals,
         styles=[style for style, *_ in styles],
-        references=[Reference(name, load_image(path, upright=True)) for path, name in called.items()],
+        references=[Reference(name, load_preview(path, REFERENCE_PIXELS)) for path, name in called.items()],
         scene=scene if isinstance(scene, SplatScene) else None,
         start=views[0],
     )

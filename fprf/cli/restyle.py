@@ -552,9 +552,9 @@ def _styles(config: RestyleConfig, file: StyleFile) -> list[tuple[str, StyleFile
 
 def _write_page(path: Path, config: RestyleConfig, scene: "SplatScene", made: Sequence[_Restyled]) -> None:
     """Write the page: views as they are and in each style, evenly taken from the nearer half."""
-    from ..datamanagers.images import load_image
+    from ..datamanagers.images import load_preview
     from ..io.images import to_uint8
-    from ..page.writer import Page, PageView, Reference, Style, write_page
+    from ..page.writer import REFERENCE_PIXELS, Page, PageView, Reference, Style, write_page
 
     # Views lie on rings around the scene or within it, the nearer ones first: from these the things can be
     # told.
@@ -581,7 +581,7 @@ def _write_page(path: Path, config: RestyleConfig, scene: "SplatScene", made: Se
         views=[PageView(scene.names[view], picture) for view, picture in zip(views, before, strict=True)],
         styles=styles,
         references=[
-            Reference(label, load_image(path, upright=True))
+            Reference(label, load_preview(path, REFERENCE_PIXELS))
             for label, path in zip(names, config.references, strict=True)
         ],
         scene=scene,

@@ -76,6 +76,7 @@ def read_flags(
     about = "\n\n".join([description, *meanings])
     config = parse(default, _joined(args, default), prog=prog, description=about, positional=positional)
     config = with_folders(config, say)
+    _say_colours(config)
     file = file._replace(style=StyleConfig(**_styles(config)))
     # Who names photographs takes them as they are now, and masks likewise.
     if path is not None:
@@ -84,6 +85,14 @@ def read_flags(
         masks = () if "--masks" in given else config.masks
         check_photographs(path, file._replace(style=replace(file.style, references=photographs, masks=masks)))
     return config, file
+
+
+def _say_colours(style: StyleConfig) -> None:
+    """Say what is decided about the colours of a style's photographs."""
+    from ..datamanagers.images import colour_notes
+
+    for note in colour_notes(style.references):
+        say(note)
 
 
 def say(text: str) -> None:
@@ -155,7 +164,9 @@ def named_styles(texts: Sequence[str], base: StyleFile) -> list[tuple[str, Style
             photographs = named_files(what)
             style = replace(base.style, references=photographs, weights=(), masks=(), pin=(), forbid=())
             file = StyleFile(style)
-        styles.append((name, file._replace(style=with_folders(file.style, say))))
+        style = with_folders(file.style, say)
+        _say_colours(style)
+        styles.append((name, file._replace(style=style)))
     return styles
 
 

@@ -17,17 +17,17 @@ _Float = TypeVar("_Float", bound=np.floating)
 Picture: TypeAlias = NDArray[np.uint8]
 Format: TypeAlias = Literal["png", "jpg", "webp"]
 
-_OPTIONS: dict[Format, list[int]] = {
+_ENCODER_OPTIONS: dict[Format, list[int]] = {
     "png": [cv2.IMWRITE_PNG_COMPRESSION, 4],
     "jpg": [cv2.IMWRITE_JPEG_QUALITY, 92],
     "webp": [cv2.IMWRITE_WEBP_QUALITY, 84],
 }
-_ENDINGS: dict[str, Format] = {".png": "png", ".jpg": "jpg", ".jpeg": "jpg", ".webp": "webp"}
+_PICTURE_ENDINGS: dict[str, Format] = {".png": "png", ".jpg": "jpg", ".jpeg": "jpg", ".webp": "webp"}
 
 
 def to_uint8(image: Annotated[Tensor, "H W 3"]) -> Picture:
-    """A float image as a picture: clipped to [0, 1] and rounded. Raises NumericsError where a value is not
-    finite.
+    """A float image as a picture, of any number of channels: clipped to [0, 1] and rounded. Raises
+    NumericsError where a value is not finite.
     """
     pixels = image.detach().to("cpu", torch.float32)
     if not bool(torch.isfinite(pixels).all()):
@@ -50,8 +50,15 @@ def checked(picture: Picture) -> Picture:
 
 
 def encode(picture: Picture, form: Format) -> bytes:
-    """The file of a picture. PNG is exact; JPEG (92) and WebP (84) are for the eye."""
-    done, data = cv2.imencode(f".{form}", cv2.cvtColor(checked(picture), cv2.COLOR_RGB2BGR), _OPTIONS[form])
+    """The file of a picture, which may have straight alpha [H W 4] in PNG and WebP. PNG is exact; JPEG (92)
+    and WebP (84) are for the eye.
+    """
+    if form != "jpg" and picture.shape[2:] == (4,):
+        checked(picture[:, :, :3])
+        swapped = cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA)
+    else:
+        swapped = cv2.cvtColor(checked(picture), cv2.COLOR_RGB2BGR)
+    done, data = cv2.imencode(f".{form}", swapped, _ENCODER_OPTIONS[form])
     if not done:
         raise DataError(
             f"{form} cannot hold a picture of {picture.shape[1]}x{picture.shape[0]} pixels; use png"
@@ -83,10 +90,14 @@ def shrink(picture: Picture, side: int) -> Picture:
 
 
 def write_image(path: Path, picture: Picture) -> None:
-    """Write a picture, whole or not at all, in the format that the name ends with: .png .jpg .jpeg .webp."""
-    form = _ENDINGS.get(path.suffix.lower())
+    """Write a picture, whole or not at all, in the format that the name ends with: .png .jpg .jpeg .webp. It
+    may have alpha as that of `encode`.
+    """
+    form = _PICTURE_ENDINGS.get(path.suffix.lower())
     if form is None:
-        raise DataError(f"{path}: '{path.suffix}' is no picture format; allowed are {' '.join(_ENDINGS)}")
+        raise DataError(
+            f"{path}: '{path.suffix}' is no picture format; allowed are {' '.join(_PICTURE_ENDINGS)}"
+        )
     write_bytes(path, encode(picture, form))
 
 

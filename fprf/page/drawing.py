@@ -21,10 +21,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..datamanagers.images import load_image
+from ..datamanagers.images import load_preview
 from ..errors import UsageError
 from ..io.atomic import write_json
-from ..io.images import Picture, shrink, to_uint8
+from ..io.images import Picture, to_uint8
 from ..io.maps import match_image, palette
 from ..ops.harmonics import HARMONIC
 from ..rendering.cameras import Cameras, ideal_cameras
@@ -106,9 +106,7 @@ class Restyler:
         """Encode a photograph. Raises DataError for an unreadable one."""
         reference = encode_photograph(path, self.encoders, name=name)
         self._photographs += 1
-        return Photograph(
-            self._photographs, name, path, shrink(load_image(path, upright=True), _THUMBNAIL), reference
-        )
+        return Photograph(self._photographs, name, path, load_preview(path, _THUMBNAIL), reference)
 
     def styled(self, look: Look) -> Styled | None:
         """The look on the scene; None for the scene as it is. Raises UsageError for rules that contradict

@@ -476,7 +476,7 @@ class ViewerServer:
         from ..io.images import encode
 
         photograph = self.session.state.photograph(_integer(request, "card"))
-        return Response(encode(photograph.thumbnail, "jpg"), media_type="image/jpeg")
+        return Response(encode(photograph.thumbnail, "webp"), media_type="image/webp")
 
     async def _gaussians(self, request: Request) -> Response:
         return self._download(await asyncio.to_thread(self.session.gaussians), "restyled.ply")

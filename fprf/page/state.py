@@ -50,6 +50,7 @@ class Photograph:
     name: str
     path: Path
     thumbnail: Picture
+    """[H W 3], or [H W 4] with alpha."""
     reference: Reference
 
 

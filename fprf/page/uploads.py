@@ -22,7 +22,8 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, NamedTuple, TypeAlias
 
-from ..datamanagers.images import IMAGE_SUFFIXES, kind_of
+from ..datamanagers.image_files import kind_of
+from ..datamanagers.images import IMAGE_SUFFIXES
 from ..datamanagers.parsers.config import recognise
 from ..errors import DataError, FprfError, UsageError
 from ..plugins.captures import endings, format_name
@@ -147,10 +148,8 @@ def decode_photographs(pipe: Connection) -> None:
     """Answer each [source, target] by what is wrong with it, empty once the target is written, until the pipe
     is closed.
     """
-    import cv2
-
-    from ..datamanagers.images import load_image
-    from ..io.images import shrink
+    from ..datamanagers.images import load_preview
+    from ..io.images import encode
 
     signal.signal(
         signal.SIGINT, signal.SIG_IGN
@@ -162,10 +161,7 @@ def decode_photographs(pipe: Connection) -> None:
         except EOFError:
             return
         try:
-            small = shrink(load_image(Path(source), upright=True), MAX_SIDE)
-            Path(target).write_bytes(
-                cv2.imencode(".png", cv2.cvtColor(small, cv2.COLOR_RGB2BGR))[1].tobytes()
-            )
+            Path(target).write_bytes(encode(load_preview(Path(source), MAX_SIDE), "png"))
             said = ""
         except FprfError as fault:
             said = str(fault).removeprefix(f"{source}: ")  # the file's own name means nothing to the client

@@ -33,8 +33,9 @@ CAPTURED = "Captured"
 _STILL = 800
 _VIEW = 512
 _MAP = 320
-_REFERENCE = 320
-"""Longest sides in pixels: of pictures on the stage and below it, of match maps and references."""
+"""Longest sides in pixels: of pictures on the stage and below it, of match maps."""
+REFERENCE_PIXELS = 320
+"""Longest side of references: as match maps, which lie beside them."""
 _CAMERAS = 48
 """Captured cameras that one can go to, at most."""
 _ROOM = 1.6
@@ -46,6 +47,7 @@ class Reference(NamedTuple):
 
     name: str
     image: Picture
+    """[H W 3] of any size, or [H W 4] with straight alpha, its longer side at most REFERENCE_PIXELS."""
 
 
 class Style(NamedTuple):
@@ -294,7 +296,7 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
 
 
 def _img(picture: Picture, side: int, alt: str) -> str:
-    small = shrink(picture, side)
+    small = picture if picture.shape[2] == 4 else shrink(picture, side)
     height, width = small.shape[:2]
     size = f'width="{width}" height="{height}"'
     return f'<img src="{data_uri(small)}" alt="{escape(alt)}" {size} decoding="async" loading="lazy">'
@@ -330,7 +332,7 @@ def _style(style: Style, views: Sequence[PageView], known: Mapping[str, Referenc
             share = f'<data value="{style.shares[place]:.4f}">{style.shares[place]:.0%}</data>'
         else:
             share = ""
-        image = _img(known[name].image, _REFERENCE, f"Reference {name}")
+        image = _img(known[name].image, REFERENCE_PIXELS, f"Reference {name}")
         rows.append(
             f"<figure>{image}<figcaption>{chip}<span>{escape(name)}</span>{share}</figcaption></figure>"
         )

@@ -448,7 +448,9 @@ def reference_views(
             pictures.append(folder / f"{view:02d}.png")
             masks.append(folder / f"{view:02d}.mask.png")
             weights.append(float(solid.double().mean()))
-            write_image(pictures[-1], to_uint8(shown.rgb))
+            # What is not solid is transparent: no encoder sees the backdrop.
+            layers = torch.cat([shown.rgb, solid[..., None].to(shown.rgb)], 2)
+            write_image(pictures[-1], to_uint8(layers))
             write_image(masks[-1], to_uint8(solid[..., None].expand(-1, -1, 3).float()))
     if not pictures:
         raise DataError(f"{path}: nothing in it is opaque enough to be a reference")

@@ -25,7 +25,7 @@ from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 if TYPE_CHECKING:
     from ..types import Origin
 
-_PIXEL = re.compile(r"(-?\d+(?:\.\d+)?),(-?\d+(?:\.\d+)?)")
+_PIXEL_PATTERN = re.compile(r"(-?\d+(?:\.\d+)?),(-?\d+(?:\.\d+)?)")
 
 
 class RegionValue(NamedTuple):
@@ -71,10 +71,11 @@ def parse_place(field: str, text: str) -> Place | None:
     count = next((k for k, each in enumerate(numbers) if len(each) != 3), len(numbers))
     points = numbers[:count]
     sizes = numbers[count:]
-    size = sizes[0] if len(sizes) == 1 else ()
-    given = all(0 <= value < math.inf for value in size) and not any(
-        math.isnan(x) for point in points for x in point
-    )
+    size: tuple[float, ...] = ()
+    if len(sizes) == 1:
+        size = sizes[0]
+    known = not any(map(math.isnan, sum(points, ())))
+    given = known and all(0 <= value < math.inf for value in size)
     if kind == "box" and given and len(points) == 2 and len(sizes) <= 1 and len(size) == len(sizes):
         low = tuple(map(min, *points))
         high = tuple(map(max, *points))
@@ -112,7 +113,7 @@ def parse_pixel(text: str) -> tuple[float, float] | None:
     """`X,Y`, x to the right and y down in pixels of the rendered view; None for something else, such as the
     name of a mask.
     """
-    match = _PIXEL.fullmatch(text)
+    match = _PIXEL_PATTERN.fullmatch(text)
     return (float(match[1]), float(match[2])) if match else None
 
 

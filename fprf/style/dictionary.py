@@ -24,7 +24,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from ..checks import at_least, between
-from ..datamanagers.images import Image, load_image, load_mask
+from ..datamanagers.images import Cutout, Image, covered_mean, filled, load_cutout, load_mask
 from ..errors import DataError
 from ..interfaces import Encoder
 from ..io.atomic import write_bytes
@@ -45,23 +45,23 @@ code 0.3, which ends further from the truth where that is known (docs/evidence).
 CLUSTERS = 20
 """Local codes a reference: with ten, as the paper suggests, trees and houses share some (docs/evidence)."""
 
-_FEW_MEMBERS = 32
+_MIN_SURE_MEMBERS = 32
 """Pixels of a code below which its own statistics say little."""
-_SAMPLES = 20_000
+_SAMPLED_PIXELS = 20_000
 """Pixels of a photograph that are looked at, about, on a regular grid."""
-_SHORTEST_LONG_SIDE = 128
+_MIN_LONG_SIDE_PIXELS = 128
 """References are encoded at the scene's size, but not below this: clusters would have too few pixels."""
-_SHORTEST = 64
+_MIN_SIDE_PIXELS = 64
 """No side is encoded smaller: deep encoders have nothing to pad with on a photograph of a few pixels."""
-_CELL = 16
+_FILTER_CELL_PIXELS = 16
 """Pixels between guided-filter coefficients."""
-_ROWS = 4096
+_FILTERED_ROWS = 4096
 """Pixels filtered at a time: bounds the memory."""
 
-_TABLES = ("keys", "mean", "covariance", "share", "weight")
+_CODE_TABLES = ("keys", "mean", "covariance", "share", "weight")
 """Fields of a dictionary with a row a code."""
-_COLOURS = ("colour_mean", "colour_covariance")
-_OPTIONAL = (*_COLOURS, "beyond")
+_COLOUR_TABLES = ("colour_mean", "colour_covariance")
+_OPTIONAL_TABLES = (*_COLOUR_TABLES, "beyond")
 """Fields with a row a code that may be None."""
 
 
@@ -104,35 +104,68 @@ def encode_photograph(path: Path, encoders: Encoders, *, name: str, mask: Path |
     """Encode one photograph to samples in the scene's terms: D is 0 without a semantic encoder or basis.
 
     Of a photograph with a `mask`, a picture of the same shape, only what is white there is sampled; the
-    encoders see all of it. Raises DataError where a file is no readable image, or a mask does not fit.
+    encoders see all of it. What is transparent is neither sampled nor seen. Raises DataError where a file is
+    no readable image, shows nothing, or a mask does not fit.
     """
-    photo = load_image(path, upright=True)
-    # Reduced to the size of the scene's views where the shape allows, and enlarged only where an encoder
-    # could not take it.
-    height, width = photo.shape[:2]
-    scale = min(1.0, max(encoders.longest, _SHORTEST_LONG_SIDE) / max(height, width))
-    width = max(_SHORTEST, round(width * scale))
-    height = max(_SHORTEST, round(height * scale))
-    reduced = np.asarray(cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    cutout = load_cutout(path)
+    size = _encoded_size(cutout.pixels, encoders.longest)
+    reduced, chosen = _reduced(cutout, size)
+    if mask is not None:
+        chosen = _within_mask(_read_mask(mask, path, cutout.pixels, size), chosen, mask, path)
     image = torch.from_numpy(reduced).to(encoders.device).float() / 255
-    # Sample a regular grid of pixels; of a mask every n-th pixel, so that a small one is looked at closely.
-    if mask is None:
-        step = max(1, round((height * width / _SAMPLES) ** 0.5))
-        y, x = torch.meshgrid(
-            torch.arange(step // 2, height, step), torch.arange(step // 2, width, step), indexing="ij"
-        )
-        pixel = torch.stack([x.flatten(), y.flatten()], 1)
-    else:
-        pixel = _read_mask(mask, path, photo, (width, height)).nonzero().flip(1)
-        step = max(1, round(len(pixel) / _SAMPLES))
-        pixel = pixel[step // 2 :: step]
-    pixel = pixel.to(image.device)
+    pixel = (_grid_pixels(size) if chosen is None else _every_nth_pixel(chosen)).to(image.device)
     content = _filtered(_encode(encoders.content, image), image, pixel, encoders.guided)
     colour = image[pixel[:, 1], pixel[:, 0]]
     if encoders.semantic is None or encoders.basis is None:
         return Reference(name, content, content.new_zeros(len(content), 0), colour=colour)
     semantic, beyond = semantic_samples(image, pixel, encoders.semantic, encoders.basis, encoders.guided)
     return Reference(name, content, semantic, colour=colour, beyond=beyond)
+
+
+def _encoded_size(photo: Image, longest: int) -> tuple[int, int]:
+    """Width and height at which a photograph is encoded: reduced to the size of the scene's views where the
+    shape allows, and enlarged only where an encoder could not take it.
+    """
+    height, width = photo.shape[:2]
+    scale = min(1.0, max(longest, _MIN_LONG_SIDE_PIXELS) / max(height, width))
+    return max(_MIN_SIDE_PIXELS, round(width * scale)), max(_MIN_SIDE_PIXELS, round(height * scale))
+
+
+def _reduced(cutout: Cutout, size: tuple[int, int]) -> tuple[Image, Annotated[Tensor, "H W"] | None]:
+    """A photograph at a size (width, height), and which of its pixels count (bool; None = all).
+
+    What is transparent takes the colour of the nearest pixel that is not: of ten photographs, cut out to an
+    island of 28 %, content features are then 0.16 of their deviation off those of the whole photograph, 0.25
+    with colours that fade from the border outwards, 0.52 with white; semantics 0.88, 0.84 and 1.35.
+    """
+    if cutout.opaque is None:
+        reduced = cv2.resize(cutout.pixels, size, interpolation=cv2.INTER_AREA)
+        return np.asarray(reduced, dtype=np.uint8), None
+    mean, cover = covered_mean(cutout.pixels, cutout.opaque.astype(np.float32), size)
+    return filled(mean, cover > 0), _mostly_covered(torch.from_numpy(cover))
+
+
+def _mostly_covered(cover: Annotated[Tensor, "H W"]) -> Annotated[Tensor, "H W"]:
+    """What is at least half covered, else whatever is covered at all."""
+    half = cover >= 0.5
+    return half if bool(half.any()) else cover > 0
+
+
+def _grid_pixels(size: tuple[int, int]) -> Annotated[Tensor, "N 2"]:
+    """Pixels (x, y, int64) of a regular grid over a picture of a size (width, height)."""
+    width, height = size
+    step = max(1, round((height * width / _SAMPLED_PIXELS) ** 0.5))
+    rows = torch.arange(step // 2, height, step)
+    columns = torch.arange(step // 2, width, step)
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
+    return torch.stack([x.flatten(), y.flatten()], 1)
+
+
+def _every_nth_pixel(chosen: Annotated[Tensor, "H W"]) -> Annotated[Tensor, "N 2"]:
+    """Every n-th of the chosen pixels (x, y, int64), so that a small part is looked at closely."""
+    pixel = chosen.nonzero().flip(1)
+    step = max(1, round(len(pixel) / _SAMPLED_PIXELS))
+    return pixel[step // 2 :: step]
 
 
 def semantic_samples(
@@ -169,15 +202,13 @@ def _filtered(
     """Apply the guided filter at pixels (x, y, int64)."""
     height, width = image.shape[:2]
     radius = round(guided.radius * min(height, width))
-    cells = coefficients(maps, image, radius=radius, eps=guided.eps, stride=_CELL)
-    parts = torch.split(pixel, _ROWS)
+    cells = coefficients(maps, image, radius=radius, eps=guided.eps, stride=_FILTER_CELL_PIXELS)
+    parts = torch.split(pixel, _FILTERED_ROWS)
     return torch.cat([apply(cells, at + 0.5, image[at[:, 1], at[:, 0]], (height, width)) for at in parts])
 
 
 def _read_mask(path: Path, photo_path: Path, photo: Image, size: tuple[int, int]) -> Annotated[Tensor, "H W"]:
-    """Read a mask at a size (width, height), bool: what is at least half covered, else whatever is covered at
-    all.
-    """
+    """Read the mask of a photograph at a size (width, height), bool."""
     white = load_mask(path, upright=True)
     (height, width) = white.shape
     (own_height, own_width) = photo.shape[:2]
@@ -186,15 +217,25 @@ def _read_mask(path: Path, photo_path: Path, photo: Image, size: tuple[int, int]
             f"{path}: a mask of {width}x{height} pixels does not fit {photo_path.name} of {own_width}x{own_height}; "
             "draw it on the photograph itself"
         )
-    cover = torch.from_numpy(
-        np.asarray(cv2.resize(white.astype(np.float32), size, interpolation=cv2.INTER_AREA))
-    )
-    selected = cover >= 0.5 if bool((cover >= 0.5).any()) else cover > 0
+    cover = np.asarray(cv2.resize(white.astype(np.float32), size, interpolation=cv2.INTER_AREA))
+    selected = _mostly_covered(torch.from_numpy(cover))
     if not bool(selected.any()):
         raise DataError(
             f"{path}: the mask selects no pixel of {photo_path.name}; paint white what makes the style"
         )
     return selected
+
+
+def _within_mask(
+    selected: Annotated[Tensor, "H W"], opaque: Annotated[Tensor, "H W"] | None, mask: Path, photo: Path
+) -> Annotated[Tensor, "H W"]:
+    """What a mask selects and is opaque."""
+    both = selected if opaque is None else selected & opaque
+    if not bool(both.any()):
+        raise DataError(
+            f"{mask}: the mask selects only what is transparent in {photo.name}; paint white what makes the style"
+        )
+    return both
 
 
 class StyleDictionary(NamedTuple):
@@ -278,7 +319,7 @@ def concatenate(
     """Join dictionaries of one reference each, under new names and weights."""
     counts = torch.tensor([len(part.keys) for part in parts])
     fields = []
-    for name in (*_TABLES, *_OPTIONAL):
+    for name in (*_CODE_TABLES, *_OPTIONAL_TABLES):
         if all(getattr(part, name) is not None for part in parts):
             fields.append(name)
     tables = {}
@@ -297,10 +338,10 @@ def _codes_of(r: Reference, clusters: int, blend: float, seed: int) -> StyleDict
     if r.semantic.shape[1] > 0:
         keys, label = kmeans(r.semantic, clusters, seed=seed)
     # Codes with few members say little: the fewer, the more of the whole image they take. `whole_share` [T]
-    # is that: `blend` for codes of _FEW_MEMBERS or more, rising to 1 for a code without any.
+    # is that: `blend` for codes of _MIN_SURE_MEMBERS or more, rising to 1 for a code without any.
     member = double(torch.nn.functional.one_hot(label, len(keys)))
     share = member.sum(0) / len(label)
-    whole_share = 1 - (1 - blend) * (share * len(label) / _FEW_MEMBERS).clamp_max(1.0)
+    whole_share = 1 - (1 - blend) * (share * len(label) / _MIN_SURE_MEMBERS).clamp_max(1.0)
 
     def statistics(
         features: Annotated[Tensor, "N C"],
@@ -313,7 +354,7 @@ def _codes_of(r: Reference, clusters: int, blend: float, seed: int) -> StyleDict
     # Of content features always; of colours, and of what lies beyond, where the reference brings them.
     tables = dict(zip(("mean", "covariance"), statistics(r.content), strict=True))
     if r.colour is not None:
-        tables |= dict(zip(_COLOURS, statistics(r.colour), strict=True))
+        tables |= dict(zip(_COLOUR_TABLES, statistics(r.colour), strict=True))
     if r.beyond is not None:
         tables["beyond"] = member.T @ double(r.beyond) / member.sum(0)
     tables |= {"keys": keys, "share": share, "weight": torch.full_like(share, r.weight)}
@@ -380,7 +421,11 @@ def choose(
     codes = references[d.reference]
     renumbered = references.cumsum(0) - 1
     part = d._replace(
-        **{name: getattr(d, name)[codes] for name in (*_TABLES, *_OPTIONAL) if getattr(d, name) is not None},
+        **{
+            name: getattr(d, name)[codes]
+            for name in (*_CODE_TABLES, *_OPTIONAL_TABLES)
+            if getattr(d, name) is not None
+        },
         reference=renumbered[d.reference[codes]],
         names=tuple(name for name, taken in zip(d.names, references.tolist(), strict=True) if taken),
         allowed=None,
@@ -393,7 +438,7 @@ def save_dictionary(path: Path, d: StyleDictionary) -> None:
     new one.
     """
     fields = []
-    for name in (*_TABLES, "reference", *_OPTIONAL):
+    for name in (*_CODE_TABLES, "reference", *_OPTIONAL_TABLES):
         if getattr(d, name) is not None:
             fields.append(name)
     tensors = {}

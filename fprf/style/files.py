@@ -37,8 +37,8 @@ from ..plugins.codec import from_json, packages_of, read_json, to_json
 from ..plugins.registry import nearest
 from .config import NO_MASK, StyleConfig
 
-_FORMAT = 1
-_KEYS = ("format", "fprf", "plugins", "style", "sha256", "semantic_encoder", "regions", "made")
+_STYLE_FORMAT = 1
+_STYLE_KEYS = ("format", "fprf", "plugins", "style", "sha256", "semantic_encoder", "regions", "made")
 
 RegionKey = tuple[float, ...]
 S = TypeVar("S", bound=StyleConfig)
@@ -65,16 +65,16 @@ def read_style(path: Path, *, centred: bool = True) -> StyleFile:
     try:
         if (
             not isinstance(whole, dict)
-            or whole.get("format") != _FORMAT
+            or whole.get("format") != _STYLE_FORMAT
             or not isinstance(whole.get("style"), dict)
         ):
             raise ConfigError(
-                f'expected an object with "format": {_FORMAT} and "style", as `fprf stylize` writes it'
+                f'expected an object with "format": {_STYLE_FORMAT} and "style", as `fprf stylize` writes it'
             )
         for key in whole:
-            if key not in _KEYS:  # a typing error would otherwise go unnoticed
+            if key not in _STYLE_KEYS:  # a typing error would otherwise go unnoticed
                 raise ConfigError(
-                    f"unknown key {key!r}{nearest(key, list(_KEYS))} (allowed: {', '.join(_KEYS)})"
+                    f"unknown key {key!r}{nearest(key, list(_STYLE_KEYS))} (allowed: {', '.join(_STYLE_KEYS)})"
                 )
         fields = whole["style"]
         if "fprf" in whole and "bold" not in fields:  # saved before there was light: all was painted
@@ -116,7 +116,7 @@ def write_style(path: Path, file: StyleFile, made: Mapping[str, Any] | None = No
     style = file.style
     masks = [p for p in style.masks if p != NO_MASK]
     whole = {
-        "format": _FORMAT,
+        "format": _STYLE_FORMAT,
         "fprf": version("fprf"),
         "plugins": packages_of(style),
         "style": to_json(_with_paths(style, partial(_portable, path))),
@@ -124,7 +124,9 @@ def write_style(path: Path, file: StyleFile, made: Mapping[str, Any] | None = No
         "semantic_encoder": file.semantic_encoder,
         "regions": {name: list(key) for name, key in file.regions.items()},
     }
-    write_json(path, whole if made is None else whole | {"made": made})
+    if made is not None:
+        whole["made"] = made
+    write_json(path, whole)
 
 
 def style_key(file: StyleFile) -> str:
@@ -213,7 +215,9 @@ def _resolved(file: Path, path: Path) -> Path:
     path = as_path(path)
     whole = file.parent / path
     beside = file.parent / path.name
-    return beside if not whole.exists() and beside.exists() else whole
+    if not whole.exists() and beside.exists():
+        return beside
+    return whole
 
 
 def _portable(file: Path, path: Path) -> Path:
@@ -256,10 +260,10 @@ def read_keyframes(path: Path) -> tuple[Keyframe, ...]:
         if (
             not isinstance(whole, dict)
             or whole.keys() != {"format", "keyframes"}
-            or whole["format"] != _FORMAT
+            or whole["format"] != _STYLE_FORMAT
         ):
             raise ConfigError(
-                f'expected an object with "format": {_FORMAT} and "keyframes", and nothing else'
+                f'expected an object with "format": {_STYLE_FORMAT} and "keyframes", and nothing else'
             )
         keys = from_json(whole["keyframes"], list[Keyframe], path="keyframes")
         if not keys or len({key.frame for key in keys}) < len(keys):

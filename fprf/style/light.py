@@ -48,50 +48,65 @@ nothing.
 """
 UNRIVALLED = 0.9
 """Lowe's ratio from which on a claim has no rival: below lies the noise between regions of one kind."""
-_RIVALLED = 0.8
+_MAX_RIVAL_SHARE = 0.8
 """What a rival takes from confidence at most."""
-_NEAREST = 0.05
+_NEAREST_SHARE = 0.05
 """Share of a reference's pixels that a score is the mean of: less may be the rim of something else."""
 APPLIED = 0.6
 """Share of the estimated exposure of things and of the cast that is applied: both are drawn to no change,
 since a few matches know the light of another place within limits.
 """
-_SMOOTH = 0.12
-_ROUGH = 0.25
-"""Deviations of luma, relative to it, up to which a region is a source of light, and from which on it is a
-thing.
-"""
-_BLACK = 0.02
+_MAX_SOURCE_ROUGHNESS = 0.12
+"""Deviation of luma, relative to it, up to which a region is a source of light: skies lie below, by eye."""
+_MIN_THING_ROUGHNESS = 0.25
+"""The same from which on it is a thing: façades and trees lie above, by eye."""
+_BLACK_OFFSET = 0.02
 """Added to colours before ratios are taken: five 8-bit steps, below which no ratio is known."""
-_WHITE = 0.95
-"""Luma that a deviation above the mean may reach by exposure."""
-_EXPOSURE = (0.05, 2.5)
-"""Least and largest gain of light."""
-_SATURATION = (0.35, 1.1)
-"""Least and largest gain of saturation: black and white takes colour away, a neon street adds little to a
-wall.
-"""
-_SKY_SATURATION = 0.7
+_MAX_EXPOSED_LUMA = 0.95
+"""Luma that a deviation above the mean may reach by exposure: what is white has no shape. By eye."""
+_MIN_EXPOSURE_GAIN = 0.05
+"""Least gain of light: a night is a twentieth as bright as a day in sRGB. By eye."""
+_MAX_EXPOSURE_GAIN = 2.5
+"""Largest gain of light: above, the noise of dark places shows. By eye."""
+_MIN_SATURATION_GAIN = 0.35
+"""Least gain of saturation: black and white takes colour away. By eye."""
+_MAX_SATURATION_GAIN = 1.1
+"""Largest gain of saturation: a neon street adds little to a wall. By eye."""
+_SOURCE_SATURATION_GAIN = 0.7
 """Gain of saturation of sources of light besides: what they show is light, no material, and an overcast sky
 is never wrong.
 """
-_CAST = 0.36
-"""Largest cast along an axis, in logarithms of sRGB."""
-_BRIGHT = 0.15
+_MAX_CAST = 0.36
+"""Largest cast along an axis, in logarithms of sRGB: a factor of 1.4. By eye."""
+_CAST_LUMA = 0.15
 """Luma below which colours count less for the cast: what is nearly black has none."""
-_LEAST_VOTE = 0.1
+_MIN_CAST_WEIGHT = 0.05
+"""Weight of black in the cast, beside 1 of bright colours: a night has a cast, too. By eye."""
+_MIN_VOTE = 0.1
 """Vote of an unsure region on the exposure, beside 1 of a sure one: a scene of nothing but these has an
 exposure, too.
 """
-_AXES = ((0.5**0.5, 0.0, -(0.5**0.5)), (-(6**-0.5), (2 / 3) ** 0.5, -(6**-0.5)))
+_MIN_THING_SHARE = 1e-3
+"""Share of things below which all of a scene, nothing but sky, votes on the exposure. By eye."""
+_MAX_CONTRAST_LOSS = 3.0
+"""Factor by which contrast is reduced at most, however near to white it lies. By eye."""
+_MAX_DISSENT_SHARE = 0.2
+"""Share of the weight that may have less of a cast, or none, before there is no common one. By eye."""
+_RIVAL_LIKENESS_POWER = 4
+"""Power of the cosine by which a rival counts as one of the region's kind. By eye."""
+_CLAIM_POWER = 0.4
+"""Power of the claim: steep where a rival appears, flat where it is much the nearer. By eye."""
+_MIN_ANGLE = 1e-6
+"""Squared distance of directions, at least: no ratio of two roundings."""
+_CAST_AXES = ((0.5**0.5, 0.0, -(0.5**0.5)), (-(6**-0.5), (2 / 3) ** 0.5, -(6**-0.5)))
 """Red against blue, green against magenta; of unit length, at right angles to grey and to each other."""
-_LUMA = (0.2126, 0.7152, 0.0722)
+_LUMA_WEIGHTS = (0.2126, 0.7152, 0.0722)
 """Rec. 709."""
 
 
 def luma(rgb: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 1"]:
     """Luma of sRGB colours, in [0, 1] for colours in [0, 1]."""
-    return (rgb * rgb.new_tensor(_LUMA)).sum(-1, keepdim=True)
+    return (rgb * rgb.new_tensor(_LUMA_WEIGHTS)).sum(-1, keepdim=True)
 
 
 class Light(nn.Module):
@@ -157,7 +172,7 @@ class Light(nn.Module):
             # counts in part.
             near, order = near.sort(1, descending=True)
             size = (self.share[codes] / self.share[codes].sum())[order]
-            taken = (_NEAREST - (size.cumsum(1) - size)).clamp_min(0).minimum(size)
+            taken = (_NEAREST_SHARE - (size.cumsum(1) - size)).clamp_min(0).minimum(size)
             own = torch.maximum(own, (taken * near).sum(1) / taken.sum(1))
         likeness = (own[:, None] / self._spread + belongs @ self.region_likeness) / 2
         return (likeness / SURE).clamp(0, 1) * (belongs @ self.claim)
@@ -198,8 +213,9 @@ class Light(nn.Module):
         return (torch.einsum("nc,ncd->nd", colour.to(maps), maps[:, :3]) + maps[:, 3]).to(colour)
 
     def _belongs(self, semantic: Tensor, belongs: Tensor | None) -> Annotated[Tensor, "N K"]:
-        share: Tensor = self.membership(semantic) if belongs is None else belongs
-        return share.to(self.maps)
+        if belongs is None:
+            belongs = self.membership(semantic)
+        return belongs.to(self.maps)
 
 
 def light_of(
@@ -230,15 +246,7 @@ def light_of(
     claim = mean.new_zeros(count)
     maps = mean.new_zeros(count, 4, 3)
     between = torch.zeros_like(mean)
-    # Cosine of each region with each code, float64: each reference is seen from its own middle.
-    own = double(scene.keys).cpu()
-    keys = double(dictionary.keys).cpu()
-    centre = double(scene.semantic_mean).cpu()
-    beyond = double(_beyond(dictionary)).cpu()
-    cosine = mean.new_zeros(count, len(dictionary.keys))
-    for i, middle in enumerate(double(_middles(scene, dictionary)).cpu()):
-        codes = (dictionary.reference == i).nonzero().squeeze(1)
-        cosine[:, codes] = cosines(own, keys[codes], beyond[codes], centre, middle)
+    cosine = _code_cosines(scene, dictionary)
     for row in sorted({tuple(row) for row in every.tolist()}):
         # All regions are matched with one choice of references; those that made it take their rows.
         chosen = torch.tensor(row)
@@ -256,6 +264,19 @@ def light_of(
         maps[rows] = lit[rows]
         between[rows] = added[rows]
     return Light(scene, dictionary, maps, between, bold, likeness, claim, every)
+
+
+def _code_cosines(scene: SceneStyle, dictionary: StyleDictionary) -> Annotated[Tensor, "K T"]:
+    """Cosine of each region with each code, float64: each reference is seen from its own middle."""
+    own = double(scene.keys).cpu()
+    keys = double(dictionary.keys).cpu()
+    centre = double(scene.semantic_mean).cpu()
+    beyond = double(_beyond(dictionary)).cpu()
+    cosine = own.new_zeros(len(own), len(keys))
+    for i, middle in enumerate(double(_middles(scene, dictionary)).cpu()):
+        codes = (dictionary.reference == i).nonzero().squeeze(1)
+        cosine[:, codes] = cosines(own, keys[codes], beyond[codes], centre, middle)
+    return cosine
 
 
 def cosines(
@@ -314,12 +335,12 @@ def unrivalled(
     # d, r and cos(k, l) of the formula; the least over rivals counts.
     units = unit(double(scene.keys), double(scene.semantic_mean))
     cosine = units @ unit(double(dictionary.keys), double(scene.semantic_mean)).T
-    distance = (1 - cosine).clamp_min(1e-6)  # no ratio of two roundings
+    distance = (1 - cosine).clamp_min(_MIN_ANGLE)
     ratio = (distance[None] / distance[:, None]).clamp_max(1)
-    like = (units @ units.T).clamp_min(0).pow(4)[..., None]
+    like = (units @ units.T).clamp_min(0).pow(_RIVAL_LIKENESS_POWER)[..., None]
     share = (table * (ratio + (1 - ratio) * like).amin(1)).sum(1)
     # Steep where a rival appears, flat where it is much the nearer: that much a wrong match still tells.
-    return 1 - _RIVALLED * (1 - (share / UNRIVALLED).clamp(0, 1)).pow(0.4)
+    return 1 - _MAX_RIVAL_SHARE * (1 - (share / UNRIVALLED).clamp(0, 1)).pow(_CLAIM_POWER)
 
 
 def light_maps(
@@ -339,59 +360,93 @@ def light_maps(
     painted = table @ codes
     own = luma(mean)[:, 0]
     grey = luma(torch.eye(3, dtype=torch.float64))
+    axes = torch.tensor(_CAST_AXES, dtype=torch.float64)
     # Smooth regions are sources of light, as the sky is; rough ones are things.
     deviation = torch.einsum("kij,ix,jx->k", covariance, grey, grey).clamp_min(0).sqrt()
-    source = ((_ROUGH - deviation / (own + _BLACK)) / (_ROUGH - _SMOOTH)).clamp(0, 1)
-    vote = share * (1 - source)
-    vote = (
-        share if float(vote.sum()) < 1e-3 * float(share.sum()) else vote
-    )  # of a scene of nothing but sky, all
-    # Exposure e, from the logarithms of luma: things take the median of their changes, sources the change of
-    # their match.
-    change = (luma(painted)[:, 0] + _BLACK).log() - (own + _BLACK).log()
-    thing = torch.full_like(change, APPLIED * _quantile(change, vote * (sure + _LEAST_VOTE), 0.5))
-    gain = torch.lerp(thing, change, source).exp().clamp(*_EXPOSURE)
+    roughness = deviation / (own + _BLACK_OFFSET)
+    source = ((_MIN_THING_ROUGHNESS - roughness) / (_MIN_THING_ROUGHNESS - _MAX_SOURCE_ROUGHNESS)).clamp(0, 1)
     # What is nearly white already, as a marble statue is, cannot become brighter without losing its shape.
-    gain = gain.minimum((_WHITE / (own + deviation)).clamp_min(1.0))
-    # White balance g, from the logarithms of colours: the cast of the references less that of the scene, axis
-    # by axis.
-    axes = torch.tensor(_AXES, dtype=torch.float64)
-    here = (mean.clamp_min(0) + _BLACK).log() @ axes.T
-    there = (codes.clamp_min(0) + _BLACK).log() @ axes.T
-    bright = odds * (luma(codes)[:, 0] / _BRIGHT).clamp(0.05, 1)
-    cast = []
-    for a in range(len(axes)):
-        common = shared(there[:, a], bright)
-        # Where the references share nothing, what the scene shares may be its material: a plant is yellowish
-        # throughout.
-        cast.append(common - shared(here[:, a], share) if common else 0.0)
-    balance = (APPLIED * torch.tensor(cast, dtype=torch.float64).clamp(-_CAST, _CAST) @ axes).exp()
+    gain = _exposure(own, luma(painted)[:, 0], share, source, sure)
+    gain = gain.minimum((_MAX_EXPOSED_LUMA / (own + deviation)).clamp_min(1.0))
+    balance = _white_balance(mean, share, codes, odds, axes)
     # Saturation s of the references against the scene's, and S = (s I + (1 - s) L) diag(g).
-    saturation = (_saturation(codes, odds) / _saturation(mean, share)).clamp(*_SATURATION)
-    saturation = (
-        saturation * torch.lerp(torch.ones_like(source), source.new_tensor(_SKY_SATURATION), source)
-    )[:, None, None]
+    change = _saturation(codes, odds) / _saturation(mean, share)
+    change = change.clamp(_MIN_SATURATION_GAIN, _MAX_SATURATION_GAIN)
+    softer = torch.lerp(torch.ones_like(source), source.new_tensor(_SOURCE_SATURATION_GAIN), source)
+    saturation = (change * softer)[:, None, None]
     towards = (saturation * torch.eye(3).to(grey) + (1 - saturation) * grey.expand(3, 3)) * balance
     # Contrast q: two deviations above the mean stay below white, with at least a third of the contrast.
-    contrast = gain.minimum(
-        ((1 - gain * own) / (2 * deviation).clamp_min(_BLACK)).clamp_min(gain.clamp_max(1) / 3)
-    )
+    below_white = (1 - gain * own) / (2 * deviation).clamp_min(_BLACK_OFFSET)
+    contrast = gain.minimum(below_white.clamp_min(gain.clamp_max(1) / _MAX_CONTRAST_LOSS))
     bias = torch.einsum("kc,kcd->kd", (gain - contrast)[:, None] * mean, towards)
-    # u takes green and magenta out of the middle of the lit and the painted mean, as far as these are
-    # opposite along red and blue.
     lit_mean = torch.einsum("kc,kcd->kd", gain[:, None] * mean, towards)
-    (red, green) = (lit_mean @ axes.T).unbind(1)
-    (other_red, other_green) = (painted @ axes.T).unbind(1)
-    opposite = (-red * other_red / red.square().maximum(other_red.square()).clamp_min(1e-12)).clamp(0, 1)
-    between = (-opposite * (green + other_green) / 2)[:, None] * axes[1]
-    return torch.cat([contrast[:, None, None] * towards, bias[:, None]], 1), between
+    maps = torch.cat([contrast[:, None, None] * towards, bias[:, None]], 1)
+    return maps, _between(lit_mean, painted, axes)
+
+
+def _exposure(
+    own: Annotated[Tensor, "K"],
+    painted: Annotated[Tensor, "K"],
+    share: Annotated[Tensor, "K"],
+    source: Annotated[Tensor, "K"],
+    sure: Annotated[Tensor, "K"],
+) -> Annotated[Tensor, "K"]:
+    """Exposure e from the logarithms of the regions' luma and that of their match: things take the median of
+    their changes, sources the change of their match.
+    """
+    vote = share * (1 - source)
+    if float(vote.sum()) < _MIN_THING_SHARE * float(share.sum()):
+        vote = share  # of a scene of nothing but sky, all
+    change = (painted + _BLACK_OFFSET).log() - (own + _BLACK_OFFSET).log()
+    thing = torch.full_like(change, APPLIED * _quantile(change, vote * (sure + _MIN_VOTE), 0.5))
+    return torch.lerp(thing, change, source).exp().clamp(_MIN_EXPOSURE_GAIN, _MAX_EXPOSURE_GAIN)
+
+
+def _white_balance(
+    mean: Annotated[Tensor, "K 3"],
+    share: Annotated[Tensor, "K"],
+    codes: Annotated[Tensor, "T 3"],
+    odds: Annotated[Tensor, "T"],
+    axes: Annotated[Tensor, "2 3"],
+) -> Annotated[Tensor, "3"]:
+    """White balance g from the logarithms of colours: the cast of the references less that of the scene, axis
+    by axis.
+    """
+    here = (mean.clamp_min(0) + _BLACK_OFFSET).log() @ axes.T
+    there = (codes.clamp_min(0) + _BLACK_OFFSET).log() @ axes.T
+    bright = odds * (luma(codes)[:, 0] / _CAST_LUMA).clamp(_MIN_CAST_WEIGHT, 1)
+    casts = []
+    for a in range(len(axes)):
+        cast = shared(there[:, a], bright)
+        # Where the references share nothing, what the scene shares may be its material: a plant is yellowish
+        # throughout.
+        if cast:
+            cast -= shared(here[:, a], share)
+        casts.append(cast)
+    cast_of_axes = torch.tensor(casts, dtype=torch.float64).clamp(-_MAX_CAST, _MAX_CAST)
+    return (APPLIED * cast_of_axes @ axes).exp()
+
+
+def _between(
+    lit: Annotated[Tensor, "K 3"], painted: Annotated[Tensor, "K 3"], axes: Annotated[Tensor, "2 3"]
+) -> Annotated[Tensor, "K 3"]:
+    """u, which takes green and magenta out of the middle of the lit and the painted mean, as far as these are
+    opposite along red and blue.
+    """
+    red, green = (lit @ axes.T).unbind(1)
+    other_red, other_green = (painted @ axes.T).unbind(1)
+    largest = red.square().maximum(other_red.square()).clamp_min(1e-12)  # black on both sides: no ratio
+    opposite = (-red * other_red / largest).clamp(0, 1)
+    return (-opposite * (green + other_green) / 2)[:, None] * axes[1]
 
 
 def shared(value: Annotated[Tensor, "N"], weight: Annotated[Tensor, "N"]) -> float:
     """What four fifths of the weight have at least, with its sign; 0 where signs differ."""
-    low = _quantile(value, weight, 0.2)
-    high = _quantile(value, weight, 0.8)
-    return low if low > 0 else high if high < 0 else 0.0
+    low = _quantile(value, weight, _MAX_DISSENT_SHARE)
+    high = _quantile(value, weight, 1 - _MAX_DISSENT_SHARE)
+    if low > 0:
+        return low
+    return min(high, 0.0)
 
 
 def _quantile(value: Tensor, weight: Tensor, at: float) -> float:
@@ -404,7 +459,7 @@ def _saturation(colour: Annotated[Tensor, "N 3"], weight: Annotated[Tensor, "N"]
     """Median distance of colours from grey, relative to their luma; never 0."""
     grey = luma(colour)
     return torch.tensor(
-        _quantile((colour - grey).abs().amax(1) / (grey[:, 0] + _BLACK), weight, 0.5) + _BLACK
+        _quantile((colour - grey).abs().amax(1) / (grey[:, 0] + _BLACK_OFFSET), weight, 0.5) + _BLACK_OFFSET
     )
 
 

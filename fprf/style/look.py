@@ -19,8 +19,9 @@ transport of three channels. Colours after the decoder are those of draws from t
 features: a trained scene knows that and needs no images. A point's colour still depends on the point alone.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -38,11 +39,11 @@ from .statistics import mix, monge, symmetric_root
 if TYPE_CHECKING:
     from ..plugins.stylizers.config import StylizerConfig
 
-_DRAWS = 512
+_REGION_DRAWS = 512
 """Points drawn of each region: means of colours are known to a fiftieth of their deviation."""
-_GAIN = 3.0
+_MAX_COLOUR_GAIN = 3.0
 """No direction of colour is amplified more: a flat region's noise must stay unseen."""
-_QUIET = 2e-4
+_COLOUR_RIDGE_VARIANCE = 2e-4
 """Variance added on both sides: a deviation of four 8-bit steps, below which colours have no shape worth
 carrying over.
 """
@@ -213,8 +214,8 @@ def carried_colours(
     else:
         target = table @ there
         wide = torch.einsum("kt,tij->kij", table, spread)
-    floor = _QUIET * torch.eye(3).to(mean)
-    matrix = monge(covariances + floor, wide + floor, gain=_GAIN)
+    floor = _COLOUR_RIDGE_VARIANCE * torch.eye(3).to(mean)
+    matrix = monge(covariances + floor, wide + floor, gain=_MAX_COLOUR_GAIN)
     return matrix, target - torch.einsum("kc,kcd->kd", mean, matrix)
 
 
@@ -231,7 +232,10 @@ def decoded_colours(
         return double(scene.region_mean), double(scene.region_covariance)
     device = next(stylizer.buffers(), scene.mean).device
     draw = torch.randn(
-        _DRAWS // 2, scene.mean.numel(), generator=torch.Generator().manual_seed(0), dtype=torch.float64
+        _REGION_DRAWS // 2,
+        scene.mean.numel(),
+        generator=torch.Generator().manual_seed(0),
+        dtype=torch.float64,
     )
     draw = torch.cat([draw, -draw])  # in pairs: the features' mean is met exactly
     means = []
@@ -340,6 +344,33 @@ class RegionStylizer(Stylizer):
         return stylizer
 
 
+class Painted(NamedTuple):
+    """What one part of a mix does to points."""
+
+    features: Annotated[Tensor, "N C"]
+    belongs: Annotated[Tensor, "N K"] | None
+    """Membership, once known to the stylizer: it serves regions, colours and light."""
+    strength: float | Annotated[Tensor, "N 1"]
+    painted: float | Annotated[Tensor, "N 1"]
+    """Strength, as far as points are sure of their match."""
+    paint: Annotated[Tensor, "N 1"] | None
+    """How sure points are; None = all are."""
+
+
+def _mixed_features(
+    parts: Sequence["Restyle"], features: Sequence[Annotated[Tensor, "N C"]]
+) -> tuple[Annotated[Tensor, "N C"], float]:
+    """Features and luminance of a mix by the shares of its parts; one alone is left as it is, bit for bit."""
+    if len(parts) == 1:
+        return features[0], parts[0].luminance
+    mixed = torch.zeros_like(features[0])
+    luminance = 0.0
+    for part, styled in zip(parts, features, strict=True):
+        mixed = mixed + part.share * styled
+        luminance += part.share * part.luminance
+    return mixed, luminance
+
+
 @dataclass(frozen=True)
 class Restyle:
     """A stylizer and how strongly it acts, 0 to 1; at 0 it is never called."""
@@ -411,56 +442,54 @@ class Restyle:
     ) -> Annotated[Tensor, "N 3"]:
         """Colours of points in this look, in [0, 1]."""
         parts = [part for part in self.parts if part.share > 0]
-        # Features: each part's stylizer, by its strength and by how sure points are of their match.
-        # Membership, once known to the stylizer (`belongs`), serves regions, colours and light.
-        styled = []
-        active = []
-        for part in parts:
-            if part.strength == 0:
-                styled.append(content)
-                continue
-            moved, belongs = part.stylizer.shared(content, semantic)
-            strength: float | Tensor = part.strength
-            if part.regions is not None:
-                # Without semantics there is one region, and nothing to look up.
-                weight: Tensor = part.regions(content[:, :0] if semantic is None else semantic, belongs)
-                strength = strength * weight
-            painted = strength
-            paint = None
-            if part.light is not None:
-                assert semantic is not None, "Want.SEMANTIC was asked for"
-                paint = part.light.paint(semantic, belongs)
-                painted = strength * paint.to(content)
-            # At 0 the scene's own features, at 1 the styled ones, both bit for bit.
-            share = part.features * painted
-            styled.append(
-                torch.lerp(content, moved, share.to(content) if isinstance(share, Tensor) else share)
-            )
-            active.append((part, belongs, strength, painted, paint))
-        # Mix the parts by their shares; one alone is left as it is, bit for bit.
-        mixed = styled[0]
-        luminance = parts[0].luminance
-        if len(parts) > 1:
-            mixed = torch.zeros_like(mixed)
-            luminance = 0.0
-            for part, features in zip(parts, styled, strict=True):
-                mixed = mixed + part.share * features
-                luminance = luminance + part.share * part.luminance
+        painted = [part.painted(content, semantic) for part in parts]
+        mixed, luminance = _mixed_features(parts, [each.features for each in painted])
         colour: Tensor = decoder(mixed)
-        lit = any(paint is not None for *_, paint in active)
-        own = decoder(content) if luminance > 0 or lit else colour
+        active = [(part, each) for part, each in zip(parts, painted, strict=True) if part.strength > 0]
+        own = colour
+        if luminance > 0 or any(each.paint is not None for _, each in active):
+            own = decoder(content)
         # Colours: the maps move what was decoded, light moves the scene's own colours.
         changes = []
-        for part, belongs, strength, painted, paint in active:
+        for part, each in active:
             if part.colours is not None:
-                changes.append(part.share * painted * part.colours(colour, semantic, belongs))
+                change = part.colours(colour, semantic, each.belongs)
+                changes.append(part.share * each.painted * change)
             if part.light is not None:
-                changes.append(part.share * strength * part.light(own, semantic, paint, belongs))
+                lit = part.light(own, semantic, each.paint, each.belongs)
+                changes.append(part.share * each.strength * lit)
         if changes:
             colour = (colour + torch.stack(changes).sum(0)).clamp(0, 1)
         if luminance > 0:
             return keep_luminance(colour, own, luminance)
         return colour
+
+    def painted(
+        self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
+    ) -> "Painted":
+        """What this part alone does to features: its stylizer, by its strength and by how sure points are of
+        their match.
+        """
+        if self.strength == 0:
+            return Painted(content, None, 0.0, 0.0, None)
+        moved, belongs = self.stylizer.shared(content, semantic)
+        strength: float | Tensor = self.strength
+        if self.regions is not None:
+            # Without semantics there is one region, and nothing to look up.
+            there = content[:, :0] if semantic is None else semantic
+            weight: Tensor = self.regions(there, belongs)
+            strength = strength * weight
+        painted = strength
+        paint = None
+        if self.light is not None:
+            assert semantic is not None, "Want.SEMANTIC was asked for"
+            paint = self.light.paint(semantic, belongs)
+            painted = strength * paint.to(content)
+        # At 0 the scene's own features, at 1 the styled ones, both bit for bit.
+        share = self.features * painted
+        if isinstance(share, Tensor):
+            share = share.to(content)
+        return Painted(torch.lerp(content, moved, share), belongs, strength, painted, paint)
 
     def match(
         self, semantic: Annotated[Tensor, "N D"], points: Annotated[Tensor, "N 3"] | None = None
@@ -480,7 +509,9 @@ class Restyle:
                     own = torch.lerp(
                         own, other.stylizer.match(semantic), place_weight(place, points)[:, None]
                     )
-            taken.append(part.share * (own if part.regions is None else own * part.regions(semantic)))
+            if part.regions is not None:
+                own = own * part.regions(semantic)
+            taken.append(part.share * own)
         return torch.cat(taken, 1)
 
     def confidence(

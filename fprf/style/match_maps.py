@@ -22,13 +22,14 @@ from .regions import Regions, membership_view, shrunk
 from .restyle import Codes, Styled
 from .scene_style import Membership
 
-_LISTED = 0.005
+_MIN_LISTED_SHARE = 0.005
 """Codes that less than this share of a view takes are not listed."""
-_VIEWS = 24
+_MAX_LOOKED_VIEWS = 24
 """Views that are looked through for where each region is largest, evenly over all."""
-_COARSE = 32
-_FINE = 160
-"""Longest side of the views that are looked through, and of the thumbnails."""
+_LOOKED_SIDE_PIXELS = 32
+"""Longest side of the views that are looked through: enough to tell the largest region."""
+_REGION_THUMBNAIL_PIXELS = 160
+"""Longest side of the thumbnails of regions: a dozen fit a sheet. By eye."""
 
 
 class MatchMap(NamedTuple):
@@ -68,7 +69,8 @@ def match_map(scene: Scene, styled: Styled, view: int, cameras: Cameras | None =
     """Matches of one of the scene's scene_style views, or of `cameras`: geometry and semantics alone are
     computed.
     """
-    cameras = scene.cameras if cameras is None else cameras
+    if cameras is None:
+        cameras = scene.cameras
     scene_style = styled.scene_style
     look = styled.restyle
     device = scene.device
@@ -131,7 +133,7 @@ def summarize(matched: MatchMap, codes: Codes) -> dict[str, Any]:
     # Codes are numbered within their reference, and listed from the most used on.
     listed = []
     for t in of_code.argsort(descending=True).tolist():
-        if float(of_code[t]) >= _LISTED:
+        if float(of_code[t]) >= _MIN_LISTED_SHARE:
             cluster = int((codes.reference[:t] == codes.reference[t]).sum())
             listed.append(
                 {
@@ -140,17 +142,17 @@ def summarize(matched: MatchMap, codes: Codes) -> dict[str, Any]:
                     "share": float(of_code[t]),
                 }
             )
+    regions = []
+    for k, share in enumerate(of_region.tolist()):
+        if share >= _MIN_LISTED_SHARE:
+            regions.append({"region": k, "share": share})
     return {
         **match_summary(matched.attention, codes.reference, codes.names, weight),
         "score": float((matched.score * weight).sum()) / styled,
         "confidence": float((matched.confidence * weight).sum()) / styled,
         "kept_share": float((kept * each).sum()) / total,
         "codes": listed,
-        "regions": [
-            {"region": k, "share": float(share)}
-            for k, share in enumerate(of_region)
-            if float(share) >= _LISTED
-        ],
+        "regions": regions,
     }
 
 
@@ -192,63 +194,69 @@ class ExplainedRegion(NamedTuple):
 def explain(regions: Regions, styled: Styled | None = None) -> list[ExplainedRegion]:
     """All regions in their order, with what they take where there is a style."""
     scene = regions.scene
-    style = regions.scene_style
-    # Views evenly over all are looked through, coarsely, for where each region is largest.
-    looked = sorted({round(i * (len(scene.names) - 1) / max(1, _VIEWS - 1)) for i in range(_VIEWS)})
-    mass = []
-    for view in looked:
-        share, opacity = membership_view(regions, view, _COARSE)
-        mass.append((share * opacity[..., None]).mean((0, 1)))
-    best = []
-    for column in torch.stack(mass).T:
-        best.append(looked[int(column.argmax())])
+    best = _best_views(regions)
     # Those views are rendered small, as they are, with the places of the regions in them.
     seen = {}
     for view in sorted(set(best)):
-        share, opacity = membership_view(regions, view, _FINE)
-        picture = to_uint8(scene.render(shrunk(scene.cameras, view, _FINE), 0).rgb)
+        share, opacity = membership_view(regions, view, _REGION_THUMBNAIL_PIXELS)
+        picture = to_uint8(scene.render(shrunk(scene.cameras, view, _REGION_THUMBNAIL_PIXELS), 0).rgb)
         seen[view] = picture, share * opacity[..., None]
     rows = []
     for k, view in enumerate(best):
-        picture = seen[view][0]
-        share = seen[view][1][..., k]
-        # Blurred membership is highest in the middle; a pixel that belongs to the region itself comes before
-        # one beside it.
-        own = share.cpu().numpy()
-        reach = 2 * (max(share.shape) // 12) + 1
-        smooth = cv2.blur(own, (reach, reach), borderType=cv2.BORDER_CONSTANT)
-        y, x = np.unravel_index(int(np.argmax(smooth * (own > 0.5) + 1e-3 * smooth)), smooth.shape)
+        picture, shares = seen[view]
+        share = shares[..., k]
         (width, height) = scene.cameras.size[view].tolist()
-        (tall, wide) = share.shape
-        pixel = int((x + 0.5) * width / wide), int((y + 0.5) * height / tall)
-        rows.append(
-            ExplainedRegion(k, float(style.share[k]), scene.names[view], pixel, highlight(picture, share))
-        )
-    if styled is None:
-        return rows
-    keys = style.keys.to(scene.device)
+        pixel = _middle_of(share, width, height)
+        part = float(regions.scene_style.share[k])
+        rows.append(ExplainedRegion(k, part, scene.names[view], pixel, highlight(picture, share)))
+    return rows if styled is None else _with_taken(rows, regions, styled)
+
+
+def _best_views(regions: Regions) -> list[int]:
+    """The view in which each region is largest; views evenly over all are looked through, coarsely."""
+    last = len(regions.scene.names) - 1
+    looked = sorted({round(i * last / max(1, _MAX_LOOKED_VIEWS - 1)) for i in range(_MAX_LOOKED_VIEWS)})
+    mass = []
+    for view in looked:
+        share, opacity = membership_view(regions, view, _LOOKED_SIDE_PIXELS)
+        mass.append((share * opacity[..., None]).mean((0, 1)))
+    return [looked[int(column.argmax())] for column in torch.stack(mass).T]
+
+
+def _middle_of(share: Annotated[Tensor, "H W"], width: int, height: int) -> tuple[int, int]:
+    """A pixel in the middle of a region, of a view of that size, by its share in a small copy."""
+    # Blurred membership is highest in the middle; a pixel that belongs to the region itself comes before one
+    # beside it.
+    own = share.cpu().numpy()
+    reach = 2 * (max(share.shape) // 12) + 1
+    smooth = cv2.blur(own, (reach, reach), borderType=cv2.BORDER_CONSTANT)
+    y, x = np.unravel_index(int(np.argmax(smooth * (own > 0.5) + 1e-3 * smooth)), smooth.shape)
+    (tall, wide) = share.shape
+    return int((x + 0.5) * width / wide), int((y + 0.5) * height / tall)
+
+
+def _with_taken(rows: list[ExplainedRegion], regions: Regions, styled: Styled) -> list[ExplainedRegion]:
+    """The regions with what each takes from the references."""
+    keys = regions.scene_style.keys.to(regions.scene.device)
     reference = styled.dictionary.reference
     controls = styled.controls
     attention = styled.restyle.stylizer.match(keys).cpu().double()
     sure = styled.restyle.confidence(keys).cpu()
+    explained = []
     for k, row in enumerate(rows):
         taken = []
         for i, name in enumerate(styled.dictionary.names):
-            taken.append(
-                ReferenceShare(
-                    name,
-                    float(attention[k][reference == i].sum()),
-                    float(controls.score[k][reference == i].max()),
-                )
-            )
-        rows[k] = row._replace(
+            share = float(attention[k][reference == i].sum())
+            taken.append(ReferenceShare(name, share, float(controls.score[k][reference == i].max())))
+        changed = row._replace(
             taken=tuple(sorted(taken, key=lambda each: (-each.share, -each.score))),
             entropy=float(torch.special.entr(attention[k]).sum()) / math.log(2),
             confidence=float(sure[k]),
             strength=float(controls.strength[k]),
             restricted=not bool(controls.allowed[k].all()),
         )
-    return rows
+        explained.append(changed)
+    return explained
 
 
 def region_row(region: ExplainedRegion) -> dict[str, Any]:
@@ -280,7 +288,9 @@ def region_tile(region: ExplainedRegion, names: tuple[str, ...]) -> Tile:
         return Tile(region.picture, tuple(lines))
     best = region.taken[0]
     matched = f"{best.name} {best.share:.0%}, score {best.score:.2f}, sure {region.confidence:.0%}"
-    lines.append("kept as it is" if region.strength == 0 else matched)
+    if region.strength == 0:
+        matched = "kept as it is"
+    lines.append(matched)
     by_name = {}
     for taken in region.taken:
         by_name[taken.name] = taken.share * region.strength

@@ -18,7 +18,7 @@ left out:
   little of the rest. Both sides are partly whitened, each by its own scatter,
 
       x'  =  (C / c + s I)^(-w/2) (x - m)        C the scatter of its keys, m their mean, c their mean variance,
-                                                 s = `_RIDGE`, w the share of whitening.
+                                                 s = `_WHITENING_RIDGE`, w the share of whitening.
 
 - Recentring: the mean of the references depends on what they were pointed at: three photographs, two of
   façades, have a mean that looks like a façade, from which trees point elsewhere than they do in the scene.
@@ -32,9 +32,9 @@ from torch import Tensor
 
 from ..ops.backend import double
 
-_FLAT = 1e-6
+_ROUNDING_SHARE = 1e-6
 """Below this share of what they were computed from, lengths and spreads are float32 rounding."""
-_RIDGE = 0.1
+_WHITENING_RIDGE = 0.1
 """Variance added to every direction before whitening, relative to the mean one: what hardly varies is not
 blown up.
 """
@@ -46,7 +46,7 @@ def unit(x: Annotated[Tensor, "N D"], centre: Annotated[Tensor, "D"]) -> Annotat
     """
     away = x - centre
     norm = torch.linalg.vector_norm(away, dim=-1, keepdim=True)
-    flat = norm <= _FLAT * torch.linalg.vector_norm(centre)
+    flat = norm <= _ROUNDING_SHARE * torch.linalg.vector_norm(centre)
     return torch.where(flat, 0.0, away / norm.clamp_min(torch.finfo(x.dtype).tiny))
 
 
@@ -67,13 +67,10 @@ def score_spread(queries: Annotated[Tensor, "N D"], keys: Annotated[Tensor, "T D
     encoders.
     """
     r = scores(double(queries), double(keys))
-    if r.numel():
-        spread = float((r - r.mean(1, keepdim=True)).square().mean().sqrt())
-    else:
-        spread = 0.0
-    if spread > _FLAT * float(r.abs().max() if r.numel() else 0.0):
-        return spread
-    return 1.0
+    if not r.numel():
+        return 1.0
+    spread = float((r - r.mean(1, keepdim=True)).square().mean().sqrt())
+    return spread if spread > _ROUNDING_SHARE * float(r.abs().max()) else 1.0
 
 
 def attention(
@@ -90,7 +87,9 @@ def attention(
     # The best score is subtracted before dividing: tiny temperatures then give -inf beside it, never inf -
     # inf.
     logits = (r - r.amax(1, keepdim=True)) / max(temperature, torch.finfo(r.dtype).tiny)
-    return torch.softmax(logits if prior is None else logits + prior.log(), 1)
+    if prior is not None:
+        logits = logits + prior.log()
+    return torch.softmax(logits, 1)
 
 
 def point_shares(
@@ -108,7 +107,9 @@ def point_shares(
     Shares below `faint` of a point's largest become 0. Rows sum to 1. Rounding errors are at most
     4 (D + 4) u / temperature, u the unit roundoff of the points' type.
     """
-    share = attention(x if centre is None else unit(x, centre), keys, temperature, prior)
+    if centre is not None:
+        x = unit(x, centre)
+    share = attention(x, keys, temperature, prior)
     if faint > 0:
         share = torch.where(share < faint * share.amax(1, keepdim=True), 0.0, share)
         share = share / share.sum(1, keepdim=True)
@@ -189,6 +190,6 @@ def whitener(
     size = scatter.diagonal().mean()
     if whitening == 0 or not bool(size > 0):
         return unity
-    values, vectors = torch.linalg.eigh(scatter / size + _RIDGE * unity)
-    root: Tensor = (vectors * values.clamp_min(_RIDGE) ** (-whitening / 2)) @ vectors.T
+    values, vectors = torch.linalg.eigh(scatter / size + _WHITENING_RIDGE * unity)
+    root: Tensor = (vectors * values.clamp_min(_WHITENING_RIDGE) ** (-whitening / 2)) @ vectors.T
     return root

@@ -45,10 +45,10 @@ Between the embedded towns in all lights and a photographed street, right matche
 below.
 """
 
-_SIDE = 128
+_MASK_SIDE_PIXELS = 128
 """Longest side in pixels at which a mask over a view is looked at."""
 
-_SOLID = 0.01
+_MIN_POINTED_OPACITY = 0.01
 """Less opacity is nothing to point at."""
 
 
@@ -96,57 +96,69 @@ def find_regions(regions: Regions, text: str) -> list[RegionMatch]:
     Raises UsageError for what names nothing on this scene, DataError for an unreadable mask.
     """
     count = len(regions.scene_style.share)
-    names = regions.scene.names
     if text.isascii() and text.isdigit():
         if int(text) >= count:
             raise UsageError(f"region {text}: regions go from 0 to {count - 1}; --explain lists them")
         return [RegionMatch(int(text), text)]
     if text in regions.keys:
         return _alike(regions, text)
-    # Longest names first: one view's name may begin with another's.
-    longest_first = sorted(range(len(names)), key=lambda v: -len(names[v]))
-    view = next((v for v in longest_first if text.startswith(f"{names[v]}:")), None)
-    if view is None:
-        if regions.keys:
-            named = f", a name in the style file ({', '.join(regions.keys)})"
-        else:
-            named = ""
-        raise UsageError(
-            f"region {text!r}: neither a number{named}, nor VIEW:X,Y or VIEW:MASK.png with a view of the run "
-            f"({names[0]} … {names[-1]})"
-        )
-    rest = text[len(names[view]) + 1 :]
-    if (pixel := parse_pixel(rest)) is not None:
-        # The region that most of what the pixel sees belongs to.
-        x, y = pixel
-        width, height = regions.scene.cameras.size[view].tolist()
-        if not (0 <= x < width and 0 <= y < height):
-            raise UsageError(
-                f"{text}: outside of the view; x goes from 0 to {width - 1}, y from 0 to {height - 1}"
-            )
-        centre = torch.tensor([[int(x) + 0.5, int(y) + 0.5]], dtype=torch.float64)
-        share, opacity = memberships(regions.scene, regions.scene_style, regions.scene.cameras, view, centre)
-        if float(opacity[0]) < _SOLID:
-            raise UsageError(f"{text}: there is nothing at that pixel; choose another")
-        found = {int(share[0].argmax())}
+    view = _view_named_in(regions, text)
+    rest = text[len(regions.scene.names[view]) + 1 :]
+    pixel = parse_pixel(rest)
+    if pixel is None:
+        found = _regions_under_mask(regions, view, as_path(rest))
     else:
-        # Regions of which the mask covers more than half of what the view shows, and the one that fills most
-        # of the mask: by their mass in the view and under the mask, on a small copy of both.
-        share, opacity = membership_view(regions, view, _SIDE)
-        painted = load_mask(as_path(rest), upright=True).astype(np.float32)
-        white = torch.from_numpy(
-            np.asarray(cv2.resize(painted, opacity.shape[::-1], interpolation=cv2.INTER_AREA))
-        )
-        mass = (share * opacity[..., None]).flatten(0, 1)
-        inside = white.flatten() @ mass
-        total = mass.sum(0)
-        if float(inside.sum()) < _SOLID:
-            raise UsageError(
-                f"{rest}: the mask selects nothing of view {names[view]}; paint white what counts"
-            )
-        mostly = (inside / total.clamp_min(1e-10) > 0.5) & (inside >= 1)
-        found = {int(inside.argmax()), *mostly.nonzero().flatten().tolist()}
+        found = {_region_at_pixel(regions, view, pixel, text)}
     return [RegionMatch(k, str(k)) for k in sorted(found)]
+
+
+def _view_named_in(regions: Regions, text: str) -> int:
+    """The view that a text begins with."""
+    names = regions.scene.names
+    # Longest names first: one view's name may begin with another's.
+    for view in sorted(range(len(names)), key=lambda v: -len(names[v])):
+        if text.startswith(f"{names[view]}:"):
+            return view
+    named = ""
+    if regions.keys:
+        named = f", a name in the style file ({', '.join(regions.keys)})"
+    raise UsageError(
+        f"region {text!r}: neither a number{named}, nor VIEW:X,Y or VIEW:MASK.png with a view of the run "
+        f"({names[0]} … {names[-1]})"
+    )
+
+
+def _region_at_pixel(regions: Regions, view: int, pixel: tuple[float, float], text: str) -> int:
+    """The region that most of what a pixel sees belongs to."""
+    x, y = pixel
+    width, height = regions.scene.cameras.size[view].tolist()
+    if not (0 <= x < width and 0 <= y < height):
+        raise UsageError(
+            f"{text}: outside of the view; x goes from 0 to {width - 1}, y from 0 to {height - 1}"
+        )
+    centre = torch.tensor([[int(x) + 0.5, int(y) + 0.5]], dtype=torch.float64)
+    share, opacity = memberships(regions.scene, regions.scene_style, regions.scene.cameras, view, centre)
+    if float(opacity[0]) < _MIN_POINTED_OPACITY:
+        raise UsageError(f"{text}: there is nothing at that pixel; choose another")
+    return int(share[0].argmax())
+
+
+def _regions_under_mask(regions: Regions, view: int, path: Path) -> set[int]:
+    """Regions of which a mask covers more than half of what the view shows, and the one that fills most of the
+    mask: by their mass in the view and under the mask, on a small copy of both.
+    """
+    share, opacity = membership_view(regions, view, _MASK_SIDE_PIXELS)
+    painted = load_mask(path, upright=True).astype(np.float32)
+    white = np.asarray(cv2.resize(painted, opacity.shape[::-1], interpolation=cv2.INTER_AREA))
+    mass = (share * opacity[..., None]).flatten(0, 1)
+    inside = torch.from_numpy(white).flatten() @ mass
+    total = mass.sum(0)
+    if float(inside.sum()) < _MIN_POINTED_OPACITY:
+        raise UsageError(
+            f"{path}: the mask selects nothing of view {regions.scene.names[view]}; paint white what counts"
+        )
+    mostly = (inside / total.clamp_min(1e-10) > 0.5) & (inside >= 1)
+    return {int(inside.argmax()), *mostly.nonzero().flatten().tolist()}
 
 
 def _alike(regions: Regions, name: str) -> list[RegionMatch]:
@@ -227,78 +239,133 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
     or contradict.
     """
     names = _StyleNames(regions, dictionary, style.references)
-    # What the style asks for, in numbers of regions and references. Pins of places are kept apart.
-    pin_texts = [parse_region_value("pin", text) for text in style.pin]
-    place_of = {pin.region: place for pin in pin_texts if (place := parse_place("pin", pin.region))}
-    pins = names.find_pairs([pin for pin in pin_texts if pin.region not in place_of])
-    bans = names.find_pairs([parse_region_value("forbid", text) for text in style.forbid])
-    kept = [match for text in style.keep for match in names.find(text)]
-    parsed = [parse_strength("region_strength", text) for text in style.region_strength]
-    strengths = [(match, value) for text, value in parsed for match in names.find(text)]
-    # A pinned region takes from the references that it is pinned to alone, every other one from all that are
-    # not forbidden.
-    allowed = torch.ones(len(regions.scene_style.share), len(dictionary.names), dtype=torch.bool)
-    pinned = {match.number for match, _ in pins}
-    allowed[sorted(pinned)] = False
-    for match, i in pins:
-        allowed[match.number, names.order[i]] = True
-    for match, i in bans:
-        allowed[match.number, names.order[i]] = False
-    for k in (~allowed.any(1)).nonzero().flatten().tolist():
-        raise UsageError(f"region {k}: every reference is forbidden; allow one, or keep the region as it is")
-    for match in kept:
-        if match.number in pinned or match.number in {f.number for f, _ in strengths}:
-            raise UsageError(
-                f"region {match.name}: is to be kept, and to be pinned or restyled in part; leave out one of both"
-            )
+    asked = _find_asked(names, style)
+    allowed = _allowed_references(names, asked)
     # Scores say whether the references show such a thing at all, so both sides are seen from the scene's
     # mean. Matching, which only has to choose, centres each side on its own: there a rose's petals are as far
     # from its leaves as the sky from the road, and something would always fit.
     centre = regions.scene_style.semantic_mean
     score = scores(unit(regions.scene_style.keys, centre), unit(dictionary.keys, centre))
+    strength = _region_strengths(names, asked, style, score, allowed)
+    file = StyleFile(_portable_style(names, asked, style), names.keys, regions.scene.semantic_encoder)
+    notes = tuple(dict.fromkeys(names.notes))
+    return RegionControls(
+        allowed, strength, score, file, regions, notes, _places_allowed(names, asked, allowed)
+    )
+
+
+class _Asked(NamedTuple):
+    """What a style asks for, in numbers of regions and references."""
+
+    pins: list[tuple[RegionMatch, int]]
+    bans: list[tuple[RegionMatch, int]]
+    kept: list[RegionMatch]
+    strengths: list[tuple[RegionMatch, float]]
+    places: dict[str, tuple[Place, set[int]]]
+    """Places by their texts, with the references that they take from."""
+
+    @property
+    def pinned(self) -> set[int]:
+        """Numbers of the regions that are pinned."""
+        return {match.number for match, _ in self.pins}
+
+
+def _find_asked(names: "_StyleNames", style: StyleConfig) -> _Asked:
+    pins = []
+    places: dict[str, tuple[Place, set[int]]] = {}
+    for text in style.pin:
+        pin = parse_region_value("pin", text)
+        place = parse_place("pin", pin.region)
+        if place is None:
+            pins.append(pin)
+        else:
+            _, chosen = places.setdefault(pin.region, (place, set()))
+            chosen.add(find_reference(pin.value, style.references))
+    bans = [parse_region_value("forbid", text) for text in style.forbid]
+    kept: list[RegionMatch] = []
+    for text in style.keep:
+        kept += names.find(text)
+    strengths: list[tuple[RegionMatch, float]] = []
+    for text in style.region_strength:
+        region, value = parse_strength("region_strength", text)
+        strengths += [(match, value) for match in names.find(region)]
+    asked = _Asked(names.find_pairs(pins), names.find_pairs(bans), kept, strengths, places)
+    partly = asked.pinned | {match.number for match, _ in strengths}
+    for match in kept:
+        if match.number in partly:
+            raise UsageError(
+                f"region {match.name}: is to be kept, and to be pinned or restyled in part; leave out one of both"
+            )
+    return asked
+
+
+def _allowed_references(names: "_StyleNames", asked: _Asked) -> Annotated[Tensor, "K references"]:
+    """References that each region may take from: a pinned region those that it is pinned to, every other one all
+    that are not forbidden.
+    """
+    allowed = torch.ones(len(names.regions.scene_style.share), len(names.dictionary.names), dtype=torch.bool)
+    allowed[sorted(asked.pinned)] = False
+    for match, i in asked.pins:
+        allowed[match.number, names.order[i]] = True
+    for match, i in asked.bans:
+        allowed[match.number, names.order[i]] = False
+    for k in (~allowed.any(1)).nonzero().flatten().tolist():
+        raise UsageError(f"region {k}: every reference is forbidden; allow one, or keep the region as it is")
+    return allowed
+
+
+def _region_strengths(
+    names: "_StyleNames",
+    asked: _Asked,
+    style: StyleConfig,
+    score: Annotated[Tensor, "K T"],
+    allowed: Annotated[Tensor, "K references"],
+) -> Annotated[Tensor, "K"]:
+    """Strength of the style in each region; 0 = kept."""
     strength = torch.ones(len(allowed))
-    for match, value in strengths:
+    for match, value in asked.strengths:
         strength[match.number] = value
-    strength[[match.number for match in kept]] = 0.0
-    if style.keep_below is not None:
-        best = score.masked_fill(~allowed[:, dictionary.reference], -torch.inf).amax(1)
-        poor = (best < style.keep_below).nonzero().flatten().tolist()
-        strength[[k for k in poor if k not in pinned]] = 0.0
-        if poor and not bool(strength.any()):
-            if len(score) == 1:
-                scored = "a scene of one region has no scores"
-            else:
-                scored = f"the best score is {float(best.max()):.2f}"
-            names.notes.append(f"keep_below {style.keep_below:g}: every region stays as it is; {scored}")
-    # Places: what regions may take of these references; all of them where that is none.
-    references_of: dict[str, set[int]] = {}
-    for pin in pin_texts:
-        if pin.region in place_of:
-            references_of.setdefault(pin.region, set()).add(find_reference(pin.value, style.references))
-    places = []
-    for text, chosen in references_of.items():
-        only = torch.zeros(len(dictionary.names), dtype=torch.bool)
+    strength[[match.number for match in asked.kept]] = 0.0
+    if style.keep_below is None:
+        return strength
+    best = score.masked_fill(~allowed[:, names.dictionary.reference], -torch.inf).amax(1)
+    poor = (best < style.keep_below).nonzero().flatten().tolist()
+    strength[[k for k in poor if k not in asked.pinned]] = 0.0
+    if poor and not bool(strength.any()):
+        if len(score) == 1:
+            scored = "a scene of one region has no scores"
+        else:
+            scored = f"the best score is {float(best.max()):.2f}"
+        names.notes.append(f"keep_below {style.keep_below:g}: every region stays as it is; {scored}")
+    return strength
+
+
+def _places_allowed(
+    names: "_StyleNames", asked: _Asked, allowed: Annotated[Tensor, "K references"]
+) -> tuple[tuple[Place, Annotated[Tensor, "K references"]], ...]:
+    """What regions may take in each place: of its references those that they may; all of them where that is
+    none.
+    """
+    found = []
+    for place, chosen in asked.places.values():
+        only = torch.zeros(allowed.shape[1], dtype=torch.bool)
         only[[names.order[i] for i in chosen]] = True
         both = allowed & only
-        places.append((place_of[text], torch.where(both.any(1, keepdim=True), both, only)))
-    # What is saved names regions by keys, which hold on other scenes, and references by file.
-    saved = replace(
+        found.append((place, torch.where(both.any(1, keepdim=True), both, only)))
+    return tuple(found)
+
+
+def _portable_style(names: "_StyleNames", asked: _Asked, style: StyleConfig) -> StyleConfig:
+    """The style with regions named by keys, which hold on other scenes, and references by file."""
+    pins = [f"{names.region(match)}={names.reference(i)}" for match, i in asked.pins]
+    for text, (_, chosen) in asked.places.items():
+        pins += [f"{text}={names.reference(i)}" for i in sorted(chosen)]
+    return replace(
         style,
-        pin=(
-            *(f"{names.region(f)}={names.reference(i)}" for f, i in pins),
-            *(
-                f"{text}={names.reference(i)}"
-                for text, chosen in references_of.items()
-                for i in sorted(chosen)
-            ),
-        ),
-        forbid=tuple(f"{names.region(f)}={names.reference(i)}" for f, i in bans),
-        keep=tuple(names.region(f) for f in kept),
-        region_strength=tuple(f"{names.region(f)}={value:g}" for f, value in strengths),
-    )
-    file = StyleFile(saved, names.keys, regions.scene.semantic_encoder)
-    return RegionControls(
-        allowed, strength, score, file, regions, tuple(dict.fromkeys(names.notes)), tuple(places)
+        pin=tuple(pins),
+        forbid=tuple(f"{names.region(match)}={names.reference(i)}" for match, i in asked.bans),
+        keep=tuple(names.region(match) for match in asked.kept),
+        region_strength=tuple(f"{names.region(match)}={value:g}" for match, value in asked.strengths),
     )
 
 
@@ -309,6 +376,7 @@ class _StyleNames:
 
     def __init__(self, regions: Regions, dictionary: StyleDictionary, references: Sequence[Path]) -> None:
         self.regions = regions
+        self.dictionary = dictionary
         self.references = references
         self.labels = labels(references)
         self.order = [dictionary.names.index(label) for label in self.labels]

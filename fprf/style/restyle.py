@@ -65,16 +65,21 @@ def apply_style(
             "--references: at least one photograph is needed, for example --references autumn.jpg night.jpg"
         )
     # Photographs are encoded once, whatever name, weight or style they are used under.
-    encoders = scene.encoders() if encoders is None else encoders
-    encoded = {} if encoded is None else encoded
+    if encoders is None:
+        encoders = scene.encoders()
+    if encoded is None:
+        encoded = {}
     references = []
     for i, (path, name) in enumerate(zip(style.references, labels(style.references), strict=True)):
-        mask = style.masks[i] if style.masks else NO_MASK
-        weight = style.weights[i] if style.weights else 1.0
+        mask = NO_MASK
+        if style.masks:
+            mask = style.masks[i]
+        weight = 1.0
+        if style.weights:
+            weight = style.weights[i]
         if (path, mask) not in encoded:
-            encoded[path, mask] = encode_photograph(
-                path, encoders, name=name, mask=None if mask == NO_MASK else mask
-            )
+            painted = None if mask == NO_MASK else mask
+            encoded[path, mask] = encode_photograph(path, encoders, name=name, mask=painted)
         references.append(encoded[path, mask]._replace(name=name, weight=weight))
     dictionary = build_dictionary(references, clusters=style.clusters, blend=style.blend, seed=encoders.seed)
     styled = apply_dictionary(scene, file._replace(style=style), encoders, dictionary)

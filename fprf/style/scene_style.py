@@ -18,17 +18,17 @@ from .matching import point_shares, score_spread, unit
 from .statistics import Moments, covariance, group_moments, kmeans
 from .statistics import moments as moments_of
 
-_SOFTNESS = 0.3
+_MEMBERSHIP_TEMPERATURE = 0.3
 """Temperature of points belonging to regions, relative to the spread of the scores: fixed with the scene,
 since the regions' statistics are taken with it.
 """
 
-_FAINT = 0.01
+_MIN_MEMBERSHIP_SHARE = 0.01
 """Memberships below this share of the largest are dropped: a point then belongs to two or three regions and
 the others cost nothing. What jumps there is below an 8-bit step.
 """
 
-_ALIKE = 0.05
+_EVEN_COLOUR_DIFFERENCE = 0.05
 """Difference of colours in [0, 1] at which two neighbouring pixels count 0.6 as one surface; at three times
 that, 0.01.
 """
@@ -116,7 +116,7 @@ class Membership(nn.Module):
     def __init__(self, keys: Annotated[Tensor, "K D"], centre: Annotated[Tensor, "D"]) -> None:
         super().__init__()
         units = unit(keys, centre)
-        self._temperature = _SOFTNESS * score_spread(units, units)
+        self._temperature = _MEMBERSHIP_TEMPERATURE * score_spread(units, units)
         self.register_buffer("centre", centre.float())
         self.register_buffer("units", units.float())
 
@@ -130,7 +130,9 @@ class Membership(nn.Module):
         semantic = semantic.to(self.units)
         if not self.divided:
             return semantic.new_ones(len(semantic), 1)
-        return point_shares(semantic, self.units, self._temperature, centre=self.centre, faint=_FAINT)
+        return point_shares(
+            semantic, self.units, self._temperature, centre=self.centre, faint=_MIN_MEMBERSHIP_SHARE
+        )
 
 
 def mixed_maps(
@@ -169,8 +171,9 @@ class RegionWeight(nn.Module):
         """The values, mixed by membership (`belongs`, where it is known): exactly 0 where all of a point's
         regions have 0.
         """
-        share: Tensor = self.membership(semantic) if belongs is None else belongs
-        return share.to(self.values) @ self.values
+        if belongs is None:
+            belongs = self.membership(semantic)
+        return belongs.to(self.values) @ self.values
 
 
 def region_contacts(
@@ -189,7 +192,9 @@ def region_contacts(
     # What one region loses between the ends of a pair, another gains; across an edge of colour it counts
     # little.
     change = ends[0] - ends[1]
-    even = torch.exp(-double(colour[:, 0] - colour[:, 1]).abs().amax(1).square() / (2 * _ALIKE**2))
+    even = torch.exp(
+        -double(colour[:, 0] - colour[:, 1]).abs().amax(1).square() / (2 * _EVEN_COLOUR_DIFFERENCE**2)
+    )
     passed = -(change * even[:, None]).T @ change / max(1, len(change))
     return passed.clamp_min(0).fill_diagonal_(0).float()
 

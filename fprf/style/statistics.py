@@ -26,15 +26,15 @@ from torch import Tensor
 from ..errors import NumericsError
 from ..ops.backend import double, float64_device
 
-_CHUNK = 16384
+_CENTRED_ROWS = 16384
 """Rows centred at a time: bounds the float64 copies of large inputs."""
 
-_FLOOR = 0.01
+_MIN_DEVIATION_SHARE = 0.01
 """A channel deviates by at least this share of the median channel: noise of dead channels must not become
 style.
 """
 
-_RESOLUTION = 1e-6
+_MEAN_ROUNDING_SHARE = 1e-6
 """A deviation below this share of the mean is float32 rounding."""
 
 
@@ -58,9 +58,9 @@ def moments(features: Annotated[Tensor, "N C"], weights: Annotated[Tensor, "N"])
     Raises NumericsError where a row that counts, or a weight, is not finite.
     """
     total = empty(features.shape[1], device=float64_device(features.device))
-    for start in range(0, len(features), _CHUNK):
-        rows = features[start : start + _CHUNK]
-        mass = double(weights[start : start + _CHUNK])
+    for start in range(0, len(features), _CENTRED_ROWS):
+        rows = features[start : start + _CENTRED_ROWS]
+        mass = double(weights[start : start + _CENTRED_ROWS])
         if not bool((mass >= 0).all() & mass.isfinite().all()):
             raise NumericsError(
                 "statistics: a weight is negative or not finite; weights must be finite and at least 0"
@@ -153,12 +153,12 @@ def deviation(
     The floor is relative, so it biases no live channel, whatever the encoder's scale; always above 0.
     """
     sigma = variance.clamp_min(0.0).sqrt()
-    floor = _FLOOR * sigma.median(dim=-1, keepdim=True).values
-    rounding = _RESOLUTION * mean.abs().amax(dim=-1, keepdim=True)
+    floor = _MIN_DEVIATION_SHARE * sigma.median(dim=-1, keepdim=True).values
+    rounding = _MEAN_ROUNDING_SHARE * mean.abs().amax(dim=-1, keepdim=True)
     return sigma.maximum(floor.maximum(rounding).clamp_min(1e-12))
 
 
-_RIDGE = 1e-4
+_MONGE_RIDGE_SHARE = 1e-4
 """Variance added in every direction, as a share of the mean variance: 1 % of the deviation, as AdaIN's
 floor.
 """
@@ -195,22 +195,23 @@ def monge(
 def _with_ridge(c: Tensor) -> Tensor:
     c = (c + c.mT) / 2
     variance = c.diagonal(dim1=-2, dim2=-1).mean(-1).clamp_min(torch.finfo(c.dtype).tiny ** 0.5)
-    return c + _RIDGE * variance[..., None, None] * torch.eye(c.shape[-1], dtype=c.dtype, device=c.device)
+    return c + _MONGE_RIDGE_SHARE * variance[..., None, None] * torch.eye(
+        c.shape[-1], dtype=c.dtype, device=c.device
+    )
 
 
-_ROWS = 20_480
+_MAX_CLUSTERED_ROWS = 20_480
 """Rows worth clustering: more do not move the centroids, and cost more than half a second."""
 
-_FEW = 4096
+_SEEDING_ROWS = 4096
 """Rows on which Lloyd's steps start: neighbouring pixels are alike; they find the same clusters at a quarter
 of the cost.
 """
 
-_ITERATIONS = 40
-_REFINED = 4
-"""Lloyd steps at most on few rows (photographs settle in 10 to 40, pure noise never does), and on all of them
-after that.
-"""
+_MAX_SEEDING_STEPS = 40
+"""Lloyd steps on few rows: photographs settle in 10 to 40, pure noise never does."""
+_MAX_REFINING_STEPS = 4
+"""Lloyd steps on all rows after that: the same inertia as 40, 2.5 times as fast (commit 4e44a8dd)."""
 
 
 class Clusters(NamedTuple):
@@ -248,14 +249,14 @@ def kmeans(
     points = points - middle
     generator = torch.Generator().manual_seed(seed)
     # Sample, and begin on a sample of the sample: seeding and most of the steps see few rows.
-    some = _sample(mass, _ROWS, generator)
+    some = _sample(mass, _MAX_CLUSTERED_ROWS, generator)
     rows = points[some]
     row_mass = mass[some]
-    few = _sample(row_mass, _FEW, generator)
+    few = _sample(row_mass, _SEEDING_ROWS, generator)
     centres = _seed(rows[few], row_mass[few], k, generator)
-    centres, label = _lloyd(rows[few], row_mass[few], centres, _ITERATIONS)
-    if len(rows) > _FEW:
-        centres, label = _lloyd(rows, row_mass, centres, _REFINED)
+    centres, label = _lloyd(rows[few], row_mass[few], centres, _MAX_SEEDING_STEPS)
+    if len(rows) > _SEEDING_ROWS:
+        centres, label = _lloyd(rows, row_mass, centres, _MAX_REFINING_STEPS)
     # Rows outside of the samples get labels, but do not move the centres.
     if len(label) < len(points):
         label = _nearest(points, centres)
@@ -267,7 +268,9 @@ def _sample(mass: Tensor, rows: int, generator: torch.Generator) -> Tensor | sli
     if len(mass) <= rows:
         return slice(None)
     some = torch.randperm(len(mass), generator=generator)[:rows].to(mass.device)
-    return some if bool(mass[some].any()) else mass.topk(rows).indices
+    if bool(mass[some].any()):
+        return some
+    return mass.topk(rows).indices
 
 
 def _lloyd(points: Tensor, mass: Tensor, centres: Tensor, steps: int) -> tuple[Tensor, Tensor]:
@@ -296,7 +299,9 @@ def _seed(points: Tensor, mass: Tensor, k: int, generator: torch.Generator) -> T
         # Rounding of the sum cannot land on odds of 0.
         edges = odds.cumsum(0)
         index = torch.searchsorted(edges, draw * edges[-1], right=True).clamp_max(len(odds) - 1)
-        centres.append(points[index if bool(odds[index] > 0) else odds.argmax()])
+        if not bool(odds[index] > 0):
+            index = odds.argmax()
+        centres.append(points[index])
         distance = distance.minimum((points - centres[-1]).square().sum(1))
         odds = mass * distance
         if not bool(odds.any()):

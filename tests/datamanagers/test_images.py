@@ -18,13 +18,13 @@ from capture_files import Capture, write_image, write_transforms
 from photo_files import HEIC, oriented, turned_jpeg, upright
 from PIL import Image, ImageCms
 
+from fprf.datamanagers.image_files import read_header
 from fprf.datamanagers.images import (
     image_names,
     load_image,
     load_images,
     load_mask,
     photographs,
-    read_header,
     useless_masks,
 )
 from fprf.datamanagers.parsers.config import parse_scene

@@ -18,7 +18,7 @@ import torch
 
 import fprf
 from benchmarks.readers import Target, fuzz, targets
-from fprf.datamanagers.images import MAX_PIXELS
+from fprf.datamanagers.image_files import MAX_PIXELS
 from fprf.errors import FprfError
 from fprf.plugins.encoders.vgg import read_tensors
 

@@ -43,6 +43,16 @@ def test_png_is_exact_and_the_others_are_close(tmp_path: Path) -> None:
         assert np.abs(read(tmp_path / name).astype(int) - picture).max() <= bound, name
 
 
+def test_png_and_webp_keep_transparency(tmp_path: Path) -> None:
+    alpha = np.arange(0, 256, dtype=np.uint8).reshape(16, 16)
+    picture = np.dstack([np.full((16, 16, 3), (200, 90, 30), np.uint8), alpha])
+    write_image(tmp_path / "a.png", picture)
+    found = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(found[:, :, [2, 1, 0, 3]], picture)
+    webp = cv2.imdecode(np.frombuffer(encode(picture, "webp"), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert np.abs(webp[:, :, 3].astype(int) - alpha).max() <= 2
+
+
 def test_other_endings_and_other_arrays_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError):
         write_image(tmp_path / "a.tiff", ramp())
@@ -50,10 +60,13 @@ def test_other_endings_and_other_arrays_are_refused(tmp_path: Path) -> None:
         ramp().astype(np.float32),
         ramp()[..., 0],
         np.zeros((0, 4, 3), np.uint8),
-        np.zeros((4, 4, 4), np.uint8),
+        np.zeros((4, 4, 5), np.uint8),
+        np.zeros((4, 4, 4), np.float32),
     ):
         with pytest.raises(DataError):
             encode(wrong, "png")
+    with pytest.raises(DataError):
+        encode(np.zeros((4, 4, 4), np.uint8), "jpg")
     with pytest.raises(DataError, match="use png"):
         encode(np.zeros((1, 20000, 3), np.uint8), "webp")
     assert not list(tmp_path.iterdir())

@@ -13,8 +13,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from photo_files import HEIC, turned_jpeg
+from raw_files import dng
 
 from fprf.errors import DataError, UsageError
+from fprf.io.images import encode
 from fprf.page.uploads import (
     MAX_BYTES,
     MAX_SIDE,
@@ -61,6 +63,30 @@ def test_photographs_of_phones_come_upright(uploaded: Uploads, tmp_path: Path) -
     )
     pytest.importorskip("pillow_heif")
     assert cv2.imread(str(uploaded.store(HEIC))).shape == (64, 48, 3)
+
+
+def test_what_is_transparent_stays_so(uploaded: Uploads) -> None:
+    layers = np.zeros((80, 120, 4), np.uint8)
+    layers[:] = (255, 255, 255, 0)
+    layers[20:60, 30:90] = (40, 90, 200, 255)
+    found = cv2.imread(str(uploaded.store(encode(layers, "png"))), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(found[:, :, 3], layers[:, :, 3])
+    assert (found[found[:, :, 3] == 255] == (200, 90, 40, 255)).all()
+    large = np.kron(layers, np.ones((20, 20, 1), np.uint8))
+    small = cv2.imread(str(uploaded.store(encode(large, "png"))), cv2.IMREAD_UNCHANGED)
+    assert max(small.shape) == MAX_SIDE
+    assert (small[small[:, :, 3] >= 128][:, :3] == (200, 90, 40)).all(), "no colour of what is behind"
+    layers[:, :, 3] = 0
+    with pytest.raises(DataError, match=r"photograph: 0\.00% of its pixels are opaque"):
+        uploaded.store(encode(layers, "png"))
+
+
+def test_raw_photographs_are_developed(uploaded: Uploads) -> None:
+    pytest.importorskip("rawpy")
+    flat = np.full((64, 96, 3), (0.8, 0.4, 0.2))
+    found = cv2.imread(str(uploaded.store(dng(flat, np.zeros((6, 9, 3), np.uint8)))))
+    assert found.shape == (64, 96, 3)
+    assert np.abs(found[:, :, ::-1] / 255 - flat).max() < 0.01
 
 
 def test_a_photograph_is_refused_by_its_first_bytes_before_anything_is_decoded(uploaded: Uploads) -> None:

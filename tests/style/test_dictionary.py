@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from photo_files import turned_jpeg
+from PIL import Image
 
 from fprf.datamanagers.basis import Basis
 from fprf.errors import DataError
@@ -219,3 +220,118 @@ def test_unreadable_files_and_masks_that_cannot_be_are_named(tmp_path: Path) -> 
     for path, mask in cases:
         with pytest.raises(DataError, match=(mask or path).name):
             encode_photograph(path, ENCODERS, name="it", mask=mask)
+
+
+def cut_out(folder: Path, name: str, hidden: tuple[int, int, int], **options: object) -> Path:
+    """A noisy disc of 28 % of a picture; everything else is transparent, with a colour that must not be seen."""
+    y, x = np.mgrid[0:120, 0:160]
+    disc = (x - 80) ** 2 + (y - 60) ** 2 < 0.28 * 120 * 160 / np.pi
+    rng = np.random.default_rng(4)
+    pixels = np.where(disc[..., None], rng.integers(20, 90, (120, 160, 3)), hidden).astype(np.uint8)
+    layers = np.dstack([pixels, np.uint8(255) * disc])
+    path = folder / name
+    image = Image.fromarray(layers)
+    if name.endswith(".heic"):
+        pillow_heif = pytest.importorskip("pillow_heif")
+        pillow_heif.from_pillow(image).save(path, quality=100, chroma=444)
+    else:
+        image.save(path, **options)
+    return path
+
+
+def palette_cut_out(folder: Path, hidden: tuple[int, int, int]) -> Path:
+    """A palette of four colours, one of them transparent (tRNS)."""
+    y, x = np.mgrid[0:120, 0:160]
+    disc = (x - 80) ** 2 + (y - 60) ** 2 < 0.28 * 120 * 160 / np.pi
+    image = Image.fromarray(np.where(disc, 1 + (x // 10) % 3, 0).astype(np.uint8), "P")
+    image.putpalette([*hidden, 80, 30, 20, 30, 70, 40, 60, 60, 20])
+    image.save(folder / "palette.png", transparency=0)
+    return folder / "palette.png"
+
+
+KINDS_WITH_ALPHA = {
+    "a.png": {},
+    "a.webp": {"lossless": True, "exact": True},
+    "a.tiff": {},
+    "a.avif": {"quality": 100, "subsampling": "4:4:4"},
+    "a.heic": {},
+    "palette.png": {},
+}
+
+
+@pytest.mark.parametrize("kind", KINDS_WITH_ALPHA)
+def test_what_is_transparent_is_neither_sampled_nor_seen(tmp_path: Path, kind: str) -> None:
+    found = []
+    for hidden in ((255, 255, 255), (255, 0, 255), (0, 0, 0)):
+        if kind == "palette.png":
+            path = palette_cut_out(tmp_path, hidden)
+        else:
+            path = cut_out(tmp_path, kind, hidden, **KINDS_WITH_ALPHA[kind])
+        found.append(encode_photograph(path, ENCODERS._replace(longest=160), name="it"))
+    lossy = kind in ("a.avif", "a.heic")
+    for one in found:
+        assert one.colour is not None
+        assert len(one.colour) == pytest.approx(0.28 * 120 * 160, rel=0.05)
+        assert float(one.colour.max()) < (0.5 if lossy else 0.36), "no colour of what is behind"
+    if not lossy:  # what codecs mix across the edge is in the pixels themselves
+        for one in found[1:]:
+            assert torch.equal(one.content, found[0].content) and torch.equal(one.semantic, found[0].semantic)
+            assert one.colour is not None and found[0].colour is not None
+            assert torch.equal(one.colour, found[0].colour)
+
+
+@pytest.mark.parametrize("longest", [160, 64])
+def test_a_flat_thing_has_the_features_of_a_flat_picture(tmp_path: Path, longest: int) -> None:
+    """At its border as in its middle, also where the photograph is reduced."""
+    encoders = ENCODERS._replace(longest=longest)
+    flat = np.full((120, 160, 3), (40, 90, 200), np.uint8)
+    layers = np.dstack([flat, np.zeros((120, 160), np.uint8)])
+    layers[37:83, 41:101, 3] = 255
+    layers[layers[..., 3] == 0, :3] = 255
+    Image.fromarray(flat).save(tmp_path / "flat.png")
+    Image.fromarray(layers).save(tmp_path / "cut.png")
+    plain = encode_photograph(tmp_path / "flat.png", encoders, name="it")
+    cut = encode_photograph(tmp_path / "cut.png", encoders, name="it")
+    assert len(cut.content) < len(plain.content) or longest == 64
+    for a, b in ((cut.content, plain.content), (cut.semantic, plain.semantic)):
+        torch.testing.assert_close(a.mean(0), b.mean(0), rtol=1e-3, atol=1e-3)
+    assert cut.colour is not None
+    torch.testing.assert_close(cut.colour * 255, torch.tensor([40.0, 90, 200]).expand(len(cut.colour), 3))
+
+
+def test_half_opaque_counts_with_its_own_colour(tmp_path: Path) -> None:
+    layers = np.zeros((64, 96, 4), np.uint8)
+    layers[:, :32] = (200, 60, 30, 128)
+    layers[:, 32:64] = (30, 200, 60, 127)
+    layers[:, 64:] = (60, 30, 200, 255)
+    Image.fromarray(layers).save(tmp_path / "a.png")
+    found = encode_photograph(tmp_path / "a.png", ENCODERS._replace(longest=128), name="it")
+    assert found.colour is not None
+    rows = (found.colour * 255).round().int().unique(dim=0).tolist()
+    assert rows == [[60, 30, 200], [200, 60, 30]]
+
+
+def test_nothing_opaque_is_refused(tmp_path: Path) -> None:
+    for value, dots in ((0, 0), (127, 0), (0, 5)):
+        layers = np.full((100, 100, 4), (90, 90, 90, value), np.uint8)
+        layers[0, :dots, 3] = 255
+        Image.fromarray(layers).save(tmp_path / "clear.png")
+        with pytest.raises(DataError, match=r"clear\.png: 0\.\d\d% of its pixels are opaque"):
+            encode_photograph(tmp_path / "clear.png", ENCODERS, name="it")
+
+
+def test_a_mask_of_a_cut_out_leaves_what_is_opaque(tmp_path: Path) -> None:
+    path = cut_out(tmp_path, "a.png", (255, 255, 255))
+    half = np.zeros((120, 160), np.uint8)
+    half[:, :80] = 255
+    Image.fromarray(half).save(tmp_path / "left.png")
+    encoders = ENCODERS._replace(longest=160)
+    whole = encode_photograph(path, encoders, name="it")
+    left = encode_photograph(path, encoders, name="it", mask=tmp_path / "left.png")
+    assert len(left.content) == pytest.approx(len(whole.content) / 2, rel=0.05)
+    assert left.colour is not None and float(left.colour.max()) < 0.36
+    half[:] = 0
+    half[:10, :10] = 255
+    Image.fromarray(half).save(tmp_path / "corner.png")
+    with pytest.raises(DataError, match=r"corner\.png: the mask selects only what is transparent in a\.png"):
+        encode_photograph(path, encoders, name="it", mask=tmp_path / "corner.png")
