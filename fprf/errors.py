@@ -5,6 +5,7 @@
       ConfigError             a saved config or a config field
       PluginError             a plug-in that is missing, ambiguous, broken or of the wrong type
       DataError               a scene folder, an image, a reference photograph
+        WriteError            a file that the system refuses to write
       WeightsError            encoder or decoder weights: absent, of another encoder, damaged
       CheckpointError         a run folder or a checkpoint
       NumericsError           a value that is not finite where it must be
@@ -39,6 +40,10 @@ class PluginError(FprfError):
 
 class DataError(FprfError):
     """A scene, an image or a reference that cannot be used as it is."""
+
+
+class WriteError(DataError):
+    """A file that the system refuses to write: a full disk, a folder that is only read."""
 
 
 class WeightsError(FprfError):

@@ -149,12 +149,9 @@ def shortage(what: str, error: BaseException, remedy: str) -> OutOfMemoryError:
         took = f"; the process held up to {held / _GIB:.2f} GiB{asked}"
     # Free memory and the process's limit, as far as the system tells.
     limits = []
-    try:
-        available = re.search(r"MemAvailable:\s+(\d+)", Path("/proc/meminfo").read_text())
-        if available:
-            limits.append(f"{int(available[1]) * 1024 / _GIB:.2f} GiB are free on this machine")
-    except OSError:
-        pass
+    free = available_memory()
+    if free is not None:
+        limits.append(f"{free / _GIB:.2f} GiB are free on this machine")
     if os.name == "posix":
         import resource
 
@@ -163,6 +160,15 @@ def shortage(what: str, error: BaseException, remedy: str) -> OutOfMemoryError:
             limits.append(f"{limit / _GIB:.2f} GiB of addresses are allowed")
     known = f" ({', '.join(limits)})" if limits else ""
     return OutOfMemoryError(f"{what}: not enough memory{took}{known}; {remedy}")
+
+
+def available_memory() -> int | None:
+    """Bytes of this machine's memory that are free or can be freed; None where the system does not tell."""
+    try:
+        available = re.search(r"MemAvailable:\s+(\d+)", Path("/proc/meminfo").read_text())
+    except OSError:
+        return None
+    return None if available is None else int(available[1]) * 1024
 
 
 def peak() -> int | None:

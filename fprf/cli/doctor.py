@@ -73,9 +73,9 @@ def run(args: list[str]) -> int:
     target = config.target
     findings: Iterator[Finding]
     if config.clean:
-        from ..training.prepare import cache_folder
+        from ..io.cache import user_folder
 
-        folder = cache_folder() / "features"
+        folder = user_folder("features")
         size = _size(folder)
         shutil.rmtree(folder, ignore_errors=True)
         findings = iter(
@@ -147,18 +147,24 @@ def machine() -> Iterator[Finding]:
     except Exception as error:  # a broken installation is a finding, not a crash
         yield Finding("torch", f"{type(error).__name__}: {error}", "pip install --force-reinstall torch")
     from ..datamanagers.features import CACHED_BYTES
-    from ..training.prepare import cache_folder
+    from ..io.cache import cache_home, refusal, user_folder
 
     free = shutil.disk_usage(Path.cwd()).free
     clean = "fprf doctor --clean    # deletes feature targets, which are made again when needed"
     yield Finding("disk", f"{free / 1024**3:.1f} GiB free here", clean if free < _MIN_DISK_BYTES else "")
     # content and semantics
-    folder = cache_folder() / "features"
-    most = 2 * CACHED_BYTES / _BYTES_PER_MIB
-    yield Finding(
-        "features",
-        f"{_size(folder) / _BYTES_PER_MIB:.0f} MiB of at most {most:.0f} in {folder}; --clean deletes them",
-    )
+    folder = user_folder("features")
+    reason = refusal(folder)
+    if reason:
+        where = "this user has no home" if cache_home() is None else f"{folder}: {reason}"
+        found = f"{where}; every command compiles its kernels and encodes images again"
+        remedy = (
+            "export XDG_CACHE_HOME=FOLDER    # one that can be written to; NUMBA_CACHE_DIR for kernels alone"
+        )
+        yield Finding("cache", found, remedy, optional=True)
+    else:
+        size = f"{_size(folder) / _BYTES_PER_MIB:.0f} MiB of at most {2 * CACHED_BYTES / _BYTES_PER_MIB:.0f}"
+        yield Finding("features", f"{size} in {folder}; --clean deletes them")
     count = sum(len(registry.installed(group)) for group in registry.groups())
     yield Finding("plug-ins", f"{count} installed; `fprf plugins --check` loads each")
     for complaint in registry.unreadable():
@@ -226,7 +232,10 @@ def method_needs(name: str) -> Iterator[Finding]:
 
 
 def _size(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    try:
+        return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    except OSError:  # of a user who may not look into it
+        return 0
 
 
 def scene_folder(data: Path) -> Iterator[Finding]:

@@ -14,6 +14,7 @@ import hashlib
 import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -26,6 +27,8 @@ from torch import Tensor
 from ..errors import DataError
 from ..interfaces import DataManager, Encoder
 from ..io.atomic import unwritable
+from ..io.cache import reason_of, say_uncached, temporary_folder
+from ..memory import available_memory
 from ..types import Batch
 from .basis import Basis
 from .config import RayBatchesConfig
@@ -35,28 +38,46 @@ from .scene import ParsedScene, find_sightings
 
 HELD = 512 * 2**20
 """Bytes of pixels that are simply held in memory."""
+_MEMORY_SHARE = 0.5
+"""Of the free memory, what pixels may take where no disk has room for them; by eye."""
 
 
 def allocate_pixels(pixels: int, folder: Path, held: int = HELD) -> Annotated[Tensor, "P 3"]:
     """Space for so many pixels, uint8, to be written to; mapped from a file in `folder` above `held` bytes.
 
-    Raises DataError where the disk has no room for it.
+    Where that has no room, from a temporary file; where the system has no room for one either, in memory.
+    Raises DataError where that would not hold it.
     """
     size = 3 * pixels
     if size <= held:
         return torch.empty(pixels, 3, dtype=torch.uint8)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder) as file:
-            if hasattr(os, "posix_fallocate"):
-                # Blocks for all of it now: a write to a mapped file that the disk has no room for would end
-                # the process.
-                os.posix_fallocate(file.fileno(), 0, size)
-            else:
-                os.ftruncate(file.fileno(), size)
-            mapped = np.memmap(file, dtype=np.uint8, mode="r+", shape=(pixels, 3))
+        return _mapped_pixels(pixels, folder)
     except OSError as error:
-        raise unwritable(folder, error, size) from error
+        say_uncached(folder, reason_of(error))
+        refused = unwritable(folder, error, size)
+    temporary = temporary_folder("pixels")
+    if temporary is not None:
+        with suppress(OSError):
+            return _mapped_pixels(pixels, temporary)
+    free = available_memory()
+    if free is None or size > _MEMORY_SHARE * free:
+        raise refused
+    return torch.empty(pixels, 3, dtype=torch.uint8)
+
+
+def _mapped_pixels(pixels: int, folder: Path) -> Annotated[Tensor, "P 3"]:
+    """Mapped from a file without a name in `folder`. Raises OSError where the system refuses."""
+    size = 3 * pixels
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=folder) as file:
+        if hasattr(os, "posix_fallocate"):
+            # Blocks for all of it now: a write to a mapped file that the disk has no room for would end
+            # the process.
+            os.posix_fallocate(file.fileno(), 0, size)
+        else:
+            os.ftruncate(file.fileno(), size)
+        mapped = np.memmap(file, dtype=np.uint8, mode="r+", shape=(pixels, 3))
     return torch.from_numpy(np.asarray(mapped))
 
 

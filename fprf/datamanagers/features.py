@@ -33,6 +33,7 @@ from torch import Tensor
 from ..errors import CheckpointError, DataError, NumericsError, PluginError
 from ..interfaces import Encoder
 from ..io import tensorfiles
+from ..io.cache import files_in
 from ..ops import guided
 from ..ops.backend import float32_convolutions
 from ..ops.config import GuidedConfig
@@ -99,7 +100,7 @@ def keep_within(folder: Path, size: int, used: Collection[str]) -> None:
     """
     # The file that was used longest ago first.
     files = []
-    for path in folder.glob("[!.]*.safetensors"):
+    for path in files_in(folder, "[!.]*.safetensors"):
         with contextlib.suppress(OSError):  # another process was first
             files.append((path.stat().st_mtime, path.stat().st_size, path))
     total = sum(bytes_of for _, bytes_of, _ in files)
@@ -225,12 +226,12 @@ def extract(
 
     `image` gives a view as uint8; `dim` asks for that many principal components (fewer, where the encoder has
     fewer), of these views unless the `basis` of a larger scene is given. A run that is cut off goes on where
-    it stopped. Raises NumericsError where the encoder's features are not finite, PluginError where they are
-    not of the shape it promises.
+    it stopped; where nothing can be written to `folder` it goes on without (`tensorfiles.keep`). Raises
+    NumericsError where the encoder's features are not finite, PluginError where they are not of the shape it
+    promises.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     # Unfinished files of processes that died go; those of the last hour may belong to a living writer.
-    for path in folder.glob(".*.safetensors"):
+    for path in files_in(folder, ".*.safetensors"):
         with contextlib.suppress(OSError):  # another process was first
             if time.time() - path.stat().st_mtime > 3600:
                 path.unlink()
@@ -265,12 +266,9 @@ def extract(
         if tensors is None or tensors.keys() != set(Entry._fields):
             if features is None:
                 features = _encode(encoder, pixels, view)
-            else:
-                features = features
-            made = _make(features, pixels, basis, radius=radius, eps=config.eps, stride=stride)._asdict()
-            tensorfiles.save(folder / f"{key}.safetensors", made, sealed=True)
-            # Read back: what trains is what lies on disk, mapped rather than held in memory.
-            tensors = read_kept(folder, key) or made
+            made = _make(features, pixels, basis, radius=radius, eps=config.eps, stride=stride)
+            # What trains is what lies on disk, mapped rather than held in memory.
+            tensors = tensorfiles.keep(folder / f"{key}.safetensors", made._asdict())
         entries[view] = Entry(**tensors)
     keep_within(folder, CACHED_BYTES, set(keys.values()))
     if progress is not None:
@@ -358,5 +356,5 @@ def _basis(
         count = min(len(cells), max(1, BASIS_CELLS // len(chosen)))
         samples.append(cells[torch.randperm(len(cells), generator=generator)[:count]])
     basis = fit_basis(torch.cat(samples), dim)
-    tensorfiles.save(folder / f"{key}.safetensors", basis.tensors(), sealed=True)
+    tensorfiles.keep(folder / f"{key}.safetensors", basis.tensors())
     return basis

@@ -10,13 +10,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from ..errors import DataError, NumericsError
+from ..errors import NumericsError, WriteError
 
 _UNFINISHED = re.compile(r"\..{1,40}\.[0-9a-f]{8}(\.\w+)?|\.tmp\w{6}")
 """Hidden names of `atomic_path`, and of safetensors beside them."""
 
 
-def unwritable(path: Path, error: OSError, needed: int | None = None) -> DataError:
+def unwritable(path: Path, error: OSError, needed: int | None = None) -> WriteError:
     """Error for a system that refuses to write at `path`; `needed` are the bytes of the file, where they are
     known.
     """
@@ -30,7 +30,7 @@ def unwritable(path: Path, error: OSError, needed: int | None = None) -> DataErr
         wants = ""
     else:
         wants = f", {-(-needed // 1024)} KiB are needed"
-    return DataError(
+    return WriteError(
         f"{path}: cannot be written ({reason}{wants}{free}); make room, or choose a folder that can be written to"
     )
 
@@ -38,7 +38,7 @@ def unwritable(path: Path, error: OSError, needed: int | None = None) -> DataErr
 def remove_unfinished(folder: Path) -> None:
     """Delete what killed processes left directly in a folder. Only where nobody else writes.
 
-    Raises DataError where the system refuses.
+    Raises WriteError where the system refuses.
     """
     try:
         for path in folder.iterdir() if folder.is_dir() else ():
@@ -63,7 +63,7 @@ def atomic_path(final: Path) -> Iterator[Path]:
 
     Keeps the ending of the name, which encoders choose their format by. Creates the folder. Of a symbolic link
     the file that it leads to is written, and the link stays. A reader sees the old file or the new one,
-    whenever the process dies. Raises DataError where `final` is a folder, its folder
+    whenever the process dies. Raises WriteError where `final` is a folder, its folder
     is a file, or the system refuses: a full disk, a folder without permission, a name that is too long.
     Errors of the block about other files are passed on.
     """
@@ -73,12 +73,12 @@ def atomic_path(final: Path) -> Iterator[Path]:
         if final.is_symlink():
             raise OSError(errno.ELOOP, "links that lead to each other")
         if final.is_dir():
-            raise DataError(
+            raise WriteError(
                 f"{final}: a folder is in the place of a file to be written; remove it or choose another name"
             )
         final.parent.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
-        raise DataError(
+        raise WriteError(
             f"{final}: {error.filename} is a file, not a folder; choose another output"
         ) from error
     except OSError as error:

@@ -8,6 +8,7 @@ import json
 import re
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,19 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from ..errors import CheckpointError
+from ..errors import CheckpointError, WriteError
 from .atomic import atomic_path, unwritable
+from .cache import reason_of, say_uncached, temporary_folder
 
 _MANIFEST = "manifest"
 """Entry of a sealed file's metadata that holds its manifest."""
 _SYSTEM = re.compile(r"os error (\d+)")
 """Number of the system's error in a message of safetensors."""
+
+
+def _plain(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors as a reader maps them: contiguous, on the CPU."""
+    return {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
 
 
 def _checksum(tensor: Tensor) -> int:
@@ -33,12 +40,10 @@ def save(path: Path, tensors: Mapping[str, Tensor], *, sealed: bool = False) -> 
     """Write the tensors; the answer holds checksum and finiteness of each, and so does the file where it is
     `sealed`.
 
-    Raises DataError, with what is needed and what is free, where the system refuses.
+    Raises WriteError, with what is needed and what is free, where the system refuses.
     """
-    # Checksums are of the bytes that a reader will map: contiguous, on the CPU.
-    plain = {}
-    for name, t in tensors.items():
-        plain[name] = t.detach().cpu().contiguous()
+    # Checksums are of the bytes that a reader will map.
+    plain = _plain(tensors)
     entries = {}
     for name, t in plain.items():
         entries[name] = {
@@ -58,6 +63,34 @@ def save(path: Path, tensors: Mapping[str, Tensor], *, sealed: bool = False) -> 
             needed = sum(t.nbytes for t in plain.values())
             raise unwritable(path, OSError(int(match[1]), str(error)), needed) from error
     return entries
+
+
+def keep(path: Path, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors, mapped from a sealed file of a cache that is written to `path`.
+
+    Where the system refuses it, which one line says, from a file that ends with this process; where it
+    refuses that, too, as they are, in memory.
+    """
+    kept = save_kept(path, tensors)
+    if not kept:
+        folder = temporary_folder("tensors")
+        if folder is not None:
+            path = folder / path.name
+            kept = save_kept(path, tensors)
+    if kept:
+        with suppress(CheckpointError):  # another process removed it already, or the disk is bad
+            return load_sealed(path)
+    return _plain(tensors)
+
+
+def save_kept(path: Path, tensors: Mapping[str, Tensor]) -> bool:
+    """Write a sealed file of a cache; False where the system refuses, which one line says."""
+    try:
+        save(path, tensors, sealed=True)
+    except WriteError as error:
+        say_uncached(path.parent, reason_of(error))
+        return False
+    return True
 
 
 def load_sealed(path: Path) -> dict[str, Tensor]:

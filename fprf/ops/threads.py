@@ -14,6 +14,7 @@ import hashlib
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from types import CellType, FunctionType
@@ -23,7 +24,10 @@ import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.extending import intrinsic
+
+from ..io.cache import cache_home, reason_of, refusal, say_uncached, user_folder
 
 
 @cache
@@ -33,9 +37,53 @@ def sources(folder: Path = Path(__file__).parent) -> str:
     return hashlib.sha256(b"".join(text for text in texts if b"\nimport torch" not in text)).hexdigest()
 
 
+class _KernelFiles(CompileResultCacheImpl):
+    """Numba's choice of a folder, but none in the home of a user who has no home: the folder would be named
+    ~, in the working directory.
+    """
+
+    def __init__(self, function):
+        if cache_home() is None:
+            found = CompileResultCacheImpl._locator_classes
+            self._locator_classes = [
+                each for each in found if not each.__name__.endswith("UserWideCacheLocator")
+            ]
+        super().__init__(function)
+
+
+class _KernelCache(FunctionCache):
+    """Numba's files of what it compiled; whatever the system or a damaged file refuses, kernels are compiled
+    in memory.
+    """
+
+    _impl_class = _KernelFiles
+
+    def load_overload(self, sig, target_context):
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # a file that is damaged or closed to us: unpickling raises whatever its bytes say
+            self._forget()
+            return None
+
+    def save_overload(self, sig, data):
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            self.disable()
+            # Its index was written before the code: it would lead to that of another version.
+            self._forget()
+            say_uncached(Path(self.cache_path), reason_of(error))
+
+    def _forget(self):
+        with suppress(OSError):
+            Path(self._cache_file._index_path).unlink()
+
+
 def cached_jit(**options: Any) -> Callable[[Any], Any]:
     """`numba.njit` with these options and a cache; numba looks for what it compiled by variables that a
     function encloses.
+
+    Without a folder that can be written to it compiles in memory, which one line says.
     """
 
     def compiled(function: Any) -> Any:
@@ -52,7 +100,13 @@ def cached_jit(**options: Any) -> Callable[[Any], Any]:
         dated.__module__ = function.__module__
         dated.__qualname__ = function.__qualname__
         dated.__doc__ = function.__doc__
-        return numba.njit(cache=True, **options)(dated)
+        kernel = numba.njit(**options)(dated)
+        try:
+            kernel._cache = _KernelCache(dated)
+        except RuntimeError:  # numba found no folder
+            folder = user_folder("")
+            say_uncached(folder, refusal(folder))
+        return kernel
 
     return compiled
 

@@ -266,11 +266,11 @@ class ViewerServer:
             address = socket.getaddrinfo(access.host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[
                 0
             ]
-            listener = socket.create_server(address[4][:2], family=address[0])
+            self._listener = socket.create_server(address[4][:2], family=address[0])
         except OSError as error:
             fault = f"--host {access.host} --port {port}: cannot listen there ({error.strerror}); choose another port"
             raise UsageError(fault) from error
-        self.port: int = listener.getsockname()[1]
+        self.port: int = self._listener.getsockname()[1]
         # A mistake of the page's user, or what this machine cannot do, is a line in the answer.
         wrong = dict.fromkeys(
             (FprfError, OSError), lambda request, error: PlainTextResponse(_line(error), 400)
@@ -298,7 +298,7 @@ class ViewerServer:
         )
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(
-            target=self._server.run, args=([listener],), name="fprf-http", daemon=True
+            target=self._server.run, args=([self._listener],), name="fprf-http", daemon=True
         )
         self._thread.start()
 
@@ -310,6 +310,7 @@ class ViewerServer:
         # Open WebSockets would hold an orderly end up for ever.
         self._server.force_exit = self._server.should_exit = True
         self._thread.join(5)
+        self._listener.close()  # uvicorn leaves it open where it ends before it has begun
 
     @property
     def address(self) -> str:

@@ -23,8 +23,9 @@ from torch import Tensor
 
 from ..errors import CheckpointError, DataError, UsageError
 from ..interfaces import Encoder
+from ..io.cache import cache_folder
 from ..io.images import to_uint8, write_image
-from ..io.tensorfiles import load_sealed, save
+from ..io.tensorfiles import load_sealed, save_kept
 from ..ops.rasterise import MIN_ALPHA
 from ..rendering.cameras import Cameras
 from ..scenes import Scene
@@ -32,7 +33,6 @@ from ..style.dictionary import code_odds
 from ..style.look import ColourMaps, Restyle
 from ..style.restyle import Styled
 from ..training.loading import open_run
-from ..training.prepare import cache_folder
 from .config import LookConfig
 from .drawing import clip_distance
 from .files import Capture, read_capture, release
@@ -145,7 +145,7 @@ def open_capture(
     default the user's own.
     """
     look = replace(look, up=look.up or capture.up)
-    folder = cache or cache_folder() / "captures"
+    folder = cache or cache_folder("captures")
     encoder = look.semantic.encoder.build()
     # What is found follows from the file, the encoder and how it is looked at. The first number counts the
     # versions of it.
@@ -156,7 +156,7 @@ def open_capture(
     path = folder / f"{digest.hexdigest()[:32]}.safetensors"
     gaussians = capture.gaussians.drawable()
     antialiased = capture.antialiased
-    if path.is_file():
+    if os.path.isfile(path):  # False also where the folder is closed to us
         try:
             tensors = load_sealed(path)
             cameras = Cameras(**tensor_group(tensors, "camera"))
@@ -176,7 +176,7 @@ def open_capture(
         views = {}
         for field in fields(Cameras):
             views[f"camera.{field.name}"] = getattr(scene.views, field.name)
-        save(path, {**views, **semantics_tensors(semantics)}, sealed=True)
+        save_kept(path, {**views, **semantics_tensors(semantics)})
         with suppress(OSError):  # another process removes files, too: what is left the next one finds
             files = []
             for each in folder.glob("*.safetensors"):

@@ -12,10 +12,11 @@ from ..datamanagers.images import WHITE
 from ..datamanagers.scene import ParsedScene
 from ..errors import WeightsError
 from ..interfaces import DataManager, Encoder
+from ..io.cache import cache_folder
 from ..rendering.space import Space
 from .facts import Facts
 from .model import build_decoder
-from .prepare import cache_folder, device_of, exposure_of, facts_of
+from .prepare import device_of, exposure_of, facts_of
 
 
 class Prepared(NamedTuple):
@@ -75,7 +76,7 @@ def prepare(
         content=content,
         semantic=semantic,
         dim=config.semantic.dim,
-        cache=cache_folder() / "features",
+        cache=cache_folder("features"),
         seed=config.seed,
         progress=progress,
         basis=basis,

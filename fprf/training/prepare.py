@@ -1,9 +1,7 @@
 """Before the first step: parse the scene, find its space, extract features."""
 
-import os
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated
 
 import torch
@@ -16,11 +14,6 @@ from ..errors import PluginError, UsageError
 from ..rendering.space import Space
 from ..run_config import RunConfig
 from .facts import Facts
-
-
-def cache_folder() -> Path:
-    """Folder of features and embedded scenes between runs: $XDG_CACHE_HOME/fprf or ~/.cache/fprf."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fprf"
 
 
 def device_of(name: str) -> torch.device:

@@ -80,6 +80,13 @@ def test_the_feature_cache_is_told_and_cleaned(
     assert not files.exists() and (tmp_path / "fprf" / "weights").is_dir()
 
 
+def test_a_cache_that_cannot_be_written_to_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    finding = _by_name(machine())["cache"]
+    assert str(tmp_path / "file") in finding.found and "XDG_CACHE_HOME" in finding.remedy and finding.optional
+
+
 def told(name: str) -> dict[str, Finding]:
     return {finding.what: finding for finding in self_test(name)}
 

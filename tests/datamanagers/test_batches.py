@@ -140,13 +140,17 @@ def test_runs_are_the_list(masks: list[list[bool]], first: int) -> None:
     assert everything[runs.holds(everything)].tolist() == wanted
 
 
-def test_a_full_disk_is_told_before_anything_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_on_a_full_disk_pixels_stay_in_memory_where_that_holds_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def full(file: int, offset: int, size: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(pixel_file.os, "posix_fallocate", full, raising=False)
+    pixels = allocate_pixels(1000, tmp_path, held=0)
+    assert pixels.shape == (1000, 3) and not list(tmp_path.iterdir())
+    assert f"{tmp_path}: No space left" in capsys.readouterr().err
+    monkeypatch.setattr(pixel_file, "available_memory", lambda: 5999)
     with pytest.raises(DataError, match="No space left"):
         allocate_pixels(1000, tmp_path, held=0)
 

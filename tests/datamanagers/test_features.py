@@ -1,5 +1,6 @@
 """The feature store and the semantic basis: right values, made once; a file is right or absent."""
 
+import errno
 import os
 import time
 from pathlib import Path
@@ -124,6 +125,34 @@ def test_the_store_answers_what_the_filter_says(tmp_path: Path, channels: int) -
     for view in (7, 10, -1):
         with pytest.raises(DataError, match=f"view {view} has no features"):
             store.at(torch.tensor([0, view]), torch.zeros(2, 2), torch.zeros(2, 3))
+
+
+@pytest.mark.parametrize("channels", [5, 8])
+def test_without_a_folder_to_write_to_the_answers_are_the_same(tmp_path: Path, channels: int) -> None:
+    (tmp_path / "file").touch()
+    where = draw()
+    encoder = Counting(channels)
+    with_files = build(tmp_path / "folder", encoder, dim=4)
+    without = build(tmp_path / "file/folder", encoder, dim=4)
+    assert torch.equal(without.at(*where), with_files.at(*where)) and without.scale == with_files.scale
+    raw = build(tmp_path / "file/folder", encoder)
+    assert torch.equal(raw.at(*where), build(tmp_path / "folder", encoder).at(*where))
+
+
+@pytest.mark.parametrize("channels", [5, 8])
+def test_features_that_no_disk_has_room_for_stay_in_memory(
+    tmp_path: Path, channels: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    where = draw()
+    encoder = Counting(channels)
+    expected = build(tmp_path / "a", encoder).at(*where)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(tensorfiles.safetensors.torch, "save_file", full)
+    assert torch.equal(build(tmp_path / "b", encoder).at(*where), expected)
+    assert not list((tmp_path / "b").iterdir())
 
 
 def test_the_spread_is_that_of_the_targets(tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """Captures in the format of Mission Bay: TFRecord files, cameras behind rays; read, refused, and trained."""
 
+import errno
 import struct
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers import blocknerf
 from fprf.datamanagers.parsers.blocknerf import crc32c, fit_camera, masked, read_examples, read_records
 from fprf.datamanagers.parsers.config import BlockNerfConfig, parse_scene, recognise
-from fprf.errors import ConfigError, DataError
+from fprf.errors import ConfigError, DataError, WriteError
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
 
 
@@ -225,6 +227,31 @@ def test_a_complete_cache_is_not_read_again(
     assert again.paths == first.paths and again.cameras.size[0].tolist() == [16, 12]
     first.paths[3].unlink()
     assert parse_scene(bay[0], 1, None).paths[3].is_file()
+
+
+def test_without_a_cache_or_with_a_disk_that_fills_the_scene_is_the_same(
+    bay: tuple[Path, Cameras], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = parse_scene(bay[0], 1, None)
+    (tmp_path / "file").touch()
+    (tmp_path / "small").mkdir()
+    written = []
+    real = blocknerf.atomic_path
+
+    def filling(path: Path) -> AbstractContextManager[Path]:
+        written.append(path)
+        if len(written) > 5 and path.is_relative_to(tmp_path / "small"):
+            raise WriteError("full") from OSError(errno.ENOSPC, "full")
+        return real(path)
+
+    monkeypatch.setattr(blocknerf, "atomic_path", filling)
+    for place in ("file", "small"):
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / place))
+        scene = parse_scene(bay[0], 1, None)
+        assert torch.equal(scene.cameras.pose, expected.cameras.pose)
+        for mine, own in zip(scene.paths, expected.paths, strict=True):
+            assert mine.read_bytes() == own.read_bytes() and not mine.is_relative_to(tmp_path)
+    assert not [path for path in (tmp_path / "small").rglob("*") if path.is_file()], "half of it is dropped"
 
 
 def test_some_cameras(bay: tuple[Path, Cameras]) -> None:

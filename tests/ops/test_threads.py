@@ -21,6 +21,7 @@ def test_kernels_are_compiled_anew_when_another_file_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A constant of another file is compiled in: under the same sources what is kept is taken."""
+    monkeypatch.setattr(threads.numba.config, "CACHE_DIR", "")
     path = tmp_path / "kernel_of_a_test.py"
     found = []
     path.write_text(KERNEL)

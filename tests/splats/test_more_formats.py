@@ -294,7 +294,9 @@ def ksplat_of(made: Gaussians, compression: int, bucket: int = 16, block: float 
         if compression:
             means = np.rint((means - centres[np.arange(count) // bucket]) / (block / 2) * 32767 + 32767)
         rows = table[:count]
-        rows["mean"], rows["scale"], rows["turn"] = means, part.log_scales.exp(), part.quaternions
+        rows["mean"] = means
+        rows["scale"] = part.log_scales.exp().numpy()
+        rows["turn"] = part.quaternions.numpy()
         rows["rgba"] = np.rint(
             255 * torch.cat([part.colours.clamp(0, 1), part.opacities[:, None]], 1).numpy()
         )

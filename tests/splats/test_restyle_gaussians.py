@@ -251,6 +251,17 @@ def test_what_the_cache_knows_of_a_capture_gives_the_same_colours(
         assert torch.equal(styled(again, photographs[0]), first) and bool(said) == damaged
 
 
+def test_a_capture_is_restyled_alike_where_nothing_can_be_cached(
+    photographs: list[Path], tmp_path: Path
+) -> None:
+    write_gaussians(tmp_path / "a.ply", ball(400))
+    (tmp_path / "file").touch()
+    capture = read_capture(tmp_path / "a.ply")
+    look = LookConfig(views=6, size=(96, 72), regions=4)
+    here = styled(open_capture(capture, look, cache=tmp_path / "cache"), photographs[0])
+    assert torch.equal(styled(open_capture(capture, look, cache=tmp_path / "file/x"), photographs[0]), here)
+
+
 def test_objects_are_seen_from_around_and_rooms_from_within() -> None:
     seen = find_views(ball(400), count=8, size=(64, 48), up=UP)
     assert len(seen) == 8 and (seen.pose[:, :, 3].norm(dim=1) > 1.2).all()

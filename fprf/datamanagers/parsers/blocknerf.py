@@ -18,8 +18,8 @@ import functools
 import hashlib
 import json
 import math
-import os
 import re
+import shutil
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -31,9 +31,10 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, te
 from google.protobuf.message import DecodeError, Message
 from numpy.typing import NDArray
 
-from ...errors import DataError
+from ...errors import DataError, WriteError
 from ...interfaces import DataParser
 from ...io.atomic import atomic_path, write_json
+from ...io.cache import cache_folder, reason_of, say_uncached, temporary_folder
 from ...rendering.lens import OPENCV
 from ..images import opened
 from ..scene import ParsedScene
@@ -277,17 +278,7 @@ class BlockNerfParser(DataParser):
         for f in files:
             facts.append((str(f.relative_to(data)), f.stat().st_size, f.stat().st_mtime_ns))
         key = hashlib.sha256(json.dumps([str(data.resolve()), facts]).encode()).hexdigest()[:12]
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        folder = cache / "fprf" / f"blocknerf-{key}"
-        # Images and fitted cameras, taken out once.
-        entries = _unpacked(folder)
-        if not entries:
-            (folder / "images").mkdir(parents=True, exist_ok=True)
-            entries = []
-            for file in files:
-                held = re.search("val|test", str(file.relative_to(data)).lower()) is not None
-                entries += [_entry(example, folder, held) for example in read_examples(file)]
-            write_json(folder / "views.json", {"format": _VIEWS_FORMAT, "views": entries})
+        folder, entries = _unpack(data, files, f"blocknerf-{key}")
         # Of the cameras that are asked for, if they are cameras.
         chosen = []
         for e in entries:
@@ -309,6 +300,37 @@ class BlockNerfParser(DataParser):
         split = split_by([entry["held"] for entry in kept])
         contents = CaptureContents(views=views, split=split, notes=notes)
         return assemble_scene(data, contents, downscale=downscale)
+
+
+def _unpack(data: Path, files: list[Path], name: str) -> tuple[Path, list[dict[str, Any]]]:
+    """The folder of images taken out of the records, once, and what is known of each view.
+
+    In folder NAME of the cache; where that has no room, in one that ends with this process.
+    """
+    folder = cache_folder(name)
+    entries = _unpacked(folder)
+    if entries:
+        return folder, entries
+    try:
+        return folder, _take_out(data, files, folder)
+    except WriteError as error:
+        say_uncached(folder, reason_of(error))
+        shutil.rmtree(folder, ignore_errors=True)  # half of the images is of no use, and needs the room
+        temporary = temporary_folder(name)
+        if temporary is None or temporary == folder:
+            raise
+        return temporary, _take_out(data, files, temporary)
+
+
+def _take_out(data: Path, files: list[Path], folder: Path) -> list[dict[str, Any]]:
+    """Write the images of all records into a folder. Raises WriteError where the system refuses."""
+    entries = []
+    for file in files:
+        held = re.search("val|test", str(file.relative_to(data)).lower()) is not None
+        for example in read_examples(file):
+            entries.append(_entry(example, folder, held))
+    write_json(folder / "views.json", {"format": _VIEWS_FORMAT, "views": entries})
+    return entries
 
 
 def _unpacked(folder: Path) -> list[dict[str, Any]]:

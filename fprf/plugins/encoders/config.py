@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from ...checks import at_least, positive
 from ...errors import ConfigError
+from ...io.cache import files_in, user_folder
 from ..config import Need, PluginConfig, absent_file
 
 if TYPE_CHECKING:
@@ -99,16 +100,19 @@ class Vgg19Config(EncoderConfig):
         return build_vgg(self.layer, weights=self.weights, normalise=self.normalise)
 
 
+def hub_folder() -> Path:
+    """Where the library of the Hugging Face hub keeps models."""
+    home = os.environ.get("HF_HOME") or user_folder("").parent / "huggingface"
+    return Path(os.environ.get("HF_HUB_CACHE") or Path(home) / "hub")
+
+
 def _hub_needs(model: str) -> tuple[Need, ...]:
     """transformers, and a model of the hub that is neither cached nor a folder."""
     needs = []
     if importlib.util.find_spec("transformers") is None:
         ships = "or choose an encoder that ships: --semantic.encoder dinov2"
         needs.append(Need("the package transformers", f"pip install 'fprf[encoders]', {ships}"))
-    # Where the hub's own library caches models.
-    home = os.environ.get("HF_HOME") or Path.home() / ".cache" / "huggingface"
-    hub = Path(os.environ.get("HF_HUB_CACHE") or Path(home) / "hub")
-    cached = any(hub.glob(f"models--{model.replace('/', '--')}/snapshots/*/config.json"))
+    cached = files_in(hub_folder(), f"models--{model.replace('/', '--')}/snapshots/*/config.json")
     if not cached and not (Path(model) / "config.json").is_file():
         needs.append(Need(f"the model {model}", f"hf download {model}", downloaded=True))
     return tuple(needs)

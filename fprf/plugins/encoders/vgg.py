@@ -24,6 +24,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ...errors import WeightsError
+from ...io.cache import cache_folder, user_folder
 from ..config import Need, absent_file
 from ..weights import IMAGENET_MEAN, IMAGENET_STD, read_weights, tensors_hash
 from .frozen import FrozenEncoder, freeze, reflect_pad, street
@@ -140,23 +141,27 @@ def _available(layer: str, path: Path | None) -> Path | None:
     """
     if path is not None or layer[4:] in BUNDLED_LAYERS:
         return path or BUNDLED
-    caches = Path.home() / ".cache/fprf/weights", Path.home() / ".cache/torch/hub/checkpoints"
-    return next((folder / FILE for folder in caches if (folder / FILE).is_file()), None)
+    # Also at home where XDG_CACHE_HOME names another cache.
+    for cache in (user_folder("").parent, Path(os.path.expanduser("~/.cache"))):
+        for name in ("fprf/weights", "torch/hub/checkpoints"):
+            file = cache / name / FILE
+            if os.path.isfile(file):  # False also where the folder is closed to us
+                return file
+    return None
 
 
 def weights_needed(layer: str, path: Path | None) -> tuple[Need, ...]:
     """Weights that `build_vgg` would have to download, or a named file that is not there."""
     if _available(layer, path) is not None:
         return absent_file(path)
-    target = Path.home() / ".cache/fprf/weights" / FILE
+    target = user_folder("weights") / FILE
     command = f"curl --create-dirs --output {target} {ORIGIN}, or name a file with {FLAG} FILE"
     return (Need(f"VGG-19's weights {target}", command, downloaded=True),)
 
 
 def _download() -> Path:
     """Download torchvision's file into fprf's cache. Raises WeightsError where it is not to be had."""
-    target = Path.home() / ".cache/fprf/weights" / FILE
-    target.parent.mkdir(parents=True, exist_ok=True)
+    target = cache_folder("weights") / FILE
     # Into a file of its own, whose hash is checked before it takes the name.
     partial_file = target.with_name(f"{FILE}.{os.getpid()}.partial")
     try:
@@ -172,7 +177,7 @@ def _download() -> Path:
     except (urllib.error.URLError, OSError, TimeoutError) as error:
         raise WeightsError(
             f"VGG-19's weights are not here and cannot be downloaded ({error}): put {ORIGIN} (SHA-256 begins with "
-            f"{_expected(FILE)}) into {target.parent}, or name a file with {FLAG} FILE"
+            f"{_expected(FILE)}) into {user_folder('weights')}, or name a file with {FLAG} FILE"
         ) from error
     finally:
         partial_file.unlink(missing_ok=True)

@@ -6,6 +6,7 @@ Blocks after the chosen one are never loaded.
 """
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated
 
 import torch
@@ -13,7 +14,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ...errors import WeightsError
+from ...io.cache import files_in, refusal, say_uncached, temporary_folder
 from ..weights import IMAGENET_MEAN, IMAGENET_STD, tensors_hash
+from .config import hub_folder
 from .frozen import FrozenEncoder, freeze, patch_grid
 
 # ViT interpolates its position table on demand, DINOv2 always does, DINOv3 turns its tokens by where they
@@ -76,15 +79,22 @@ def build_vit(family: str, name: str, *, layer: int, stride: int | None) -> VitE
             "or choose one that ships: --semantic.encoder dinov2"
         ) from error
     # The model up to the block alone: transformers loads only as many as the config says.
+    # Without a home the hub's library would take a folder named ~ in the working directory.
+    hub = hub_folder()
+    reason = "" if files_in(hub, "models--*") else refusal(hub)
+    elsewhere = None
+    if reason and not Path(name).is_dir():
+        say_uncached(hub, reason)
+        elsewhere = temporary_folder("huggingface")
     verbosity = logging.get_verbosity()
     logging.set_verbosity_error()  # else it lists the blocks that are left out
     try:
-        config = AutoConfig.from_pretrained(name)  # nosec B615  # `name` says which revision; the identity hashes the weights
+        config = AutoConfig.from_pretrained(name, cache_dir=elsewhere)  # nosec B615  # `name` says which revision; the identity hashes the weights
         if config.model_type not in TYPES[family]:
             raise ValueError(f"it is of type {config.model_type}, not {' or '.join(TYPES[family])}")
         blocks = int(config.num_hidden_layers)
         config.num_hidden_layers = _block(layer, blocks, name)
-        model = AutoModel.from_pretrained(name, config=config)  # nosec B615
+        model = AutoModel.from_pretrained(name, config=config, cache_dir=elsewhere)  # nosec B615
     except (OSError, ValueError, KeyError) as error:
         reason = str(error).strip().splitlines()[0]
         raise WeightsError(
