@@ -41,11 +41,13 @@ def read(
     views: int = 32,
     up: Sequence[float] | None = None,
     inside: bool | None = None,
+    activated: bool = False,
 ) -> "FinishedCapture":
     """A finished capture of 3D Gaussians, ready to restyle and write: a file of any format that is installed.
 
-    `views`, `up` and `inside` are those of `fprf restyle`: how it is looked at. Raises DataError where it
-    cannot be read.
+    `views`, `up` and `inside` are those of `fprf restyle`: how it is looked at. `activated` reads numbers that
+    look activated already as such; `capture.notes` of what is returned says where they do. Raises DataError
+    where it cannot be read.
     """
     from .api import FinishedCapture
     from .io.paths import as_path
@@ -54,5 +56,5 @@ def read(
     from .splats.files import read_capture
 
     direction = None if up is None else three_numbers("up", up)
-    look = LookConfig(views=views, up=direction, inside=inside)
-    return FinishedCapture(read_capture(as_path(path)), look)
+    look = LookConfig(views=views, up=direction, inside=inside, activated=activated)
+    return FinishedCapture(read_capture(as_path(path), activated=activated), look)

@@ -32,7 +32,8 @@ from .rendering.cameras import Cameras
 from .rendering.local_frame import offset_file
 from .rendering.paths import look_at, make_path, pinhole, upwards
 from .scenes import Scene
-from .splats.captures import Captures, light_alone, open_captures
+from .splats.capture_light import light_alone
+from .splats.captures import Captures, open_captures
 from .splats.config import LookConfig
 from .splats.files import Capture, write_capture
 from .splats.gaussians import Gaussians

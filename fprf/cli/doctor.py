@@ -21,6 +21,7 @@ from rich.markup import escape
 from .. import __version__
 from ..errors import ConfigError, DataError
 from ..plugins import registry
+from ..plugins.captures import format_name, is_scene
 from ..plugins.slots import slots
 from .parsing import parse
 
@@ -48,7 +49,7 @@ class DoctorConfig:
     """Settings of `fprf doctor`."""
 
     target: Path | None = None
-    """A scene folder or a method; none = this machine."""
+    """A scene folder, a capture of 3D Gaussians or a method; none = this machine."""
     device: str = "auto"
     """Device of this machine that is tested: cpu, cuda, mps, or auto; not with a target."""
     clean: bool = False
@@ -67,6 +68,7 @@ def run(args: list[str]) -> int:
     """Print the findings as they come; 1 if something that is needed is wrong."""
     about = (
         "`fprf doctor` looks over this machine and tests its device, `fprf doctor DIR` a scene folder,\n"
+        "`fprf doctor FILE` a capture of 3D Gaussians,\n"
         "`fprf doctor METHOD` what a method needs here."
     )
     config = parse(DoctorConfig(), args, prog="fprf doctor", description=about, positional=("target",))
@@ -85,6 +87,8 @@ def run(args: list[str]) -> int:
         findings = chain(machine(), self_test(config.device))
     elif str(target) in registry.installed("fprf.methods"):
         findings = method_needs(str(target))
+    elif is_scene(target) and not (target / "config.json").is_file():
+        findings = capture_file(target)
     else:
         findings = scene_folder(target)
     console = Console(highlight=False)
@@ -296,3 +300,29 @@ def scene_folder(data: Path) -> Iterator[Finding]:
         more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
         yield Finding("images", f"{broken[0]}{more}", "replace them, or remove their poses")
     yield Finding("next", f"fprf train --data {shlex.quote(str(data))}")
+
+
+def capture_file(path: Path) -> Iterator[Finding]:
+    """Format, Gaussians, what points up and how numbers are meant of a capture. Raises DataError where it
+    cannot be read.
+    """
+    from ..splats.captures import direction_up
+    from ..splats.files import read_capture
+    from ..splats.ground import axis_name
+
+    capture = read_capture(path)
+    gaussians = capture.gaussians
+    yield Finding("format", format_name(capture.path) or "")
+    faults = gaussians.faults()
+    said = ", ".join([f"{len(gaussians)}, harmonics of degree {gaussians.degree}", *faults])
+    remedy = "they are left out of what is drawn; export the capture again" if faults else ""
+    yield Finding("gaussians", said, remedy, optional=True)
+    up, reason = direction_up(capture)
+    yield Finding("up", f"{axis_name(up)}: {reason}; --up says otherwise")
+    # The last note of a capture that looks activated says that, too.
+    for note in capture.notes[: -1 if capture.activation else None]:
+        yield Finding("note", note)
+    if capture.activation:
+        found = f"{capture.activation}, as if activated already"
+        yield Finding("numbers", found, f"fprf restyle {shlex.quote(str(path))} --activated true ...")
+    yield Finding("next", f"fprf restyle {shlex.quote(str(path))} --references PHOTO.jpg --output NEW.ply")

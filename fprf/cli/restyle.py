@@ -170,12 +170,12 @@ def _neighbours_gain(
     config: RestyleConfig, photographed: Sequence[Path], seen: "Captures", display: Display
 ) -> "Tensor | None":
     """Gains of colours that `--match-light` takes from captures that lie beside; None where it takes means."""
-    from ..splats.captures import neighbouring_light
+    from ..splats.capture_light import neighbouring_light
 
     captures = [path for path in photographed if format_name(path) is not None]
     if not config.match_light or not captures or len(captures) < len(photographed):
         return None
-    gain = neighbouring_light(seen, photographed)
+    gain = neighbouring_light(seen, photographed, activated=config.activated)
     how = "by the means of all colours" if gain is None else "where the captures meet"
     display.say(f"--match-light: {how}")
     return gain
@@ -185,7 +185,7 @@ def _apply(
     styles: Sequence[tuple[str, StyleFile]], scene: "SplatScene", gain: "Tensor | None", config: RestyleConfig
 ) -> list[_Restyled]:
     """The scene in each style; encoders are loaded once."""
-    from ..splats.captures import light_alone
+    from ..splats.capture_light import light_alone
     from ..style.restyle import apply_style
 
     made = []
@@ -217,7 +217,7 @@ def _write_captures(
     done = 0
     # Of a single capture that is not written the faults are told all the same.
     for number, path in enumerate(config.captures if files or len(config.captures) == 1 else ()):
-        capture = seen.first if number == 0 else read_capture(path)
+        capture = seen.first if number == 0 else read_capture(path, activated=config.activated)
         faulty = False
         for one, out in zip(made, files[number] if files else (), strict=False):
             display.count(done, steps, "restyling")

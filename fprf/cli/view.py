@@ -39,7 +39,13 @@ class ViewConfig(QualityConfig):
     output: Path = Path("my_scenes")
     """Folder of what the start page makes, with a folder for each scene."""
     up: tuple[float, float, float] | None = None
-    """Direction that points up in a capture's own axes; none = as the file says, else 0 -1 0."""
+    """Direction that points up in a capture's own axes; none = as the file says, else away from its ground,
+    else 0 -1 0.
+    """
+    activated: bool = False
+    """Read opacities, sizes and colours of a capture that look activated already as such; one line says where
+    they do.
+    """
     inside: bool | None = None
     """Look at a capture from within, as in rooms and streets, or around an object; none = found out."""
     semantic: GaussianSemanticsConfig = GaussianSemanticsConfig()
@@ -162,9 +168,13 @@ def _load(config: ViewConfig, notify: Callable[[str], None], path: Path, name: s
         if done == 0:
             notify("looking at the capture, once; a photograph can be dropped already")
 
-    capture = read_capture(path)
-    look = LookConfig(up=config.up, inside=config.inside, semantic=config.semantic)
-    scene = open_capture(capture, look, progress=progress)
+    capture = read_capture(path, activated=config.activated)
+    for note in capture.notes:
+        say(f"{capture.path}: {note}")
+    look = LookConfig(
+        up=config.up, inside=config.inside, activated=config.activated, semantic=config.semantic
+    )
+    scene = open_capture(capture, look, progress=progress, say=say)
     name = name or path.resolve().name.partition(".")[0]
     style = StyleConfig(stylizer=config.stylizer or RegionToneConfig(centred=False))
     viewed = Viewed(scene, name, 0, root=config.output / name, capture=capture, style=style)

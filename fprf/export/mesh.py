@@ -31,7 +31,7 @@ from ..rendering.local_frame import added_and_beside, write_offset
 from ..rendering.space import Space
 from ..scenes import Scene
 from ..splats.files.base import in_world
-from ..splats.files.ply import ply_file
+from ..splats.files.ply_tables import ply_file
 from ..types import Origin
 
 Report = Callable[[int, int], None]

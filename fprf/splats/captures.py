@@ -10,18 +10,18 @@ memory.
 
 import functools
 import hashlib
-import math
+import itertools
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..errors import CheckpointError, DataError, UsageError
+from ..errors import CheckpointError, DataError
 from ..interfaces import Encoder
 from ..io.cache import cache_folder
 from ..io.images import to_uint8, write_image
@@ -29,50 +29,61 @@ from ..io.tensorfiles import load_sealed, save_kept
 from ..ops.rasterise import MIN_ALPHA
 from ..rendering.cameras import Cameras
 from ..scenes import Scene
-from ..style.dictionary import code_odds
-from ..style.look import ColourMaps, Restyle
-from ..style.restyle import Styled
+from ..style.look import Restyle
 from ..training.loading import open_run
+from ..types import Origin
 from .config import LookConfig
 from .drawing import clip_distance
 from .files import Capture, read_capture, release
 from .files.base import pieces
-from .gaussians import Gaussians, bulk_of, cells_of
+from .gaussians import Gaussians, bulk_of
+from .ground import USUAL_UP, Direction, axis_name, find_ground
+from .neighbours import Neighbours, sampled
 from .restyle import restyled_harmonics
 from .scene import SplatScene
 from .semantics import Semantics, find_semantics, load_semantics, semantics_tensors, tensor_group
 from .views import find_views
 
-_UP = (0.0, -1.0, 0.0)
-"""Direction that points up where nothing says so."""
-_CACHED = 24
-"""Captures of which the cache keeps what was found out."""
 SAMPLE = 2_000_000
 """Gaussians that are looked at, at most: what is in memory of captures of any size, beside the file at
 hand.
 """
-_FINEST = 1024
-_LEVELS = 12
-"""Cells along the longest side of the bulk at the finest level; levels, each of cells twice as wide."""
-_STRAY = 500.0
-"""Extents of the bulk from it, beyond which Gaussians do not say where cells begin: twice that fits into 2^20
-finest ones.
-"""
-_BLACK = 0.055
-"""Added to sRGB, it is a power of linear light."""
-_VIEW = (480, 360)
-_SOLID = 0.95
-"""Size of views in the place of photographs; opacity from which on their pixels count."""
+_CACHE_VERSION = 11
+"""Of what is found out about a capture: it counts up whenever the same file gives something else."""
+_MAX_CACHED_CAPTURES = 24
+"""Captures of which the cache keeps what was found out, some MB each."""
+_REFERENCE_SIZE = (480, 360)
+"""Width and height of views in the place of photographs: what encoders see of photographs."""
+_MIN_REFERENCE_OPACITY = 0.95
+"""Of pixels of such views that count: of others a part is background."""
 MAX_REFERENCE_VIEWS = 16
-"""Views of a capture that are references, at most."""
-_GAP = 0.1
+"""Views of a capture that are references, at most: more say the same again (by eye)."""
+_ROW_GAP = 0.1
 """Distance between captures that would overlap, as a share of their width, where they are put in a row."""
-_SHARED = 24
-_ENOUGH = 64
-_ALIKE = 0.4
-"""Cells that captures share, at least and enough, and correlation of their brightness there: then they are of
-one place.
+_MIN_OVERLAP = 0.5
+"""Of the sides of the smaller one of two boxes, from which on captures lie in one place: neighbours overlap
+by less.
 """
+
+
+def direction_up(capture: Capture) -> tuple[Direction, str]:
+    """What points up in a capture, as its file says or as its ground shows, and what tells it, in words."""
+    if capture.up is not None:
+        return capture.up, capture.up_reason or "the file says so"
+    ground = find_ground(capture.gaussians.drawable())
+    # A slab at +z is a wall, as photographs along z see it; no program has its captures stand on one.
+    if ground is None or ground.up == (0.0, 0.0, -1.0):
+        return USUAL_UP, "as in most captures, since nothing in this one tells it"
+    return ground.up, str(ground)
+
+
+def with_direction_up(look: LookConfig, capture: Capture, say: Callable[[str], None]) -> LookConfig:
+    """How a capture is looked at, with a direction up, which is said where it was not asked for."""
+    if look.up is not None:
+        return look
+    up, reason = direction_up(capture)
+    say(f"{capture.path}: up is {axis_name(up)}: {reason} (--up says otherwise)")
+    return replace(look, up=up)
 
 
 def look_at_capture(
@@ -90,7 +101,7 @@ def look_at_capture(
     be seen.
     """
     # Mistakes are told before views are sought, which takes seconds.
-    up = torch.tensor(config.up or _UP)
+    up = torch.tensor(config.up or USUAL_UP)
     if not bool(up.isfinite().all() & (up.norm() > 0)):
         raise DataError(f"up {config.up}: no direction; give three numbers, not all 0")
     if float(gaussians.opacities.max()) < MIN_ALPHA:
@@ -140,53 +151,71 @@ def open_capture(
 ) -> SplatScene:
     """A capture as a scene: its Gaussians that can be drawn, with views and features from the cache.
 
-    What points up is as `look` says, else as the file does. Where views and features are absent, views are
+    What points up is as `look` says, else as `direction_up`. Where views and features are absent, views are
     found here, and features, which are then stored, when they are first asked for. `cache` is the folder; by
     default the user's own.
     """
-    look = replace(look, up=look.up or capture.up)
-    folder = cache or cache_folder("captures")
+    look = with_direction_up(look, capture, say)
     encoder = look.semantic.encoder.build()
-    # What is found follows from the file, the encoder and how it is looked at. The first number counts the
-    # versions of it.
-    digest = hashlib.sha256(capture.data)
-    digest.update(
-        f"10 {encoder.identity} {look.up} {look.inside} {look.views} {look.size} {look.regions}".encode()
-    )
-    path = folder / f"{digest.hexdigest()[:32]}.safetensors"
+    path = (cache or cache_folder("captures")) / _cache_name(capture, look, encoder)
     gaussians = capture.gaussians.drawable()
-    antialiased = capture.antialiased
-    if os.path.isfile(path):  # False also where the folder is closed to us
-        try:
-            tensors = load_sealed(path)
-            cameras = Cameras(**tensor_group(tensors, "camera"))
-            semantics = load_semantics(tensors, len(gaussians))
-        except (CheckpointError, TypeError) as error:
-            say(f"looking again: {error}")
-        else:
-            with suppress(OSError):  # another process may just have removed it
-                os.utime(path)
-            return replace(
-                _scene_of(gaussians, antialiased, cameras, lambda: semantics, encoder), origin=capture.origin
-            )
-    scene = look_at_capture(gaussians, antialiased, encoder, look, progress, capture.camera)
+    kept = _load_findings(path, len(gaussians), say)
+    if kept is not None:
+
+        def known() -> Semantics:
+            return kept.semantics
+
+        scene = _scene_of(gaussians, capture.antialiased, kept.cameras, known, encoder)
+        return replace(scene, origin=capture.origin)
+    scene = look_at_capture(gaussians, capture.antialiased, encoder, look, progress, capture.camera)
 
     def found() -> Semantics:
         semantics = scene.found()
-        views = {}
-        for field in fields(Cameras):
-            views[f"camera.{field.name}"] = getattr(scene.views, field.name)
-        save_kept(path, {**views, **semantics_tensors(semantics)})
-        with suppress(OSError):  # another process removes files, too: what is left the next one finds
-            files = []
-            for each in folder.glob("*.safetensors"):
-                if each.is_file():
-                    files.append(each)
-            for old in sorted(files, key=lambda each: each.stat().st_mtime)[:-_CACHED]:
-                old.unlink(missing_ok=True)
+        _save_findings(path, _Findings(scene.views, semantics))
         return semantics
 
     return replace(scene, found=functools.cache(found), origin=capture.origin)
+
+
+class _Findings(NamedTuple):
+    """What is found out about a capture, as the cache keeps it."""
+
+    cameras: Cameras
+    semantics: Semantics
+
+
+def _cache_name(capture: Capture, look: LookConfig, encoder: Encoder) -> str:
+    """A name that follows from all that findings depend on: the file, the encoder and how it is looked at."""
+    digest = hashlib.sha256(capture.data)
+    viewed = f"{look.up} {look.inside} {look.views} {look.size} {look.regions} {look.activated}"
+    digest.update(f"{_CACHE_VERSION} {encoder.identity} {viewed}".encode())
+    return f"{digest.hexdigest()[:32]}.safetensors"
+
+
+def _load_findings(path: Path, count: int, say: Callable[[str], None]) -> _Findings | None:
+    """What the cache keeps of a capture of `count` Gaussians; None where it keeps nothing, or nothing sound."""
+    if not os.path.isfile(path):  # False also where the folder is closed to us
+        return None
+    try:
+        tensors = load_sealed(path)
+        found = _Findings(Cameras(**tensor_group(tensors, "camera")), load_semantics(tensors, count))
+    except (CheckpointError, TypeError) as error:
+        say(f"looking again: {error}")
+        return None
+    with suppress(OSError):  # another process may just have removed it
+        os.utime(path)
+    return found
+
+
+def _save_findings(path: Path, found: _Findings) -> None:
+    """Keep what was found out, and remove what was not asked for longest."""
+    views = {f"camera.{field.name}": getattr(found.cameras, field.name) for field in fields(Cameras)}
+    save_kept(path, {**views, **semantics_tensors(found.semantics)})
+    with suppress(OSError):  # another process removes files, too: what is left the next one finds
+        files = [each for each in path.parent.glob("*.safetensors") if each.is_file()]
+        files.sort(key=lambda each: each.stat().st_mtime)
+        for old in files[:-_MAX_CACHED_CAPTURES]:
+            old.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,15 +238,9 @@ class Captures:
         gaussians = capture.gaussians
         rows = self.rows[index]
         finite = gaussians.finite
-        if bool(finite.all()):
-            gaussians = gaussians
-        else:
+        if not bool(finite.all()):
             gaussians = gaussians.select(finite)
-        here = tuple(a - b for a, b in zip(capture.origin, self.scene.origin, strict=True))
-        if any(here):
-            means = gaussians.means + torch.tensor(here)
-        else:
-            means = gaussians.means
+        means = gaussians.means + moved_origin(capture.origin, self.scene.origin)
         features = self.scene.found().features[rows]
         if len(features) == len(gaussians):
             return restyled_harmonics(gaussians.harmonics, means, features, look)
@@ -244,61 +267,82 @@ def open_captures(
     Of several captures each gives a like share of the sample. `first` is the first one, where it was read
     already. Raises DataError where nothing can be seen.
     """
-    first = first or _read(paths[0], say)
+    first = first or _read(paths[0], look, say)
     if len(paths) == 1 and len(first.gaussians) <= sample:
         scene = open_capture(first, look, cache=cache, progress=progress, say=say)
-        return Captures(
-            scene, (slice(0, len(scene.gaussians)),), (torch.zeros(3),), first, len(first.gaussians)
-        )
-    parts = list[Gaussians]()
-    key = hashlib.sha256(f"{sample} {len(paths)}".encode())
-    compensated = first.antialiased
-    count = 0
+        whole = (slice(0, len(scene.gaussians)),)
+        return Captures(scene, whole, (torch.zeros(3),), first, len(first.gaussians))
+    samples = []
     for path in paths:
-        capture = first if path == paths[0] else _read(path, say)
-        key.update(hashlib.sha256(capture.data).digest())
+        capture = first if path == paths[0] else _read(path, look, say)
+        samples.append(_sample_of(capture, first.origin, max(1, sample // len(paths))))
         release(capture.data)
-        count += len(capture.gaussians)
-        here = torch.tensor([a - b for a, b in zip(capture.origin, first.origin, strict=True)])
-        part = sampled(capture.gaussians.drawable(), max(1, sample // len(paths)))
-        if bool(here.any()):
-            key.update(f"{here.tolist()}".encode())  # an offset beside a file moves it among the others
-            part = replace(part, means=part.means + here)
-        parts.append(part)
-        compensated = compensated or capture.antialiased
+    parts = [each.part for each in samples]
     moved = _apart(parts)
-    together = _joined([replace(part, means=part.means + by) for part, by in zip(parts, moved, strict=True)])
-    # What lies in one row is looked at as an object; a known camera is that of one capture alone.
-    alone = len(paths) == 1
-    whole = replace(
+    joined = _joined(parts, moved)
+    together = replace(
         first,
-        gaussians=together,
-        antialiased=compensated,
-        data=key.digest(),
-        camera=first.camera if alone else None,
+        gaussians=joined,
+        antialiased=any(each.antialiased for each in samples),
+        data=_joint_key(samples, sample),
     )
-    scene = open_capture(whole, look, cache=cache, progress=progress, say=say)
-    ends = torch.tensor([len(part) for part in parts]).cumsum(0).tolist()
-    rows = tuple(slice(end - len(part), end) for end, part in zip(ends, parts, strict=True))
-    return Captures(scene, rows, tuple(moved), first, count)
+    if len(paths) > 1:
+        # What lies in one row is looked at as an object; a known camera is that of one capture alone.
+        together = replace(together, camera=None)
+    scene = open_capture(together, look, cache=cache, progress=progress, say=say)
+    rows = []
+    start = 0
+    for part in parts:
+        rows.append(slice(start, start + len(part)))
+        start += len(part)
+    count = sum(each.total for each in samples)
+    return Captures(scene, tuple(rows), tuple(moved), first, count)
 
 
-def _read(path: Path, say: Callable[[str], None]) -> Capture:
+class _Sample(NamedTuple):
+    """What is kept of one of several captures."""
+
+    part: Gaussians
+    """Some of those that can be drawn, about the origin of the first capture."""
+    here: Annotated[Tensor, "3"]
+    """The capture's own origin, seen from that."""
+    digest: bytes
+    """Of its file."""
+    total: int
+    """Gaussians that it has."""
+    antialiased: bool
+
+
+def moved_origin(origin: Origin, new: Origin) -> Annotated[Tensor, "3"]:
+    """What is added to positions about one origin to have them about a new one."""
+    return torch.tensor([old - other for old, other in zip(origin, new, strict=True)])
+
+
+def _sample_of(capture: Capture, origin: Origin, most: int) -> _Sample:
+    """At most so many Gaussians of a capture, about an origin."""
+    here = moved_origin(capture.origin, origin)
+    part = sampled(capture.gaussians.drawable(), most)
+    part = replace(part, means=part.means + here)
+    digest = hashlib.sha256(capture.data).digest()
+    return _Sample(part, here, digest, len(capture.gaussians), capture.antialiased)
+
+
+def _joint_key(samples: Sequence[_Sample], most: int) -> bytes:
+    """What the findings about several captures depend on, in the place of a file's content."""
+    key = hashlib.sha256(f"{most} {len(samples)}".encode())
+    for each in samples:
+        key.update(each.digest)
+        if bool(each.here.any()):
+            key.update(f"{each.here.tolist()}".encode())  # an offset beside a file moves it among the others
+    return key.digest()
+
+
+def _read(path: Path, look: LookConfig, say: Callable[[str], None]) -> Capture:
     """A capture, with what its file was taken for."""
-    capture = read_capture(path)
+    capture = read_capture(path, activated=look.activated)
     for note in capture.notes:
         say(f"{capture.path}: {note}")
     return capture
-
-
-def sampled(gaussians: Gaussians, most: int) -> Gaussians:
-    """At most so many of the Gaussians, at equal steps, and wider by as many as each stands for."""
-    count = len(gaussians)
-    if count <= most:
-        return gaussians
-    some = gaussians.select(torch.arange(most) * count // most)
-    # What is seen are surfaces: areas grow as the numbers shrink.
-    return replace(some, log_scales=some.log_scales + 0.5 * math.log(count / most))
 
 
 def _apart(parts: Sequence[Gaussians]) -> list[Annotated[Tensor, "3"]]:
@@ -310,140 +354,67 @@ def _apart(parts: Sequence[Gaussians]) -> list[Annotated[Tensor, "3"]]:
         # Stray Gaussians do not make neighbours of captures that are apart.
         inner = part.means[torch.from_numpy(bulk_of(part.means.numpy()).apart <= 0.5)]
         boxes.append((inner.amin(0), inner.amax(0)))
-    overlap = False
-    for i, (low, high) in enumerate(boxes):
-        for other_low, other_high in boxes[:i]:
-            shared = (torch.minimum(high, other_high) - torch.maximum(low, other_low)).clamp_min(0)
-            least = torch.minimum(high - low, other_high - other_low)
-            overlap = overlap or bool((shared > 0.5 * least).all())
+    if not _overlap(boxes):
+        return [torch.zeros(3) for _ in parts]
     moves = []
     at = 0.0
     for low, high in boxes:
-        moves.append(torch.tensor([at - float(low[0]), 0.0, 0.0]) if overlap else torch.zeros(3))
-        at += (1 + _GAP) * float(high[0] - low[0])
+        moves.append(torch.tensor([at - float(low[0]), 0.0, 0.0]))
+        at += (1 + _ROW_GAP) * float(high[0] - low[0])
     return moves
 
 
-def _joined(parts: Sequence[Gaussians]) -> Gaussians:
-    """All Gaussians of several, with as many harmonics as the most of them have."""
-    if len(parts) == 1:
-        return parts[0]
+def _overlap(boxes: Sequence[tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]]) -> bool:
+    """Whether any two boxes, lowest and highest corner, lie in one place."""
+    for (low, high), (other_low, other_high) in itertools.combinations(boxes, 2):
+        shared = (torch.minimum(high, other_high) - torch.maximum(low, other_low)).clamp_min(0)
+        smaller = torch.minimum(high - low, other_high - other_low)
+        if bool((shared > _MIN_OVERLAP * smaller).all()):
+            return True
+    return False
+
+
+def _joined(parts: Sequence[Gaussians], moved: Sequence[Annotated[Tensor, "3"]]) -> Gaussians:
+    """All Gaussians of several, each moved, with as many harmonics as the most of them have."""
     bands = max(part.harmonics.shape[1] for part in parts)
-    same = []
+    harmonics = []
     for part in parts:
         # Harmonics of a higher degree are 0 where a file has none.
         missing = part.harmonics.new_zeros(len(part), bands - part.harmonics.shape[1], 3)
-        same.append(part.recoloured(torch.cat([part.harmonics, missing], 1)))
-    return Gaussians(*(torch.cat(each) for each in zip(*(vars(part).values() for part in same), strict=True)))
-
-
-def neighbouring_light(captures: Captures, references: Sequence[Path]) -> Annotated[Tensor, "3"] | None:
-    """Gains of colours + 0.055 that take captures to the light of other captures which they overlap or border
-    on.
-
-    Found where both have Gaussians in one cell, so that what only one of them shows has no part in it: the
-    median over cells. None where they share too few cells, or where their colours in these have nothing in
-    common: then they are not of one place.
-    """
-    own = captures.scene.gaussians
-    means = own.means.clone()
-    for rows, by in zip(captures.rows, captures.moved, strict=True):
-        means[rows] -= by
-    others = [read_capture(path) for path in references]
-    parts = []
-    for other in others:
-        parts.append(sampled(other.gaussians.drawable(), SAMPLE // len(others)))
-    shifts = []
-    for other in others:
-        shifts.append([a - b for a, b in zip(other.origin, captures.scene.origin, strict=True)])
-    theirs = torch.cat([part.means + torch.tensor(shift) for part, shift in zip(parts, shifts, strict=True)])
-    places = torch.cat([means, theirs])
-    colours = (
-        torch.cat([own.colours, *(part.colours for part in parts)]).double().clamp(0, 1) + _BLACK
-    ).log()
-    # What can be seen counts, by its opacity.
-    weight = torch.cat([own.opacities, *(part.opacities for part in parts)]).double()
-    low, edge = _grid(means)
-    gain = None
-    most = _SHARED - 1
-    for level in range(_LEVELS - 2):
-        cell = torch.unique(cells_of(places, low, edge * 2**level), return_inverse=True)[1]
-        count = int(cell.max()) + 1
-        # Of each cell the mean colour of either side.
-        sides = []
-        for rows in (slice(0, len(means)), slice(len(means), None)):
-            share = torch.zeros(count).double().index_add_(0, cell[rows], weight[rows])
-            sums = (
-                torch.zeros(count, 3).double().index_add_(0, cell[rows], weight[rows, None] * colours[rows])
-            )
-            sides.append((share, sums))
-        both = (sides[0][0] > 0.5) & (sides[1][0] > 0.5)
-        if int(both.sum()) <= most:
-            continue
-        before, after = (sums[both] / share[both, None] for share, sums in sides)
-        alike = torch.corrcoef(torch.stack([before.mean(1), after.mean(1)]))[0, 1]
-        if not alike > _ALIKE:
-            continue
-        gain = (after - before).median(0).values.exp()
-        most = int(both.sum())
-        # The smaller the cells, the more alike are the things in them.
-        if most >= _ENOUGH:
-            break
-    return gain
-
-
-def light_alone(styled: Styled, gain: Annotated[Tensor, "3"] | None = None) -> Styled:
-    """A style as its exposure and white balance alone: one gain a channel, in linear light, for the whole
-    scene.
-
-    Without a known `gain` it takes the scene's mean colour, of logarithms, to that of the references: right
-    where both are of the same materials.
-    """
-    style = styled.scene_style
-    dictionary = styled.dictionary
-    regions = len(styled.scene_style.keys)
-    if dictionary.colour_mean is None:
-        raise UsageError("--match-light: the style has no colours of photographs; name references")
-    # sRGB is a power of linear light but for the black end: a gain is a factor of colours plus 0.055.
-    sides = ((style.region_mean, style.share), (dictionary.colour_mean, code_odds(dictionary)))
-    before, after = (
-        (share.double() / share.double().sum()) @ (colour.double().clamp(0, 1) + _BLACK).log()
-        for colour, share in sides
+        harmonics.append(torch.cat([part.harmonics, missing], 1))
+    return Gaussians(
+        means=torch.cat([part.means + by for part, by in zip(parts, moved, strict=True)]),
+        quaternions=torch.cat([part.quaternions for part in parts]),
+        log_scales=torch.cat([part.log_scales for part in parts]),
+        logits=torch.cat([part.logits for part in parts]),
+        harmonics=torch.cat(harmonics),
     )
-    gain = (after - before).exp() if gain is None else gain
-    maps = ColourMaps(style, gain.diag().expand(regions, 3, 3), (_BLACK * (gain - 1)).expand(regions, 3), 1.0)
-    return styled._replace(restyle=replace(styled.restyle, colours=maps, light=None, places=()))
 
 
-def reference_views(
-    path: Path, look: LookConfig, folder: Path
-) -> tuple[tuple[Path, ...], tuple[Path, ...], tuple[float, ...]]:
+class ReferenceViews(NamedTuple):
+    """Pictures in the place of photographs."""
+
+    pictures: tuple[Path, ...]
+    masks: tuple[Path, ...]
+    """White where a picture shows something."""
+    weights: tuple[float, ...]
+    """Shares of the pictures that show anything."""
+
+
+def reference_views(path: Path, look: LookConfig, folder: Path) -> ReferenceViews:
     """Write pictures of views of a capture or of a run into a folder: in the place of photographs, as
-    references.
-
-    Returns them, masks of what they show, and the shares of them that show anything. Raises DataError where
-    none does.
+    references. Raises DataError where none shows anything.
     """
-    if (path / "config.json").is_file():
-        scene: Scene = open_run(path, device="cpu").scene
-    else:
-        capture = read_capture(path)
-        encoder = look.semantic.encoder.build()
-        gaussians = sampled(capture.gaussians.drawable(), SAMPLE)
-        # As many views as a capture that takes the style is looked at from: of one place both show alike
-        # shares.
-        look = replace(look, size=_VIEW, up=look.up or capture.up)
-        scene = look_at_capture(gaussians, capture.antialiased, encoder, look, camera=capture.camera)
-    chosen = (
-        torch.linspace(0, len(scene.names) - 1, min(MAX_REFERENCE_VIEWS, len(scene.names))).round().long()
-    )
+    scene = _reference_scene(path, look)
+    count = min(MAX_REFERENCE_VIEWS, len(scene.names))
+    chosen = torch.linspace(0, len(scene.names) - 1, count).round().long()
     cameras = scene.cameras.select(chosen)
     pictures = list[Path]()
     masks = list[Path]()
     weights = list[float]()
     for view in range(len(cameras)):
         shown = scene.render(cameras, view)
-        solid = shown.opacity > _SOLID
+        solid = shown.opacity > _MIN_REFERENCE_OPACITY
         if bool(solid.any()):
             pictures.append(folder / f"{view:02d}.png")
             masks.append(folder / f"{view:02d}.mask.png")
@@ -454,39 +425,18 @@ def reference_views(
             write_image(masks[-1], to_uint8(solid[..., None].expand(-1, -1, 3).float()))
     if not pictures:
         raise DataError(f"{path}: nothing in it is opaque enough to be a reference")
-    return tuple(pictures), tuple(masks), tuple(weights)
+    return ReferenceViews(tuple(pictures), tuple(masks), tuple(weights))
 
 
-def _grid(points: Annotated[Tensor, "N 3"]) -> tuple[Annotated[Tensor, "3"], float]:
-    """Lowest corner of the cells around points, and the edge of the finest. Strays are left out: the grid
-    cannot reach both.
+def _reference_scene(path: Path, look: LookConfig) -> Scene:
+    """The scene of a run, or a sample of a capture with as many views as one that takes the style is looked at
+    from: of one place both show alike shares.
     """
-    bulk = bulk_of(points.numpy())
-    return points[torch.from_numpy(bulk.apart <= _STRAY)].amin(0), (bulk.side or 1.0) / _FINEST
-
-
-class Neighbours:
-    """Features at places, as the mean of those of the points in the smallest cell around that holds any."""
-
-    def __init__(self, points: Annotated[Tensor, "M 3"], features: Annotated[Tensor, "M D"]) -> None:
-        self.low, self.edge = _grid(points)
-        self.fallback = features.float().mean(0)
-        self.levels = []
-        for level in range(_LEVELS):
-            keys, cell = torch.unique(cells_of(points, self.low, self.edge * 2**level), return_inverse=True)
-            # A level has the means of its cells, by the sorted numbers of these.
-            sums = torch.zeros(len(keys), features.shape[1]).index_add_(0, cell, features.float())
-            self.levels.append((keys, (sums / cell.bincount()[:, None]).half()))
-
-    def __call__(self, places: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N D"]:
-        """Half precision, as semantics are."""
-        out = self.fallback.half().expand(len(places), -1).clone()
-        left = torch.arange(len(places))
-        for level, (keys, means) in enumerate(self.levels):
-            cells = cells_of(places[left], self.low, self.edge * 2**level)
-            # Those without a cell at this level ask the next, where cells are twice as wide.
-            at = torch.searchsorted(keys, cells).clamp_max(len(keys) - 1)
-            found = keys[at] == cells
-            out[left[found]] = means[at[found]]
-            left = left[~found]
-        return out
+    if (path / "config.json").is_file():
+        return open_run(path, device="cpu").scene
+    capture = read_capture(path, activated=look.activated)
+    up = look.up or direction_up(capture)[0]
+    gaussians = sampled(capture.gaussians.drawable(), SAMPLE)
+    encoder = look.semantic.encoder.build()
+    look = replace(look, size=_REFERENCE_SIZE, up=up)
+    return look_at_capture(gaussians, capture.antialiased, encoder, look, camera=capture.camera)

@@ -42,8 +42,8 @@ class LookConfig:
     """Views of a capture, from which its regions and statistics are found."""
 
     up: tuple[float, float, float] | None = None
-    """Direction that points up in the capture's own axes; none = as the file says, else 0 -1 0: most captures
-    have y down.
+    """Direction that points up in the capture's own axes; none = as the file says, else away from its ground,
+    else 0 -1 0: most captures have y down. One line says which.
     """
     inside: bool | None = None
     """Look from within, as in rooms and streets, or around an object; none = found out."""
@@ -53,6 +53,11 @@ class LookConfig:
     """Their width and height in pixels."""
     regions: int = 16
     """Semantic regions of the scene, at least 1."""
+    activated: bool = False
+    """Read opacities all in [0, 1] as such, not as logits, sizes that are all positive as such, not as
+    logarithms, and colours in [0, 1] or [0, 255] in the place of harmonics. One line says where a capture
+    looks so.
+    """
     semantic: GaussianSemanticsConfig = GaussianSemanticsConfig()
     """Semantics."""
 

@@ -20,7 +20,8 @@ from fprf.ops.harmonics import HARMONIC
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.plugins.stylizers.config import RegionToneConfig
 from fprf.rendering.local_frame import write_offset
-from fprf.splats.captures import neighbouring_light, open_captures
+from fprf.splats.capture_light import neighbouring_light
+from fprf.splats.captures import open_captures
 from fprf.splats.config import GaussianSemanticsConfig, LookConfig
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.gaussians import Gaussians

@@ -26,7 +26,8 @@ from fprf.plugins.stylizers.config import (
     StylizerConfig,
 )
 from fprf.rendering.cameras import pixel_grid
-from fprf.splats.captures import light_alone, look_at_capture, open_capture
+from fprf.splats.capture_light import light_alone
+from fprf.splats.captures import look_at_capture, open_capture
 from fprf.splats.config import LookConfig
 from fprf.splats.drawing import draw
 from fprf.splats.files import read_capture, write_gaussians
@@ -248,7 +249,8 @@ def test_what_the_cache_knows_of_a_capture_gives_the_same_colours(
         if damaged:
             kept.write_bytes(kept.read_bytes()[:-1])
         again = open_capture(capture, look, cache=tmp_path / "cache", say=said.append)
-        assert torch.equal(styled(again, photographs[0]), first) and bool(said) == damaged
+        assert torch.equal(styled(again, photographs[0]), first)
+        assert any("again" in each for each in said) == damaged
 
 
 def test_a_capture_is_restyled_alike_where_nothing_can_be_cached(

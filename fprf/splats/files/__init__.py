@@ -3,6 +3,7 @@
 """
 
 import mmap
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -15,14 +16,20 @@ from ...errors import DataError
 from ...rendering.cameras import Cameras
 from ...rendering.local_frame import added_and_beside, read_offset, write_offset
 from ...types import Origin
+from ..activation import activated as with_activated
+from ..activation import file_harmonics, find_activation
 from ..drawing import seen_means
 from ..gaussians import GaussianRows, Gaussians, bulk_of
-from .base import Capture, Data, format_of, pieces, release
+from .base import Bools, Capture, Data, Floats, format_of, pieces, release
 
 __all__ = ["Capture", "Written", "read_capture", "release", "write_capture", "write_gaussians"]
 
-_MAPPED = 1 << 28
-"""Bytes from which on files are mapped."""
+_MIN_MAPPED_BYTES = 1 << 28
+"""Of files that are mapped: smaller ones are read faster than they are mapped, and fit beside the rest."""
+_LFS_POINTER = b"version https://git-lfs"
+"""Begin of the text that Git leaves in the place of a large file."""
+_MAX_STEP_OF_FLOATS = 0.05
+"""Of positions, in extents of the bulk: beyond, its shape is lost (by eye)."""
 
 
 class Written(NamedTuple):
@@ -40,54 +47,93 @@ class Written(NamedTuple):
         return [*([f"{self.far} far from the others left out"] if self.far else []), *self.notes]
 
 
-def read_capture(path: Path) -> Capture:
+def read_capture(path: Path, *, activated: bool = False) -> Capture:
     """Read a file of Gaussians, or a folder of SOG. Raises DataError for another ending, or a file that is
     not what it says.
+
+    `activated`: opacities, sizes and colours that look activated already (`splats.activation`) are taken so.
     """
     if path.is_dir():
-        path = path / ("lod-meta.json" if (path / "lod-meta.json").is_file() else "meta.json")
+        index = path / "lod-meta.json"
+        path = index if index.is_file() else path / "meta.json"
     form = format_of(path)
-    try:
-        # Large files are mapped: what was decoded need not stay in memory beside the Gaussians.
-        if path.stat().st_size < _MAPPED:
-            data: Data = path.read_bytes()
-        else:
-            with path.open("rb") as file:
-                data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    except OSError as error:
-        raise DataError(
-            f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
-        ) from error
-    if data[:23] == b"version https://git-lfs":
+    data = _content(path)
+    if data[: len(_LFS_POINTER)] == _LFS_POINTER:
         raise DataError(f"{path}: a pointer of Git LFS in the place of the file; run git lfs pull")
     with np.errstate(over="ignore", invalid="ignore"):  # damaged files hold numbers of any kind
         capture = form.read(path, data)
     release(data)
     if not len(capture.gaussians):
         raise DataError(f"{path}: holds no Gaussian")
+    capture = _with_activation(capture, activated)
     finite = capture.gaussians.finite
     if not bool(finite.any()):
         reasons = " and ".join(capture.gaussians.faults())
-        raise DataError(
-            f"{path}: holds no Gaussian that can be drawn, but {reasons}; export the capture again"
-        )
-    # Far from 0, float32 rounds a capture to a few places along an axis; positions that were float64 have
-    # further digits.
-    local = capture.gaussians.means[finite].numpy()
-    for axis, away in zip(local.T, np.abs(capture.shift), strict=True):
-        step = float(np.spacing(np.float32(away)))
-        if not away or step <= 0.05 * bulk_of(local).side or bool((axis == axis[0]).all()):
-            continue
-        if not (axis % np.float32(step)).any():
-            raise DataError(
-                f"{path}: lies {away:.2g} from 0, where float32 has steps of {step:.2g}, too coarse for its shape; "
-                "export it closer to the origin, or with float64 positions"
-            )
+        remedy = "; ".join([*capture.notes, "export the capture again"])
+        raise DataError(f"{path}: holds no Gaussian that can be drawn, but {reasons}; {remedy}")
+    _check_precision(capture, capture.gaussians.means[finite].numpy())
     x, y, z = capture.shift
     camera = None
     if capture.camera is not None:
         camera = capture.camera.shifted((-x, -y, -z))
     return replace(capture, camera=camera, offset=read_offset(path))
+
+
+def _content(path: Path) -> Data:
+    """The bytes of a file; large ones are mapped: what was decoded need not stay in memory beside the
+    Gaussians.
+    """
+    try:
+        if path.stat().st_size < _MIN_MAPPED_BYTES:
+            return path.read_bytes()
+        with path.open("rb") as file:
+            return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except OSError as error:
+        raise DataError(
+            f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
+        ) from error
+
+
+def _with_activation(capture: Capture, asked: bool) -> Capture:
+    """A capture with what was found out about its numbers being activated: a note, and where that was asked
+    for the Gaussians that it means.
+    """
+    found = find_activation(capture.gaussians, asked=asked)
+    if not asked and not found:
+        return capture
+    if not asked:
+        note = f"its {found}, as if activated already; if so, read it with --activated true"
+        return replace(capture, notes=(*capture.notes, note), activation=found)
+    if not found:
+        note = "none of its opacities, sizes and colours can be activated already; they are read as they are"
+        return replace(capture, notes=(*capture.notes, note))
+
+    def recolour(harmonics: Floats, changed: Bools) -> Iterable[bytes]:
+        return capture.recolour(file_harmonics(torch.from_numpy(harmonics), found).numpy(), changed)
+
+    note = f"its {found}: read as activated already"
+    return replace(
+        capture,
+        gaussians=with_activated(capture.gaussians, found),
+        recolour=recolour,
+        notes=(*capture.notes, note),
+    )
+
+
+def _check_precision(capture: Capture, local: Floats) -> None:
+    """Raise DataError where float32 rounded a capture far from 0, with local means [N 3], to a few places
+    along an axis; positions that were float64 have further digits.
+    """
+    for axis, away in zip(local.T, np.abs(capture.shift), strict=True):
+        step = float(np.spacing(np.float32(away)))
+        fine = step <= _MAX_STEP_OF_FLOATS * bulk_of(local).side
+        if not away or fine or bool((axis == axis[0]).all()):
+            continue
+        if not (axis % np.float32(step)).any():
+            raise DataError(
+                f"{capture.path}: lies {away:.2g} from 0, where float32 has steps of {step:.2g}, too coarse "
+                "for its shape; export it closer to the origin, or with float64 positions"
+            )
 
 
 def write_gaussians(
@@ -186,7 +232,11 @@ def write_capture(
         form.write(path, capture.recolour(harmonics.numpy(), np.asarray(changed)))
     else:
         form.write(
-            path, (capture.data[start : start + _MAPPED] for start in range(0, len(capture.data), _MAPPED))
+            path,
+            (
+                capture.data[start : start + _MIN_MAPPED_BYTES]
+                for start in range(0, len(capture.data), _MIN_MAPPED_BYTES)
+            ),
         )
     write_offset(path, capture.offset)
     return Written()

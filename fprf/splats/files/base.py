@@ -28,6 +28,7 @@ from ...plugins.config import PluginConfig
 from ...rendering.cameras import Cameras
 from ...rendering.local_frame import local_origin
 from ...types import Origin
+from ..activation import Activation
 from ..gaussians import GaussianRows, Gaussians, bulk_of, from_arrays, morton_order
 
 Data: TypeAlias = bytes | mmap.mmap
@@ -69,7 +70,9 @@ class Capture:
     else as it was.
     """
     up: tuple[float, float, float] | None = None
-    """Direction that points up, where the file says so."""
+    """Direction that points up, where the file says so, or its format."""
+    up_reason: str = ""
+    """What says so, as a phrase."""
     camera: Cameras | None = None
     """The view that the capture was made from, where the file holds it."""
     shift: Origin = (0.0, 0.0, 0.0)
@@ -78,6 +81,8 @@ class Capture:
     """What a file beside it adds to them (see `rendering.local_frame`)."""
     notes: tuple[str, ...] = ()
     """How the file was understood where it could mean two things, each as a sentence."""
+    activation: Activation = Activation()
+    """Which numbers look activated already, and were not read so."""
 
     @property
     def origin(self) -> Origin:

@@ -27,6 +27,7 @@ from ...errors import DataError
 from ...io.images import srgb_to_linear
 from ...rendering.splines import quaternions, rotations
 from ...types import Origin
+from ..activation import TYPICAL_LN_SIZE, nearest_distance
 from ..gaussians import COUNTS, Gaussians
 from . import base
 from .base import Bools, Capture, CaptureFormat, Data, Floats
@@ -46,12 +47,8 @@ share theirs.
 """
 _LINEAR_SINCE = (2, 7)
 """Version of splat-transform from which on its .glb has linear sizes (playcanvas/splat-transform#268)."""
-_ASKED = 64
-"""Gaussians whose nearest neighbours are looked for."""
-_TYPICAL = -0.5
-"""ln of the middle axis of Gaussians over the distance to the nearest neighbour: -0.2 to -0.9 in trained
-captures.
-"""
+_ASKED_SIZES = 64
+"""Gaussians whose sizes are held against the distances between neighbours."""
 
 
 class _Part(NamedTuple):
@@ -371,28 +368,15 @@ def _logarithmic(document: dict[str, Any], parts: list[_Part]) -> tuple[bool, st
     # as wide.
     part = max(parts, key=lambda part: len(part.columns["POSITION"]))
     points = part.columns["POSITION"]
-    some = np.linspace(0, len(points) - 1, _ASKED).astype(np.int64)
-    asked = torch.from_numpy(_values(points[some]))
-    asked = asked[asked.isfinite().all(1)]
-    nearest = torch.full((len(asked),), torch.inf)
-    for rows in base.pieces(len(points)):
-        here = torch.from_numpy(_values(points[rows]))
-        # About the first one, so that float32 keeps the digits of places far from 0.
-        apart = torch.cdist(
-            (asked - asked[:1]).float(),
-            (here - asked[:1]).float(),
-            compute_mode="donot_use_mm_for_euclid_dist",
-        )
-        nearest = torch.minimum(nearest, apart.masked_fill(~(apart > 0), torch.inf).amin(1))
-    nearest = nearest[nearest.isfinite()]
+    spacing = nearest_distance(torch.from_numpy(_values(points)))
+    some = np.linspace(0, len(points) - 1, _ASKED_SIZES).astype(np.int64)
     middle = np.sort(part.sizes(some), 1)[:, 1]
     middle = middle[np.isfinite(middle)]
-    if not len(nearest) or not len(middle):
+    if spacing is None or not len(middle):
         return False, "nothing tells otherwise"
-    spacing = float(nearest.median().log())
     number = float(np.median(middle))
-    ratios = (math.log(max(number, _LEAST)) - spacing, number - spacing)
-    logarithmic = abs(ratios[1] - _TYPICAL) < abs(ratios[0] - _TYPICAL)
+    ratios = (math.log(max(number, _LEAST)) - math.log(spacing), number - math.log(spacing))
+    logarithmic = abs(ratios[1] - TYPICAL_LN_SIZE) < abs(ratios[0] - TYPICAL_LN_SIZE)
     shares = []
     for ratio in (ratios[logarithmic], ratios[not logarithmic]):
         shares.append(f"{math.exp(min(ratio, 99)):.2g}")

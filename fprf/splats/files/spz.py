@@ -4,9 +4,9 @@ streams (version 4).
 Streams: positions of 24 bits with a common number of fractional bits (version 1: float16), opacity, mean
 colour
 0.15 dc + 0.5, ln-scale (v / 16 - 10), rotation (x y z bytes; from version 3 on the smallest three of 10 bits, index 3 = w),
-harmonics (v - 128) / 128, coefficient by coefficient, channels fastest. Axes are right up back, or those of
-the extension `SPZ_ADOBE_coordinate_system`; what this module returns has those of PLY files, right down
-front, so that a capture has the same axes whatever file it comes from. Version 4: a plain header of 32 bytes,
+harmonics (v - 128) / 128, coefficient by coefficient, channels fastest. Axes are those of `spz_axes`; what this
+module returns has those of PLY files, right down front, so that a capture has the same axes whatever file it
+comes from. Version 4: a plain header of 32 bytes,
 a table of (compressed, raw) sizes, one zstd frame a stream. It needs `zstandard`. Extensions are records of
 type, length and payload, where flag 2 is set: before version 4 behind the streams, else before the table. All
 are kept.
@@ -15,6 +15,7 @@ are kept.
 import itertools
 import struct
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -24,34 +25,54 @@ from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...types import Origin
-from ..gaussians import COUNTS, Gaussians, bulk_of
+from ..gaussians import COUNTS, Gaussians, bulk_of, from_arrays
 from . import base
 from .base import Bools, Capture, CaptureFormat, Data, Floats
+from .spz_axes import PLY_AXES, Axes, axes_record, guessed_axes, said_axes
 
 _MAGIC = 0x5053474E
-_HEADER = struct.Struct("<IIIBBBB")
+"""The letters NGSP."""
+_SPZ_HEADER = struct.Struct("<IIIBBBB")
+"""Magic, version, Gaussians, degree, fractional bits, flags; a byte of 0."""
 _WIDE_HEADER = struct.Struct("<IIIBBBBI12x")
-_ENTRY = struct.Struct("<QQ")
-_FRACTION = 23
-"""Fractional bits of positions at most."""
-_PRECISION = 2.0**-13
+"""That of version 4: the last byte is the number of streams, then where their table begins."""
+_TABLE_ENTRY = struct.Struct("<QQ")
+"""Bytes of a stream, packed and unpacked."""
+_ANTIALIASED_FLAG = 1
+_EXTENSIONS_FLAG = 2
+_MAX_FRACTION = 23
+"""Fractional bits of positions at most: of 24 bits one is the sign."""
+_MAX_POSITION = 2**23 - 1
+"""In the steps of positions."""
+_MIN_EXTENT = 1e-9
+"""Of coordinates, so that the logarithm of steps is finite."""
+_MAX_READ_FRACTION = 30
+"""Fractional bits beyond it are damage: other programs write 12."""
+_MAX_STEP_OF_SPZ = 2.0**-13
 """Steps of positions in extents of the capture, to which outliers do not matter; steps of mm in a room are
 finer.
 """
-_SIZES = (-10.0, 5.9375)
-"""Smallest and largest ln-scale."""
-_RATIO = 1032
-"""Times its size that deflated data may unpack to at most."""
-_TRAILER = 1 << 20
+_MAX_STEP_SHARE = 1e-3
+"""Steps of positions in extents of the bulk, above which they are said: a pixel of a view of it."""
+_LN_SIZE_RANGE = (-10.0, 5.9375)
+"""Smallest and largest ln-scale: bytes 0 and 255."""
+_LN_SIZE_STEPS = 16
+"""A unit of ln-scale."""
+_MAX_DEFLATE_RATIO = 1032
+"""Times its size that deflated data may unpack to at most (zlib)."""
+_MAX_ZSTD_RATIO = 64
+"""The same of positions of version 4, which hardly shrink in captures, and some bytes for small files."""
+_ZSTD_SLACK_BYTES = 1 << 16
+_MAX_TRAILER_BYTES = 1 << 20
 """Bytes behind the streams (extensions) that are kept."""
-_PIECE = 1 << 12
+_PIECE_BYTES = 1 << 12
 """Packed bytes at a time."""
-_TINT = 0.15
-_COORDINATES = 0xADBE0003
-"""Type of the extension that says which axes a file has; its payload is their number."""
-_RUB = 4
-_TURN = (1, 2, 3, 0)
+_TINT_SCALE = 0.15
+"""Of mean colours: bytes reach harmonics of -3.3 to 3.3."""
+_TURN_ORDER = (1, 2, 3, 0)
 """Where the components x y z w of a file lie in w x y z."""
+_SAMPLED_GAUSSIANS = 20_000
+"""As many as tell the ground (`ground.find_ground`)."""
 
 
 class _Header(NamedTuple):
@@ -68,10 +89,119 @@ class _Header(NamedTuple):
         """Bytes of each stream: positions, opacities, colours, scales, rotations, harmonics."""
         position = 6 if self.version == 1 else 9
         turn = 4 if self.version >= 3 else 3
-        found: list[int] = []
-        for each in (position, 1, 3, 3, turn, 3 * (COUNTS[self.degree] - 1)):
-            found.append(self.number * each)
-        return found
+        rest = 3 * (COUNTS[self.degree] - 1)
+        return [self.number * each for each in (position, 1, 3, 3, turn, rest)]
+
+
+_TINT_STREAM = 2
+_REST_STREAM = 5
+"""Numbers of the streams that colours are in."""
+
+
+class _Container(NamedTuple):
+    """A file, taken apart."""
+
+    header: _Header
+    streams: list[bytes]
+    """Unpacked; the last one is empty where there are no harmonics but the constants."""
+    extensions: bytes
+    """What lies behind the streams, or before the table of version 4."""
+    unpacked: Data
+    """The file without gzip."""
+    trailer: bytes | None
+    """What lies behind the gzip members; None where the file is not of gzip."""
+    frames: list[bytes]
+    """Packed streams of version 4."""
+
+    @property
+    def axes_records(self) -> bytes:
+        """Extensions where the header announces any."""
+        return self.extensions if self.header.flags & _EXTENSIONS_FLAG else b""
+
+    def with_streams(self, new: Mapping[int, bytes]) -> list[bytes]:
+        """The file with other bytes in some streams; what is packed alone stays as it is packed."""
+        if self.header.version < 4:
+            parts = [new.get(number, stream) for number, stream in enumerate(self.streams)]
+            whole = b"".join([self.unpacked[: self.header.size], *parts, self.extensions])
+            if self.trailer is None:
+                return [whole]
+            return [zlib.compress(whole, 6, wbits=31), self.trailer]
+        import zstandard
+
+        table = self.header.size + len(self.extensions)
+        frames = list(self.frames)
+        for number, stream in new.items():
+            if number < len(frames):
+                frames[number] = zstandard.ZstdCompressor().compress(stream)
+        entries = []
+        for frame, stream in zip(frames, self.streams, strict=False):
+            entries.append(_TABLE_ENTRY.pack(len(frame), len(stream)))
+        end = table + _TABLE_ENTRY.size * len(frames) + sum(map(len, self.frames))
+        return [self.unpacked[:table], *entries, *frames, self.unpacked[end:]]
+
+
+class _Rows:
+    """The Gaussians of a file, of which some rows at a time are decoded."""
+
+    def __init__(self, header: _Header, streams: list[bytes]) -> None:
+        count = header.number
+        means, opacity, tint, scales, turns, rest = (np.frombuffer(each, np.uint8) for each in streams)
+        self.header = header
+        self.means = means
+        self.opacity = opacity
+        self.tint = tint.reshape(count, 3)
+        self.scales = scales.reshape(count, 3)
+        self.turns = turns
+        self.rest = rest.reshape(count, COUNTS[header.degree] - 1, 3)
+
+    def decoded(self, rows: slice, axes: Axes) -> tuple[Floats, ...]:
+        """Some of them as `base.decoded` wants them."""
+        constants = (self.tint[rows, None] / 255 - 0.5) / _TINT_SCALE
+        rest = (self.rest[rows].astype(np.float64) - 128) / 128
+        return (
+            axes.points(self._points(rows)),
+            axes.quaternions(self._quaternions(rows)),
+            self.scales[rows] / _LN_SIZE_STEPS + _LN_SIZE_RANGE[0],
+            base.logit(self.opacity[rows] / 255),
+            axes.harmonics(np.concatenate([constants, rest], 1)),
+        )
+
+    def sample(self) -> Gaussians:
+        """Some of them in the file's own axes, evenly through the file."""
+        step = -(-self.header.number // _SAMPLED_GAUSSIANS)
+        some = self.decoded(slice(0, None, max(step, 1)), PLY_AXES)
+        return from_arrays(some[0], some[1], some[2], some[3], some[4])
+
+    def _points(self, rows: slice) -> Floats:
+        count = self.header.number
+        if self.header.version == 1:
+            return self.means.view("<f2").reshape(count, 3)[rows].astype(np.float64)
+        # 24 bits, the lowest byte first; the highest bit is the sign.
+        low, middle, high = self.means.reshape(count, 3, 3)[rows].astype(np.int32).transpose(2, 0, 1)
+        steps = ((low | middle << 8 | high << 16) ^ 0x800000) - 0x800000
+        return np.asarray(steps / 2.0**self.header.fraction)
+
+    def _quaternions(self, rows: slice) -> Floats:
+        if self.header.version < 3:
+            three = self.turns.reshape(self.header.number, 3)[rows] / 127.5 - 1
+            w = np.sqrt(np.maximum(0, 1 - (three**2).sum(1, keepdims=True)))
+            return np.concatenate([w, three], 1)
+        word = self.turns.view("<u4")[rows]
+        parts = np.stack([word >> shift & 1023 for shift in (20, 10, 0)], 1).astype(np.int64)
+        sizes = (parts & 511) / 511 * np.where(parts >> 9, -1.0, 1.0)
+        found = base.three_to_four((word >> 30).astype(np.int64), sizes)
+        quaternions = np.empty_like(found)
+        quaternions[:, _TURN_ORDER] = found
+        return quaternions
+
+    def recoloured(self, harmonics: Floats, changed: Bools) -> dict[int, bytes]:
+        """The streams of colours with other ones [M K 3] for the Gaussians that changed; the others keep
+        their bytes.
+        """
+        tint = self.tint.copy()
+        rest = self.rest.copy()
+        tint[changed], rest[changed] = _colour_bytes(harmonics)
+        return {_TINT_STREAM: tint.tobytes(), _REST_STREAM: rest.tobytes()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,121 +215,54 @@ class Spz(CaptureFormat):
         """A .spz file of versions 1 to 4. Raises DataError for others, and for version 4 where `zstandard` is
         not installed.
         """
-        # The streams, packed together or each alone.
-        packed = data[:2] == b"\x1f\x8b"
-        unpacked, after = _unzip(path, data) if packed else (data, b"")
-        header = _header(path, unpacked)
-        if header.version < 4:
-            ends = np.cumsum([header.size, *header.sizes]).tolist()
-            if ends[-1] > len(unpacked):
-                raise base.short(
-                    path, len(unpacked), ends[-1], f"{header.number} Gaussians{' unpacked' * packed}"
-                )
-            streams = []
-            for start, stop in itertools.pairwise(ends):
-                streams.append(unpacked[start:stop])
-            extensions = unpacked[ends[-1] :]
-        else:
-            streams, frames, table = _frames(path, data, header)
-            extensions = data[header.size : table]
-        axes = _axes(path, extensions if header.flags & 2 else b"", header.degree)
-        means, opacity, tint, scales, turns, rest = (np.frombuffer(each, np.uint8) for each in streams)
-        count = header.number
-        bands = COUNTS[header.degree]
+        file = _container(path, data)
+        header = file.header
+        rows = _Rows(header, file.streams)
+        notes: tuple[str, ...] = ()
+        axes = said_axes(path, file.axes_records, header.degree)
+        if axes is None:
+            axes, reason = guessed_axes(header.version, header.fraction, rows.sample())
+            notes = (reason,)
 
-        def part(rows: slice) -> tuple[Floats, ...]:
-            # Positions and rotations are stored otherwise in each version; the rest never changed.
-            if header.version == 1:
-                points: Floats = means.view("<f2").reshape(count, 3)[rows].astype(np.float64)
-            else:
-                # 24 bits, the lowest byte first; the highest bit is the sign.
-                low, middle, high = means.reshape(count, 3, 3)[rows].astype(np.int32).transpose(2, 0, 1)
-                points = (((low | middle << 8 | high << 16) ^ 0x800000) - 0x800000) / 2.0**header.fraction
-            if header.version < 3:
-                three = turns.reshape(count, 3)[rows] / 127.5 - 1
-                quaternions = np.concatenate(
-                    [np.sqrt(np.maximum(0, 1 - (three**2).sum(1, keepdims=True))), three], 1
-                )
-            else:
-                word = turns.view("<u4")[rows]
-                parts = np.stack([word >> shift & 1023 for shift in (20, 10, 0)], 1).astype(np.int64)
-                found = base.three_to_four(
-                    (word >> 30).astype(np.int64), (parts & 511) / 511 * np.where(parts >> 9, -1.0, 1.0)
-                )
-                quaternions = np.empty_like(found)
-                quaternions[:, _TURN] = found
-            constants = (tint.reshape(count, 1, 3)[rows] / 255 - 0.5) / _TINT
-            bits = rest.reshape(count, bands - 1, 3)[rows].astype(np.float64)
-            return (
-                axes.points(points),
-                axes.quaternions(quaternions),
-                scales.reshape(count, 3)[rows] / 16 - 10,
-                base.logit(opacity[rows] / 255),
-                axes.harmonics(np.concatenate([constants, (bits - 128) / 128], 1)),
-            )
+        def part(some: slice) -> tuple[Floats, ...]:
+            return rows.decoded(some, axes)
 
         def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
-            # Bytes of Gaussians that did not change stay as they are.
-            colours = (tint.reshape(count, 3).copy(), rest.reshape(count, bands - 1, 3).copy())
-            new_bytes = _colour_bytes(axes.harmonics(base.finite(harmonics[changed]), back=True))
-            for stream, bytes_ in zip(colours, new_bytes, strict=True):
-                stream[changed] = bytes_
-            new = dict(zip((2, 5), (stream.tobytes() for stream in colours), strict=True))
-            if header.version > 3:  # the other streams stay as they are packed
-                import zstandard
+            new = axes.harmonics(base.finite(harmonics[changed]), back=True)
+            return file.with_streams(rows.recoloured(new, changed))
 
-                pack = zstandard.ZstdCompressor().compress
-                again = []
-                for k, frame in enumerate(frames):
-                    again.append(pack(new[k]) if k in new else frame)
-                entries = []
-                for frame, each in zip(again, streams, strict=False):
-                    entries.append(_ENTRY.pack(len(frame), len(each)))
-                end = table + sum(map(len, frames)) + len(b"".join(entries))
-                return [data[:table], *entries, *again, data[end:]]
-            parts = [new.get(i, each) for i, each in enumerate(streams)]
-            whole = b"".join([unpacked[: header.size], *parts, extensions])
-            if packed:
-                return [zlib.compress(whole, 6, wbits=31), after]
-            return [whole]
-
-        gaussians, shift = base.decoded(bands, (count, part))
-        return Capture(path, gaussians, bool(header.flags & 1), data, recolour, shift=shift)
+        gaussians, shift = base.decoded(COUNTS[header.degree], (header.number, part))
+        antialiased = bool(header.flags & _ANTIALIASED_FLAG)
+        return Capture(path, gaussians, antialiased, data, recolour, shift=shift, notes=notes)
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
-        """Version 3, with as many fractional bits as the largest coordinate leaves."""
+        """Version 3 in the axes of PLY files, which it names, with as many fractional bits as the largest
+        coordinate leaves.
+        """
         means, turns, scales, logits, harmonics = base.arrays(gaussians)
-        axes = _Axes(False, (1.0, -1.0, -1.0))
         fraction = -int(np.log2(_step(means)))
-        points = axes.points(means.astype(np.float64)) * 2.0**fraction
-        at = np.clip(np.rint(points), -(2**23), 2**23 - 1).astype(np.int64) & 0xFFFFFF
-        most, three = base.smallest_three(axes.quaternions(turns.astype(np.float64))[:, _TURN])
-        # Two bits say which component is left out; each other one has a sign and 9 bits.
-        word = most.astype(np.uint32)
-        for column in three.T:
-            word = (
-                word << 10
-                | (column < 0).astype(np.uint32) << 9
-                | base.steps(np.abs(column), 511).astype(np.uint32)
-            )
-        tint, rest = _colour_bytes(axes.harmonics(base.finite(harmonics)))
+        steps = np.rint(means.astype(np.float64) * 2.0**fraction)
+        at = np.clip(steps, -_MAX_POSITION - 1, _MAX_POSITION).astype(np.int64) & 0xFFFFFF
+        ln_sizes = (base.finite(scales) - _LN_SIZE_RANGE[0]) * _LN_SIZE_STEPS
+        tint, rest = _colour_bytes(base.finite(harmonics))
+        flags = _EXTENSIONS_FLAG | (_ANTIALIASED_FLAG if antialiased else 0)
         parts = [
-            _HEADER.pack(_MAGIC, 3, len(gaussians), gaussians.degree, fraction, int(antialiased), 0),
+            _SPZ_HEADER.pack(_MAGIC, 3, len(gaussians), gaussians.degree, fraction, flags, 0),
             np.stack([at & 255, at >> 8 & 255, at >> 16], -1).astype(np.uint8).tobytes(),
             base.steps(base.sigmoid(logits), 255).astype(np.uint8).tobytes(),
             tint.tobytes(),
-            np.clip(np.rint((base.finite(scales) + 10) * 16), 0, 255).astype(np.uint8).tobytes(),
-            word.astype("<u4").tobytes(),
+            np.clip(np.rint(ln_sizes), 0, 255).astype(np.uint8).tobytes(),
+            _packed_turns(turns).tobytes(),
             rest.tobytes(),
+            axes_record(),
         ]
         return [zlib.compress(b"".join(parts), 6, wbits=31)]
 
     def keeps(self, gaussians: Gaussians) -> Bools:
         """Those within the reach of 24 bits whose steps suit the bulk."""
         means = gaussians.means.numpy()
-        return np.asarray(
-            base.precise(means, lambda kept, _: _step(kept), _PRECISION) & (np.abs(means) <= 2**23 - 1).all(1)
-        )
+        precise = base.precise(means, lambda kept, _: _step(kept), _MAX_STEP_OF_SPZ)
+        return np.asarray(precise & (np.abs(means) <= _MAX_POSITION).all(1))
 
     def notes(self, gaussians: Gaussians) -> list[str]:
         means = gaussians.means.numpy()
@@ -207,115 +270,82 @@ class Spz(CaptureFormat):
         step = _step(means)
         side = bulk_of(means).side
         notes = []
-        if step > 1e-3 * side > 0:
+        if step > _MAX_STEP_SHARE * side > 0:
             notes.append(
                 f"positions in steps of {step:g}, as they lie {float(np.abs(means).max()):.2g} from the origin"
             )
-        limited = int(((largest < _SIZES[0] - 1 / 32) | (largest > _SIZES[1] + 1 / 32)).sum())
+        smallest = _LN_SIZE_RANGE[0] - 0.5 / _LN_SIZE_STEPS
+        widest = _LN_SIZE_RANGE[1] + 0.5 / _LN_SIZE_STEPS
+        limited = int(((largest < smallest) | (largest > widest)).sum())
         if limited:
-            notes.append(
-                f"{limited} with sizes that .spz limits to {np.exp(_SIZES[0]):.2g} to {np.exp(_SIZES[1]):.3g}"
-            )
+            low, high = np.exp(_LN_SIZE_RANGE)
+            notes.append(f"{limited} with sizes that .spz limits to {low:.2g} to {high:.3g}")
         return notes
 
 
 def _step(means: Floats) -> float:
     """Distance between positions that 24 bits tell apart; infinite for those that they do not reach."""
     largest = float(np.abs(means).max(initial=0.0))
-    if largest > 2**23 - 1:
+    if largest > _MAX_POSITION:
         return np.inf
-    return float(2.0 ** -np.clip(np.floor(np.log2((2**23 - 1) / max(largest, 1e-9))), 0, _FRACTION))
+    fraction = np.floor(np.log2(_MAX_POSITION / max(largest, _MIN_EXTENT)))
+    return float(2.0 ** -np.clip(fraction, 0, _MAX_FRACTION))
 
 
-class _Axes(NamedTuple):
-    """The axes of a file, against right down front: turned by 90 degrees about x, then mirrored."""
-
-    turned: bool
-    """z is up or down, y front or back."""
-    signs: tuple[float, float, float]
-
-    def points(self, points: Floats) -> Floats:
-        """Points [N 3] of a file, right down front."""
-        if self.turned:
-            points = np.stack([points[:, 0], points[:, 2], -points[:, 1]], 1)
-        return np.asarray(points * np.array(self.signs))
-
-    def quaternions(self, turns: Floats) -> Floats:
-        """Rotations [N 4], w x y z, as `points`. Mirroring the world and the own axes of a Gaussian leaves
-        its shape.
-        """
-        if self.turned:
-            w, x, y, z = turns.T * 0.5**0.5
-            turns = np.stack([w + x, x - w, y + z, z - y], 1)
-        a, b, c = self.signs
-        return np.asarray(turns * np.array([1.0, b * c, a * c, a * b]))
-
-    def harmonics(self, harmonics: Floats, back: bool = False) -> Floats:
-        """Harmonics [N K 3] as `points`; `back`: those of a file."""
-        bands = harmonics.shape[1]
-        degree = np.sqrt(np.arange(bands)).astype(np.int64)
-        order = np.arange(bands) - degree * (degree + 1)
-        odd = np.where(order < 0, -1.0, 1.0)  # those of negative order have the sign of y
-        flips = (odd * (-1.0) ** order, odd, (-1.0) ** (degree + order))
-        parity = np.prod(
-            [flip if sign < 0 else np.ones(bands) for flip, sign in zip(flips, self.signs, strict=True)], 0
-        )
-        if not self.turned:
-            return np.asarray(harmonics * parity[:, None])
-        turn = base.turned_harmonics(np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]), bands)
-        matrix = parity[:, None] * turn
-        return np.asarray(np.matmul(matrix.T if back else matrix, harmonics))
+def _packed_turns(turns: Floats) -> NDArray[np.uint32]:
+    """Rotations [N 4], w x y z, in one word each."""
+    largest, three = base.smallest_three(turns.astype(np.float64)[:, _TURN_ORDER])
+    # Two bits say which component is left out; each other one has a sign and 9 bits.
+    word = largest.astype(np.uint32)
+    for column in three.T:
+        sign = (column < 0).astype(np.uint32)
+        size = base.steps(np.abs(column), 511).astype(np.uint32)
+        word = word << 10 | sign << 9 | size
+    return word.astype("<u4")
 
 
-def _axes(path: Path, extensions: bytes, degree: int) -> _Axes:
-    """The axes that a record `SPZ_ADOBE_coordinate_system` names by its number, else right up back."""
-    number = _RUB
-    at = 0
-    while at + 12 <= len(extensions):
-        kind, size, value = struct.unpack_from("<III", extensions, at)
-        if kind == _COORDINATES and size == 4:
-            number = value or _RUB
-            break
-        at += 8 + size
-    if number > 16:
-        raise DataError(f"{path}: axes of number {number} (SPZ_ADOBE_coordinate_system); 1 to 16 are known")
-    # Right, up and front are bits, another one swaps y and z.
-    right, up, front, turned = (number - 1 >> k & 1 for k in range(4))
-    if turned and degree > 3:
-        raise DataError(
-            f"{path}: harmonics of degree 4 with z up or down; save the file with y up, or with degree 3"
-        )
-    x = 2.0 * right - 1
-    down = 1 - 2.0 * up
-    ahead = 2.0 * front - 1
-    # Turned, a point of right front up is (x, z, -y), and of right down front (x, -z, y).
-    if turned:
-        return _Axes(True, (x, down, -ahead))
-    return _Axes(False, (x, down, ahead))
+def _container(path: Path, data: Data) -> _Container:
+    """The streams of a file, packed together or each alone. Raises DataError where it is damaged."""
+    packed = data[:2] == b"\x1f\x8b"
+    unpacked = data
+    trailer = None
+    if packed:
+        unpacked, trailer = _unzip(path, data)
+    header = _header(path, unpacked)
+    if header.version > 3:
+        streams, frames, table = _frames(path, data, header)
+        return _Container(header, streams, data[header.size : table], data, None, frames)
+    ends = np.cumsum([header.size, *header.sizes]).tolist()
+    if ends[-1] > len(unpacked):
+        state = " unpacked" if packed else ""
+        raise base.short(path, len(unpacked), ends[-1], f"{header.number} Gaussians{state}")
+    streams = []
+    for start, stop in itertools.pairwise(ends):
+        streams.append(unpacked[start:stop])
+    return _Container(header, streams, unpacked[ends[-1] :], unpacked, trailer, [])
 
 
 def _colour_bytes(harmonics: Floats) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Constants [N 3] and the other harmonics [N K-1 3] of a file, as it has them."""
-    tint = base.steps(harmonics[:, 0] * _TINT + 0.5, 255).astype(np.uint8)
+    tint = base.steps(harmonics[:, 0] * _TINT_SCALE + 0.5, 255).astype(np.uint8)
     return tint, np.clip(np.rint(harmonics[:, 1:] * 128) + 128, 0, 255).astype(np.uint8)
 
 
 def _header(path: Path, data: Data) -> _Header:
-    if len(data) < _HEADER.size:
-        raise base.short(path, len(data), _HEADER.size, "the header")
-    magic, version, count, degree, fraction, flags, _ = _HEADER.unpack_from(data)
+    if len(data) < _SPZ_HEADER.size:
+        raise base.short(path, len(data), _SPZ_HEADER.size, "the header")
+    magic, version, count, degree, fraction, flags, _ = _SPZ_HEADER.unpack_from(data)
     if magic != _MAGIC:
         raise DataError(f"{path}: does not begin as a .spz file does; it is damaged or of another kind")
     for what, value, least, most in (
         ("version", version, 1, 4),
         ("degree of harmonics", degree, 0, len(COUNTS) - 1),
-        ("number of fractional bits", fraction, 0, 30),
+        ("number of fractional bits", fraction, 0, _MAX_READ_FRACTION),
     ):
         if not least <= value <= most:
             raise DataError(f"{path}: a .spz whose {what} is {value}; {least} to {most} can be read")
-    return _Header(
-        version, count, degree, fraction, flags, _HEADER.size if version < 4 else _WIDE_HEADER.size
-    )
+    size = _SPZ_HEADER.size if version < 4 else _WIDE_HEADER.size
+    return _Header(version, count, degree, fraction, flags, size)
 
 
 def _unzip(path: Path, data: Data) -> tuple[bytes, bytes]:
@@ -324,31 +354,30 @@ def _unzip(path: Path, data: Data) -> tuple[bytes, bytes]:
     """
     content = bytearray()
     at = 0
-    most = _HEADER.size
+    most = _SPZ_HEADER.size
     try:
         while data[at : at + 2] == b"\x1f\x8b":
             packer = zlib.decompressobj(31)
             while not packer.eof and len(content) < most:
                 # zlib copies what it leaves of a piece: of the whole file that would take minutes where
                 # members are many.
-                piece = data[at : at + _PIECE]
+                piece = data[at : at + _PIECE_BYTES]
                 got = packer.decompress(piece, most - len(content))
                 at += len(piece) - len(packer.unused_data if packer.eof else packer.unconsumed_tail)
                 content += got
-                if len(content) == most == _HEADER.size:  # the header bounds the rest
+                if len(content) == most == _SPZ_HEADER.size:  # the header bounds the rest
                     header = _header(path, bytes(content))
                     if header.version > 3:
                         raise DataError(f"{path}: .spz of version 4 within gzip; unpack it first (gunzip)")
-                    most += sum(header.sizes) + _TRAILER
-                    if sum(header.sizes) > _RATIO * len(data):
-                        raise base.short(
-                            path, len(data), sum(header.sizes) // _RATIO, f"{header.number} Gaussians"
-                        )
+                    most += sum(header.sizes) + _MAX_TRAILER_BYTES
+                    if sum(header.sizes) > _MAX_DEFLATE_RATIO * len(data):
+                        needed = sum(header.sizes) // _MAX_DEFLATE_RATIO
+                        raise base.short(path, len(data), needed, f"{header.number} Gaussians")
                 if not got and not piece and not packer.eof:
                     return bytes(content), b""
             if not packer.eof:
                 raise DataError(
-                    f"{path}: more than {_TRAILER} bytes behind the Gaussians; it is damaged or of another kind"
+                    f"{path}: more than {_MAX_TRAILER_BYTES} bytes behind the Gaussians; it is damaged or of another kind"
                 )
     except zlib.error as error:
         if "data check" in str(error):
@@ -369,16 +398,17 @@ def _frames(path: Path, data: Data, header: _Header) -> tuple[list[bytes], list[
     wanted = 5 if header.degree == 0 else 6
     if count != wanted or at < _WIDE_HEADER.size:
         raise DataError(f"{path}: version 4 with {count} streams from byte {at}; there are {wanted}")
-    start = at + count * _ENTRY.size
+    start = at + count * _TABLE_ENTRY.size
     if start > len(data):
         raise base.short(path, len(data), start, "the table of streams")
-    sizes = [*_ENTRY.iter_unpack(data[at:start])]
+    sizes = [*_TABLE_ENTRY.iter_unpack(data[at:start])]
     end = start + sum(size for size, _ in sizes)
     if end > len(data):
         raise base.short(path, len(data), end, "the streams")
     # A zstd frame may unpack to anything: positions of captures hardly shrink, so they bound the rest.
-    if sizes[0][1] > 64 * sizes[0][0] + (1 << 16):
-        raise base.short(path, sizes[0][0], sizes[0][1] // 64, f"{header.number} positions")
+    packed, unpacked = sizes[0]
+    if unpacked > _MAX_ZSTD_RATIO * packed + _ZSTD_SLACK_BYTES:
+        raise base.short(path, packed, unpacked // _MAX_ZSTD_RATIO, f"{header.number} positions")
     try:
         import zstandard as zstd
     except ImportError:
@@ -402,4 +432,6 @@ def _frames(path: Path, data: Data, header: _Header) -> tuple[list[bytes], list[
         if len(streams[-1]) != needed:
             raise base.short(path, len(streams[-1]), needed, "a stream unpacked")
         start += size
-    return ([*streams, b""] if header.degree == 0 else streams), frames, at
+    if header.degree == 0:
+        streams.append(b"")
+    return streams, frames, at
