@@ -145,8 +145,11 @@ def raw_kind_of(file: IO[bytes], name: object) -> str:
     empty or of no known format.
     """
     head, kind = _sniffed(file, name)
-    directories = tiff_directories(file) if kind == "TIFF" else []
-    return raw_kind(head, directories)
+    if kind == RAW:
+        return raw_kind(head, [])
+    if kind == "TIFF":
+        return raw_kind(head, tiff_directories(file))
+    return ""
 
 
 def open_image(file: IO[bytes], name: object) -> tuple[str, ImageFile]:
@@ -181,9 +184,11 @@ def kind_of(head: bytes) -> str:
     """The format of a file by its first 64 bytes: JPEG, PNG, WebP, BMP, TIFF, AVIF, HEIC or raw; empty for
     another. Raw photographs that begin as TIFF are told by `raw_kind_of`.
     """
-    if raw_kind(head, []):
-        return RAW
-    return next((kind for kind, (first, _) in _READERS.items() if re.match(first, head, re.DOTALL)), "")
+    for kind, (first, _) in _READERS.items():
+        if re.match(first, head, re.DOTALL):
+            # Of these only TIFF may be the beginning of a raw photograph.
+            return RAW if kind == "TIFF" and raw_kind(head, []) else kind
+    return RAW if raw_kind(head, []) else ""
 
 
 def _at_full_picture(file: IO[bytes]) -> IO[bytes]:
