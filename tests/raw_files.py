@@ -97,6 +97,8 @@ def dng(
         272: (2, [b"test camera"]),
         274: (3, [orientation]),
         330: (4, ["inside"]),
+        37386: (5, [(35, 1)]),
+        41989: (3, [52]),
     }
     if version:
         first |= {

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from PIL import ImageCms
 from PIL.AvifImagePlugin import AvifImageFile
 from PIL.BmpImagePlugin import BmpImageFile
+from PIL.ExifTags import IFD
 from PIL.ExifTags import Base as Tag
 from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
@@ -41,7 +42,7 @@ from PIL.WebPImagePlugin import WebPImageFile
 from ..errors import DataError
 from ..io.transfer import picture_of
 from .colour_tags import ColourTag, boxes_tag, exif_tag, heif_tag, png_tag
-from .raw import develop, full_picture, raw_kind, raw_size, tiff_directories
+from .raw import develop, full_picture, raw_exif, raw_kind, raw_size, tiff_directories
 
 MAX_PIXELS = 100_000_000
 """Files that claim more are refused before they are decoded: a camera's largest, with room for copies."""
@@ -145,8 +146,24 @@ def raw_kind_of(file: IO[bytes], name: object) -> str:
     empty or of no known format.
     """
     head, kind = _sniffed(file, name)
-    directories = tiff_directories(file) if kind == "TIFF" else []
-    return raw_kind(head, directories)
+    if kind == RAW:
+        return raw_kind(head, [])
+    if kind == "TIFF":
+        return raw_kind(head, tiff_directories(file))
+    return ""
+
+
+def exif_of(file: IO[bytes], name: object) -> PIL.Image.Exif:
+    """The EXIF block of an open file; of a raw photograph what it says of its lens. Raises whatever Pillow
+    raises over a damaged one.
+    """
+    if raw_kind_of(file, name):
+        return raw_exif(file)
+    image = open_image(file, name)[1]
+    with silent():
+        exif = image.getexif()
+        exif.get_ifd(IFD.Exif)  # while the file is open: of a TIFF it is read only when asked for
+    return exif
 
 
 def open_image(file: IO[bytes], name: object) -> tuple[str, ImageFile]:
@@ -181,9 +198,11 @@ def kind_of(head: bytes) -> str:
     """The format of a file by its first 64 bytes: JPEG, PNG, WebP, BMP, TIFF, AVIF, HEIC or raw; empty for
     another. Raw photographs that begin as TIFF are told by `raw_kind_of`.
     """
-    if raw_kind(head, []):
-        return RAW
-    return next((kind for kind, (first, _) in _READERS.items() if re.match(first, head, re.DOTALL)), "")
+    for kind, (first, _) in _READERS.items():
+        if re.match(first, head, re.DOTALL):
+            # Of these only TIFF may be the beginning of a raw photograph.
+            return RAW if kind == "TIFF" and raw_kind(head, []) else kind
+    return RAW if raw_kind(head, []) else ""
 
 
 def _at_full_picture(file: IO[bytes]) -> IO[bytes]:

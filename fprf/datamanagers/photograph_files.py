@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import DataError
-from .images import IMAGE_SUFFIXES, Image, ImageHeader, load_image, read_header
+from .images import IMAGE_SUFFIXES, Image, ImageHeader, load_image, raw_twins, read_header
 from .picture_names import MAP_WORDS, THUMBNAIL_WORDS, spelling, without_suffixes, without_words
 
 COPIES = "copies of other photographs"
@@ -25,6 +25,7 @@ _OTHERS = "files of other programs"
 _THUMBNAILS = "thumbnails"
 _MAPS = "masks and maps of other photographs"
 _RECONSTRUCTION = "pictures of a reconstruction"
+_RAW_TWINS = "raw files of other photographs"
 _REDUCED = "reduced copies of other photographs"
 
 _FOLDERS_OF_OTHERS = frozenset(("__macosx", "$recycle.bin", "#recycle", "@recycle", "lost+found"))
@@ -98,6 +99,7 @@ def find_photographs(folder: Path, *, below: bool = True, without: Path | None =
             left_out[kind].append(shown_name(inner))
         else:
             files.append(path)
+    files = _without(files, folder, left_out, dict.fromkeys(raw_twins(files), _RAW_TWINS))
     files = _without(files, folder, left_out, _companions(files))
     files = _without(files, folder, left_out, _reduced(files))
     return Photographs(files, dict(left_out))

@@ -15,7 +15,9 @@ from io import BytesIO
 from typing import IO, TYPE_CHECKING
 
 import numpy as np
+import PIL.Image
 from numpy.typing import NDArray
+from PIL.ExifTags import IFD
 from PIL.ExifTags import Base as Tag
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
@@ -46,8 +48,11 @@ _SENSOR_SAMPLES = frozenset({32803, 34892})
 """PhotometricInterpretation of a colour filter array (TIFF/EP) and of linear samples of the sensor (DNG)."""
 _MAKERS_COMPRESSIONS = frozenset({32767, 32769, 32770, 34713, 65000, 65535})
 """Compression of Sony, Epson, Samsung, Nikon, Kodak and Pentax: nothing else is stored so (libtiff, tiff.h)."""
+_LENS_TAGS = (Tag.Make, Tag.Model, Tag.FocalLength, Tag.FocalLengthIn35mmFilm)
 _DNG_VERSION = 50706
+"""Tag that every DNG has (DNG 1.7, chapter 4)."""
 _NEW_SUBFILE_TYPE = 254
+"""Tag that says what part of a file a picture is (TIFF 6.0, section 8)."""
 _REDUCED = 1
 """Bit of NewSubfileType: a smaller copy of another picture of the file."""
 _MAX_DIRECTORIES = 64
@@ -66,26 +71,56 @@ def raw_kind(head: bytes, directories: list[ImageFileDirectory_v2]) -> str:
     return "DNG" if _DNG_VERSION in directories[0] else "raw TIFF"
 
 
+def raw_exif(file: IO[bytes]) -> PIL.Image.Exif:
+    """What a raw photograph that is a TIFF says of its lens: model and focal lengths; empty for others."""
+    exif = PIL.Image.Exif()
+    directories = tiff_directories(file)
+    if not directories:
+        return exif
+    # TIFF/EP has them in the first directory, most makers in the EXIF directory that it names.
+    values = {tag: directories[0].get(tag) for tag in _LENS_TAGS}
+    for offset in _numbers(directories[0], IFD.Exif):
+        inner = _directory_at(file, offset)
+        values |= {tag: inner[tag] for tag in _LENS_TAGS if tag in inner}
+    for tag, value in values.items():
+        if value is None:
+            continue
+        if tag in (Tag.Make, Tag.Model):
+            exif[tag] = value
+        else:
+            exif.get_ifd(IFD.Exif)[tag] = value
+    return exif
+
+
+def _tiff_head(file: IO[bytes]) -> bytes:
+    """The header of an open TIFF file: 8 bytes, 16 of BigTIFF."""
+    file.seek(0)
+    head = file.read(8)
+    return head + file.read(8) if head[2:3] == b"+" else head
+
+
+def _directory_at(file: IO[bytes], offset: int) -> ImageFileDirectory_v2:
+    """A directory of an open TIFF file; what is damaged in it is absent."""
+    directory = ImageFileDirectory_v2(_tiff_head(file))
+    file.seek(offset)
+    directory.load(file)
+    return directory
+
+
 def tiff_directories(file: IO[bytes]) -> list[ImageFileDirectory_v2]:
     """The directories of an open TIFF file, in its order, each followed by those inside of it; what is damaged
     ends the list.
     """
-    file.seek(0)
-    head = file.read(8)
     found: list[ImageFileDirectory_v2] = []
     try:
-        if head[2:3] == b"+":  # BigTIFF
-            head += file.read(8)
-        left = [ImageFileDirectory_v2(head).next]
+        left = [ImageFileDirectory_v2(_tiff_head(file)).next]
         seen = {0}
         while left and len(found) < _MAX_DIRECTORIES:
             offset = left.pop(0)
             if offset in seen:
                 continue
             seen.add(offset)
-            directory = ImageFileDirectory_v2(head)
-            file.seek(offset)
-            directory.load(file)
+            directory = _directory_at(file, offset)
             found.append(directory)
             left = [*_numbers(directory, Tag.SubIFDs), directory.next, *left]
     except Exception:  # whatever the bytes made of it: the decoder will say what is wrong

@@ -20,7 +20,7 @@ import PIL.Image
 from PIL.ExifTags import IFD
 from PIL.ExifTags import Base as Tag
 
-from ..datamanagers.images import IMAGE_SUFFIXES, Image, load_image, open_image, read_header, silent
+from ..datamanagers.images import IMAGE_SUFFIXES, Image, exif_of, load_image, read_header
 from ..datamanagers.photograph_files import (
     COPIES,
     digest_of_pixels,
@@ -46,7 +46,7 @@ _QUALITY = 95
 """File of a frame, and its quality as JPEG."""
 _FEWEST = 3
 """Images that a scene needs at least."""
-_FOREIGN = frozenset({"WebP", "AVIF", "HEIC"})
+_FOREIGN = frozenset({"WebP", "AVIF", "HEIC", "raw"})
 """Formats that COLMAP does not read, as it is packaged. It tells formats by their content, as we do."""
 _EXIF_BYTES = (1 << 16) - 16
 """Bytes of an EXIF block that a JPEG takes."""
@@ -185,11 +185,7 @@ def _exif(path: Path) -> PIL.Image.Exif:
     """
     try:
         with path.open("rb") as file:
-            image = open_image(file, path)[1]
-            with silent():
-                exif = image.getexif()
-                exif.get_ifd(IFD.Exif)  # while the file is open: of a TIFF it is read only when asked for
-                return exif
+            return exif_of(file, path)
     except Exception:  # whatever is wrong with it, it is not needed
         return PIL.Image.Exif()
 

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from photo_files import HEIC, oriented
 from PIL import Image
 from PIL.ExifTags import IFD, Base
+from raw_files import dng
 
 from fprf.datamanagers.images import load_image
 from fprf.errors import ConfigError, DataError, UsageError
@@ -162,6 +163,35 @@ def test_heic_becomes_jpeg_with_its_lens_or_says_what_is_missing(
     jpeg = place.images / "IMG_0.HEIC.jpg"
     assert np.array_equal(load_image(jpeg), load_image(jpeg, upright=True)), "it is upright already"
     assert abs(load_image(jpeg).astype(int) - load_image(source / "IMG 0.HEIC")).mean() < 3
+
+
+def test_raw_photographs_become_jpegs_and_those_beside_a_jpeg_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = tmp_path / "in"
+    source.mkdir()
+    small = np.zeros((4, 6, 3), np.uint8)
+    colours = np.array([[0.8, 0.3, 0.2], [0.2, 0.6, 0.3], [0.3, 0.3, 0.8], [0.7, 0.7, 0.2]])
+    for k in range(4):
+        flat = np.tile(colours[k], (40, 60, 1))
+        (source / f"{k}.DNG").write_bytes(dng(flat, small, orientation=6))
+    photo(source / "3.jpg", 1)
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "rawpy", None)
+        with pytest.raises(
+            DataError, match=r"3 of 4 files .*: 0\.DNG, .* \(is a raw photograph .*fprf\[raw\]"
+        ):
+            gathered(source, SceneFolder(tmp_path / "without"))
+    pytest.importorskip("rawpy")
+    place = SceneFolder(tmp_path / "scene")
+    state = gathered(source, place)
+    assert names(place) == list(state.images) == ["0.DNG.jpg", "1.DNG.jpg", "2.DNG.jpg", "3.jpg"]
+    assert state.images["0.DNG.jpg"]["lens"] == ["test camera", 35.0, 52]
+    for k in range(3):
+        found = load_image(place.images / f"{k}.DNG.jpg")
+        assert found.shape == (60, 40, 3)
+        assert np.abs(found / 255 - colours[k]).max() < 0.02
+    assert any("raw" in note and "3.DNG" in note for note in state.notes["left out"])
 
 
 def test_what_colmap_does_not_read_becomes_jpeg_whatever_it_is_called(tmp_path: Path) -> None:
