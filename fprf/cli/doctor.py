@@ -253,10 +253,10 @@ def scene_folder(data: Path) -> Iterator[Finding]:
     try:
         parser = recognise(data)
     except DataError:
-        found = find_photographs(data) if data.is_dir() else None
-        if found is None or not found.files:
+        photographs = find_photographs(data) if data.is_dir() else None
+        if photographs is None or not photographs.files:
             raise
-        yield from photographs_without_poses(data, found)
+        yield from photographs_without_poses(data, photographs)
         return
     yield Finding("format", registry.name_of(DataParserConfig.group, type(parser)))
     scene = parse_scene(data, 1, parser)
