@@ -89,7 +89,9 @@ class _Photographs:
     def owners(self, name: str, folder: tuple[str, ...], words: str) -> tuple[int, list[int]]:
         """The photographs that a file of this name is the mask of, and how unlikely its name is, from 0 on."""
         stems = list(without_suffixes(name))
-        bases = [base for stem in stems for base in without_words(stem, words)]
+        bases: list[str] = []
+        for stem in stems:
+            bases += without_words(stem, words)
         tries = [(self.by_name, stems[:1]), (self.by_name, [name]), (self.by_stem, stems)]
         tries += [(self.by_name, bases), (self.by_stem, bases)]
         for rank, (index, keys) in enumerate(tries):
