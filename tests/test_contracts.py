@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from fprf import testing
 from fprf.blocks.config import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig
-from fprf.datamanagers.config import RayBatchesConfig
+from fprf.datamanagers.config import FeatureTargets, RayBatchesConfig, TrainingPixels
 from fprf.fields.config import ContentFieldConfig, PlanesConfig, SemanticPlanesConfig
 from fprf.interfaces import (
     BlockLayout,
@@ -178,8 +178,11 @@ class PixelsConfig(RayBatchesConfig):
     rays: int = 64
     wrong: str = ""
 
-    def build(self, *, seed: int, **named: Any) -> DataManager:
-        return Pixels(super().build(seed=0 if self.wrong == "seed" else seed, **named), self.wrong)
+    def build(
+        self, pixels: TrainingPixels, targets: FeatureTargets, *, seed: int, **named: Any
+    ) -> DataManager:
+        drawn = 0 if self.wrong == "seed" else seed
+        return Pixels(super().build(pixels, targets, seed=drawn, **named), self.wrong)
 
     def batch_rays(self) -> int:
         return 3 if self.wrong == "count" else self.rays

@@ -16,6 +16,7 @@ from tiny_world import World, prepared_for, trained_for
 
 from fprf.config import TrainConfig
 from fprf.datamanagers.batches import RayBatches
+from fprf.datamanagers.config import FeatureTargets, TrainingPixels
 from fprf.io.images import write_image
 from fprf.methods import fprf_lite
 from fprf.plugins.codec import leaves
@@ -184,7 +185,7 @@ def test_it_counts_where_the_capture_has_them(where: str, world: World, tmp_path
     for name in ("", *shown(where)):
         config = replaced(base, name, SECOND[name][0]) if name else base
         manager = config.datamanager.build(
-            scene=scene, content=None, semantic=None, dim=8, cache=tmp_path / "cache", seed=config.seed
+            TrainingPixels(scene=scene), FeatureTargets(), cache=tmp_path / "cache", seed=config.seed
         )
         there = replace(world, prepared=world.prepared._replace(scene=scene, manager=manager))
         found.append(

@@ -25,19 +25,18 @@ import torch
 from torch import Tensor
 
 from ..errors import DataError
-from ..interfaces import DataManager, Encoder
+from ..interfaces import DataManager
 from ..io.atomic import unwritable
 from ..io.cache import reason_of, say_uncached, temporary_folder
 from ..memory import available_memory
 from ..types import Batch
-from .basis import Basis
-from .config import RayBatchesConfig
-from .features import Progress, extract
+from .config import FeatureTargets, RayBatchesConfig, TrainingPixels
+from .features import FeatureStore, Progress, Projection, extract
 from .images import WHITE, load_images, load_mask
-from .scene import ParsedScene, find_sightings
+from .scene import find_sightings
 
 HELD = 512 * 2**20
-"""Bytes of pixels that are simply held in memory."""
+"""Bytes of pixels that are simply held in memory: by eye, a sixteenth of what a small machine has."""
 _MEMORY_SHARE = 0.5
 """Of the free memory, what pixels may take where no disk has room for them; by eye."""
 
@@ -186,21 +185,17 @@ class RayBatches(DataManager):
     def __init__(
         self,
         config: RayBatchesConfig,
+        pixels: TrainingPixels,
+        targets: FeatureTargets,
         *,
-        scene: ParsedScene,
-        content: Encoder | None,
-        semantic: Encoder | None,
-        dim: int,
         cache: Path,
         seed: int,
         progress: Progress | None = None,
-        basis: Basis | None = None,
-        seen: Callable[[int], Annotated[Tensor, "H W"]] | None = None,
-        background: tuple[float, float, float] | None = None,
     ) -> None:
+        scene = pixels.scene
         if not len(scene.train):
             raise DataError(f"{scene.name}: no training views; at least one image must not be held out")
-        self.background = background or (WHITE if scene.alpha else None)
+        self.background = pixels.background or (WHITE if scene.alpha else None)
         """Colour (RGB in [0, 1]) behind transparent pixels; None for opaque scenes."""
         self._config = config
         self._scene = scene
@@ -210,43 +205,57 @@ class RayBatches(DataManager):
         self._sizes = scene.cameras.size[scene.train]
         self._ends = self._sizes.prod(1).cumsum(0)
         self._slots = {view: slot for slot, view in enumerate(self._views)}
-        # All training pixels, view after view; many of them mapped from a file.
-        self._pixels = allocate_pixels(int(self._ends[-1]), cache)
-        filled = 0
-        for first in range(0, len(self._views), DECODE):
-            for image in load_images(scene, self.background, self._views[first : first + DECODE]):
-                rows = torch.from_numpy(image).reshape(-1, 3)
-                self._pixels[filled : filled + len(rows)] = rows
-                filled += len(rows)
-        # Pixels that may be drawn, those of sky, and those that show points.
-        if config.masks:
-            masks, skies = (scene.masks, scene.sky_masks)
-        else:
-            masks, skies = ((), ())
-        every = PixelRuns(torch.zeros(1, dtype=torch.int64), self._ends[-1:])
-        if masks or seen is not None:
-            self._chosen = self._runs(masks, unmasked=True, seen=seen)
-        else:
-            self._chosen = every
-        if not len(self._chosen):
-            raise DataError(
-                f"{scene.name}: none of {len(self._views)} training views shows what is to be learnt"
-            )
-        sky = self._runs(skies, unmasked=False) if skies else None
-        if config.depth_share > 0:
-            marked, distance = self._marked()
-        else:
-            marked, distance = (None, None)
-        self._source = _Source(
-            self._pixels, scene.train, self._sizes, self._ends, self._chosen, sky, marked, distance
-        )
+        self._pixels = self._load_pixels(cache)
+        self._chosen = self._drawn_pixels(pixels.seen)
+        self._source = self._source_of()
         # Features are those of the very pixels above, which are not decoded again for each encoder.
         features = partial(
             extract, views=self._views, image=self._stored, config=config.guided, progress=progress
         )
-        self.content_store = None if content is None else features(cache / "content", encoder=content)
-        self.semantic_store = (
-            None if semantic is None else features(cache / "semantic", encoder=semantic, dim=dim, basis=basis)
+        self.content_store: FeatureStore | None = None
+        self.semantic_store: FeatureStore | None = None
+        if targets.content is not None:
+            self.content_store = features(cache / "content", encoder=targets.content)
+        if targets.semantic is not None:
+            projection = Projection(targets.dim, targets.basis)
+            self.semantic_store = features(
+                cache / "semantic", encoder=targets.semantic, projection=projection
+            )
+
+    def _load_pixels(self, cache: Path) -> Annotated[Tensor, "P 3"]:
+        """All training pixels, view after view; many of them mapped from a file in `cache`."""
+        pixels = allocate_pixels(int(self._ends[-1]), cache)
+        filled = 0
+        for first in range(0, len(self._views), DECODE):
+            some = self._views[first : first + DECODE]
+            for image in load_images(self._scene, self.background, some):
+                rows = torch.from_numpy(image).reshape(-1, 3)
+                pixels[filled : filled + len(rows)] = rows
+                filled += len(rows)
+        return pixels
+
+    def _drawn_pixels(self, seen: Callable[[int], Annotated[Tensor, "H W"]] | None) -> PixelRuns:
+        """The pixels that may be drawn. Raises DataError where there are none."""
+        masks = self._scene.masks if self._config.masks else ()
+        if not masks and seen is None:
+            return PixelRuns(torch.zeros(1, dtype=torch.int64), self._ends[-1:])
+        chosen = self._runs(masks, unmasked=True, seen=seen)
+        if not len(chosen):
+            raise DataError(
+                f"{self._scene.name}: none of {len(self._views)} training views shows what is to be learnt"
+            )
+        return chosen
+
+    def _source_of(self) -> _Source:
+        """What batches are drawn from: all pixels, those of sky, and those that show points."""
+        skies = self._scene.sky_masks if self._config.masks else ()
+        sky = self._runs(skies, unmasked=False) if skies else None
+        marked = None
+        distance = None
+        if self._config.depth_share > 0:
+            marked, distance = self._marked()
+        return _Source(
+            self._pixels, self._scene.train, self._sizes, self._ends, self._chosen, sky, marked, distance
         )
 
     def batch(self, step: int) -> Batch:

@@ -18,25 +18,27 @@ from ..rendering.cameras import Cameras, rays_through
 from ..rendering.space import Kind, Space
 from .scene import ParsedScene
 
-FORWARD_ANGLE = math.radians(35)
-"""Cameras that all look within this angle of their mean direction may be forward-facing."""
-FORWARD_SPREAD = 0.5
-"""... if they also stand within this share of the median depth of what they see."""
+MAX_FORWARD_ANGLE = math.radians(35)
+"""Cameras that all look within this angle (radians) of their mean direction may be forward-facing: by eye."""
+MAX_FORWARD_SPREAD = 0.5
+"""... if they also stand within this share of the median depth of what they see: by eye."""
 BOX_SHARE = 0.45
-"""Half the side of an object's box, as a share of the cameras' distance to its centre."""
+"""Half the side of an object's box, as a share of the cameras' distance to its centre: by eye."""
 FAR = 1e3
 """Farthest distance in the contraction, in units of the scene's inner radius: beyond it disparity is below
 1e-3.
 """
 NEAR = 0.05
-"""Nearest distance in the contraction where nothing is known of depths, in units of the inner radius."""
+"""Nearest distance in the contraction where nothing is known of depths, in units of the inner radius: by
+eye.
+"""
 MARGIN = 1.02
 """Bounds are this much wider than what the training rays span, so that no training point lies on a border."""
-DEPTHS = 1 << 22
+MAX_DEPTHS = 1 << 22
 """About how many depths of points are looked at; a large capture has billions, and quantile() takes 16
 million.
 """
-_MOST = 1 << 24
+_MAX_SPREAD_POINTS = 1 << 24
 """Points whose spread is measured, at most: as many as quantile() takes."""
 ROUNDING = 1e-12
 """Cameras closer together than this share of their coordinates stand in one place: the rest is float64's
@@ -91,14 +93,14 @@ def find_kind(scene: ParsedScene) -> Kind:
     cameras = scene.cameras
     axis = -cameras.pose[:, :, 2]
     mean = axis.mean(0)
-    if len(cameras) < 3 or mean.norm() < math.cos(FORWARD_ANGLE):
+    if len(cameras) < 3 or mean.norm() < math.cos(MAX_FORWARD_ANGLE):
         return "contraction"
     mean = mean / mean.norm()
-    if (axis @ mean).amin() < math.cos(FORWARD_ANGLE) or (depth := _depths(scene)) is None:
+    if (axis @ mean).amin() < math.cos(MAX_FORWARD_ANGLE) or (depth := _depths(scene)) is None:
         return "contraction"
     # ... and stand close together against the depth of what they see.
     offset = cameras.pose[:, :, 3] - cameras.pose[:, :, 3].mean(0)
-    if offset.norm(dim=-1).amax() < FORWARD_SPREAD * depth.median():
+    if offset.norm(dim=-1).amax() < MAX_FORWARD_SPREAD * depth.median():
         return "ndc"
     return "contraction"
 
@@ -109,7 +111,7 @@ def _depths(scene: ParsedScene) -> Tensor | None:
     """
     if scene.points is not None and len(scene.points) >= 8:
         pose = scene.cameras.pose
-        points = scene.points[:: max(1, len(pose) * len(scene.points) // DEPTHS)]
+        points = scene.points[:: max(1, len(pose) * len(scene.points) // MAX_DEPTHS)]
         x, y, z = ((points[None] - pose[:, None, :, 3]) @ pose[:, :, :3]).unbind(-1)
         # Only what a view sees: a street passes points at no distance at all, beside its cameras.
         reach = (scene.cameras.size / scene.cameras.focal / 2)[:, :, None]
@@ -161,7 +163,7 @@ def _contraction(scene: ParsedScene) -> Space:
     local = (position - centre) @ rotation.T
     radius = float(local.abs().amax(-1).quantile(0.9))
     if scene.points is not None and len(scene.points) >= 8:
-        some = scene.points[:: -(-len(scene.points) // _MOST)]
+        some = scene.points[:: -(-len(scene.points) // _MAX_SPREAD_POINTS)]
         spread = float(((some - centre) @ rotation.T).abs().amax(-1).quantile(0.5))
         radius = max(radius, min(spread, 3 * radius if radius > 0 else spread))
     if radius <= ROUNDING * float(position.abs().amax()):
@@ -216,7 +218,8 @@ def _ndc(scene: ParsedScene) -> Space:
     high = spread.amax(0)
     middle = (low + high) / 2
     half = (high - low) / 2 * MARGIN
-    (left, bottom, _), (right_end, top, _) = (middle - half).tolist(), (middle + half).tolist()
+    left, bottom, _ = (middle - half).tolist()
+    right_end, top, _ = (middle + half).tolist()
     return replace(whole, low=(left, bottom, -1.0), high=(right_end, top, 1.0))
 
 

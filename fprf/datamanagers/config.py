@@ -21,6 +21,29 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
+class TrainingPixels:
+    """What batches are drawn from."""
+
+    scene: ParsedScene
+    seen: Callable[[int], Tensor] | None = None
+    """Which pixels [H W] of a training view batches are drawn from, for a block of a larger scene; None = all."""
+    background: tuple[float, float, float] | None = None
+    """Colour that transparent pixels show, RGB in [0, 1]; None = white."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureTargets:
+    """What the features of a batch are made with."""
+
+    content: Encoder | None = None
+    semantic: Encoder | None = None
+    dim: int = 0
+    """Principal semantic components that the field learns."""
+    basis: Basis | None = None
+    """Basis of a larger scene, for a block of it; None = of the training views."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class DataManagerConfig(PluginConfig):
     """Feeds training with pixels and their feature targets."""
 
@@ -37,25 +60,16 @@ class DataManagerConfig(PluginConfig):
 
     def build(
         self,
+        pixels: TrainingPixels,
+        targets: FeatureTargets,
         *,
-        scene: ParsedScene,
-        content: Encoder | None,
-        semantic: Encoder | None,
-        dim: int,
         cache: Path,
         seed: int,
         progress: Callable[[int, int, str], None] | None = None,
-        basis: Basis | None = None,
-        seen: Callable[[int], Tensor] | None = None,
-        background: tuple[float, float, float] | None = None,
     ) -> DataManager:
-        """The data manager; features are computed into `cache` unless they lie there already. `dim` is the
-        number of principal semantic components that the field learns; `progress(done, total, what)` is told
-        of the features.
+        """The data manager; features are computed into `cache` unless they lie there already.
 
-        For a block of a larger scene, `basis` is the whole scene's, instead of one of these views;
-        `seen(view)` says which pixels [H W] of a training view batches are drawn from, instead of all.
-        `background` is what transparent pixels show, RGB in [0, 1]; white by default.
+        `progress(done, total, what)` is told of the features.
         """
         raise NotImplementedError
 
@@ -84,33 +98,16 @@ class RayBatchesConfig(DataManagerConfig):
 
     def build(
         self,
+        pixels: TrainingPixels,
+        targets: FeatureTargets,
         *,
-        scene: ParsedScene,
-        content: Encoder | None,
-        semantic: Encoder | None,
-        dim: int,
         cache: Path,
         seed: int,
         progress: Callable[[int, int, str], None] | None = None,
-        basis: Basis | None = None,
-        seen: Callable[[int], Tensor] | None = None,
-        background: tuple[float, float, float] | None = None,
     ) -> DataManager:
         from .batches import RayBatches
 
-        return RayBatches(
-            self,
-            scene=scene,
-            content=content,
-            semantic=semantic,
-            dim=dim,
-            cache=cache,
-            seed=seed,
-            progress=progress,
-            basis=basis,
-            seen=seen,
-            background=background,
-        )
+        return RayBatches(self, pixels, targets, cache=cache, seed=seed, progress=progress)
 
     def batch_rays(self) -> int:
         """As many as `rays`."""

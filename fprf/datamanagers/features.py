@@ -40,7 +40,9 @@ from ..ops.config import GuidedConfig
 from .basis import Basis, fit_basis
 
 GREY = 0.5
+"""Colour about which b is taken: colours are then in [-0.5, 0.5]."""
 LANES = 8
+"""Channels that a kernel takes at once: eight floats are a vector of AVX."""
 # Part of every key: raise it when the same inputs give other files.
 FORMAT = "fprf-features-1"
 # Stored numbers stay within +-TOP: far from half precision's 65504, and its 24 bits below 1 are left for the
@@ -117,13 +119,18 @@ Progress = Callable[[int, int, str], None]
 """Told (done, total, what)."""
 
 BASIS_VIEWS = 64
+"""Views, spread evenly, that a basis is fitted on, at most: by eye."""
 BASIS_CELLS = 32_768
+"""Cells of all these views that it is fitted on, at most: some 40 for each of 768 channels (by eye)."""
 # Features met while fitting the basis are remembered up to this, so that small scenes are encoded once, not
 # twice.
 REMEMBER_BYTES = 1 << 28
 MOMENT_PIXELS = 2048
+"""Pixels of a view that moments of its features are measured on: they are then known to some percent."""
+_UNFINISHED_SECONDS = 3600.0
+"""Age from which a file that was not finished belongs to no living writer: encoding a view takes minutes at most."""
 CACHED_BYTES = 1 << 30
-"""Most bytes of the files in a folder; those of the views at hand stay whatever they take."""
+"""Bytes of the files in a folder, at most; those of the views at hand stay whatever they take. By eye."""
 # A and b move within a window's fifth: measured on photographs, a coarser grid costs more than 1.5 % of the
 # features' spread.
 CELLS_PER_WINDOW = 5
@@ -211,6 +218,15 @@ class FeatureStore:
         return out.to(view.device)
 
 
+class Projection(NamedTuple):
+    """What features are projected on before they are kept."""
+
+    dim: int
+    """Principal components; fewer, where the encoder has fewer."""
+    basis: Basis | None = None
+    """The basis of a larger scene; None = the components of the views themselves."""
+
+
 def extract(
     folder: Path,
     views: Sequence[int],
@@ -218,22 +234,19 @@ def extract(
     encoder: Encoder,
     config: GuidedConfig,
     *,
-    dim: int | None = None,
+    projection: Projection | None = None,
     progress: Progress | None = None,
-    basis: Basis | None = None,
 ) -> FeatureStore:
     """The store of some views, made in `folder` as far as it is not there yet.
 
-    `image` gives a view as uint8; `dim` asks for that many principal components (fewer, where the encoder has
-    fewer), of these views unless the `basis` of a larger scene is given. A run that is cut off goes on where
-    it stopped; where nothing can be written to `folder` it goes on without (`tensorfiles.keep`). Raises
-    NumericsError where the encoder's features are not finite, PluginError where they are not of the shape it
-    promises.
+    `image` gives a view as uint8. A run that is cut off goes on where it stopped; where nothing can be written to
+    `folder` it goes on without (`tensorfiles.keep`). Raises NumericsError where the encoder's features are not
+    finite, PluginError where they are not of the shape it promises.
     """
     # Unfinished files of processes that died go; those of the last hour may belong to a living writer.
     for path in files_in(folder, ".*.safetensors"):
         with contextlib.suppress(OSError):  # another process was first
-            if time.time() - path.stat().st_mtime > 3600:
+            if time.time() - path.stat().st_mtime > _UNFINISHED_SECONDS:
                 path.unlink()
     # What a view's features depend on begins with its pixels.
     prints = {}
@@ -241,12 +254,12 @@ def extract(
         pixels = image(view)
         prints[view] = digest(str(tuple(pixels.shape)), pixels.contiguous().numpy().tobytes())
     remembered: dict[int, Tensor] = {}
-    if basis is None and dim is not None:
-        basis = _basis(folder, prints, image, encoder, dim, remembered)
-    if basis:
-        projection = digest(*(t.numpy().tobytes() for t in basis.tensors().values()))
-    else:
-        projection = "raw"
+    basis = None if projection is None else projection.basis
+    if projection is not None and basis is None:
+        basis = _basis(folder, prints, image, encoder, projection.dim, remembered)
+    projected = "raw"
+    if basis is not None:
+        projected = digest(*(t.numpy().tobytes() for t in basis.tensors().values()))
     device = _device(encoder)
     # Other devices round otherwise; files without "float32" are from when CUDA convolved in TF32.
     place = () if device.type == "cpu" else (device.type, "float32")
@@ -260,7 +273,7 @@ def extract(
         radius = round(config.radius * min(pixels.shape[:2]))
         stride = min(config.stride, max(1, (2 * radius + 1) // CELLS_PER_WINDOW))
         settings = f"radius {radius} eps {config.eps!r} stride {stride} fineness {guided.FINENESS}"
-        keys[view] = key = digest(prints[view], encoder.identity, settings, projection, *place)
+        keys[view] = key = digest(prints[view], encoder.identity, settings, projected, *place)
         tensors = read_kept(folder, key)
         features = remembered.pop(view, None)
         if tensors is None or tensors.keys() != set(Entry._fields):

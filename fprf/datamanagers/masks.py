@@ -89,7 +89,9 @@ class _Photographs:
     def owners(self, name: str, folder: tuple[str, ...], words: str) -> tuple[int, list[int]]:
         """The photographs that a file of this name is the mask of, and how unlikely its name is, from 0 on."""
         stems = list(without_suffixes(name))
-        bases = [base for stem in stems for base in without_words(stem, words)]
+        bases: list[str] = []
+        for stem in stems:
+            bases += without_words(stem, words)
         tries = [(self.by_name, stems[:1]), (self.by_name, [name]), (self.by_stem, stems)]
         tries += [(self.by_name, bases), (self.by_stem, bases)]
         for rank, (index, keys) in enumerate(tries):
@@ -213,10 +215,14 @@ class _Search:
         return [f"masks in {where}: {'; '.join(said)}"]
 
 
-def masks_in(folder: Path, photographs: Sequence[Path]) -> FoundMasks:
-    """Masks of photographs in one folder that somebody names."""
+def masks_in(folder: Path, photographs: Sequence[Path], *, for_all: bool = True) -> FoundMasks:
+    """Masks of photographs in one folder that somebody names; unless it is for all of them, masks of others are
+    not told.
+    """
     search = _Search(photographs, USED.words)
     search.look_into(folder, range(len(photographs)))
+    if any(search.masks) and not for_all:
+        search.unused = []
     return search.found()
 
 

@@ -21,7 +21,7 @@ from .picture_names import MAP_WORDS, THUMBNAIL_WORDS, spelling, without_suffixe
 
 COPIES = "copies of other photographs"
 HIDDEN = "hidden files"
-_OTHERS = "files of other programs"
+_OTHER_PROGRAMS = "files of other programs"
 _THUMBNAILS = "thumbnails"
 _MAPS = "masks and maps of other photographs"
 _RECONSTRUCTION = "pictures of a reconstruction"
@@ -47,7 +47,7 @@ _MAP_ADJECTIVES = frozenset(
     | {"vis", "viz", "object", "objects", "people", "person"}
 )
 """A folder of these words alone, one a noun, holds maps: depth, mono_normals, sky_masks_4."""
-_SAMPLES = 3
+_COMPARED_PAIRS = 3
 """Pairs of pictures that are looked at before a folder counts as reduced copies of another: by eye."""
 _THUMBNAIL_PIXELS = 32
 """Side at which two pictures are compared by their look, at most: by eye."""
@@ -120,7 +120,7 @@ def _kind_of_path(path: PurePath) -> str:
     for name in folders:
         words = set(re.split(r"[\s_.\-\d]+", name)) - {""}
         if name in _FOLDERS_OF_OTHERS:
-            return _OTHERS
+            return _OTHER_PROGRAMS
         if words and words <= _THUMBNAIL_FOLDERS:
             return _THUMBNAILS
         if words & _MAP_NOUNS and words <= _MAP_NOUNS | _MAP_ADJECTIVES:
@@ -140,7 +140,9 @@ def _companions(files: Sequence[Path]) -> dict[Path, str]:
         there = stems[path.parent]
         own = list(without_suffixes(spelling(path.name)))
         for kind, words in ((_MAPS, MAP_WORDS), (_THUMBNAILS, THUMBNAIL_WORDS)):
-            bases = {base for stem in own for base in without_words(stem, words)}
+            bases: set[str] = set()
+            for stem in own:
+                bases |= set(without_words(stem, words))
             if bases & (there - set(own)):
                 found[path] = kind
     photographs = [path for path in files if path not in found]
@@ -188,9 +190,9 @@ def _stem(path: Path) -> str:
 
 def _are_reduced(pairs: Sequence[tuple[Path, Path]]) -> bool:
     """True where each first one is the second at a smaller size, by their headers and by some pairs' look."""
-    some = pairs[:: -(-len(pairs) // _SAMPLES)]
-    if not all(_is_smaller(*pair) for pair in some) or not all(_is_smaller(*pair) for pair in pairs):
+    if not all(_is_smaller(*pair) for pair in pairs):
         return False
+    some = pairs[:: -(-len(pairs) // _COMPARED_PAIRS)]
     return all(_look_alike(*pair) for pair in some)
 
 

@@ -9,17 +9,17 @@ from collections.abc import Iterator
 
 from .images import IMAGE_SUFFIXES
 
-_GAP = r"[\s_.\-]*"
+_SEPARATORS = r"[\s_.\-]*"
 _SUBJECTS = r"(?:people|persons?|humans?|objects?|dynamic|static|binary|fg|foreground)"
-MASK_WORDS = rf"(?:(?:{_SUBJECTS}{_GAP})?(?:masks?|msk|seg|segmentation|matte|alpha))"
+MASK_WORDS = rf"(?:(?:{_SUBJECTS}{_SEPARATORS})?(?:masks?|msk|seg|segmentation|matte|alpha))"
 """A pattern of the words that tell a mask from its photograph, in 0001_mask.png or mask_0001.png."""
-SKY_WORDS = rf"(?:sky(?:{_GAP}masks?)?|masks?)"
+SKY_WORDS = rf"(?:sky(?:{_SEPARATORS}masks?)?|masks?)"
 """The same of masks of sky."""
 MAP_WORDS = rf"(?:{MASK_WORDS}|{SKY_WORDS}|depths?|disparity|normals?|semantics?|confidence)"
 """The same of all masks and of maps."""
 THUMBNAIL_WORDS = r"(?:thumbs?|thumbnails?|tn|previews?|small|\d+x\d+)"
 """The same of thumbnails."""
-_CAMERA_WORDS = re.compile(rf"(?:rgb|images?|img|frames?|colou?r|photo|picture|pic|view){_GAP}(?=.)")
+_CAMERA_WORDS = re.compile(rf"(?:rgb|images?|img|frames?|colou?r|photo|picture|pic|view){_SEPARATORS}(?=.)")
 _LAST_NUMBER = re.compile(r"[\s_.\-]+\d+$")
 
 
@@ -47,12 +47,12 @@ def without_words(stem: str, words: str) -> Iterator[str]:
     """What is left of a spelled stem without words before or behind it, and numbers about those: of
     a_0_mask_1 that is a_0, then a. Nothing where it has none of the words.
     """
-    behind = re.fullmatch(rf"(.+?){_GAP}{words}(?:{_GAP}\d+)*", stem)
+    behind = re.fullmatch(rf"(.+?){_SEPARATORS}{words}(?:{_SEPARATORS}\d+)*", stem)
     if behind:
         yield behind[1]
         shorter = _LAST_NUMBER.sub("", behind[1])
         if shorter and shorter != behind[1]:
             yield shorter
-    before = re.fullmatch(rf"{words}{_GAP}(.+)", stem)
+    before = re.fullmatch(rf"{words}{_SEPARATORS}(.+)", stem)
     if before:
         yield before[1]

@@ -2,7 +2,7 @@
 views see.
 
 Reconstructions say which views see a point. Where one does not, points are projected and only the nearest
-layer counts: in each tile of an image those no farther than LAYER times the nearest. It takes the wall before
+layer counts: in each tile of an image those no farther than MAX_LAYER_RATIO times the nearest. It takes the wall before
 the street behind it.
 
 Exposure is measured where several views see the same point. A sighting's brightness is b = g(view) + a(point)
@@ -80,13 +80,15 @@ def at_origin(scene: ParsedScene, origin: Origin) -> ParsedScene:
 
 
 TILES = 16
-"""Tiles across the longer side of an image."""
-LAYER = 1.15
-"""Points up to so many times the nearest distance in their tile are seen."""
-PROJECTIONS = 1 << 26
-"""Points are thinned so that no more projections than these are made."""
-PIECE = 1 << 20
-"""Pairs that are projected at once: each takes about 250 bytes on the way."""
+"""Tiles across the longer side of an image: by eye."""
+MAX_LAYER_RATIO = 1.15
+"""Points up to so many times the nearest distance in their tile are seen: a wall that is seen at a slant is that
+deep in a tile (by eye).
+"""
+MAX_PROJECTIONS = 1 << 26
+"""Points are thinned so that no more projections than these are made: some ten seconds (by eye)."""
+PAIRS_AT_ONCE = 1 << 20
+"""Pairs that are projected at once: each takes about 250 bytes on the way, all of them 256 MiB."""
 
 
 class Sightings(NamedTuple):
@@ -111,10 +113,10 @@ def find_sightings(scene: ParsedScene) -> Sightings | None:
         kept = scene.seen[torch.isin(scene.seen[:, 0], scene.train)]
         kept = kept[kept[:, 0].argsort(stable=True)]
         parts = []
-        for view, point in torch.split(kept.T, PIECE, 1):
+        for view, point in torch.split(kept.T, PAIRS_AT_ONCE, 1):
             parts.append(_sighted(scene.cameras, view, scene.points[point]))
     else:
-        points = scene.points[:: max(1, len(scene.points) * len(scene.train) // PROJECTIONS)]
+        points = scene.points[:: max(1, len(scene.points) * len(scene.train) // MAX_PROJECTIONS)]
         parts = []
         for view in scene.train.tolist():
             parts.append(_nearest(scene.cameras, view, points))
@@ -150,28 +152,33 @@ def _nearest(cameras: Cameras, view: int, points: Tensor) -> Sightings:
     least = sightings.distance.new_full((TILES * TILES,), torch.inf).scatter_reduce(
         0, tile, sightings.distance, "amin"
     )
-    front = sightings.distance <= LAYER * least[tile]
+    front = sightings.distance <= MAX_LAYER_RATIO * least[tile]
     return Sightings(*(x[front] for x in sightings))
 
 
 GAMMA = 1 / 2.2
 """Light is in proportion to exposure, sRGB to about this power of light."""
-DIFFERENT = 0.08
-"""Standard deviation of the views' brightness, in the logarithm of sRGB, above which exposures differ."""
-LEAST = 16
-"""Sightings of a view that its exposure is measured from, at least."""
-MOST = 1 << 19
-"""Pairs of a view and a point that are looked at, about."""
-DARK = 0.03
-BRIGHT = 0.97
-"""sRGB outside of which a pixel says nothing: noise, or clipped."""
+MIN_EXPOSURE_SPREAD = 0.08
+"""Standard deviation of the views' brightness, in the logarithm of sRGB, above which exposures differ: by eye."""
+MIN_SIGHTINGS = 16
+"""Sightings of a view that its exposure is measured from, at least: by eye."""
+MAX_EXPOSURE_PAIRS = 1 << 19
+"""Pairs of a view and a point that exposures are measured from, about: half a second (by eye)."""
+MIN_LEVEL = 0.03
+"""sRGB below which a pixel says nothing of exposure: noise (by eye)."""
+MAX_LEVEL = 0.97
+"""sRGB above which it says nothing: clipped (by eye)."""
 
 
 def exposures_differ(exposure: Annotated[Tensor, "V"] | None) -> bool:
     """True where views were taken so differently that each needs a factor of its own; not where nothing is
     known.
     """
-    return exposure is not None and len(exposure) > 1 and GAMMA * float(exposure.log().std()) > DIFFERENT
+    return (
+        exposure is not None
+        and len(exposure) > 1
+        and GAMMA * float(exposure.log().std()) > MIN_EXPOSURE_SPREAD
+    )
 
 
 def with_exposure(scene: ParsedScene, image: Callable[[int], Annotated[Tensor, "H W 3"]]) -> ParsedScene:
@@ -204,10 +211,16 @@ def with_exposure(scene: ParsedScene, image: Callable[[int], Annotated[Tensor, "
 
 
 def sparser(scene: ParsedScene) -> ParsedScene:
-    """The scene with every n-th point, so that about MOST pairs are left."""
+    """The scene with every n-th point, so that about MAX_EXPOSURE_PAIRS pairs are left."""
     if scene.points is None:
         return scene
-    step = -(-(len(scene.points) * len(scene.train) if scene.seen is None else len(scene.seen)) // MOST) or 1
+    step = (
+        -(
+            -(len(scene.points) * len(scene.train) if scene.seen is None else len(scene.seen))
+            // MAX_EXPOSURE_PAIRS
+        )
+        or 1
+    )
     seen = scene.seen
     if seen is not None:
         seen = seen[seen[:, 1] % step == 0] // torch.tensor([1, step])
@@ -226,14 +239,14 @@ def _gains(
         at = (sightings.view == view).nonzero()[:, 0]
         x, y = sightings.pixel[at].long().unbind(1)
         rgb[at] = image(view)[y, x].double()
-    kept = ((rgb >= DARK) & (rgb <= BRIGHT)).all(1)
+    kept = ((rgb >= MIN_LEVEL) & (rgb <= MAX_LEVEL)).all(1)
     view = sightings.view[kept]
     bright = rgb[kept].log().mean(1)
     point = torch.unique(sightings.point[kept], dim=0, return_inverse=True)[1]
     # Twice: the second time without what the first fit calls outliers. Points that one view saw say nothing.
     gain = None
     for _ in range(2):
-        known = torch.bincount(view, minlength=len(scene.paths))[view] >= LEAST
+        known = torch.bincount(view, minlength=len(scene.paths))[view] >= MIN_SIGHTINGS
         shared = torch.bincount(point)[point] >= 2
         view = view[known & shared]
         point = point[known & shared]

@@ -19,7 +19,7 @@ from torch import nn
 
 from ..blocks import routing
 from ..blocks.config import LayoutConfig
-from ..datamanagers.config import DataManagerConfig
+from ..datamanagers.config import DataManagerConfig, FeatureTargets, TrainingPixels
 from ..datamanagers.parsers.config import DataParserConfig
 from ..errors import DataError
 from ..fields.config import ContentFieldConfig, SemanticFieldConfig
@@ -430,7 +430,10 @@ def check_data_manager(config: DataManagerConfig) -> None:
         def build(seed: int = 0, *, features: bool = True) -> DataManager:
             given = encoder if features else None
             return config.build(
-                scene=scene, content=given, semantic=given, dim=3, cache=Path(folder, "cache"), seed=seed
+                TrainingPixels(scene=scene),
+                FeatureTargets(content=given, semantic=given, dim=3),
+                cache=Path(folder, "cache"),
+                seed=seed,
             )
 
         manager = build()

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ..config import TrainConfig
 from ..datamanagers.basis import Basis
+from ..datamanagers.config import FeatureTargets, TrainingPixels
 from ..datamanagers.images import WHITE
 from ..datamanagers.scene import ParsedScene
 from ..errors import WeightsError
@@ -59,7 +60,7 @@ def prepare(
 ) -> Prepared:
     """Everything of a scene of fields but the model, in a space that is found where none is given.
 
-    Arguments as of `RunConfig.build` and `DataManagerConfig.build`. Raises WeightsError where an encoder or a
+    Arguments as of `RunConfig.build`, `TrainingPixels` and `FeatureTargets`. Raises WeightsError where an encoder or a
     decoder lacks its weights.
     """
     device = device_of(config.device)
@@ -72,16 +73,11 @@ def prepare(
     background = config.render.background or (WHITE if scene.alpha else None)
     # Decodes all images and extracts their features, or finds both in the cache.
     manager = config.datamanager.build(
-        scene=scene,
-        content=content,
-        semantic=semantic,
-        dim=config.semantic.dim,
+        TrainingPixels(scene=scene, seen=seen, background=background),
+        FeatureTargets(content=content, semantic=semantic, dim=config.semantic.dim, basis=basis),
         cache=cache_folder("features"),
         seed=config.seed,
         progress=progress,
-        basis=basis,
-        seen=seen,
-        background=background,
     )
     exposure = exposure_of(config.tones, scene, manager.image, saved)
     facts = facts_of(scene, background, space=space, exposure=exposure, poses=config.poses > 0)

@@ -19,7 +19,7 @@ from tiny_world import World
 
 import fprf.datamanagers.batches as pixel_file
 from fprf.datamanagers.batches import PixelRuns, RayBatches, allocate_pixels
-from fprf.datamanagers.config import RayBatchesConfig
+from fprf.datamanagers.config import FeatureTargets, RayBatchesConfig, TrainingPixels
 from fprf.datamanagers.scene import ParsedScene
 from fprf.errors import DataError
 from fprf.plugins.encoders.config import RandomConfig
@@ -64,7 +64,8 @@ def make(
     one, two = (
         encoder if asked else None for encoder, asked in zip(encoders, (content, semantic), strict=True)
     )
-    return RayBatches(config, scene=scene, content=one, semantic=two, dim=4, cache=cache, seed=seed)
+    targets = FeatureTargets(content=one, semantic=two, dim=4)
+    return RayBatches(config, TrainingPixels(scene=scene), targets, cache=cache, seed=seed)
 
 
 def test_colours_are_those_of_the_files_at_the_pixel_centres(scene: ParsedScene, tmp_path: Path) -> None:

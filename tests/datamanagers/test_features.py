@@ -14,7 +14,7 @@ from torch import Tensor
 
 from fprf.datamanagers import features as store_files
 from fprf.datamanagers.basis import Basis, fit_basis
-from fprf.datamanagers.features import FeatureStore, extract
+from fprf.datamanagers.features import FeatureStore, Projection, extract
 from fprf.errors import DataError, NumericsError, PluginError
 from fprf.interfaces import Encoder
 from fprf.io import tensorfiles
@@ -92,7 +92,9 @@ def draw(count: int = 300) -> tuple[Tensor, Tensor, Tensor]:
 def build(
     folder: Path, encoder: Encoder, config: GuidedConfig | None = None, dim: int | None = None
 ) -> FeatureStore:
-    return extract(folder, list(SIZES), picture, encoder, config or GuidedConfig(radius=0.2), dim=dim)
+    projection = None if dim is None else Projection(dim)
+    guided = config or GuidedConfig(radius=0.2)
+    return extract(folder, list(SIZES), picture, encoder, guided, projection=projection)
 
 
 def truth(encoder: Encoder, view: Tensor, pixel: Tensor, rgb: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ from .config import Record3DConfig, recording
 from .files import Record, as_record, read_json
 from .views import View, quaternion_rotation, read_views, rigid_pose, stated_size
 
-_NUMBER = re.compile("[0-9]{1,9}")
+_FRAME_NUMBER = re.compile("[0-9]{1,9}")
 
 
 class Record3DParser(DataParser):
@@ -46,7 +46,7 @@ class Record3DParser(DataParser):
         numbered = []
         others = []
         for path in found.files:
-            if _NUMBER.fullmatch(path.stem):
+            if _FRAME_NUMBER.fullmatch(path.stem):
                 numbered.append((int(path.stem), path.name))
             else:
                 others.append(path.name)
