@@ -328,12 +328,15 @@ class LossTerm(ABC):
 
 
 class BlockLayout(ABC):
-    """Division of a scene into blocks: geometry only, no parameters."""
+    """Division of a scene into blocks of fields or cells of Gaussians: geometry only, no parameters."""
 
     @abstractmethod
     def cut(self, site: Site) -> list[Cell]:
         """At least one cell in the frame of the site, all with one border; one alone means that the scene is
         not cut.
+
+        What no cell holds stays as the whole scene has it. Outer cells may have no end. Raises ConfigError where
+        the site allows no such cells, in words that go on after the scene's name.
         """
 
 

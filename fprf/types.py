@@ -51,9 +51,11 @@ class Level(NamedTuple):
 
 
 class Site(NamedTuple):
-    """Inputs of a block layout: training cameras and sparse points in the scene's space, float64.
+    """Inputs of a layout: training cameras and sparse points in a frame of the scene, float64.
 
-    Axis 0 runs along the capture, axis 2 upwards; one unit is the distance that views commonly see.
+    Axis 0 runs along the capture, axis 2 upwards, or they are the principal axes of the points
+    (`LayoutConfig.principal`, where the origin may lie anywhere); one unit is the distance that views commonly
+    see, then up to a factor of 1.5.
     """
 
     position: Annotated[Tensor, "V 3"]
@@ -63,6 +65,8 @@ class Site(NamedTuple):
     """None at all (P = 0) where the capture has no reconstruction."""
     unit: float
     """World units of one space unit."""
+    seen: Annotated[Tensor, "O 3"] | None = None
+    """Points, each as often as training views see it; None where no view sees any."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,14 +74,16 @@ class Cell:
     """A box of a partitioned scene: a block of fields or a cell of Gaussians. Neighbours share faces.
 
     Point x lies in it where low <= frame x < high; all are float64. Of blocks the frame is that of the
-    scene's space.
+    scene's space; layouts leave it as it is, and their boxes are in the frame of the site.
     """
 
     low: Annotated[Tensor, "3"]
     """Lowest corner; -inf where the cell has no end."""
     high: Annotated[Tensor, "3"]
     border: Annotated[Tensor, "3"]
-    """Width of the surroundings that it learns as well; there blocks blend with their neighbours."""
+    """Width of the surroundings that it learns as well; there blocks blend with their neighbours. Cells of Gaussians
+    have borders of their own (`blocks.windows`).
+    """
     frame: Annotated[Tensor, "3 3"] = field(default_factory=lambda: torch.eye(3, dtype=torch.float64))
     """Rows: the axes of all cells of a scene; orthonormal."""
     windows: Mapping[int, Window] = field(default_factory=dict)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from fprf import testing
-from fprf.blocks.config import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig
+from fprf.blocks.config import AdaptiveConfig, BisectConfig, GridConfig, LayoutConfig, SingleConfig
 from fprf.datamanagers.config import FeatureTargets, RayBatchesConfig, TrainingPixels
 from fprf.fields.config import ContentFieldConfig, PlanesConfig, SemanticPlanesConfig
 from fprf.interfaces import (
@@ -49,6 +49,7 @@ BUILT_IN: list[tuple[Callable[[Any], None], Any]] = [
     (testing.check_layout, SingleConfig()),
     (testing.check_layout, GridConfig()),
     (testing.check_layout, AdaptiveConfig()),
+    (testing.check_layout, BisectConfig(count=5)),
     (testing.check_executor, SerialConfig()),
     (testing.check_data_manager, RayBatchesConfig(rays=64, semantic_share=0.5)),
     *(

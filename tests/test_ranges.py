@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.restyle import RestyleConfig
-from fprf.blocks.config import AdaptiveConfig, GridConfig
+from fprf.blocks.config import AdaptiveConfig, BisectConfig, GridConfig
 from fprf.checks import at_least, between, positive
 from fprf.config import (
     LossConfig,
@@ -64,6 +64,7 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
     PlanesConfig: PLANES | {"degree": [0, 5]},
     SemanticPlanesConfig: PLANES,
     GridConfig: {"cells": [(0, 1)], "size": [0.0], "margin": [0.0, 0.6]},
+    BisectConfig: {"count": [0], "margin": [0.0, 0.6]},
     AdaptiveConfig: {"rays": [0], "smallest": [-1.0], "margin": [0.0]},
     UniformConfig: {"samples": [0, -3]},
     ProposalConfig: {

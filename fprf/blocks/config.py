@@ -1,5 +1,5 @@
-"""Block layouts: how a scene is cut. One block over the whole scene is the default. `build` imports the
-implementation.
+"""Layouts: how a scene is cut, into blocks of fields or cells of Gaussians. One part, the whole scene, is the
+default. `build` imports the implementation.
 
 Lengths are in world units: metres, or whatever the capture's poses are in.
 """
@@ -18,11 +18,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class LayoutConfig(PluginConfig):
-    """Cuts a scene into blocks."""
+    """Cuts a scene into parts; a number N stands for `bisect` with N of them."""
 
     group: ClassVar[str] = "fprf.layouts"
     cuts: ClassVar[bool] = True
-    """True where it may give more than one block."""
+    """True where it may give more than one part."""
+    principal: ClassVar[bool] = False
+    """True where the site that it cuts has the principal axes of what views see of the reconstruction's points,
+    not those along, across and above the capture.
+    """
+
+    @classmethod
+    def of_number(cls, number: int) -> LayoutConfig:
+        return SingleConfig() if number == 1 else BisectConfig(count=number)
 
     def build(self) -> BlockLayout:
         """The layout."""
@@ -31,12 +39,12 @@ class LayoutConfig(PluginConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class SingleConfig(LayoutConfig):
-    """One block over the whole scene."""
+    """One part: the whole scene."""
 
     cuts: ClassVar[bool] = False
 
     def build(self) -> BlockLayout:
-        from .partition import GridLayout
+        from .layouts import GridLayout
 
         return GridLayout(GridConfig(cells=(1, 1)))
 
@@ -54,14 +62,14 @@ class GridConfig(LayoutConfig):
 
     def __post_init__(self) -> None:
         for count in self.cells:
-            at_least("blocks.cells", count, 1)
+            at_least("cells", count, 1)
         if self.size is not None:
-            positive("blocks.size", self.size)
-        positive("blocks.margin", self.margin)
-        between("blocks.margin", self.margin, 0.0, 0.5)
+            positive("size", self.size)
+        positive("margin", self.margin)
+        between("margin", self.margin, 0.0, 0.5)
 
     def build(self) -> BlockLayout:
-        from .partition import GridLayout
+        from .layouts import GridLayout
 
         return GridLayout(self)
 
@@ -78,13 +86,39 @@ class AdaptiveConfig(LayoutConfig):
     """Overlap of a block with its neighbours, as a share of the smallest side; in (0, 0.5]."""
 
     def __post_init__(self) -> None:
-        at_least("blocks.rays", self.rays, 1)
+        at_least("rays", self.rays, 1)
         if self.smallest is not None:
-            positive("blocks.smallest", self.smallest)
-        positive("blocks.margin", self.margin)
-        between("blocks.margin", self.margin, 0.0, 0.5)
+            positive("smallest", self.smallest)
+        positive("margin", self.margin)
+        between("margin", self.margin, 0.0, 0.5)
 
     def build(self) -> BlockLayout:
-        from .partition import AdaptiveLayout
+        from .layouts import AdaptiveLayout
 
         return AdaptiveLayout(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BisectConfig(LayoutConfig):
+    """Parts that photographs see equally often, along the principal axes of the reconstruction's points. They
+    cover all of space.
+    """
+
+    principal: ClassVar[bool] = True
+
+    count: int = 2
+    """Parts."""
+    margin: float = 0.1
+    """Overlap of a block of fields with its neighbours, as a share of the shortest side of what is seen in any; in
+    (0, 0.5].
+    """
+
+    def __post_init__(self) -> None:
+        at_least("count", self.count, 1)
+        positive("margin", self.margin)
+        between("margin", self.margin, 0.0, 0.5)
+
+    def build(self) -> BlockLayout:
+        from .layouts import BisectLayout
+
+        return BisectLayout(self)

@@ -144,6 +144,10 @@ def _read(data: Any, hint: Any, path: str, packages: Mapping[str, str]) -> Any:
     origin = get_origin(hint)
     args = get_args(hint)
     if is_slot(hint):
+        # A number may stand for a plug-in: runs from before cells had layouts hold how many there are.
+        numbered = _of_number(data, hint, path)
+        if numbered is not None:
+            return numbered
         # A plug-in is named; one that cannot be loaded is kept as data.
         fields = dict(_expect(data, dict, path))
         name = fields.pop("type", None)
@@ -201,6 +205,16 @@ def _read(data: Any, hint: Any, path: str, packages: Mapping[str, str]) -> Any:
     if hint in (bool, int, str):
         return _expect(data, hint, path)
     raise ConfigError(f"{path}: a field of type {hint} cannot be read from a file")
+
+
+def _of_number(data: Any, kind: type[PluginConfig], path: str) -> PluginConfig | None:
+    """The config that a number stands for in a slot; None where it is none, or stands for nothing."""
+    if type(data) is not int:
+        return None
+    try:
+        return kind.of_number(data)
+    except ConfigError as fault:
+        raise ConfigError(f"{path}: {fault}") from fault
 
 
 def _shown(text: str) -> str:

@@ -27,6 +27,14 @@ class PluginConfig:
 
     group: ClassVar[str]
 
+    @classmethod
+    def of_number(cls, number: int) -> "PluginConfig | None":
+        """The config that a whole number stands for in a slot of this kind, on the command line and in files.
+
+        By default none. Raises ConfigError for numbers out of range.
+        """
+        return None
+
     def needs(self) -> tuple[Need, ...]:
         """Packages and files that `build` wants and that are not here, found without building or downloading
         anything.

@@ -8,7 +8,7 @@ import types
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from ..errors import PluginError, UsageError
+from ..errors import ConfigError, PluginError, UsageError
 from . import registry
 from .config import PluginConfig
 
@@ -101,6 +101,18 @@ def take_flag(args: Sequence[str], flag: str) -> tuple[str | None, list[str]]:
     return value, rest
 
 
+def _of_number(slot: Slot, text: str) -> PluginConfig | None:
+    """The config that a number in the place of a name stands for; None where it is none, or stands for
+    nothing.
+    """
+    if not text.isdecimal() or text in slot.choices:
+        return None
+    try:
+        return slot.kind.of_number(int(text))
+    except ConfigError as error:
+        raise ConfigError(f"--{slot.path}: {error}") from error
+
+
 def resolve(config: C, args: Sequence[str]) -> tuple[C, list[str]]:
     """Apply the slot flags among the arguments, outermost first, so that a chosen plug-in may bring slots of
     its own.
@@ -120,6 +132,10 @@ def resolve(config: C, args: Sequence[str]) -> tuple[C, list[str]]:
             if not slot.optional:
                 raise UsageError(f"--{slot.path}: cannot be none; allowed are {', '.join(slot.choices)}")
             config = replace(config, slot.path, None)
+            continue
+        numbered = _of_number(slot, name)
+        if numbered is not None:
+            config = replace(config, slot.path, numbered)
             continue
         try:
             if type(slot.value) is not registry.load(slot.kind.group, name, slot.kind):

@@ -1,5 +1,5 @@
 """Scenes of Gaussians in cells, each a task of its own (`training.tasks`); how they are cut says
-`blocks.partition`.
+`blocks.windows`.
 
 The whole scene is trained first, on photographs of half the size, for most of the schedule. Each cell goes on
 from there, with the poses that were refined there. It starts from Gaussians of the whole scene: those that
@@ -21,7 +21,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..blocks.partition import bisect_sightings, read_cells, write_cells
+from ..blocks.partition import read_cells, write_cells
+from ..blocks.windows import held_apart
 from ..datamanagers.images import load_images
 from ..datamanagers.scene import ParsedScene
 from ..errors import CheckpointError
@@ -93,10 +94,17 @@ class Cells(Partition):
     """A scene that is ready to be trained cell by cell."""
 
     def __init__(
-        self, config: GaussiansConfig, scene: ParsedScene, saved: Facts | None, *, device: torch.device = CPU
+        self,
+        config: GaussiansConfig,
+        scene: ParsedScene,
+        cells: Sequence[Cell],
+        saved: Facts | None,
+        *,
+        device: torch.device = CPU,
     ) -> None:
         self.config = config
         self.scene = scene
+        self.cells = cells
         self.device = device
         self._facts = saved or light_and_poses(
             config, scene, lambda view: load_images(scene, config.background, [view])[0]
@@ -112,7 +120,8 @@ class Cells(Partition):
         """
         config = self.config
         size = self.scene.cameras.size
-        cells = self.write(run)
+        cells = self.cells
+        self.write(run)
         pixels = []
         for cell in cells:
             pixels.append(sum(width * height for _, _, width, height in cell.windows.values()))
@@ -134,14 +143,10 @@ class Cells(Partition):
         )
         display.say(f"{unite(run.root, cells)} Gaussians")
 
-    def write(self, run: Run) -> list[Cell]:
-        """Cut the scene and write the cells. Those of another cut, which could be taken for these, are
-        removed.
-        """
-        cells = bisect_sightings(self.scene, self.config.cells)
-        if write_cells(run.root / "cells.json", cells):
+    def write(self, run: Run) -> None:
+        """Write the cells. Those of another cut, which could be taken for these, are removed."""
+        if write_cells(run.root / "cells.json", self.cells):
             shutil.rmtree(run.root / "cells", ignore_errors=True)
-        return cells
 
 
 def load_overview(root: Path) -> checkpoint.Saved:
@@ -419,7 +424,8 @@ def unite(root: Path, cells: Sequence[Cell]) -> int:
             )
         # What lies outside of the cell only explained what its windows show: its own cells know it better.
         gaussians = from_tensors(saved.model)
-        parts.append(tuple(vars(gaussians.select(cell.holds(gaussians.means))).values()))
+        own_part = gaussians.select(held_apart(cells, number, gaussians.means))
+        parts.append(tuple(vars(own_part).values()))
         step = max(step, start.step + saved.step)
         seconds = seconds + saved.seconds
         if tones is not None:
@@ -430,6 +436,13 @@ def unite(root: Path, cells: Sequence[Cell]) -> int:
             )
             gain[used] += own.gains().detach()[used]
             count[used] += 1
+    # What no cell holds is as the whole scene has it.
+    around = from_tensors(start.model)
+    held = torch.zeros(len(around), dtype=torch.bool)
+    for cell in cells:
+        held |= cell.holds(around.means)
+    if not bool(held.all()):
+        parts.append(tuple(vars(around.select(~held)).values()))
     # Poses were refined in the whole scene alone.
     gaussians = Gaussians(*(torch.cat(column) for column in zip(*parts, strict=True)))
     corrections = {}

@@ -3,9 +3,10 @@ torch.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
+from ..blocks.config import LayoutConfig, SingleConfig
 from ..checks import at_least, between, positive
 from ..datamanagers.parsers.config import DataParserConfig
 from ..errors import ConfigError
@@ -135,9 +136,9 @@ class GaussiansConfig(RunConfig):
     """Steps between moves of transparent Gaussians to where views err."""
     rate: float = 1.0
     """Factor of all learning rates."""
-    cells: int = 1
-    """Parts of space that are trained apart, each with a part of the time and of the Gaussians; 1 = none.
-    More need points of a reconstruction.
+    cells: LayoutConfig = SingleConfig()
+    """Layout of the cells that the scene is cut into: parts of space that are trained apart, each with a part of
+    the time and of the Gaussians. They need points of a reconstruction.
     """
     overview: float = 0.9
     """Share of steps and minutes in which the whole scene is trained at half the size before its cells go on
@@ -160,7 +161,7 @@ class GaussiansConfig(RunConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("initial", "pixels_per_gaussian", "cells", "regions", "relocate_every"):
+        for name in ("initial", "pixels_per_gaussian", "regions", "relocate_every"):
             at_least(name, getattr(self, name), 1)
         for name in ("cap", "passes"):
             if (value := getattr(self, name)) is not None:
@@ -187,13 +188,17 @@ class GaussiansConfig(RunConfig):
         progress: Callable[[int, int, str], None] | None = None,
     ) -> "SceneLearner | Partition":
         """Read the photographs and find the first points; cells where there are to be some."""
-        if self.cells > 1:
-            from .cells import Cells
-
-            return Cells(self, scene, saved, device=device)
         from .setup import build
 
-        return build(self, scene, saved, device=device)
+        if not self.cells.cuts:
+            return build(self, scene, saved, device=device)
+        from ..blocks.windows import cut_into_windows
+        from .cells import Cells
+
+        cells = cut_into_windows(scene, self.cells)
+        if len(cells) == 1:
+            return build(replace(self, cells=SingleConfig()), scene, saved, device=device)
+        return Cells(self, scene, cells, saved, device=device)
 
     def compile_kernels(self, device: "torch.device", say: Callable[[str], None]) -> None:
         """gsplat's kernels for a CUDA device, or those of the CPU."""

@@ -101,7 +101,7 @@ def plan(config: "GaussiansConfig", scene: "ParsedScene", device: torch.device) 
     cap = config.cap
     if cap is None:
         cap = min(_MOST, max(_FEWEST, 10_000 * round(_FEWEST / 10_000 * (seconds / 60) ** _GROWTH)))
-        if config.cells == 1:
+        if not config.cells.cuts:
             cap = min(cap, max(1, int(views * pixels / size**2) // config.pixels_per_gaussian))
     return replace(found, downscale=size, cap=cap)
 

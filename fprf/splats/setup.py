@@ -72,7 +72,7 @@ def build(
     """
     # Few photographs get few Gaussians, which they would else learn by heart; cells bound theirs by the whole
     # scene.
-    if config.cells == 1:
+    if not config.cells.cuts:
         pixels = int(scene.cameras.size[scene.train].prod(1).sum())
         cap = max(1, min(config.most, pixels // config.pixels_per_gaussian))
         config = replace(config, cap=cap, initial=max(1, config.initial * cap // config.most))
@@ -96,7 +96,7 @@ def build(
         scene_scale(scene),
         max(config.most, len(points.position) + config.surroundings),
         None if sphere is None else sphere.encloses,
-        limit_widths(scene, near, cells=config.cells > 1, sphere=sphere),
+        limit_widths(scene, near, cells=config.cells.cuts, sphere=sphere),
         near=near,
         tones=tones_of(facts),
         poses=poses_of(facts, 1.0),

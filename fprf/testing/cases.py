@@ -49,7 +49,13 @@ def site(views: int, points: int) -> Site:
     way = torch.linspace(-3, 3, views, dtype=torch.float64)
     position = torch.stack([way, 0.3 * torch.sin(2 * way), torch.zeros_like(way)], 1)
     spread = normal(points, 3, seed=16).double() * torch.tensor([3.0, 1.0, 0.3], dtype=torch.float64)
-    return Site(position=position, rays=torch.full((views,), 640 * 480), points=spread, unit=10.0)
+    return Site(
+        position=position,
+        rays=torch.full((views,), 640 * 480),
+        points=spread,
+        unit=10.0,
+        seen=spread.repeat(2, 1) if points else None,
+    )
 
 
 def space() -> Space:

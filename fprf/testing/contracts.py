@@ -350,6 +350,8 @@ def check_layout(config: LayoutConfig) -> None:
                 f"{name}: a cell's lowest corner must lie below its highest",
             )
             require(torch.equal(cell.border, cells[0].border), f"{name}: all cells must have the same border")
+            turned = not torch.equal(cell.frame, torch.eye(3, dtype=torch.float64))
+            require(not turned, f"{name}: cells must be boxes along the axes of the site")
             same = torch.equal(cell.low, other.low) and torch.equal(cell.high, other.high)
             require(same, f"{name}: must be deterministic")
         require(

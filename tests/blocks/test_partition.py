@@ -10,10 +10,9 @@ import torch
 from block_scenes import drone, street
 from torch import Tensor
 
-from fprf.blocks.config import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig
+from fprf.blocks.config import AdaptiveConfig, BisectConfig, GridConfig, LayoutConfig, SingleConfig
+from fprf.blocks.layouts import bounds
 from fprf.blocks.partition import (
-    bisect_sightings,
-    bounds,
     make_plan,
     open_space,
     pixel_mask,
@@ -22,6 +21,7 @@ from fprf.blocks.partition import (
     write_cells,
 )
 from fprf.blocks.routing import shares
+from fprf.blocks.windows import cut_into_windows
 from fprf.datamanagers.scene import ParsedScene, find_sightings
 from fprf.errors import CheckpointError, ConfigError
 from fprf.splats.cells import scene_in_windows
@@ -29,7 +29,8 @@ from fprf.types import Cell, Site
 
 
 def site(scene: ParsedScene) -> Site:
-    return site_of(scene, open_space(scene, find_sightings(scene)))
+    sightings = find_sightings(scene)
+    return site_of(scene, open_space(scene, sightings), sightings)
 
 
 DRONE = site(drone())
@@ -52,6 +53,8 @@ def holding(cells: list[Cell], points: Tensor) -> Tensor:
         (SingleConfig(), STREET),
         (GridConfig(cells=(5, 1)), STREET),
         (AdaptiveConfig(rays=20_000), STREET),
+        (BisectConfig(count=5), DRONE),
+        (BisectConfig(), STREET),
     ],
     ids=str,
 )
@@ -119,7 +122,7 @@ def scene(request: pytest.FixtureRequest) -> ParsedScene:
 
 @pytest.fixture(scope="module")
 def cells(scene: ParsedScene) -> list[Cell]:
-    return bisect_sightings(scene, COUNT)
+    return cut_into_windows(scene, BisectConfig(count=COUNT))
 
 
 def test_cells_cover_space_once_and_have_equally_many_sightings(
@@ -162,13 +165,16 @@ def test_windows_of_a_photograph_reach_its_edges(scene: ParsedScene, cells: list
 
 def test_without_points_cells_are_refused() -> None:
     with pytest.raises(ConfigError, match="too few points"):
-        bisect_sightings(replace(drone(), points=None), 2)
+        cut_into_windows(replace(drone(), points=None), BisectConfig())
 
 
 @pytest.mark.parametrize("kind", ["blocks", "cells"])
 def test_a_partition_comes_back_from_its_file(tmp_path: Path, kind: str) -> None:
     file = tmp_path / "cells.json"
-    cells = bisect_sightings(drone(), 2) if kind == "cells" else make_plan(drone(), GridConfig()).cells
+    if kind == "cells":
+        cells = cut_into_windows(drone(), BisectConfig())
+    else:
+        cells = [*make_plan(drone(), GridConfig()).cells]
     assert not write_cells(file, cells) and not write_cells(file, cells)
     assert [*map(repr, read_cells(file))] == [*map(repr, cells)]
     assert write_cells(file, cells[:1]), "it held another one"

@@ -11,7 +11,8 @@ from gsplat_stand_in import stand_in
 from pretend_cuda import pretend_cuda
 
 from benchmarks.town.write import write_town
-from fprf.blocks.partition import bisect_sightings
+from fprf.blocks.config import BisectConfig
+from fprf.blocks.windows import cut_into_windows
 from fprf.cli.main import main
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.images import write_image
@@ -53,7 +54,9 @@ def test_the_union_holds_each_cell_s_own(town: Path, tmp_path: Path) -> None:
     assert main(["export", str(run), "ply", "--output", str(tmp_path / "a.ply")]) == 0
     gaussians = read_capture(tmp_path / "a.ply").gaussians
     cut = load_cells(run)
-    assert [*map(repr, cut)] == [*map(repr, bisect_sightings(parse_scene(town, 1, None), 3))]
+    assert [*map(repr, cut)] == [
+        *map(repr, cut_into_windows(parse_scene(town, 1, None), BisectConfig(count=3)))
+    ]
     assert (
         len(gaussians) > 0 and torch.stack([cell.holds(gaussians.means) for cell in cut]).sum(0).eq(1).all()
     )

@@ -15,6 +15,7 @@ from splat_ball import equal
 from torch import Tensor
 
 import fprf
+from fprf.blocks.config import BisectConfig, LayoutConfig, SingleConfig
 from fprf.cli.main import main
 from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers.config import parse_scene
@@ -449,9 +450,9 @@ def test_surroundings_do_not_reach_the_cameras(
     assert far.sum() == config.surroundings and (widths[far] <= 0.22 * distance[far]).all()
 
 
-@pytest.mark.parametrize(("cells", "share"), [(1, 0.5), (2, 0.25)])
+@pytest.mark.parametrize(("cells", "share"), [(SingleConfig(), 0.5), (BisectConfig(), 0.25)])
 def test_nothing_covers_a_camera(
-    config: GaussiansConfig, scene: ParsedScene, cells: int, share: float
+    config: GaussiansConfig, scene: ParsedScene, cells: LayoutConfig, share: float
 ) -> None:
     before, widths = after_a_step_of_wide_ones(replace(config, cells=cells, surroundings=0), scene)
     near = torch.cdist(before, scene.cameras.pose[scene.train][:, :, 3].float()).amin(1)[:, None]

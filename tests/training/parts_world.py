@@ -11,7 +11,7 @@ import torch
 from tiny_world import tiny
 
 from benchmarks.town.write import write_town
-from fprf.blocks.config import GridConfig, LayoutConfig
+from fprf.blocks.config import BisectConfig, GridConfig, LayoutConfig
 from fprf.config import StatisticsConfig, TrainConfig
 from fprf.io import tensorfiles
 from fprf.run_config import RunConfig
@@ -148,7 +148,14 @@ def world_of_blocks(config: RunConfig, root: Path) -> TaskWorld:
 
 def small_cells(data: Path, output: Path, **change: Any) -> GaussiansConfig:
     """Two cells of a few hundred Gaussians."""
-    words = {"downscale": 1, "steps": 150, "cells": 2, "initial": 300, "cap": 600, "output": output}
+    words = {
+        "downscale": 1,
+        "steps": 150,
+        "cells": BisectConfig(),
+        "initial": 300,
+        "cap": 600,
+        "output": output,
+    }
     return GaussiansConfig(data=data, **words | change)
 
 

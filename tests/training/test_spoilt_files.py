@@ -14,7 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.town.write import write_town
+from fprf.blocks.config import BisectConfig
 from fprf.blocks.partition import write_cells
+from fprf.blocks.windows import cut_into_windows
 from fprf.config_files import save_config
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import ParsedScene
@@ -77,8 +79,9 @@ class Example:
 
     def cells(self) -> Cells:
         """Its scene, ready to be cut into cells."""
-        config = GaussiansConfig(data=self.root.parent / "town", cells=2)
-        return Cells(config, self.scene, Run(self.root).load_known().facts)
+        config = GaussiansConfig(data=self.root.parent / "town", cells=BisectConfig())
+        cut = cut_into_windows(self.scene, config.cells)
+        return Cells(config, self.scene, cut, Run(self.root).load_known().facts)
 
     def documents(self) -> list[Path]:
         return [path for path in self.content if path.suffix in (".json", ".jsonl")]
